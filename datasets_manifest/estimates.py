@@ -1,0 +1,116 @@
+"""What a pose estimator says about one frame, and the JSON-lines file that holds many."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from datasets_manifest.json_types import FrozenModel, Matrix6, Transform
+from geometry.stereo import Eye
+
+TANGENT = "left: t' = t + dt, R' = exp([w]x) R; order dt [m], w [rad]"
+
+
+class Feature(FrozenModel):
+    """One measured image point.
+
+    Attributes:
+        eye: which image.
+        index: of the marker in the drogue's order; `hub` for the hub.
+        center_px: measured centre.
+        cov_px2: (2, 2) covariance of the centre, row-major. [px^2]
+        used: whether the pose rests on it.
+    """
+
+    eye: Eye
+    index: int | Literal["hub"]
+    center_px: tuple[float, float]
+    cov_px2: tuple[tuple[float, float], tuple[float, float]]
+    used: bool
+
+
+class Mode(FrozenModel):
+    """One of several poses that explain the images."""
+
+    left_from_drogue: Transform
+    weight: float = Field(ge=0, le=1)
+
+
+class PoseEstimate(FrozenModel):
+    """A pose of the drogue.
+
+    Attributes:
+        left_from_drogue: modulo the markers' symmetry.
+        covariance: (6, 6) in the tangent that `tangent` names; None where a method knows none.
+        modes: every pose that explains the images, the best first; weights sum to 1.
+        features: what was measured.
+        stage_s: seconds by stage. [s]
+    """
+
+    status: Literal["fix"] = "fix"
+    frame_index: int = Field(ge=0)
+    method: str = Field(min_length=1, max_length=80)
+    left_from_drogue: Transform
+    covariance: Matrix6 | None = None
+    tangent: str = TANGENT
+    modes: tuple[Mode, ...] = ()
+    features: tuple[Feature, ...] = ()
+    stage_s: dict[str, float] = Field(default_factory=dict)
+
+
+class NoFix(FrozenModel):
+    """No pose, and why."""
+
+    status: Literal["no_fix"] = "no_fix"
+    frame_index: int = Field(ge=0)
+    method: str = Field(min_length=1, max_length=80)
+    reason: str = Field(min_length=1)
+    features: tuple[Feature, ...] = ()
+    stage_s: dict[str, float] = Field(default_factory=dict)
+
+
+Estimate = PoseEstimate | NoFix
+_ADAPTER: TypeAdapter[Estimate] = TypeAdapter(Annotated[Estimate, Field(discriminator="status")])
+
+
+def write_estimates(path: Path, estimates: Iterable[Estimate]) -> int:
+    """Write one JSON object a line, replacing `path` only once all are written.
+
+    Returns:
+        How many were written.
+    """
+    part = path.with_name(path.name + ".part")
+    count = 0
+    try:
+        with part.open("w", encoding="utf-8") as stream:
+            for estimate in estimates:
+                stream.write(estimate.model_dump_json() + "\n")
+                count += 1
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return count
+
+
+def read_estimates(path: Path) -> Iterator[Estimate]:
+    """Estimates of a JSON-lines file, ours or anybody's.
+
+    Raises:
+        ValueError: the file cannot be read, or a line is not an estimate; names file and line.
+    """
+    try:
+        with path.open(encoding="utf-8") as stream:
+            for number, line in enumerate(stream, start=1):
+                if not line.strip():
+                    continue
+                try:
+                    yield _ADAPTER.validate_python(json.loads(line))
+                except (ValidationError, ValueError, RecursionError) as error:
+                    first = str(error).splitlines()[0]
+                    raise ValueError(f"{path}, line {number}: not a pose estimate: {first}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read: {error}") from error

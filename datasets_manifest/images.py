@@ -1,0 +1,54 @@
+"""What the cameras of the rig deliver: the only pictures that navigation sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True, eq=False)
+class StereoImages:
+    """One stereo pair of images.
+
+    Attributes:
+        left, right: (H, W, 3) in the order red, green, blue, or (H, W) for a mono sensor.
+        left_mosaic, right_mosaic: (H, W) raw RGGB mosaic of a Bayer sensor, else None.
+        bits: how many bits of the integers are used: 8 in uint8, 12 in uint16.
+        encoding: `linear`, or `gamma` (the sRGB curve); a mosaic is always linear.
+        black_level_dn: number that no light gives. [DN]
+        time_s: mid-exposure. [s]
+        exposure_s: [s]
+    """
+
+    left: Pixels
+    right: Pixels
+    time_s: float
+    exposure_s: float
+    bits: Literal[8, 12] = 8
+    encoding: Literal["linear", "gamma"] = "linear"
+    black_level_dn: float = 0.0
+    left_mosaic: Pixels | None = None
+    right_mosaic: Pixels | None = None
+
+    def __post_init__(self) -> None:
+        dtype = np.uint8 if self.bits == 8 else np.uint16
+        for name, image in (("left", self.left), ("right", self.right)):
+            if image.dtype != dtype or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+                raise ValueError(
+                    f"{name}: must be (H, W) or (H, W, 3) of {dtype.__name__}, got {image.shape} {image.dtype}"
+                )
+        if self.left.shape != self.right.shape:
+            raise ValueError(f"right: must have the left image's shape {self.left.shape}, got {self.right.shape}")
+        for name, mosaic in (("left_mosaic", self.left_mosaic), ("right_mosaic", self.right_mosaic)):
+            if mosaic is not None and (mosaic.shape != self.left.shape[:2] or mosaic.dtype != dtype):
+                raise ValueError(f"{name}: must be {self.left.shape[:2]} of {dtype.__name__}, got {mosaic.shape}")
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height). [px]"""
+        return int(self.left.shape[1]), int(self.left.shape[0])

@@ -1,0 +1,1 @@
+"""What a drogue is: dimensions with sources, marker layout and hub, meshes and materials."""

@@ -1,0 +1,75 @@
+"""Where the features of a drogue lie: what an estimator needs to know of it, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from drogue_models.parameters import DrogueParameters
+from geometry.se3 import Array, read_only
+
+# Markers count as one even ring when their places agree with it within this, far below any centroid's worth.
+_RING_TOLERANCE_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerLayout:
+    """Centres and radii of the markers and the hub in the drogue frame.
+
+    Attributes:
+        centers_m: (N, 3) marker centres, z = 0. [m]
+        radius_m: radius of every marker. [m]
+        hub_center_m: (3,) centre of the hub annulus, or None. [m]
+        hub_inner_radius_m, hub_outer_radius_m: its edges, 0 without a hub. [m]
+    """
+
+    centers_m: Array
+    radius_m: float
+    hub_center_m: Array | None
+    hub_inner_radius_m: float = 0.0
+    hub_outer_radius_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centers_m", read_only(self.centers_m, (-1, 3), "centers_m"))
+        if self.hub_center_m is not None:
+            object.__setattr__(self, "hub_center_m", read_only(self.hub_center_m, (3,), "hub_center_m"))
+
+    @cached_property
+    def count(self) -> int:
+        """Number of markers."""
+        return int(self.centers_m.shape[0])
+
+    @cached_property
+    def ring_radius_m(self) -> float | None:
+        """Radius of the circle around the origin on which all markers lie, or None. [m]"""
+        radii = np.hypot(self.centers_m[:, 0], self.centers_m[:, 1])
+        return float(radii.mean()) if np.ptp(radii) < _RING_TOLERANCE_M else None
+
+    @cached_property
+    def symmetry_order(self) -> int:
+        """How many rotations about the axis map the markers onto themselves (8 for an even ring of 8)."""
+        for order in range(self.count, 1, -1):
+            angle = 2 * np.pi / order
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            turned = self.centers_m[:, :2] @ turn.T
+            gaps = np.linalg.norm(turned[:, None] - self.centers_m[None, :, :2], axis=-1).min(axis=1)
+            if gaps.max() < _RING_TOLERANCE_M:
+                return order
+        return 1
+
+
+def marker_layout(drogue: DrogueParameters) -> MarkerLayout:
+    """The features of a drogue."""
+    centers = np.zeros((drogue.marker_count, 3))
+    centers[:, :2] = drogue.marker_positions_m
+    if drogue.hub is None:
+        return MarkerLayout(centers, drogue.marker_radius_m, None)
+    return MarkerLayout(
+        centers,
+        drogue.marker_radius_m,
+        np.array([0.0, 0.0, drogue.hub.depth_m]),
+        drogue.hub.inner_radius_m,
+        drogue.hub.outer_radius_m,
+    )

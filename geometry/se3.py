@@ -1,0 +1,158 @@
+"""Rigid transforms `a_from_b`, the drogue's attitude angles, and constant-twist motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import RigidTransform as _ScipyRigidTransform
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+# float64 products of a few rotations stay far within this; a typing slip in a file does not.
+_ORTHONORMAL_TOLERANCE = 1e-6
+
+
+def read_only(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    """A read-only float64 copy of `values`.
+
+    Args:
+        values: anything numpy can read.
+        shape: the shape it must have; -1 stands for any length.
+        name: the field's name, for the error.
+
+    Raises:
+        ValueError: wrong shape, or a value that is not finite.
+    """
+    array = np.array(values, dtype=np.float64)
+    if array.ndim != len(shape) or any(want not in (-1, got) for want, got in zip(shape, array.shape, strict=True)):
+        raise ValueError(f"{name}: must have shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: must be finite, got {array.tolist()}")
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class RigidTransform:
+    """`a_from_b`: takes coordinates in frame b to coordinates in frame a.
+
+    Attributes:
+        rotation: (3, 3) proper rotation.
+        translation_m: (3,) origin of b in a. [m]
+    """
+
+    rotation: Array
+    translation_m: Array
+
+    def __post_init__(self) -> None:
+        rotation = read_only(self.rotation, (3, 3), "rotation")
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise ValueError(f"rotation: must be orthonormal with determinant +1, got {rotation.tolist()}")
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation_m", read_only(self.translation_m, (3,), "translation_m"))
+
+    @staticmethod
+    def identity() -> RigidTransform:
+        """The transform that changes nothing."""
+        return RigidTransform(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: ArrayLike) -> RigidTransform:
+        """From a homogeneous (4, 4) matrix, row-major."""
+        m = read_only(matrix, (4, 4), "matrix")
+        if np.abs(m[3] - (0.0, 0.0, 0.0, 1.0)).max() > _ORTHONORMAL_TOLERANCE:
+            raise ValueError(f"matrix: last row must be 0 0 0 1, got {m[3].tolist()}")
+        return RigidTransform(m[:3, :3], m[:3, 3])
+
+    def as_matrix(self) -> Array:
+        """Homogeneous (4, 4) matrix."""
+        m = np.eye(4)
+        m[:3, :3] = self.rotation
+        m[:3, 3] = self.translation_m
+        return m
+
+    def __matmul__(self, other: RigidTransform) -> RigidTransform:
+        return RigidTransform(self.rotation @ other.rotation, self.rotation @ other.translation_m + self.translation_m)
+
+    def inverse(self) -> RigidTransform:
+        """`b_from_a`."""
+        return RigidTransform(self.rotation.T, -self.rotation.T @ self.translation_m)
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Coordinates of (..., 3) points of b in a. [m]"""
+        result: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation_m
+        return result
+
+    def rotate(self, vectors: ArrayLike) -> Array:
+        """Components of (..., 3) directions of b in a."""
+        result: Array = np.asarray(vectors, dtype=np.float64) @ self.rotation.T
+        return result
+
+
+def exp_twist(twist: ArrayLike) -> RigidTransform:
+    """Exponential of a twist.
+
+    Args:
+        twist: (6,) translational part [m], then rotation vector [rad].
+
+    Source: scipy.spatial.transform.RigidTransform (which orders rotation first).
+    """
+    t = read_only(twist, (6,), "twist")
+    matrix = _ScipyRigidTransform.from_exp_coords(np.concatenate([t[3:], t[:3]])).as_matrix()
+    return RigidTransform.from_matrix(matrix)
+
+
+def log_twist(transform: RigidTransform) -> Array:
+    """(6,) twist whose exponential is `transform`: translational part [m], then rotation vector [rad]."""
+    coords = np.asarray(_ScipyRigidTransform.from_matrix(transform.as_matrix()).as_exp_coords())
+    return np.concatenate([coords[3:], coords[:3]])
+
+
+def rotation_from_angles(pitch_rad: float, yaw_rad: float, roll_rad: float) -> Array:
+    """Attitude of the drogue in the camera, `R_y(yaw) R_x(pitch) R_z(roll)`.
+
+    Positive pitch lifts the hose end, positive yaw turns the hose end to the right.
+
+    Returns:
+        (3, 3) rotation `camera_from_drogue`.
+
+    Source: the seed paper's eq. 8 with its entry (1, 1) corrected.
+    """
+    matrix: Array = Rotation.from_euler("YXZ", [yaw_rad, pitch_rad, roll_rad]).as_matrix()
+    return matrix
+
+
+def angles_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
+    """(pitch, yaw, roll) in radians; the inverse of `rotation_from_angles` for |pitch| < 90 degrees."""
+    r = np.asarray(rotation, dtype=np.float64)
+    pitch, yaw = angles_from_axis(r[:, 2])
+    roll = float(np.arctan2(r[1, 0], r[1, 1]))
+    return float(pitch), float(yaw), roll
+
+
+def angles_from_axis(axis: ArrayLike) -> tuple[Array, Array]:
+    """Pitch and yaw of the drogue's axis.
+
+    Args:
+        axis: (..., 3) unit vectors in the camera frame, from the mouth to the hose.
+
+    Returns:
+        pitch (...), yaw (...). [rad]
+
+    Source: the seed paper's eqs. 10 and 11 in arctangent form.
+    """
+    n = np.asarray(axis, dtype=np.float64)
+    return np.arctan2(-n[..., 1], np.hypot(n[..., 0], n[..., 2])), np.arctan2(n[..., 0], n[..., 2])
+
+
+def skew(vectors: ArrayLike) -> Array:
+    """(..., 3, 3) cross-product matrices of (..., 3) vectors: `skew(a) @ b == cross(a, b)`."""
+    v = np.asarray(vectors, dtype=np.float64)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out

@@ -1,0 +1,104 @@
+"""The rectified stereo rig: two equal pinholes, the right one `baseline_m` along +x of the left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import Array, RigidTransform, read_only
+
+Eye = Literal["left", "right"]
+EYES: tuple[Eye, Eye] = ("left", "right")
+
+# Aviation body axes (x forward, y right, z down) seen from camera axes (x right, y down, z forward).
+BODY_FROM_OPTICAL_ROTATION = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """Two equal rectified cameras on the receiver.
+
+    Attributes:
+        camera: intrinsics of both eyes.
+        baseline_m: distance of the right eye from the left, along x.
+        body_from_left: left camera frame to the receiver's body axes (forward, right, down).
+        probe_tip_body_m: (3,) tip of the refuelling probe in body axes.
+    """
+
+    camera: PinholeCamera
+    baseline_m: float
+    body_from_left: RigidTransform = field(
+        default_factory=lambda: RigidTransform(BODY_FROM_OPTICAL_ROTATION, np.zeros(3))
+    )
+    probe_tip_body_m: Array = field(default_factory=lambda: np.array([1.0, 0.45, 0.35]))
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.baseline_m) and self.baseline_m > 0):
+            raise ValueError(f"baseline_m: must be positive, got {self.baseline_m}")
+        object.__setattr__(self, "probe_tip_body_m", read_only(self.probe_tip_body_m, (3,), "probe_tip_body_m"))
+
+    def eye_offset_m(self, eye: Eye) -> Array:
+        """(3,) centre of the eye in the left camera frame. [m]"""
+        return np.array([0.0 if eye == "left" else self.baseline_m, 0.0, 0.0])
+
+    def project(self, points_left_m: ArrayLike, eye: Eye) -> Array:
+        """(..., 2) image in one eye of (..., 3) points given in the left camera frame. [px]"""
+        return self.camera.project(np.asarray(points_left_m, dtype=np.float64) - self.eye_offset_m(eye))
+
+    def triangulate(self, left_px: ArrayLike, right_px: ArrayLike) -> Array:
+        """Maximum-likelihood points for equal isotropic noise in both eyes.
+
+        Args:
+            left_px: (..., 2) pixel coordinates.
+            right_px: (..., 2) of the same points in the right eye.
+
+        Returns:
+            (..., 3) points in the left camera frame; nan where the disparity is not positive. [m]
+
+        Source: the seed paper's eqs. 1 and 2, with the mean of both rows.
+        """
+        left, right = np.asarray(left_px, dtype=np.float64), np.asarray(right_px, dtype=np.float64)
+        c = self.camera
+        disparity = left[..., 0] - right[..., 0]
+        disparity = np.where(disparity > 0, disparity, np.nan)
+        z = c.fx_px * self.baseline_m / disparity
+        x = ((left[..., 0] + right[..., 0]) / 2 - c.cx_px) * z / c.fx_px + self.baseline_m / 2
+        y = ((left[..., 1] + right[..., 1]) / 2 - c.cy_px) * z / c.fy_px
+        return np.stack([x, y, z], axis=-1)
+
+    def common_field_m(self, depth_m: float, radius_m: float) -> tuple[float, float, float, float] | None:
+        """Where the centre of a ball may lie so that both eyes see all of it (to first order, as a disc facing them).
+
+        Args:
+            depth_m: Z of the centre. [m]
+            radius_m: radius of the ball. [m]
+
+        Returns:
+            (x_low, x_high, y_low, y_high) in the left camera frame [m], or None where there is no room.
+        """
+        c = self.camera
+        half_pixel = 0.5
+        left_reach = (c.cx_px + half_pixel) / c.fx_px * depth_m
+        right_reach = (c.width_px - half_pixel - c.cx_px) / c.fx_px * depth_m
+        up_reach = (c.cy_px + half_pixel) / c.fy_px * depth_m
+        down_reach = (c.height_px - half_pixel - c.cy_px) / c.fy_px * depth_m
+        x_low, x_high = self.baseline_m - left_reach + radius_m, right_reach - radius_m
+        y_low, y_high = radius_m - up_reach, down_reach - radius_m
+        return None if x_low > x_high or y_low > y_high else (x_low, x_high, y_low, y_high)
+
+    def nearest_full_view_m(self, radius_m: float) -> float:
+        """Depth of the nearest facing disc of this radius that both eyes can see whole. [m]"""
+        c = self.camera
+        vertical = 2 * radius_m * c.fy_px / c.height_px
+        horizontal = (2 * radius_m + self.baseline_m) * c.fx_px / c.width_px
+        return max(vertical, horizontal)
+
+
+def paper_rig() -> StereoRig:
+    """The seed paper's rig: 1280x960 pixels of 3.75 um behind 8 mm, baseline 0.12 m (its section 4.2)."""
+    focal_px = 8e-3 / 3.75e-6
+    return StereoRig(PinholeCamera(1280, 960, focal_px, focal_px, 639.5, 479.5), 0.12)
