@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -65,6 +66,22 @@ class Environment(FrozenModel):
         return 3.912 / self.visibility_m
 
 
+class Exposure(FrozenModel):
+    """Shutter and aperture of both eyes."""
+
+    time_s: float = Field(gt=0, le=1)
+    f_number: float = Field(ge=0.5, le=64)
+    gain: float = Field(default=1.0, ge=0.1, le=64)
+
+    @property
+    def lux_per_cd_m2(self) -> float:
+        """Illuminance of the sensor per luminance of the scene, for a lens without loss, focused far away. [lux m2/cd]
+
+        Source: camera equation E = pi L / (4 N^2), EMVA Standard 1288.
+        """
+        return math.pi / (4.0 * self.f_number**2)
+
+
 class Sensor(FrozenModel):
     """What turns radiance into numbers.
 
@@ -92,13 +109,9 @@ class Sensor(FrozenModel):
     black_level_dn: int = Field(ge=0, le=1000)
     encoding: Literal["linear", "gamma"] = "linear"
 
-
-class Exposure(FrozenModel):
-    """Shutter and aperture of both eyes."""
-
-    time_s: float = Field(gt=0, le=1)
-    f_number: float = Field(ge=0.5, le=64)
-    gain: float = Field(default=1.0, ge=0.1, le=64)
+    def electrons_per_cd_m2(self, exposure: Exposure) -> float:
+        """Electrons of one pixel per luminance of the scene. [e- m2/cd]"""
+        return self.responsivity_e_per_lux_s * exposure.lux_per_cd_m2 * exposure.time_s
 
 
 class FrameSpec(FrozenModel):
@@ -107,21 +120,23 @@ class FrameSpec(FrozenModel):
     Attributes:
         seed: of the dataset; with `frame_index` it keys every random stream.
         frame_index: place in the dataset.
+        family: the recipe's name for these conditions, for tables.
         scene_id: which drawn environment; splits are by scene.
         sequence_id: which sequence, or None for single frames.
         time_s: mid-exposure. [s]
         drogue: what hangs there, or None for an empty frame.
         left_from_drogue: pose at mid-exposure, or None for an empty frame.
         world_from_left: world axes are x east, y north, z up; origin at the left eye.
-        left_twist_per_s, drogue_twist_per_s: (6,) body twists over the exposure, each in its own frame, relative to axes
-            that fly along with the tanker: velocity [m/s], then angular velocity [rad/s].
+        left_twist_per_s, drogue_twist_per_s: (6,) body twists over the exposure, each in its own frame, relative to
+            axes that fly along with the tanker: velocity [m/s], then angular velocity [rad/s].
         left_from_tanker: tanker frame x aft, y right wing, z up at the pod's hose exit, or None.
-        hose_nodes_left_m: (K, 3) centre line from the coupling to the pod in the left camera at mid-exposure, or None. [m]
+        hose_nodes_left_m: (K, 3) centre line from coupling to pod in the left camera at mid-exposure, or None. [m]
         rig, sensor, exposure, environment: as named.
     """
 
     seed: int = Field(ge=0)
     frame_index: int = Field(ge=0)
+    family: str = "clear"
     scene_id: int = Field(ge=0)
     sequence_id: int | None = Field(default=None, ge=0)
     time_s: float

@@ -243,7 +243,7 @@ class Recipe(FrozenModel):
         limit = self.rig.nearest_full_view_m(self.drogue.rim_radius_m)
         if nearest < limit:
             raise ValueError(
-                f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue still fits into both views"
+                f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue just fits into both views"
             )
         return self
 
@@ -274,7 +274,7 @@ def load_recipe(name_or_path: str, seed: int | None = None) -> tuple[Recipe, str
         path = Path(name_or_path)
         if path.suffix != ".toml":
             raise ValueError(
-                f"recipe: none named {name_or_path!r} ships; there are {', '.join(recipe_names())}, or give a .toml file"
+                f"recipe: no {name_or_path!r} ships; there are {', '.join(recipe_names())}, or give a .toml file"
             )
         base = path.parent
         try:

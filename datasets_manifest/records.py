@@ -85,6 +85,7 @@ class PairRecord(FrozenModel):
         roll_modulo_deg: roll modulo the markers' symmetry, in [0, 360/order).
         file_sha256: of every other file of the frame, by name.
         engine, engine_version: what made the radiance.
+        image_black_level_dn: number in the stored images that no light gives. [DN]
         frame: the specification that it was made from.
     """
 
@@ -104,5 +105,6 @@ class PairRecord(FrozenModel):
     conditions: Conditions
     engine: str
     engine_version: str
+    image_black_level_dn: float = Field(default=0.0, ge=0)
     file_sha256: dict[str, str]
     frame: FrameSpec

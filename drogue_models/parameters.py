@@ -6,6 +6,7 @@ Drogue frame: origin at the centre of the marker circle in the rim plane, z alon
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -50,6 +51,26 @@ class HubParameters(FrozenModel):
         return self
 
 
+class BodyMesh(FrozenModel):
+    """A user's mesh of canopy, ribs and coupling in one, pinned by its contents.
+
+    Attributes:
+        path: as the user wrote it, relative to `folder` unless absolute.
+        sha256: of the file.
+        folder: where the drogue's TOML file lies. It is not stored with a dataset, which must not depend on where it
+            was made; a drogue that is read back looks in the working directory.
+    """
+
+    path: str = Field(min_length=1, max_length=1000)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    folder: Path = Field(default=Path(), exclude=True)
+
+    @property
+    def file(self) -> Path:
+        """Where the mesh lies."""
+        return self.folder / self.path
+
+
 class DrogueParameters(FrozenModel):
     """A drogue with round markers set into its dark face.
 
@@ -69,6 +90,7 @@ class DrogueParameters(FrozenModel):
         rib_count: struts between rim and coupling.
         coupling_radius_m, coupling_length_m: the body behind the hub face. [m]
         hose_radius_m: [m]
+        body_mesh: a mesh instead of canopy, ribs and coupling, or none. Its part is the coupling.
     """
 
     name: str = Field(min_length=1, max_length=80)
@@ -88,12 +110,17 @@ class DrogueParameters(FrozenModel):
     coupling_radius_m: Metres = 0.085
     coupling_length_m: Metres = 0.20
     hose_radius_m: Metres = 0.0335  # hose diameter 67 mm
+    body_mesh: BodyMesh | None = None
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         face_outer_m = self.rim_radius_m - self.rim_tube_radius_m
         if self.face_inner_radius_m >= face_outer_m:
             raise ValueError(f"face_inner_radius_m: must be below {face_outer_m:g} m, where the rim begins")
+        if self.coupling_radius_m >= self.face_inner_radius_m:
+            raise ValueError(f"coupling_radius_m: must be below face_inner_radius_m ({self.face_inner_radius_m} m)")
+        if self.hub_depth_m <= 2 * self.rim_tube_radius_m:
+            raise ValueError(f"hub.depth_m: must exceed the rim's thickness, {2 * self.rim_tube_radius_m:g} m")
         for index, (x, y) in enumerate(self.marker_positions_m):
             distance = math.hypot(x, y)
             if (

@@ -40,3 +40,14 @@ def marker_id(index: int) -> int:
 def drogue_part_ids(marker_count: int) -> list[int]:
     """All ids that belong to the drogue's box."""
     return [int(part) for part in DROGUE_PARTS] + [marker_id(index) for index in range(marker_count)]
+
+
+def part_name(part_id: int) -> str:
+    """Name of a part for people and files: `face`, `marker_3`.
+
+    Raises:
+        ValueError: no part has this id.
+    """
+    if FIRST_MARKER_ID <= part_id < FIRST_MARKER_ID + MAX_MARKERS:
+        return f"marker_{part_id - FIRST_MARKER_ID}"
+    return Part(part_id).name.lower()

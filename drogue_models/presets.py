@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
 from drogue_models.parameters import WHITE_PAINT, DrogueParameters, HubParameters, even_ring
+from drogue_models.parts import MAX_MARKERS
 
 # The largest even ring that leaves 10 mm of dark face around markers of 0.10 m inside a rim of 0.33 m.
 RING_RADIUS_M = 0.27
@@ -34,6 +37,9 @@ PRESETS: dict[str, DrogueParameters] = {
 def load_drogue(name_or_path: str, base: Path | None = None) -> DrogueParameters:
     """A shipped preset by name, or a drogue from a TOML file.
 
+    The file holds the keys of `DrogueParameters`. An even ring may be given as `marker_count` and
+    `marker_ring_radius_m` instead of `marker_positions_m`, and `body_mesh` as the path of a mesh, relative to the file.
+
     Args:
         name_or_path: name of a preset, or path of a `.toml` file.
         base: folder against which a relative path is read; the working directory by default.
@@ -55,9 +61,41 @@ def load_drogue(name_or_path: str, base: Path | None = None) -> DrogueParameters
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from error
     try:
+        _expand_ring(table)
+        _pin_body_mesh(table, path.parent)
         return DrogueParameters.model_validate(table)
     except ValidationError as error:
         raise ValueError(f"{path}: {explain(error)}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _expand_ring(table: dict[str, Any]) -> None:
+    """Replace the short form of an even ring by its positions."""
+    if "marker_count" not in table and "marker_ring_radius_m" not in table:
+        return
+    if "marker_positions_m" in table:
+        raise ValueError("marker_positions_m: leave it out, or leave out marker_count and marker_ring_radius_m")
+    count, radius_m = table.pop("marker_count", None), table.pop("marker_ring_radius_m", None)
+    if not isinstance(count, int) or isinstance(count, bool) or not 3 <= count <= MAX_MARKERS:
+        raise ValueError(f"marker_count: must be a whole number from 3 to {MAX_MARKERS}, got {count!r}")
+    if not isinstance(radius_m, int | float) or isinstance(radius_m, bool) or not 0 < radius_m <= 10:
+        raise ValueError(f"marker_ring_radius_m: must be a number above 0 and up to 10, got {radius_m!r}")
+    table["marker_positions_m"] = even_ring(count, radius_m)
+
+
+def _pin_body_mesh(table: dict[str, Any], folder: Path) -> None:
+    """Replace the path of the body's mesh by path, hash and folder."""
+    if "body_mesh" not in table:
+        return
+    given = table["body_mesh"]
+    if not isinstance(given, str) or not given:
+        raise ValueError(f"body_mesh: must be the path of a mesh file, got {given!r}")
+    try:
+        data = (folder / given).read_bytes()
+    except OSError as error:
+        raise ValueError(f"body_mesh: {folder / given} cannot be read: {error.strerror}; correct the path") from error
+    table["body_mesh"] = {"path": given, "sha256": hashlib.sha256(data).hexdigest(), "folder": folder}
 
 
 def explain(error: ValidationError) -> str:

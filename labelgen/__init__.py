@@ -1,0 +1,1 @@
+"""Labels from frames and passes, their validation, and exports."""

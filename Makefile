@@ -1,0 +1,42 @@
+# Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
+# where the folder lies.
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow lint bench clean
+SHELL := /bin/bash
+BIN := .venv/bin
+
+help: ## this list
+	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1|\2/p' Makefile | while IFS='|' read -r name text; do \
+	  printf '%-18s %s\n' "$$name" "$$text"; done
+
+setup: ## make .venv with everything in it (all extras)
+	@scripts/setup all
+
+demo: ## render a small dataset, navigate on it blind, and report how accurate the poses are (installs core and Mitsuba)
+	@scripts/setup mitsuba
+	@echo "demo: rendering, navigating and scoring into out/demo"
+	@$(BIN)/droguekit demo --out out/demo
+	@echo "demo: the report is $(CURDIR)/out/demo/report.html"
+
+test: setup lint ## linters, types and the fast tests
+	@echo "test: pytest, the fast tests"
+	@$(BIN)/python -m pytest -m "not slow"
+
+test-slow: setup ## the tests that render for longer
+	@echo "test-slow: pytest, the slow tests"
+	@$(BIN)/python -m pytest -m slow
+
+lint: setup ## formatting, style, types, walls between the packages
+	@echo "lint: ruff, import-linter, mypy"
+	@$(BIN)/ruff format --check --quiet . || { echo "lint: run .venv/bin/ruff format"; exit 1; }
+	@$(BIN)/ruff check --quiet .
+	@$(BIN)/lint-imports --no-logo
+	@$(BIN)/mypy
+
+bench: ## CPU seconds per stereo pair by distance and stage
+	@scripts/setup mitsuba
+	@$(BIN)/droguekit bench
+
+clean: ## remove the environment, caches and build results; out/ stays
+	rm -rf .venv .bootstrap build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './out/*' -prune -exec rm -rf {} +

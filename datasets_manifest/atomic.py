@@ -1,0 +1,60 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TextIO
+
+PART_SUFFIX = ".part"
+"""Ends the name of everything that is still being written; such names also begin with a dot."""
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def part_path(target: Path) -> Path:
+    """A name beside `target` that nobody else uses, for what is still being written."""
+    return target.with_name(f".{target.name}-{uuid.uuid4().hex}{PART_SUFFIX}")
+
+
+@contextmanager
+def open_text_atomic(path: Path) -> Iterator[TextIO]:
+    """A UTF-8 text stream whose file takes its name when the block ends without an error.
+
+    Raises:
+        OSError: it cannot be written; one line that names the file. Nothing is left behind.
+    """
+    part = part_path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("x", encoding="utf-8", newline="\n") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def write_text_atomic(path: Path, text: str) -> None:
+    """Write or replace a text file by one rename.
+
+    Raises:
+        OSError: it cannot be written; one line that names the file. Nothing is left behind.
+    """
+    with open_text_atomic(path) as stream:
+        stream.write(text)

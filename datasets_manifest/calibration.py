@@ -1,0 +1,73 @@
+"""The rig's calibration as other programs read it: OpenCV's stereo YAML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.layout import CALIBRATION_FOLDER
+from geometry.se3 import Array
+from geometry.stereo import StereoRig
+
+OPENCV_STEREO_FILE = "opencv_stereo.yaml"
+
+
+def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
+    """A rectified rig in the names and conventions of `cv2.stereoRectify`.
+
+    Returns:
+        M1, M2: (3, 3) intrinsics [px]; D1, D2: (1, 5) zero distortion; R, T: right from left [m]; R1, R2: rectifying
+        rotations; P1, P2: (3, 4) projections; Q: (4, 4) from (u, v, disparity, 1) to homogeneous points [m].
+
+    Source: OpenCV's documentation of `stereoRectify`; its pixels too count from the centre of the top-left one.
+    """
+    camera, baseline_m = rig.camera, rig.baseline_m
+    matrix, none = camera.matrix(), np.zeros((1, 5))
+    left = np.hstack([matrix, np.zeros((3, 1))])
+    right = left.copy()
+    right[0, 3] = -camera.fx_px * baseline_m
+    # A pixel's row counts in units of fy, its disparity in units of fx.
+    row_scale = camera.fx_px / camera.fy_px
+    reprojection = np.array(
+        [
+            [1.0, 0.0, 0.0, -camera.cx_px],
+            [0.0, row_scale, 0.0, -camera.cy_px * row_scale],
+            [0.0, 0.0, 0.0, camera.fx_px],
+            [0.0, 0.0, 1.0 / baseline_m, 0.0],
+        ]
+    )
+    return {
+        "M1": matrix,
+        "D1": none,
+        "M2": matrix,
+        "D2": none,
+        "R": np.eye(3),
+        "T": np.array([[-baseline_m], [0.0], [0.0]]),
+        "R1": np.eye(3),
+        "R2": np.eye(3),
+        "P1": left,
+        "P2": right,
+        "Q": reprojection,
+    }
+
+
+def write_calibration(dataset: Path, rig: StereoRig) -> list[Path]:
+    """Write the rig into the dataset's calibration folder.
+
+    Returns:
+        The files.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", rig.camera.width_px)
+    storage.write("image_height", rig.camera.height_px)
+    for name, matrix in opencv_stereo_matrices(rig).items():
+        storage.write(name, matrix)
+    path = dataset / CALIBRATION_FOLDER / OPENCV_STEREO_FILE
+    write_text_atomic(path, storage.releaseAndGetString())
+    return [path]

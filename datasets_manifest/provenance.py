@@ -1,0 +1,44 @@
+"""What a dataset's numbers rest on: the conventions they follow and the machine they were made on."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+CONVENTIONS = {
+    "transforms": "a_from_b takes coordinates in b to coordinates in a; 4x4, row-major",
+    "camera_axes": "x right, y down, z forward",
+    "drogue_axes": "origin at the centre of the marker circle in the rim plane, z from the mouth to the hose",
+    "world_axes": "x east, y north, z up",
+    "body_axes": "x forward, y right, z down",
+    "units": "metres, seconds, cd/m2; angles in degrees where a name ends in _deg",
+    "pixel_centre": "integer coordinates are pixel centres; the full frame is [-0.5, -0.5, width, height]",
+    "coco_pixels": "COCO files add 0.5 to boxes and keypoints: their origin is the corner of the image",
+    "quaternion_order": "x y z w, wherever an export writes quaternions",
+    "attitude": "left_from_drogue rotation = Ry(yaw) Rx(pitch) Rz(roll)",
+    "time": "of the middle of the exposure",
+}
+
+_SOFTWARE = ("droguekit", "numpy", "scipy", "opencv-python-headless", "pydantic", "trimesh", "mitsuba", "drjit", "bpy")
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that pixels and labels depend on, as far as they are installed."""
+    versions = {"python": platform.python_version()}
+    for package in _SOFTWARE:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def cpu_features() -> list[str]:
+    """Instruction sets that numpy found on this machine; they decide the last bits of derived numbers."""
+    # numpy's stubs leave out the form with `mode`.
+    report: dict[str, Any] = np.show_config(mode="dicts")  # type: ignore[call-arg, assignment, func-returns-value]
+    extensions = report["SIMD Extensions"]
+    return [*extensions.get("baseline", ()), *extensions.get("found", ())]

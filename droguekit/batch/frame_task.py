@@ -1,0 +1,134 @@
+"""One frame from the recipe to its files: the unit of work that a worker process repeats."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+
+from datasets_manifest.layout import passes_file
+from datasets_manifest.recipe import Recipe
+from datasets_manifest.records import PairRecord
+from datasets_manifest.writer import encode_files, write_frame
+from geometry.stereo import EYES, Eye
+from labelgen.frame_labels import label_frame
+from labelgen.validation import check_against_passes
+from render.engine import EyeRadiance, RenderEngine, StereoRadiance, load_engine
+from render.exr import encode_passes
+from render.sensor import expose
+from scenes.sampler import sample_frame
+
+
+class FrameFaultError(ValueError):
+    """Labels and rendered passes of a frame contradict each other; the frame is not written."""
+
+
+@dataclass(frozen=True)
+class FrameTask:
+    """Makes frames of one recipe and writes them into one dataset; calling it with an index makes that frame.
+
+    Attributes:
+        recipe: what to make.
+        dataset: the folder.
+        engine_version: what the frames that are already there were made with, or None when there are none.
+    """
+
+    recipe: Recipe
+    dataset: Path
+    engine_version: str | None = None
+
+    def __call__(self, frame_index: int) -> FrameReport:
+        """Make and write frame `frame_index`.
+
+        Raises:
+            FrameFaultError: its labels contradict its passes.
+            ValueError: the engine cannot be used, or is not the one that made the other frames.
+            OSError: the frame could not be written; nothing of it is left.
+        """
+        engine = _engine(self.recipe.render.engine)
+        if self.engine_version not in (None, engine.version):
+            raise ValueError(
+                f"{self.dataset}: its frames were made by {self.engine_version}, but here runs {engine.version}, whose "
+                "pixels differ; go on where they were made, or render into a new folder"
+            )
+        began_s = time.monotonic()
+        record, files, stage_s = make_frame(self.recipe, frame_index, engine)
+        with _timed(stage_s, "write"):
+            write_frame(self.dataset, record, files)
+        distance_m = record.conditions.distance_m
+        size_bytes = sum(len(content) for content in files.values())
+        return FrameReport(socket.gethostname(), time.monotonic() - began_s, stage_s, distance_m, size_bytes)
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What making a frame cost.
+
+    Attributes:
+        host: where it was made.
+        wall_s: from start to end, with the engine loaded. [s]
+        stage_s: CPU seconds by stage. [s]
+        distance_m: of the drogue, None in an empty frame. [m]
+        size_bytes: of its files without the record.
+    """
+
+    host: str
+    wall_s: float
+    stage_s: dict[str, float]
+    distance_m: float | None
+    size_bytes: int
+
+
+def make_frame(
+    recipe: Recipe, frame_index: int, engine: RenderEngine
+) -> tuple[PairRecord, dict[str, bytes], dict[str, float]]:
+    """A frame in memory.
+
+    Returns:
+        Its record (without the hashes of its files), its files by name, and CPU seconds by stage.
+
+    Raises:
+        FrameFaultError: the labels contradict the rendered passes.
+    """
+    stage_s: dict[str, float] = {}
+    with _timed(stage_s, "sample"):
+        frame = sample_frame(recipe, frame_index)
+    radiance = engine.render(frame, recipe.render)
+    stage_s.update(radiance.stage_s)
+    with _timed(stage_s, "sensor"):
+        images = expose(frame, radiance)
+    with _timed(stage_s, "labels"):
+        record = label_frame(frame, radiance, images)
+        faults = check_against_passes(record, radiance)
+    if faults:
+        raise FrameFaultError(f"labels and rendered passes disagree: {'; '.join(faults)}")
+    with _timed(stage_s, "encode"):
+        files = encode_files(images, {eye: eye_radiance(radiance, eye).part_id for eye in EYES})
+        if recipe.outputs.exr:
+            files.update({passes_file(eye): encode_passes(eye_radiance(radiance, eye)) for eye in EYES})
+    return record, files, stage_s
+
+
+def eye_radiance(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
+    """What one eye would see."""
+    return radiance.left if eye == "left" else radiance.right
+
+
+@cache
+def _engine(name: str) -> RenderEngine:
+    """The engine of this process, loaded once and used with one thread, on which the sameness of pixels rests."""
+    cv2.setNumThreads(1)
+    return load_engine(name)
+
+
+@contextmanager
+def _timed(stage_s: dict[str, float], stage: str) -> Iterator[None]:
+    began_s = time.process_time()
+    yield
+    stage_s[stage] = stage_s.get(stage, 0.0) + time.process_time() - began_s

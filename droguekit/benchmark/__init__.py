@@ -1,0 +1,1 @@
+"""Estimates against the truth: numbers, plots, report. Knows estimators only by what they wrote to disk."""

@@ -1,0 +1,190 @@
+"""Error against distance, drawn as inline SVG that takes the page's ink and needs nothing from outside."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from droguekit.benchmark.number_text import three_digits
+from droguekit.benchmark.result import BenchmarkResult, MethodResult, ReferenceBin
+
+# Mid-tones that stand out on white and on black; the first eight of M. Okabe and K. Ito's colour-blind-safe idea,
+# lightened or darkened, then brown and grey for files with many methods.
+_COLORS = ("#1f78c8", "#e0660a", "#12946a", "#c2589c", "#b58900", "#3ba7d6", "#8a63d2", "#d03a3a", "#9a6a3a", "#7f8890")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*", "d")
+
+# Stands for the page's own text colour while matplotlib draws.
+_INK = "#010203"
+
+_STYLE = {
+    "svg.hashsalt": "droguekit",  # element ids that do not change from run to run
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 10.0,
+    "text.color": _INK,
+    "axes.edgecolor": _INK,
+    "axes.labelcolor": _INK,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+}
+
+_WIDTH_IN, _HEIGHT_IN = 4.4, 3.3
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a panel shows.
+
+    Attributes:
+        key: of the row.
+        bound_key: of the bound.
+        title: above the panel, with the unit.
+        scale: from the row's unit to the panel's.
+    """
+
+    key: str
+    bound_key: str
+    title: str
+    scale: float
+
+
+QUANTITIES = (
+    Quantity("position_rmse_m", "position_m", "Position, RMS error [mm]", 1e3),
+    Quantity("x_rmse_m", "x_m", "X (to the right), RMS error [mm]", 1e3),
+    Quantity("y_rmse_m", "y_m", "Y (down), RMS error [mm]", 1e3),
+    Quantity("z_rmse_m", "z_m", "Z (depth), RMS error [mm]", 1e3),
+    Quantity("pitch_rmse_deg", "pitch_deg", "Pitch, RMS error [deg]", 1.0),
+    Quantity("yaw_rmse_deg", "yaw_deg", "Yaw, RMS error [deg]", 1.0),
+)
+
+
+@dataclass(frozen=True)
+class MethodStyle:
+    """How a method is drawn everywhere."""
+
+    color: str
+    marker: str
+
+
+def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
+    """Colour and marker of each method; no two of the first 130 share both."""
+    return {
+        name: MethodStyle(_COLORS[k % len(_COLORS)], _MARKERS[k % len(_MARKERS)]) for k, name in enumerate(methods)
+    }
+
+
+def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
+    """One quantity of every method against distance, with its interval and the bound, both axes logarithmic.
+
+    Returns:
+        An `<svg>` element.
+    """
+    with _drawing() as (figure, axes):
+        names = list(result.methods)
+        styles = method_styles(names)
+        for k, name in enumerate(names):
+            # A little apart, so that the error bars of different methods do not cover each other.
+            _draw_method(axes, result.methods[name], quantity, styles[name], 1.012 ** (k - (len(names) - 1) / 2))
+        _draw_bound(axes, result.reference, quantity)
+        _finish_axes(axes, quantity)
+        return _svg(figure, quantity.key, f"{quantity.title} against distance, by method")
+
+
+def legend_key(style: MethodStyle | None) -> str:
+    """A short line as the panels draw it, for the page's legend; None is the bound."""
+    with _drawing((0.5, 0.2)) as (figure, axes):
+        axes.set_position((0, 0, 1, 1))
+        axes.set_axis_off()
+        axes.set(xlim=(0, 2), ylim=(-1, 1))
+        if style is None:
+            axes.plot([0, 2], [0, 0], color=_INK, linestyle=(0, (4, 2)), linewidth=1.4)
+        else:
+            axes.plot([0, 1, 2], [0, 0, 0], color=style.color, marker=style.marker, markevery=[1], markersize=6)
+        return _svg(figure, "key", "")
+
+
+def _draw_method(axes: Axes, method: MethodResult, quantity: Quantity, style: MethodStyle, shift: float) -> None:
+    rows = [(row, row.value(quantity.key)) for row in method.bins]
+    # A logarithmic axis has no place for an error of exactly nothing.
+    points = [(row, value) for row, value in rows if value is not None and value > 0]
+    if not points:
+        return
+    x = np.array([_middle(row.low_m, row.high_m) * shift for row, _ in points])
+    y = np.array([value for _, value in points])
+    ends = np.array([row.intervals[quantity.key] for row, _ in points])
+    bars = np.abs(ends - y[:, None]).T
+    axes.errorbar(
+        x,
+        y * quantity.scale,
+        yerr=bars * quantity.scale,
+        color=style.color,
+        marker=style.marker,
+        markersize=5,
+        linewidth=1.2,
+        elinewidth=0.9,
+        capsize=2,
+    )
+
+
+def _draw_bound(axes: Axes, reference: Sequence[ReferenceBin], quantity: Quantity) -> None:
+    places = [(_middle(b.low_m, b.high_m), getattr(b.bound, quantity.bound_key)) for b in reference if b.bound]
+    drawn = [(x, y * quantity.scale) for x, y in places if y > 0]
+    if drawn:
+        # A single distance has no line: a cross stands for it.
+        axes.plot(*zip(*drawn, strict=True), color=_INK, linestyle=(0, (4, 2)), linewidth=1.4, marker="+", markersize=5)
+
+
+def _finish_axes(axes: Axes, quantity: Quantity) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_title(quantity.title, fontsize=10.5, loc="left")
+    axes.set_xlabel("Distance [m]")
+    axes.grid(True, color=_INK, alpha=0.15, linewidth=0.6)
+    low, high = axes.get_ylim()
+    # Only decades where there are enough of them, else 1, 2 and 5 of each.
+    subdivisions = (1.0,) if np.log10(high / low) > 3 else (1.0, 2.0, 5.0)
+    for axis, parts in ((axes.xaxis, (1.0, 2.0, 5.0)), (axes.yaxis, subdivisions)):
+        axis.set_major_locator(LogLocator(base=10, subs=parts, numticks=12))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: three_digits(value)))
+        axis.set_minor_formatter(NullFormatter())
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+def _middle(low_m: float, high_m: float) -> float:
+    return float(np.sqrt(low_m * high_m))
+
+
+@contextmanager
+def _drawing(size_in: tuple[float, float] = (_WIDTH_IN, _HEIGHT_IN)) -> Iterator[tuple[Figure, Axes]]:
+    """A figure of its own, without pyplot and without a trace in matplotlib's settings."""
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=size_in, layout="constrained" if size_in[1] > 1 else None)
+        FigureCanvasSVG(figure)
+        figure.patch.set_alpha(0)
+        axes = figure.add_subplot()
+        axes.patch.set_alpha(0)
+        yield figure, axes
+
+
+def _svg(figure: Figure, name: str, label: str) -> str:
+    """The figure as an element for an HTML page; `name` keeps its ids apart from those of the page's other figures."""
+    stream = io.StringIO()
+    figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"\s+xmlns(:\w+)?=\"[^\"]*\"", "", text).replace("xlink:href", "href")
+    text = re.sub(r"\s+(width|height)=\"[\d.]+pt\"", "", text, count=2)
+    text = re.sub(r"(\bid=\"|url\(#|href=\"#)", rf"\g<1>{name}-", text).replace(_INK, "currentColor")
+    role = f'role="img" aria-label="{label}"' if label else 'aria-hidden="true"'
+    return text.replace("<svg", f"<svg {role}", 1).strip()

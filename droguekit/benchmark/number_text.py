@@ -1,0 +1,50 @@
+"""Numbers as a reader wants them: a sensible unit and three significant digits, never an exponent."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+ABSENT = "–"
+
+
+def three_digits(value: float | None) -> str:
+    """Rounded to three significant digits; trailing zeros are kept where they are significant."""
+    if value is None:
+        return ABSENT
+    rounded = Decimal(f"{value:.2e}")
+    exponent = rounded.adjusted() if rounded else 0
+    text = f"{rounded:.{max(0, 2 - exponent)}f}"
+    return text.replace("-", "−")
+
+
+def millimetres(value_m: float | None) -> str:
+    """A length in metres, told in millimetres."""
+    return three_digits(None if value_m is None else value_m * 1e3)
+
+
+def percent(fraction: float | None) -> str:
+    """A fraction, told in percent with one decimal, and none where it is whole."""
+    if fraction is None:
+        return ABSENT
+    # Less than all is never told as all, nor more than none as none.
+    shown = min(max(round(fraction * 100, 1), 0.1), 99.9) if 0 < fraction < 1 else fraction * 100
+    return f"{shown:g} %"
+
+
+def distance_text(low_m: float, high_m: float) -> str:
+    """A bin's distances: one number for a station."""
+    # A station's frames stand within 1 % of it.
+    if high_m <= low_m * 1.0201:
+        return f"{_short((low_m * high_m) ** 0.5)} m"
+    return f"{_short(low_m)}–{_short(high_m)} m"
+
+
+def interval_text(ends: tuple[float, float] | None, scale: float = 1.0) -> str:
+    """An interval's two ends."""
+    return ABSENT if ends is None else f"{three_digits(ends[0] * scale)} to {three_digits(ends[1] * scale)}"
+
+
+def _short(value: float) -> str:
+    """Three significant digits without trailing zeros."""
+    text = three_digits(value)
+    return text.rstrip("0").rstrip(".") if "." in text else text

@@ -1,0 +1,71 @@
+"""How far each estimated pose is from the true one, and the estimates of a file sorted by method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from datasets_manifest.estimates import Estimate
+from geometry.se3 import Array, RigidTransform, angles_from_axis
+
+COMPONENTS = ("x", "y", "z", "pitch", "yaw")
+"""Order of errors and bounds: X, Y, Z in the left camera [m], then pitch and yaw [deg]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseError:
+    """Estimate minus truth, for one pair.
+
+    Attributes:
+        components: (5,) X, Y, Z in the left camera [m], pitch and yaw of the axis [deg].
+        transverse_m: length of the part across the line of sight to the true rim centre. [m]
+    """
+
+    components: Array
+    transverse_m: float
+
+    @property
+    def position_m(self) -> float:
+        """Length of the position error. [m]"""
+        return float(np.linalg.norm(self.components[:3]))
+
+
+def pose_error(estimate: RigidTransform, truth: RigidTransform) -> PoseError:
+    """Error of a pose; roll does not count, for equal markers leave it open.
+
+    Angles are compared as pitch and yaw of the axis, each difference in (-180, 180]. [deg]
+    """
+    offset = estimate.translation_m - truth.translation_m
+    sight = truth.translation_m / np.linalg.norm(truth.translation_m)
+    across = offset - (offset @ sight) * sight
+    pitch, yaw = angles_from_axis(np.stack([estimate.rotation[:, 2], truth.rotation[:, 2]]))
+    turns = np.rad2deg([pitch[0] - pitch[1], yaw[0] - yaw[1]])
+    wrapped = 180.0 - np.mod(180.0 - turns, 360.0)
+    return PoseError(np.concatenate([offset, wrapped]), float(np.linalg.norm(across)))
+
+
+def by_method(estimates: Iterable[Estimate], frame_indices: Iterable[int]) -> dict[str, dict[int, Estimate]]:
+    """Estimates by method and frame, methods in the order of the file.
+
+    Args:
+        estimates: all of a file.
+        frame_indices: the dataset's pairs.
+
+    Raises:
+        ValueError: no estimates at all, one for a pair that the dataset lacks, or two of a method for the same pair.
+    """
+    known = set(frame_indices)
+    methods: dict[str, dict[int, Estimate]] = {}
+    for estimate in estimates:
+        index, method = estimate.frame_index, estimate.method
+        if index not in known:
+            raise ValueError(f"estimates: method {method!r}: frame {index} is not in the dataset")
+        frames = methods.setdefault(method, {})
+        if index in frames:
+            raise ValueError(f"estimates: method {method!r}: frame {index} occurs twice")
+        frames[index] = estimate
+    if not methods:
+        raise ValueError("estimates: the file holds none; run the estimator on this dataset first")
+    return methods

@@ -1,0 +1,93 @@
+"""Root mean squares, percentiles and fractions with their 95 % confidence intervals."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from geometry.se3 import Array
+
+CONFIDENCE = 0.95
+RESAMPLES = 1000
+
+# Numbers drawn in one go by the bootstrap: bounds its memory to some tens of megabytes.
+_DRAWS_AT_ONCE = 2_000_000
+
+Interval = tuple[float, float]
+
+
+def root_mean_square(values: Array) -> float:
+    """Root mean square over all values."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def rms_interval(values: Array) -> Interval:
+    """Confidence interval of the root mean square of independent errors about zero, by the chi-square law.
+
+    Errors that are no sample of one normal law, such as those of a mixture of distances or with outliers, know their
+    mean square less well than their number says: the degrees of freedom are what matches the measured variance of the
+    squares, and never more than the number of errors.
+
+    Args:
+        values: (n,) errors.
+
+    Source: n s^2 / sigma^2 ~ chi-square(n); degrees of freedom 2 n m2^2 / (m4 - m2^2), matching the second moment.
+    """
+    squares = np.square(values)
+    mean = float(squares.mean())
+    if mean == 0.0:
+        return 0.0, 0.0
+    spread = float(squares.var())
+    freedom = len(values) if spread == 0.0 else min(float(len(values)), 2 * len(values) * mean**2 / spread)
+    low, high = (freedom * mean / chi2.ppf(p, freedom) for p in ((1 + CONFIDENCE) / 2, (1 - CONFIDENCE) / 2))
+    return float(np.sqrt(low)), float(np.sqrt(high))
+
+
+def fraction_interval(hits: int, count: int) -> Interval:
+    """Confidence interval of a fraction.
+
+    Source: E. B. Wilson, J. Am. Stat. Assoc. 22 (1927) 209, doi:10.1080/01621459.1927.10502953.
+    """
+    z = float(norm.ppf((1 + CONFIDENCE) / 2))
+    share = hits / count
+    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+    # Where none or all hit, an end is exactly 0 or 1, which rounding misses.
+    return (float(middle - half) if hits else 0.0), (float(middle + half) if hits < count else 1.0)
+
+
+def keyed_generator(key: str) -> np.random.Generator:
+    """A random stream of its own for every key, the same on every machine."""
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(zlib.crc32(key.encode()))))
+
+
+def bootstrap_intervals(columns: Array, percentiles: tuple[float, ...], key: str) -> tuple[Array, Array]:
+    """Percentile-bootstrap intervals of means and percentiles, all from the same resampled frames.
+
+    With few frames the upper end of a high percentile cannot pass the largest error that was seen.
+
+    Args:
+        columns: (n, C) one row a frame; the result does not depend on the rows' order.
+        percentiles: which, in percent.
+        key: of the random stream.
+
+    Returns:
+        (C, 2) intervals of the means of `columns`, (C, P, 2) intervals of the percentiles of their absolute values.
+
+    Source: B. Efron, Ann. Statist. 7 (1979) 1, doi:10.1214/aos/1176344552.
+    """
+    ordered = columns[np.lexsort(columns.T)]
+    size = len(ordered)
+    rng = keyed_generator(key)
+    means, ranks = [], []
+    step = max(1, _DRAWS_AT_ONCE // (size * columns.shape[1]))
+    for start in range(0, RESAMPLES, step):
+        drawn = ordered[rng.integers(0, size, (min(step, RESAMPLES - start), size))]
+        means.append(drawn.mean(axis=1))
+        ranks.append(np.percentile(np.abs(drawn), percentiles, axis=1))
+    ends = (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE))
+    mean_ends = np.percentile(np.concatenate(means), ends, axis=0)
+    rank_ends = np.percentile(np.concatenate(ranks, axis=1), ends, axis=1)
+    return mean_ends.T, rank_ends.transpose(2, 1, 0)

@@ -1,0 +1,131 @@
+"""One row of the result from the frames that belong to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from droguekit.benchmark.centroid_errors import CentroidErrors, centroid_statistics
+from droguekit.benchmark.pose_errors import COMPONENTS, PoseError
+from droguekit.benchmark.result import Bound, Centroids, ComponentRatios, Row
+from droguekit.benchmark.statistics import (
+    Interval,
+    bootstrap_intervals,
+    fraction_interval,
+    rms_interval,
+    root_mean_square,
+)
+from geometry.se3 import Array
+
+UNITS = {"x": "m", "y": "m", "z": "m", "pitch": "deg", "yaw": "deg"}
+_PERCENTILES = (95.0, 99.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameScore:
+    """One method in one pair that shows a drogue.
+
+    Attributes:
+        error: of its pose, or None without a fix.
+        bound: (5,) Cramer-Rao bound at the noise of the pair's bin [m, deg], or None where there is none.
+        centroids: errors of its features.
+        from_centroids_m: (3,) position error that its centroids alone would make, or None. [m]
+    """
+
+    error: PoseError | None
+    bound: Array | None
+    centroids: CentroidErrors
+    from_centroids_m: Array | None
+
+
+def summarize(scores: Sequence[FrameScore], key: str) -> Row:
+    """The row of some pairs, of which there is at least one.
+
+    Args:
+        scores: one for each pair; their order does not matter.
+        key: of the bootstrap's random stream.
+    """
+    fixed = [score for score in scores if score.error is not None]
+    numbers: dict[str, float] = {}
+    intervals: dict[str, Interval] = {"fix_fraction": fraction_interval(len(fixed), len(scores))}
+    bound = mean_bound([score.bound for score in fixed])
+    bounded = [score.error for score in fixed if score.error is not None and score.bound is not None]
+    if fixed:
+        errors = [score.error for score in fixed if score.error is not None]
+        numbers, error_intervals = _error_numbers(errors, key)
+        intervals |= error_intervals
+    return Row.model_validate(
+        {
+            "n": len(scores),
+            "fixes": len(fixed),
+            "fix_fraction": len(fixed) / len(scores),
+            **numbers,
+            "intervals": intervals,
+            "bound": bound,
+            "bound_ratio": _ratios(bounded, bound),
+            "centroids": Centroids(**asdict(centroid_statistics([score.centroids for score in scores]))),
+            **_centroid_share(fixed),
+        }
+    )
+
+
+def mean_bound(bounds: Sequence[Array | None]) -> Bound | None:
+    """Root mean square of the bounds of the frames that have one, or None where none has."""
+    known = [bound for bound in bounds if bound is not None]
+    if not known:
+        return None
+    squares = np.mean(np.square(known), axis=0)
+    x, y, z, pitch, yaw = np.sqrt(squares).tolist()
+    position = float(np.sqrt(squares[:3].sum()))
+    return Bound(position_m=position, x_m=x, y_m=y, z_m=z, pitch_deg=pitch, yaw_deg=yaw)
+
+
+def _error_numbers(errors: Sequence[PoseError], key: str) -> tuple[dict[str, float], dict[str, Interval]]:
+    position = np.array([error.position_m for error in errors])
+    columns = np.column_stack([position, np.stack([error.components for error in errors])])
+    names = [("position", "m"), *UNITS.items()]
+    mean_ends, rank_ends = bootstrap_intervals(columns, _PERCENTILES, key)
+    numbers: dict[str, float] = {}
+    intervals: dict[str, Interval] = {}
+    for k, (name, unit) in enumerate(names):
+        column = columns[:, k]
+        average = f"{name}_mean_{unit}" if name == "position" else f"{name}_bias_{unit}"
+        numbers[average] = float(column.mean())
+        intervals[average] = tuple(mean_ends[k].tolist())
+        numbers[f"{name}_rmse_{unit}"] = root_mean_square(column)
+        intervals[f"{name}_rmse_{unit}"] = rms_interval(column)
+        for p, percent in enumerate(_PERCENTILES):
+            rank = f"{name}_p{percent:.0f}_{unit}"
+            numbers[rank] = float(np.percentile(np.abs(column), percent))
+            intervals[rank] = tuple(rank_ends[k, p].tolist())
+        numbers[f"{name}_max_{unit}"] = float(np.abs(column).max())
+    transverse = np.array([error.transverse_m for error in errors])
+    numbers["transverse_rmse_m"] = root_mean_square(transverse)
+    intervals["transverse_rmse_m"] = rms_interval(transverse)
+    return numbers, intervals
+
+
+def _ratios(errors: Sequence[PoseError], bound: Bound | None) -> ComponentRatios | None:
+    if bound is None:
+        return None
+    limits = np.array([getattr(bound, f"{name}_{UNITS[name]}") for name in COMPONENTS])
+    # Centroids without any error, such as those of another program's truth, set no limit.
+    if not (limits > 0).all():
+        return None
+    rms = np.sqrt(np.mean(np.square([error.components for error in errors]), axis=0))
+    return ComponentRatios(**dict(zip(COMPONENTS, (rms / limits).tolist(), strict=True)))
+
+
+def _centroid_share(fixed: Sequence[FrameScore]) -> dict[str, float | None]:
+    """What the centroids explain, over the frames where they determine a pose."""
+    pairs = [(s.error.components[:3], s.from_centroids_m) for s in fixed if s.error is not None]
+    known = [(error, predicted) for error, predicted in pairs if predicted is not None]
+    if not known:
+        return {"position_from_centroids_rmse_m": None, "centroid_share": None}
+    errors, predicted = np.array([k[0] for k in known]), np.array([k[1] for k in known])
+    total, rest = float(np.square(errors).sum()), float(np.square(errors - predicted).sum())
+    share = None if total == 0 else max(0.0, 1 - rest / total)
+    from_centroids = float(np.sqrt(np.square(predicted).sum(axis=1).mean()))
+    return {"position_from_centroids_rmse_m": from_centroids, "centroid_share": share}

@@ -1,0 +1,46 @@
+"""Arguments that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+RecipeArgument = Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a shipped recipe, or a .toml file.")]
+DatasetArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The dataset's folder.")]
+SeedOption = Annotated[int | None, typer.Option("--seed", help="Replaces the recipe's seed.")]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        help="Worker processes; by default as many as cores and memory allow. 0 works in this process, for debugging.",
+    ),
+]
+EngineOption = Annotated[str | None, typer.Option("--engine", metavar="NAME", help="Replaces the recipe's engine.")]
+
+
+def parse_frames(text: str | None, count: int) -> range:
+    """The frames of `A:B`: from A up to but without B; either may be left out, and all are meant by None.
+
+    Raises:
+        ValueError: not of that form, or outside the recipe.
+    """
+    if text is None:
+        return range(count)
+    low, colon, high = text.partition(":")
+    if not colon or not all(part.isdecimal() or part == "" for part in (low, high)):
+        raise ValueError(f"--frames: must be A:B with whole numbers, such as 0:100, got {text!r}")
+    first, last = int(low or 0), int(high or count)
+    if not first < last <= count:
+        raise ValueError(f"--frames: must name frames of the recipe's {count}, at least one, got {text!r}")
+    return range(first, last)
+
+
+def human_size(size_bytes: float) -> str:
+    """A size for people."""
+    for unit in ("B", "kB", "MB"):
+        if size_bytes < 1000:
+            return f"{size_bytes:.0f} {unit}" if unit == "B" else f"{size_bytes:.3g} {unit}"
+        size_bytes /= 1000
+    return f"{size_bytes:.3g} GB"

@@ -1,0 +1,96 @@
+"""`droguekit doctor`."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import sys
+
+import typer
+
+from droguekit.cli.main import FAULT
+
+EXAMPLES = ("droguekit doctor",)
+_PACKAGES = (
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "OpenEXR",
+    "pydantic",
+    "pycocotools",
+    "trimesh",
+    "matplotlib",
+    "pebble",
+    "typer",
+    "mitsuba",
+    "drjit",
+)
+
+
+def doctor() -> None:
+    """Show what is installed here, which engines work, and what is missing.
+
+    Exits with 1 when no engine works; labels, navigation and benchmark work without any.
+    """
+    _show_machine()
+    _show_packages()
+    if not _show_engines():
+        raise typer.Exit(FAULT)
+
+
+def _show_machine() -> None:
+    from datasets_manifest.provenance import cpu_features
+    from droguekit.batch.workers import available_cores, available_memory_gib, default_workers
+
+    typer.echo(f"python     {platform.python_version()}, {sys.executable}")
+    typer.echo(f"system     {platform.platform()}")
+    typer.echo(f"processor  {available_cores()} of {os.cpu_count()} cores; {' '.join(cpu_features())}")
+    typer.echo(f"memory     {available_memory_gib():.1f} GiB free: {default_workers()} workers by default")
+
+
+def _show_packages() -> None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    for package in ("droguekit", *_PACKAGES):
+        try:
+            found = version(package)
+        except PackageNotFoundError:
+            found = "missing"
+        typer.echo(f"package    {package} {found}")
+
+
+def _show_engines() -> bool:
+    """Try each engine; returns whether one works."""
+    from render.mitsuba_engine.variant import probe_variant
+
+    missing = _missing_libraries()
+    for name, remedy in missing:
+        typer.echo(f"library    {name} is missing; {remedy}")
+    try:
+        variant = probe_variant()
+    except ValueError as error:
+        typer.echo(f"engine     mitsuba does not work: {error}")
+        return False
+    if _LIBATOMIC in missing:
+        typer.echo("engine     mitsuba does not work without libatomic.so.1")
+        return False
+    typer.echo(f"engine     mitsuba works as {variant.variant}: {variant.reason}")
+    return True
+
+
+_LIBATOMIC = ("libatomic.so.1", "apt-get install libatomic1")
+
+
+def _missing_libraries() -> list[tuple[str, str]]:
+    """System libraries that Mitsuba asks for and that are not here, each with what to do."""
+    from render.mitsuba_engine.variant import llvm_libraries
+
+    missing = []
+    try:
+        ctypes.CDLL(_LIBATOMIC[0])
+    except OSError:
+        missing.append(_LIBATOMIC)
+    if not any(library.exists() for library in llvm_libraries()):
+        missing.append(("LLVM >= 15", "apt-get install libllvm15 (or newer), or name one in DRJIT_LIBLLVM_PATH"))
+    return missing

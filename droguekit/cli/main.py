@@ -1,0 +1,140 @@
+"""The command's entry: its list of commands, its errors and its exit codes."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+DONE, FAULT, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+# Every command lives in the module and the function of its name, imported only when it is asked for.
+COMMANDS = {
+    "plan": "Show what a recipe will make, how long it takes and how large it gets.",
+    "render": "Make a dataset from a recipe; goes on where it stopped.",
+    "validate": "Check a dataset: files, hashes, labels against part ids.",
+    "reproduce": "Make one frame of a dataset again and compare.",
+    "export": "Write a dataset's labels in another format.",
+    "preview": "Draw a contact sheet of a dataset with its labels.",
+    "navigate": "Estimate the drogue's pose in every pair, without the truth.",
+    "benchmark": "Compare estimates with the truth: numbers and a report.",
+    "model": "Write the drogue as a mesh.",
+    "demo": "Render a small dataset, navigate on it, and report.",
+    "bench": "Measure the CPU time of a pair by distance and stage.",
+    "doctor": "Show what is installed and which engines work.",
+}
+
+HELP = """Synthetic stereo pairs of a refuelling drogue with ground truth, and navigation measured against it.
+
+`droguekit COMMAND --help` explains a command and shows examples. With --debug anywhere, an error shows its traceback.
+
+Exit codes: 0 done, 1 the work found a fault, 2 wrong usage or input, 130 interrupted.
+"""
+
+
+def load_command(name: str) -> Any:
+    """The command `name`, its module imported now; None where there is none."""
+    if name not in COMMANDS:
+        return None
+    module = importlib.import_module(f"droguekit.cli.{name}")
+    examples: tuple[str, ...] = getattr(module, "EXAMPLES", ())
+    # The backspace keeps the help's line breaks.
+    epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)]) if examples else None
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    app.command(name=name, epilog=epilog, short_help=COMMANDS[name], no_args_is_help=False)(getattr(module, name))
+    return typer.main.get_command(app)
+
+
+class LazyGroup(TyperGroup):
+    """Commands whose modules are imported when one of them is used, so that `--help` answers at once."""
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override]
+        """Names of all commands."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: typer.Context, cmd_name: str) -> Any:  # type: ignore[override]
+        """The command, imported now; None where there is none."""
+        return load_command(cmd_name)
+
+    def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
+        """List the commands for `--help` without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+app = typer.Typer(
+    cls=LazyGroup, add_completion=False, rich_markup_mode=None, no_args_is_help=True, pretty_exceptions_enable=False
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"droguekit {version('droguekit')}")
+        raise typer.Exit(DONE)
+
+
+@app.callback(help=HELP)
+def droguekit(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Root of all commands; its help text is `HELP`."""
+
+
+def explain(error: BaseException) -> str:
+    """An error as one line that names what it is about."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, ValueError | OSError):
+        return text
+    return f"internal fault, {type(error).__name__}: {text}; please report it with what --debug shows"
+
+
+def run(arguments: list[str]) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: everything after the command's name. A `--debug` anywhere in it lets errors show their traceback.
+
+    Returns:
+        The exit code.
+    """
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    try:
+        typer.main.get_command(app).main(args=arguments, prog_name="droguekit", standalone_mode=True)
+    except SystemExit as exit_:
+        code = exit_.code if isinstance(exit_.code, int) else DONE if exit_.code is None else WRONG_INPUT
+        if code == INTERRUPTED:
+            print("droguekit: interrupted; the same command goes on with what is finished", file=sys.stderr)
+        return code
+    except Exception as error:
+        if debug:
+            raise
+        print(f"droguekit: error: {explain(error)}", file=sys.stderr)
+        return WRONG_INPUT
+    return DONE
+
+
+def main() -> None:
+    """Entry point of the installed command."""
+    code = run(sys.argv[1:])
+    with contextlib.suppress(BrokenPipeError):
+        sys.stdout.flush()
+        sys.exit(code)
+    # Whoever read our output has gone; Python would complain while closing it.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

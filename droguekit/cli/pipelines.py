@@ -1,0 +1,170 @@
+"""What the commands do that takes more than one room: the only place where rooms are put together.
+
+Rooms are imported where they are used: a command loads only what it needs, and those that need no renderer work
+without one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from datasets_manifest.estimates import Estimate
+    from datasets_manifest.recipe import Recipe
+    from droguekit.batch.local import RunSummary
+    from droguekit.batch.progress import ProgressReport
+    from droguekit.benchmark.benchmark import BenchmarkResult
+
+
+def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tuple[Recipe, str]:
+    """A recipe and its text as given, with seed and engine replaced where they are not None.
+
+    Raises:
+        ValueError: no such recipe, wrong keys, or no such engine.
+    """
+    from datasets_manifest.recipe import Recipe, load_recipe
+    from render.engine import EngineUnavailableError, engine_names
+
+    recipe, text = load_recipe(name_or_path, seed)
+    if engine is not None:
+        settings = recipe.render.model_copy(update={"engine": engine})
+        recipe = Recipe.model_validate(recipe.model_copy(update={"render": settings}).model_dump())
+    if recipe.render.engine not in engine_names():
+        raise EngineUnavailableError(
+            f"engine: no engine named {recipe.render.engine!r}; there are {', '.join(engine_names())}"
+        )
+    return recipe, text
+
+
+def render_frames(
+    recipe: Recipe, text: str, out: Path, frames: Sequence[int], workers: int | None, report: ProgressReport
+) -> RunSummary:
+    """Make frames of a recipe into a dataset, with as many workers as the machine holds when `workers` is None.
+
+    Raises:
+        ValueError: a folder of another recipe, or an engine that cannot be used.
+        OSError: the folder cannot be written or the disk is full; finished frames stay.
+    """
+    from droguekit.batch.local import render_dataset
+    from droguekit.batch.workers import default_workers
+
+    chosen = default_workers() if workers is None else workers
+    if chosen < 0:
+        raise ValueError(f"workers: must not be negative, got {chosen}")
+    return render_dataset(recipe, text, out, frames, chosen, report)
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """How many poses a method found in how many pairs."""
+
+    method: str
+    fixes: int
+    pairs: int
+
+
+def navigate_dataset(dataset: Path, methods: Sequence[str], out: Path, report: ProgressReport) -> list[Fixes]:
+    """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
+
+    Raises:
+        ValueError: no such dataset or method, or an image that cannot be read.
+        OSError: the estimates cannot be written.
+    """
+    from datasets_manifest.blind import BlindDataset
+    from datasets_manifest.estimates import write_estimates
+    from nav.runner import method_names, navigate
+
+    chosen = list(dict.fromkeys(methods)) or list(method_names())
+    blind = BlindDataset(dataset)
+    estimates = navigate(blind, chosen)
+    fixes: Counter[str] = Counter()
+
+    def counted() -> Iterator[Estimate]:
+        for number, estimate in enumerate(estimates, start=1):
+            fixes[estimate.method] += estimate.status == "fix"
+            yield estimate
+            if number % len(chosen) == 0:
+                report.advance()
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    report.begin("pairs", len(blind.frame_indices))
+    try:
+        write_estimates(out, counted())
+    finally:
+        report.end()
+    return [Fixes(method, fixes[method], len(blind.frame_indices)) for method in chosen]
+
+
+def benchmark_dataset(dataset: Path, estimates: Path, json_out: Path | None, html_out: Path | None) -> BenchmarkResult:
+    """Compare estimates with the truth, and write the numbers and the report where a place is given for them.
+
+    Raises:
+        ValueError: a dataset or estimates that cannot be read.
+        OSError: a result cannot be written.
+    """
+    from datasets_manifest.writer import write_text_atomic
+    from droguekit.benchmark.benchmark import run_benchmark
+    from droguekit.benchmark.report import write_report
+
+    result = run_benchmark(dataset, estimates)
+    if json_out is not None:
+        write_text_atomic(json_out, result.to_json())
+    if html_out is not None:
+        html_out.parent.mkdir(parents=True, exist_ok=True)
+        write_report(dataset, estimates, result, html_out)
+    return result
+
+
+@dataclass(frozen=True)
+class DemoFiles:
+    """What a demo leaves in its folder."""
+
+    dataset: Path
+    estimates: Path
+    benchmark: Path
+    report: Path
+
+
+def run_demo(recipe_name: str, out: Path, workers: int | None, report: ProgressReport) -> tuple[DemoFiles, RunSummary]:
+    """From a recipe to a report; pairs that are there already are kept.
+
+    Raises:
+        ValueError: the folder holds another dataset, or the engine cannot be used.
+        OSError: the folder cannot be written.
+    """
+    files = DemoFiles(out / "dataset", out / "estimates.jsonl", out / "benchmark.json", out / "report.html")
+    recipe, text = open_recipe(recipe_name, None, None)
+    count = recipe.frames.count
+    report.say(f"1 of 3: rendering {count} stereo pairs into {files.dataset}")
+    summary = render_frames(recipe, text, files.dataset, range(count), workers, report)
+    report.say("2 of 3: navigating on them, without the truth, by every method")
+    navigate_dataset(files.dataset, (), files.estimates, report)
+    report.say("3 of 3: comparing the estimates with the truth")
+    benchmark_dataset(files.dataset, files.estimates, files.benchmark, files.report)
+    return files, summary
+
+
+_BENCH_STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
+
+
+def open_bench_recipe(repeat: int, engine: str | None) -> Recipe:
+    """The recipe by which speed is measured: `repeat` full-size pairs at each of five distances.
+
+    Raises:
+        ValueError: fewer than one pair, or no such engine.
+    """
+    from datasets_manifest.recipe import Recipe
+
+    if repeat < 1:
+        raise ValueError(f"--repeat: must be at least 1, got {repeat}")
+    demo, _ = open_recipe("demo", None, engine)
+    changes = {
+        "frames": {"count": repeat * len(_BENCH_STATIONS_M)},
+        "distance": {"law": "stations", "stations_m": _BENCH_STATIONS_M},
+        "render": {**demo.render.model_dump(), "samples_per_px": 16},
+    }
+    return Recipe.model_validate({**demo.model_dump(), **changes})

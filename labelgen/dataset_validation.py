@@ -1,0 +1,239 @@
+"""A dataset's folder checked from the outside: files, hashes, labels against pixels, annotations against records."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.json_types import FrozenModel
+from datasets_manifest.layout import RECORD_FILE, frame_folder, frame_indices, parts_file
+from datasets_manifest.manifest import FrameEntry, Manifest, count_pairs
+from datasets_manifest.png import png_fault
+from datasets_manifest.reader import Dataset
+from datasets_manifest.records import PairRecord
+from datasets_manifest.writer import leftovers
+from drogue_models.marker_layout import marker_layout
+from drogue_models.parts import drogue_part_ids
+from geometry.stereo import EYES, Eye
+from labelgen.coco_validation import CocoFiles
+from labelgen.validation import check_boxes, check_empty, check_unoccluded_marker, named_features
+
+# Two ways to project in float64 agree far better; a pixel convention that is wrong does not.
+_PROJECTION_TOLERANCE_PX = 1e-6
+# The eyes' rows come out of the same numbers.
+_EPIPOLAR_TOLERANCE_PX = 1e-9
+
+
+class Check(FrozenModel):
+    """One kind of check.
+
+    Attributes:
+        name: what was checked.
+        count: how often.
+        faults: what was wrong, a line each.
+    """
+
+    name: str
+    count: int
+    faults: tuple[str, ...]
+
+
+class ValidationReport(FrozenModel):
+    """What a validation found.
+
+    Attributes:
+        pairs: in the manifest.
+        checks: in the order in which they were made.
+    """
+
+    pairs: int
+    checks: tuple[Check, ...]
+
+    @property
+    def faults(self) -> list[str]:
+        """All faults, a line each."""
+        return [fault for check in self.checks for fault in check.faults]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.faults
+
+    def table(self) -> str:
+        """The checks with their counts, a line each."""
+        rows = [f"{check.name:<34}{check.count:>9}{len(check.faults):>9}" for check in self.checks]
+        return "\n".join([f"{'check':<34}{'checked':>9}{'faults':>9}", *rows])
+
+
+class _Tally:
+    """Counts and faults by check."""
+
+    def __init__(self) -> None:
+        self._counts: defaultdict[str, int] = defaultdict(int)
+        self._faults: defaultdict[str, list[str]] = defaultdict(list)
+
+    def add(self, name: str, faults: Sequence[str]) -> None:
+        """One more thing was checked."""
+        self._counts[name] += 1
+        self._faults[name] += faults
+
+    def report(self, pairs: int) -> ValidationReport:
+        """The result so far."""
+        checks = (
+            Check(name=name, count=count, faults=tuple(self._faults[name])) for name, count in self._counts.items()
+        )
+        return ValidationReport(pairs=pairs, checks=tuple(checks))
+
+
+def validate_dataset(path: Path) -> ValidationReport:
+    """Check everything that can be checked about a dataset without making it again.
+
+    Args:
+        path: the dataset's folder.
+
+    Returns:
+        What was checked and what is wrong; damaged files are faults, not exceptions.
+
+    Raises:
+        ValueError: there is no such folder.
+    """
+    if not path.is_dir():
+        raise ValueError(f"{path}: there is no such dataset folder")
+    tally = _Tally()
+    try:
+        dataset = Dataset(path)
+    except ValueError as error:
+        tally.add("manifest", [str(error)])
+        return tally.report(pairs=0)
+    manifest = dataset.manifest
+    tally.add("manifest", _count_faults(manifest))
+    tally.add("split", _split_faults(manifest))
+    tally.add("leftovers", [f"{entry}: was left by a run that was killed" for entry in leftovers(path)])
+    for frame_index in sorted(set(frame_indices(path)) - set(dataset.frame_indices)):
+        tally.add("frames on disk", [f"{frame_folder(path, frame_index)}: is not in the manifest"])
+    coco = CocoFiles(path, manifest)
+    for fault in coco.faults():
+        tally.add("annotation files", [fault])
+    for entry in manifest.frames:
+        _check_frame(dataset, entry, coco, tally)
+    return tally.report(len(manifest.frames))
+
+
+def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _Tally) -> None:
+    folder = frame_folder(dataset.path, entry.frame_index)
+    try:
+        record = dataset.record(entry.frame_index)
+    except ValueError as error:
+        tally.add("records", [str(error)])
+        return
+    tally.add("records", [f"{folder / RECORD_FILE}: {fault}" for fault in _entry_faults(record, entry)])
+    tally.add("hashes", [*dataset.verify(entry.frame_index), *_stray_files(folder, record)])
+    try:
+        dataset.images(entry.frame_index)
+        tally.add("images", [])
+    except ValueError as error:
+        tally.add("images", [str(error)])
+    tally.add("projection", [f"{folder}: {fault}" for fault in _projection_faults(record)])
+    for eye in EYES:
+        path = folder / parts_file(eye)
+        part_id = _read_part_ids(path, record)
+        if part_id is None:
+            tally.add("part ids", [f"{path}: cannot be read as 8 bit grey of the rig's size"])
+            continue
+        tally.add("part ids", [])
+        tally.add("labels against part ids", [f"{path}: {fault}" for fault in _label_faults(record, eye, part_id)])
+        tally.add("annotations", coco.annotation_faults(record, eye, part_id))
+
+
+def _count_faults(manifest: Manifest) -> list[str]:
+    want = count_pairs(manifest.frames)
+    return [] if manifest.counts == want else [f"manifest.json: counts are {manifest.counts}, the frames give {want}"]
+
+
+def _split_faults(manifest: Manifest) -> list[str]:
+    splits: defaultdict[int, set[str]] = defaultdict(set)
+    for entry in manifest.frames:
+        splits[entry.scene_id].add(entry.split)
+    return [
+        f"manifest.json: scene {scene_id} is in more than one split: {', '.join(sorted(names))}"
+        for scene_id, names in splits.items()
+        if len(names) > 1
+    ]
+
+
+def _entry_faults(record: PairRecord, entry: FrameEntry) -> list[str]:
+    faults = []
+    if record.scene_id != entry.scene_id or (record.left_from_drogue is None) != entry.empty:
+        faults.append("scene_id, left_from_drogue: differ from the manifest's entry")
+    if record.frame.frame_index != record.frame_index or record.frame.scene_id != record.scene_id:
+        faults.append("frame: belongs to another frame or scene")
+    if (record.left_from_drogue is None) != (record.frame.drogue is None):
+        faults.append("left_from_drogue: must be given exactly when the frame has a drogue")
+    return faults
+
+
+def _stray_files(folder: Path, record: PairRecord) -> list[str]:
+    known = {*record.file_sha256, RECORD_FILE}
+    return [f"{entry}: is not on record" for entry in sorted(folder.iterdir()) if entry.name not in known]
+
+
+def _projection_faults(record: PairRecord) -> list[str]:
+    """Centres against OpenCV's projection of the pose, and row against row of the rectified pair."""
+    pose, drogue = record.left_from_drogue, record.frame.drogue
+    if pose is None or drogue is None:
+        return []
+    layout, rig = marker_layout(drogue), record.frame.rig
+    centers_m = layout.centers_m
+    if layout.hub_center_m is not None:
+        centers_m = np.vstack([centers_m, layout.hub_center_m])
+    turn, _ = cv2.Rodrigues(pose.rotation)
+    faults, labels = [], {}
+    for eye in EYES:
+        named = named_features(record, layout, pose, eye)
+        if len(named) != len(centers_m):
+            return [f"{eye}: has {len(named)} features, the drogue {len(centers_m)}"]
+        offset = pose.translation_m - rig.eye_offset_m(eye)
+        want, _ = cv2.projectPoints(centers_m, turn, offset, rig.camera.matrix(), None)
+        labels[eye] = np.array([view.center_proj_px for _, view, _ in named])
+        error = np.abs(labels[eye] - want[:, 0]).max(axis=1)
+        for index in np.flatnonzero(error > _PROJECTION_TOLERANCE_PX):
+            faults.append(f"{eye}: {named[index][0]}: center_proj_px: is {error[index]:.3g} px off the pose's image")
+    gap = float(np.abs(labels["left"][:, 1] - labels["right"][:, 1]).max())
+    if gap > _EPIPOLAR_TOLERANCE_PX:
+        faults.append(f"center_proj_px: rows of left and right differ by {gap:.3g} px")
+    return faults
+
+
+def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> list[str]:
+    view = record.views.left if eye == "left" else record.views.right
+    pose, drogue = record.left_from_drogue, record.frame.drogue
+    if pose is None or drogue is None:
+        return check_empty(view, part_id)
+    layout = marker_layout(drogue)
+    faults = check_boxes(view, np.isin(part_id, drogue_part_ids(layout.count)))
+    if len(view.markers) != layout.count:
+        return [*faults, f"markers: {len(view.markers)} are labelled, the drogue has {layout.count}"]
+    for name, feature, disc in named_features(record, layout, pose, eye):
+        if (feature.visible_fraction > 0) != bool((part_id == disc.part).any()):
+            faults.append(f"{name}: visible_fraction: is {feature.visible_fraction}, the part ids say otherwise")
+        elif name != "hub" and feature.in_image and feature.visible_fraction == 1:
+            faults += [f"{name}: {fault}" for fault in check_unoccluded_marker(feature, disc, part_id)]
+    return faults
+
+
+def _read_part_ids(path: Path, record: PairRecord) -> NDArray[np.uint8] | None:
+    """The part ids by OpenCV's own reader; None where they cannot be had."""
+    camera = record.frame.rig.camera
+    try:
+        whole = png_fault(path.read_bytes()) is None
+    except OSError:
+        return None
+    part_id: NDArray[np.uint8] | None = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if whole else None
+    if part_id is None or part_id.dtype != np.uint8 or part_id.shape != (camera.height_px, camera.width_px):
+        return None
+    return part_id

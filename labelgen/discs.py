@@ -1,0 +1,127 @@
+"""A disc as one eye sees it: the ellipse of its image, and where pixel centres meet its plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drogue_models.marker_layout import MarkerLayout
+from drogue_models.parts import Part, marker_id
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import Array, RigidTransform
+from geometry.stereo import Eye, StereoRig
+
+
+@dataclass(frozen=True, eq=False)
+class DiscInEye:
+    """A disc in the frame of the eye that sees it.
+
+    Attributes:
+        part: part id of the feature that ends at the disc's edge.
+        center_m: (3,) [m]
+        normal: (3,) unit vector.
+        radius_m: [m]
+        camera: the eye's intrinsics.
+    """
+
+    part: int
+    center_m: Array
+    normal: Array
+    radius_m: float
+    camera: PinholeCamera
+
+    def dual_conic(self) -> Array:
+        """(3, 3) dual conic D of the image ellipse: lines l touch it where l^T D l = 0.
+
+        Source: `K (r^2 (I - n n^T) - t t^T) K^T`; the circle's own dual conic diag(1, 1, -1), mapped by the
+        homography from its plane to the image.
+        """
+        matrix = self.camera.matrix()
+        in_plane = np.eye(3) - np.outer(self.normal, self.normal)
+        conic: Array = matrix @ (self.radius_m**2 * in_plane - np.outer(self.center_m, self.center_m)) @ matrix.T
+        return conic
+
+    def extent_px(self) -> tuple[float, float, float, float]:
+        """Lowest u, lowest v, highest u, highest v of the image ellipse. [px]"""
+        d = self.dual_conic() / self.dual_conic()[2, 2]
+        center = d[:2, 2]
+        half = np.sqrt(center**2 - np.diag(d)[:2])
+        low, high = center - half, center + half
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def semi_axes_px(self) -> tuple[float, float]:
+        """Longer and shorter semi-axis of the image ellipse. [px]"""
+        d = self.dual_conic() / self.dual_conic()[2, 2]
+        shape = np.outer(d[:2, 2], d[:2, 2]) - d[:2, :2]
+        shorter, longer = np.sqrt(np.maximum(np.linalg.eigvalsh(shape), 0.0))
+        return float(longer), float(shorter)
+
+    def plane_depth_m(self, pixels_px: ArrayLike) -> Array:
+        """(...) planar depth at which rays through (..., 2) pixel coordinates meet the disc's plane. [m]"""
+        depth: Array = (self.center_m @ self.normal) / (self.camera.rays(pixels_px) @ self.normal)
+        return depth
+
+    def distance_m(self, pixels_px: ArrayLike) -> Array:
+        """(...) distance from the disc's centre at which rays through (..., 2) pixels meet its plane. [m]"""
+        points = self.camera.rays(pixels_px) * self.plane_depth_m(pixels_px)[..., None]
+        distance: Array = np.linalg.norm(points - self.center_m, axis=-1)
+        return distance
+
+
+def marker_discs(layout: MarkerLayout, rig: StereoRig, pose: RigidTransform, eye: Eye) -> list[DiscInEye]:
+    """The markers in their order, as one eye sees them; `pose` is `left_from_drogue`."""
+    centers = pose.apply(layout.centers_m) - rig.eye_offset_m(eye)
+    axis = pose.rotation[:, 2]
+    return [
+        DiscInEye(marker_id(index), center, axis, layout.radius_m, rig.camera) for index, center in enumerate(centers)
+    ]
+
+
+def hub_discs(
+    layout: MarkerLayout, rig: StereoRig, pose: RigidTransform, eye: Eye
+) -> tuple[DiscInEye, DiscInEye] | None:
+    """The discs of the hub's outer and inner edge, as one eye sees them, or None without a hub."""
+    if layout.hub_center_m is None:
+        return None
+    center = pose.apply(layout.hub_center_m) - rig.eye_offset_m(eye)
+    outer, inner = (
+        DiscInEye(int(Part.HUB), center, pose.rotation[:, 2], radius_m, rig.camera)
+        for radius_m in (layout.hub_outer_radius_m, layout.hub_inner_radius_m)
+    )
+    return outer, inner
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A rectangle of pixels.
+
+    Attributes:
+        rows, columns: where it lies in the image.
+        pixels_px: (h, w, 2) coordinates of its pixel centres.
+    """
+
+    rows: slice
+    columns: slice
+    pixels_px: Array
+
+
+def window_around(disc: DiscInEye, factor: float) -> Window | None:
+    """The pixels of the image near a disc, or None where its surroundings lie outside.
+
+    Args:
+        disc: the disc.
+        factor: how many times the extent of its image to cover.
+    """
+    u_low, v_low, u_high, v_high = disc.extent_px()
+    columns = _within((u_low + u_high) / 2, factor * (u_high - u_low) / 2, disc.camera.width_px)
+    rows = _within((v_low + v_high) / 2, factor * (v_high - v_low) / 2, disc.camera.height_px)
+    if not columns or not rows:
+        return None
+    u, v = np.meshgrid(np.array(columns, dtype=np.float64), np.array(rows, dtype=np.float64))
+    return Window(slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1), np.stack([u, v], axis=-1))
+
+
+def _within(middle_px: float, reach_px: float, size_px: int) -> range:
+    return range(max(int(np.ceil(middle_px - reach_px)), 0), min(int(np.floor(middle_px + reach_px)) + 1, size_px))

@@ -1,0 +1,120 @@
+"""All labels of one stereo pair."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from datasets_manifest.frame import FrameSpec
+from datasets_manifest.images import StereoImages
+from datasets_manifest.records import Conditions, PairRecord, StereoViews, ViewRecord
+from drogue_models.marker_layout import marker_layout
+from drogue_models.parts import Part
+from geometry.se3 import RigidTransform, angles_from_rotation
+from geometry.stereo import Eye
+from labelgen.boxes import full_box, leaves_image, visible_box, visible_mask
+from labelgen.marker_labels import hub_view, marker_views
+from render.engine import EyeRadiance, StereoRadiance
+from scenes.sky import REC709_LUMINANCE
+
+
+def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages) -> PairRecord:
+    """The truth of one pair.
+
+    Args:
+        frame: what was rendered.
+        radiance: with the passes that visibility is read from.
+        images: what the sensor made of it.
+
+    Returns:
+        The record, without its files' hashes.
+
+    Raises:
+        ValueError: images or passes do not belong to the frame.
+    """
+    _check_belongs(frame, radiance, images)
+    pose = frame.left_from_drogue
+    half_s = frame.exposure.time_s / 2
+    pitch, yaw, roll = (None, None, None) if pose is None else _angles_deg(pose)
+    return PairRecord(
+        frame_index=frame.frame_index,
+        scene_id=frame.scene_id,
+        sequence_id=frame.sequence_id,
+        time_s=frame.time_s,
+        left_from_drogue=pose,
+        left_from_drogue_open=None if pose is None else frame.left_from_drogue_at(-half_s),
+        left_from_drogue_close=None if pose is None else frame.left_from_drogue_at(half_s),
+        pitch_deg=pitch,
+        yaw_deg=yaw,
+        roll_deg=roll,
+        roll_modulo_deg=_roll_modulo_deg(frame, roll),
+        views=StereoViews(
+            left=_view(frame, pose, "left", radiance.left), right=_view(frame, pose, "right", radiance.right)
+        ),
+        conditions=Conditions(
+            family=frame.family,
+            distance_m=None if pose is None else float(pose.translation_m[2]),
+            sun_elevation_deg=frame.environment.sun_elevation_deg,
+            background_luminance_cd_m2=_background_luminance_cd_m2(radiance),
+            monte_carlo_noise_fraction=radiance.monte_carlo_noise_fraction,
+        ),
+        engine=radiance.engine,
+        engine_version=radiance.engine_version,
+        image_black_level_dn=images.black_level_dn,
+        file_sha256={},
+        frame=frame,
+    )
+
+
+def _check_belongs(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages) -> None:
+    camera = frame.rig.camera
+    size = (camera.width_px, camera.height_px)
+    if images.size_px != size or images.time_s != frame.time_s:
+        raise ValueError(f"images: must be {size} px at {frame.time_s} s, got {images.size_px} at {images.time_s} s")
+    for name, eye in (("left", radiance.left), ("right", radiance.right)):
+        if eye.part_id.shape != size[::-1]:
+            raise ValueError(f"radiance.{name}: must be {size[::-1]}, got {eye.part_id.shape}")
+
+
+def _angles_deg(pose: RigidTransform) -> tuple[float, float, float]:
+    pitch, yaw, roll = np.degrees(angles_from_rotation(pose.rotation))
+    return float(pitch), float(yaw), float(roll)
+
+
+def _roll_modulo_deg(frame: FrameSpec, roll_deg: float | None) -> float | None:
+    if roll_deg is None or frame.drogue is None:
+        return None
+    step_deg = 360.0 / marker_layout(frame.drogue).symmetry_order
+    modulo = roll_deg % step_deg
+    # A tiny negative roll rounds up to the step itself.
+    return modulo if modulo < step_deg else 0.0
+
+
+def _view(frame: FrameSpec, pose: RigidTransform | None, eye: Eye, seen: EyeRadiance) -> ViewRecord:
+    if frame.drogue is None or pose is None:
+        return ViewRecord(
+            markers=(),
+            hub=None,
+            box_full_xywh_px=None,
+            box_visible_xywh_px=None,
+            visible_drogue_px=0,
+            truncated=False,
+        )
+    layout = marker_layout(frame.drogue)
+    mask = visible_mask(seen.part_id, layout.count)
+    box = full_box(frame.drogue, frame.rig, pose, eye)
+    return ViewRecord(
+        markers=marker_views(frame, layout, pose, eye, seen),
+        hub=hub_view(frame, layout, pose, eye, seen),
+        box_full_xywh_px=box,
+        box_visible_xywh_px=visible_box(mask),
+        visible_drogue_px=int(np.count_nonzero(mask)),
+        truncated=leaves_image(box, frame.rig.camera),
+    )
+
+
+def _background_luminance_cd_m2(radiance: StereoRadiance) -> float:
+    """Mean luminance of the pixels of both eyes that see no part; of all pixels where every one sees some part."""
+    light = np.concatenate([eye.radiance_cd_m2.reshape(-1, 3) for eye in (radiance.left, radiance.right)])
+    open_sky = np.concatenate([eye.part_id.ravel() == Part.SKY for eye in (radiance.left, radiance.right)])
+    chosen = light[open_sky] if open_sky.any() else light
+    return float(chosen.mean(axis=0, dtype=np.float64) @ REC709_LUMINANCE)

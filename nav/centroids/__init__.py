@@ -1,0 +1,1 @@
+"""Where in an image the markers are, to a fraction of a pixel."""

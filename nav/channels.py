@@ -1,0 +1,88 @@
+"""The single picture in which markers are sought: bright where a marker is, dark elsewhere."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from datasets_manifest.images import Pixels, StereoImages
+from drogue_models.parameters import DrogueParameters
+from geometry.stereo import Eye
+
+# A paint counts as coloured when its strongest component leads the others by this share of itself; the shipped red
+# leads by 0.95, white by 0.
+_SATURATED_FRACTION = 0.5
+
+# Where the first site of each colour lies in an RGGB cell; the mean of both greens lies between them. [px]
+_SITE_OFFSET_PX = (0.0, 0.5, 1.0)
+
+
+def marker_color(drogue: DrogueParameters) -> int | None:
+    """Index of the colour that sets the markers apart (0 red, 1 green, 2 blue), or None for white and grey ones."""
+    lit = drogue.marker_luminance_cd_m2 > 0
+    rgb = drogue.marker_emission_rgb if lit else drogue.marker_reflectance_rgb
+    strongest = int(np.argmax(rgb))
+    others = max(value for index, value in enumerate(rgb) if index != strongest)
+    return strongest if rgb[strongest] - others > _SATURATED_FRACTION * rgb[strongest] else None
+
+
+def marker_channel(images: StereoImages, eye: Eye, color: int | None) -> Pixels:
+    """Linear picture of how much a pixel looks like a marker.
+
+    With a colour it is `max(c - max(the other two), 0)`, the paper's subtraction of channels; sites of that colour in a
+    raw mosaic are preferred to a demosaiced image. Without a colour, or from a mono sensor, it is the brightness: the
+    smallest of the three channels, which keeps white paint and dims a blue sky.
+
+    Args:
+        images: the pair.
+        eye: which of the two.
+        color: see `marker_color`.
+
+    Returns:
+        (H, W) of unsigned integers on the image's own grid, proportional to light above the black level.
+    """
+    image, mosaic = (images.left, images.left_mosaic) if eye == "left" else (images.right, images.right_mosaic)
+    if color is not None and mosaic is not None:
+        return _from_mosaic(mosaic, color)
+    linear = _linear(image, images)
+    if linear.ndim == 2:
+        return linear
+    planes = cv2.split(linear)
+    if color is None:
+        return np.asarray(cv2.min(cv2.min(planes[0], planes[1]), planes[2]))
+    first, second = (planes[index] for index in range(3) if index != color)
+    return np.asarray(cv2.subtract(planes[color], cv2.max(first, second)))
+
+
+def _linear(image: Pixels, images: StereoImages) -> Pixels:
+    """The image proportional to light, black level removed."""
+    if images.encoding == "linear":
+        black = round(images.black_level_dn)
+        return image if black == 0 else np.maximum(image, image.dtype.type(black)) - image.dtype.type(black)
+    codes = np.arange(2**images.bits) / (2**images.bits - 1)
+    black = images.black_level_dn / (2**images.bits - 1)
+    light = np.maximum(_srgb_to_linear(codes) - _srgb_to_linear(np.array(black)), 0)
+    levels: Pixels = np.round(65535 * light).astype(np.uint16)[image]
+    return levels
+
+
+def _srgb_to_linear(
+    code: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Light of an sRGB value, both in 0..1 (IEC 61966-2-1)."""
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
+def _from_mosaic(mosaic: Pixels, color: int) -> Pixels:
+    """Difference of the sites of one RGGB cell, brought bilinearly to the full grid at the colour's own place."""
+    height, width = mosaic.shape
+    even = mosaic[: height // 2 * 2, : width // 2 * 2]
+    green = cv2.addWeighted(even[0::2, 1::2], 0.5, even[1::2, 0::2], 0.5, 0)
+    planes = (np.ascontiguousarray(even[0::2, 0::2]), green, np.ascontiguousarray(even[1::2, 1::2]))
+    first, second = (planes[index] for index in range(3) if index != color)
+    difference = cv2.subtract(planes[color], cv2.max(first, second))
+    shift = -_SITE_OFFSET_PX[color] / 2
+    full_to_site = np.array([[0.5, 0.0, shift], [0.0, 0.5, shift]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    upsampled = cv2.warpAffine(difference, full_to_site, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(upsampled)

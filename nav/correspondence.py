@@ -1,0 +1,121 @@
+"""Which region of which image is which marker.
+
+In each image the drogue's ring is found among the regions (`nav.ring_match`), which orders the markers up to the
+layout's symmetry and leaves gaps where one is missing. Then every turn of the right image's order against the left's is
+tried, and the one with the smallest epipolar and disparity cost is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.marker_layout import MarkerLayout
+from geometry.se3 import Array
+from geometry.stereo import StereoRig
+from nav.centroids.binary_chain import Centroids
+from nav.pose.interface import NoFixReason, Observation
+from nav.ring_match import RingMatch, match_ring, symmetry_permutations
+
+# The best turn must explain the pairs within this share of the gap between neighbours; a wrong turn misses by a gap.
+_LARGEST_COST_FRACTION = 0.35
+# A pair whose rows differ by more than this is not one marker: room for the rig's calibration, and six deviations.
+_ROW_TOLERANCE_PX = 1.0
+_ROW_TOLERANCE_SIGMA = 6.0
+# A marker cut by something before it has lost a third of its area before its centre is a fifth of a radius off.
+_AREA_FACTOR = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class _EyeMarkers:
+    """Markers of one eye in the layout's order; nan where one was not found."""
+
+    centers_px: Array
+    cov_px2: Array
+
+    def turned(self, permutation: NDArray[np.int64]) -> _EyeMarkers:
+        """The same markers, named after another turn of the layout."""
+        return _EyeMarkers(self.centers_px[permutation], self.cov_px2[permutation])
+
+
+def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayout) -> Observation | NoFixReason:
+    """Match regions of both eyes with each other and with the drogue's markers.
+
+    The roll that the layout's symmetry leaves open is the one nearest to zero.
+
+    Args:
+        left: regions found in the left image.
+        right: regions found in the right image.
+        rig: the stereo rig.
+        layout: the drogue's markers.
+
+    Returns:
+        What the estimators work on, or why there is nothing to work on.
+    """
+    rings: list[RingMatch] = []
+    for eye, centroids in (("left", left), ("right", right)):
+        ring = match_ring(centroids.blobs, layout)
+        if ring is None:
+            return NoFixReason(f"no ring of markers among {len(centroids.blobs)} regions of the {eye} image")
+        rings.append(ring)
+    permutations = symmetry_permutations(layout)
+    upright = permutations[_turn_nearest_to_zero(rings[0], layout)]
+    first = _markers(left, rings[0]).turned(upright)
+    others = [_markers(right, rings[1]).turned(permutation) for permutation in permutations]
+    disparity_px = rig.baseline_m * rings[0].scale_px_per_m
+    costs = [_cost_px(first.centers_px, other.centers_px, disparity_px) for other in others]
+    best = int(np.argmin(costs))
+    gap_px = _smallest_gap_m(layout) * rings[0].scale_px_per_m
+    if costs[best] > _LARGEST_COST_FRACTION * gap_px:
+        return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
+    return _without_bad_pairs(first, others[best], rig, layout)
+
+
+def _markers(centroids: Centroids, ring: RingMatch) -> _EyeMarkers:
+    """The ring's regions in the layout's order, without those of an odd size."""
+    found = ring.blob_of_marker >= 0
+    blob = ring.blob_of_marker[found]
+    areas = centroids.blobs.areas_px2[blob]
+    whole = np.abs(np.log(areas / np.median(areas))) < np.log(_AREA_FACTOR)
+    found[found] = whole
+    centers = np.full((len(found), 2), np.nan)
+    covariances = np.full((len(found), 2, 2), np.nan)
+    centers[found], covariances[found] = centroids.blobs.centers_px[blob[whole]], centroids.cov_px2[blob[whole]]
+    return _EyeMarkers(centers, covariances)
+
+
+def _turn_nearest_to_zero(ring: RingMatch, layout: MarkerLayout) -> int:
+    """Which of the layout's turns brings the ring's roll nearest to zero."""
+    linear = ring.affine[:, :2]
+    roll = np.arctan2(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1])
+    order = layout.symmetry_order
+    # Naming markers by a turn of 2 pi k / order takes that much from the roll.
+    return int(np.round(roll * order / (2 * np.pi))) % order
+
+
+def _cost_px(left_px: Array, right_px: Array, disparity_px: float) -> float:
+    """Root mean square of the row differences and of the disparities against the ring's size. [px]"""
+    difference = left_px - right_px - (disparity_px, 0.0)
+    both = np.isfinite(difference).all(axis=1)
+    return float(np.sqrt(np.mean(difference[both] ** 2))) if both.any() else np.inf
+
+
+def _smallest_gap_m(layout: MarkerLayout) -> float:
+    gaps = np.linalg.norm(layout.centers_m[:, None] - layout.centers_m, axis=2)
+    return float(gaps[np.triu_indices(layout.count, 1)].min())
+
+
+def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers, rig: StereoRig, layout: MarkerLayout) -> Observation:
+    """The observation, without pairs whose rows differ more than those of the others."""
+    rows_px = left.centers_px[:, 1] - right.centers_px[:, 1]
+    both = np.isfinite(rows_px)
+    sigma_px = np.sqrt(left.cov_px2[:, 1, 1] + right.cov_px2[:, 1, 1])
+    bad = np.zeros_like(both)
+    off_px = np.abs(rows_px[both] - np.median(rows_px[both]))
+    bad[both] = off_px > _ROW_TOLERANCE_PX + _ROW_TOLERANCE_SIGMA * sigma_px[both]
+    pixels = np.stack([left.centers_px, right.centers_px])
+    covariances = np.stack([left.cov_px2, right.cov_px2])
+    pixels[:, bad], covariances[:, bad] = np.nan, np.nan
+    return Observation(rig, layout, pixels, covariances)

@@ -1,0 +1,77 @@
+"""A detector without training: blobs of the markers' colour that form the drogue's ring."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.images import Pixels, StereoImages
+from drogue_models.marker_layout import marker_layout
+from drogue_models.parameters import DrogueParameters
+from geometry.se3 import Array
+from geometry.stereo import Eye
+from nav.blobs import disc_like_blobs
+from nav.channels import marker_channel, marker_color
+from nav.detector.interface import Detection, StereoDetection
+from nav.ring_match import RingMatch, match_ring
+
+# A marker of 5 px diameter covers about 20 pixels; half of them stay above half its contrast after blurring.
+_LEAST_AREA_PX2 = 7.0
+# So many pixels must be as bright as the brightest level tried: what the smallest ring of markers has.
+_PEAK_PIXELS = 30
+# Levels tried, as shares of that peak: markers in shade reach a tenth of what something sunlit and red does.
+_LEVELS = tuple(0.8 * 0.75**step for step in range(11))
+# Below this many levels of the picture there is only quantisation noise.
+_LEAST_LEVEL_DN = 2.0
+_MOST_BLOBS = 150
+
+
+class ColorBlobDetector:
+    """Finds the ring of markers at the brightness level that shows most of it.
+
+    Attributes:
+        name: `color-blob`.
+    """
+
+    name = "color-blob"
+
+    def __init__(self, drogue: DrogueParameters) -> None:
+        self._layout = marker_layout(drogue)
+        self._rim_radius_m = drogue.rim_radius_m
+        self._color = marker_color(drogue)
+
+    def detect(self, images: StereoImages) -> StereoDetection:
+        """Boxes around the rim in both images."""
+        return StereoDetection(self._detect_eye(images, "left"), self._detect_eye(images, "right"))
+
+    def _detect_eye(self, images: StereoImages, eye: Eye) -> Detection | None:
+        channel = cv2.blur(marker_channel(images, eye, self._color), (3, 3))
+        best: RingMatch | None = None
+        for level in _levels(channel):
+            mask: NDArray[np.uint8] = (channel > level).view(np.uint8)
+            match = match_ring(disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS), self._layout)
+            if match is not None and (best is None or match.count > best.count):
+                best = match
+            if best is not None and best.count == self._layout.count:
+                break
+        if best is None:
+            return None
+        score = best.count / self._layout.count * max(0.0, 1 - best.rms_fraction)
+        return Detection(_circle_box(best.affine, self._rim_radius_m), score)
+
+
+def _levels(channel: Pixels) -> list[float]:
+    """Thresholds to try, the highest first."""
+    top = int(np.iinfo(channel.dtype).max) + 1
+    histogram = cv2.calcHist([channel], [0], None, [top], [0, top]).ravel()
+    at_least = np.cumsum(histogram[::-1])[::-1]
+    peak = float(np.flatnonzero(at_least >= min(_PEAK_PIXELS, channel.size))[-1])
+    return [share * peak for share in _LEVELS if share * peak >= _LEAST_LEVEL_DN]
+
+
+def _circle_box(affine: Array, radius_m: float) -> tuple[float, float, float, float]:
+    """x, y, width, height of the image of a circle about the layout's origin. [px]"""
+    half_width, half_height = radius_m * np.hypot(affine[:, 0], affine[:, 1])
+    x, y = affine[:, 2]
+    return float(x - half_width), float(y - half_height), float(2 * half_width), float(2 * half_height)

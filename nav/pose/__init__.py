@@ -1,0 +1,1 @@
+"""From matched features to a pose: one interface, many methods."""

@@ -1,0 +1,123 @@
+"""Method `paper`: the seed paper's three-sphere pose, in the reading that works.
+
+Every three triangulated markers give a candidate for the drogue's origin; the candidate whose reprojection into both
+eyes fits all markers best is taken and shifted along its line of sight. Attitude: the plane through all markers.
+Source: the seed paper, section 3.3, eqs. 1-16; docs/conventions.md lists what is corrected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from drogue_models.marker_layout import MarkerLayout
+from geometry.se3 import Array, RigidTransform
+from nav.pose.interface import NoFixReason, Observation, Solution, fault
+from nav.pose.prediction import (
+    eye_points,
+    plane_normal,
+    predict_px,
+    rotations_with_axis,
+    triangulate_pairs,
+    used_pairs,
+    with_best_roll,
+)
+
+# Threshold of the Huber loss: twice the centroids' standard deviation, and no less than a good centroid's error.
+_HUBER_SIGMAS = 2.0
+_LEAST_HUBER_PX = 0.05
+_DEPTH_STEPS = 5
+# No step changes the distance by more than this share of it.
+_LARGEST_DEPTH_STEP = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Triples:
+    """Circles through three points each.
+
+    Attributes:
+        centers_m: (T, 3) circumcentres.
+        normals: (T, 3) unit normals with positive z.
+        radii2_m2: (T,) squared circumradii.
+    """
+
+    centers_m: Array
+    normals: Array
+    radii2_m2: Array
+
+
+def triple_circles(points_m: Array) -> Triples:
+    """Circles through all C(K, 3) triples of (K, 3) points; nan for three points on a line."""
+    triples = np.array(list(combinations(range(len(points_m)), 3)))
+    p, a, b = (points_m[triples[:, column]] for column in range(3))
+    a, b = a - p, b - p
+    across = np.cross(a, b)
+    across2 = (across**2).sum(axis=1, keepdims=True)
+    across2 = np.where(across2 > 0, across2, np.nan)
+    a2, b2 = (a**2).sum(axis=1, keepdims=True), (b**2).sum(axis=1, keepdims=True)
+    offset = (np.cross(across, a) * b2 + np.cross(b, across) * a2) / (2 * across2)
+    normals = across / np.sqrt(across2)
+    normals = np.where(normals[:, 2:] < 0, -normals, normals)
+    return Triples(p + offset, normals, (offset**2).sum(axis=1))
+
+
+def paper(observation: Observation) -> Solution | NoFixReason:
+    """Pose by the three-sphere construction, visual reprojection and the Huber-weighted step in depth."""
+    reason = fault(observation)
+    if reason is not None:
+        return reason
+    ring_radius_m = observation.layout.ring_radius_m
+    if ring_radius_m is None:
+        return NoFixReason("the paper's method needs all markers on one circle about the drogue's origin")
+    index, points = triangulate_pairs(observation)
+    layout = MarkerLayout(observation.layout.centers_m[index], observation.layout.radius_m, None)
+    pixels = observation.pixels_px[:, index]
+    huber_px = max(_HUBER_SIGMAS * observation.sigma_px, _LEAST_HUBER_PX)
+
+    circles = triple_circles(points)
+    # The spheres about three markers meet twice on the circle's axis; noise leaves no real root where it is negative.
+    discriminant = ring_radius_m**2 - circles.radii2_m2
+    origins = circles.centers_m + circles.normals * np.sqrt(np.maximum(discriminant, 0))[:, None]
+    sound = np.isfinite(origins).all(axis=1) & (origins[:, 2] > ring_radius_m)
+    if not sound.any():
+        return NoFixReason("no three markers give a place in front of the cameras")
+    origins, axes = origins[sound], circles.normals[sound]
+    rotations = with_best_roll(rotations_with_axis(axes), points, origins, layout.centers_m)
+    # A nearly edge-on candidate can put a marker behind a camera; its prediction is then infinite or nan, never best.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        residuals = np.linalg.norm(predict_px(observation.rig, layout, rotations, origins) - pixels, axis=-1)
+        scores = np.where(np.isfinite(residuals), _huber(residuals, huber_px), np.inf).sum(axis=(1, 2))
+    best = int(np.argmin(scores))
+    origin = _depth_steps(observation, layout, pixels, huber_px, RigidTransform(rotations[best], origins[best]))
+    if not (np.isfinite(origin).all() and origin[2] > 0):
+        return NoFixReason("the step in depth left the space in front of the cameras")
+    unrolled = rotations_with_axis(plane_normal(points)[None])
+    rotation = with_best_roll(unrolled, points, origin[None], layout.centers_m)[0]
+    return Solution(RigidTransform(rotation, origin), used_pairs(observation))
+
+
+def _huber(residuals_px: Array, threshold_px: float) -> Array:
+    """Huber's loss of residual norms. [px^2]"""
+    return np.where(residuals_px <= threshold_px, residuals_px**2 / 2, threshold_px * (residuals_px - threshold_px / 2))
+
+
+def _depth_steps(
+    observation: Observation, layout: MarkerLayout, pixels_px: Array, huber_px: float, start: RigidTransform
+) -> Array:
+    """(3,) origin moved along its line of sight by Huber-weighted Gauss-Newton steps (the paper's eqs. 14-16). [m]"""
+    camera, rotation = observation.rig.camera, start.rotation[None]
+    origin = start.translation_m.copy()
+    for _ in range(_DEPTH_STEPS):
+        residuals = predict_px(observation.rig, layout, rotation, origin[None])[0] - pixels_px
+        points = eye_points(observation.rig, layout.centers_m, rotation, origin[None])[0]
+        direction = origin / origin[2]
+        slope_x = camera.fx_px / points[..., 2] * (direction[0] - points[..., 0] / points[..., 2])
+        slope_y = camera.fy_px / points[..., 2] * (direction[1] - points[..., 1] / points[..., 2])
+        slopes = np.stack([slope_x, slope_y], axis=-1)
+        weights = np.minimum(1.0, huber_px / np.maximum(np.linalg.norm(residuals, axis=-1), huber_px))[..., None]
+        step = -(weights * slopes * residuals).sum() / (weights * slopes**2).sum()
+        limit = _LARGEST_DEPTH_STEP * origin[2]
+        origin = origin + direction * float(np.clip(step, -limit, limit))
+    return origin

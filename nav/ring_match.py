@@ -1,0 +1,162 @@
+"""Which blobs of one image are the markers: the largest set that one affine map carries the drogue's layout onto.
+
+An affine map is the image of a flat pattern up to perspective within it, which moves a marker by less than a third of
+its radius where the whole drogue is in view. Missing markers, false blobs and the hub (near the middle, where no marker
+is) need no rule of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.marker_layout import MarkerLayout
+from geometry.se3 import Array
+from nav.blobs import Blobs
+
+# Blurring and thresholds change a disc's apparent radius by less than this factor at 5 px of diameter.
+_SIZE_FACTOR = 1.6
+# Tolerances as a share of a marker's radius: for two-point guesses, which ignore tilt, and for the fitted map.
+_GUESS_TOLERANCE = 0.8
+_FIT_TOLERANCE = 0.4
+_STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
+_REFINED_GUESSES = 16
+# A complete ring this near its map needs no second guess.
+_GOOD_RMS_FRACTION = 0.1
+_CHUNK = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class RingMatch:
+    """The markers of one image.
+
+    Attributes:
+        affine: (2, 3) map from the rim plane [m] to pixels.
+        blob_of_marker: (N,) index of each marker's blob, -1 where it was not found; modulo the layout's symmetry.
+        rms_fraction: distance of blobs from the map, as a share of a marker's radius.
+    """
+
+    affine: Array
+    blob_of_marker: NDArray[np.int64]
+    rms_fraction: float
+
+    @property
+    def count(self) -> int:
+        """Number of markers found."""
+        return int((self.blob_of_marker >= 0).sum())
+
+    @property
+    def scale_px_per_m(self) -> float:
+        """Largest stretch of the map: focal length over distance. [px/m]"""
+        return float(np.linalg.svd(self.affine[:, :2], compute_uv=False)[0])
+
+
+def least_markers(layout: MarkerLayout) -> int:
+    """Fewest markers that are taken for the drogue: 3/5 of them, and at least four where there are four."""
+    return min(layout.count, max(4, -(-3 * layout.count // 5)))
+
+
+def symmetry_permutations(layout: MarkerLayout) -> NDArray[np.int64]:
+    """(order, N) for each turn that maps the layout onto itself: which marker comes to lie on marker i."""
+    turns = np.exp(2j * np.pi * np.arange(layout.symmetry_order) / layout.symmetry_order)
+    places = _complex(layout.centers_m[:, :2])
+    gaps = np.abs(turns[:, None, None] * places[None, None, :] - places[None, :, None])
+    permutations: NDArray[np.int64] = np.argmin(gaps, axis=2)
+    return permutations
+
+
+def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
+    """The best consistent set of markers among blobs, or None.
+
+    Args:
+        blobs: of one image.
+        layout: the drogue's markers.
+    """
+    if len(blobs) < least_markers(layout):
+        return None
+    best: RingMatch | None = None
+    for turn, shift in _best_guesses(blobs, layout):
+        affine = np.array([[turn.real, -turn.imag, shift.real], [turn.imag, turn.real, shift.imag]])
+        match = _fit(affine, blobs, layout)
+        if match is not None and (best is None or _rank(match) > _rank(best)):
+            best = match
+        if best is not None and best.count == layout.count and best.rms_fraction < _GOOD_RMS_FRACTION:
+            break
+    return best
+
+
+def _rank(match: RingMatch) -> tuple[int, float]:
+    return match.count, -match.rms_fraction
+
+
+def _complex(points: Array) -> NDArray[np.complex128]:
+    result: NDArray[np.complex128] = points[..., 0] + 1j * points[..., 1]
+    return result
+
+
+def _best_guesses(blobs: Blobs, layout: MarkerLayout) -> list[tuple[complex, complex]]:
+    """Similarity maps `z -> turn z + shift` that carry the most markers onto blobs, from all pairs of blobs."""
+    turns, shifts = _pair_guesses(blobs, layout)
+    places, image = _complex(layout.centers_m[:, :2]), _complex(blobs.centers_px)
+    votes = np.zeros(len(turns))
+    for start in range(0, len(turns), _CHUNK):
+        turn, shift = turns[start : start + _CHUNK, None], shifts[start : start + _CHUNK, None]
+        distance = np.abs((turn * places + shift)[:, :, None] - image)
+        radius = layout.radius_m * np.abs(turn)[:, :, None]
+        fits = (blobs.radii_px < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * blobs.radii_px)
+        nearness = np.where(fits, 1 - distance / (_GUESS_TOLERANCE * radius), 0).max(axis=2).clip(min=0)
+        # A marker hit counts one, its nearness breaks ties.
+        votes[start : start + _CHUNK] = (nearness > 0).sum(axis=1) + nearness.mean(axis=1) * 0.5
+    order = np.argsort(-votes, kind="stable")[:_REFINED_GUESSES]
+    return [(complex(turns[i]), complex(shifts[i])) for i in order if votes[i] >= 3]
+
+
+def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Maps that carry two markers onto two blobs of a size that goes with their distance."""
+    places, image = _complex(layout.centers_m[:, :2]), _complex(blobs.centers_px)
+    radii = blobs.radii_px
+    size_scale = np.sqrt(radii[:, None] * radii) / layout.radius_m
+    alike = (radii[:, None] < _SIZE_FACTOR * radii) & (radii < _SIZE_FACTOR * radii[:, None])
+    np.fill_diagonal(alike, False)
+    gaps = np.abs(image[:, None] - image)
+    turns, shifts = [np.zeros(0, complex)], [np.zeros(0, complex)]
+    # One marker of each orbit of the symmetry is enough as the first: the others give the same maps, turned.
+    first_markers = np.unique(symmetry_permutations(layout).min(axis=0))
+    for i in first_markers:
+        for j in range(layout.count):
+            if j == i:
+                continue
+            scale = gaps / abs(places[j] - places[i])
+            plausible = alike & (scale < _SIZE_FACTOR * size_scale) & (size_scale < _SIZE_FACTOR * scale)
+            p, q = np.nonzero(plausible)
+            turn = (image[q] - image[p]) / (places[j] - places[i])
+            turns.append(turn)
+            shifts.append(image[p] - turn * places[i])
+    return np.concatenate(turns), np.concatenate(shifts)
+
+
+def _fit(affine: Array, blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
+    """Affine map refined on the blobs that it hits, or None where they cannot be the drogue."""
+    places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
+    for tolerance in (_GUESS_TOLERANCE, _GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE):
+        stretch = np.linalg.svd(affine[:, :2], compute_uv=False)
+        radius = layout.radius_m * np.sqrt(stretch[0] * stretch[1])
+        distance = np.linalg.norm((places @ affine.T)[:, None] - blobs.centers_px, axis=2)
+        sizes = blobs.radii_px
+        alike = (sizes < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * sizes)
+        distance = np.where(alike, distance, np.inf)
+        nearest = distance.argmin(axis=1)
+        hit = distance[np.arange(layout.count), nearest] < tolerance * radius
+        if hit.sum() < least_markers(layout):
+            return None
+        seen = places[hit]
+        if np.linalg.matrix_rank(seen, tol=1e-6) < 3:
+            return None
+        affine = np.linalg.lstsq(seen, blobs.centers_px[nearest[hit]], rcond=None)[0].T
+    stretch = np.linalg.svd(affine[:, :2], compute_uv=False)
+    if np.linalg.det(affine[:, :2]) <= 0 or stretch[1] < _STRONGEST_TILT_COSINE * stretch[0]:
+        return None
+    residual = np.linalg.norm(seen @ affine.T - blobs.centers_px[nearest[hit]], axis=1)
+    return RingMatch(affine, np.where(hit, nearest, -1), float(np.sqrt(np.mean(residual**2)) / radius))

@@ -1,0 +1,101 @@
+"""What a tracer hands back for one eye, which pixels it has to trace, and how that goes over the surroundings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.frame import FrameSpec
+from drogue_models.parts import Part, drogue_part_ids
+from geometry.se3 import exp_twist
+from geometry.stereo import Eye
+from render.engine import EyeRadiance
+
+
+@dataclass(eq=False)
+class TracedEye:
+    """Passes of all pixel centres, and radiance of the traced pixels.
+
+    Attributes:
+        part_id, depth_m, normal, amodal_px: as in `EyeRadiance`.
+        pixel: (P,) flat indices of the traced pixels.
+        radiance_cd_m2: (P, 3) light from parts alone, already weighted by coverage. [cd/m2]
+        coverage: (P,) share of the pixel that parts cover.
+    """
+
+    part_id: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    amodal_px: dict[int, int]
+    pixel: NDArray[np.int64]
+    radiance_cd_m2: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+
+    def over(self, behind: NDArray[np.float32]) -> EyeRadiance:
+        """The traced pixels over the surroundings `behind` (H, W, 3)."""
+        radiance = behind.copy()
+        flat = radiance.reshape(-1, 3)
+        flat[self.pixel] = self.radiance_cd_m2 + (1.0 - self.coverage)[:, None] * flat[self.pixel]
+        coverage = np.zeros(behind.shape[:2], dtype=np.float32)
+        coverage.reshape(-1)[self.pixel] = self.coverage
+        return EyeRadiance(radiance, coverage, self.part_id, self.depth_m, self.normal, self.amodal_px)
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """Both eyes of one frame."""
+
+    eyes: dict[Eye, TracedEye]
+    monte_carlo_noise_fraction: float
+    stage_s: dict[str, float]
+
+
+def pose_polynomial(frame: FrameSpec, eye: Eye) -> NDArray[np.float64]:
+    """Pose of an eye in the drogue frame over the exposure.
+
+    Returns:
+        (3, 3, 4) coefficients c of `drogue_from_eye(s) = c[0] + c[1] s + c[2] s^2`, s from -1 (shutter opens) to 1
+        (it closes); exact at both ends and the middle, the rest is of third order in the motion.
+    """
+    half_s = frame.exposure.time_s / 2
+    eye_from_left = exp_twist(np.concatenate([-frame.rig.eye_offset_m(eye), np.zeros(3)]))
+    opened, middle, closed = (
+        (eye_from_left @ frame.left_from_drogue_at(offset_s)).inverse().as_matrix()[:3]
+        for offset_s in (-half_s, 0.0, half_s)
+    )
+    return np.stack([middle, (closed - opened) / 2, (closed + opened) / 2 - middle])
+
+
+def blur_px(frame: FrameSpec) -> float:
+    """Largest movement of the drogue's image from mid-exposure to either end. [px]"""
+    half_s = frame.exposure.time_s / 2
+    assert frame.drogue is not None
+    reach = frame.drogue.rim_radius_m * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
+    seen = [frame.rig.camera.project(frame.left_from_drogue_at(s).apply(reach)) for s in (-half_s, 0.0, half_s)]
+    return float(max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[2] - seen[1]).max()))
+
+
+def pixels_to_trace(
+    ids: list[NDArray[np.uint8]], margin_px: int, marker_count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Flat indices of the pixels that may see the drogue, and of the others that may see hose or tanker.
+
+    Args:
+        ids: (H, W) part ids of pixel centres, at one or more times of the exposure.
+        margin_px: how far beyond those a part may reach into other pixels.
+        marker_count: number of markers.
+    """
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
+    belongs = np.zeros(256, dtype=np.uint8)
+    belongs[drogue_part_ids(marker_count)] = 1
+    drogue = np.zeros(ids[0].shape, dtype=np.uint8)
+    covered = np.zeros(ids[0].shape, dtype=np.uint8)
+    for part_id in ids:
+        drogue |= belongs[part_id]
+        covered |= (part_id != Part.SKY).astype(np.uint8)
+    drogue = cv2.dilate(drogue, kernel)
+    covered = cv2.dilate(covered, kernel)
+    return np.flatnonzero(drogue), np.flatnonzero(covered & ~drogue & 1)

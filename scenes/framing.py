@@ -1,0 +1,85 @@
+"""Attitude and position of the drogue so that both eyes see all of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from datasets_manifest.recipe import Recipe
+from drogue_models.parameters import DrogueParameters
+from geometry.se3 import Array, RigidTransform, rotation_from_angles
+from geometry.stereo import StereoRig
+from scenes.environment import draw
+
+_MOST_TRIES = 1000
+_OUTLINE_POINTS = 72
+# The rim polygon of 72 points lies within 0.1 % of the circle; a pixel of margin covers that and the lens blur.
+_MARGIN_PX = 1.5
+
+
+def outline(drogue: DrogueParameters) -> Array:
+    """(M, 3) points of the drogue frame around everything that must be in view: rim, and back end. [m]"""
+    angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(_OUTLINE_POINTS)], axis=-1)
+    back_m = drogue.hub_depth_m + drogue.coupling_length_m
+    return np.concatenate(
+        [
+            ring * drogue.rim_radius_m,
+            ring * drogue.rim_radius_m + np.array([0.0, 0.0, 2 * drogue.rim_tube_radius_m]),
+            ring * drogue.coupling_radius_m + np.array([0.0, 0.0, back_m]),
+        ]
+    )
+
+
+def room_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[float, float, float, float] | None:
+    """Where the drogue's origin may lie at one depth.
+
+    Args:
+        rig: the stereo rig.
+        points_m: (M, 3) points around the origin, in camera axes. [m]
+        depth_m: Z of the origin. [m]
+
+    Returns:
+        (x_low, x_high, y_low, y_high) so that both eyes see every point [m], or None where there is no room.
+    """
+    c = rig.camera
+    z = depth_m + points_m[:, 2]
+    if z.min() <= 0:
+        return None
+    left = (_MARGIN_PX - 0.5 - c.cx_px) / c.fx_px * z - points_m[:, 0]
+    right = (c.width_px - 0.5 - _MARGIN_PX - c.cx_px) / c.fx_px * z - points_m[:, 0]
+    up = (_MARGIN_PX - 0.5 - c.cy_px) / c.fy_px * z - points_m[:, 1]
+    down = (c.height_px - 0.5 - _MARGIN_PX - c.cy_px) / c.fy_px * z - points_m[:, 1]
+    x_low, x_high, y_low, y_high = left.max() + rig.baseline_m, right.min(), up.max(), down.min()
+    return None if x_low > x_high or y_low > y_high else (float(x_low), float(x_high), float(y_low), float(y_high))
+
+
+def sample_pose(rng: np.random.Generator, recipe: Recipe, depth_m: float) -> RigidTransform:
+    """`left_from_drogue` at one depth: attitude from the recipe's ranges, place uniform in the common field of view.
+
+    An attitude that does not fit into both views at this depth is drawn again.
+
+    Raises:
+        ValueError: no attitude of the ranges fits.
+    """
+    points = outline(recipe.drogue)
+    for _ in range(_MOST_TRIES):
+        pitch, yaw, roll = np.radians(
+            [draw(rng, limits) for limits in (recipe.pose.pitch_deg, recipe.pose.yaw_deg, recipe.pose.roll_deg)]
+        )
+        rotation = rotation_from_angles(pitch, yaw, roll)
+        room = room_m(recipe.rig, points @ rotation.T, depth_m)
+        place = rng.random(2)
+        if room is None:
+            continue
+        x_low, x_high, y_low, y_high = room
+        if recipe.pose.on_axis:
+            middle = np.array([recipe.rig.baseline_m / 2, 0.0, depth_m])
+            if not (x_low <= middle[0] <= x_high and y_low <= middle[1] <= y_high):
+                continue
+            return RigidTransform(rotation, middle)
+        x_m, y_m = x_low + place[0] * (x_high - x_low), y_low + place[1] * (y_high - y_low)
+        return RigidTransform(rotation, np.array([x_m, y_m, depth_m]))
+    raise ValueError(
+        f"pose: at {depth_m:g} m no attitude within the recipe's ranges keeps the drogue in both views; "
+        "widen pitch_deg and yaw_deg towards 0 or move away"
+    )

@@ -1,0 +1,99 @@
+"""The walls between the packages stand, and each of them stops the import that it is there to stop."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import grimp
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SETTINGS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
+PACKAGES = SETTINGS["root_packages"]
+
+# Of each wall: a module and the import in it that must not pass.
+TRESPASSES = [
+    ("rooms", "geometry/trespass.py", "import drogue_models.parameters"),
+    ("rooms", "scenes/trespass.py", "import render.engine"),
+    ("rooms", "datasets_manifest/trespass.py", "import scenes.seeding"),
+    ("rooms", "labelgen/trespass.py", "import nav.runner"),
+    ("application", "droguekit/benchmark/trespass.py", "import droguekit.batch.workers"),
+    ("application", "droguekit/batch/trespass.py", "import droguekit.benchmark.benchmark"),
+    ("application", "droguekit/batch/trespass.py", "import droguekit.cli.main"),
+    ("blind", "nav/trespass.py", "import datasets_manifest.records"),
+    ("blind", "nav/pose/trespass.py", "from datasets_manifest import reader"),
+    ("blind", "nav/trespass.py", "import datasets_manifest"),
+    ("no-generator", "nav/trespass.py", "def f():\n    import scenes.seeding"),
+    ("no-generator", "droguekit/benchmark/trespass.py", "import labelgen.frame_labels"),
+    ("light", "nav/trespass.py", "import drogue_models.meshes"),
+    ("light", "droguekit/benchmark/trespass.py", "import trimesh"),
+    ("renderers", "labelgen/trespass.py", "import mitsuba"),
+    ("renderers", "droguekit/cli/trespass.py", "import drjit"),
+    ("dimensions", "drogue_models/parameters.py", "import trimesh"),
+    ("torch", "nav/pose/trespass.py", "import torch"),
+    ("torch", "droguekit/benchmark/trespass.py", "import torch"),
+    ("geometry", "geometry/trespass.py", "import cv2"),
+    ("cycles", "datasets_manifest/layout.py", "import datasets_manifest.reader"),
+]
+
+
+def lint(folder: Path, *contracts: str) -> subprocess.CompletedProcess[str]:
+    """Check the import contracts on the packages that lie in a folder."""
+    chosen = [argument for contract in contracts for argument in ("--contract", contract)]
+    code = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"
+    return subprocess.run(
+        [sys.executable, "-c", code, "--no-cache", "--no-logo", *chosen],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of our packages in which a test may break things."""
+    folder = tmp_path_factory.mktemp("walls")
+    for package in PACKAGES:
+        shutil.copytree(REPOSITORY / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(REPOSITORY / "pyproject.toml", folder)
+    return folder
+
+
+def test_the_contracts_hold() -> None:
+    result = lint(REPOSITORY)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_every_contract_has_a_trespass_that_tests_it() -> None:
+    assert {wall for wall, _, _ in TRESPASSES} == {contract["id"] for contract in SETTINGS["contracts"]}
+
+
+@pytest.mark.parametrize(("wall", "module", "statement"), TRESPASSES)
+def test_a_wall_stops_what_it_is_there_for(copy: Path, wall: str, module: str, statement: str) -> None:
+    path = copy / module
+    before = path.read_text(encoding="utf-8") if path.exists() else None
+    try:
+        path.write_text((before or "") + "\n" + statement + "\n", encoding="utf-8")
+        result = lint(copy, wall)
+    finally:
+        if before is None:
+            path.unlink()
+        else:
+            path.write_text(before, encoding="utf-8")
+    assert result.returncode == 1, result.stdout + result.stderr
+    assert "1 broken" in result.stdout, result.stdout + result.stderr
+
+
+def test_geometry_imports_nothing_but_numpy_and_scipy() -> None:
+    # The contract names the libraries that geometry must not use; this names those that it may.
+    graph = grimp.build_graph(*PACKAGES, include_external_packages=True, cache_dir=None)
+    modules = {"geometry", *graph.find_descendants("geometry")}
+    imported = {name.split(".")[0] for module in modules for name in graph.find_modules_directly_imported_by(module)}
+    assert imported - set(sys.stdlib_module_names) <= {"geometry", "numpy", "scipy"}

@@ -1,0 +1,135 @@
+"""Worker processes: what a death costs, what an error costs, and that nobody outlives the run."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from pebble import ProcessExpired
+
+from droguekit.batch.workers import MAX_ATTEMPTS, default_workers, run_alone, run_tasks
+
+# Workers are fresh processes: what they run must be importable there, which a test module is not.
+TASKS = """
+import os, signal, threading
+from pathlib import Path
+
+def square(index):
+    return index * index
+
+def die_once(folder, victim, index):
+    mark = Path(folder) / str(index)
+    if index == victim and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return index * index
+
+def die_always(victim, index):
+    if index == victim:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return index * index
+
+def refuse(victim, index):
+    if index == victim:
+        raise ValueError(f"index: {index} is refused")
+    return index * index
+
+def threads():
+    return [os.environ[name] for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")]
+
+def tell_and_wait(pipe, index):
+    with open(pipe, "w") as stream:
+        stream.write(f"{os.getpid()}\\n")
+    threading.Event().wait()
+"""
+
+
+@pytest.fixture
+def tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    (tmp_path / "worker_tasks.py").write_text(TASKS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "worker_tasks", raising=False)
+    import worker_tasks
+
+    return worker_tasks
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_every_task_is_done_once_whatever_the_number_of_workers(tasks: ModuleType, workers: int) -> None:
+    attempts = [*run_tasks(tasks.square, range(5), workers)]
+    assert sorted((attempt.index, attempt.value) for attempt in attempts) == [(i, i * i) for i in range(5)]
+    assert all(attempt.final and attempt.number == 1 and attempt.error is None for attempt in attempts)
+
+
+def test_a_killed_worker_costs_one_attempt_of_one_task(tasks: ModuleType, tmp_path: Path) -> None:
+    attempts = [*run_tasks(partial(tasks.die_once, str(tmp_path), 2), range(5), 2)]
+    failed = [attempt for attempt in attempts if attempt.error is not None]
+    assert [(attempt.index, attempt.number, attempt.final) for attempt in failed] == [(2, 1, False)]
+    assert isinstance(failed[0].error, ProcessExpired)
+    assert {attempt.index: attempt.value for attempt in attempts if attempt.final} == {i: i * i for i in range(5)}
+    assert next(attempt.number for attempt in attempts if attempt.index == 2 and attempt.final) == 2
+
+
+def test_a_task_that_always_kills_its_worker_is_given_up_and_the_others_are_done(tasks: ModuleType) -> None:
+    attempts = [*run_tasks(partial(tasks.die_always, 1), range(3), 1)]
+    deaths = [attempt for attempt in attempts if attempt.index == 1]
+    assert [attempt.number for attempt in deaths] == list(range(1, MAX_ATTEMPTS + 1))
+    assert [attempt.final for attempt in deaths] == [False] * (MAX_ATTEMPTS - 1) + [True]
+    assert {attempt.index: attempt.value for attempt in attempts if attempt.final} == {0: 0, 1: None, 2: 4}
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_is_reported_and_not_tried_again(tasks: ModuleType, workers: int) -> None:
+    attempts = [*run_tasks(partial(tasks.refuse, 1), range(3), workers)]
+    assert len(attempts) == 3
+    error = next(attempt.error for attempt in attempts if attempt.index == 1)
+    assert isinstance(error, ValueError)
+    assert str(error) == "index: 1 is refused"
+
+
+def test_workers_get_one_thread_each_and_this_process_keeps_its_own(
+    tasks: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    assert run_alone(tasks.threads) == ["1", "1", "1"]
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MKL_NUM_THREADS" not in os.environ
+
+
+def test_a_function_that_runs_alone_raises_here_what_it_raised_there(tasks: ModuleType) -> None:
+    with pytest.raises(ValueError, match="index: 3 is refused"):
+        run_alone(partial(tasks.refuse, 3, 3))
+
+
+def test_workers_end_with_the_process_that_started_them(tasks: ModuleType, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    script = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from functools import partial\n"
+        "import worker_tasks\n"
+        "from droguekit.batch.workers import run_tasks\n"
+        "if __name__ == '__main__':\n"
+        f"    list(run_tasks(partial(worker_tasks.tell_and_wait, {str(pipe)!r}), [0], 1))\n"
+    )
+    main = tmp_path / "main.py"
+    main.write_text(script)
+    with subprocess.Popen([sys.executable, str(main)], stderr=subprocess.DEVNULL) as parent:
+        with pipe.open() as stream:
+            worker = os.pidfd_open(int(stream.readline()))
+        parent.kill()
+        parent.wait()
+    ended, _, _ = select.select([worker], [], [], 60)  # a process handle is readable once the process has ended
+    os.close(worker)
+    assert ended
+
+
+def test_there_is_always_a_worker() -> None:
+    assert 1 <= default_workers() <= len(os.sched_getaffinity(0))

@@ -1,0 +1,182 @@
+"""Records of drogues that nobody has rendered: their features stand where the projection puts them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from datasets_manifest.estimates import Feature, PoseEstimate
+from datasets_manifest.frame import Environment, Exposure, FrameSpec
+from datasets_manifest.records import Conditions, FeatureView, HubView, PairRecord, StereoViews, ViewRecord
+from datasets_manifest.rigs import SENSORS
+from drogue_models.marker_layout import marker_layout
+from drogue_models.parameters import DrogueParameters, HubParameters, even_ring
+from geometry.circles import project_disc_centers
+from geometry.se3 import RigidTransform, angles_from_rotation, rotation_from_angles
+from geometry.stereo import EYES, Eye, paper_rig
+
+RIG = paper_rig()
+SIGMA_COVARIANCE = ((1e-4, 0.0), (0.0, 1e-4))
+
+
+def make_drogue(count: int = 8, ring_m: float = 0.27, hub: HubParameters | None = None) -> DrogueParameters:
+    # The ring of the golden numbers, 0.28 m, leaves no face around the markers unless the rim's tube is thin.
+    return DrogueParameters(
+        name="test",
+        marker_positions_m=even_ring(count, ring_m),
+        hub=hub,
+        rim_tube_radius_m=1e-5,
+        rim_radius_m=0.3301,
+    )
+
+
+def make_pose(
+    x_m: float, y_m: float, z_m: float, pitch_deg: float = 0.0, yaw_deg: float = 0.0, roll_deg: float = 0.0
+) -> RigidTransform:
+    return RigidTransform(
+        rotation_from_angles(*np.deg2rad([pitch_deg, yaw_deg, roll_deg])), np.array([x_m, y_m, z_m], dtype=np.float64)
+    )
+
+
+def _view(drogue: DrogueParameters, pose: RigidTransform, eye: Eye) -> ViewRecord:
+    layout = marker_layout(drogue)
+    radii = np.full(layout.count, layout.radius_m)
+    image = RIG.project(pose.apply(layout.centers_m), eye)
+    ellipse = project_disc_centers(RIG, pose, layout.centers_m, radii, eye)
+    markers = tuple(
+        FeatureView(
+            center_proj_px=tuple(p), center_ellipse_px=tuple(e), visible_fraction=1, in_image=True, signal_to_noise=50
+        )
+        for p, e in zip(image.tolist(), ellipse.tolist(), strict=True)
+    )
+    hub = None
+    if layout.hub_center_m is not None:
+        point = layout.hub_center_m[None]
+        edges = [
+            project_disc_centers(RIG, pose, point, [radius], eye)[0].tolist()
+            for radius in (layout.hub_outer_radius_m, layout.hub_inner_radius_m)
+        ]
+        hub = HubView(
+            center_proj_px=tuple(RIG.project(pose.apply(point), eye)[0].tolist()),
+            center_ellipse_px=edges[0],
+            center_ellipse_inner_px=edges[1],
+            visible_fraction=1,
+            in_image=True,
+            signal_to_noise=50,
+        )
+    half = RIG.camera.fx_px * drogue.rim_radius_m / pose.translation_m[2]
+    middle = RIG.project(pose.translation_m, eye)
+    box = (middle[0] - half, middle[1] - half, 2 * half, 2 * half)
+    return ViewRecord(
+        markers=markers,
+        hub=hub,
+        box_full_xywh_px=box,
+        box_visible_xywh_px=box,
+        visible_drogue_px=round(np.pi * half**2),
+        truncated=False,
+    )
+
+
+def make_record(frame_index: int, pose: RigidTransform | None, drogue: DrogueParameters | None = None) -> PairRecord:
+    shown = (drogue or make_drogue(hub=HubParameters())) if pose is not None else None
+    frame = FrameSpec(
+        seed=1,
+        frame_index=frame_index,
+        scene_id=0,
+        time_s=0.0,
+        drogue=shown,
+        left_from_drogue=pose,
+        world_from_left=RigidTransform.identity(),
+        left_twist_per_s=np.zeros(6),
+        drogue_twist_per_s=np.zeros(6),
+        left_from_tanker=None,
+        hose_nodes_left_m=None,
+        rig=RIG,
+        sensor=SENSORS["rgb-ideal"],
+        exposure=Exposure(time_s=1e-3, f_number=2.8),
+        environment=Environment(
+            sun_elevation_deg=40,
+            sun_azimuth_deg=0,
+            turbidity=3,
+            visibility_m=40_000,
+            altitude_m=3000,
+            ground_reflectance_rgb=(0.1, 0.1, 0.1),
+            ground_texture_seed=1,
+        ),
+    )
+    nothing = ViewRecord(
+        markers=(),
+        hub=None,
+        box_full_xywh_px=None,
+        box_visible_xywh_px=None,
+        visible_drogue_px=0,
+        truncated=False,
+    )
+    views = [nothing if shown is None or pose is None else _view(shown, pose, eye) for eye in EYES]
+    angles = [None] * 3 if pose is None else np.rad2deg(angles_from_rotation(pose.rotation)).tolist()
+    return PairRecord(
+        frame_index=frame_index,
+        scene_id=0,
+        sequence_id=None,
+        time_s=0.0,
+        left_from_drogue=pose,
+        left_from_drogue_open=pose,
+        left_from_drogue_close=pose,
+        pitch_deg=angles[0],
+        yaw_deg=angles[1],
+        roll_deg=angles[2],
+        roll_modulo_deg=None if angles[2] is None else angles[2] % 45,
+        views=StereoViews(left=views[0], right=views[1]),
+        conditions=Conditions(
+            family="clear",
+            distance_m=None if pose is None else float(pose.translation_m[2]),
+            sun_elevation_deg=40,
+            background_luminance_cd_m2=3000,
+            monte_carlo_noise_fraction=0.01,
+        ),
+        engine="none",
+        engine_version="0",
+        file_sha256={},
+        frame=frame,
+    )
+
+
+def make_features(record: PairRecord, offset_px: Callable[[], Sequence[float]], turn: int = 0) -> tuple[Feature, ...]:
+    """Measurements of every feature, `offset_px` off; `turn` renumbers the markers."""
+    features = []
+    for eye, view in (("left", record.views.left), ("right", record.views.right)):
+        named = [((i + turn) % len(view.markers), marker) for i, marker in enumerate(view.markers)]
+        for index, truth in [*named, *([("hub", view.hub)] if view.hub is not None else [])]:
+            du, dv = offset_px()
+            u, v = truth.center_ellipse_px
+            features.append(
+                Feature(eye=eye, index=index, center_px=(u + du, v + dv), cov_px2=SIGMA_COVARIANCE, used=True)
+            )
+    return tuple(features)
+
+
+def make_estimate(
+    frame_index: int, pose: RigidTransform, method: str = "joint", features: tuple[Feature, ...] = ()
+) -> PoseEstimate:
+    return PoseEstimate(frame_index=frame_index, method=method, left_from_drogue=pose, features=features)
+
+
+@pytest.fixture
+def build() -> SimpleNamespace:
+    return SimpleNamespace(
+        drogue=make_drogue,
+        pose=make_pose,
+        record=make_record,
+        features=make_features,
+        estimate=make_estimate,
+        hub=HubParameters,
+        rig=RIG,
+    )
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)

@@ -1,0 +1,36 @@
+"""What tests of several packages share."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from pathlib import Path
+
+import pytest
+
+RENDERED_FIXTURES = {"smoke_dataset", "tiny_dataset"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests on rendered datasets, and skip all that need Mitsuba where it is missing."""
+    missing = importlib.util.find_spec("mitsuba") is None
+    for item in items:
+        if RENDERED_FIXTURES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.mitsuba)
+        if missing and item.get_closest_marker("mitsuba") is not None:
+            item.add_marker(pytest.mark.skip(reason="mitsuba is missing: pip install 'droguekit[mitsuba]'"))
+
+
+@pytest.fixture(scope="session")
+def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped recipe `smoke`, rendered once by the real engine; to be read only (copy it to change it)."""
+    from datasets_manifest.recipe import load_recipe
+    from droguekit.batch.local import render_dataset
+    from droguekit.batch.progress import PlainProgress
+
+    recipe, text = load_recipe("smoke")
+    out = tmp_path_factory.mktemp("smoke") / "dataset"
+    told = io.StringIO()
+    summary = render_dataset(recipe, text, out, range(recipe.frames.count), 2, PlainProgress(told))
+    assert summary.drops == (), told.getvalue()
+    return out

@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from drogue_models.example_body import example_body
+from drogue_models.meshes import drogue_meshes
+from drogue_models.parameters import DrogueParameters, even_ring
+from drogue_models.parts import Part
+from drogue_models.presets import load_drogue
+
+RING = 'name = "mine"\nmarker_count = 6\nmarker_ring_radius_m = 0.27\n'
+
+
+def write_toml(folder: Path, text: str) -> str:
+    path = folder / "mine.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def tube(length_m: float = 0.3) -> trimesh.Trimesh:
+    mesh = trimesh.creation.cylinder(radius=0.1, height=length_m, sections=24)
+    mesh.apply_translation([0.0, 0.0, 0.25 + length_m / 2])
+    return mesh
+
+
+@pytest.mark.parametrize("name", ["seven-markers", "funnel"])
+def test_shipped_examples_load_and_are_closed(name: str) -> None:
+    with as_file(files("drogue_models") / "examples") as folder:
+        drogue = load_drogue(f"{name}.toml", folder)
+        meshes = drogue_meshes(drogue)
+    assert drogue.name == name
+    for part, mesh in meshes.items():
+        assert mesh.is_watertight and mesh.volume > 0, part
+        assert mesh.bounds[0][2] >= -1e-9
+
+
+def test_shipped_body_is_what_its_call_makes() -> None:
+    with as_file(files("drogue_models") / "examples" / "funnel-body.ply") as path:
+        shipped = trimesh.load_mesh(path, process=False)
+    made = example_body()
+    np.testing.assert_array_equal(shipped.faces, made.faces)
+    # The file holds float32: half a unit in the last place of 0.4 m is 1.5e-8.
+    np.testing.assert_allclose(shipped.vertices, made.vertices, rtol=0, atol=2e-8)
+
+
+def test_short_form_of_a_ring(tmp_path: Path) -> None:
+    drogue = load_drogue(write_toml(tmp_path, RING))
+    assert drogue == DrogueParameters(name="mine", marker_positions_m=even_ring(6, 0.27))
+
+
+def test_long_form_of_the_positions(tmp_path: Path) -> None:
+    text = 'name = "mine"\nmarker_positions_m = [[0.27, 0.0], [0.0, 0.27], [-0.27, 0]]\n'
+    assert load_drogue(write_toml(tmp_path, text)).marker_positions_m == ((0.27, 0.0), (0.0, 0.27), (-0.27, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (RING + "marker_radius = 0.05\n", "marker_radius: Extra inputs are not permitted"),
+        (RING.replace("6", "24"), "marker_positions_m: markers 0 and 1 overlap"),
+        (RING.replace("0.27", "0.29"), "marker_positions_m: marker 0 must lie on the face"),
+        (RING.replace("6", "2"), "marker_count: must be a whole number from 3 to 32, got 2"),
+        (RING.replace("6", "6.0"), "marker_count: must be a whole number"),
+        (RING.replace("marker_count = 6", ""), "marker_count: must be a whole number from 3 to 32, got None"),
+        (RING.replace("0.27", "nan"), "marker_ring_radius_m: must be a number above 0"),
+        (RING + "marker_positions_m = [[0.27, 0.0]]\n", "marker_positions_m: leave it out"),
+        ('name = "mine"\n', "marker_positions_m: Field required"),
+        (RING + "rim_radius_m = nan\n", "rim_radius_m: "),
+        (RING + "rim_radius_m = -1\n", "rim_radius_m: Input should be greater than 0, got -1"),
+        (RING + "face_inner_radius_m = 0.33\n", "face_inner_radius_m: must be below 0.324 m"),
+        (RING + "coupling_radius_m = 0.22\n", "coupling_radius_m: must be below face_inner_radius_m"),
+        (RING + "coupling_radius_m = 0.07\n", "coupling_radius_m: must exceed the hub's outer radius"),
+        (RING + "hose_radius_m = 0.09\n", "hose_radius_m: must be below coupling_radius_m"),
+        (RING + "[hub]\ndepth_m = 0.01\n", "hub.depth_m: must exceed the rim's thickness, 0.012 m"),
+        (RING + "[hub]\ninner_radius_m = 0.08\n", "hub: inner_radius_m: must be below outer_radius_m"),
+        (RING + "[hub]\ncolour = 1\n", "hub.colour: Extra inputs are not permitted"),
+        (RING + "body_mesh = 3\n", "body_mesh: must be the path of a mesh file, got 3"),
+        (RING + 'body_mesh = "none.ply"\n', "body_mesh: .*none.ply cannot be read: No such file or directory"),
+        ("name = \n", "not valid TOML"),
+    ],
+)
+def test_faults_name_the_file_and_the_key(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        load_drogue(write_toml(tmp_path, text))
+    assert "mine.toml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_unknown_presets_and_missing_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no preset named 'red-9'; there are red-8"):
+        load_drogue("red-9")
+    with pytest.raises(ValueError, match="none.toml: cannot be read: No such file"):
+        load_drogue("none.toml", tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "obj", "glb"])
+def test_body_mesh_replaces_canopy_ribs_and_coupling(tmp_path: Path, suffix: str) -> None:
+    tube().export(tmp_path / f"body.{suffix}")
+    drogue = load_drogue(write_toml(tmp_path, RING + f'body_mesh = "body.{suffix}"\n'))
+    meshes = drogue_meshes(drogue)
+    assert int(Part.CANOPY) not in meshes and int(Part.RIBS) not in meshes
+    # The files hold float32 or eight decimals.
+    np.testing.assert_allclose(meshes[int(Part.COUPLING)].bounds, tube().bounds, rtol=0, atol=1e-7)
+    assert {int(Part.FACE), int(Part.RIM), int(Part.HUB)} <= set(meshes)
+
+
+def test_stored_drogue_pins_the_mesh_but_not_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tube().export(tmp_path / "body.ply")
+    drogue = load_drogue(write_toml(tmp_path, RING + 'body_mesh = "body.ply"\n'))
+    stored = drogue.model_dump_json()
+    assert str(tmp_path) not in stored
+    again = DrogueParameters.model_validate_json(stored)
+    assert again.model_dump() == drogue.model_dump()
+    with pytest.raises(ValueError, match="body_mesh: body.ply cannot be read: .*working directory"):
+        drogue_meshes(again)
+    monkeypatch.chdir(tmp_path)
+    assert int(Part.COUPLING) in drogue_meshes(again)
+
+
+def test_changed_mesh_is_refused(tmp_path: Path) -> None:
+    tube().export(tmp_path / "body.ply")
+    drogue = load_drogue(write_toml(tmp_path, RING + 'body_mesh = "body.ply"\n'))
+    tube(0.31).export(tmp_path / "body.ply")
+    with pytest.raises(ValueError, match="body_mesh: .*body.ply has changed since the drogue was loaded"):
+        drogue_meshes(drogue)
+
+
+def _open(mesh: trimesh.Trimesh) -> None:
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+
+
+def _not_finite(mesh: trimesh.Trimesh) -> None:
+    mesh.vertices[0, 0] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_open, "must be closed"),
+        (_not_finite, "not finite"),
+        (lambda mesh: mesh.invert(), "must have its normals outwards"),
+        (lambda mesh: mesh.apply_scale(1000.0), "coordinates in metres, got 300"),
+        (lambda mesh: mesh.apply_scale(0.001), "coordinates in metres, got 0.0003"),
+        (lambda mesh: mesh.apply_translation([0.0, 0.0, -0.3]), "behind the rim plane .* got z down to -0.05 m"),
+    ],
+)
+def test_unfit_meshes_are_refused(tmp_path: Path, spoil: Callable[[trimesh.Trimesh], object], message: str) -> None:
+    mesh = tube()
+    spoil(mesh)
+    mesh.export(tmp_path / "body.ply")
+    drogue = load_drogue(write_toml(tmp_path, RING + 'body_mesh = "body.ply"\n'))
+    with pytest.raises(ValueError, match=f"body_mesh: .*body.ply .*{message}") as caught:
+        drogue_meshes(drogue)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("body.ply", b"not a mesh", "cannot be read as ply"),
+        ("body.txt", b"x", "of a kind that cannot be read; use one of .*ply"),
+        ("body.stl", b"solid empty\nendsolid empty\n", "body.stl"),
+    ],
+)
+def test_files_that_are_no_meshes_are_refused(tmp_path: Path, name: str, data: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    drogue = load_drogue(write_toml(tmp_path, RING + f'body_mesh = "{name}"\n'))
+    with pytest.raises(ValueError, match=f"body_mesh: .*{message}"):
+        drogue_meshes(drogue)

@@ -1,0 +1,125 @@
+"""Stereo pairs drawn without the project's projection code: every sample of a pixel asks its ray where it meets a plane."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from datasets_manifest.images import StereoImages
+from drogue_models.parameters import DrogueParameters
+from geometry.se3 import RigidTransform, rotation_from_angles
+from geometry.stereo import EYES, StereoRig
+
+SAMPLES = 8
+READ_NOISE_DN = 1.0
+FULL_WELL_E = 11_700.0
+
+SKY_RGB = (95.0, 120.0, 160.0)
+CLOUD_RGB = (205.0, 208.0, 212.0)
+BROWN_RGB = (80.0, 62.0, 45.0)
+GREEN_RGB = (48.0, 66.0, 30.0)
+FACE_RGB = (7.0, 7.0, 7.0)
+
+
+def pose(x_m: float, y_m: float, z_m: float, pitch_deg: float = 0, yaw_deg: float = 0, roll_deg: float = 0):
+    return RigidTransform(rotation_from_angles(*np.radians([pitch_deg, yaw_deg, roll_deg])), np.array([x_m, y_m, z_m]))
+
+
+@pytest.fixture
+def make_pose() -> Callable[..., RigidTransform]:
+    return pose
+
+
+def background(rig: StereoRig, kind: str) -> np.ndarray:
+    """(H, W, 3) sky; `cloud` adds bright bands, `ground` has brown and green fields below the middle row."""
+    height, width = rig.camera.height_px, rig.camera.width_px
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    image = np.array(SKY_RGB) * (0.8 + 0.3 * v / height)[..., None]
+    if kind == "cloud":
+        share = 0.5 + 0.5 * np.sin(u / width * 23 + 2 * np.sin(v / height * 17))
+        image += (np.array(CLOUD_RGB) - image) * (share**2)[..., None]
+    if kind == "ground":
+        fields = (np.floor(u * 9 / width) + np.floor(v * 9 / height)) % 2
+        ground = np.where(fields[..., None] == 0, BROWN_RGB, GREEN_RGB)
+        image = np.where((v > 0.4 * height)[..., None], ground, image)
+    return image
+
+
+def paint_disc(
+    image: np.ndarray, rig: StereoRig, eye: str, place: RigidTransform, center: Sequence[float], edges, rgb
+) -> None:
+    """Paint an annulus (inner and outer radius `edges`) across the drogue's axis with the exact share of every pixel."""
+    camera = rig.camera
+    offset = np.array([0.0 if eye == "left" else rig.baseline_m, 0.0, 0.0])
+    origin = place.rotation @ np.asarray(center) + place.translation_m - offset
+    inner, outer = edges
+    u, v = camera.fx_px * origin[:2] / origin[2] + (camera.cx_px, camera.cy_px)
+    reach = 1.2 * camera.fx_px * outer / origin[2] + 3
+    left, right = max(0, int(u - reach)), min(camera.width_px, int(u + reach) + 1)
+    top, bottom = max(0, int(v - reach)), min(camera.height_px, int(v + reach) + 1)
+    if left >= right or top >= bottom:
+        return
+    # Few samples for what has no centre to be measured, so that near drogues stay quick to draw.
+    samples = SAMPLES if outer < 0.1 else 2
+    sub = (np.arange(samples) + 0.5) / samples - 0.5
+    x = ((np.arange(left, right)[:, None] + sub).ravel() - camera.cx_px) / camera.fx_px
+    y = ((np.arange(top, bottom)[:, None] + sub).ravel() - camera.cy_px) / camera.fy_px
+    n = place.rotation[:, 2]
+    depth = (n @ origin) / (n[0] * x[None, :] + n[1] * y[:, None] + n[2])
+    radius2 = (
+        (depth * x[None, :] - origin[0]) ** 2 + (depth * y[:, None] - origin[1]) ** 2 + (depth - origin[2]) ** 2
+    )
+    inside = (radius2 <= outer**2) & (radius2 >= inner**2)
+    share = inside.reshape(bottom - top, samples, right - left, samples).mean(axis=(1, 3))[..., None]
+    part = image[top:bottom, left:right]
+    part += (np.asarray(rgb, dtype=np.float64) - part) * share
+
+
+def expose(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
+    """8 bit with shot and read noise."""
+    if rng is not None:
+        electrons_per_dn = FULL_WELL_E / 255
+        noise = np.sqrt(np.maximum(image, 0) / electrons_per_dn + READ_NOISE_DN**2 / 16)
+        image = image + noise * rng.standard_normal(image.shape)
+    return np.clip(np.round(image), 0, 255).astype(np.uint8)
+
+
+def draw_eye(
+    rig: StereoRig,
+    drogue: DrogueParameters | None,
+    place: RigidTransform,
+    eye: str,
+    kind: str = "sky",
+    marker_rgb: Sequence[float] = (150.0, 9.0, 9.0),
+    hidden: Sequence[int] = (),
+    extra_discs: Sequence[tuple[float, float, float, float]] = (),
+) -> np.ndarray:
+    """Radiance picture; `extra_discs` are (x, y, z, radius) in the drogue frame, painted like markers."""
+    image = background(rig, kind)
+    if drogue is None:
+        return image
+    paint_disc(image, rig, eye, place, (0, 0, 0.02), (0.0, drogue.rim_radius_m), FACE_RGB)
+    if drogue.hub is not None:
+        edges = (drogue.hub.inner_radius_m, drogue.hub.outer_radius_m)
+        paint_disc(image, rig, eye, place, (0, 0, drogue.hub.depth_m), edges, marker_rgb)
+    for index, (x, y) in enumerate(drogue.marker_positions_m):
+        if index not in hidden:
+            paint_disc(image, rig, eye, place, (x, y, 0), (0.0, drogue.marker_radius_m), marker_rgb)
+    for x, y, z, radius in extra_discs:
+        paint_disc(image, rig, eye, place, (x, y, z), (0.0, radius), marker_rgb)
+    return image
+
+
+def draw_pair(
+    rig: StereoRig, drogue: DrogueParameters | None, place: RigidTransform, rng: np.random.Generator | None, **kwargs
+) -> StereoImages:
+    images = [expose(draw_eye(rig, drogue, place, eye, **kwargs), rng) for eye in EYES]
+    return StereoImages(images[0], images[1], time_s=0.0, exposure_s=1e-3)
+
+
+@pytest.fixture
+def draw() -> Callable[..., StereoImages]:
+    """`draw(rig, drogue, left_from_drogue, rng, kind=..., hidden=..., extra_discs=...)`."""
+    return draw_pair

@@ -1,0 +1,148 @@
+"""Path-traced pixels against the closed forms and OpenCV: what the labels rest on."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from drogue_models.marker_layout import marker_layout
+from geometry.circles import disc_area_px2, project_disc_centers
+from geometry.stereo import EYES
+from scenes.sampler import sample_frame
+from scenes.sky import REC709_LUMINANCE
+
+pytestmark = pytest.mark.mitsuba
+
+# (1 - Rec. 709 luminance of the lamp's light is 1 by construction): far above any sky.
+LAMP_CD_M2 = 1e6
+
+
+def lit(frame, luminance_cd_m2):
+    drogue = frame.drogue.model_copy(update={"marker_luminance_cd_m2": luminance_cd_m2})
+    return frame.model_copy(update={"drogue": drogue})
+
+
+def emission_images(engine, frame, settings):
+    """Light of the lamps alone: the same frame with lamps minus without."""
+    on, off = engine.render(lit(frame, LAMP_CD_M2), settings), engine.render(frame, settings)
+    return {
+        eye: (getattr(on, eye).radiance_cd_m2 - getattr(off, eye).radiance_cd_m2) @ REC709_LUMINANCE for eye in EYES
+    }
+
+
+def centroid_and_area(image, center_px, radius_px):
+    """Weighted centroid and area within a window that reaches 2.5 px beyond the disc."""
+    reach = radius_px + 2.5
+    u0, v0 = np.floor(center_px - reach).astype(int)
+    u1, v1 = np.ceil(center_px + reach).astype(int) + 1
+    v, u = np.mgrid[v0:v1, u0:u1]
+    weight = np.where(np.hypot(u - center_px[0], v - center_px[1]) <= reach, image[v0:v1, u0:u1], 0.0) / LAMP_CD_M2
+    return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum(), weight.sum()
+
+
+def test_centroids_of_lit_markers_are_the_ellipse_centres(engine, make_recipe):
+    recipe = make_recipe(stations_m=(2.0, 5.0, 10.0, 20.0, 40.0), samples=64)
+    errors, area_ratios = [], []
+    for index in range(5):
+        frame = sample_frame(recipe, index)
+        images = emission_images(engine, frame, recipe.render)
+        layout = marker_layout(frame.drogue)
+        radii = np.full(layout.count, layout.radius_m)
+        for eye in EYES:
+            truth = project_disc_centers(recipe.rig, frame.left_from_drogue, layout.centers_m, radii, eye)
+            for center_m, center_px in zip(layout.centers_m, truth, strict=True):
+                area = disc_area_px2(recipe.rig, frame.left_from_drogue, center_m, layout.radius_m, eye)
+                measured, got_area = centroid_and_area(images[eye], center_px, 1.1 * np.sqrt(area / np.pi))
+                errors.append(measured - center_px)
+                area_ratios.append(got_area / area)
+    errors = np.array(errors)
+    assert len(errors) == 5 * 8 * 2
+    print("rms px", np.sqrt(np.mean(errors**2)), "mean px", errors.mean(axis=0), "area", np.mean(area_ratios))
+    # The bar that the labels are held to; 64 jittered samples a pixel leave about 0.004 px of sampling noise.
+    assert np.sqrt(np.mean(errors**2)) <= 0.01
+    assert np.abs(errors.mean(axis=0)).max() <= 0.003
+    # Area: haze over 40 m takes below 0.1 %; sampling noise of one area is below 1 %, of the mean below 0.1 %.
+    assert np.mean(area_ratios) == pytest.approx(1.0, abs=0.004)
+
+
+def test_opencv_predicts_the_same_places(make_recipe):
+    """The 3-D centres that labels project, projected by cv2.projectPoints, in both eyes."""
+    recipe = make_recipe(stations_m=(2.0, 10.0, 40.0))
+    for index in range(3):
+        frame = sample_frame(recipe, index)
+        layout = marker_layout(frame.drogue)
+        rotation_vector, _ = cv2.Rodrigues(frame.left_from_drogue.rotation)
+        for eye in EYES:
+            translation = frame.left_from_drogue.translation_m - recipe.rig.eye_offset_m(eye)
+            theirs, _ = cv2.projectPoints(
+                layout.centers_m, rotation_vector, translation, recipe.rig.camera.matrix(), np.zeros(5)
+            )
+            ours = recipe.rig.project(frame.left_from_drogue.apply(layout.centers_m), eye)
+            # Rodrigues and back costs a few ulp of 2000 px.
+            np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-9)
+
+
+def test_passes_of_pixel_centres(engine, make_recipe):
+    recipe = make_recipe(scale=0.5, stations_m=(3.0,), samples=1)
+    frame = sample_frame(recipe, 0)
+    radiance = engine.render(frame, recipe.render)
+    layout = marker_layout(frame.drogue)
+    normal = frame.left_from_drogue.rotation[:, 2]
+    for eye in EYES:
+        seen = getattr(radiance, eye)
+        on_marker = (seen.part_id >= 32) & (seen.part_id < 32 + layout.count)
+        v, u = np.nonzero(on_marker)
+        rays = recipe.rig.camera.rays(np.stack([u, v], axis=-1))
+        origin = frame.left_from_drogue.translation_m - recipe.rig.eye_offset_m(eye)
+        plane_depth = (origin @ normal) / (rays @ normal)
+        # float32 coordinates of 3 m carry 2e-7 m; a few roundings on the way.
+        np.testing.assert_allclose(seen.depth_m[on_marker], plane_depth, atol=3e-6)
+        # Visible faces look at the camera, against the drogue's axis.
+        np.testing.assert_allclose(seen.normal[on_marker], np.broadcast_to(-normal, (len(u), 3)), atol=1e-5)
+        points = rays * plane_depth[:, None] + recipe.rig.eye_offset_m(eye)
+        in_drogue = frame.left_from_drogue.inverse().apply(points)
+        index = seen.part_id[on_marker] - 32
+        offset = np.linalg.norm(in_drogue - layout.centers_m[index], axis=1)
+        assert offset.max() <= layout.radius_m * 1.001
+        assert np.isinf(seen.depth_m[seen.part_id == 0]).all()
+        # Nothing stands before the markers, so what is visible is all there is, on the same grid.
+        for marker in range(layout.count):
+            assert seen.amodal_px[32 + marker] == np.count_nonzero(seen.part_id == 32 + marker)
+
+
+def test_same_frame_same_bits(engine, make_recipe):
+    recipe = make_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4)
+    first = engine.render(sample_frame(recipe, 0), recipe.render)
+    engine.render(sample_frame(recipe, 1), recipe.render)
+    again = engine.render(sample_frame(recipe, 0), recipe.render)
+    for eye in EYES:
+        for name in ("radiance_cd_m2", "coverage", "part_id", "depth_m", "normal"):
+            assert np.array_equal(getattr(getattr(first, eye), name), getattr(getattr(again, eye), name)), name
+
+
+def test_moving_drogue_is_blurred_around_its_middle(engine, make_recipe):
+    """The centroid of a streak is the mid-exposure place, and the streak is as long as speed times time says."""
+    recipe = make_recipe(scale=0.5, stations_m=(5.0,), samples=64)
+    still = sample_frame(recipe, 0).model_copy(
+        update={"exposure": sample_frame(recipe, 0).exposure.model_copy(update={"time_s": 0.01})}
+    )
+    across = still.left_from_drogue.rotation.T @ np.array([3.0, 0.0, 0.0])
+    moving = still.model_copy(update={"drogue_twist_per_s": np.concatenate([across, np.zeros(3)])})
+    layout = marker_layout(still.drogue)
+    truth = project_disc_centers(
+        recipe.rig, still.left_from_drogue, layout.centers_m, np.full(8, layout.radius_m), "left"
+    )
+    sharp, blurred = (emission_images(engine, frame, recipe.render)["left"] for frame in (still, moving))
+    travel_px = recipe.rig.camera.fx_px * 3.0 * 0.01 / 5.0
+    for center in truth:
+        radius_px = 1.1 * layout.radius_m * recipe.rig.camera.fx_px / 5.0 + travel_px / 2
+        place, area = centroid_and_area(blurred, center, radius_px)
+        still_place, still_area = centroid_and_area(sharp, center, radius_px)
+        # 64 random times of a streak of 6 px scatter each edge pixel; 0.1 px is 4 standard errors of the centroid.
+        assert np.abs(place - still_place).max() < 0.1
+        assert area == pytest.approx(still_area, rel=0.03)
+    row = int(round(truth[0, 1]))
+    width = [np.count_nonzero(image[row] > 0.02 * LAMP_CD_M2) for image in (sharp, blurred)]
+    # The streak's ends are spread over a pixel each.
+    assert width[1] - width[0] == pytest.approx(2 * travel_px, abs=4)
