@@ -11,7 +11,8 @@ from drogue_models.solids import loft
 from geometry.se3 import Array
 
 RINGS_PER_SEGMENT = 6
-SECTIONS = 20
+SECTIONS = 32
+END_FRACTION = 0.005
 
 
 def hose_mesh(nodes_m: ArrayLike, radius_m: float) -> trimesh.Trimesh:
@@ -37,7 +38,10 @@ def hose_mesh(nodes_m: ArrayLike, radius_m: float) -> trimesh.Trimesh:
     knots = np.concatenate([[0.0], np.cumsum(chord_m)])
     curve = CubicSpline(knots, nodes, bc_type="natural")
     between = np.arange(RINGS_PER_SEGMENT) / RINGS_PER_SEGMENT
-    at = np.append((knots[:-1, None] + chord_m[:, None] * between).ravel(), knots[-1])
+    inner = (knots[:-1, None] + chord_m[:, None] * between).ravel()[1:]
+    # A ring close to either end keeps the cap's direction out of the tube's interpolated normals.
+    ends_m = END_FRACTION * chord_m[[0, -1]]
+    at = np.concatenate([[0.0, ends_m[0]], inner, [knots[-1] - ends_m[1], knots[-1]]])
     tangents = curve(at, 1)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     side, up = _carried_frame(tangents)

@@ -100,15 +100,21 @@ def _best_guesses(blobs: Blobs, layout: MarkerLayout) -> list[tuple[complex, com
     """Similarity maps `z -> turn z + shift` that carry the most markers onto blobs, from all pairs of blobs."""
     turns, shifts = _pair_guesses(blobs, layout)
     places, image = _complex(layout.centers_m[:, :2]), _complex(blobs.centers_px)
+    sizes = blobs.radii_px.astype(np.float32)
     votes = np.zeros(len(turns))
     for start in range(0, len(turns), _CHUNK):
         turn, shift = turns[start : start + _CHUNK, None], shifts[start : start + _CHUNK, None]
-        distance = np.abs((turn * places + shift)[:, :, None] - image)
-        radius = layout.radius_m * np.abs(turn)[:, :, None]
-        fits = (blobs.radii_px < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * blobs.radii_px)
-        nearness = np.where(fits, 1 - distance / (_GUESS_TOLERANCE * radius), 0).max(axis=2).clip(min=0)
+        guess = turn * places + shift
+        gap_x = guess.real.astype(np.float32)[:, :, None] - image.real.astype(np.float32)
+        gap_y = guess.imag.astype(np.float32)[:, :, None] - image.imag.astype(np.float32)
+        radius = (layout.radius_m * np.abs(turn)).astype(np.float32)
+        fits = (sizes < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * sizes)
+        nearest = np.sqrt(
+            (gap_x**2 + gap_y**2 + np.where(fits, np.float32(0), np.float32(np.inf))[:, None]).min(axis=2)
+        )
+        nearness = np.maximum(0, 1 - nearest / (_GUESS_TOLERANCE * radius))
         # A marker hit counts one, its nearness breaks ties.
-        votes[start : start + _CHUNK] = (nearness > 0).sum(axis=1) + nearness.mean(axis=1) * 0.5
+        votes[start : start + _CHUNK] = (nearness > 0).sum(axis=1) + nearness.mean(axis=1) / 2
     order = np.argsort(-votes, kind="stable")[:_REFINED_GUESSES]
     return [(complex(turns[i]), complex(shifts[i])) for i in order if votes[i] >= 3]
 

@@ -15,11 +15,10 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from droguekit.benchmark.number_text import three_digits
+from droguekit.benchmark.number_text import plain_number
 from droguekit.benchmark.result import BenchmarkResult, MethodResult, ReferenceBin
 
-# Mid-tones that stand out on white and on black; the first eight of M. Okabe and K. Ito's colour-blind-safe idea,
-# lightened or darkened, then brown and grey for files with many methods.
+# Mid-tones, our choice: each stands out on white and on black, and neighbours differ in lightness as well as in hue.
 _COLORS = ("#1f78c8", "#e0660a", "#12946a", "#c2589c", "#b58900", "#3ba7d6", "#8a63d2", "#d03a3a", "#9a6a3a", "#7f8890")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*", "d")
 
@@ -78,9 +77,7 @@ class MethodStyle:
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
     """Colour and marker of each method; no two of the first 130 share both."""
-    return {
-        name: MethodStyle(_COLORS[k % len(_COLORS)], _MARKERS[k % len(_MARKERS)]) for k, name in enumerate(methods)
-    }
+    return {name: MethodStyle(_COLORS[k % len(_COLORS)], _MARKERS[k % len(_MARKERS)]) for k, name in enumerate(methods)}
 
 
 def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
@@ -155,7 +152,7 @@ def _finish_axes(axes: Axes, quantity: Quantity) -> None:
     subdivisions = (1.0,) if np.log10(high / low) > 3 else (1.0, 2.0, 5.0)
     for axis, parts in ((axes.xaxis, (1.0, 2.0, 5.0)), (axes.yaxis, subdivisions)):
         axis.set_major_locator(LogLocator(base=10, subs=parts, numticks=12))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: three_digits(value)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
         axis.set_minor_formatter(NullFormatter())
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)

@@ -35,8 +35,8 @@ def distance_text(low_m: float, high_m: float) -> str:
     """A bin's distances: one number for a station."""
     # A station's frames stand within 1 % of it.
     if high_m <= low_m * 1.0201:
-        return f"{_short((low_m * high_m) ** 0.5)} m"
-    return f"{_short(low_m)}–{_short(high_m)} m"
+        return f"{plain_number((low_m * high_m) ** 0.5)} m"
+    return f"{plain_number(low_m)}–{plain_number(high_m)} m"
 
 
 def interval_text(ends: tuple[float, float] | None, scale: float = 1.0) -> str:
@@ -44,7 +44,7 @@ def interval_text(ends: tuple[float, float] | None, scale: float = 1.0) -> str:
     return ABSENT if ends is None else f"{three_digits(ends[0] * scale)} to {three_digits(ends[1] * scale)}"
 
 
-def _short(value: float) -> str:
+def plain_number(value: float) -> str:
     """Three significant digits without trailing zeros."""
     text = three_digits(value)
     return text.rstrip("0").rstrip(".") if "." in text else text

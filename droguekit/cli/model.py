@@ -20,7 +20,7 @@ FORMATS = (".glb", ".ply", ".stl", ".obj")
 
 def model(
     preset_or_file: Annotated[
-        str, typer.Argument(metavar="[PRESET|FILE.toml]", help="A shipped drogue, or one described in a TOML file.")
+        str, typer.Argument(metavar="PRESET|FILE.toml", help="A shipped drogue, or one described in a TOML file.")
     ] = "red-8",
     *,
     out: Annotated[

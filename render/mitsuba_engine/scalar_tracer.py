@@ -51,14 +51,14 @@ class ScalarTracer:
         noise: list[float] = []
         for eye in EYES:
             view = _View(frame, eye)
-            ids = [view.passes(self._scene.scene, moment) for moment in moments]
-            alone = view.passes(self._scene.features, 0.0)[0]
+            seen = [view.passes(self._scene.scene, moment) for moment in moments]
+            alone, _, _ = view.passes(self._scene.features, 0.0)
             stage_s["passes"] = stage_s.get("passes", 0.0) + time.process_time() - started
             started = time.process_time()
             plans = pixels_to_trace(
-                [part_id for part_id, _, _ in ids], 1 + int(np.ceil(moves_px)), frame.drogue.marker_count
+                [part_id for part_id, _, _ in seen], 1 + int(np.ceil(moves_px)), frame.drogue.marker_count
             )
-            eyes[eye] = _passes_of(ids[0], alone)
+            eyes[eye] = _passes_of(seen[0], alone)
             noise += self._fill_radiance(eyes[eye], view, plans, settings, (frame, around, seeds, moves_px))
             stage_s["paths"] = stage_s.get("paths", 0.0) + time.process_time() - started
             started = time.process_time()
@@ -100,13 +100,12 @@ class ScalarTracer:
 
 
 def _passes_of(
-    own: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]],
-    alone: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]],
+    seen: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]], alone: NDArray[np.uint8]
 ) -> TracedEye:
-    counts = np.bincount(alone[0].ravel(), minlength=256)
+    counts = np.bincount(alone.ravel(), minlength=256)
     amodal = {part: int(counts[part]) for part in (int(Part.HUB), *range(FIRST_MARKER_ID, 256)) if counts[part]}
     nothing = np.zeros(0, dtype=np.float32)
-    return TracedEye(*own, amodal, np.zeros(0, dtype=np.int64), nothing.reshape(0, 3), nothing)
+    return TracedEye(*seen, amodal, np.zeros(0, dtype=np.int64), nothing.reshape(0, 3), nothing)
 
 
 def _relative_noise(pictures: list[NDArray[np.float32]]) -> float:
@@ -126,7 +125,8 @@ def _through_haze(
     nearest = cv2.erode(traced.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[pixel]
     clear = np.exp(-frame.environment.extinction_per_m * np.where(np.isfinite(nearest), nearest, 0.0))[:, None]
     hazed = rgba[:, :3] * clear + rgba[:, 3:] * around.horizon_radiance * (1.0 - clear)
-    return np.concatenate([hazed, rgba[:, 3:]], axis=1).astype(np.float32)
+    result: NDArray[np.float32] = np.concatenate([hazed, rgba[:, 3:]], axis=1).astype(np.float32)
+    return result
 
 
 class _View:
@@ -177,10 +177,10 @@ class _View:
         sensor = self._sensor(s, center_sampler, "rgb", {})
         integrator = mi.load_dict({"type": "aov", "aovs": "id:shape_index,p:position,n:geo_normal"})
         values = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=1, seed=0))[..., -7:]
-        # The integrator writes 0 both for the first shape and for no shape; a normal tells them apart.
-        hit = np.abs(values[..., 4:]).max(axis=-1) > 0
-        table = np.array([int(shape.id().removeprefix("part_")) for shape in scene.shapes()], dtype=np.uint8)
-        part_id = np.where(hit, table[np.where(hit, values[..., 0], 0).astype(np.int64)], 0).astype(np.uint8)
+        # The integrator counts shapes from 1; 0 is no shape.
+        table = np.array([0, *(int(shape.id().removeprefix("part_")) for shape in scene.shapes())], dtype=np.uint8)
+        part_id: NDArray[np.uint8] = table[values[..., 0].astype(np.int64)]
+        hit = part_id > 0
         pose = self._drogue_from_eye(s)
         depth = np.where(hit, (values[..., 1:4] - pose[:3, 3]) @ pose[:3, 2], np.inf).astype(np.float32)
         normal = np.where(hit[..., None], values[..., 4:] @ pose[:3, :3], 0.0).astype(np.float32)

@@ -16,7 +16,7 @@ from droguekit.batch.progress import PlainProgress
 
 TINY_RECIPE = """
 name = "tiny"
-seed = 3
+seed = 5
 [rig]
 preset = "rgb-ideal"
 width_px = 320

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import Feature, PoseEstimate
+from datasets_manifest.estimates import Estimate, Feature, NoFix, PoseEstimate
 from datasets_manifest.frame import Environment, Exposure, FrameSpec
+from datasets_manifest.images import StereoImages
+from datasets_manifest.manifest import build_manifest, write_manifest
+from datasets_manifest.recipe import parse_recipe
 from datasets_manifest.records import Conditions, FeatureView, HubView, PairRecord, StereoViews, ViewRecord
 from datasets_manifest.rigs import SENSORS
+from datasets_manifest.writer import encode_files, write_frame
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters, HubParameters, even_ring
-from geometry.circles import project_disc_centers
-from geometry.se3 import RigidTransform, angles_from_rotation, rotation_from_angles
+from geometry.circles import disc_outline, project_disc_centers
+from geometry.se3 import RigidTransform, angles_from_rotation, exp_twist, rotation_from_angles
 from geometry.stereo import EYES, Eye, paper_rig
 
 RIG = paper_rig()
@@ -164,6 +170,92 @@ def make_estimate(
     return PoseEstimate(frame_index=frame_index, method=method, left_from_drogue=pose, features=features)
 
 
+def _picture(record: PairRecord, eye: Eye) -> np.ndarray:
+    """A bright sky with a dark disc and coloured markers: enough to see where labels lie."""
+    camera = RIG.camera
+    rows = np.linspace(90, 160, camera.height_px)[:, None, None]
+    picture = np.repeat(rows * [0.7, 0.85, 1.0], camera.width_px, axis=1).astype(np.uint8)
+    drogue, pose = record.frame.drogue, record.left_from_drogue
+    if drogue is None or pose is None:
+        return picture
+    layout = marker_layout(drogue)
+
+    def disc(center_m: Sequence[float], radius_m: float, color: tuple[int, int, int]) -> None:
+        outline = RIG.project(disc_outline(pose, center_m, radius_m, 64), eye)
+        cv2.fillPoly(picture, [np.rint(outline * 16).astype(np.int32)], color, cv2.LINE_AA, shift=4)
+
+    disc((0, 0, 0), drogue.rim_radius_m, (12, 12, 12))
+    disc((0, 0, 0), drogue.face_inner_radius_m, (28, 30, 26))
+    for center in layout.centers_m:
+        disc(center, layout.radius_m, (150, 14, 14))
+    if layout.hub_center_m is not None:
+        disc(layout.hub_center_m, layout.hub_outer_radius_m, (150, 14, 14))
+        disc(layout.hub_center_m, layout.hub_inner_radius_m, (8, 8, 8))
+    return picture
+
+
+def make_dataset(folder: Path, records: Sequence[PairRecord]) -> Path:
+    """A dataset on disk of records made here, with plain pictures."""
+    parts = {eye: np.zeros((RIG.camera.height_px, RIG.camera.width_px), np.uint8) for eye in EYES}
+    for record in records:
+        left, right = (_picture(record, eye) for eye in EYES)
+        images = StereoImages(left=left, right=right, time_s=0.0, exposure_s=1e-3)
+        write_frame(folder, record, encode_files(images, parts))
+    recipe = parse_recipe(
+        f'name = "bench-test"\ndescription = "Flat pictures of a drogue."\nframes = {{count = {len(records)}}}\n'
+        'distance = {law = "uniform", low_m = 1.7, high_m = 40}'
+    )
+    write_manifest(folder, build_manifest(folder, recipe, "test", lambda _: "train"))
+    return folder
+
+
+def make_estimates(
+    records: Sequence[PairRecord], methods: dict[str, float], rng: np.random.Generator, sigma_px: float = 0.1
+) -> list[Estimate]:
+    """Poses that err like the bound times a factor, along depth and across, with the centroids that go with it."""
+    estimates: list[Estimate] = []
+    for record in records:
+        pose = record.left_from_drogue
+        if pose is None:
+            estimates += [NoFix(frame_index=record.frame_index, method=name, reason="nothing seen") for name in methods]
+            continue
+        features = make_features(record, lambda: rng.normal(0, sigma_px, 2))
+        z = pose.translation_m[2]
+        for name, factor in methods.items():
+            scale = factor * sigma_px * z * np.array([1.2e-4, 1.2e-4, 4e-4 * z])
+            offset = rng.normal(0, scale)
+            turn = rng.normal(0, factor * sigma_px * z * 1.5e-3, 3)
+            rotation = exp_twist(np.r_[0, 0, 0, turn]).rotation @ pose.rotation
+            moved = RigidTransform(rotation, pose.translation_m + offset)
+            estimates.append(
+                PoseEstimate(
+                    frame_index=record.frame_index,
+                    method=name,
+                    left_from_drogue=moved,
+                    features=features,
+                    stage_s={"detect": 0.012, "centroids": 0.0045, "pose": 0.003 * factor},
+                )
+            )
+    return estimates
+
+
+def make_records(stations_m: Sequence[float], count: int, rng: np.random.Generator, empty: int = 0) -> list[PairRecord]:
+    """`count` pairs at each station inside the common field of view, then `empty` pairs without a drogue."""
+    records = []
+    for z in np.repeat(stations_m, count):
+        x_low, x_high, y_low, y_high = RIG.common_field_m(z, 0.36) or (0.06, 0.06, 0.0, 0.0)
+        place = rng.uniform([x_low, y_low], [x_high, y_high])
+        records.append(make_record(len(records), make_pose(*place, z, *rng.uniform(-10, 10, 2), rng.uniform(-22, 22))))
+    return [*records, *(make_record(len(records) + k, None) for k in range(empty))]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[PairRecord]]:
+    """Nine pairs at three stations and one without a drogue."""
+    records = make_records([2.0, 8.0, 30.0], 3, np.random.default_rng(3), empty=1)
+    return make_dataset(tmp_path_factory.mktemp("dataset"), records), records
+
+
 @pytest.fixture
 def build() -> SimpleNamespace:
     return SimpleNamespace(
@@ -173,6 +265,9 @@ def build() -> SimpleNamespace:
         features=make_features,
         estimate=make_estimate,
         hub=HubParameters,
+        records=make_records,
+        estimates=make_estimates,
+        dataset=make_dataset,
         rig=RIG,
     )
 

@@ -94,7 +94,7 @@ def test_faults_name_the_file_and_the_key(tmp_path: Path, text: str, message: st
 def test_unknown_presets_and_missing_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no preset named 'red-9'; there are red-8"):
         load_drogue("red-9")
-    with pytest.raises(ValueError, match="none.toml: cannot be read: No such file"):
+    with pytest.raises(ValueError, match=r"none\.toml: cannot be read: No such file"):
         load_drogue("none.toml", tmp_path)
 
 
@@ -116,7 +116,7 @@ def test_stored_drogue_pins_the_mesh_but_not_the_folder(tmp_path: Path, monkeypa
     assert str(tmp_path) not in stored
     again = DrogueParameters.model_validate_json(stored)
     assert again.model_dump() == drogue.model_dump()
-    with pytest.raises(ValueError, match="body_mesh: body.ply cannot be read: .*working directory"):
+    with pytest.raises(ValueError, match=r"body_mesh: body\.ply cannot be read: .*working directory"):
         drogue_meshes(again)
     monkeypatch.chdir(tmp_path)
     assert int(Part.COUPLING) in drogue_meshes(again)
@@ -126,7 +126,7 @@ def test_changed_mesh_is_refused(tmp_path: Path) -> None:
     tube().export(tmp_path / "body.ply")
     drogue = load_drogue(write_toml(tmp_path, RING + 'body_mesh = "body.ply"\n'))
     tube(0.31).export(tmp_path / "body.ply")
-    with pytest.raises(ValueError, match="body_mesh: .*body.ply has changed since the drogue was loaded"):
+    with pytest.raises(ValueError, match=r"body_mesh: .*body\.ply has changed since the drogue was loaded"):
         drogue_meshes(drogue)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from datasets_manifest.recipe import Recipe, parse_recipe
 from datasets_manifest.records import PairRecord
 from datasets_manifest.writer import encode_files, write_frame
 from drogue_models.meshes import drogue_meshes
+from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import Eye
 from labelgen.export.coco import write_coco
@@ -49,13 +51,21 @@ test = 0.33
 SKY, FEATURE, STRUCTURE = 2000.0, 6000.0, 150.0
 
 
+@lru_cache(maxsize=1)
+def drogue_triangles(drogue: DrogueParameters) -> dict[int, np.ndarray]:
+    """(T, 3, 3) corners of every part in the drogue frame."""
+    return {part: np.asarray(mesh.triangles) for part, mesh in drogue_meshes(drogue).items()}
+
+
 def facing_triangles(frame: FrameSpec, eye: Eye) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Part id, (3, 3) corners in the eye's frame and (3,) normal of every face that looks at the eye."""
+    """Part id, (3, 3) corners in the eye's frame and (3,) normal of every face that may show at a pixel centre."""
     assert frame.drogue is not None and frame.left_from_drogue is not None
-    for part, mesh in drogue_meshes(frame.drogue).items():
-        corners = frame.left_from_drogue.apply(np.asarray(mesh.triangles)) - frame.rig.eye_offset_m(eye)
+    for part, triangles in drogue_triangles(frame.drogue).items():
+        corners = frame.left_from_drogue.apply(triangles) - frame.rig.eye_offset_m(eye)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         facing = (normals * corners[:, 0]).sum(axis=1) < 0
+        image = frame.rig.camera.project(corners)
+        facing &= (np.ceil(image.min(axis=1)) <= np.floor(image.max(axis=1))).all(axis=1)
         for triangle, normal in zip(corners[facing], normals[facing], strict=True):
             yield part, triangle, normal / np.linalg.norm(normal)
 

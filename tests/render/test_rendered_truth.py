@@ -142,7 +142,7 @@ def test_moving_drogue_is_blurred_around_its_middle(engine, make_recipe):
         # 64 random times of a streak of 6 px scatter each edge pixel; 0.1 px is 4 standard errors of the centroid.
         assert np.abs(place - still_place).max() < 0.1
         assert area == pytest.approx(still_area, rel=0.03)
-    row = int(round(truth[0, 1]))
+    row = round(truth[0, 1])
     width = [np.count_nonzero(image[row] > 0.02 * LAMP_CD_M2) for image in (sharp, blurred)]
     # The streak's ends are spread over a pixel each.
     assert width[1] - width[0] == pytest.approx(2 * travel_px, abs=4)

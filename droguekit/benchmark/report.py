@@ -1,0 +1,111 @@
+"""The benchmark as one HTML page that needs nothing from outside: no network, no script, no other file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.estimates import read_estimates
+from datasets_manifest.manifest import Manifest
+from datasets_manifest.reader import Dataset
+from drogue_models.marker_layout import marker_layout
+from droguekit.benchmark.contact_sheet import contact_tiles
+from droguekit.benchmark.figures import QUANTITIES, error_panel, legend_key, method_styles
+from droguekit.benchmark.narrative import result_sentences
+from droguekit.benchmark.number_text import plain_number, three_digits
+from droguekit.benchmark.report_tables import centroid_table, component_tables, overall_table, position_table
+from droguekit.benchmark.result import BenchmarkResult
+
+
+def write_report(dataset: Path, estimates: Path, result: BenchmarkResult, out_html: Path) -> None:
+    """Write the page; it is replaced as a whole, or not at all.
+
+    Args:
+        dataset: the dataset's folder, for its facts and pictures.
+        estimates: the file that was scored, for the times that its methods took.
+        result: what `run_benchmark` made of the two.
+        out_html: where to write.
+
+    Raises:
+        ValueError: dataset or estimates cannot be read, or the result is of another dataset.
+        OSError: the page cannot be written.
+    """
+    data = Dataset(dataset)
+    if data.manifest.dataset_sha256 != result.dataset.sha256:
+        raise ValueError(
+            f"{dataset}: is not the dataset of this result, whose hash begins {result.dataset.sha256[:12]}"
+        )
+    environment = Environment(
+        loader=PackageLoader("droguekit.benchmark"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    styles = method_styles(list(result.methods))
+    page = environment.get_template("report.html.j2").render(
+        result=result,
+        sentences=result_sentences(result),
+        facts=dataset_facts(data.manifest, estimates.name),
+        tiles=[(tile, plain_number(tile.distance_m)) for tile in contact_tiles(data)],
+        panels=[Markup(error_panel(result, quantity)) for quantity in QUANTITIES],
+        legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
+        bound_key=Markup(legend_key(None)),
+        tables=[overall_table(result), position_table(result), *component_tables(result), centroid_table(result)],
+        times=stage_times_ms(estimates),
+    )
+    write_text_atomic(out_html, page)
+
+
+def dataset_facts(manifest: Manifest, estimates_name: str) -> list[tuple[str, str]]:
+    """What was measured on, as pairs of a name and a value."""
+    recipe = manifest.recipe
+    camera, layout = recipe.rig.camera, marker_layout(recipe.drogue)
+    markers = f"{layout.count} markers of {plain_number(200 * layout.radius_m)} cm diameter"
+    if layout.ring_radius_m is not None:
+        markers += f" on a ring of {plain_number(layout.ring_radius_m)} m radius"
+    hub = "no hub feature"
+    if layout.hub_center_m is not None:
+        hub = f"hub annulus {plain_number(layout.hub_center_m[2])} m behind the rim plane"
+    empty = f", {manifest.counts.empty} of them without a drogue" if manifest.counts.empty else ""
+    return [
+        ("Dataset", recipe.name),
+        ("Description", recipe.description or "none"),
+        ("Content hash (SHA-256)", manifest.dataset_sha256),
+        ("Stereo pairs", f"{manifest.counts.pairs}{empty}"),
+        (
+            "Rig",
+            f"two cameras of {camera.width_px} × {camera.height_px} px, focal length {camera.fx_px:.1f} px, "
+            f"baseline {plain_number(recipe.rig.baseline_m)} m",
+        ),
+        ("Sensor", f"{recipe.sensor.name}, {recipe.sensor.output_bits} bit, {recipe.sensor.encoding}"),
+        ("Drogue", f"{recipe.drogue.name}: {markers}, {hub}"),
+        ("Rendered by", ", ".join(sorted(manifest.engines)) or "nothing"),
+        ("Seed", str(recipe.seed)),
+        ("Estimates", estimates_name),
+    ]
+
+
+def stage_times_ms(estimates: Path) -> list[tuple[str, str, str]]:
+    """Median time for a pair by method: name, total, and the stages. [ms]
+
+    Methods that report no times are left out.
+    """
+    stages: dict[str, dict[str, list[float]]] = {}
+    for estimate in read_estimates(estimates):
+        if not estimate.stage_s:
+            continue
+        for stage, seconds in {**estimate.stage_s, "": sum(estimate.stage_s.values())}.items():
+            stages.setdefault(estimate.method, {}).setdefault(stage, []).append(1e3 * seconds)
+    return [
+        (
+            method,
+            three_digits(float(np.median(times[""]))),
+            ", ".join(f"{stage} {three_digits(float(np.median(ms)))}" for stage, ms in times.items() if stage),
+        )
+        for method, times in stages.items()
+    ]

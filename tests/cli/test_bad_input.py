@@ -1,0 +1,187 @@
+"""Bad input: one line that says what, where and what to do, exit code 2, and nothing half-written."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from datasets_manifest import layout
+from droguekit.cli.main import FAULT, WRONG_INPUT
+
+RECIPE = """
+name = "mine"
+[frames]
+count = 2
+[distance]
+law = "uniform"
+low_m = 3.0
+high_m = 9.0
+[render]
+samples_per_px = 1
+"""
+
+
+def _run(*arguments: str | Path, before: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "droguekit.cli.main", *(str(argument) for argument in arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=before)
+
+
+def _assert_refused(result: subprocess.CompletedProcess[str], message: str) -> None:
+    errors = [line for line in result.stderr.splitlines() if line.startswith("droguekit: error: ")]
+    assert result.returncode == WRONG_INPUT, result.stderr
+    assert len(errors) == 1
+    assert errors[0] == result.stderr.splitlines()[-1]
+    assert re.search(message, errors[0])
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("[frames]", "[frames]\ncolour = 1"), r"mine\.toml.*frames\.colour"),
+        (("[render]", "[render]\nsample_per_px = 1"), r"mine\.toml.*render\.sample_per_px"),
+        (("low_m = 3.0", "low_m = 1.0"), r"mine\.toml.*distance: 1 m is nearer than 1\.\d\d m"),
+        (("[frames]", "seed = -1\n[frames]"), r"mine\.toml"),
+        (("count = 2", "count = 0"), r"mine\.toml.*frames\.count"),
+        (("[render]", '[render]\nengine = "povray"'), r"engine: no engine named 'povray'; there are"),
+        (("[frames]", "[frames"), r"mine\.toml: not valid TOML"),
+    ],
+)
+def test_a_wrong_recipe_names_file_and_key(change: tuple[str, str], message: str, tmp_path: Path) -> None:
+    recipe = tmp_path / "mine.toml"
+    recipe.write_text(RECIPE.replace(*change))
+    _assert_refused(_run("render", recipe, "--out", tmp_path / "out"), message)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seed", "-1"], r"seed: .*greater than or equal to 0, got -1"),
+        (["--frames", "2:1"], r"--frames: .* got '2:1'"),
+        (["--frames", "0:7"], r"--frames: must name frames of the recipe's 6"),
+        (["--frames", "five"], r"--frames: must be A:B"),
+        (["--workers", "-2"], r"workers: must not be negative, got -2"),
+        (["--engine", "povray"], r"engine: no engine named 'povray'"),
+    ],
+)
+def test_wrong_options_of_render(arguments: list[str], message: str, tmp_path: Path) -> None:
+    _assert_refused(_run("render", "smoke", "--out", tmp_path / "out", *arguments), message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_engine_that_is_not_installed(tmp_path: Path) -> None:
+    blocked = tmp_path / "blocked"
+    blocked.mkdir()
+    # What `import mitsuba` and its metadata look like where the package is missing, in this process and its workers.
+    (blocked / "sitecustomize.py").write_text(
+        "import sys, importlib.metadata as metadata\n"
+        "sys.modules['mitsuba'] = None\n"
+        "found = metadata.Distribution.from_name\n"
+        "def from_name(name):\n"
+        "    if name == 'mitsuba':\n"
+        "        raise metadata.PackageNotFoundError(name)\n"
+        "    return found(name)\n"
+        "metadata.Distribution.from_name = staticmethod(from_name)\n"
+    )
+    out = tmp_path / "out"
+    result = subprocess.run(
+        [sys.executable, "-m", "droguekit.cli.main", "render", "smoke", "--out", str(out), "--workers", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(blocked)},
+    )
+    _assert_refused(result, r"mitsuba.*not installed.*pip install")
+    assert not out.exists()
+
+
+def test_an_unwritable_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    _assert_refused(_run("render", "smoke", "--out", tmp_path / "file" / "out"), r"file.*Not a directory")
+    if os.geteuid() != 0:  # nothing is unwritable for root
+        (tmp_path / "closed").mkdir(mode=0o555)
+        _assert_refused(_run("render", "smoke", "--out", tmp_path / "closed" / "out"), r"closed.*Permission denied")
+
+
+@pytest.mark.mitsuba
+def test_a_full_disk_leaves_no_half_frame(smoke_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    # No file may grow beyond this: the manifest fits, an image does not, and the system says so as on a full disk.
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+
+    result = _run("render", "smoke", "--out", out, "--workers", "1", before=limit)
+    _assert_refused(result, r"frames/000000: cannot be written: File too large")
+    assert not out.exists()
+
+
+@pytest.fixture
+def damaged(smoke_dataset: Path, tmp_path: Path) -> Path:
+    out = tmp_path / "damaged"
+    shutil.copytree(smoke_dataset, out)
+    return out
+
+
+def test_a_truncated_image(damaged: Path, tmp_path: Path) -> None:
+    image = layout.frame_folder(damaged, 1) / "right.png"
+    image.write_bytes(image.read_bytes()[:2000])
+    result = _run("validate", damaged)
+    assert result.returncode == FAULT
+    assert re.search(r"000001/right\.png", result.stdout)
+    estimates = tmp_path / "estimates.jsonl"
+    _assert_refused(_run("navigate", damaged, "--out", estimates), r"000001/right\.png: the PNG is truncated")
+    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
+
+
+def test_a_truncated_record(damaged: Path, tmp_path: Path) -> None:
+    record = layout.frame_folder(damaged, 2) / layout.RECORD_FILE
+    record.write_bytes(record.read_bytes()[:500])
+    result = _run("validate", damaged)
+    assert result.returncode == FAULT
+    assert re.search(r"000002/record\.json", result.stdout)
+    _assert_refused(_run("preview", damaged, "--out", tmp_path / "sheet.png"), r"000002/record\.json: is truncated")
+    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["validate"],
+        ["navigate", "--out", "e.jsonl"],
+        ["preview", "--out", "s.png"],
+        ["reproduce", "--frame", "0"],
+        ["export", "--format", "coco", "--out", "x"],
+        ["benchmark", "--estimates", "e.jsonl"],
+    ],
+)
+def test_a_dataset_that_is_not_there(arguments: list[str], tmp_path: Path) -> None:
+    name, *rest = arguments
+    _assert_refused(_run(name, tmp_path / "missing", *rest), r"missing: there is no such dataset folder")
+
+
+def test_wrong_names_of_methods_formats_and_frames(smoke_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    _assert_refused(_run("navigate", smoke_dataset, "--method", "guess", "--out", out), r"'guess'.*paper")
+    _assert_refused(_run("export", smoke_dataset, "--format", "voc", "--out", out), r"no format named 'voc'; there are")
+    _assert_refused(_run("preview", smoke_dataset, "--out", tmp_path / "sheet.gif"), r"must end in \.png or \.jpg")
+    _assert_refused(_run("preview", smoke_dataset, "--out", tmp_path / "s.png", "--columns", "0"), r"--columns")
+    _assert_refused(_run("reproduce", smoke_dataset, "--frame", "99"), r"has no frame 99")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_estimates_that_are_none(smoke_dataset: Path, tmp_path: Path) -> None:
+    estimates = tmp_path / "estimates.jsonl"
+    estimates.write_text('{"status": "fix"}\n')
+    result = _run("benchmark", smoke_dataset, "--estimates", estimates, "--json", tmp_path / "out.json")
+    _assert_refused(result, r"estimates\.jsonl, line 1: not a pose estimate")
+    assert [path.name for path in tmp_path.iterdir()] == ["estimates.jsonl"]

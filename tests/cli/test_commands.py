@@ -1,0 +1,91 @@
+"""Each command on a real dataset, through its own entry point."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets_manifest import layout
+from datasets_manifest.estimates import read_estimates
+from datasets_manifest.manifest import read_manifest
+from droguekit.cli.main import DONE, run
+from nav.runner import method_names
+
+
+def test_validate_finds_nothing_in_what_render_made(smoke_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["validate", str(smoke_dataset)]) == DONE
+    assert capsys.readouterr().out.endswith(f"{smoke_dataset}: 6 pairs, no faults\n")
+
+
+def test_reproduce_says_what_it_proved(smoke_dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["reproduce", str(smoke_dataset), "--frame", "4"]) == DONE
+    assert capsys.readouterr().out == "frame 4: record and images are the same bit for bit\n"
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_preview_shows_every_pair_it_is_asked_for(smoke_dataset: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"sheet{suffix}"
+    options = ["--count", "5", "--columns", "3", "--tile-width", "160"]
+    assert run(["preview", str(smoke_dataset), "--out", str(out), *options]) == DONE
+    sheet = cv2.imread(str(out))
+    # Two rows of three tiles of 160 x (120 + 22 for the caption), with gaps of 4 around each.
+    assert sheet.shape == (2 * (120 + 22) + 3 * 4, 3 * 160 + 4 * 4, 3)
+    captions = [sheet[4 + row * 146 + 120 : 4 + row * 146 + 142] for row in (0, 1)]
+    tiles = [caption[:, 4 + column * 164 : 164 + column * 164] for caption in captions for column in range(3)]
+    assert [bool(np.ptp(tile) > 100) for tile in tiles] == [True] * 5 + [False]
+
+
+def test_export_writes_the_annotations_that_the_dataset_has(smoke_dataset: Path, tmp_path: Path) -> None:
+    assert run(["export", str(smoke_dataset), "--format", "coco", "--out", str(tmp_path / "coco")]) == DONE
+    exported = json.loads((tmp_path / "coco" / "all.json").read_text())
+    stored = json.loads((smoke_dataset / layout.ANNOTATIONS_FOLDER / "all.json").read_text())
+    assert exported["annotations"] == stored["annotations"]
+
+
+def test_navigate_writes_one_estimate_for_each_pair_and_method(smoke_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "estimates.jsonl"
+    assert run(["navigate", str(smoke_dataset), "--method", "joint", "--method", "paper", "--out", str(out)]) == DONE
+    found = [(estimate.frame_index, estimate.method) for estimate in read_estimates(out)]
+    assert found == [(index, method) for index in range(6) for method in ("joint", "paper")]
+
+
+def test_plan_counts_without_rendering(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["plan", "smoke", "--no-probe"]) == DONE
+    shown = capsys.readouterr().out
+    assert "smoke: 6 pairs of 2 x 320 x 240" in shown
+    assert "by split: train 3, val 0, test 3" in shown
+    assert [int(count) for count in re.findall(r"^ +[\d.]+ m +(\d+) #+$", shown, re.MULTILINE)] == [2, 2, 2]
+
+
+@pytest.mark.mitsuba
+def test_doctor_names_the_engine_that_works(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["doctor"]) == DONE
+    assert re.search(r"^engine +mitsuba works as (llvm_ad_rgb|scalar_rgb): ", capsys.readouterr().out, re.MULTILINE)
+
+
+@pytest.mark.mitsuba
+def test_demo_goes_from_a_recipe_to_a_report_and_keeps_what_is_there(
+    smoke_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "demo"
+    shutil.copytree(smoke_dataset, out / "dataset")
+    assert run(["demo", "smoke", "--out", str(out)]) == DONE
+    told = capsys.readouterr()
+    assert "6 of 6 pairs are there already and whole" in told.err
+    assert sorted(path.name for path in out.iterdir()) == [
+        "benchmark.json",
+        "dataset",
+        "estimates.jsonl",
+        "report.html",
+    ]
+    result = json.loads((out / "benchmark.json").read_text())
+    assert result["schema"] == 1
+    assert result["dataset"]["sha256"] == read_manifest(smoke_dataset).dataset_sha256
+    assert set(result["methods"]) == set(method_names())
+    assert "<svg" in (out / "report.html").read_text()

@@ -1,0 +1,171 @@
+import json
+import shutil
+
+import pytest
+
+from datasets_manifest.layout import frame_folder
+from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
+from datasets_manifest.reader import Dataset
+from datasets_manifest.writer import canonical_json
+from labelgen.dataset_validation import validate_dataset
+
+
+def folder_of(dataset, pair):
+    return frame_folder(dataset, pair.frame.frame_index)
+
+
+def faults_of(dataset):
+    report = validate_dataset(dataset)
+    assert not report.passed
+    assert all("\n" not in fault for fault in report.faults)
+    return report.faults
+
+
+def edit_record(dataset, pair, edit):
+    """Change a record's JSON and describe the dataset anew, so that only its contents are wrong."""
+    path = folder_of(dataset, pair) / "record.json"
+    table = json.loads(path.read_text())
+    edit(table)
+    path.write_text(canonical_json(table) + "\n")
+    manifest = read_manifest(dataset)
+    splits = {entry.scene_id: entry.split for entry in manifest.frames}
+    write_manifest(dataset, build_manifest(dataset, manifest.recipe, "1", splits.__getitem__))
+
+
+def test_a_whole_dataset_passes(small_dataset, pairs, capfd):
+    report = validate_dataset(small_dataset)
+    assert report.faults == [] and report.passed and report.pairs == len(pairs)
+    counts = {check.name: check.count for check in report.checks}
+    assert counts["hashes"] == len(pairs) and counts["labels against part ids"] == 2 * len(pairs)
+    assert "labels against part ids" in report.table()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_no_folder_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="there is no such dataset folder"):
+        validate_dataset(tmp_path / "none")
+
+
+def test_a_truncated_manifest_is_a_fault(small_dataset):
+    path = small_dataset / "manifest.json"
+    path.write_text(path.read_text()[:500])
+    (fault,) = faults_of(small_dataset)
+    assert "manifest.json: is truncated" in fault
+
+
+@pytest.mark.parametrize("name", ["left.png", "right_parts.png"])
+def test_truncated_images_are_faults(small_dataset, full_pairs, name, capfd):
+    path = folder_of(small_dataset, full_pairs[0]) / name
+    path.write_bytes(path.read_bytes()[:-20])
+    faults = faults_of(small_dataset)
+    assert all(str(path) in fault for fault in faults) and len(faults) == 2
+    # The decoder must not be let loose on it: libpng writes to standard error.
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_changed_pixel_is_a_fault(small_dataset, full_pairs):
+    one, other = (folder_of(small_dataset, pair) / "left.png" for pair in full_pairs[:2])
+    shutil.copy(other, one)
+    (fault,) = faults_of(small_dataset)
+    assert fault == f"{one}: was changed, its hash is not the one on record"
+
+
+@pytest.mark.parametrize("damage", [lambda text: text[: len(text) // 2], lambda text: "[]", lambda text: "[" * 100_000])
+def test_a_damaged_record_is_a_fault(small_dataset, full_pairs, damage):
+    path = folder_of(small_dataset, full_pairs[0]) / "record.json"
+    path.write_text(damage(path.read_text()))
+    (fault,) = faults_of(small_dataset)
+    assert fault.startswith(f"{path}: ")
+
+
+def test_missing_and_stray_files_are_faults(small_dataset, full_pairs):
+    shutil.rmtree(folder_of(small_dataset, full_pairs[0]))
+    missing = folder_of(small_dataset, full_pairs[1]) / "right.png"
+    missing.unlink()
+    stray = folder_of(small_dataset, full_pairs[1]) / "notes.txt"
+    stray.write_text("")
+    leftover = small_dataset / "frames" / ".000001-abc.part"
+    leftover.mkdir()
+    shutil.copytree(folder_of(small_dataset, full_pairs[1]), small_dataset / "frames" / "000099")
+    faults = faults_of(small_dataset)
+    for wanted in (
+        f"{folder_of(small_dataset, full_pairs[0]) / 'record.json'}: is missing",
+        f"{missing}: is missing",
+        f"{stray}: is not on record",
+        f"{leftover}: was left by a run that was killed",
+        f"{small_dataset / 'frames' / '000099'}: is not in the manifest",
+    ):
+        assert wanted in faults
+
+
+def test_shifted_labels_are_faults(small_dataset, full_pairs):
+    def shift(table):
+        # As a renderer with its origin at the pixel corner would have it.
+        for view in table["views"].values():
+            for marker in view["markers"]:
+                marker["center_proj_px"] = [value + 0.5 for value in marker["center_proj_px"]]
+                marker["center_ellipse_px"] = [value + 0.5 for value in marker["center_ellipse_px"]]
+
+    edit_record(small_dataset, full_pairs[0], shift)
+    faults = faults_of(small_dataset)
+    assert sum("off the pose's image" in fault for fault in faults) == 16
+    assert sum("from the centroid of part" in fault for fault in faults) == 16
+    assert sum("keypoints: differ" in fault for fault in faults) == 2
+
+
+def test_rows_that_differ_between_the_eyes_are_a_fault(small_dataset, full_pairs):
+    def lower(table):
+        table["views"]["right"]["markers"][0]["center_proj_px"][1] += 1e-7
+
+    edit_record(small_dataset, full_pairs[0], lower)
+    assert any("rows of left and right differ by 1e-07 px" in fault for fault in faults_of(small_dataset))
+
+
+def test_a_wrong_box_is_a_fault(small_dataset, full_pairs):
+    def widen(table):
+        table["views"]["left"]["box_visible_xywh_px"][2] += 1
+
+    edit_record(small_dataset, full_pairs[0], widen)
+    faults = faults_of(small_dataset)
+    assert any("left_parts.png: box_visible_xywh_px" in fault for fault in faults)
+    assert any("bbox: is" in fault for fault in faults)
+
+
+def test_a_scene_in_two_splits_is_a_fault(small_dataset, small_recipe):
+    calls = iter(range(100))
+    leaky = build_manifest(small_dataset, small_recipe, "1", lambda _: "train" if next(calls) % 2 else "test")
+    write_manifest(small_dataset, leaky)
+    assert any("is in more than one split" in fault for fault in faults_of(small_dataset))
+
+
+def test_annotations_that_disagree_are_faults(small_dataset):
+    annotations = small_dataset / "annotations"
+    table = json.loads((annotations / "all.json").read_text())
+    table["annotations"][0]["area"] += 1
+    table["annotations"][1]["segmentation"] = table["annotations"][0]["segmentation"]
+    del table["annotations"][2]["bbox"]
+    del table["images"][-1]
+    (annotations / "all.json").write_text(json.dumps(table))
+    parts = sorted(path for path in annotations.iterdir() if path.name != "all.json")
+    parts[0].write_text("{")
+    parts[1].unlink()
+    faults = faults_of(small_dataset)
+    for wanted in (
+        "area: is",
+        "segmentation: differs",
+        "annotation cannot be used: KeyError",
+        "all.json: has 11 images",
+    ):
+        assert any(wanted in fault for fault in faults), wanted
+    assert any(fault.startswith(f"{parts[0]}: is truncated") for fault in faults)
+    assert f"{parts[1]}: is missing" in faults
+
+
+def test_a_path_out_of_the_frame_is_a_fault(small_dataset, full_pairs):
+    edit_record(
+        small_dataset, full_pairs[0], lambda table: table["file_sha256"].update({"../../recipe.toml": "0" * 64})
+    )
+    (fault,) = faults_of(small_dataset)
+    assert "must name files of the frame's own folder" in fault
+    with pytest.raises(ValueError, match="own folder"):
+        Dataset(small_dataset).record(full_pairs[0].frame.frame_index)

@@ -1,0 +1,151 @@
+"""The sensor against closed forms: camera equation, photon transfer, full well, mosaic, encoding."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.frame import Exposure
+from datasets_manifest.rigs import SENSORS
+from render.engine import EyeRadiance, StereoRadiance
+from render.sensor import MONO_WEIGHTS, dn_per_electron, expose
+from scenes.sampler import sample_frame
+
+SHAPE = (96, 128)
+
+
+def flat_pair(level_cd_m2, rgb=(1.0, 1.0, 1.0)):
+    radiance = np.full((*SHAPE, 3), level_cd_m2, dtype=np.float32) * np.array(rgb, dtype=np.float32)
+    nothing = np.zeros(SHAPE, dtype=np.float32)
+    eye = EyeRadiance(radiance, nothing, nothing.astype(np.uint8), nothing, np.zeros((*SHAPE, 3), np.float32), {})
+    return StereoRadiance(eye, eye, "test pattern", "1", 0.0, {})
+
+
+@pytest.fixture
+def frame(make_recipe):
+    return sample_frame(make_recipe(scale=0.1), 0)
+
+
+def with_sensor(frame, name="rgb-ideal", seed=5, time_s=1e-3, gain=1.0, **changes):
+    sensor = SENSORS[name].model_copy(update={"output_bits": 12, **changes})
+    exposure = Exposure(time_s=time_s, f_number=2.8, gain=gain)
+    return frame.model_copy(update={"sensor": sensor, "exposure": exposure, "seed": seed})
+
+
+def level_for(frame, electrons):
+    return electrons / frame.sensor.electrons_per_cd_m2(frame.exposure)
+
+
+def test_white_marker_at_50_klux_fills_7000_electrons_in_0_13_ms():
+    """The specification's own example: white at 50 klux, f/2.8, 0.13 ms."""
+    sensor = SENSORS["rgb-ideal"]
+    luminance = 50_000 * 0.8 / np.pi
+    electrons = luminance * sensor.electrons_per_cd_m2(Exposure(time_s=0.13e-3, f_number=2.8))
+    assert electrons == pytest.approx(7000, rel=0.01)
+
+
+@pytest.mark.parametrize("electrons", [3.0, 20.0, 200.0, 2000.0, 8000.0])
+def test_photon_transfer_curve(frame, electrons):
+    """Variance = shot + read^2 + (PRNU mean)^2 + quantisation, in electrons; mean = light."""
+    frame = with_sensor(frame)
+    images = expose(frame, flat_pair(level_for(frame, electrons)))
+    per_electron = dn_per_electron(frame.sensor, 1.0)
+    got = (images.left.astype(float) - frame.sensor.black_level_dn) / per_electron
+    expected = (
+        electrons
+        + frame.sensor.read_noise_e**2
+        + (frame.sensor.prnu_fraction * electrons) ** 2
+        + 1 / (12 * per_electron**2)
+    )
+    count = got.size
+    # Standard errors: mean sigma/sqrt(n), variance sqrt(2/n) relative; four of them, and half a DN of rounding bias.
+    assert got.mean() == pytest.approx(electrons, abs=4 * np.sqrt(expected / count) + 0.05 / per_electron)
+    assert got.var() == pytest.approx(expected, rel=4 * np.sqrt(2 / count) + 0.01)
+
+
+def test_read_noise_alone_in_the_dark(frame):
+    frame = with_sensor(frame)
+    images = expose(frame, flat_pair(0.0))
+    assert images.left.mean() == pytest.approx(frame.sensor.black_level_dn, abs=0.1)
+    assert images.left.min() > 0  # the black level keeps the noise from being cut off
+
+
+def test_full_well_clips(frame):
+    frame = with_sensor(frame)
+    images = expose(frame, flat_pair(level_for(frame, 3 * frame.sensor.full_well_e)))
+    assert np.all(images.left == 4095)
+
+
+def test_gain_scales_numbers_not_electrons(frame):
+    one, two = with_sensor(frame, read_noise_e=0.0), with_sensor(frame, gain=2.0, read_noise_e=0.0)
+    level = level_for(one, 2000)
+    low, high = (expose(f, flat_pair(level)).left.astype(float) - 64 for f in (one, two))
+    # Same draws: doubled up to rounding of both.
+    assert np.abs(high - 2 * low).max() <= 1.5
+
+
+def test_gains_of_pixels_stay_from_frame_to_frame(frame):
+    frame = with_sensor(frame, read_noise_e=0.0)
+    other = frame.model_copy(update={"frame_index": 1})
+    pictures = [expose(f, flat_pair(level_for(f, 8000))).left.astype(float) for f in (frame, other)]
+    correlation = np.corrcoef(pictures[0].ravel(), pictures[1].ravel())[0, 1]
+    # PRNU 80 e- against shot noise 89 e-: 80^2 / (80^2 + 89^2) = 0.45; 0.02 is four standard errors.
+    assert correlation == pytest.approx(0.444, abs=0.03)
+
+
+def test_eyes_have_their_own_noise(frame):
+    images = expose(with_sensor(frame), flat_pair(1000.0))
+    left, right = images.left.astype(float).ravel(), images.right.astype(float).ravel()
+    assert abs(np.corrcoef(left, right)[0, 1]) < 4 / np.sqrt(left.size)
+
+
+def test_mosaic_takes_one_colour_a_site(frame):
+    frame = with_sensor(frame, "paper-colour", read_noise_e=0.0, prnu_fraction=0.0)
+    images = expose(frame, flat_pair(level_for(frame, 4000), rgb=(1.0, 0.5, 0.25)))
+    mosaic = images.left_mosaic.astype(float) - 64
+    per_electron = dn_per_electron(frame.sensor, 1.0)
+    for rows, columns, electrons in ((0, 0, 4000), (0, 1, 2000), (1, 0, 2000), (1, 1, 1000)):
+        assert mosaic[rows::2, columns::2].mean() == pytest.approx(electrons * per_electron, rel=0.01)
+    # The demosaiced image shows red as red: channel order red, green, blue.
+    means = images.left[8:-8, 8:-8].reshape(-1, 3).mean(axis=0) - 64
+    np.testing.assert_allclose(means, np.array([4000, 2000, 1000]) * per_electron, rtol=0.02)
+
+
+def test_mono_weighs_the_bands(frame):
+    frame = with_sensor(frame, "mono", read_noise_e=0.0)
+    images = expose(frame, flat_pair(level_for(frame, 4000), rgb=(1.0, 0.0, 0.0)))
+    assert images.left.ndim == 2
+    expected = 4000 * MONO_WEIGHTS[0, 0] * dn_per_electron(frame.sensor, 1.0)
+    assert images.left.mean() - 64 == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_bits_and_gamma(frame, bits):
+    frame = with_sensor(frame, output_bits=bits, encoding="gamma", read_noise_e=0.0, prnu_fraction=0.0)
+    signal = 0.18
+    images = expose(frame, flat_pair(level_for(frame, signal * frame.sensor.full_well_e)))
+    assert images.left.dtype == (np.uint8 if bits == 8 else np.uint16)
+    # sRGB of 18 % grey is 0.4614 of full scale; shot noise averages out, the curve's bend shifts it below 0.1 %.
+    assert images.left.mean() / (2**bits - 1) == pytest.approx(0.4614, rel=0.005)
+
+
+def test_same_frame_same_image(frame):
+    frame = with_sensor(frame)
+    first, again = (expose(frame, flat_pair(1000.0)) for _ in range(2))
+    assert np.array_equal(first.left, again.left) and np.array_equal(first.right, again.right)
+    other = expose(frame.model_copy(update={"frame_index": 7}), flat_pair(1000.0))
+    assert not np.array_equal(first.left, other.left)
+
+
+def test_blur_keeps_light_and_place(frame):
+    """A point of light keeps its sum and centroid and spreads by the stated variance."""
+    from render.optics import blur
+
+    image = np.zeros((41, 41, 1), dtype=np.float32)
+    image[20, 17] = 1.0
+    seen = blur(image, 0.8).reshape(41, 41)
+    _, u = np.mgrid[:41, :41]
+    assert seen.sum() == pytest.approx(1.0, abs=1e-6)
+    assert (seen * u).sum() == pytest.approx(17.0, abs=1e-5)
+    # The sampled Gaussian, cut at four sigma, keeps its variance within 0.5 %.
+    assert (seen * (u - 17) ** 2).sum() == pytest.approx(0.64, rel=0.005)

@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe import parse_recipe
+from drogue_models.marker_layout import marker_layout
+from geometry.circles import disc_outline
+from geometry.stereo import EYES
+from scenes.distance import sample_distance_m
+from scenes.sampler import sample_frame, scene_of_frame, split_of_scene
+from scenes.seeding import bulk_generator, generator
+
+BASE = """
+name = "sampler-test"
+seed = %d
+[frames]
+count = 400
+scenes = 10
+empty_fraction = %f
+[distance]
+%s
+[split]
+train = 0.7
+val = 0.2
+test = 0.1
+"""
+STATIONS = 'law = "stations"\nstations_m = [1.7, 3.0, 10.0, 40.0]'
+
+
+def recipe(distance=STATIONS, seed=1, empty=0.0, more=""):
+    return parse_recipe(BASE % (seed, empty, distance) + more)
+
+
+def test_frames_depend_on_seed_and_index_alone():
+    first = [sample_frame(recipe(), index).model_dump_json() for index in (3, 0, 7)]
+    again = [sample_frame(recipe(), index).model_dump_json() for index in (7, 3, 0)]
+    assert first == [again[1], again[2], again[0]]
+    assert sample_frame(recipe(seed=2), 3).model_dump_json() != first[0]
+
+
+def test_seed_zero_is_a_seed():
+    assert sample_frame(recipe(seed=0), 0).model_dump_json() == sample_frame(recipe(seed=0), 0).model_dump_json()
+    assert sample_frame(recipe(seed=0), 0).left_from_drogue.as_matrix().tolist() != (
+        sample_frame(recipe(seed=1), 0).left_from_drogue.as_matrix().tolist()
+    )
+
+
+@pytest.mark.parametrize("make", [generator, bulk_generator])
+def test_streams_are_independent_of_each_other(make):
+    draws = {
+        key: make(*key).standard_normal(2000)
+        for key in [(1, 0, "a"), (1, 0, "b"), (1, 1, "a"), (2, 0, "a"), (2**40 + 1, 0, "a")]
+    }
+    values = list(draws.values())
+    for i, one in enumerate(values):
+        for other in values[:i]:
+            # Four standard errors of a correlation of independent draws.
+            assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(2000)
+
+
+def test_negative_seed_is_refused():
+    with pytest.raises(ValueError, match="must not be negative"):
+        generator(-1, 0, "a")
+
+
+@pytest.mark.parametrize("distance_m", [1.7, 3.0, 10.0, 40.0])
+def test_the_whole_drogue_is_in_both_views(distance_m):
+    drawn = recipe(f'law = "stations"\nstations_m = [{distance_m}]')
+    for index in range(40):
+        frame = sample_frame(drawn, index)
+        assert frame.left_from_drogue.translation_m[2] == pytest.approx(distance_m)
+        rim = disc_outline(frame.left_from_drogue, np.zeros(3), frame.drogue.rim_radius_m, 360)
+        for eye in EYES:
+            assert frame.rig.camera.contains(frame.rig.project(rim, eye), margin_px=0.5).all()
+
+
+def test_places_fill_the_common_field():
+    frames = [sample_frame(recipe('law = "stations"\nstations_m = [10.0]'), index) for index in range(200)]
+    places = np.array([frame.left_from_drogue.translation_m[:2] for frame in frames])
+    x_low, x_high, y_low, y_high = frames[0].rig.common_field_m(10.0, 0.33)
+    # Uniform: of 200 draws the extremes lie within 4 % of the ends (0.96^200 = 3e-4).
+    assert places[:, 0].min() < x_low + 0.04 * (x_high - x_low) + 0.1
+    assert places[:, 0].max() > x_high - 0.04 * (x_high - x_low) - 0.1
+    assert places[:, 1].min() < y_low + 0.04 * (y_high - y_low) + 0.1
+    assert places[:, 1].max() > y_high - 0.04 * (y_high - y_low) - 0.1
+
+
+def test_on_axis_stays_on_the_rig_axis():
+    drawn = recipe(more="[pose]\non_axis = true\n")
+    for index in range(8):
+        np.testing.assert_allclose(sample_frame(drawn, index).left_from_drogue.translation_m[:2], [0.06, 0.0])
+
+
+def test_an_attitude_that_never_fits_is_one_clear_error():
+    drawn = recipe('law = "stations"\nstations_m = [1.47]', more="[pose]\npitch_deg = 0\nyaw_deg = [40, 45]\n")
+    with pytest.raises(ValueError, match="no attitude within the recipe's ranges"):
+        sample_frame(drawn, 0)
+
+
+def quantile_error(law, transform):
+    rng = np.random.default_rng(1)
+    draws = np.sort([transform(sample_distance_m(rng, law, 0)) for _ in range(4000)])
+    ends = sorted([transform(2.0), transform(40.0)])
+    return np.abs((draws - ends[0]) / (ends[1] - ends[0]) - (np.arange(4000) + 0.5) / 4000).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "transform"),
+    [("uniform", lambda z: z), ("log-uniform", np.log), ("uniform-image-size", lambda z: 1 / z)],
+)
+def test_distance_laws(name, transform):
+    """Kolmogorov-Smirnov distance to the intended law; 1.95/sqrt(n) is its 0.1 % point."""
+    law = recipe(f'law = "{name}"\nlow_m = 2.0\nhigh_m = 40.0').distance
+    assert quantile_error(law, transform) < 1.95 / np.sqrt(4000)
+
+
+def test_stations_cycle():
+    drawn = recipe()
+    distances = [sample_frame(drawn, index).left_from_drogue.translation_m[2] for index in range(8)]
+    np.testing.assert_allclose(distances, [1.7, 3.0, 10.0, 40.0] * 2)
+
+
+def test_scenes_are_visited_evenly_and_split_whole():
+    drawn = recipe()
+    scenes = [scene_of_frame(drawn, index) for index in range(400)]
+    assert np.bincount(scenes).tolist() == [40] * 10
+    splits = [split_of_scene(drawn, scene) for scene in range(10)]
+    assert sorted(splits) == ["test"] + ["train"] * 7 + ["val"] * 2
+
+
+def test_empty_frames_have_no_drogue():
+    drawn = recipe(empty=0.25)
+    empty = sum(sample_frame(drawn, index).drogue is None for index in range(400))
+    # Binomial of 400 draws: standard deviation 8.7; four of them.
+    assert abs(empty - 100) < 35
+
+
+def test_hose_runs_from_the_coupling_to_the_pod():
+    frame = sample_frame(recipe(), 2)
+    nodes = frame.hose_nodes_left_m
+    tail = frame.left_from_drogue.apply([0, 0, frame.drogue.hub_depth_m + frame.drogue.coupling_length_m])
+    assert np.linalg.norm(nodes[0] - tail) < 0.05
+    np.testing.assert_allclose(nodes[-1], frame.left_from_tanker.translation_m)
+    along = np.diff(nodes, axis=0)
+    cosines = (along[1:] * along[:-1]).sum(axis=1) / np.prod(np.linalg.norm([along[1:], along[:-1]], axis=-1), axis=0)
+    assert cosines.min() > 0.9  # no kinks
+
+
+def test_meter_lights_the_brighter_of_sky_and_plate():
+    drawn = recipe()
+    for index in range(10):
+        frame = sample_frame(drawn, index)
+        assert 20e-6 <= frame.exposure.time_s <= 20e-3
+    assert marker_layout(frame.drogue).count == 8
