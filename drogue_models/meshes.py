@@ -24,8 +24,9 @@ RIM_TUBE_SECTIONS = 16
 # Our choices, as those of published drogues are not given.
 PLATE_THICKNESS_M = 0.004
 BACKING_THICKNESS_M = 0.001
-# Paint: a lip of any depth would be seen past the inner edge of a tilted hub and move it.
-HUB_THICKNESS_M = 0.0001
+HUB_THICKNESS_M = 0.003
+# A dark sleeve lines the hub's hole: the bright wall of the hole would be seen past the near edge and move it.
+SLEEVE_THICKNESS_M = 0.00002
 RIB_WIDTH_M = 0.008
 RIB_THICKNESS_M = 0.004
 CANOPY_THICKNESS_M = 0.003
@@ -132,7 +133,9 @@ def _coupling(drogue: DrogueParameters) -> trimesh.Trimesh:
     else:
         inner_m, outer_m = _hub_radii_m(drogue.hub)
         thickness_m = _hub_thickness_m(drogue)
-        profile = [(0.0, recess_m), (inner_m, recess_m), (inner_m, thickness_m), (outer_m, thickness_m), (outer_m, 0.0)]
+        sleeve_m = inner_m - SLEEVE_THICKNESS_M
+        profile = [(0.0, recess_m), (sleeve_m, recess_m), (sleeve_m, 0.0), (inner_m, 0.0)]
+        profile += [(inner_m, thickness_m), (outer_m, thickness_m), (outer_m, 0.0)]
     profile += [
         (collar_m, 0.0),
         (collar_m, 0.30 * length_m),

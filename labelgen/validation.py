@@ -22,6 +22,9 @@ LATTICE_RMS = float(np.sqrt(2.0 / (12.0 * np.pi)))
 # The largest of 1e5 simulated discs was 2.9 rms; the error has an end, unlike a normal one.
 _LATTICE_LIMIT_RMS = 4.0
 
+# Meshes draw circles as polygons of 128 sides and the same area, whose corners stand out by (pi / 128)^2 / 6 = 1e-4.
+_OUTLINE_TOLERANCE = 5e-4
+
 # Rays, vertices and the product of a few transforms, each rounded to float32 at the scale of the distance.
 _DEPTH_ROUNDINGS = 32.0
 
@@ -29,9 +32,9 @@ _DEPTH_ROUNDINGS = 32.0
 def check_against_passes(record: PairRecord, radiance: StereoRadiance) -> list[str]:
     """Faults between the labels of a pair and its passes, one line each; empty if there are none.
 
-    Checked: the part id at the centre of every unoccluded marker; the depth of every pixel of a marker or the hub
-    against the feature's plane; the centroid of every unoccluded marker's pixels against `center_ellipse_px`; visible
-    against amodal pixels; the boxes against the pixels; that an empty frame shows no drogue.
+    Checked: the part id at the centre of every unoccluded marker; that every pixel of a marker or the hub lies on it
+    and has the depth of its plane; the centroid of every unoccluded marker's pixels against `center_ellipse_px`;
+    visible against amodal pixels; the boxes against the pixels; that an empty frame shows no drogue.
     """
     faults = []
     for eye, seen in zip(EYES, (radiance.left, radiance.right), strict=True):
@@ -119,9 +122,8 @@ def _check_drogue(
         return [f"markers, hub: {len(view.markers)} markers are labelled, the drogue has {layout.count}"]
     faults = check_boxes(view, np.isin(seen.part_id, drogue_part_ids(layout.count)))
     for name, feature, disc in named_features(record, layout, pose, eye):
-        # Through the hub's hole the annulus shows its inner wall, which leaves the plane.
         hole_m = layout.hub_inner_radius_m if name == "hub" else 0.0
-        found = _check_visibility(feature, disc, seen) + _check_depth(disc, hole_m, seen)
+        found = _check_visibility(feature, disc, seen) + _check_pixels(disc, hole_m, seen)
         if name != "hub" and feature.in_image and feature.visible_fraction == 1:
             found += check_unoccluded_marker(feature, disc, seen.part_id)
         faults += [f"{name}: {fault}" for fault in found]
@@ -154,13 +156,19 @@ def _check_visibility(feature: FeatureView, disc: DiscInEye, seen: EyeRadiance) 
     return [] if feature.visible_fraction == want else [f"visible_fraction: is {feature.visible_fraction}, not {want}"]
 
 
-def _check_depth(disc: DiscInEye, hole_m: float, seen: EyeRadiance) -> list[str]:
-    """The depth of every pixel of a feature around a hole against its plane, within what float32 can hold."""
+def _check_pixels(disc: DiscInEye, hole_m: float, seen: EyeRadiance) -> list[str]:
+    """Every pixel of a feature around a hole: whether it lies on it, and its depth against the feature's plane."""
     rows, columns = np.nonzero(seen.part_id == disc.part)
     pixels = np.stack([columns, rows], axis=-1).astype(np.float64)
-    on_face = disc.distance_m(pixels) > hole_m
+    distance_m = disc.distance_m(pixels)
+    faults = []
+    beyond = int(np.count_nonzero(distance_m > disc.radius_m * (1 + _OUTLINE_TOLERANCE)))
+    if beyond:
+        faults.append(f"{beyond} pixels of part {disc.part} lie beyond its edge")
+    # On the outline a ray may slip between two parts that touch; through the hole it sees the inner wall.
+    on_face = (distance_m > hole_m * (1 + _OUTLINE_TOLERANCE)) & (distance_m < disc.radius_m * (1 - _OUTLINE_TOLERANCE))
     if not on_face.any():
-        return []
+        return faults
     rows, columns, pixels = rows[on_face], columns[on_face], pixels[on_face]
     error_m = np.abs(seen.depth_m[rows, columns].astype(np.float64) - disc.plane_depth_m(pixels))
     rays = disc.camera.rays(pixels)
@@ -168,12 +176,12 @@ def _check_depth(disc: DiscInEye, hole_m: float, seen: EyeRadiance) -> list[str]
     reach_m = float(np.linalg.norm(disc.center_m)) + disc.radius_m
     limit_m = _DEPTH_ROUNDINGS * float(np.finfo(np.float32).eps) * reach_m / slant
     worst = int(np.argmax(error_m / limit_m))
-    if error_m[worst] <= limit_m[worst]:
-        return []
-    return [
-        f"depth at pixel {columns[worst]}, {rows[worst]} is {error_m[worst]:.2e} m off the plane of part {disc.part}, "
-        f"more than {limit_m[worst]:.2e} m"
-    ]
+    if error_m[worst] > limit_m[worst]:
+        faults.append(
+            f"depth at pixel {columns[worst]}, {rows[worst]} is {error_m[worst]:.2e} m off the plane of part "
+            f"{disc.part}, more than {limit_m[worst]:.2e} m"
+        )
+    return faults
 
 
 def _contains(outer: PixelBox, inner: PixelBox, margin_px: float) -> bool:

@@ -21,7 +21,6 @@ from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.interface import Detector
 from nav.pose.interface import NoFixReason, Observation
 from nav.pose.registry import pose_method
-from nav.ring_match import least_markers
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Navigator:
             if found is None:
                 return Sighting(NoFixReason(f"no drogue detected in the {eye} image"), stage_s)
             channel = marker_channel(images, eye, self._color)
-            centroids.append(binary_centroids(channel, found.box_xywh_px, least_markers(self._layout)))
+            centroids.append(binary_centroids(channel, found.box_xywh_px, self._layout))
         measured = perf_counter()
         observation = correspond(centroids[0], centroids[1], self._rig, self._layout)
         stage_s |= {"centroids": measured - detected, "correspond": perf_counter() - measured}

@@ -68,6 +68,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         seed=seed,
         frame_index=frame_index,
         scene_id=scene_id,
+        family=recipe.family,
         time_s=frame_index * FRAME_PERIOD_S,
         drogue=None if empty else recipe.drogue,
         left_from_drogue=left_from_drogue,

@@ -28,7 +28,7 @@ def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from droguekit.batch.local import render_dataset
     from droguekit.batch.progress import PlainProgress
 
-    recipe, text = load_recipe("smoke", 2)
+    recipe, text = load_recipe("smoke")
     out = tmp_path_factory.mktemp("smoke") / "dataset"
     told = io.StringIO()
     summary = render_dataset(recipe, text, out, range(recipe.frames.count), 2, PlainProgress(told))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -58,7 +59,12 @@ class FrameTask:
                 "pixels differ; go on where they were made, or render into a new folder"
             )
         began_s = time.monotonic()
-        record, files, stage_s = make_frame(self.recipe, frame_index, engine)
+        try:
+            record, files, stage_s = make_frame(self.recipe, frame_index, engine)
+        except OSError as error:
+            # Engines and encoders pass things through temporary files.
+            where = error.filename or tempfile.gettempdir()
+            raise OSError(error.errno, f"frame {frame_index}: cannot be made: {where}: {error.strerror}") from error
         with _timed(stage_s, "write"):
             write_frame(self.dataset, record, files)
         distance_m = record.conditions.distance_m

@@ -15,8 +15,8 @@ from droguekit.batch.measure import measure_frames
 from geometry.se3 import Array
 from scenes.sampler import sample_frame, scene_of_frame, split_of_scene
 
-# Enough for shares to within 1 % and a histogram without holes; more only takes time.
-_MOST_SAMPLED = 2000
+# Enough for shares to within 2 % and a histogram without holes; more only takes time.
+_MOST_SAMPLED = 1000
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def run_benchmark(dataset: Path, estimates: Path) -> BenchmarkResult:
             names one twice for a method.
     """
     data = Dataset(dataset)
-    methods = by_method(read_estimates(estimates), data.frame_indices)
+    methods = by_method(read_estimates(estimates), data.frame_indices, str(estimates))
     truths = {index: drogue_truth(data.record(index)) for index in data.frame_indices}
     facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(data.frame_indices))
     return score(facts, truths, methods)
@@ -75,7 +75,7 @@ def score(facts: DatasetFacts, truths: Truths, methods: Mapping[str, Mapping[int
     drogues = {index: truth for index, truth in sorted(truths.items()) if truth is not None}
     if not drogues:
         raise ValueError("dataset: no pair shows a drogue, so there is nothing to compare poses with")
-    centroids = {name: _centroids(drogues, estimates) for name, estimates in methods.items()}
+    centroids = {name: _centroids(name, drogues, estimates) for name, estimates in methods.items()}
     reference = _reference(drogues, centroids)
     return BenchmarkResult(
         dataset=facts,
@@ -92,14 +92,16 @@ def score(facts: DatasetFacts, truths: Truths, methods: Mapping[str, Mapping[int
     )
 
 
-def _centroids(drogues: Mapping[int, DrogueTruth], estimates: Mapping[int, Estimate]) -> dict[int, CentroidErrors]:
+def _centroids(
+    method: str, drogues: Mapping[int, DrogueTruth], estimates: Mapping[int, Estimate]
+) -> dict[int, CentroidErrors]:
     found = {}
     for index, truth in drogues.items():
         estimate = estimates.get(index)
         try:
             found[index] = centroid_errors(truth, estimate.features if estimate is not None else ())
         except ValueError as error:
-            raise ValueError(f"estimates: frame {index}: {error}") from error
+            raise ValueError(f"estimates: method {method!r}: frame {index}: {error}") from error
     return found
 
 

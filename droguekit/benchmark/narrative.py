@@ -31,15 +31,12 @@ def result_sentences(result: BenchmarkResult) -> list[str]:
         f"{percent(method.overall.fix_fraction)} of the pairs."
     ]
     fixed = [row for row in method.bins if row.fixes]
-    sentences.append(_at(fixed[0], best))
-    if len(fixed) > 1:
-        sentences.append(_at(fixed[-1], None))
+    sentences += [_at(row) for row in (fixed[0], fixed[-1])[: len(fixed)]]
     sentences += _against_bound(result, best)
-    sentences += _others(result, best)
     empty = method.empty_frames
     if empty.n:
-        sentences.append(f"Of the {empty.n} pairs without a drogue, {best} saw one in {empty.false_fixes or 'none'}.")
-    return sentences
+        sentences.append(f"It reported a pose in {empty.false_fixes} of {empty.n} pairs without a drogue.")
+    return sentences + _others(result, best)
 
 
 def best_method(result: BenchmarkResult) -> str | None:
@@ -53,13 +50,12 @@ def best_method(result: BenchmarkResult) -> str | None:
     return min(means, key=lambda name: means[name]) if means else None
 
 
-def _at(row: BinRow, method: str | None) -> str:
-    where = f"At {distance_text(row.low_m, row.high_m)}"
-    errors = (
-        f"{millimetres(row.z_rmse_m)} mm RMS in depth, {millimetres(row.transverse_rmse_m)} mm across the line of "
-        f"sight, {three_digits(row.pitch_rmse_deg)} deg in pitch and {three_digits(row.yaw_rmse_deg)} deg in yaw"
+def _at(row: BinRow) -> str:
+    return (
+        f"At {distance_text(row.low_m, row.high_m)} its RMS error is {millimetres(row.z_rmse_m)} mm in depth, "
+        f"{millimetres(row.transverse_rmse_m)} mm across the line of sight, {three_digits(row.pitch_rmse_deg)} deg in "
+        f"pitch and {three_digits(row.yaw_rmse_deg)} deg in yaw."
     )
-    return f"{where} {method} is off by {errors}." if method else f"{where} that grows to {errors}."
 
 
 def _against_bound(result: BenchmarkResult, name: str) -> list[str]:
@@ -68,8 +64,8 @@ def _against_bound(result: BenchmarkResult, name: str) -> list[str]:
     ratios = [row.bound_ratio.z for row in result.methods[name].bins if row.bound_ratio is not None]
     if ratios:
         sentences.append(
-            f"In depth that is {_span(ratios)} times the smallest error that centroids of the measured noise allow "
-            "(the Cramér–Rao bound with every visible feature)."
+            f"Bin by bin, its depth error is {_span(ratios)} times the Cramér–Rao bound, the smallest error that "
+            "centroids of the measured noise allow."
         )
     if overall.centroid_share is not None:
         sentences.append(

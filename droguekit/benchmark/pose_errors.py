@@ -46,12 +46,15 @@ def pose_error(estimate: RigidTransform, truth: RigidTransform) -> PoseError:
     return PoseError(np.concatenate([offset, wrapped]), float(np.linalg.norm(across)))
 
 
-def by_method(estimates: Iterable[Estimate], frame_indices: Iterable[int]) -> dict[str, dict[int, Estimate]]:
+def by_method(
+    estimates: Iterable[Estimate], frame_indices: Iterable[int], source: str
+) -> dict[str, dict[int, Estimate]]:
     """Estimates by method and frame, methods in the order of the file.
 
     Args:
         estimates: all of a file.
         frame_indices: the dataset's pairs.
+        source: what to call the file in errors.
 
     Raises:
         ValueError: no estimates at all, one for a pair that the dataset lacks, or two of a method for the same pair.
@@ -61,11 +64,11 @@ def by_method(estimates: Iterable[Estimate], frame_indices: Iterable[int]) -> di
     for estimate in estimates:
         index, method = estimate.frame_index, estimate.method
         if index not in known:
-            raise ValueError(f"estimates: method {method!r}: frame {index} is not in the dataset")
+            raise ValueError(f"{source}: method {method!r}: frame {index} is not in the dataset")
         frames = methods.setdefault(method, {})
         if index in frames:
-            raise ValueError(f"estimates: method {method!r}: frame {index} occurs twice")
+            raise ValueError(f"{source}: method {method!r}: frame {index} occurs twice")
         frames[index] = estimate
     if not methods:
-        raise ValueError("estimates: the file holds none; run the estimator on this dataset first")
+        raise ValueError(f"{source}: holds no estimates; run an estimator on this dataset first")
     return methods

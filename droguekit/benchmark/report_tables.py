@@ -61,9 +61,9 @@ def overall_table(result: BenchmarkResult) -> Table:
 
 
 def position_table(result: BenchmarkResult) -> Table:
-    """Position error by distance and method, with what the centroids explain."""
+    """Position error by distance and method."""
     columns = ["pairs", "pose found", "mean", "95 % interval", "RMS", "95 % interval", "transverse RMS", "p95", "p99"]
-    columns += ["max", "bound", "from centroids", "share"]
+    columns += ["max", "bound"]
 
     def cells(row: BinRow) -> list[str]:
         return [
@@ -75,8 +75,6 @@ def position_table(result: BenchmarkResult) -> Table:
             interval_text(row.intervals.get("position_rmse_m"), 1e3),
             *map(millimetres, (row.transverse_rmse_m, row.position_p95_m, row.position_p99_m, row.position_max_m)),
             millimetres(row.bound.position_m if row.bound else None),
-            millimetres(row.position_from_centroids_rmse_m),
-            percent(None if row.centroid_share is None else round(row.centroid_share, 3)),
         ]
 
     return Table("position", "Position error [mm]", columns, _by_distance(result, cells))
@@ -88,8 +86,9 @@ def component_tables(result: BenchmarkResult) -> list[Table]:
 
 
 def centroid_table(result: BenchmarkResult) -> Table:
-    """What each method's centroids are worth. [px]"""
+    """What each method's centroids are worth, and how much of its position error they explain."""
     columns = ["centroids", "RMS", "bias right", "bias down", "bias outward", "hub RMS", "mistaken"]
+    columns += ["position from centroids [mm]", "share"]
 
     def cells(row: BinRow) -> list[str]:
         c = row.centroids
@@ -98,6 +97,8 @@ def centroid_table(result: BenchmarkResult) -> Table:
             str(c.count),
             *map(three_digits, (c.sigma_px, *biases, c.hub_sigma_px)),
             str(c.mistaken),
+            millimetres(row.position_from_centroids_rmse_m),
+            percent(None if row.centroid_share is None else round(row.centroid_share, 3)),
         ]
 
     return Table(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -9,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.images import Pixels
+from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from nav.blobs import Blobs, disc_like_blobs
+from nav.ring_match import match_ring
 
 # Share of the box added on every side, so that a box that is a little too small cuts no marker.
 _BOX_MARGIN_FRACTION = 0.06
@@ -37,17 +40,20 @@ class Centroids:
     cov_px2: Array
 
 
-def binary_centroids(channel: Pixels, box_xywh_px: tuple[float, float, float, float], least_count: int) -> Centroids:
+def binary_centroids(
+    channel: Pixels, box_xywh_px: tuple[float, float, float, float], layout: MarkerLayout
+) -> Centroids:
     """Centres of mass of the regions above Otsu's threshold in a box.
 
-    Where that leaves too few regions, as when white markers run together with a bright sky, Otsu's threshold of the
-    brighter class is tried. Median and opening are left out where the discs are smaller than they can stand. Regions
-    that touch the edge of the box or of the image are dropped: their centre of mass is not the marker's.
+    Where that does not show the whole ring of markers, Otsu's thresholds of its brighter class (white markers that run
+    together with a bright sky) and of its darker class (markers in shade beside sunlit ones) are tried. Median and
+    opening are left out where the discs are smaller than they can stand. Regions that touch the edge of the box or of
+    the image are dropped: their centre of mass is not the marker's.
 
     Args:
         channel: (H, W) marker channel.
         box_xywh_px: the detector's box in pixel-centre coordinates.
-        least_count: fewest regions of which something can be made.
+        layout: the drogue's markers.
 
     Source: the seed paper, section 3.2; Otsu, doi:10.1109/TSMC.1979.4310076.
     """
@@ -55,11 +61,7 @@ def binary_centroids(channel: Pixels, box_xywh_px: tuple[float, float, float, fl
     if right - left < 3 or bottom - top < 3:
         return Centroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
     roi = np.ascontiguousarray(channel[top:bottom, left:right])
-    level = _otsu(roi.ravel())
-    blobs, opened = _regions(roi > level)
-    bright = roi[roi > level]
-    if len(blobs) < least_count and bright.size:
-        blobs, opened = max((blobs, opened), _regions(roi > _otsu(bright)), key=lambda regions: len(regions[0]))
+    blobs, opened = _best_regions(roi, layout)
     moved = Blobs(blobs.centers_px + np.array([left, top]), blobs.areas_px2)
     variance = quantisation_variance_px2(moved.radii_px)
     if opened:
@@ -72,9 +74,32 @@ def _otsu(levels: Pixels) -> float:
     return float(cv2.threshold(levels, 0, 1, cv2.THRESH_BINARY | cv2.THRESH_OTSU)[0])
 
 
-def _regions(above: NDArray[np.bool_]) -> tuple[Blobs, bool]:
-    """Disc-like regions, and whether they went through median and opening."""
-    mask = above.view(np.uint8)
+def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool]:
+    """Regions by the first of three thresholds that shows most of the ring of markers."""
+    best, most = (Blobs(np.zeros((0, 2)), np.zeros(0)), False), -1
+    for level in _thresholds(roi):
+        regions = _regions(roi, level)
+        ring = match_ring(regions[0], layout)
+        count = 0 if ring is None else ring.count
+        if count > most:
+            best, most = regions, count
+        if most == layout.count:
+            break
+    return best
+
+
+def _thresholds(roi: Pixels) -> Iterator[float]:
+    """Otsu's threshold, then those of its brighter and its darker class."""
+    level = _otsu(roi.ravel())
+    yield level
+    for part in (roi[roi > level], roi[roi <= level]):
+        if part.size:
+            yield _otsu(part)
+
+
+def _regions(roi: Pixels, level: float) -> tuple[Blobs, bool]:
+    """Disc-like regions above a level, and whether they went through median and opening."""
+    mask: NDArray[np.uint8] = (roi > level).view(np.uint8)
     blobs = disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS)
     if len(blobs) == 0 or 2 * np.median(blobs.radii_px) < _LEAST_DIAMETER_FOR_MORPHOLOGY_PX:
         return blobs, False

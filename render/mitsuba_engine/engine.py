@@ -66,6 +66,8 @@ class MitsubaEngine:
         traced = self._tracer.trace(frame, settings, around)
         stage_s |= traced.stage_s
         started = time.process_time()
+        for eye in EYES:
+            traced.eyes[eye].put_behind_air(frame.environment.extinction_per_m, around.horizon_radiance)
         eyes = {eye: traced.eyes[eye].over(behind) for eye in EYES}
         stage_s["composite"] = time.process_time() - started
         return StereoRadiance(

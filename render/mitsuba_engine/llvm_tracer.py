@@ -13,11 +13,18 @@ from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
-from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.scene import DrogueScene, scene_key
-from render.mitsuba_engine.traced import Traced, TracedEye, blur_px, pixels_to_trace, pose_polynomial
+from render.mitsuba_engine.traced import (
+    Traced,
+    TracedEye,
+    amodal_counts,
+    blur_px,
+    pixels_to_trace,
+    pose_polynomial,
+    settings_by_plan,
+)
 from scenes.seeding import generator
 from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import Surroundings
@@ -25,6 +32,9 @@ from scenes.surroundings import Surroundings
 # Lanes of one launch: bounds memory (about 300 bytes a lane) without costing speed.
 _MOST_LANES = 2_000_000
 _PLAN = ("drogue", "surround")
+CENTER = (0.5, 0.5)
+# Next to the centre by a thousandth of a pixel, off any axis: for rays that slip through a seam at the centre itself.
+ASIDE = (0.501, 0.5007)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +70,13 @@ class LlvmTracer:
         plans: dict[Eye, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
         for eye in EYES:
             passes = _Passes(frame, eye, self._scene)
-            ids = [passes.part_ids(moment) for moment in times]
-            eyes[eye] = passes.traced_eye(ids[0])
-            plans[eye] = pixels_to_trace(ids, 1 + int(np.ceil(moves_px)), frame.drogue.marker_count)
+            seen = [passes.part_ids(moment) for moment in times]
+            eyes[eye] = passes.traced_eye(*seen[0])
+            plans[eye] = pixels_to_trace(
+                [ids for ids, _ in seen], 1 + int(np.ceil(moves_px)), frame.drogue.marker_count
+            )
         stage_s["passes"], started = time.process_time() - started, time.process_time()
-        noise = self._trace_radiance(frame, settings, around, eyes, plans)
+        noise = self._trace_radiance(frame, settings, eyes, plans)
         stage_s["paths"] = time.process_time() - started
         return Traced(eyes, noise, stage_s)
 
@@ -79,20 +91,19 @@ class LlvmTracer:
         self,
         frame: FrameSpec,
         settings: RenderSettings,
-        around: Surroundings,
         eyes: dict[Eye, TracedEye],
         plans: dict[Eye, tuple[NDArray[np.int64], NDArray[np.int64]]],
     ) -> float:
         """Fill in the traced pixels of both eyes; returns the relative noise of the drogue's pixels."""
         seeds = generator(frame.seed, frame.frame_index, "mitsuba samples")
-        counts = (settings.samples_per_px, settings.surround_samples_per_px)
-        haze = frame.environment.extinction_per_m, around.horizon_radiance
+        assert frame.drogue is not None
+        lit = frame.drogue.marker_luminance_cd_m2 > 0
         noise: list[NDArray[np.float32]] = []
         for eye in EYES:
             camera = _CameraRays(frame, eye)
             parts = []
-            for name, pixel, count in zip(_PLAN, plans[eye], counts, strict=True):
-                samples = self._sample_pixels(camera, pixel, count, settings.max_depth, haze, seeds)
+            for name, pixel, count, depth in zip(_PLAN, plans[eye], *settings_by_plan(settings), strict=True):
+                samples = self._sample_pixels(camera, pixel, count, (depth, lit), seeds)
                 parts.append((pixel, samples))
                 if name == "drogue" and count > 1:
                     noise.append(samples.variance[samples.coverage > 0.999])
@@ -107,11 +118,18 @@ class LlvmTracer:
         camera: _CameraRays,
         pixel: NDArray[np.int64],
         count: int,
-        max_depth: int,
-        haze: tuple[float, NDArray[np.float64]],
+        path: tuple[int, bool],
         seeds: np.random.Generator,
     ) -> _Samples:
-        """Mean over `count` paths through random places of each pixel, at random times of the exposure."""
+        """Mean over `count` paths through random places of each pixel, at random times of the exposure.
+
+        Args:
+            camera: gives the rays.
+            pixel: (P,) flat indices.
+            count: paths a pixel.
+            path: the longest path, and whether lamps are lit.
+            seeds: draws the sampler's seeds.
+        """
         radiance = np.empty((len(pixel), 3), dtype=np.float32)
         coverage = np.empty(len(pixel), dtype=np.float32)
         variance = np.zeros(len(pixel), dtype=np.float32)
@@ -119,7 +137,7 @@ class LlvmTracer:
         for first in range(0, len(pixel), step):
             part = slice(first, min(first + step, len(pixel)))
             seed = int(seeds.integers(2**31))
-            sums = self._launch(camera, pixel[part], count, max_depth, haze, seed)
+            sums = self._launch(camera, pixel[part], count, path, seed)
             radiance[part], coverage[part] = sums[:, :3] / count, sums[:, 3] / count
             if count > 1:
                 luminance = radiance[part] @ REC709_LUMINANCE.astype(np.float32)
@@ -132,8 +150,7 @@ class LlvmTracer:
         camera: _CameraRays,
         pixel: NDArray[np.int64],
         count: int,
-        max_depth: int,
-        haze: tuple[float, NDArray[np.float64]],
+        path: tuple[int, bool],
         seed: int,
     ) -> NDArray[np.float32]:
         """(P, 5) sums over the paths of each pixel: red, green, blue, coverage, squared luminance."""
@@ -146,12 +163,13 @@ class LlvmTracer:
         sampler.seed(seed, lanes)
         of_pixel = dr.arange(mi.UInt32, lanes) // count
         ray = camera.rays(dr.gather(mi.UInt32, mi.UInt32(pixel), of_pixel), sampler.next_2d(), sampler.next_1d())
+        max_depth, lit = path
         color, hit, _ = self._integrator(max_depth).sample(self._scene.scene, sampler, ray)
-        first = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-        color = dr.select(hit, color + first.emitter(self._scene.scene).eval(first), 0.0)
-        extinction, air = haze
-        clear = dr.exp(-extinction * dr.select(hit, first.t, 0.0))
-        color = dr.select(hit, color * clear + mi.Color3f(air.tolist()) * (1.0 - clear), 0.0)
+        color = dr.select(hit, color, 0.0)
+        if lit:
+            # The integrator hides the lamps themselves along with the sky.
+            first = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
+            color += first.emitter(self._scene.scene).eval(first)
         luminance = dr.dot(mi.Vector3f(color), mi.Vector3f(REC709_LUMINANCE.tolist()))
         channels = [color[0], color[1], color[2], dr.select(hit, mi.Float(1.0), 0.0), dr.square(luminance)]
         # Without this every sum would trace the paths again.
@@ -165,6 +183,7 @@ class _CameraRays:
     def __init__(self, frame: FrameSpec, eye: Eye) -> None:
         self.camera: PinholeCamera = frame.rig.camera
         self._pose = pose_polynomial(frame, eye)
+        self.pose_at_middle = self._pose[0]
         self.moves = bool(np.abs(self._pose[1:]).max() > 0)
 
     def rays(self, pixel: Any, place: Any, moment: Any) -> Any:
@@ -203,19 +222,18 @@ class _Passes:
         self._scene = scene
         camera = frame.rig.camera
         self._shape = (camera.height_px, camera.width_px)
-        self._eye_from_drogue = np.linalg.inv(np.vstack([self._rays._pose[0], [0, 0, 0, 1]]))[:3, :3]
 
-    def _center_rays(self, pixel: Any, moment: float = 0.5) -> Any:
-        return self._rays.rays(pixel, mi.Point2f(0.5, 0.5), mi.Float(moment))
+    def _center_rays(self, pixel: Any, moment: float = 0.5, place: tuple[float, float] = CENTER) -> Any:
+        return self._rays.rays(pixel, mi.Point2f(*place), mi.Float(moment))
 
-    def part_ids(self, s: float) -> NDArray[np.uint8]:
-        """(H, W) part ids at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""
+    def part_ids(self, s: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """(H, W) part ids and distances [m] at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""
         pixel = dr.arange(mi.UInt32, self._shape[0] * self._shape[1])
-        ids = self._ids(self._scene.scene, self._center_rays(pixel, (s + 1) / 2))
-        return ids.reshape(self._shape)
+        ids, distance = self._hits(self._scene.scene, self._center_rays(pixel, (s + 1) / 2))
+        return ids.reshape(self._shape), distance.reshape(self._shape)
 
     @staticmethod
-    def _ids(scene: Any, ray: Any) -> NDArray[np.uint8]:
+    def _hits(scene: Any, ray: Any) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
         registry: Any = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
         registry_ids = np.array(registry)
@@ -224,40 +242,55 @@ class _Passes:
             table[index] = int(shape.id().removeprefix("part_"))
         of_hit: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
         ids = dr.gather(mi.UInt32, mi.UInt32(table), of_hit, hit.is_valid())
-        return np.array(ids).astype(np.uint8)
+        dr.eval(ids, hit.t)
+        return np.array(ids).astype(np.uint8), np.array(hit.t)
 
-    def traced_eye(self, part_id: NDArray[np.uint8]) -> TracedEye:
+    def traced_eye(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> TracedEye:
         """The passes at mid-exposure, without radiance yet."""
         depth = np.full(self._shape, np.inf, dtype=np.float32)
         normal = np.zeros((*self._shape, 3), dtype=np.float32)
         covered = np.flatnonzero(part_id)
         if len(covered):
-            ray = self._center_rays(mi.UInt32(covered))
-            hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-            points, normals = np.array(hit.p).T, np.array(hit.n).T
-            pose = self._rays._pose[0]
-            forward = pose[:, 2]
-            depth.reshape(-1)[covered] = (points - pose[:, 3]) @ forward
-            normal.reshape(-1, 3)[covered] = normals @ self._eye_from_drogue.T
+            points, normals, leaked = self._surface(covered, CENTER)
+            if leaked.any():
+                aside = covered[leaked]
+                points[leaked], normals[leaked], _ = self._surface(aside, ASIDE)
+                ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=ASIDE))
+                part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
+            pose = self._rays.pose_at_middle
+            depth.reshape(-1)[covered] = (points - pose[:, 3]) @ pose[:, 2]
+            normal.reshape(-1, 3)[covered] = normals @ pose[:, :3]
         return TracedEye(
             part_id,
             depth,
             normal,
-            self._amodal(part_id),
+            self._amodal(part_id, distance_m),
             np.zeros(0, dtype=np.int64),
             np.zeros((0, 3), dtype=np.float32),
             np.zeros(0, dtype=np.float32),
         )
 
-    def _amodal(self, part_id: NDArray[np.uint8]) -> dict[int, int]:
+    def _surface(
+        self, pixel: NDArray[np.int64], place: tuple[float, float]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        """(P, 3) points and normals in the drogue frame, and (P,) which rays slipped into a part through a seam.
+
+        All parts are closed: a surface that looks away from the camera is seen from inside, by a ray that passed
+        exactly between two triangles.
+        """
+        ray = self._center_rays(mi.UInt32(pixel), place=place)
+        hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
+        inside = hit.is_valid() & (dr.dot(hit.n, ray.d) > 0)
+        dr.eval(hit.p, hit.n, inside)
+        return np.array(hit.p).T, np.array(hit.n).T, np.array(inside)
+
+    def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
         """Pixel centres that each marker and the hub would cover alone, on the image's grid."""
         rows, columns = np.flatnonzero(part_id.any(axis=1)), np.flatnonzero(part_id.any(axis=0))
         if not len(rows):
             return {}
         # Where a hidden feature would be, something else is seen: what is covered bounds the features too.
-        width = self._shape[1]
-        inside = (np.arange(rows[0], rows[-1] + 1)[:, None] * width + np.arange(columns[0], columns[-1] + 1)).ravel()
-        ids = self._ids(self._scene.features, self._center_rays(mi.UInt32(inside)))
-        counts = np.bincount(ids, minlength=256)
-        wanted = [int(Part.HUB), *range(FIRST_MARKER_ID, 256)]
-        return {part: int(counts[part]) for part in wanted if counts[part]}
+        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        pixel = np.arange(part_id.size, dtype=np.uint32).reshape(self._shape)[window].ravel()
+        alone_id, alone_m = self._hits(self._scene.features, self._center_rays(mi.UInt32(pixel)))
+        return amodal_counts(part_id[window].ravel(), distance_m[window].ravel(), alone_id, alone_m)

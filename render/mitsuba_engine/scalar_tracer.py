@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -13,11 +12,18 @@ from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
-from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.scene import DrogueScene, scene_key
-from render.mitsuba_engine.traced import Traced, TracedEye, blur_px, pixels_to_trace, pose_polynomial
+from render.mitsuba_engine.traced import (
+    Traced,
+    TracedEye,
+    amodal_counts,
+    blur_px,
+    pixels_to_trace,
+    pose_polynomial,
+    settings_by_plan,
+)
 from scenes.seeding import generator
 from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import Surroundings
@@ -52,14 +58,14 @@ class ScalarTracer:
         for eye in EYES:
             view = _View(frame, eye)
             seen = [view.passes(self._scene.scene, moment) for moment in moments]
-            alone, _, _ = view.passes(self._scene.features, 0.0)
+            alone = view.passes(self._scene.features, 0.0)
             stage_s["passes"] = stage_s.get("passes", 0.0) + time.process_time() - started
             started = time.process_time()
             plans = pixels_to_trace(
                 [part_id for part_id, _, _ in seen], 1 + int(np.ceil(moves_px)), frame.drogue.marker_count
             )
             eyes[eye] = _passes_of(seen[0], alone)
-            noise += self._fill_radiance(eyes[eye], view, plans, settings, (frame, around, seeds, moves_px))
+            noise += self._fill_radiance(eyes[eye], view, plans, settings, (seeds, moves_px))
             stage_s["paths"] = stage_s.get("paths", 0.0) + time.process_time() - started
             started = time.process_time()
         return Traced(eyes, float(np.sqrt(np.mean(np.square(noise)))) if noise else 1.0, stage_s)
@@ -70,13 +76,14 @@ class ScalarTracer:
         view: _View,
         plans: tuple[NDArray[np.int64], NDArray[np.int64]],
         settings: RenderSettings,
-        context: tuple[FrameSpec, Surroundings, np.random.Generator, float],
+        context: tuple[np.random.Generator, float],
     ) -> list[float]:
-        frame, around, seeds, moves_px = context
+        """Trace the planned pixels; returns the relative noise of the drogue's pixels where it can be told."""
+        seeds, moves_px = context
         slices = _STILL_SLICES if moves_px < 0.05 else _MOVING_SLICES
         chunks: list[tuple[NDArray[np.int64], NDArray[np.float32]]] = []
         noise: list[float] = []
-        for pixel, samples in zip(plans, (settings.samples_per_px, settings.surround_samples_per_px), strict=True):
+        for pixel, samples, depth in zip(plans, *settings_by_plan(settings), strict=True):
             if len(pixel) == 0:
                 continue
             pictures = []
@@ -84,14 +91,12 @@ class ScalarTracer:
                 # Samples that do not divide evenly go to the first slices.
                 count = samples // min(slices, samples) + (index < samples % min(slices, samples))
                 moment = (index + 0.5) / min(slices, samples) * 2 - 1 if moves_px >= 0.05 else 0.0
-                rgba = view.radiance(
-                    self._scene, (pixel, moment, count, settings.max_depth), int(seeds.integers(2**31))
-                )
+                rgba = view.radiance(self._scene, (pixel, moment, count, depth), int(seeds.integers(2**31)))
                 pictures.append(rgba.reshape(-1, 4)[pixel])
             mean = np.mean(pictures, axis=0)
             if pixel is plans[0] and len(pictures) > 1 and moves_px < 0.05:
                 noise.append(_relative_noise(pictures))
-            chunks.append((pixel, _through_haze(mean, traced, pixel, frame, around)))
+            chunks.append((pixel, mean.astype(np.float32)))
         if chunks:
             traced.pixel = np.concatenate([pixel for pixel, _ in chunks])
             values = np.concatenate([rgba for _, rgba in chunks])
@@ -99,11 +104,11 @@ class ScalarTracer:
         return noise
 
 
-def _passes_of(
-    seen: tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]], alone: NDArray[np.uint8]
-) -> TracedEye:
-    counts = np.bincount(alone.ravel(), minlength=256)
-    amodal = {part: int(counts[part]) for part in (int(Part.HUB), *range(FIRST_MARKER_ID, 256)) if counts[part]}
+_Passes = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
+
+
+def _passes_of(seen: _Passes, alone: _Passes) -> TracedEye:
+    amodal = amodal_counts(seen[0], seen[1], alone[0], alone[1])
     nothing = np.zeros(0, dtype=np.float32)
     return TracedEye(*seen, amodal, np.zeros(0, dtype=np.int64), nothing.reshape(0, 3), nothing)
 
@@ -116,17 +121,6 @@ def _relative_noise(pictures: list[NDArray[np.float32]]) -> float:
         return 1.0
     relative = (first[full] - second[full]) / (first[full] + second[full])
     return float(np.sqrt(np.mean(relative**2)))
-
-
-def _through_haze(
-    rgba: NDArray[np.float32], traced: TracedEye, pixel: NDArray[np.int64], frame: FrameSpec, around: Surroundings
-) -> NDArray[np.float32]:
-    """The pixels behind the air between them and the camera; an edge pixel has the depth of its nearest neighbour."""
-    nearest = cv2.erode(traced.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[pixel]
-    clear = np.exp(-frame.environment.extinction_per_m * np.where(np.isfinite(nearest), nearest, 0.0))[:, None]
-    hazed = rgba[:, :3] * clear + rgba[:, 3:] * around.horizon_radiance * (1.0 - clear)
-    result: NDArray[np.float32] = np.concatenate([hazed, rgba[:, 3:]], axis=1).astype(np.float32)
-    return result
 
 
 class _View:
@@ -171,7 +165,7 @@ class _View:
             }
         )
 
-    def passes(self, scene: Any, s: float) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    def passes(self, scene: Any, s: float) -> _Passes:
         """Part ids, planar depth and normals along the rays through the pixel centres."""
         center_sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
         sensor = self._sensor(s, center_sampler, "rgb", {})
@@ -182,9 +176,24 @@ class _View:
         part_id: NDArray[np.uint8] = table[values[..., 0].astype(np.int64)]
         hit = part_id > 0
         pose = self._drogue_from_eye(s)
+        self._mend_leaks(scene, pose, (part_id, values))
         depth = np.where(hit, (values[..., 1:4] - pose[:3, 3]) @ pose[:3, 2], np.inf).astype(np.float32)
         normal = np.where(hit[..., None], values[..., 4:] @ pose[:3, :3], 0.0).astype(np.float32)
         return part_id, depth, normal
+
+    def _mend_leaks(self, scene: Any, pose: Array, passes: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
+        """Look again, a thousandth of a pixel aside, where a ray slipped between two triangles into a closed part."""
+        part_id, values = passes
+        towards = values[..., 1:4] - pose[:3, 3]
+        for v, u in np.argwhere((part_id > 0) & ((values[..., 4:] * towards).sum(axis=-1) > 0)):
+            direction = pose[:3, :3] @ self._camera.rays(np.array([u + 0.001, v + 0.0007]))
+            ray = mi.Ray3f(
+                mi.Point3f(pose[:3, 3].tolist()), mi.Vector3f((direction / np.linalg.norm(direction)).tolist())
+            )
+            hit = scene.ray_intersect(ray)
+            if hit.is_valid():
+                part_id[v, u] = int(hit.shape.id().removeprefix("part_"))
+                values[v, u, 1:] = [*hit.p, *hit.n]
 
     def radiance(
         self, scene: DrogueScene, what: tuple[NDArray[np.int64], float, int, int], seed: int

@@ -9,10 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
-from drogue_models.parts import Part, drogue_part_ids
+from datasets_manifest.recipe import RenderSettings
+from drogue_models.parts import FIRST_MARKER_ID, Part, drogue_part_ids
 from geometry.se3 import exp_twist
 from geometry.stereo import Eye
 from render.engine import EyeRadiance
+
+# Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
+_SEAM_DEPTH_FRACTION = 1e-5
 
 
 @dataclass(eq=False)
@@ -33,6 +37,20 @@ class TracedEye:
     pixel: NDArray[np.int64]
     radiance_cd_m2: NDArray[np.float32]
     coverage: NDArray[np.float32]
+
+    def put_behind_air(self, extinction_per_m: float, air: NDArray[np.float64]) -> None:
+        """Let the air between parts and camera take its share of their light and add its own, in place.
+
+        A pixel on an edge has the depth of its nearest neighbour; the drogue's own depth matters little to the haze.
+
+        Args:
+            extinction_per_m: extinction coefficient. [1/m]
+            air: (3,) radiance of endless air. [cd/m2]
+        """
+        nearest = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[self.pixel]
+        clear = np.exp(-extinction_per_m * np.where(np.isfinite(nearest), nearest, 0.0))[:, None]
+        through = self.radiance_cd_m2 * clear + self.coverage[:, None] * (1.0 - clear) * air
+        self.radiance_cd_m2 = through.astype(np.float32)
 
     def over(self, behind: NDArray[np.float32]) -> EyeRadiance:
         """The traced pixels over the surroundings `behind` (H, W, 3)."""
@@ -76,6 +94,36 @@ def blur_px(frame: FrameSpec) -> float:
     reach = frame.drogue.rim_radius_m * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
     seen = [frame.rig.camera.project(frame.left_from_drogue_at(s).apply(reach)) for s in (-half_s, 0.0, half_s)]
     return float(max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[2] - seen[1]).max()))
+
+
+def amodal_counts(
+    part_id: NDArray[np.uint8],
+    depth_m: NDArray[np.float32],
+    alone_id: NDArray[np.uint8],
+    alone_depth_m: NDArray[np.float32],
+) -> dict[int, int]:
+    """Pixel centres that each marker and the hub would cover if nothing stood before it.
+
+    A ray along the seam between a feature and the part that it is set into may fall to either; both lie at one depth,
+    and then the whole scene's verdict counts, so that an unoccluded feature has exactly as many as are seen of it.
+
+    Args:
+        part_id, depth_m: what the pixel centres see, and how far.
+        alone_id, alone_depth_m: the same with markers and hub alone; of equal shape.
+    """
+    feature = (part_id >= FIRST_MARKER_ID) | (part_id == Part.HUB)
+    with np.errstate(invalid="ignore"):
+        one_depth = np.abs(depth_m - alone_depth_m) <= _SEAM_DEPTH_FRACTION * depth_m
+    counts = np.bincount(np.where(feature | one_depth, part_id, alone_id).ravel(), minlength=256)
+    return {part: int(counts[part]) for part in (int(Part.HUB), *range(FIRST_MARKER_ID, 256)) if counts[part]}
+
+
+def settings_by_plan(settings: RenderSettings) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Samples a pixel, and longest path, for the drogue and for what hangs around it.
+
+    Hose and tanker are convex enough for light straight from sky, sun and ground.
+    """
+    return (settings.samples_per_px, settings.surround_samples_per_px), (settings.max_depth, 2)
 
 
 def pixels_to_trace(

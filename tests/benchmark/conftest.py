@@ -249,7 +249,7 @@ def make_records(stations_m: Sequence[float], count: int, rng: np.random.Generat
     return [*records, *(make_record(len(records) + k, None) for k in range(empty))]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[PairRecord]]:
     """Nine pairs at three stations and one without a drogue."""
     records = make_records([2.0, 8.0, 30.0], 3, np.random.default_rng(3), empty=1)

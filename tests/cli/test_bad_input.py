@@ -113,15 +113,20 @@ def test_an_unwritable_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.mitsuba
-def test_a_full_disk_leaves_no_half_frame(smoke_dataset: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+@pytest.mark.parametrize(
+    ("most_bytes", "message"),
+    [(500_000, r"out/frames/000000: cannot be written: File too large"), (20_000, r"cannot be .*File too large")],
+)
+def test_a_full_disk_leaves_nothing_half_written(most_bytes: int, message: str, tmp_path: Path) -> None:
+    recipe, out = tmp_path / "mine.toml", tmp_path / "out"
+    recipe.write_text(RECIPE.replace("3.0", "30.0").replace("9.0", "40.0"))
 
-    # No file may grow beyond this: the manifest fits, an image does not, and the system says so as on a full disk.
+    # No file may grow beyond this, and the system says so as on a full disk: the larger limit first meets a noisy
+    # image of 1280 x 960 pixels, the smaller one a temporary file or the manifest.
     def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
-    result = _run("render", "smoke", "--out", out, "--workers", "1", before=limit)
-    _assert_refused(result, r"frames/000000: cannot be written: File too large")
+    _assert_refused(_run("render", recipe, "--out", out, "--workers", "1", before=limit), message)
     assert not out.exists()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -31,9 +30,9 @@ name = "small"
 seed = 3
 [rig]
 preset = "rgb-ideal"
-width_px = 240
-height_px = 180
-focal_px = 400.0
+width_px = 160
+height_px = 120
+focal_px = 266.0
 [frames]
 count = 6
 scenes = 3
@@ -52,49 +51,58 @@ SKY, FEATURE, STRUCTURE = 2000.0, 6000.0, 150.0
 
 
 @lru_cache(maxsize=1)
-def drogue_triangles(drogue: DrogueParameters) -> dict[int, np.ndarray]:
-    """(T, 3, 3) corners of every part in the drogue frame."""
-    return {part: np.asarray(mesh.triangles) for part, mesh in drogue_meshes(drogue).items()}
+def drogue_triangles(drogue: DrogueParameters) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 3, 3) corners of all triangles in the drogue frame and (T,) part ids."""
+    meshes = drogue_meshes(drogue)
+    corners = np.concatenate([np.asarray(mesh.triangles) for mesh in meshes.values()])
+    parts = np.repeat(np.array(list(meshes), dtype=np.uint8), [len(mesh.faces) for mesh in meshes.values()])
+    return corners, parts
 
 
-def facing_triangles(frame: FrameSpec, eye: Eye) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Part id, (3, 3) corners in the eye's frame and (3,) normal of every face that may show at a pixel centre."""
+def hits_of(frame: FrameSpec, eye: Eye) -> tuple[np.ndarray, ...]:
+    """Every hit of a pixel centre's ray on a face that looks at the eye: flat pixel, depth, part id, unit normal."""
     assert frame.drogue is not None and frame.left_from_drogue is not None
-    for part, triangles in drogue_triangles(frame.drogue).items():
-        corners = frame.left_from_drogue.apply(triangles) - frame.rig.eye_offset_m(eye)
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        facing = (normals * corners[:, 0]).sum(axis=1) < 0
-        image = frame.rig.camera.project(corners)
-        facing &= (np.ceil(image.min(axis=1)) <= np.floor(image.max(axis=1))).all(axis=1)
-        for triangle, normal in zip(corners[facing], normals[facing], strict=True):
-            yield part, triangle, normal / np.linalg.norm(normal)
+    camera = frame.rig.camera
+    corners, parts = drogue_triangles(frame.drogue)
+    corners = frame.left_from_drogue.apply(corners) - frame.rig.eye_offset_m(eye)
+    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    image = camera.project(corners)
+    low = np.maximum(np.ceil(image.min(axis=1)), 0).astype(int)
+    high = np.minimum(np.floor(image.max(axis=1)), (camera.width_px - 1, camera.height_px - 1)).astype(int)
+    size = np.maximum(high - low + 1, 0)
+    # Every pixel centre in every triangle's bounding box.
+    count = size.prod(axis=1) * ((faces * corners[:, 0]).sum(axis=1) < 0)
+    index = np.repeat(np.arange(len(count)), count)
+    place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    pixel = low[index] + np.stack([place % size[index, 0], place // size[index, 0]], axis=-1)
+    side = []
+    for one, other in ((0, 1), (1, 2), (2, 0)):
+        edge, reach = image[index, other] - image[index, one], pixel - image[index, one]
+        side.append(edge[:, 0] * reach[:, 1] - edge[:, 1] * reach[:, 0])
+    inside = (np.min(side, axis=0) >= 0) | (np.max(side, axis=0) <= 0)
+    index, pixel = index[inside], pixel[inside]
+    depth = (corners[index, 0] * faces[index]).sum(axis=1) / (camera.rays(pixel) * faces[index]).sum(axis=1)
+    normals = faces[index] / np.linalg.norm(faces[index], axis=1, keepdims=True)
+    return pixel[:, 1] * camera.width_px + pixel[:, 0], depth, parts[index], normals
 
 
 def draw_eye(frame: FrameSpec, eye: Eye) -> EyeRadiance:
-    """One eye's passes by a z-buffer at pixel centres, each part evenly bright."""
+    """One eye's passes at pixel centres, each part evenly bright."""
     camera = frame.rig.camera
     shape = (camera.height_px, camera.width_px)
     ids, depth, normal = np.zeros(shape, np.uint8), np.full(shape, np.inf), np.zeros((*shape, 3))
-    fronts: dict[int, np.ndarray] = {}
-    for part, corners, face in [] if frame.drogue is None else facing_triangles(frame, eye):
-        image = camera.project(corners)
-        low = np.maximum(np.ceil(image.min(axis=0)), 0).astype(int)
-        high = np.minimum(np.floor(image.max(axis=0)), (camera.width_px - 1, camera.height_px - 1)).astype(int)
-        if (low > high).any():
-            continue
-        v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
-        edges = [
-            (b[0] - a[0]) * (v - a[1]) - (b[1] - a[1]) * (u - a[0])
-            for a, b in zip(image, image[[1, 2, 0]], strict=True)
-        ]
-        inside = np.all([edge >= 0 for edge in edges], axis=0) | np.all([edge <= 0 for edge in edges], axis=0)
-        z = (corners[0] @ face) / (camera.rays(np.stack([u, v], axis=-1)) @ face)
-        window = (slice(low[1], high[1] + 1), slice(low[0], high[0] + 1))
-        nearer = inside & (z < depth[window])
-        depth[window][nearer], ids[window][nearer], normal[window][nearer] = z[nearer], part, face
+    amodal = {}
+    if frame.drogue is not None:
+        pixels, depths, parts, normals = hits_of(frame, eye)
+        order = np.lexsort((depths, pixels))
+        _, first = np.unique(pixels[order], return_index=True)
+        nearest = order[first]
+        ids.flat[pixels[nearest]], depth.flat[pixels[nearest]] = parts[nearest], depths[nearest]
+        normal.reshape(-1, 3)[pixels[nearest]] = normals[nearest]
         # What counts as the whole feature is its front face, which looks along the drogue's -z.
-        if (part == Part.HUB or part >= FIRST_MARKER_ID) and face @ frame.left_from_drogue.rotation[:, 2] < -0.999:
-            fronts.setdefault(part, np.zeros(shape, bool))[window] |= inside
+        front = normals @ frame.left_from_drogue.rotation[:, 2] < -0.999
+        features = (int(Part.HUB), *(FIRST_MARKER_ID + index for index in range(frame.drogue.marker_count)))
+        amodal = {part: len(np.unique(pixels[front & (parts == part)])) for part in features}
     level = np.where(ids == Part.SKY, SKY, STRUCTURE)
     level = np.where((ids == Part.HUB) | (ids >= FIRST_MARKER_ID), FEATURE, level)
     return EyeRadiance(
@@ -103,7 +111,7 @@ def draw_eye(frame: FrameSpec, eye: Eye) -> EyeRadiance:
         part_id=ids,
         depth_m=depth.astype(np.float32),
         normal=normal.astype(np.float32),
-        amodal_px={part: int(np.count_nonzero(front)) for part, front in fronts.items()},
+        amodal_px=amodal,
     )
 
 

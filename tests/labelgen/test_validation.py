@@ -102,6 +102,16 @@ def test_depth_error_of_a_tenth_of_a_millimetre_is_found(full_pairs):
         )
 
 
+def test_a_marker_that_spreads_over_the_face_is_found(full_pairs):
+    pair = full_pairs[0]
+    ids = pair.radiance.left.part_id.copy()
+    rows, columns = np.nonzero(ids == FIRST_MARKER_ID)
+    ids[rows[0] - 2, columns[0]] = FIRST_MARKER_ID
+    amodal = pair.radiance.left.amodal_px | {FIRST_MARKER_ID: len(rows) + 1}
+    faults = check_against_passes(pair.record, with_left(pair, part_id=ids, amodal_px=amodal))
+    assert len(faults) == 1 and "markers[0]: 1 pixels of part 32 lie beyond its edge" in faults[0]
+
+
 def test_wrong_visibility_is_found(full_pairs):
     pair = full_pairs[0]
     amodal = dict(pair.radiance.left.amodal_px)

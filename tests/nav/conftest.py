@@ -23,13 +23,15 @@ GREEN_RGB = (48.0, 66.0, 30.0)
 FACE_RGB = (7.0, 7.0, 7.0)
 
 
-def pose(x_m: float, y_m: float, z_m: float, pitch_deg: float = 0, yaw_deg: float = 0, roll_deg: float = 0):
+def make_left_from_drogue(
+    x_m: float, y_m: float, z_m: float, pitch_deg: float = 0, yaw_deg: float = 0, roll_deg: float = 0
+):
     return RigidTransform(rotation_from_angles(*np.radians([pitch_deg, yaw_deg, roll_deg])), np.array([x_m, y_m, z_m]))
 
 
 @pytest.fixture
 def make_pose() -> Callable[..., RigidTransform]:
-    return pose
+    return make_left_from_drogue
 
 
 def background(rig: StereoRig, kind: str) -> np.ndarray:
@@ -68,9 +70,7 @@ def paint_disc(
     y = ((np.arange(top, bottom)[:, None] + sub).ravel() - camera.cy_px) / camera.fy_px
     n = place.rotation[:, 2]
     depth = (n @ origin) / (n[0] * x[None, :] + n[1] * y[:, None] + n[2])
-    radius2 = (
-        (depth * x[None, :] - origin[0]) ** 2 + (depth * y[:, None] - origin[1]) ** 2 + (depth - origin[2]) ** 2
-    )
+    radius2 = (depth * x[None, :] - origin[0]) ** 2 + (depth * y[:, None] - origin[1]) ** 2 + (depth - origin[2]) ** 2
     inside = (radius2 <= outer**2) & (radius2 >= inner**2)
     share = inside.reshape(bottom - top, samples, right - left, samples).mean(axis=(1, 3))[..., None]
     part = image[top:bottom, left:right]

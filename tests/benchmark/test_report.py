@@ -1,0 +1,210 @@
+import re
+import xml.etree.ElementTree as ElementTree
+from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
+
+import matplotlib
+import numpy as np
+import pytest
+
+from datasets_manifest.estimates import NoFix, write_estimates
+from datasets_manifest.reader import Dataset
+from datasets_manifest.records import PairRecord
+from droguekit.benchmark.benchmark import run_benchmark
+from droguekit.benchmark.contact_sheet import contact_tiles, label_picture
+from droguekit.benchmark.figures import QUANTITIES, error_panel, method_styles
+from droguekit.benchmark.narrative import best_method, result_sentences
+from droguekit.benchmark.number_text import distance_text, percent, plain_number, three_digits
+from droguekit.benchmark.report import write_report
+from droguekit.benchmark.result import BenchmarkResult
+
+DatasetFixture = tuple[Path, list[PairRecord]]
+METHODS = {"joint": 1.0, "paper": 6.0, "circle-fit": 4.0}
+
+# Elements that HTML allows to stay open.
+VOID = {"meta", "img", "link", "br", "hr"}
+
+
+class Page(HTMLParser):
+    """Collects ids and references, and checks that elements nest."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.tags: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        self._look(attrs)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self._look(attrs)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def _look(self, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("src", "href", "action", "data", "poster"):
+                self.references.append(value or "")
+
+
+@pytest.fixture
+def scored(
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path, rng: np.random.Generator
+) -> tuple[Path, Path, BenchmarkResult]:
+    folder, records = dataset
+    estimates = tmp_path / "estimates.jsonl"
+    write_estimates(estimates, build.estimates(records, METHODS, rng))
+    return folder, estimates, run_benchmark(folder, estimates)
+
+
+def test_the_page_needs_nothing_from_outside(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
+    write_report(*scored, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = Page()
+    page.feed(text)
+    assert page.open == []
+    assert all(reference.startswith(("#", "data:image/jpeg;base64,")) for reference in page.references)
+    without_pictures = re.sub(r"data:image/jpeg;base64,[\w+/=]+", "", text)
+    assert not re.search(r"https?:|//[a-z]|@import|url\((?!#)", without_pictures)
+    assert "script" not in page.tags
+    assert "link" not in page.tags
+    targets = {reference[1:] for reference in page.references if reference.startswith("#")}
+    assert targets <= set(page.ids)
+
+
+def test_the_page_has_every_figure_picture_and_table(
+    scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path
+) -> None:
+    folder, estimates, result = scored
+    write_report(folder, estimates, result, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for quantity in QUANTITIES:
+        assert f'aria-label="{quantity.title} against distance' in text
+    assert text.count("data:image/jpeg") == 9
+    for name in ("overall", "position", "x", "y", "z", "pitch", "yaw", "centroids", "times"):
+        assert f'id="table-{name}"' in text
+    assert result.dataset.sha256 in text
+    assert "prefers-color-scheme: dark" in text
+    assert "@media print" in text
+    assert three_digits(1e3 * result.methods["paper"].overall.position_mean_m) in text
+
+
+def test_the_page_is_the_same_every_time(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
+    for name in ("a.html", "b.html"):
+        write_report(*scored, tmp_path / name)
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_a_result_of_another_dataset_is_refused(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
+    folder, estimates, result = scored
+    other = result.model_copy(update={"dataset": result.dataset.model_copy(update={"sha256": "f" * 64})})
+    with pytest.raises(ValueError, match="is not the dataset of this result"):
+        write_report(folder, estimates, other, tmp_path / "report.html")
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_names_from_files_cannot_break_the_page(
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    folder, records = dataset
+    estimates = tmp_path / "estimates.jsonl"
+    write_estimates(estimates, build.estimates(records, {'<b>&"method': 1.0}, rng))
+    write_report(folder, estimates, run_benchmark(folder, estimates), tmp_path / "report.html")
+    page = Page()
+    page.feed((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert page.open == []
+    assert "b" not in page.tags
+
+
+def test_a_page_without_a_single_pose(dataset: DatasetFixture, tmp_path: Path) -> None:
+    folder, records = dataset
+    estimates = tmp_path / "estimates.jsonl"
+    write_estimates(estimates, [NoFix(frame_index=r.frame_index, method="blind", reason="dark") for r in records])
+    result = run_benchmark(folder, estimates)
+    write_report(folder, estimates, result, tmp_path / "report.html")
+    assert best_method(result) is None
+    assert "None of the methods found a pose" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_panels_are_well_formed_and_leave_no_trace(scored: tuple[Path, Path, BenchmarkResult]) -> None:
+    before = dict(matplotlib.rcParams)
+    panels = [error_panel(scored[2], quantity) for quantity in QUANTITIES]
+    assert dict(matplotlib.rcParams) == before
+    ids: list[str] = []
+    for panel in panels:
+        root = ElementTree.fromstring(panel)
+        ids += [element.attrib["id"] for element in root.iter() if "id" in element.attrib]
+        assert root.attrib["viewBox"]
+        assert "currentColor" in panel
+    assert len(ids) == len(set(ids))
+    assert panels == [error_panel(scored[2], quantity) for quantity in QUANTITIES]
+
+
+def test_every_method_looks_different() -> None:
+    names = [f"method-{k}" for k in range(13)]
+    styles = method_styles(names)
+    assert len({(style.color, style.marker) for style in styles.values()}) == 13
+    assert len({style.marker for style in styles.values()}) == 13
+
+
+def test_the_sentences_name_the_best_method(scored: tuple[Path, Path, BenchmarkResult]) -> None:
+    result = scored[2]
+    assert best_method(result) == "joint"
+    text = " ".join(result_sentences(result))
+    assert three_digits(1e3 * result.methods["joint"].overall.position_mean_m) in text
+    assert "9 stereo pairs from 2 to 30 m" in text
+    assert "in 0 of 1 pairs without a drogue" in text
+
+
+def test_the_box_stands_where_the_record_has_it(build: SimpleNamespace) -> None:
+    """The box is drawn where the record has it, near and far."""
+    for distance_m in (1.7, 20.0):
+        record = build.record(0, build.pose(0.1, 0.0, distance_m))
+        black = np.zeros((build.rig.camera.height_px, build.rig.camera.width_px, 3), np.uint8)
+        tile = label_picture(black, record.views.left)
+        assert tile.shape == (300, 400, 3)
+        box = record.views.left.box_visible_xywh_px
+        scale = 400 / 1280
+        edge = tile[:, round((box[0] + 0.5) * scale - 0.5)]
+        # The yellow left edge of the box runs down this column, blurred over two by smoothing.
+        assert edge[:, 0].max() > 60
+
+
+def test_tiles_span_the_distances(dataset: DatasetFixture) -> None:
+    tiles = contact_tiles(Dataset(dataset[0]), count=3)
+    assert [tile.distance_m for tile in tiles] == [2.0, 8.0, 30.0]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0012345, "0.00123"),
+        (12.345, "12.3"),
+        (999.96, "1000"),
+        (123456.0, "123000"),
+        (-0.5, "−0.500"),
+        (0.0, "0.00"),
+        (None, "–"),
+    ],
+)
+def test_three_digits(value: float | None, text: str) -> None:
+    assert three_digits(value) == text
+
+
+def test_numbers_for_readers() -> None:
+    assert plain_number(2.0) == "2"
+    assert plain_number(40.0) == "40"
+    assert distance_text(1.7, 1.7) == "1.7 m"
+    assert distance_text(1.7, 2.4) == "1.7–2.4 m"
+    assert percent(0.9999) == "99.9 %"
+    assert percent(1.0) == "100 %"

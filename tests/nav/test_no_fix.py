@@ -1,0 +1,167 @@
+"""What cannot carry a pose is answered with a reason, by every method, and never with a pose or an exception."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.estimates import NoFix
+from datasets_manifest.images import StereoImages
+from drogue_models.marker_layout import MarkerLayout, marker_layout
+from drogue_models.presets import PRESETS
+from geometry.circles import project_disc_centers
+from geometry.stereo import EYES, paper_rig
+from nav.navigator import Navigator, Sighting, estimate_pose
+from nav.pose.interface import NoFixReason, Observation
+from nav.pose.registry import METHODS, pose_method
+
+RIG = paper_rig()
+DROGUE = PRESETS["red-8"]
+LAYOUT = marker_layout(DROGUE)
+
+
+def one_eye_only(pixels, cov):
+    pixels[1] = np.nan
+
+
+def nothing_seen(pixels, cov):
+    pixels[:] = np.nan
+
+
+def two_pairs(pixels, cov):
+    pixels[:, 2:] = np.nan
+
+
+def no_common_markers(pixels, cov):
+    pixels[0, :4], pixels[1, 4:] = np.nan, np.nan
+
+
+def on_one_line(pixels, cov):
+    pixels[..., 1] = 480.0
+
+
+def huge(pixels, cov):
+    pixels[0, 3, 0] = 1e12
+
+
+def infinite(pixels, cov):
+    pixels[1, 3, 1] = np.inf
+
+
+def wrong_order(pixels, cov):
+    pixels[0] = pixels[0, [0, 4, 1, 5, 2, 6, 3, 7]]
+    pixels[1] = pixels[1, [0, 4, 1, 5, 2, 6, 3, 7]]
+
+
+def eyes_swapped(pixels, cov):
+    pixels[:] = pixels[::-1].copy()
+
+
+def covariance_not_a_number(pixels, cov):
+    cov[0, 2] = np.nan
+
+
+def covariance_zero(pixels, cov):
+    cov[0, 2] = 0
+
+
+FAULTS = {
+    one_eye_only: "one eye only",
+    nothing_seen: "no markers in either eye",
+    two_pairs: "2 markers in both eyes",
+    no_common_markers: "0 markers in both eyes",
+    on_one_line: "on one line",
+    huge: "marker 3 of the left eye lies far outside",
+    infinite: "marker 3 of the right eye lies far outside",
+    eyes_swapped: "disparity is not positive",
+    covariance_not_a_number: "marker 2 of the left eye has no positive covariance",
+    covariance_zero: "marker 2 of the left eye has no positive covariance",
+}
+
+
+def broken(make_pose, corrupt) -> Observation:
+    place = make_pose(0.06, 0, 5, 7, 7)
+    pixels = np.stack([project_disc_centers(RIG, place, LAYOUT.centers_m, LAYOUT.radius_m, eye) for eye in EYES])
+    cov = np.tile(0.01 * np.eye(2), (2, 8, 1, 1))
+    corrupt(pixels, cov)
+    return Observation(RIG, LAYOUT, pixels, cov)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("corrupt", FAULTS, ids=lambda corrupt: corrupt.__name__)
+def test_every_method_gives_the_reason(make_pose, method, corrupt):
+    answer = METHODS[method](broken(make_pose, corrupt))
+    assert isinstance(answer, NoFixReason)
+    assert FAULTS[corrupt] in answer.reason
+
+
+def test_joint_refuses_markers_in_a_wrong_order(make_pose):
+    answer = METHODS["joint"](broken(make_pose, wrong_order))
+    assert isinstance(answer, NoFixReason)
+    assert "do not fit the drogue" in answer.reason
+
+
+def test_the_papers_method_needs_a_circle(make_pose):
+    centers = LAYOUT.centers_m.copy()
+    centers[0] *= 1.1
+    good = broken(make_pose, lambda pixels, cov: None)
+    observation = Observation(RIG, MarkerLayout(centers, 0.05, None), good.pixels_px, good.cov_px2)
+    answer = METHODS["paper"](observation)
+    assert isinstance(answer, NoFixReason)
+    assert "one circle" in answer.reason
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_random_points_never_raise(method):
+    rng = np.random.default_rng(6)
+    for _ in range(60):
+        pixels = rng.uniform(0, 1280, (2, 8, 2))
+        pixels[0, :, 0] = pixels[1, :, 0] + rng.uniform(0.01, 400, 8)
+        # Anything but an exception will do; a pose must be a proper one, which its type checks.
+        METHODS[method](Observation(RIG, LAYOUT, pixels, np.tile(0.01 * np.eye(2), (2, 8, 1, 1))))
+
+
+@pytest.mark.parametrize("size", [(480, 640), (961, 1280), (1, 1)])
+def test_images_of_another_size_than_the_rigs(size):
+    image = np.zeros((*size, 3), np.uint8)
+    estimates = Navigator(RIG, DROGUE).estimate(4, StereoImages(image, image, 0.0, 1e-3), list(METHODS))
+    assert [estimate.method for estimate in estimates] == list(METHODS)
+    for estimate in estimates:
+        assert isinstance(estimate, NoFix)
+        assert estimate.frame_index == 4
+        assert f"the images are {size[1]}x{size[0]} px" in estimate.reason
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_flat_images(level):
+    image = np.full((960, 1280, 3), level, np.uint8)
+    sighting = Navigator(RIG, DROGUE).observe(StereoImages(image, image, 0.0, 1e-3))
+    assert isinstance(sighting.observation, NoFixReason)
+    assert "no drogue detected in the left image" in sighting.observation.reason
+
+
+@pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
+def test_pictures_without_a_drogue(draw, make_pose, kind):
+    images = draw(RIG, None, make_pose(0, 0, 5), np.random.default_rng(7), kind=kind)
+    assert isinstance(Navigator(RIG, DROGUE).observe(images).observation, NoFixReason)
+
+
+def test_a_reason_of_the_method_keeps_the_features(make_pose):
+    sighting = Sighting(broken(make_pose, on_one_line), {"detect": 0.01})
+    estimate = estimate_pose(3, sighting, "joint")
+    assert isinstance(estimate, NoFix)
+    assert len(estimate.features) == 16
+    assert not any(feature.used for feature in estimate.features)
+    assert set(estimate.stage_s) == {"detect", "pose"}
+
+
+def test_unknown_method():
+    with pytest.raises(ValueError, match="method: there is no pose method named 'best'; there are paper, joint"):
+        pose_method("best")
+
+
+def test_observation_checks_its_shapes():
+    with pytest.raises(ValueError, match=r"pixels_px: must have shape \(2, 8, 2\)"):
+        Observation(RIG, LAYOUT, np.zeros((2, 7, 2)), np.zeros((2, 8, 2, 2)))
+    with pytest.raises(ValueError, match=r"cov_px2: must have shape \(2, 8, 2, 2\)"):
+        Observation(RIG, LAYOUT, np.zeros((2, 8, 2)), np.zeros((2, 8, 2)))
