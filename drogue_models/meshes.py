@@ -9,7 +9,7 @@ from drogue_models.body_mesh import load_body_mesh
 from drogue_models.hose import hose_mesh
 from drogue_models.parameters import DrogueParameters, HubParameters
 from drogue_models.parts import Part, marker_id
-from drogue_models.solids import area_radius_m, bar, circle_m, plate, revolve
+from drogue_models.solids import area_radius_m, bar, circle_m, plate, pocketed_plate, revolve
 from drogue_models.tanker import tanker_mesh
 from geometry.se3 import Array
 
@@ -22,9 +22,11 @@ RIM_SECTIONS = 256
 RIM_TUBE_SECTIONS = 16
 
 # Our choices, as those of published drogues are not given.
-PLATE_THICKNESS_M = 0.004
-BACKING_THICKNESS_M = 0.001
-HUB_THICKNESS_M = 0.003
+FACE_THICKNESS_M = 0.005
+POCKET_DEPTH_M = 0.004
+MARKER_THICKNESS_M = 0.003
+HUB_THICKNESS_M = 0.002
+GROOVE_PER_HUB_THICKNESS = 1.5
 # A dark sleeve lines the hub's hole: the bright wall of the hole would be seen past the near edge and move it.
 SLEEVE_THICKNESS_M = 0.00002
 RIB_WIDTH_M = 0.008
@@ -62,7 +64,7 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
     if drogue.hub is not None:
         meshes[int(Part.HUB)] = _hub(drogue, drogue.hub)
     for index in range(drogue.marker_count):
-        meshes[marker_id(index)] = plate(_marker_outline_m(drogue, index), [], PLATE_THICKNESS_M)
+        meshes[marker_id(index)] = plate(_marker_outline_m(drogue, index), [], MARKER_THICKNESS_M)
     return meshes
 
 
@@ -72,13 +74,11 @@ def _marker_outline_m(drogue: DrogueParameters, index: int) -> Array:
 
 
 def _face(drogue: DrogueParameters) -> trimesh.Trimesh:
-    """The pierced plate, and a thin one behind it that keeps the markers' backs from being seen or from shining."""
-    holes = [circle_m(drogue.face_inner_radius_m, RIM_SECTIONS)]
-    holes += [_marker_outline_m(drogue, index) for index in range(drogue.marker_count)]
+    """The plate with a pocket for every marker, deeper than the marker: two surfaces at one place would flicker."""
+    opening = circle_m(drogue.face_inner_radius_m, RIM_SECTIONS)
+    pockets = [_marker_outline_m(drogue, index) for index in range(drogue.marker_count)]
     outer = circle_m(drogue.rim_radius_m - drogue.rim_tube_radius_m, RIM_SECTIONS)
-    backing = plate(outer, holes[:1], BACKING_THICKNESS_M)
-    backing.apply_translation([0.0, 0.0, PLATE_THICKNESS_M])
-    return trimesh.util.concatenate([plate(outer, holes, PLATE_THICKNESS_M), backing])
+    return pocketed_plate(outer, opening, pockets, FACE_THICKNESS_M, POCKET_DEPTH_M)
 
 
 def _rim(drogue: DrogueParameters) -> trimesh.Trimesh:
@@ -91,7 +91,7 @@ def _rim(drogue: DrogueParameters) -> trimesh.Trimesh:
 
 def _rib_line_m(drogue: DrogueParameters) -> tuple[Array, Array]:
     """Both ends (radius, z) of a rib's centre line: inside the rim, and in the coupling's collar. [m]"""
-    front = (drogue.rim_radius_m - drogue.rim_tube_radius_m, max(drogue.rim_tube_radius_m, PLATE_THICKNESS_M))
+    front = (drogue.rim_radius_m - drogue.rim_tube_radius_m, max(drogue.rim_tube_radius_m, FACE_THICKNESS_M))
     back = (drogue.coupling_radius_m, drogue.hub_depth_m + 0.15 * drogue.coupling_length_m)
     return np.array(front), np.array(back)
 
@@ -132,7 +132,7 @@ def _coupling(drogue: DrogueParameters) -> trimesh.Trimesh:
         profile = [(0.0, recess_m), (mouth_m, recess_m), (mouth_m, 0.0)]
     else:
         inner_m, outer_m = _hub_radii_m(drogue.hub)
-        thickness_m = _hub_thickness_m(drogue)
+        thickness_m = GROOVE_PER_HUB_THICKNESS * _hub_thickness_m(drogue)
         sleeve_m = inner_m - SLEEVE_THICKNESS_M
         profile = [(0.0, recess_m), (sleeve_m, recess_m), (sleeve_m, 0.0), (inner_m, 0.0)]
         profile += [(inner_m, thickness_m), (outer_m, thickness_m), (outer_m, 0.0)]

@@ -43,6 +43,49 @@ def plate(outer_m: Array, holes_m: Sequence[Array], thickness_m: float) -> trime
     return mesh
 
 
+def pocketed_plate(
+    outer_m: Array, opening_m: Array, pockets_m: Sequence[Array], thickness_m: float, depth_m: float
+) -> trimesh.Trimesh:
+    """A flat ring between z = 0 and z = `thickness_m` with pockets sunk into its front; one solid without inner faces.
+
+    Args:
+        outer_m, opening_m: (N, 2) outlines of the ring.
+        pockets_m: (M, 2) outline of each pocket.
+        thickness_m: of the ring.
+        depth_m: of the pockets, below `thickness_m`.
+    """
+    parts = [_cap(outer_m, [opening_m, *pockets_m], 0.0, -1), _cap(outer_m, [opening_m], thickness_m, 1)]
+    parts += [_cap(pocket, [], depth_m, -1) for pocket in pockets_m]
+    parts += [_wall(outer_m, thickness_m, 1), _wall(opening_m, thickness_m, -1)]
+    parts += [_wall(pocket, depth_m, -1) for pocket in pockets_m]
+    mesh = trimesh.util.concatenate(parts)
+    mesh.merge_vertices()
+    return mesh
+
+
+def _cap(outer_m: Array, holes_m: Sequence[Array], z_m: float, facing: int) -> trimesh.Trimesh:
+    """A flat piece at one height that looks along +z or -z."""
+    points, faces = trimesh.creation.triangulate_polygon(Polygon(outer_m, holes_m), engine="earcut")
+    flat = trimesh.Trimesh(np.column_stack([points, np.full(len(points), z_m)]), faces, process=False)
+    if np.sign(flat.face_normals[:, 2].sum()) != facing:
+        flat.invert()
+    return flat
+
+
+def _wall(outline_m: Array, height_m: float, facing: int) -> trimesh.Trimesh:
+    """The wall between z = 0 and `height_m` over a counter-clockwise outline, looking outwards (1) or inwards (-1)."""
+    count = len(outline_m)
+    here, beside = np.arange(count), (np.arange(count) + 1) % count
+    points = np.vstack([np.column_stack([outline_m, np.full(count, z_m)]) for z_m in (0.0, height_m)])
+    faces = np.vstack(
+        [np.column_stack([here, beside, beside + count]), np.column_stack([here, beside + count, here + count])]
+    )
+    wall = trimesh.Trimesh(points, faces, process=False)
+    if facing < 0:
+        wall.invert()
+    return wall
+
+
 def revolve(profile_m: ArrayLike, sections: int) -> trimesh.Trimesh:
     """The body that a closed profile sweeps around the z axis.
 

@@ -70,7 +70,7 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
     gap_px = _smallest_gap_m(layout) * rings[0].scale_px_per_m
     if costs[best] > _LARGEST_COST_FRACTION * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
-    return _without_bad_pairs(first, others[best], rig, layout)
+    return Observation(rig, layout, *_without_bad_pairs(first, others[best]))
 
 
 def _markers(centroids: Centroids, ring: RingMatch) -> _EyeMarkers:
@@ -107,8 +107,8 @@ def _smallest_gap_m(layout: MarkerLayout) -> float:
     return float(gaps[np.triu_indices(layout.count, 1)].min())
 
 
-def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers, rig: StereoRig, layout: MarkerLayout) -> Observation:
-    """The observation, without pairs whose rows differ more than those of the others."""
+def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers) -> tuple[Array, Array]:
+    """Centres (2, N, 2) and covariances (2, N, 2, 2), nan for pairs whose rows differ more than those of the others."""
     rows_px = left.centers_px[:, 1] - right.centers_px[:, 1]
     both = np.isfinite(rows_px)
     sigma_px = np.sqrt(left.cov_px2[:, 1, 1] + right.cov_px2[:, 1, 1])
@@ -118,4 +118,4 @@ def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers, rig: StereoRig, la
     pixels = np.stack([left.centers_px, right.centers_px])
     covariances = np.stack([left.cov_px2, right.cov_px2])
     pixels[:, bad], covariances[:, bad] = np.nan, np.nan
-    return Observation(rig, layout, pixels, covariances)
+    return pixels, covariances

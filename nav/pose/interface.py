@@ -42,6 +42,10 @@ class Observation:
             raise ValueError(f"pixels_px: must have shape (2, {count}, 2), got {self.pixels_px.shape}")
         if self.cov_px2.shape != (2, count, 2, 2):
             raise ValueError(f"cov_px2: must have shape (2, {count}, 2, 2), got {self.cov_px2.shape}")
+        for name, values in (("pixels_px", self.pixels_px), ("cov_px2", self.cov_px2)):
+            frozen = np.array(values, dtype=np.float64)
+            frozen.flags.writeable = False
+            object.__setattr__(self, name, frozen)
 
     @property
     def seen(self) -> NDArray[np.bool_]:

@@ -185,6 +185,10 @@ class _CameraRays:
         self._pose = pose_polynomial(frame, eye)
         self.pose_at_middle = self._pose[0]
         self.moves = bool(np.abs(self._pose[1:]).max() > 0)
+        # Plain numbers would become part of the compiled kernel, and every frame would compile its own.
+        self._opaque_pose = [
+            [[dr.opaque(mi.Float, float(value)) for value in row] for row in coefficient] for coefficient in self._pose
+        ]
 
     def rays(self, pixel: Any, place: Any, moment: Any) -> Any:
         """Rays through pixels.
@@ -206,12 +210,10 @@ class _CameraRays:
         return mi.Ray3f(mi.Point3f(*[pose[i][3] for i in range(3)]), dr.normalize(direction))
 
     def _pose_at(self, s: Any) -> list[list[Any]]:
-        c = self._pose
+        c = self._opaque_pose
         if not self.moves:
-            return [[mi.Float(float(c[0, i, j])) for j in range(4)] for i in range(3)]
-        return [
-            [float(c[0, i, j]) + s * (float(c[1, i, j]) + s * float(c[2, i, j])) for j in range(4)] for i in range(3)
-        ]
+            return c[0]
+        return [[c[0][i][j] + s * (c[1][i][j] + s * c[2][i][j]) for j in range(4)] for i in range(3)]
 
 
 class _Passes:
@@ -224,7 +226,7 @@ class _Passes:
         self._shape = (camera.height_px, camera.width_px)
 
     def _center_rays(self, pixel: Any, moment: float = 0.5, place: tuple[float, float] = CENTER) -> Any:
-        return self._rays.rays(pixel, mi.Point2f(*place), mi.Float(moment))
+        return self._rays.rays(pixel, mi.Point2f(*place), dr.opaque(mi.Float, moment))
 
     def part_ids(self, s: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """(H, W) part ids and distances [m] at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""

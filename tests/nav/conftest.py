@@ -1,4 +1,4 @@
-"""Stereo pairs drawn without the project's projection code: every sample of a pixel asks its ray where it meets a plane."""
+"""Stereo pairs drawn without the project's projection code: each sample of a pixel asks where its ray meets a plane."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def background(rig: StereoRig, kind: str) -> np.ndarray:
 def paint_disc(
     image: np.ndarray, rig: StereoRig, eye: str, place: RigidTransform, center: Sequence[float], edges, rgb
 ) -> None:
-    """Paint an annulus (inner and outer radius `edges`) across the drogue's axis with the exact share of every pixel."""
+    """Paint an annulus (inner and outer radius `edges`) across the drogue's axis by every pixel's share."""
     camera = rig.camera
     offset = np.array([0.0 if eye == "left" else rig.baseline_m, 0.0, 0.0])
     origin = place.rotation @ np.asarray(center) + place.translation_m - offset

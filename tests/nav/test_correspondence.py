@@ -1,0 +1,176 @@
+"""Matching drawn-up centres: rolls, missing markers, false blobs, rings that do not belong together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drogue_models.marker_layout import MarkerLayout, marker_layout
+from drogue_models.presets import PRESETS
+from geometry.circles import disc_area_px2, project_disc_centers
+from geometry.stereo import EYES, paper_rig
+from nav.blobs import Blobs
+from nav.centroids.binary_chain import Centroids, quantisation_variance_px2
+from nav.correspondence import correspond
+from nav.pose.interface import NoFixReason
+from nav.ring_match import least_markers, match_ring, symmetry_permutations
+
+RIG = paper_rig()
+
+
+def centroids(layout, place, eye, rng, hidden=(), false_discs=()) -> Centroids:
+    """Centres of the visible markers and the hub with their noise in a random order; false ones as (dx, dy, factor)."""
+    kept = [i for i in range(layout.count) if i not in hidden]
+    centers = project_disc_centers(RIG, place, layout.centers_m, layout.radius_m, eye)[kept]
+    areas = np.array([disc_area_px2(RIG, place, layout.centers_m[i], layout.radius_m, eye) for i in kept])
+    hub = project_disc_centers(RIG, place, layout.hub_center_m[None], [layout.hub_outer_radius_m], eye)
+    hub_area = disc_area_px2(RIG, place, layout.hub_center_m, layout.hub_outer_radius_m, eye)
+    middle = RIG.project(place.translation_m, eye)
+    radius_px = RIG.camera.fx_px * 0.27 / place.translation_m[2]
+    extra = np.array([middle + radius_px * np.array(disc[:2]) for disc in false_discs]).reshape(-1, 2)
+    extra_areas = [areas.mean() * disc[2] for disc in false_discs]
+    centers, areas = np.concatenate([centers, hub, extra]), np.concatenate([areas, [hub_area], extra_areas])
+    variance = quantisation_variance_px2(np.sqrt(areas / np.pi))
+    centers = centers + np.sqrt(variance)[:, None] * rng.standard_normal(centers.shape)
+    order = rng.permutation(len(areas))
+    return Centroids(Blobs(centers[order], areas[order]), variance[order, None, None] * np.eye(2))
+
+
+def worst_match_px(observation, layout, place) -> float:
+    """Largest distance of a matched centre from where its marker is, over the best turn of the layout."""
+    worst = []
+    for permutation in symmetry_permutations(layout):
+        truth = np.stack(
+            [project_disc_centers(RIG, place, layout.centers_m[permutation], layout.radius_m, eye) for eye in EYES]
+        )
+        worst.append(np.nanmax(np.abs(observation.pixels_px - truth)))
+    return float(min(worst))
+
+
+def matched(layout, place, rng, hidden=(), false_discs=()):
+    left, right = (centroids(layout, place, eye, rng, hidden, false_discs) for eye in EYES)
+    return correspond(left, right, RIG, layout)
+
+
+@pytest.mark.parametrize("count", [5, 7, 8])
+@pytest.mark.parametrize("z_m", [1.7, 5, 40])
+def test_all_markers_at_every_roll(make_pose, count, z_m):
+    layout = marker_layout(PRESETS[f"red-{count}"])
+    rng = np.random.default_rng([count, int(z_m)])
+    for roll_deg in np.linspace(-180, 180, 17):
+        place = make_pose(0.06, 0, z_m, *rng.uniform(-10, 10, 2), roll_deg)
+        observation = matched(layout, place, rng)
+        assert not isinstance(observation, NoFixReason), observation.reason
+        assert observation.paired.sum() == count
+        # Five standard deviations of the noisiest centre, 0.092 px at 40 m.
+        assert worst_match_px(observation, layout, place) < 0.46
+
+
+@pytest.mark.parametrize("count", [5, 7, 8])
+@pytest.mark.parametrize("missing", [0, 2, 4])
+def test_one_missing_marker_leaves_a_gap(make_pose, count, missing):
+    layout = marker_layout(PRESETS[f"red-{count}"])
+    rng = np.random.default_rng(missing)
+    place = make_pose(0.06, 0, 10, 8, -6, 10)
+    observation = matched(layout, place, rng, hidden=(missing,))
+    assert not isinstance(observation, NoFixReason), observation.reason
+    assert observation.paired.sum() == count - 1
+    assert worst_match_px(observation, layout, place) < 0.46
+
+
+@pytest.mark.parametrize("count", [5, 7, 8])
+def test_false_blobs_are_left_out(make_pose, count):
+    layout = marker_layout(PRESETS[f"red-{count}"])
+    # Beside the ring, inside it, and of the wrong size near a marker.
+    false_discs = [(1.3, 0.4, 1.0), (-0.5, 0.3, 1.0), (0.1, -1.4, 1.2), (0.95, -0.6, 0.1), (-1.2, -1.2, 3.0)]
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        place = make_pose(0.06, 0, rng.uniform(2, 30), *rng.uniform(-10, 10, 2), rng.uniform(-180, 180))
+        observation = matched(layout, place, rng, false_discs=false_discs)
+        assert not isinstance(observation, NoFixReason), observation.reason
+        assert observation.paired.sum() == count
+        assert worst_match_px(observation, layout, place) < 0.46
+
+
+def test_a_marker_may_be_missing_in_one_eye_only(make_pose):
+    layout = marker_layout(PRESETS["red-8"])
+    rng = np.random.default_rng(3)
+    place = make_pose(0.06, 0, 5, 7, 7, 12)
+    observation = correspond(
+        centroids(layout, place, "left", rng), centroids(layout, place, "right", rng, hidden=(2,)), RIG, layout
+    )
+    assert not isinstance(observation, NoFixReason)
+    assert observation.seen.sum(axis=1).tolist() == [8, 7]
+    assert worst_match_px(observation, layout, place) < 0.46
+
+
+def test_markers_that_are_cut_or_off_their_row_are_dropped(make_pose):
+    layout = marker_layout(PRESETS["red-8"])
+    rng = np.random.default_rng(4)
+    place = make_pose(0.06, 0, 5, 7, 7, 12)
+    left, right = (centroids(layout, place, eye, rng) for eye in EYES)
+    # Area order is random: take two regions that are markers, told from the hub by their area.
+    first, second = np.flatnonzero(left.blobs.areas_px2 < 1.5 * np.median(left.blobs.areas_px2))[:2]
+    left.blobs.areas_px2[first] *= 0.55
+    left.blobs.centers_px[second, 1] += 3
+    observation = correspond(left, right, RIG, layout)
+    assert not isinstance(observation, NoFixReason)
+    assert observation.seen.sum(axis=1).tolist() == [6, 7]
+
+
+def test_rings_of_two_drogues_are_not_matched(make_pose):
+    layout = marker_layout(PRESETS["red-8"])
+    rng = np.random.default_rng(5)
+    left = centroids(layout, make_pose(0.06, 0, 5), "left", rng)
+    right = centroids(layout, make_pose(0.9, 0.3, 5), "right", rng)
+    answer = correspond(left, right, RIG, layout)
+    assert isinstance(answer, NoFixReason)
+    assert "do not belong together" in answer.reason
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_too_few_regions_in_one_eye(make_pose, eye):
+    layout = marker_layout(PRESETS["red-8"])
+    rng = np.random.default_rng(6)
+    place = make_pose(0.06, 0, 5)
+    parts = {other: centroids(layout, place, other, rng) for other in EYES}
+    parts[eye] = centroids(layout, place, eye, rng, hidden=range(4))
+    answer = correspond(parts["left"], parts["right"], RIG, layout)
+    assert isinstance(answer, NoFixReason)
+    assert f"of the {eye} image" in answer.reason
+
+
+def test_an_uneven_layout_keeps_its_own_names(make_pose):
+    centers = marker_layout(PRESETS["red-8"]).centers_m[[0, 1, 2, 4, 5, 7]]
+    layout = MarkerLayout(centers, 0.05, np.array([0, 0, 0.25]), 0.05, 0.075)
+    assert layout.symmetry_order == 1
+    rng = np.random.default_rng(7)
+    for roll_deg in (-150, -20, 0, 100):
+        place = make_pose(0.06, 0, 8, 5, -8, roll_deg)
+        observation = matched(layout, place, rng)
+        assert not isinstance(observation, NoFixReason), observation.reason
+        assert worst_match_px(observation, layout, place) < 0.46
+
+
+@pytest.mark.parametrize(("count", "least"), [(3, 3), (4, 4), (5, 4), (7, 5), (8, 5), (12, 8)])
+def test_least_markers(count, least):
+    angles = 2 * np.pi * np.arange(count) / count
+    centers = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
+    assert least_markers(MarkerLayout(centers, 0.05, None)) == least
+
+
+def test_permutations_of_an_even_ring_are_its_turns():
+    permutations = symmetry_permutations(marker_layout(PRESETS["red-5"]))
+    assert sorted(map(tuple, permutations)) == sorted(tuple(np.roll(np.arange(5), shift)) for shift in range(5))
+
+
+def test_a_mirrored_ring_is_no_ring():
+    # Gaps of 1, 2, 1, 1 and 3 places have a handedness: no turn makes them 1, 1, 2, 1 and 3.
+    centers = marker_layout(PRESETS["red-8"]).centers_m[[0, 1, 3, 4, 5]]
+    layout = MarkerLayout(centers, 0.05, None)
+    areas_px2 = np.full(5, np.pi * 20**2)
+    good = match_ring(Blobs(centers[:, :2] * 400 + 600, areas_px2), layout)
+    assert good is not None
+    assert good.count == 5
+    mirrored = match_ring(Blobs(centers[:, :2] * (-400, 400) + 600, areas_px2), layout)
+    assert mirrored is None or mirrored.count < 5
