@@ -133,6 +133,17 @@ class Clouds(FrozenModel):
     feature_size_m: Range = Range(low=1500, high=4000)
     optical_depth: Range = Range(low=4, high=14)
 
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        height = self.height_above_camera_m
+        height.within(-15000, 15000, "height_above_camera_m")
+        if height.low < 100 and height.high > -100:
+            raise ValueError("height_above_camera_m: the whole range must lie above 100 m or below -100 m")
+        self.cover_fraction.within(0, 1, "cover_fraction")
+        self.feature_size_m.within(10, 1e5, "feature_size_m")
+        self.optical_depth.within(0.01, 200, "optical_depth")
+        return self
+
 
 class EnvironmentRanges(FrozenModel):
     """From what each scene's environment is drawn; units and meaning as in `Environment`."""

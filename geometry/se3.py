@@ -83,12 +83,13 @@ class RigidTransform:
 
     def apply(self, points: ArrayLike) -> Array:
         """Coordinates of (..., 3) points of b in a. [m]"""
-        result: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation_m
+        result: Array = self.rotate(points) + self.translation_m
         return result
 
     def rotate(self, vectors: ArrayLike) -> Array:
         """Components of (..., 3) directions of b in a."""
-        result: Array = np.asarray(vectors, dtype=np.float64) @ self.rotation.T
+        # Not a BLAS product: its rounding would depend on how many rows and threads there are.
+        result: Array = np.einsum("ij,...j->...i", self.rotation, np.asarray(vectors, dtype=np.float64))
         return result
 
 

@@ -1,4 +1,7 @@
-"""The clear sky and the sun in absolute units, as a function of direction."""
+"""The clear sky and the sun in absolute units, as a function of direction.
+
+Products over many directions are written with einsum: BLAS would round differently with another number of threads.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +96,7 @@ class ClearSky:
         """
         d = np.asarray(directions, dtype=np.float64)
         cos_zenith = np.maximum(d[..., 2], _LOWEST_COSINE)
-        cos_gamma = np.clip(d @ self.sun_direction, -1.0, 1.0)
+        cos_gamma = np.clip(np.einsum("...i,i->...", d, self.sun_direction), -1.0, 1.0)
         gamma = np.arccos(cos_gamma)
         zenith = self._zenith_xyy
         x, y, luminance = (
@@ -103,7 +106,7 @@ class ClearSky:
             )
         )
         xyz = np.stack([x / y * luminance, luminance, (1.0 - x - y) / y * luminance], axis=-1)
-        result: Radiance = np.maximum(xyz @ _REC709_FROM_XYZ.T, 0.0).astype(np.float32)
+        result: Radiance = np.maximum(np.einsum("...j,ij->...i", xyz, _REC709_FROM_XYZ), 0.0).astype(np.float32)
         return result
 
     def _relative(
@@ -119,7 +122,7 @@ class ClearSky:
 
     def add_sun_disc(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
         """Add the sun's disc, in place, to (..., 3) radiance seen along (..., 3) unit directions."""
-        cosine = directions @ self.sun_direction.astype(np.float32)
+        cosine = np.einsum("...i,i->...", directions, self.sun_direction.astype(np.float32))
         disc = cosine > np.cos(SUN_RADIUS_RAD)
         if disc.any():
             radiance[disc] += (self.sun_illuminance_lux / SUN_SOLID_ANGLE_SR).astype(np.float32)

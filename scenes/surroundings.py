@@ -171,7 +171,12 @@ class Surroundings:
         azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
         p, a = np.meshgrid(polar, azimuth, indexing="ij")
         directions = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
-        weight = np.maximum(directions @ normal, 0.0) * np.sin(p) * (np.pi / height) * (2 * np.pi / width)
+        weight = (
+            np.maximum(np.einsum("...i,i->...", directions, normal), 0.0)
+            * np.sin(p)
+            * (np.pi / height)
+            * (2 * np.pi / width)
+        )
         diffuse = (light * weight[..., None]).sum(axis=(0, 1))
         direct = self.sky.sun_illuminance_lux * max(float(self.sky.sun_direction @ normal), 0.0)
         result: NDArray[np.float64] = diffuse + direct
@@ -196,5 +201,5 @@ def surroundings(environment: Environment) -> Surroundings:
 
 def luminance(radiance: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """(...) luminance of (..., 3) radiance. [cd/m2]"""
-    result: NDArray[np.float64] = np.asarray(radiance, dtype=np.float64) @ REC709_LUMINANCE
+    result: NDArray[np.float64] = np.einsum("...c,c->...", np.asarray(radiance, dtype=np.float64), REC709_LUMINANCE)
     return result

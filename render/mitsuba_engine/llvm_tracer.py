@@ -140,7 +140,7 @@ class LlvmTracer:
             sums = self._launch(camera, pixel[part], count, path, seed)
             radiance[part], coverage[part] = sums[:, :3] / count, sums[:, 3] / count
             if count > 1:
-                luminance = radiance[part] @ REC709_LUMINANCE.astype(np.float32)
+                luminance = np.einsum("pc,c->p", radiance[part], REC709_LUMINANCE.astype(np.float32))
                 spread = np.maximum(sums[:, 4] / count - luminance**2, 0.0) / (count - 1)
                 variance[part] = spread / np.maximum(luminance, 1e-6) ** 2
         return _Samples(radiance, coverage, variance)
@@ -260,8 +260,8 @@ class _Passes:
                 ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=ASIDE))
                 part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
             pose = self._rays.pose_at_middle
-            depth.reshape(-1)[covered] = (points - pose[:, 3]) @ pose[:, 2]
-            normal.reshape(-1, 3)[covered] = normals @ pose[:, :3]
+            depth.reshape(-1)[covered] = np.einsum("pi,i->p", points - pose[:, 3], pose[:, 2])
+            normal.reshape(-1, 3)[covered] = np.einsum("pi,ij->pj", normals, pose[:, :3])
         return TracedEye(
             part_id,
             depth,

@@ -115,7 +115,7 @@ def _passes_of(seen: _Passes, alone: _Passes) -> TracedEye:
 
 def _relative_noise(pictures: list[NDArray[np.float32]]) -> float:
     """Relative standard error of the mean of two pictures, from the half difference of full pixels."""
-    first, second = (picture[:, :3] @ REC709_LUMINANCE for picture in pictures[:2])
+    first, second = (np.einsum("pc,c->p", picture[:, :3], REC709_LUMINANCE) for picture in pictures[:2])
     full = (pictures[0][:, 3] > 0.999) & (first + second > 0)
     if not full.any():
         return 1.0
@@ -177,8 +177,12 @@ class _View:
         hit = part_id > 0
         pose = self._drogue_from_eye(s)
         self._mend_leaks(scene, pose, (part_id, values))
-        depth = np.where(hit, (values[..., 1:4] - pose[:3, 3]) @ pose[:3, 2], np.inf).astype(np.float32)
-        normal = np.where(hit[..., None], values[..., 4:] @ pose[:3, :3], 0.0).astype(np.float32)
+        depth = np.where(hit, np.einsum("...i,i->...", values[..., 1:4] - pose[:3, 3], pose[:3, 2]), np.inf).astype(
+            np.float32
+        )
+        normal = np.where(hit[..., None], np.einsum("...i,ij->...j", values[..., 4:], pose[:3, :3]), 0.0).astype(
+            np.float32
+        )
         return part_id, depth, normal
 
     def _mend_leaks(self, scene: Any, pose: Array, passes: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
