@@ -44,8 +44,9 @@ class StereoRadiance:
 
     Attributes:
         engine, engine_version: what made it, down to the variant.
-        monte_carlo_noise_fraction: relative standard error of a drogue pixel's luminance, root mean square over the
-            pixels; 0 for an engine without sampling.
+        monte_carlo_noise_fraction: relative standard error of a pixel's luminance inside the drogue's parts, root mean
+            square over the pixels, estimated from the spread of each pixel's samples as if they were independent (they
+            are better than that); 0 for an engine without sampling.
         stage_s: CPU seconds by stage. [s]
     """
 
@@ -70,7 +71,7 @@ class RenderEngine(Protocol):
 
 def engine_names() -> tuple[str, ...]:
     """Engines that this version knows."""
-    return ("mitsuba",)
+    return ("mitsuba", "analytic")
 
 
 def load_engine(name: str) -> RenderEngine:
@@ -81,6 +82,10 @@ def load_engine(name: str) -> RenderEngine:
     """
     if name not in engine_names():
         raise EngineUnavailableError(f"engine: no engine named {name!r}; there are {', '.join(engine_names())}")
+    if name == "analytic":
+        from render.analytic_engine.engine import AnalyticEngine
+
+        return AnalyticEngine()
     from render.mitsuba_engine.engine import MitsubaEngine
 
     return MitsubaEngine()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.estimates import Feature
 from drogue_models.marker_layout import MarkerLayout
-from droguekit.benchmark.bounds import pose_covariance, stereo_jacobian
+from droguekit.benchmark.bounds import pose_covariance
 from droguekit.benchmark.frame_truth import DrogueTruth
 from geometry.se3 import Array
 from geometry.stereo import EYES
@@ -142,13 +142,13 @@ def position_error_from_centroids(truth: DrogueTruth, errors: CentroidErrors) ->
         (3,) estimate minus truth [m], or None where the centroids leave the pose open.
     """
     eye, feature = errors.eye[errors.used], errors.feature[errors.used]
-    jacobian = stereo_jacobian(truth.rig, truth.left_from_drogue, truth.layout)[eye, feature]
+    jacobian = truth.jacobian[eye, feature]
     root = np.sqrt(errors.weight[errors.used])[:, None]
     whitened = jacobian * root[..., None]
     covariance = pose_covariance(whitened)
     if covariance is None:
         return None
-    gradient = np.einsum("kij,ki->j", whitened, errors.offset_px[errors.used] * root)
+    gradient = np.einsum("kij,ki->j", whitened[..., :6], errors.offset_px[errors.used] * root)
     error: Array = (covariance @ gradient)[:3]
     return error
 

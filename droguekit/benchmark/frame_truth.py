@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.records import FeatureView, PairRecord, ViewRecord
 from drogue_models.marker_layout import MarkerLayout, marker_layout
+from droguekit.benchmark.bounds import stereo_jacobian
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
 
@@ -31,6 +32,7 @@ class DrogueTruth:
         layout: the drogue's features.
         centers_px: (2, M, 2) centres of the image ellipses. [px]
         visible: (2, M) whether the feature lies in the image and is visible.
+        sequence_id: of the sequence that the pair belongs to, or None for a single one.
     """
 
     left_from_drogue: RigidTransform
@@ -38,6 +40,12 @@ class DrogueTruth:
     layout: MarkerLayout
     centers_px: Array
     visible: NDArray[np.bool_]
+    sequence_id: int | None = None
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(2, M, 2, 7) see `bounds.stereo_jacobian`."""
+        return stereo_jacobian(self.rig, self.left_from_drogue, self.layout)
 
     @property
     def distance_m(self) -> float:
@@ -73,6 +81,7 @@ def drogue_truth(record: PairRecord) -> DrogueTruth | None:
         visible=np.array(
             [[f.in_image and f.visible_fraction >= VISIBLE_FRACTION for f in features] for features in eyes]
         ),
+        sequence_id=record.sequence_id,
     )
 
 

@@ -5,47 +5,19 @@ from __future__ import annotations
 import json
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_serializer
+from pydantic import Field, model_serializer
 
-
-class ResultModel(BaseModel):
-    """A part of the result; numbers are finite, what is not defined is null."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
-
-
-class ComponentRatios(ResultModel):
-    """One number for each component of the pose."""
-
-    x: float
-    y: float
-    z: float
-    pitch: float
-    yaw: float
-
-
-class Bound(ResultModel):
-    """Cramer-Rao bound, as root mean square over frames."""
-
-    position_m: float
-    x_m: float
-    y_m: float
-    z_m: float
-    pitch_deg: float
-    yaw_deg: float
-
-
-class Centroids(ResultModel):
-    """Measured minus true ellipse centres of a method's features; see `CentroidStatistics`."""
-
-    count: int
-    sigma_px: float | None
-    bias_u_px: float | None
-    bias_v_px: float | None
-    bias_outward_px: float | None
-    hub_count: int
-    hub_sigma_px: float | None
-    mistaken: int
+from droguekit.benchmark.result_parts import (
+    Bound,
+    Centroids,
+    Comparison,
+    ComponentErrors,
+    ComponentRatios,
+    Flips,
+    Nees,
+    NormalizedErrors,
+    ResultModel,
+)
 
 
 class Row(ResultModel):
@@ -67,6 +39,15 @@ class Row(ResultModel):
         position_from_centroids_rmse_m: what least squares would make of these very centroids. [m]
         centroid_share: share of the mean squared position error that this explains, in [0, 1]; the rest is the
             method's own.
+        normalized: errors over the bound of their own frame, of all visible features, markers and hub each at the
+            noise of the best centroids in the file.
+        normalized_own: the same over the bound of the features that the method itself used, at its own noise.
+        nees: how well the errors fit the covariances that the method reports; null without any.
+        flips: tilts that came out mirrored, as seen along the optical axis.
+        sight_flips: the same as seen along the line of sight, about which the mirror really lies.
+        failures: pairs without a pose.
+        rmse_with_failures: root mean square errors over all n pairs, where a pair without a pose counts with the
+            standard deviation of the true poses of the dataset.
     """
 
     n: int
@@ -109,6 +90,13 @@ class Row(ResultModel):
     centroids: Centroids
     position_from_centroids_rmse_m: float | None
     centroid_share: float | None
+    normalized: NormalizedErrors | None
+    normalized_own: NormalizedErrors | None
+    nees: Nees | None
+    flips: Flips
+    sight_flips: Flips
+    failures: int
+    rmse_with_failures: ComponentErrors
 
     def value(self, key: str) -> float | None:
         """The number of that name.
@@ -153,6 +141,7 @@ class ReferenceBin(ResultModel):
         n: pairs that show a drogue.
         centroid_sigma_px: noise of the best centroids in the file, null without any. [px]
         centroid_method: whose they are.
+        hub_sigma_px, hub_method: the same of the hub.
         bound: at that noise, over all pairs of the bin whose features determine a pose.
     """
 
@@ -161,6 +150,8 @@ class ReferenceBin(ResultModel):
     n: int
     centroid_sigma_px: float | None
     centroid_method: str | None
+    hub_sigma_px: float | None
+    hub_method: str | None
     bound: Bound | None
 
 
@@ -181,6 +172,7 @@ class BenchmarkResult(ResultModel):
     confidence: float
     reference: list[ReferenceBin]
     methods: dict[str, MethodResult]
+    comparisons: list[Comparison]
 
     @model_serializer(mode="plain")
     def _with_schema(self) -> dict[str, Any]:

@@ -16,11 +16,13 @@ from datasets_manifest.recipe import RenderSettings
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.scene import DrogueScene, scene_key
+from render.mitsuba_engine.sun_sky_paths import trace_paths
 from render.mitsuba_engine.traced import (
     Traced,
     TracedEye,
     amodal_counts,
     blur_px,
+    inside_one_part,
     pixels_to_trace,
     pose_polynomial,
     settings_by_plan,
@@ -53,7 +55,6 @@ class LlvmTracer:
         dr.set_thread_count(1)
         self._key: str | None = None
         self._scene: DrogueScene
-        self._integrators: dict[int, Any] = {}
 
     def trace(self, frame: FrameSpec, settings: RenderSettings, around: Surroundings) -> Traced:
         """Passes and radiance of both eyes of a frame with a drogue."""
@@ -80,13 +81,6 @@ class LlvmTracer:
         stage_s["paths"] = time.process_time() - started
         return Traced(eyes, noise, stage_s)
 
-    def _integrator(self, max_depth: int) -> Any:
-        if max_depth not in self._integrators:
-            self._integrators[max_depth] = mi.load_dict(
-                {"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True}
-            )
-        return self._integrators[max_depth]
-
     def _trace_radiance(
         self,
         frame: FrameSpec,
@@ -106,7 +100,7 @@ class LlvmTracer:
                 samples = self._sample_pixels(camera, pixel, count, (depth, lit), seeds)
                 parts.append((pixel, samples))
                 if name == "drogue" and count > 1:
-                    noise.append(samples.variance[samples.coverage > 0.999])
+                    noise.append(samples.variance[inside_one_part(eyes[eye].part_id).reshape(-1)[pixel]])
             eyes[eye].pixel = np.concatenate([pixel for pixel, _ in parts])
             eyes[eye].radiance_cd_m2 = np.concatenate([samples.radiance for _, samples in parts])
             eyes[eye].coverage = np.concatenate([samples.coverage for _, samples in parts])
@@ -163,13 +157,7 @@ class LlvmTracer:
         sampler.seed(seed, lanes)
         of_pixel = dr.arange(mi.UInt32, lanes) // count
         ray = camera.rays(dr.gather(mi.UInt32, mi.UInt32(pixel), of_pixel), sampler.next_2d(), sampler.next_1d())
-        max_depth, lit = path
-        color, hit, _ = self._integrator(max_depth).sample(self._scene.scene, sampler, ray)
-        color = dr.select(hit, color, 0.0)
-        if lit:
-            # The integrator hides the lamps themselves along with the sky.
-            first = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-            color += first.emitter(self._scene.scene).eval(first)
+        color, hit = trace_paths(self._scene.scene, self._scene.sun, sampler, ray, path)
         luminance = dr.dot(mi.Vector3f(color), mi.Vector3f(REC709_LUMINANCE.tolist()))
         channels = [color[0], color[1], color[2], dr.select(hit, mi.Float(1.0), 0.0), dr.square(luminance)]
         # Without this every sum would trace the paths again.

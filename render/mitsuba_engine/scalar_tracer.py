@@ -20,6 +20,7 @@ from render.mitsuba_engine.traced import (
     TracedEye,
     amodal_counts,
     blur_px,
+    inside_one_part,
     pixels_to_trace,
     pose_polynomial,
     settings_by_plan,
@@ -95,7 +96,7 @@ class ScalarTracer:
                 pictures.append(rgba.reshape(-1, 4)[pixel])
             mean = np.mean(pictures, axis=0)
             if pixel is plans[0] and len(pictures) > 1 and moves_px < 0.05:
-                noise.append(_relative_noise(pictures))
+                noise.append(_relative_noise(pictures, inside_one_part(traced.part_id).reshape(-1)[pixel]))
             chunks.append((pixel, mean.astype(np.float32)))
         if chunks:
             traced.pixel = np.concatenate([pixel for pixel, _ in chunks])
@@ -113,10 +114,10 @@ def _passes_of(seen: _Passes, alone: _Passes) -> TracedEye:
     return TracedEye(*seen, amodal, np.zeros(0, dtype=np.int64), nothing.reshape(0, 3), nothing)
 
 
-def _relative_noise(pictures: list[NDArray[np.float32]]) -> float:
-    """Relative standard error of the mean of two pictures, from the half difference of full pixels."""
+def _relative_noise(pictures: list[NDArray[np.float32]], inside: NDArray[np.bool_]) -> float:
+    """Relative standard error of the mean of two pictures, from their half difference inside parts."""
     first, second = (np.einsum("pc,c->p", picture[:, :3], REC709_LUMINANCE) for picture in pictures[:2])
-    full = (pictures[0][:, 3] > 0.999) & (first + second > 0)
+    full = inside & (first + second > 0)
     if not full.any():
         return 1.0
     relative = (first[full] - second[full]) / (first[full] + second[full])

@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import trimesh
@@ -77,7 +78,7 @@ class DrogueScene:
     Attributes:
         scene: everything.
         features: markers and hub alone, for their amodal pixels.
-        part_of_shape: part id by Mitsuba's registry index of the shape.
+        sun: direction towards the sun in the drogue frame, and its illuminance of a facing plane [lux].
     """
 
     def __init__(self, drogue: DrogueParameters, frame: FrameSpec) -> None:
@@ -119,7 +120,9 @@ class DrogueScene:
             _homogeneous(drogue_from_world.rotation @ _MAP_FROM_WORLD.T).tolist()
         )
         self._parameters["sky.data"] = _map_tensor(around.light_map)
-        away_from_sun = -drogue_from_world.rotate(around.sky.sun_direction)
+        to_sun = drogue_from_world.rotate(around.sky.sun_direction)
+        self.sun = (_opaque(mi.Vector3f, to_sun), _opaque(mi.Color3f, around.sky.sun_illuminance_lux))
+        away_from_sun = -to_sun
         self._parameters["sun.to_world"] = mi.Transform4f().look_at(
             origin=[0.0, 0.0, 0.0], target=away_from_sun.tolist(), up=_any_up(away_from_sun)
         )
@@ -134,6 +137,13 @@ class DrogueScene:
     def _set_buffer(self, key: str, rows: NDArray[np.float64]) -> None:
         # The buffer's type depends on the variant.
         self._parameters[key] = type(self._parameters[key])(rows.astype(np.float32).ravel())
+
+
+def _opaque(kind: Any, values: NDArray[np.float64]) -> Any:
+    """Numbers that do not become part of a compiled kernel, so that the next frame can use the same one."""
+    result = kind(*values.tolist())
+    dr.make_opaque(result)
+    return result
 
 
 def _lights() -> dict[str, Any]:

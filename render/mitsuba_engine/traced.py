@@ -126,6 +126,13 @@ def settings_by_plan(settings: RenderSettings) -> tuple[tuple[int, int], tuple[i
     return (settings.samples_per_px, settings.surround_samples_per_px), (settings.max_depth, 2)
 
 
+def inside_one_part(part_id: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W) pixels whose eight neighbours see the same part: what spreads there is noise and no edge."""
+    kernel = np.ones((3, 3), dtype=np.uint8)
+    alone: NDArray[np.bool_] = (cv2.erode(part_id, kernel) == cv2.dilate(part_id, kernel)) & (part_id > 0)
+    return alone
+
+
 def pixels_to_trace(
     ids: list[NDArray[np.uint8]], margin_px: int, marker_count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,0 +1,154 @@
+"""What the rows of `benchmark.json` are made of."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+
+class ResultModel(BaseModel):
+    """A part of the result; numbers are finite, what is not defined is null."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
+
+
+class ComponentRatios(ResultModel):
+    """One number for each component of the pose."""
+
+    x: float
+    y: float
+    z: float
+    pitch: float
+    yaw: float
+
+
+class Bound(ResultModel):
+    """Cramer-Rao bound, as root mean square over frames."""
+
+    position_m: float
+    x_m: float
+    y_m: float
+    z_m: float
+    pitch_deg: float
+    yaw_deg: float
+
+
+class Centroids(ResultModel):
+    """Measured minus true ellipse centres of a method's features; see `CentroidStatistics`."""
+
+    count: int
+    sigma_px: float | None
+    bias_u_px: float | None
+    bias_v_px: float | None
+    bias_outward_px: float | None
+    hub_count: int
+    hub_sigma_px: float | None
+    mistaken: int
+
+
+class ComponentErrors(ResultModel):
+    """One error for each component of the pose."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    pitch_deg: float
+    yaw_deg: float
+
+
+class NormalizedErrors(ResultModel):
+    """Root mean square of errors over the bound of their frame; 1 is what physics allows.
+
+    Attributes:
+        n: poses in frames that have a bound.
+        nrms: by component.
+        upper: one-sided 95 % upper limit of each, `nrms sqrt(n / chi2_{0.05, n})`.
+    """
+
+    n: int
+    nrms: ComponentRatios
+    upper: ComponentRatios
+
+
+class NeesPart(ResultModel):
+    """Normalized estimation error squared, over its degrees of freedom; 1 for covariances that tell the truth.
+
+    Attributes:
+        freedom: degrees of freedom of one pose.
+        per_freedom: mean over the poses.
+        low, high: where 95 % of such means lie when the covariances tell the truth, by the chi-square law.
+    """
+
+    freedom: int
+    per_freedom: float
+    low: float
+    high: float
+
+
+class Nees(ResultModel):
+    """How well the errors fit the reported covariances.
+
+    Attributes:
+        n: poses with a covariance that counts.
+        unusable: poses whose covariance is not positive definite, or in a tangent that is not ours.
+        position: of X, Y, Z.
+        attitude: of pitch and yaw.
+        pose: of all five. Roll is marginalised in all of them.
+    """
+
+    n: int
+    unusable: int
+    position: NeesPart | None
+    attitude: NeesPart | None
+    pose: NeesPart | None
+
+
+class Flips(ResultModel):
+    """Tilts that came out mirrored, among the poses whose true tilt exceeds five times its bound.
+
+    Attributes:
+        n: how many poses that is.
+        flips, rate, interval: how many of them were mirrored; their share and its Wilson interval.
+        predicted: share that the flip law expects at the method's own noise; null where the law does not hold, as for
+            a method that uses the hub or one eye.
+    """
+
+    n: int
+    flips: int
+    rate: float | None
+    interval: tuple[float, float] | None
+    predicted: float | None
+
+
+class MeanRatios(ResultModel):
+    """Mean error of one method over that of another, over the pairs in which both found a pose.
+
+    Attributes:
+        n: how many pairs.
+        blocks: what was resampled: sequences, or pairs that belong to none.
+        position: of the lengths of the position errors; null where the other's mean is zero, or n is.
+        attitude: of the sizes of pitch and yaw errors together.
+        position_interval, attitude_interval: 95 %, by bootstrap; null with fewer than two blocks.
+    """
+
+    n: int
+    blocks: int
+    position: float | None
+    position_interval: tuple[float, float] | None
+    attitude: float | None
+    attitude_interval: tuple[float, float] | None
+
+
+class BinRatios(MeanRatios):
+    """Ratios over the distances from `low_m` to `high_m`. [m]"""
+
+    low_m: float
+    high_m: float
+
+
+class Comparison(ResultModel):
+    """One method beside another on the same pairs."""
+
+    method: str
+    against: str
+    overall: MeanRatios
+    bins: list[BinRatios]

@@ -1,0 +1,82 @@
+"""Ellipses in a pair of images, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geometry.se3 import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipses:
+    """Outlines of discs, or of one edge of annuli, in both images.
+
+    Attributes:
+        eyes: (M,) 0 for the left image, 1 for the right.
+        centers_px: (M, 2) centres.
+        shapes_px: (M, 2, 2) symmetric and positive: the outline is `center + shape @ (cos a, sin a)`.
+    """
+
+    eyes: NDArray[np.int64]
+    centers_px: Array
+    shapes_px: Array
+
+    def __post_init__(self) -> None:
+        count = len(self.eyes)
+        if self.centers_px.shape != (count, 2) or not np.isfinite(self.centers_px).all():
+            raise ValueError(f"centers_px: must be ({count}, 2) finite numbers, got {self.centers_px.shape}")
+        if self.shapes_px.shape != (count, 2, 2) or not np.isfinite(self.shapes_px).all():
+            raise ValueError(f"shapes_px: must be ({count}, 2, 2) finite numbers, got {self.shapes_px.shape}")
+        if count and np.linalg.eigvalsh(self.shapes_px).min() <= 0:
+            raise ValueError("shapes_px: must be positive, got a semi-axis of zero or less")
+
+    def __len__(self) -> int:
+        return len(self.eyes)
+
+    @property
+    def semi_axes_px(self) -> Array:
+        """(M, 2) semi-axes, the smaller first. [px]"""
+        axes: Array = np.linalg.eigvalsh(self.shapes_px)
+        return axes
+
+    @property
+    def radii_px(self) -> Array:
+        """(M,) radii of the circles of the same area. [px]"""
+        radii: Array = np.sqrt(np.linalg.det(self.shapes_px))
+        return radii
+
+    def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Ellipses:
+        """Some of them."""
+        return Ellipses(self.eyes[index], self.centers_px[index], self.shapes_px[index])
+
+
+def circles(eyes: ArrayLike, centers_px: ArrayLike, radii_px: ArrayLike) -> Ellipses:
+    """Circles of (M,) radii about (M, 2) centres, as from regions of known area."""
+    shapes = np.asarray(radii_px, dtype=np.float64)[:, None, None] * np.eye(2)
+    return Ellipses(np.asarray(eyes, dtype=np.int64), np.asarray(centers_px, dtype=np.float64), shapes)
+
+
+def outline_shapes(offsets: Array) -> Array:
+    """Shapes of ellipses from their outlines.
+
+    Args:
+        offsets: (M, K, 2) points of an affine image of a circle, evenly spaced on that circle, minus their mean. [px]
+
+    Returns:
+        (M, 2, 2). The second moment of such points is half the squared shape. [px]
+    """
+    return _square_roots(2 * np.einsum("mki,mkj->mij", offsets, offsets) / offsets.shape[1])
+
+
+def moment_shapes(second_moments_px2: Array) -> Array:
+    """Shapes of evenly filled ellipses from their (M, 2, 2) second moments: four times the moment is the square."""
+    return _square_roots(4 * second_moments_px2)
+
+
+def _square_roots(squares: Array) -> Array:
+    values, vectors = np.linalg.eigh(squares)
+    roots: Array = np.einsum("mik,mk,mjk->mij", vectors, np.sqrt(np.maximum(values, 0)), vectors)
+    return roots

@@ -1,0 +1,124 @@
+"""Levenberg-Marquardt for many small problems of one form at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.se3 import Array
+from nav.centroids.marker_signal import Array32
+
+# Values (N, K) and their derivatives (N, P, K) at (N, P) parameters.
+Model = Callable[[Array], tuple[Array32, Array32]]
+
+_FIRST_DAMPING = 1e-4
+_SMALLEST_DAMPING = 1e-9
+# A step that moves the centre by less than this changes no digit that matters. [px]
+_SMALL_STEP_PX = 2e-4
+# Keeps a parameter that no pixel tells of where it is.
+_TINY_CURVATURE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the iteration ended.
+
+    Attributes:
+        parameters: (N, P).
+        residuals: (N, K) data minus model.
+        jacobian: (N, P, K).
+        normal: (N, P, P) `J W J^T`.
+        converged: (N,) whether the last step was small.
+    """
+
+    parameters: Array
+    residuals: Array32
+    jacobian: Array32
+    normal: Array
+    converged: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+    def covariance(self) -> Array:
+        """(N, P, P) inverse of the normal matrices."""
+        scale = _scales(self.normal)
+        inverse: Array = np.linalg.inv(_scaled(self.normal, scale)) * scale[:, :, None] * scale[:, None, :]
+        return inverse
+
+    def leverages(self, covariance: Array, weights: Array32) -> Array32:
+        """(N, K) share of each pixel's noise that its own fit swallows."""
+        root = np.linalg.cholesky(covariance).astype(np.float32)
+        swallowed = np.matmul(root.transpose(0, 2, 1), self.jacobian)
+        leverages: Array32 = np.einsum("npk,npk->nk", swallowed, swallowed) * weights
+        return leverages
+
+
+def minimise(model: Model, data: Array32, weights: Array32, start: Array, most_steps: int) -> Minimum:
+    """Weighted least squares of `data - model`; the first two parameters are a place in pixels.
+
+    Args:
+        model: values and derivatives.
+        data: (N, K).
+        weights: (N, K), 0 for padding.
+        start: (N, P).
+        most_steps: evaluations of the model after the first.
+    """
+    parameters = start
+    values, jacobian = model(parameters)
+    residuals = data - values
+    cost = _cost(residuals, weights)
+    damping = np.full(len(start), _FIRST_DAMPING)
+    converged = np.zeros(len(start), np.bool_)
+    normal, gradient = _normal_equations(jacobian, residuals, weights)
+    for _ in range(most_steps):
+        step = _step(normal, gradient, damping)
+        tried = parameters + step
+        values, new_jacobian = model(tried)
+        new_residuals = data - values
+        new_cost = _cost(new_residuals, weights)
+        better = new_cost <= cost * (1 + 1e-6)
+        if better.all():
+            parameters, cost, residuals, jacobian = tried, new_cost, new_residuals, new_jacobian
+        else:
+            parameters = np.where(better[:, None], tried, parameters)
+            cost = np.where(better, new_cost, cost)
+            residuals = np.where(better[:, None], new_residuals, residuals)
+            jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
+        damping = np.where(better, np.maximum(damping / 10, _SMALLEST_DAMPING), damping * 10)
+        converged = np.abs(step[:, :2]).max(axis=1) < _SMALL_STEP_PX
+        normal, gradient = _normal_equations(jacobian, residuals, weights)
+        if converged.all():
+            break
+    return Minimum(parameters, residuals, jacobian, normal, converged)
+
+
+def _cost(residuals: Array32, weights: Array32) -> Array:
+    cost = np.einsum("nk,nk,nk->n", residuals, residuals, weights).astype(np.float64)
+    return np.where(np.isfinite(cost), cost, np.inf)
+
+
+def _normal_equations(jacobian: Array32, residuals: Array32, weights: Array32) -> tuple[Array, Array]:
+    weighted = jacobian * weights[:, None]
+    normal = np.matmul(weighted, jacobian.transpose(0, 2, 1)).astype(np.float64)
+    gradient = np.matmul(weighted, residuals[:, :, None])[..., 0].astype(np.float64)
+    return normal, gradient
+
+
+def _scales(normal: Array) -> Array:
+    """(N, P) scales that bring the diagonal to one."""
+    diagonal = np.einsum("npp->np", normal)
+    scales: Array = 1 / np.sqrt(np.maximum(diagonal, _TINY_CURVATURE))
+    return scales
+
+
+def _scaled(normal: Array, scale: Array) -> Array:
+    """Normal matrices with a unit diagonal, kept invertible where single precision would not."""
+    scaled: Array = normal * scale[:, :, None] * scale[:, None, :]
+    return scaled + 1e-6 * np.eye(normal.shape[1])
+
+
+def _step(normal: Array, gradient: Array, damping: Array) -> Array:
+    scale = _scales(normal)
+    damped = _scaled(normal, scale) + damping[:, None, None] * np.eye(normal.shape[1])
+    step: Array = np.linalg.solve(damped, (gradient * scale)[..., None])[..., 0] * scale
+    return step

@@ -1,0 +1,112 @@
+"""The marker channel of both eyes on the sites where the sensor measured it, cut to where discs are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.images import Pixels, StereoImages
+from geometry.stereo import EYES, Eye
+from nav.centroids.ellipses import Ellipses
+from nav.channels import marker_channel
+
+Array32 = NDArray[np.float32]
+
+# Room around an outline: the widest window about it, and what an initial centre may be off. [px]
+_MARGIN_PX = 10
+# First site of each colour in an RGGB cell, as row and column.
+_FIRST_SITE = ((0, 0), (0, 1), (1, 1))
+_GREEN = 1
+# Where the other two colours lie around a red or a blue site (beside it, across the corners), and around a green one.
+_CROSS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], np.float32) / 4
+_CORNERS = np.array([[1, 0, 1], [0, 0, 0], [1, 0, 1]], np.float32) / 4
+_ROW = np.array([[0, 0, 0], [1, 0, 1], [0, 0, 0]], np.float32) / 2
+_NEIGHBOURS = ((_CROSS, _CORNERS), (_ROW, _ROW.T.copy()))
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerSignal:
+    """Part of one image.
+
+    Attributes:
+        values: (H, W) linear signal.
+        clipped: (H, W) where the sensor's range ended.
+        first_px: x and y of the first site in the image. [px]
+        pitch_px: from site to site; 2 on one colour of a mosaic. [px]
+        is_difference: a colour's lead over the others, dark beside the markers, or a plain picture.
+    """
+
+    values: Array32
+    clipped: NDArray[np.bool_]
+    first_px: tuple[float, float]
+    pitch_px: int
+    is_difference: bool
+
+
+def marker_signals(images: StereoImages, color: int | None, ellipses: Ellipses) -> tuple[MarkerSignal, MarkerSignal]:
+    """Signals of the left and the right eye around the given outlines.
+
+    From a mosaic only the sites of the markers' colour are taken, with the means of their neighbours for the other two
+    colours: interpolation between sites moves the edges of discs of a few pixels.
+
+    Args:
+        images: the pair.
+        color: see `nav.channels.marker_color`.
+        ellipses: where to look; outlines over the image's edge are allowed.
+    """
+    signals = []
+    for index, eye in enumerate(EYES):
+        window = _window(ellipses.take(ellipses.eyes == index), images.size_px)
+        mosaic = images.left_mosaic if eye == "left" else images.right_mosaic
+        if color is not None and mosaic is not None:
+            signals.append(_mosaic_signal(images, mosaic, window, color))
+        else:
+            signals.append(_image_signal(images, eye, window, color))
+    return signals[0], signals[1]
+
+
+def _window(ellipses: Ellipses, size_px: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom (the last two exclusive) of the outlines' box on the image, left and top even."""
+    if len(ellipses) == 0:
+        return 0, 0, 2, 2
+    reach = np.sqrt(np.einsum("mij,mij->mi", ellipses.shapes_px, ellipses.shapes_px)) + _MARGIN_PX
+    low = np.floor((ellipses.centers_px - reach).min(axis=0)).astype(int) // 2 * 2
+    high = np.ceil((ellipses.centers_px + reach).max(axis=0)).astype(int) + 1
+    width, height = size_px
+    left, top = (int(np.clip(value, 0, size - 2)) for value, size in zip(low, size_px, strict=True))
+    return left, top, int(np.clip(high[0], left + 2, width)), int(np.clip(high[1], top + 2, height))
+
+
+def _image_signal(
+    images: StereoImages, eye: Eye, window: tuple[int, int, int, int], color: int | None
+) -> MarkerSignal:
+    left, top, right, bottom = window
+    image = images.left if eye == "left" else images.right
+    part = image[top:bottom, left:right]
+    values = marker_channel(replace(images, left=part, right=part, left_mosaic=None, right_mosaic=None), "left", color)
+    full = 2**images.bits - 1
+    is_difference = color is not None and image.ndim == 3
+    if is_difference:
+        clipped = part[..., color] >= full
+    else:
+        clipped = (part if part.ndim == 2 else part.max(axis=2)) >= full
+    return MarkerSignal(values.astype(np.float32), clipped, (float(left), float(top)), 1, is_difference)
+
+
+def _mosaic_signal(
+    images: StereoImages, mosaic: Pixels, window: tuple[int, int, int, int], color: int
+) -> MarkerSignal:
+    left, top, right, bottom = window
+    part = mosaic[top : top + (bottom - top) // 2 * 2, left : left + (right - left) // 2 * 2]
+    row, column = _FIRST_SITE[color]
+    own = part[row::2, column::2]
+    # Reflection about the outermost site, OpenCV's default, keeps the colours of the mosaic.
+    first, second = (
+        cv2.filter2D(part, cv2.CV_32F, kernel)[row::2, column::2] for kernel in _NEIGHBOURS[color == _GREEN]
+    )
+    values = np.maximum(own - np.maximum(first, second), np.float32(0))
+    clipped = own >= 2**images.bits - 1
+    return MarkerSignal(values, clipped, (float(left + column), float(top + row)), 2, True)

@@ -1,0 +1,100 @@
+"""The drogue reduced to flat rings across its axis, and the light that each sends to the camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from datasets_manifest.frame import FrameSpec
+from drogue_models.materials import part_reflectance_rgb
+from drogue_models.meshes import FACE_THICKNESS_M
+from drogue_models.parameters import DrogueParameters
+from drogue_models.parts import FIRST_MARKER_ID, Part, marker_id
+from geometry.se3 import Array
+from scenes.sky import REC709_LUMINANCE
+from scenes.surroundings import Surroundings
+
+
+@dataclass(frozen=True)
+class FlatRing:
+    """A disc, or a disc with a hole, across the drogue's axis.
+
+    Attributes:
+        part: its part id.
+        center_m: in the drogue frame. [m]
+        outer_radius_m, inner_radius_m: its edges; 0 inside for a disc. [m]
+    """
+
+    part: int
+    center_m: tuple[float, float, float]
+    outer_radius_m: float
+    inner_radius_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class FlatDrogue:
+    """What the analytic engine draws of a drogue.
+
+    Attributes:
+        behind: coupling and hub, behind the opening.
+        front: rim and face, which hide what lies behind them. The rim's torus is the ring of its equator. The face is
+            drawn at its back and at its front: what is seen through both is what its thickness lets through.
+        markers: on the face.
+    """
+
+    behind: tuple[FlatRing, ...]
+    front: tuple[FlatRing, ...]
+    markers: tuple[FlatRing, ...]
+
+    @property
+    def back_to_front(self) -> tuple[FlatRing, ...]:
+        """All rings; a later one hides an earlier one."""
+        return self.behind + self.front + self.markers
+
+
+def flat_drogue(drogue: DrogueParameters) -> FlatDrogue:
+    """The flat rings of a drogue with its dimensions."""
+    depth_m, tube_m = drogue.hub_depth_m, drogue.rim_tube_radius_m
+    behind = [FlatRing(int(Part.COUPLING), (0.0, 0.0, depth_m), drogue.coupling_radius_m)]
+    if drogue.hub is not None:
+        hub = drogue.hub
+        behind.append(FlatRing(int(Part.HUB), (0.0, 0.0, depth_m), hub.outer_radius_m, hub.inner_radius_m))
+    opening_m, face_outer_m = drogue.face_inner_radius_m, drogue.rim_radius_m - tube_m
+    front = [
+        FlatRing(int(Part.RIM), (0.0, 0.0, tube_m), drogue.rim_radius_m, face_outer_m - tube_m),
+        FlatRing(int(Part.FACE), (0.0, 0.0, FACE_THICKNESS_M), face_outer_m, opening_m),
+        FlatRing(int(Part.FACE), (0.0, 0.0, 0.0), face_outer_m, opening_m),
+    ]
+    markers = [
+        FlatRing(marker_id(index), (x, y, 0.0), drogue.marker_radius_m)
+        for index, (x, y) in enumerate(drogue.marker_positions_m)
+    ]
+    return FlatDrogue(tuple(behind), tuple(front), tuple(markers))
+
+
+def ring_radiance(frame: FrameSpec, around: Surroundings, rings: tuple[FlatRing, ...]) -> dict[int, Array]:
+    """Radiance of each ring at the camera, the same all over it.
+
+    Light falls on every ring as on the open rim plane, `L = reflectance E / pi`, lamps add their own, and the air takes
+    its share over the planar depth of the ring's centre and adds the horizon's. Rings with one part id stand for one
+    part; the last one counts.
+
+    Returns:
+        (3,) luminance-scaled linear Rec. 709 by part id. [cd/m2]
+    """
+    drogue, pose = frame.drogue, frame.left_from_drogue
+    assert drogue is not None and pose is not None
+    towards_camera = -np.sign(pose.translation_m @ pose.rotation[:, 2]) * pose.rotation[:, 2]
+    illuminance_lux = around.plate_illuminance_lux(frame.world_from_left.rotate(towards_camera))
+    emission = np.array(drogue.marker_emission_rgb)
+    lamp = drogue.marker_luminance_cd_m2 * emission / (emission @ REC709_LUMINANCE)
+    air = around.horizon_radiance
+    radiance: dict[int, Array] = {}
+    for ring in rings:
+        sent = np.array(part_reflectance_rgb(drogue, ring.part)) * illuminance_lux / np.pi
+        if ring.part >= FIRST_MARKER_ID:
+            sent = sent + lamp
+        clear = np.exp(-frame.environment.extinction_per_m * pose.apply(ring.center_m)[2])
+        radiance[ring.part] = sent * clear + air * (1.0 - clear)
+    return radiance

@@ -1,0 +1,113 @@
+"""Part id, depth and normal at the pixel centres of one eye, by the rays' meeting with flat rings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.parts import FIRST_MARKER_ID, Part
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import Array
+from render.analytic_engine.flat_parts import FlatDrogue, FlatRing
+from render.analytic_engine.outlines import EyeView
+
+
+@dataclass(frozen=True, eq=False)
+class PixelPasses:
+    """The passes of `EyeRadiance` that pixel centres decide."""
+
+    part_id: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    amodal_px: dict[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _RowSpans:
+    """For consecutive rows of the image the columns from `first` to `last`; empty where `last < first`."""
+
+    top: int
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+
+
+def empty_passes(camera: PinholeCamera) -> PixelPasses:
+    """Passes of an eye that sees nothing but its surroundings."""
+    shape = (camera.height_px, camera.width_px)
+    depth = np.full(shape, np.inf, dtype=np.float32)
+    return PixelPasses(np.zeros(shape, np.uint8), depth, np.zeros((*shape, 3), np.float32), {})
+
+
+def pixel_passes(flat: FlatDrogue, view: EyeView) -> PixelPasses:
+    """What the rays through the pixel centres of one eye meet first."""
+    camera = view.rig.camera
+    passes = empty_passes(camera)
+    axis = view.left_from_drogue.rotation[:, 2]
+    for ring in flat.back_to_front:
+        spans = _disc_spans(ring, ring.outer_radius_m, view)
+        if not len(spans.first):
+            continue
+        rows = slice(spans.top, spans.top + len(spans.first))
+        left, right = int(spans.first.min()), int(spans.last.max()) + 1
+        columns = np.arange(left, right)
+        inside = (columns >= spans.first[:, None]) & (columns <= spans.last[:, None])
+        if ring.inner_radius_m > 0:
+            hole = _disc_spans(ring, ring.inner_radius_m, view)
+            here = slice(hole.top - spans.top, hole.top - spans.top + len(hole.first))
+            inside[here] &= (columns < hole.first[:, None]) | (columns > hole.last[:, None])
+        count = int(np.count_nonzero(inside))
+        if count and (ring.part >= FIRST_MARKER_ID or ring.part == Part.HUB):
+            passes.amodal_px[ring.part] = count
+        if view.sees_front or ring in flat.front:
+            depth = _plane_depth_m(view.center_m(ring), axis, camera, rows, columns)
+            np.copyto(passes.part_id[rows, left:right], np.uint8(ring.part), where=inside)
+            np.copyto(passes.depth_m[rows, left:right], depth, where=inside)
+    normal = (-axis if view.sees_front else axis).astype(np.float32)
+    covered = passes.part_id != Part.SKY
+    for row in np.flatnonzero(covered.any(axis=1)):
+        passes.normal[row, covered[row]] = normal
+    return passes
+
+
+def _plane_depth_m(
+    center_m: Array, axis: Array, camera: PinholeCamera, rows: slice, columns: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """(h, w) planar depth at which rays through pixel centres meet a plane across the axis. [m]"""
+    along_x = axis[0] / camera.fx_px * (columns - camera.cx_px) + axis[2]
+    along_y = axis[1] / camera.fy_px * (np.arange(rows.start, rows.stop) - camera.cy_px)
+    depth: NDArray[np.float32] = ((center_m @ axis) / (along_y[:, None] + along_x)).astype(np.float32)
+    return depth
+
+
+def _disc_spans(ring: FlatRing, radius_m: float, view: EyeView) -> _RowSpans:
+    """The pixel centres on the image whose rays meet a disc.
+
+    The ray x meets the plane at `x (t.n) / (x.n)`, and lies within the radius of t where
+    `|x (t.n) - t (x.n)|^2 <= r^2 (x.n)^2`: a conic in the image, solved for the two columns of every row.
+    """
+    camera, axis, center_m = view.rig.camera, view.left_from_drogue.rotation[:, 2], view.center_m(ring)
+    reach = (center_m @ axis) * np.eye(3) - np.outer(center_m, axis)
+    quadric = reach.T @ reach - radius_m**2 * np.outer(axis, axis)
+    # Pixels are counted from the disc's centre, where nothing cancels.
+    middle = camera.project(center_m)
+    matrix = camera.matrix()
+    matrix[:2, 2] -= middle
+    inverse = np.linalg.inv(matrix)
+    conic = inverse.T @ quadric @ inverse
+    if conic[0, 0] <= 0:
+        return _RowSpans(0, np.zeros(0, np.int64), np.zeros(0, np.int64))
+    v = np.arange(camera.height_px) - middle[1]
+    half = conic[0, 1] * v + conic[0, 2]
+    rest = conic[1, 1] * v**2 + 2 * conic[1, 2] * v + conic[2, 2]
+    root = half**2 - conic[0, 0] * rest
+    crossed = np.flatnonzero(root >= 0)
+    if not len(crossed):
+        return _RowSpans(0, np.zeros(0, np.int64), np.zeros(0, np.int64))
+    rows = slice(crossed[0], crossed[-1] + 1)
+    width = np.sqrt(np.maximum(root[rows], 0.0))
+    first = np.ceil((-half[rows] - width) / conic[0, 0] + middle[0])
+    last = np.floor((-half[rows] + width) / conic[0, 0] + middle[0])
+    on_image = np.clip(first, 0, camera.width_px), np.clip(last, -1, camera.width_px - 1)
+    return _RowSpans(int(rows.start), on_image[0].astype(np.int64), on_image[1].astype(np.int64))

@@ -1,0 +1,110 @@
+"""The exact share of every pixel's box that polygons cover."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geometry.se3 import Array
+
+# Sums of signed areas leave pixels wholly inside or outside within some 1e-12 of 1 or 0.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCoverage:
+    """Coverage of the pixels of a rectangle of the image; 0 outside.
+
+    Attributes:
+        rows, columns: where it lies in the image.
+        share: (h, w) covered shares, 0 to 1.
+    """
+
+    rows: slice
+    columns: slice
+    share: Array
+
+
+def pixel_coverage(areas: Sequence[Any], width_px: int, height_px: int) -> PixelCoverage | None:
+    """Mean coverage by several areas, as at several moments of an exposure.
+
+    Args:
+        areas: shapely polygons or multipolygons, in pixel coordinates. [px]
+        width_px, height_px: size of the image.
+
+    Returns:
+        Exact up to rounding, or None where no area reaches the image.
+
+    Source: Green's theorem. An edge piece within one pixel covers, to its right, `dy` times its mean distance from the
+    pixel's right side there, and `dy` of every further pixel of the row; the signed sum over all edges is the area.
+    """
+    image = shapely.box(-0.5, -0.5, width_px - 0.5, height_px - 0.5)
+    inside = [area if shapely.covers(image, area) else shapely.intersection(area, image) for area in areas]
+    bounds = np.array([shapely.bounds(area) for area in inside if not shapely.is_empty(area)])
+    if not len(bounds):
+        return None
+    # From here on pixel i is the interval from i to i + 1 of the window.
+    low = np.floor(bounds[:, :2].min(axis=0) + 0.5).astype(int)
+    size = np.ceil(bounds[:, 2:].max(axis=0) + 0.5).astype(int) - low
+    start, end = (np.concatenate(points) + 0.5 - low for points in zip(*map(_edges, inside), strict=True))
+    start, end = _split_at_integers(*_split_at_integers(start, end, 1), 0)
+    rise = end[:, 1] - start[:, 1]
+    middle = (start + end) / 2
+    # A piece on the window's far side lies in no pixel of it and covers nothing to its right.
+    pixel = np.clip(np.floor(middle).astype(np.int64), 0, size - 1)
+    into = middle[:, 0] - pixel[:, 0]
+    # One column more takes what would run on beyond the last one.
+    flat = pixel[:, 1] * (size[0] + 1) + pixel[:, 0]
+    cells = (size[0] + 1) * size[1]
+    change = np.bincount(flat, rise * (1.0 - into), cells) + np.bincount(flat + 1, rise * into, cells)
+    share = change.reshape(size[1], size[0] + 1).cumsum(axis=1)[:, :-1] / len(areas)
+    share[np.abs(share) < _ROUNDING] = 0.0
+    share[np.abs(share - 1.0) < _ROUNDING] = 1.0
+    return PixelCoverage(slice(low[1], low[1] + size[1]), slice(low[0], low[0] + size[0]), share)
+
+
+def _edges(area: Any) -> tuple[Array, Array]:
+    """(E, 2) starts and ends of all edges; outer rings run upwards on their left, holes on their right."""
+    starts, ends = [np.zeros((0, 2))], [np.zeros((0, 2))]
+    for polygon in shapely.get_parts(area):
+        # An intersection with the image may leave points and lines beside the polygons.
+        if shapely.get_type_id(polygon) != shapely.GeometryType.POLYGON:
+            continue
+        for index, ring in enumerate([polygon.exterior, *polygon.interiors]):
+            points = shapely.get_coordinates(ring)
+            upwards_on_the_right = shapely.is_ccw(ring)
+            if upwards_on_the_right == (index == 0):
+                points = points[::-1]
+            starts.append(points[:-1])
+            ends.append(points[1:])
+    return np.concatenate(starts), np.concatenate(ends)
+
+
+def _split_at_integers(start: Array, end: Array, axis: int) -> tuple[Array, Array]:
+    """Edges cut wherever a coordinate passes an integer.
+
+    Args:
+        start, end: (E, 2) ends of the edges.
+        axis: the coordinate.
+
+    Returns:
+        (P, 2) starts and ends of the pieces.
+    """
+    a, b = start[:, axis], end[:, axis]
+    first: NDArray[np.float64] = np.floor(np.minimum(a, b)) + 1
+    last: NDArray[np.float64] = np.ceil(np.maximum(a, b)) - 1
+    pieces = np.maximum(last - first + 1, 0).astype(np.int64) + 1
+    edge = np.repeat(np.arange(len(start)), pieces)
+    index = np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    rises = (b > a)[edge]
+    cut = np.where(rises, first[edge] + index, last[edge] - index)
+    run = np.where(b == a, 1.0, b - a)[edge]
+    share = ((cut - a[edge]) / run)[:, None]
+    stops = np.where((index == pieces[edge] - 1)[:, None], end[edge], start[edge] + share * (end - start)[edge])
+    starts = np.where((index == 0)[:, None], start[edge], np.roll(stops, 1, axis=0))
+    return starts, stops
