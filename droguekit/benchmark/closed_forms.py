@@ -64,7 +64,7 @@ class FacingRing:
 
     @property
     def tilt_rad(self) -> float:
-        """Tilt about one axis from the known ring in both eyes, near zero tilt: the scale s0 of the flip law. [rad/px]"""
+        """Tilt about one axis from the known ring in both eyes, near zero tilt; the flip law's scale s0. [rad/px]"""
         spread = self.count * (self.ring_radius_m**2 / 2 + self.baseline_m**2 / 4)
         return self.distance_m**2 / (self.focal_px * self.ring_radius_m * math.sqrt(spread))
 
@@ -84,12 +84,12 @@ class FacingRing:
         Not proportional to the noise, and so not per pixel.
 
         Args:
-            sigma_px: centroid noise. [px]
+            sigma_px: centroid noise, above zero. [px]
             scale_sd: standard deviation of the ring's radius over the radius.
         """
         by_stereo = sigma_px * self.stereo_depth_m
         by_size = math.hypot(sigma_px * self.size_depth_m, self.distance_m * scale_sd)
-        return (by_stereo**-2 + by_size**-2) ** -0.5
+        return 1 / math.hypot(1 / by_stereo, 1 / by_size)
 
 
 def flip_probability(tilt: float, tilt_scale: float) -> float:

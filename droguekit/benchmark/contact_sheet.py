@@ -8,18 +8,20 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from datasets_manifest.images import StereoImages
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord, PixelBox, PixelPoint, ViewRecord
-
-Picture = NDArray[np.uint8]
+from droguekit.benchmark.label_drawing import (
+    BOX_RGB,
+    Picture,
+    display_picture,
+    draw_box,
+    draw_crosses,
+    resized,
+)
 
 _TILE_WIDTH_PX = 400
 _JPEG_QUALITY = 82
-_BOX_RGB = (255, 221, 51)
-_CENTER_RGB = (51, 238, 255)
 
 # A drogue smaller than this share of the picture's width is shown once more, enlarged, in a corner.
 _ENLARGE_BELOW = 0.3
@@ -28,9 +30,6 @@ _INSET_MARGIN = 1.25
 
 # Pairs looked at for their distance: enough to spread a dozen over any range of distances.
 _MOST_LOOKED_AT = 240
-
-# Coordinates are handed to OpenCV in 1/16 px, so that lines stand where the labels say.
-_SHIFT = 4
 
 
 @dataclass(frozen=True)
@@ -66,33 +65,20 @@ def contact_tiles(dataset: Dataset, count: int = 12) -> list[Tile]:
     return tiles
 
 
-def display_picture(images: StereoImages) -> Picture:
-    """(H, W, 3) left image in sRGB, as a screen wants it."""
-    span = 2**images.bits - 1 - images.black_level_dn
-    level = np.clip((images.left.astype(np.float32) - images.black_level_dn) / span, 0, 1)
-    if images.encoding == "linear":
-        # IEC 61966-2-1, the sRGB curve.
-        level = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
-    picture = np.rint(255 * level).astype(np.uint8)
-    return np.repeat(picture[..., None], 3, axis=2) if picture.ndim == 2 else picture
-
-
 def label_picture(picture: Picture, view: ViewRecord) -> Picture:
     """A small copy of an image with the visible box and the marker centres; a far drogue also enlarged in a corner."""
-    height, width = picture.shape[:2]
-    scale = _TILE_WIDTH_PX / width
-    size = (_TILE_WIDTH_PX, round(height * scale))
-    tile = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    width = picture.shape[1]
+    tile, scale = resized(picture, _TILE_WIDTH_PX)
     box = view.box_visible_xywh_px
     if box is None:
-        return np.asarray(tile, dtype=np.uint8)
-    _draw_box(tile, box, scale, (-0.5, -0.5))
+        return tile
+    draw_box(tile, box, scale)
     centers = [marker.center_ellipse_px for marker in view.markers if marker.visible_fraction > 0]
     if box[2] >= _ENLARGE_BELOW * width:
-        _draw_centers(tile, centers, scale, (-0.5, -0.5))
+        draw_crosses(tile, centers, scale)
     else:
         _put_inset(tile, picture, box, centers)
-    return np.asarray(tile, dtype=np.uint8)
+    return tile
 
 
 def jpeg_uri(picture: Picture) -> str:
@@ -114,31 +100,11 @@ def _put_inset(tile: Picture, picture: Picture, box: PixelBox, centers: Sequence
     inset = cv2.warpAffine(
         picture, warp, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
     )
-    _draw_centers(inset, centers, scale, corner)
-    cv2.rectangle(inset, (0, 0), (side - 1, side - 1), _BOX_RGB, 1)
+    draw_crosses(inset, centers, scale, corner)
+    cv2.rectangle(inset, (0, 0), (side - 1, side - 1), BOX_RGB, 1)
     x = 0 if middle[0] > picture.shape[1] / 2 else tile.shape[1] - side
     y = 0 if middle[1] > picture.shape[0] / 2 else tile.shape[0] - side
     tile[y : y + side, x : x + side] = inset
-
-
-def _draw_box(tile: Picture, box: PixelBox, scale: float, corner: PixelPoint) -> None:
-    ends = [(box[0], box[1]), (box[0] + box[2], box[1] + box[3])]
-    low, high = (_fixed_point(end, scale, corner) for end in ends)
-    cv2.rectangle(tile, low, high, _BOX_RGB, 1, cv2.LINE_AA, _SHIFT)
-
-
-def _draw_centers(tile: Picture, centers: Sequence[PixelPoint], scale: float, corner: PixelPoint) -> None:
-    for center in centers:
-        x, y = _fixed_point(center, scale, corner)
-        arm = 4 << _SHIFT
-        cv2.line(tile, (x - arm, y), (x + arm, y), _CENTER_RGB, 1, cv2.LINE_AA, _SHIFT)
-        cv2.line(tile, (x, y - arm), (x, y + arm), _CENTER_RGB, 1, cv2.LINE_AA, _SHIFT)
-
-
-def _fixed_point(point: PixelPoint, scale: float, corner: PixelPoint) -> tuple[int, int]:
-    """Where an image point lies in an enlarged cut-out, whose low corner is given, in OpenCV's fixed point."""
-    x, y = ((value - low) * scale - 0.5 for value, low in zip(point, corner, strict=True))
-    return round(x * 2**_SHIFT), round(y * 2**_SHIFT)
 
 
 def _spread(length: int, count: int) -> list[int]:

@@ -76,9 +76,7 @@ def ring_tilt_scale(truth: DrogueTruth, centroids: CentroidErrors, sigma_px: flo
         return None
     camera = truth.rig.camera
     focal_px = float(np.sqrt(camera.fx_px * camera.fy_px))
-    ring = FacingRing(
-        focal_px, truth.rig.baseline_m, layout.ring_radius_m, round(float(both.mean())), truth.distance_m
-    )
+    ring = FacingRing(focal_px, truth.rig.baseline_m, layout.ring_radius_m, round(float(both.mean())), truth.distance_m)
     return sigma_px * ring.tilt_rad
 
 

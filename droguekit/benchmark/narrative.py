@@ -10,17 +10,15 @@ from droguekit.benchmark.number_text import (
     plain_number,
     three_digits,
 )
+from droguekit.benchmark.ranking import best_method
 from droguekit.benchmark.result import BenchmarkResult, BinRow
-
-# A method that finds the drogue only where that is easy is not the best one.
-_FIXES_OF_MOST = 0.9
 
 
 def result_sentences(result: BenchmarkResult) -> list[str]:
     """What came out, one thought a sentence."""
     low, high = (plain_number(end) for end in (result.reference[0].low_m, result.reference[-1].high_m))
     shown = sum(place.n for place in result.reference)
-    best = best_method(result)
+    best = best_method(result.methods)
     if best is None:
         return [f"None of the methods found a pose in any of the {shown} pairs, from {low} to {high} m."]
     method = result.methods[best]
@@ -37,17 +35,6 @@ def result_sentences(result: BenchmarkResult) -> list[str]:
     if empty.n:
         sentences.append(f"It reported a pose in {empty.false_fixes} of {empty.n} pairs without a drogue.")
     return sentences + _others(result, best)
-
-
-def best_method(result: BenchmarkResult) -> str | None:
-    """Smallest mean position error among the methods that found nearly as many poses as any; None without a pose."""
-    most = max(method.overall.fix_fraction for method in result.methods.values())
-    means = {
-        name: method.overall.position_mean_m
-        for name, method in result.methods.items()
-        if method.overall.position_mean_m is not None and method.overall.fix_fraction >= _FIXES_OF_MOST * most
-    }
-    return min(means, key=lambda name: means[name]) if means else None
 
 
 def _at(row: BinRow) -> str:

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 
 from droguekit.benchmark.result import MethodResult
 
+# Whatever it is compared with, a method is also compared with the seed paper's.
+PAPER_METHOD = "paper"
+
 # A method that finds the drogue only where that is easy is not the best one.
 _FIXES_OF_MOST = 0.9
 

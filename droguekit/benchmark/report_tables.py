@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from droguekit.benchmark.number_text import distance_text, interval_text, millimetres, percent, three_digits
@@ -135,11 +135,14 @@ def _component_table(result: BenchmarkResult, name: str) -> Table:
     return Table(name, TITLES[name], columns, _by_distance(result, cells))
 
 
+def with_overall(result: BenchmarkResult, names: Sequence[str], cells: Callable[[Row], list[str]]) -> list[Group]:
+    """A group over all distances and one for each bin, with a row for each of the named methods."""
+    groups = [Group("all", [[name, *cells(result.methods[name].overall)] for name in names])]
+    for k, place in enumerate(result.reference):
+        rows = [[name, *cells(result.methods[name].bins[k])] for name in names]
+        groups.append(Group(distance_text(place.low_m, place.high_m), rows))
+    return groups
+
+
 def _by_distance(result: BenchmarkResult, cells: Callable[[BinRow], list[str]]) -> list[Group]:
-    return [
-        Group(
-            distance_text(place.low_m, place.high_m),
-            [[name, *cells(method.bins[k])] for name, method in result.methods.items()],
-        )
-        for k, place in enumerate(result.reference)
-    ]
+    return with_overall(result, list(result.methods), cells)[1:]

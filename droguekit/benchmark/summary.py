@@ -8,8 +8,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from droguekit.benchmark.centroid_errors import CentroidErrors, centroid_statistics
+from droguekit.benchmark.consistency import nees, normalized_errors
+from droguekit.benchmark.flips import FlipTrials, flip_row
 from droguekit.benchmark.pose_errors import COMPONENTS, PoseError
-from droguekit.benchmark.result import Bound, Centroids, ComponentRatios, Row
+from droguekit.benchmark.result import Row
+from droguekit.benchmark.result_parts import Bound, Centroids, ComponentErrors, ComponentRatios
 from droguekit.benchmark.statistics import (
     Interval,
     bootstrap_intervals,
@@ -24,37 +27,59 @@ _PERCENTILES = (95.0, 99.0)
 
 
 @dataclass(frozen=True, eq=False)
+class PoseScore:
+    """One pose.
+
+    Attributes:
+        error: estimate minus truth.
+        common_bound: (5,) bound of all visible features, markers and hub each at its own noise, or None. [m, deg]
+        own_bound: (5,) bound of the features that the method used, at its own noise, or None. [m, deg]
+        has_covariance: whether the estimate carries one.
+        squared_errors: (3,) see `consistency.squared_errors`.
+        flips: None where no bound is known.
+    """
+
+    error: PoseError
+    common_bound: Array | None
+    own_bound: Array | None
+    has_covariance: bool
+    squared_errors: Array | None
+    flips: FlipTrials | None
+
+
+@dataclass(frozen=True, eq=False)
 class FrameScore:
     """One method in one pair that shows a drogue.
 
     Attributes:
-        error: of its pose, or None without a fix.
+        pose: how good its pose is, or None without one.
         bound: (5,) Cramer-Rao bound at the noise of the pair's bin [m, deg], or None where there is none.
         centroids: errors of its features.
         from_centroids_m: (3,) position error that its centroids alone would make, or None. [m]
     """
 
-    error: PoseError | None
+    pose: PoseScore | None
     bound: Array | None
     centroids: CentroidErrors
     from_centroids_m: Array | None
 
 
-def summarize(scores: Sequence[FrameScore], key: str) -> Row:
+def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Row:
     """The row of some pairs, of which there is at least one.
 
     Args:
         scores: one for each pair; their order does not matter.
+        truth_spread: (5,) what a pair without a pose counts with in `rmse_with_failures`. [m, deg]
         key: of the bootstrap's random stream.
     """
-    fixed = [score for score in scores if score.error is not None]
+    fixed = [score for score in scores if score.pose is not None]
+    poses = [score.pose for score in scores if score.pose is not None]
     numbers: dict[str, float] = {}
     intervals: dict[str, Interval] = {"fix_fraction": fraction_interval(len(fixed), len(scores))}
     bound = mean_bound([score.bound for score in fixed])
-    bounded = [score.error for score in fixed if score.error is not None and score.bound is not None]
-    if fixed:
-        errors = [score.error for score in fixed if score.error is not None]
-        numbers, error_intervals = _error_numbers(errors, key)
+    bounded = [score.pose.error for score in fixed if score.pose is not None and score.bound is not None]
+    if poses:
+        numbers, error_intervals = _error_numbers([pose.error for pose in poses], key)
         intervals |= error_intervals
     return Row.model_validate(
         {
@@ -67,6 +92,9 @@ def summarize(scores: Sequence[FrameScore], key: str) -> Row:
             "bound_ratio": _ratios(bounded, bound),
             "centroids": Centroids(**asdict(centroid_statistics([score.centroids for score in scores]))),
             **_centroid_share(fixed),
+            **_checks(poses),
+            "failures": len(scores) - len(poses),
+            "rmse_with_failures": _with_failures(poses, len(scores), truth_spread),
         }
     )
 
@@ -111,16 +139,34 @@ def _ratios(errors: Sequence[PoseError], bound: Bound | None) -> ComponentRatios
     if bound is None:
         return None
     limits = np.array([getattr(bound, f"{name}_{UNITS[name]}") for name in COMPONENTS])
-    # Centroids without any error, such as those of another program's truth, set no limit.
-    if not (limits > 0).all():
-        return None
     rms = np.sqrt(np.mean(np.square([error.components for error in errors]), axis=0))
     return ComponentRatios(**dict(zip(COMPONENTS, (rms / limits).tolist(), strict=True)))
 
 
+def _checks(poses: Sequence[PoseScore]) -> dict[str, object]:
+    """Errors against bounds and covariances, pose by pose, and mirrored tilts."""
+    optical = [pose.flips.optical for pose in poses if pose.flips is not None]
+    sight = [pose.flips.sight for pose in poses if pose.flips is not None]
+    return {
+        "normalized": normalized_errors([(p.error, p.common_bound) for p in poses if p.common_bound is not None]),
+        "normalized_own": normalized_errors([(p.error, p.own_bound) for p in poses if p.own_bound is not None]),
+        "nees": nees([pose.squared_errors for pose in poses if pose.has_covariance]),
+        "flips": flip_row([trial for trial in optical if trial is not None]),
+        "sight_flips": flip_row([trial for trial in sight if trial is not None]),
+    }
+
+
+def _with_failures(poses: Sequence[PoseScore], count: int, truth_spread: Array) -> ComponentErrors:
+    squares = (count - len(poses)) * truth_spread**2
+    for pose in poses:
+        squares = squares + pose.error.components**2
+    x, y, z, pitch, yaw = np.sqrt(squares / count).tolist()
+    return ComponentErrors(x_m=x, y_m=y, z_m=z, pitch_deg=pitch, yaw_deg=yaw)
+
+
 def _centroid_share(fixed: Sequence[FrameScore]) -> dict[str, float | None]:
     """What the centroids explain, over the frames where they determine a pose."""
-    pairs = [(s.error.components[:3], s.from_centroids_m) for s in fixed if s.error is not None]
+    pairs = [(s.pose.error.components[:3], s.from_centroids_m) for s in fixed if s.pose is not None]
     known = [(error, predicted) for error, predicted in pairs if predicted is not None]
     if not known:
         return {"position_from_centroids_rmse_m": None, "centroid_share": None}

@@ -17,7 +17,7 @@ OUTER_DIFFERENCE_PX = 2.5
 OUTER_PLAIN_PX = 5.0
 # Discs up to this radius are taken whole. Of larger ones the pixels within the band of the edge are, and of the rest,
 # which tells only level and shading, one in three by three.
-_WHOLE_RADIUS_PX = 12.0
+WHOLE_RADIUS_PX = 12.0
 _BAND_PX = 3.0
 _THIN = 3
 
@@ -64,13 +64,24 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
 def disc_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
     """Pixels in and around discs."""
     outer = np.float32(OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
-    whole = bool(discs.radii_px.max() <= _WHOLE_RADIUS_PX)
+    whole = bool(discs.radii_px.max() <= WHOLE_RADIUS_PX)
 
     def choose(x: Array32, y: Array32, thin: NDArray[np.bool_]) -> NDArray[np.bool_]:
         distance = edge_distances(discs.shapes_px, x, y)
         chosen: NDArray[np.bool_] = distance >= -outer
         if not whole:
             chosen &= (np.abs(distance) <= _BAND_PX) | thin
+        return chosen
+
+    return _gather(signals, discs, float(outer), choose)
+
+
+def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
+    """One in three by three of the pixels in and around discs."""
+    outer = np.float32(OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
+
+    def choose(x: Array32, y: Array32, thin: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        chosen: NDArray[np.bool_] = thin & (edge_distances(discs.shapes_px, x, y) >= -outer)
         return chosen
 
     return _gather(signals, discs, float(outer), choose)

@@ -1,4 +1,4 @@
-"""Weighted Gauss-Newton adjustment of a pose to the markers of both eyes, for several starts at once."""
+"""Weighted Gauss-Newton adjustment of many poses at once, each to its own frame's features."""
 
 from __future__ import annotations
 
@@ -7,17 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geometry.se3 import Array, skew
-from nav.pose.interface import Observation
-from nav.pose.prediction import eye_points, predict_px
+from geometry.se3 import Array
+from nav.pose.features import Features
+from nav.pose.reprojection import SQUARES, Linearised, Loss, State, linearise
 
 _ITERATIONS = 20
 # Keeps the normal equations of a frontal, far drogue solvable; far below any information a marker brings.
 _DAMPING_FRACTION = 1e-9
 _LARGEST_TURN_RAD = 0.35
 _LARGEST_MOVE_FRACTION = 0.3
-# A step below this changes no digit that a benchmark prints. [m and rad]
-_CONVERGED = 1e-9
+_LARGEST_RESCALE = 0.1
+# The cost is known to be minimal when a step would lower it by less: it then moves no parameter by 2e-6 deviations.
+_CONVERGED = 1e-12
+# A start whose steps had to be shortened to this share is stuck at its minimum's rounding.
+_LEAST_REACH = 1e-4
+# Poses that are done leave the batch when they are more than this share of it; copying costs less than computing then.
+_DONE_FRACTION = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,104 +32,133 @@ class Adjusted:
     Attributes:
         rotations: (S, 3, 3) `left_from_drogue`.
         translations_m: (S, 3).
-        costs: (S,) half the sum of squared whitened residuals.
-        information: (S, 6, 6) `J^T W J` in the tangent of `datasets_manifest.estimates`.
+        scales: (S,) radius of the ring over that of the layout.
+        costs: (S,) half the sum of squared whitened residuals, with priors.
+        information: (S, K, K) in the tangent of `datasets_manifest.estimates`, and the ring's scale where it is free.
     """
 
     rotations: Array
     translations_m: Array
+    scales: Array
     costs: Array
     information: Array
 
 
-def adjust(observation: Observation, rotations: Array, translations_m: Array) -> Adjusted:
-    """Minimise the whitened reprojection error over all measurements of both eyes.
+def adjust(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARES) -> Adjusted:
+    """Minimise the whitened reprojection error over all measurements.
 
     A step that raises the cost is shortened, so a start never ends worse than it began.
 
     Args:
-        observation: at least three markers, not on a line.
+        features: S frames, in each at least three markers that are not on a line.
         rotations: (S, 3, 3) starts.
         translations_m: (S, 3).
+        loss: how residuals count.
     """
-    whitening = whitening_matrices(observation)
-    rotations, translations_m = rotations.copy(), translations_m.copy()
-    residuals = _residuals(observation, whitening, rotations, translations_m)
-    costs = _costs(residuals)
-    reach = np.ones(len(costs))
-    for _ in range(_ITERATIONS):
-        jacobian = _jacobian(observation, whitening, rotations, translations_m)
-        steps = reach[:, None] * _steps(jacobian, residuals, translations_m)
-        new_rotations = Rotation.from_rotvec(steps[:, 3:]).as_matrix() @ rotations
-        new_translations = translations_m + steps[:, :3]
-        new_residuals = _residuals(observation, whitening, new_rotations, new_translations)
-        new_costs = _costs(new_residuals)
-        better = new_costs <= costs
-        rotations[better], translations_m[better] = new_rotations[better], new_translations[better]
-        residuals[better], costs[better] = new_residuals[better], new_costs[better]
-        reach = np.where(better, np.minimum(1.0, 2 * reach), 0.25 * reach)
-        if np.abs(steps).max() < _CONVERGED:
-            break
-    jacobian = _jacobian(observation, whitening, rotations, translations_m)
-    return Adjusted(rotations, translations_m, costs, np.swapaxes(jacobian, 1, 2) @ jacobian)
-
-
-def whitening_matrices(observation: Observation) -> Array:
-    """(2, N, 2, 2) matrices that turn residuals into units of standard deviations; zero where nothing was measured."""
-    whitening = np.zeros_like(observation.cov_px2)
-    seen = observation.seen
-    whitening[seen] = np.linalg.inv(np.linalg.cholesky(observation.cov_px2[seen]))
-    return whitening
-
-
-def _residuals(observation: Observation, whitening: Array, rotations: Array, translations_m: Array) -> Array:
-    """(S, 4N) whitened differences of prediction and measurement."""
-    measured = np.nan_to_num(observation.pixels_px)
-    # A trial step may put a marker at a camera's own depth; its infinite cost turns the step down.
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        difference = predict_px(observation.rig, observation.layout, rotations, translations_m) - measured
-        whitened = np.einsum("enij,senj->seni", whitening, difference)
-    flat: Array = whitened.reshape(len(rotations), -1)
-    return flat
-
-
-def _costs(residuals: Array) -> Array:
-    """(S,) half the sum of squares, infinite where it is not a number."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        costs = (residuals**2).sum(axis=1) / 2
-    return np.where(np.isfinite(costs), costs, np.inf)
-
-
-def _jacobian(observation: Observation, whitening: Array, rotations: Array, translations_m: Array) -> Array:
-    """(S, 4N, 6) derivatives of the residuals; the shift of a disc's centre is left out, it hardly changes."""
-    camera = observation.rig.camera
-    points = eye_points(observation.rig, observation.layout.centers_m, rotations, translations_m)
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    zero = np.zeros_like(x)
-    by_point = np.stack(
-        [
-            np.stack([camera.fx_px / z, zero, -camera.fx_px * x / z**2], axis=-1),
-            np.stack([zero, camera.fy_px / z, -camera.fy_px * y / z**2], axis=-1),
-        ],
-        axis=-2,
+    count = len(rotations)
+    state = State(rotations.copy(), translations_m.copy(), np.ones(count))
+    size = 7 if features.ring_sigma > 0 else 6
+    result = Adjusted(
+        rotations.copy(), translations_m.copy(), np.ones(count), np.empty(count), np.empty((count, size, size))
     )
-    levers = np.einsum("sij,nj->sni", rotations, observation.layout.centers_m)
-    by_turn = -np.einsum("senij,snjk->senik", by_point, skew(levers))
-    full = np.einsum("enij,senjk->senik", whitening, np.concatenate([by_point, by_turn], axis=-1))
-    flat: Array = full.reshape(len(rotations), -1, 6)
-    return flat
-
-
-def _steps(jacobian: Array, residuals: Array, translations_m: Array) -> Array:
-    """(S, 6) Gauss-Newton steps of limited length."""
-    normal = np.swapaxes(jacobian, 1, 2) @ jacobian
-    trace = np.trace(normal, axis1=1, axis2=2)
-    damped = normal + _DAMPING_FRACTION * trace[:, None, None] * np.eye(6)
-    gradient = np.einsum("smk,sm->sk", jacobian, residuals)
-    steps = -np.linalg.solve(damped, gradient[..., None])[..., 0]
-    move = np.linalg.norm(steps[:, :3], axis=1) / (_LARGEST_MOVE_FRACTION * np.abs(translations_m[:, 2]))
-    turn = np.linalg.norm(steps[:, 3:], axis=1) / _LARGEST_TURN_RAD
-    steps[:, :3] /= np.maximum(1.0, move)[:, None]
-    steps[:, 3:] /= np.maximum(1.0, turn)[:, None]
-    result: Array = steps
+    now = linearise(features, state, loss)
+    active, reach = np.arange(count), np.ones(count)
+    done = np.zeros(count, dtype=bool)
+    for _ in range(_ITERATIONS):
+        steps, gain = _steps(now, state)
+        trial = _moved(state, reach[:, None] * steps)
+        ahead = linearise(features, trial, loss)
+        better = ahead.costs <= now.costs
+        state, now = _chosen(better, trial, state), _kept(better, ahead, now)
+        reach = np.where(better, np.minimum(1.0, 2 * reach), 0.25 * reach)
+        done |= (gain < _CONVERGED) | (reach < _LEAST_REACH)
+        if done.all():
+            break
+        if done.sum() > _DONE_FRACTION * len(done):
+            _store(result, active[done], state, now, done)
+            left = ~done
+            active, reach, done = active[left], reach[left], done[left]
+            features = features.take(np.flatnonzero(left))
+            state = State(state.rotations[left], state.translations_m[left], state.scales[left])
+            now = Linearised(now.jacobian[left], now.residuals[left], now.costs[left])
+    _store(result, active, state, now, np.ones(len(active), dtype=bool))
     return result
+
+
+def information_at(features: Features, rotations: Array, translations_m: Array) -> Array:
+    """(S, K, K) information that the features of S frames hold in given poses; see `Adjusted`."""
+    return linearise(features, State(rotations, translations_m, np.ones(len(rotations)))).information
+
+
+def inverse_information(information: Array) -> tuple[Array, Array]:
+    """Covariances of the pose.
+
+    Args:
+        information: (S, K, K), K = 6 or 7; whatever follows the pose is marginalised.
+
+    Returns:
+        (S, 6, 6) covariances, (S,) whether the measurements determine the whole pose; the covariance of others is zero.
+    """
+    # Metres and radians differ in size: judge the eigenvalues of the scaled matrix.
+    diagonal = np.diagonal(information, axis1=1, axis2=2)
+    sound = (np.isfinite(information).all(axis=(1, 2)) & (diagonal > 0).all(axis=1))[:, None]
+    scale = np.sqrt(np.where(sound, diagonal, 1.0))
+    outer = scale[:, :, None] * scale[:, None, :]
+    values, vectors = np.linalg.eigh(np.where(sound[..., None], information / outer, np.eye(information.shape[1])))
+    sound = sound[:, 0] & (values[:, 0] > np.finfo(np.float64).eps)
+    inverse = (vectors / np.where(sound, values.T, np.inf).T[:, None, :]) @ np.swapaxes(vectors, 1, 2) / outer
+    return inverse[:, :6, :6], sound
+
+
+def _steps(now: Linearised, state: State) -> tuple[Array, Array]:
+    """(S, K) Gauss-Newton steps of limited length, (S,) by how much the linearised cost would sink."""
+    normal = now.information
+    size = normal.shape[1]
+    trace = np.trace(normal, axis1=1, axis2=2)
+    # Where nothing was measured, any positive number keeps the equations solvable; the step is zero there.
+    normal[:, np.arange(size), np.arange(size)] += (_DAMPING_FRACTION * trace + (trace == 0))[:, None]
+    sound = np.isfinite(now.costs)
+    if not sound.all():
+        normal = np.where(sound[:, None, None], normal, np.eye(size))
+    gradient = (now.jacobian @ now.residuals[..., None])[..., 0]
+    gradient = np.where(sound[:, None], gradient, 0.0)
+    steps = -np.linalg.solve(normal, gradient[..., None])[..., 0]
+    gain = -(steps * gradient).sum(axis=1) / 2
+    move = np.sqrt((steps[:, :3] ** 2).sum(axis=1)) / (_LARGEST_MOVE_FRACTION * np.abs(state.translations_m[:, 2]))
+    turn = np.sqrt((steps[:, 3:6] ** 2).sum(axis=1)) / _LARGEST_TURN_RAD
+    steps[:, :3] /= np.maximum(1.0, move)[:, None]
+    steps[:, 3:6] /= np.maximum(1.0, turn)[:, None]
+    np.clip(steps[:, 6:], -_LARGEST_RESCALE, _LARGEST_RESCALE, out=steps[:, 6:])
+    return steps, gain
+
+
+def _moved(state: State, steps: Array) -> State:
+    rotations = Rotation.from_rotvec(steps[:, 3:6]).as_matrix() @ state.rotations
+    scales = state.scales + steps[:, 6] if steps.shape[1] > 6 else state.scales
+    return State(rotations, state.translations_m + steps[:, :3], scales)
+
+
+def _chosen(better: Array, trial: State, state: State) -> State:
+    if better.all():
+        return trial
+    return State(
+        np.where(better[:, None, None], trial.rotations, state.rotations),
+        np.where(better[:, None], trial.translations_m, state.translations_m),
+        np.where(better, trial.scales, state.scales),
+    )
+
+
+def _kept(better: Array, ahead: Linearised, now: Linearised) -> Linearised:
+    if better.all():
+        return ahead
+    return Linearised(
+        np.where(better[:, None, None], ahead.jacobian, now.jacobian),
+        np.where(better[:, None], ahead.residuals, now.residuals),
+        np.where(better, ahead.costs, now.costs),
+    )
+
+
+def _store(result: Adjusted, where: Array, state: State, now: Linearised, which: Array) -> None:
+    result.rotations[where], result.translations_m[where] = state.rotations[which], state.translations_m[which]
+    result.scales[where], result.costs[where] = state.scales[which], now.costs[which]
+    result.information[where] = now.information[which]

@@ -14,7 +14,8 @@ import numpy as np
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
-from nav.pose.interface import NoFixReason, Observation, Solution, fault
+from nav.pose.faults import fault
+from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.prediction import (
     eye_points,
     plane_normal,

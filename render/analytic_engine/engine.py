@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 
 import numpy as np
@@ -48,34 +50,40 @@ class AnalyticEngine:
         Raises:
             ValueError: part of the drogue is not in front of the camera.
         """
-        stage_s = {"sky": 0.0, "passes": 0.0, "outlines": 0.0, "composite": 0.0}
-        started = time.process_time()
-        behind = background(frame)
-        stage_s["sky"] = time.process_time() - started
-        eyes = {eye: _draw_eye(frame, eye, behind, stage_s) for eye in EYES}
+        stage_s = {"sky": 0.0, "light": 0.0, "passes": 0.0, "outlines": 0.0, "composite": 0.0}
+        with _timed(stage_s, "sky"):
+            behind = background(frame)
+        if frame.drogue is None or frame.left_from_drogue is None:
+            return self._stereo({eye: _empty_eye(frame, behind) for eye in EYES}, stage_s)
+        flat = flat_drogue(frame.drogue)
+        with _timed(stage_s, "light"):
+            light = ring_radiance(frame, surroundings(frame.environment), flat.back_to_front)
+        eyes = {}
+        for eye in EYES:
+            with _timed(stage_s, "passes"):
+                passes = pixel_passes(flat, EyeView(frame.rig, eye, frame.left_from_drogue))
+            with _timed(stage_s, "outlines"):
+                views = [EyeView(frame.rig, eye, frame.left_from_drogue_at(offset_s)) for offset_s in _moments_s(frame)]
+                moments = [seen_areas(flat, view) for view in views]
+            with _timed(stage_s, "composite"):
+                eyes[eye] = EyeRadiance(*paint(moments, light, behind), **vars(passes))
+        return self._stereo(eyes, stage_s)
+
+    def _stereo(self, eyes: dict[Eye, EyeRadiance], stage_s: dict[str, float]) -> StereoRadiance:
         return StereoRadiance(eyes["left"], eyes["right"], self.name, self.version, 0.0, stage_s)
 
 
-def _draw_eye(frame: FrameSpec, eye: Eye, behind: NDArray[np.float32], stage_s: dict[str, float]) -> EyeRadiance:
-    """One eye over the surroundings `behind` (H, W, 3); adds its CPU seconds to `stage_s`."""
-    if frame.drogue is None or frame.left_from_drogue is None:
-        nothing = empty_passes(frame.rig.camera)
-        coverage = np.zeros(behind.shape[:2], dtype=np.float32)
-        return EyeRadiance(behind.copy(), coverage, nothing.part_id, nothing.depth_m, nothing.normal, nothing.amodal_px)
-    times = [time.process_time()]
-    flat = flat_drogue(frame.drogue)
-    passes = pixel_passes(flat, EyeView(frame.rig, eye, frame.left_from_drogue))
-    times.append(time.process_time())
-    moments = [
-        seen_areas(flat, EyeView(frame.rig, eye, frame.left_from_drogue_at(offset_s))) for offset_s in _moments_s(frame)
-    ]
-    times.append(time.process_time())
-    light = ring_radiance(frame, surroundings(frame.environment), flat.back_to_front)
-    radiance, coverage = paint(moments, light, behind)
-    times.append(time.process_time())
-    for stage, spent_s in zip(("passes", "outlines", "composite"), np.diff(times), strict=True):
-        stage_s[stage] += float(spent_s)
-    return EyeRadiance(radiance, coverage, passes.part_id, passes.depth_m, passes.normal, passes.amodal_px)
+@contextmanager
+def _timed(stage_s: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the CPU time of a block to a stage."""
+    started = time.process_time()
+    yield
+    stage_s[stage] += time.process_time() - started
+
+
+def _empty_eye(frame: FrameSpec, behind: NDArray[np.float32]) -> EyeRadiance:
+    coverage = np.zeros(behind.shape[:2], dtype=np.float32)
+    return EyeRadiance(behind.copy(), coverage, **vars(empty_passes(frame.rig.camera)))
 
 
 def _moments_s(frame: FrameSpec) -> NDArray[np.float64]:

@@ -40,11 +40,10 @@ def paint(
             if _painted_on(part) == Part.SKY:
                 coverage[covered.rows, covered.columns] += share
     image = behind.copy()
-    for _, rows, columns, _ in painted:
-        # Windows overlap: each pixel is weighted from the surroundings anew.
-        np.multiply(
-            behind[rows, columns], 1.0 - coverage[rows, columns, None], out=image[rows, columns], dtype=np.float32
-        )
+    for part, rows, columns, _ in painted:
+        if _painted_on(part) == Part.SKY:
+            # Windows may overlap: the pixels are weighted anew from the surroundings.
+            image[rows, columns] = behind[rows, columns] * (1.0 - coverage[rows, columns, None])
     for part, rows, columns, share in painted:
         under = _painted_on(part)
         adds = radiance[part] - (radiance[under] if under != Part.SKY else 0.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -13,18 +12,17 @@ from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
-from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
+from render.mitsuba_engine.camera_rays import CameraRays
+from render.mitsuba_engine.center_passes import CenterPasses
 from render.mitsuba_engine.scene import DrogueScene, scene_key
 from render.mitsuba_engine.sun_sky_paths import trace_paths
 from render.mitsuba_engine.traced import (
     Traced,
     TracedEye,
-    amodal_counts,
     blur_px,
     inside_one_part,
     pixels_to_trace,
-    pose_polynomial,
     settings_by_plan,
 )
 from scenes.seeding import generator
@@ -34,9 +32,6 @@ from scenes.surroundings import Surroundings
 # Lanes of one launch: bounds memory (about 300 bytes a lane) without costing speed.
 _MOST_LANES = 2_000_000
 _PLAN = ("drogue", "surround")
-CENTER = (0.5, 0.5)
-# Next to the centre by a thousandth of a pixel, off any axis: for rays that slip through a seam at the centre itself.
-ASIDE = (0.501, 0.5007)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +65,7 @@ class LlvmTracer:
         eyes: dict[Eye, TracedEye] = {}
         plans: dict[Eye, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
         for eye in EYES:
-            passes = _Passes(frame, eye, self._scene)
+            passes = CenterPasses(frame, eye, self._scene)
             seen = [passes.part_ids(moment) for moment in times]
             eyes[eye] = passes.traced_eye(*seen[0])
             plans[eye] = pixels_to_trace(
@@ -94,7 +89,7 @@ class LlvmTracer:
         lit = frame.drogue.marker_luminance_cd_m2 > 0
         noise: list[NDArray[np.float32]] = []
         for eye in EYES:
-            camera = _CameraRays(frame, eye)
+            camera = CameraRays(frame, eye)
             parts = []
             for name, pixel, count, depth in zip(_PLAN, plans[eye], *settings_by_plan(settings), strict=True):
                 samples = self._sample_pixels(camera, pixel, count, (depth, lit), seeds)
@@ -109,7 +104,7 @@ class LlvmTracer:
 
     def _sample_pixels(
         self,
-        camera: _CameraRays,
+        camera: CameraRays,
         pixel: NDArray[np.int64],
         count: int,
         path: tuple[int, bool],
@@ -141,7 +136,7 @@ class LlvmTracer:
 
     def _launch(
         self,
-        camera: _CameraRays,
+        camera: CameraRays,
         pixel: NDArray[np.int64],
         count: int,
         path: tuple[int, bool],
@@ -163,124 +158,3 @@ class LlvmTracer:
         # Without this every sum would trace the paths again.
         dr.eval(channels)
         return np.stack([np.array(dr.block_sum(channel, count)) for channel in channels], axis=-1)
-
-
-class _CameraRays:
-    """Rays of one eye in the drogue frame."""
-
-    def __init__(self, frame: FrameSpec, eye: Eye) -> None:
-        self.camera: PinholeCamera = frame.rig.camera
-        self._pose = pose_polynomial(frame, eye)
-        self.pose_at_middle = self._pose[0]
-        self.moves = bool(np.abs(self._pose[1:]).max() > 0)
-        # Plain numbers would become part of the compiled kernel, and every frame would compile its own.
-        self._opaque_pose = [
-            [[dr.opaque(mi.Float, float(value)) for value in row] for row in coefficient] for coefficient in self._pose
-        ]
-
-    def rays(self, pixel: Any, place: Any, moment: Any) -> Any:
-        """Rays through pixels.
-
-        Args:
-            pixel: flat pixel indices.
-            place: 2-D place in the pixel's box, (0.5, 0.5) its centre.
-            moment: time in the exposure, 0 when the shutter opens and 1 when it closes.
-        """
-        camera = self.camera
-        row = pixel // camera.width_px
-        u = mi.Float(pixel - row * camera.width_px) + (place.x - 0.5)
-        v = mi.Float(row) + (place.y - 0.5)
-        local = dr.normalize(
-            mi.Vector3f((u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px, mi.Float(1.0))
-        )
-        pose = self._pose_at(2.0 * moment - 1.0)
-        direction = mi.Vector3f(*[pose[i][0] * local.x + pose[i][1] * local.y + pose[i][2] * local.z for i in range(3)])
-        return mi.Ray3f(mi.Point3f(*[pose[i][3] for i in range(3)]), dr.normalize(direction))
-
-    def _pose_at(self, s: Any) -> list[list[Any]]:
-        c = self._opaque_pose
-        if not self.moves:
-            return c[0]
-        return [[c[0][i][j] + s * (c[1][i][j] + s * c[2][i][j]) for j in range(4)] for i in range(3)]
-
-
-class _Passes:
-    """Part id, depth and normal by the rays through the pixel centres of one eye."""
-
-    def __init__(self, frame: FrameSpec, eye: Eye, scene: DrogueScene) -> None:
-        self._rays = _CameraRays(frame, eye)
-        self._scene = scene
-        camera = frame.rig.camera
-        self._shape = (camera.height_px, camera.width_px)
-
-    def _center_rays(self, pixel: Any, moment: float = 0.5, place: tuple[float, float] = CENTER) -> Any:
-        return self._rays.rays(pixel, mi.Point2f(*place), dr.opaque(mi.Float, moment))
-
-    def part_ids(self, s: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """(H, W) part ids and distances [m] at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""
-        pixel = dr.arange(mi.UInt32, self._shape[0] * self._shape[1])
-        ids, distance = self._hits(self._scene.scene, self._center_rays(pixel, (s + 1) / 2))
-        return ids.reshape(self._shape), distance.reshape(self._shape)
-
-    @staticmethod
-    def _hits(scene: Any, ray: Any) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        hit = scene.ray_intersect_preliminary(ray, coherent=True)
-        registry: Any = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
-        registry_ids = np.array(registry)
-        table = np.zeros(int(registry_ids.max()) + 1, dtype=np.uint32)
-        for index, shape in zip(registry_ids, scene.shapes(), strict=True):
-            table[index] = int(shape.id().removeprefix("part_"))
-        of_hit: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
-        ids = dr.gather(mi.UInt32, mi.UInt32(table), of_hit, hit.is_valid())
-        dr.eval(ids, hit.t)
-        return np.array(ids).astype(np.uint8), np.array(hit.t)
-
-    def traced_eye(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> TracedEye:
-        """The passes at mid-exposure, without radiance yet."""
-        depth = np.full(self._shape, np.inf, dtype=np.float32)
-        normal = np.zeros((*self._shape, 3), dtype=np.float32)
-        covered = np.flatnonzero(part_id)
-        if len(covered):
-            points, normals, leaked = self._surface(covered, CENTER)
-            if leaked.any():
-                aside = covered[leaked]
-                points[leaked], normals[leaked], _ = self._surface(aside, ASIDE)
-                ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=ASIDE))
-                part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
-            pose = self._rays.pose_at_middle
-            depth.reshape(-1)[covered] = np.einsum("pi,i->p", points - pose[:, 3], pose[:, 2])
-            normal.reshape(-1, 3)[covered] = np.einsum("pi,ij->pj", normals, pose[:, :3])
-        return TracedEye(
-            part_id,
-            depth,
-            normal,
-            self._amodal(part_id, distance_m),
-            np.zeros(0, dtype=np.int64),
-            np.zeros((0, 3), dtype=np.float32),
-            np.zeros(0, dtype=np.float32),
-        )
-
-    def _surface(
-        self, pixel: NDArray[np.int64], place: tuple[float, float]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """(P, 3) points and normals in the drogue frame, and (P,) which rays slipped into a part through a seam.
-
-        All parts are closed: a surface that looks away from the camera is seen from inside, by a ray that passed
-        exactly between two triangles.
-        """
-        ray = self._center_rays(mi.UInt32(pixel), place=place)
-        hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-        inside = hit.is_valid() & (dr.dot(hit.n, ray.d) > 0)
-        dr.eval(hit.p, hit.n, inside)
-        return np.array(hit.p).T, np.array(hit.n).T, np.array(inside)
-
-    def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
-        """Pixel centres that each marker and the hub would cover alone, on the image's grid."""
-        rows, columns = np.flatnonzero(part_id.any(axis=1)), np.flatnonzero(part_id.any(axis=0))
-        if not len(rows):
-            return {}
-        # Where a hidden feature would be, something else is seen: what is covered bounds the features too.
-        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        pixel = np.arange(part_id.size, dtype=np.uint32).reshape(self._shape)[window].ravel()
-        alone_id, alone_m = self._hits(self._scene.features, self._center_rays(mi.UInt32(pixel)))
-        return amodal_counts(part_id[window].ravel(), distance_m[window].ravel(), alone_id, alone_m)

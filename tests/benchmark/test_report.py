@@ -14,8 +14,9 @@ from datasets_manifest.records import PairRecord
 from droguekit.benchmark.benchmark import run_benchmark
 from droguekit.benchmark.contact_sheet import contact_tiles, label_picture
 from droguekit.benchmark.figures import QUANTITIES, error_panel, method_styles
-from droguekit.benchmark.narrative import best_method, result_sentences
+from droguekit.benchmark.narrative import result_sentences
 from droguekit.benchmark.number_text import distance_text, percent, plain_number, three_digits
+from droguekit.benchmark.ranking import best_method
 from droguekit.benchmark.report import write_report
 from droguekit.benchmark.result import BenchmarkResult
 
@@ -132,7 +133,7 @@ def test_a_page_without_a_single_pose(dataset: DatasetFixture, tmp_path: Path) -
     write_estimates(estimates, [NoFix(frame_index=r.frame_index, method="blind", reason="dark") for r in records])
     result = run_benchmark(folder, estimates)
     write_report(folder, estimates, result, tmp_path / "report.html")
-    assert best_method(result) is None
+    assert best_method(result.methods) is None
     assert "None of the methods found a pose" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
@@ -159,7 +160,7 @@ def test_every_method_looks_different() -> None:
 
 def test_the_sentences_name_the_best_method(scored: tuple[Path, Path, BenchmarkResult]) -> None:
     result = scored[2]
-    assert best_method(result) == "joint"
+    assert best_method(result.methods) == "joint"
     text = " ".join(result_sentences(result))
     assert three_digits(1e3 * result.methods["joint"].overall.position_mean_m) in text
     assert "9 stereo pairs from 2 to 30 m" in text

@@ -1,0 +1,147 @@
+"""How far a fitted outline can be trusted: noise from residuals, spread of residuals about the outline, reasons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.se3 import Array
+from nav.centroids.marker_signal import Array32
+
+# Rounding to integers. [DN^2]
+_QUANTISATION_DN2 = 1 / 12
+# Shares of light from within that count as one side, and as the edge.
+_ONE_SIDE, _EDGE = 0.03, (0.2, 0.8)
+# Of an outline whose residuals are so much above the usual, none tells of the sensor.
+_ODD_FACTOR = 3.0
+# Noise beside a marker may be cut off by the difference of channels; on the way up the edge it is not.
+_LEAST_DARK_SHARE = 0.25
+SECTORS = 8
+# A shadow or a thing before the disc leaves residuals beyond so many deviations of a sector's mean, and beyond this
+# share of the contrast; what is smaller moves the centre by less than the noise of one edge pixel.
+_SECTOR_SIGMA = 4.0
+_SECTOR_SHARE = 0.04
+# Mean square of a sector's summed noise that 5 % of even discs exceed (chi-square of 8).
+_USUAL_SECTOR_CHI2 = 1.94
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance of a pixel by what it sees, from the images themselves.
+
+    Attributes:
+        dark_dn2: beside the markers.
+        per_signal_dn: shot noise: growth with the signal above the background.
+        edge_share2: further variance on an edge, in squared steps of light (render noise, unevenness of the pixels).
+    """
+
+    dark_dn2: float
+    per_signal_dn: float
+    edge_share2: float
+
+    def variances(self, inside: Array32, contrast: Array32) -> Array32:
+        """Variances where the share `inside` of the light comes from `contrast` above the background. [DN^2]"""
+        shot = np.float32(self.per_signal_dn) * np.maximum(contrast, 0) * inside
+        edge = np.float32(4 * self.edge_share2) * contrast * contrast * inside * (1 - inside)
+        variances: Array32 = np.float32(self.dark_dn2) + shot + edge
+        return variances
+
+
+def measure_noise(squares: Array32, present: Array32, inside: Array32, contrast: Array) -> NoiseModel:
+    """Noise from the squared residuals of many outlines.
+
+    Args:
+        squares: (N, K) squared residuals, corrected for what the fit swallowed. [DN^2]
+        present: (N, K) 0 for padding.
+        inside: (N, K) share of the light from within.
+        contrast: (N,) [DN]
+    """
+    mean = (squares * present).sum(axis=1) / np.maximum(present.sum(axis=1), 1)
+    usual = mean <= _ODD_FACTOR * np.median(mean)
+    squares, present, inside = squares[usual], present[usual], inside[usual]
+    level = float(np.median(contrast[usual]))
+    zones = (inside < _ONE_SIDE, (inside > _EDGE[0]) & (inside < _EDGE[1]), inside > 1 - _ONE_SIDE)
+    dark, edge, bright = (
+        float((squares * present * zone).sum() / max(1.0, float((present * zone).sum()))) for zone in zones
+    )
+    dark = max(dark, _LEAST_DARK_SHARE * bright, _QUANTISATION_DN2)
+    bright = max(bright, dark)
+    mean_shape = 0.83  # of 4 S (1 - S) over the edge's zone
+    further = max(0.0, edge - (dark + bright) / 2) / mean_shape
+    return NoiseModel(dark, (bright - dark) / max(level, 1e-6), further / max(level, 1e-6) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSpread:
+    """What is left of N patches after the fit.
+
+    Attributes:
+        chi2_per_dof: (N,) mean square of the residuals over their variances.
+        worst_sector_sigma: (N,) largest mean of a sector over its deviation.
+        worst_sector_share: (N,) largest mean of a sector over the contrast.
+        sector_chi2: (N,) mean square of the sectors' summed residuals over their variances; 1 for white noise.
+    """
+
+    chi2_per_dof: Array
+    worst_sector_sigma: Array
+    worst_sector_share: Array
+    sector_chi2: Array
+
+    @property
+    def uneven(self) -> NDArray[np.bool_]:
+        """(N,) whether a shadow or something before the disc shows."""
+        found: NDArray[np.bool_] = (self.worst_sector_sigma > _SECTOR_SIGMA) & (self.worst_sector_share > _SECTOR_SHARE)
+        return found
+
+    @property
+    def inflation(self) -> Array:
+        """(N,) factor by which residuals that hang together widen the covariance."""
+        factor: Array = np.maximum(1.0, self.sector_chi2 / _USUAL_SECTOR_CHI2)
+        return factor
+
+
+def residual_spread(
+    residuals: Array32,
+    weights: Array32,
+    sectors: NDArray[np.int64],
+    contrast: Array,
+    fitted: int,
+) -> ResidualSpread:
+    """Residuals summed over the patch and over sectors.
+
+    Args:
+        residuals: (N, K). [DN]
+        weights: (N, K) inverse variances, 0 for padding. [1/DN^2]
+        sectors: (N, K) in 0..S-1.
+        contrast: (N,) [DN]
+        fitted: number of parameters.
+    """
+    count = int(sectors.max()) + 1
+    index = (sectors + count * np.arange(len(residuals))[:, None]).ravel()
+
+    def by_sector(values: Array32) -> Array:
+        return np.bincount(index, values.ravel(), len(residuals) * count).reshape(len(residuals), count)
+
+    weight = np.maximum(by_sector(weights), 1e-12)
+    summed = by_sector(weights * residuals)
+    squares = (weights * residuals * residuals).sum(axis=1, dtype=np.float64)
+    dof = np.maximum((weights > 0).sum(axis=1) - fitted, 1)
+    sigma = np.abs(summed) / np.sqrt(weight)
+    mean = np.abs(summed) / weight
+    share = mean / np.maximum(contrast, 1e-6)[:, None]
+    worst = np.argmax(np.minimum(sigma / _SECTOR_SIGMA, share / _SECTOR_SHARE), axis=1)[:, None]
+    return ResidualSpread(
+        squares / dof,
+        np.take_along_axis(sigma, worst, 1)[:, 0],
+        np.take_along_axis(share, worst, 1)[:, 0],
+        (summed**2 / weight).mean(axis=1),
+    )
+
+
+def sector_index(x_px: Array32, y_px: Array32, count: int) -> NDArray[np.int64]:
+    """Which of so many equal sectors about the origin a place lies in."""
+    turn = np.arctan2(y_px, x_px) / (2 * np.pi)
+    sectors: NDArray[np.int64] = np.floor(turn * count).astype(np.int64) % count
+    return sectors

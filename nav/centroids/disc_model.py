@@ -1,0 +1,63 @@
+"""The picture of a disc: a blurred edge between two planes of light."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.se3 import Array
+from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_profile, ellipse_parameters
+from nav.centroids.least_squares import Model
+from nav.centroids.marker_signal import Array32
+from nav.centroids.patches import PixelSet, edge_distances
+
+# Places in the vector of parameters, after those of the ellipse.
+WIDTH, BACKGROUND, LEVEL = ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS + 1, ELLIPSE_PARAMETERS + 2
+_PLAIN_COUNT = ELLIPSE_PARAMETERS + 3
+# An initial outline may be this far off; pixels this far from it show one side only. [px]
+_CLEAR_PX = 1.0
+
+
+def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool) -> Model:
+    """`I = (b + g.x) (1 - S) + (A + h.x) S`.
+
+    Args:
+        pixels: where.
+        slope_outside: whether the background's plane g is fitted.
+        slope_inside: whether the disc's plane h is fitted.
+    """
+    x, y = pixels.x_px, pixels.y_px
+    count = _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside
+
+    def model(parameters: Array) -> tuple[Array32, Array32]:
+        edge = edge_profile(parameters[:, :ELLIPSE_PARAMETERS], parameters[:, WIDTH], x, y)
+        rest = parameters[:, BACKGROUND:].astype(np.float32)[:, :, None]
+        inside, outside = edge.inside, 1 - edge.inside
+        dark, bright = rest[:, 0], rest[:, 1]
+        jacobian = np.empty((len(x), count, x.shape[1]), np.float32)
+        place = _PLAIN_COUNT
+        if slope_outside:
+            dark = dark + rest[:, 2] * x + rest[:, 3] * y
+            jacobian[:, place], jacobian[:, place + 1] = x * outside, y * outside
+            place += 2
+        if slope_inside:
+            bright = bright + rest[:, place - BACKGROUND] * x + rest[:, place + 1 - BACKGROUND] * y
+            jacobian[:, place], jacobian[:, place + 1] = x * inside, y * inside
+        steep = (bright - dark) * edge.density
+        np.multiply(edge.slopes, steep[:, None], out=jacobian[:, :ELLIPSE_PARAMETERS])
+        jacobian[:, WIDTH] = -steep * edge.distance_px / parameters[:, WIDTH, None].astype(np.float32)
+        jacobian[:, BACKGROUND], jacobian[:, LEVEL] = outside, inside
+        return dark + (bright - dark) * inside, jacobian
+
+    return model
+
+
+def disc_start(pixels: PixelSet, shapes_px: Array, slope_outside: bool, slope_inside: bool) -> Array:
+    """(N, P) parameters of the initial outlines with the mean levels on either side of them."""
+    parameters = np.zeros((len(shapes_px), _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside))
+    parameters[:, :ELLIPSE_PARAMETERS] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
+    parameters[:, WIDTH] = START_WIDTH_PX
+    distance = edge_distances(shapes_px, pixels.x_px, pixels.y_px)
+    for column, side in ((BACKGROUND, distance < -_CLEAR_PX), (LEVEL, distance > _CLEAR_PX)):
+        weight = pixels.present * side
+        parameters[:, column] = (weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
+    return parameters

@@ -1,0 +1,101 @@
+"""What makes measurements unfit to carry a pose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.se3 import Array
+from geometry.stereo import EYES
+from nav.pose.interface import NoFixReason, Observation
+
+# Three points fix a plane.
+_LEAST_PAIRS = 3
+# Markers are on a line when their spread across it is below this share of that along it; 89 degrees of tilt look so.
+_COLLINEAR_FRACTION = 0.02
+# A centre may lie outside the image when something else than our detector measured it, but not by more than its size.
+_OUTSIDE_IMAGES = 1.0
+
+
+def fault(observation: Observation) -> NoFixReason | None:
+    """Why no pose can rest on the markers in both eyes, or None when one can."""
+    for eye in range(2):
+        reason = _bad_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
+        if reason is not None:
+            return reason
+    return _too_few_pairs(observation) or _degenerate_pairs(observation)
+
+
+def hub_fault(observation: Observation) -> NoFixReason | None:
+    """What is wrong with the measured edges of the hub, or None."""
+    assert observation.hub_px is not None
+    assert observation.hub_cov_px2 is not None
+    for eye in range(2):
+        reason = _bad_numbers(observation, observation.hub_px[eye], observation.hub_cov_px2[eye], eye, "hub edge")
+        if reason is not None:
+            return reason
+    return None
+
+
+def left_fault(observation: Observation, least: int) -> NoFixReason | None:
+    """Why no pose can rest on the markers of the left eye alone, or None when one can.
+
+    Args:
+        observation: what was measured; the right eye is not looked at.
+        least: how many markers the method needs.
+    """
+    reason = _bad_numbers(observation, observation.pixels_px[0], observation.cov_px2[0], 0, "marker")
+    if reason is not None:
+        return reason
+    seen = observation.seen[0]
+    if seen.sum() < least:
+        return NoFixReason(f"{int(seen.sum())} markers in the left eye, {least} are needed")
+    if _on_a_line(observation.layout.centers_m[seen, :2]) or _on_a_line(observation.pixels_px[0, seen]):
+        return NoFixReason("the markers that the left eye sees lie on one line")
+    return None
+
+
+def _bad_numbers(observation: Observation, pixels: Array, cov: Array, eye: int, what: str) -> NoFixReason | None:
+    size = np.array([observation.rig.camera.width_px, observation.rig.camera.height_px])
+    seen = ~np.isnan(pixels).any(axis=1)
+    outside = seen & ((pixels < -_OUTSIDE_IMAGES * size) | (pixels > (1 + _OUTSIDE_IMAGES) * size)).any(axis=1)
+    if outside.any():
+        index = int(np.argmax(outside))
+        x, y = pixels[index]
+        return NoFixReason(
+            f"{what} {index} of the {EYES[eye]} eye lies far outside the image, at ({x:g}, {y:g}) px"
+        )
+    # A product of huge or infinite entries is not a number, and then not a positive covariance either.
+    with np.errstate(invalid="ignore", over="ignore"):
+        determinant = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] * cov[:, 1, 0]
+        sound = np.isfinite(cov).all(axis=(1, 2)) & (cov[:, 0, 0] > 0) & (determinant > 0) & np.isfinite(determinant)
+    if (seen & ~sound).any():
+        return NoFixReason(
+            f"{what} {int(np.argmax(seen & ~sound))} of the {EYES[eye]} eye has no positive covariance"
+        )
+    return None
+
+
+def _too_few_pairs(observation: Observation) -> NoFixReason | None:
+    left, right = observation.seen.sum(axis=1)
+    if left == 0 or right == 0:
+        return NoFixReason("no markers in either eye" if left == right else "markers in one eye only")
+    pairs = int(observation.paired.sum())
+    if pairs < _LEAST_PAIRS:
+        return NoFixReason(f"{pairs} markers in both eyes, {_LEAST_PAIRS} are needed")
+    return None
+
+
+def _degenerate_pairs(observation: Observation) -> NoFixReason | None:
+    paired = observation.paired
+    for points in (observation.layout.centers_m[paired, :2], *observation.pixels_px[:, paired]):
+        if _on_a_line(points):
+            return NoFixReason("the markers that both eyes see lie on one line")
+    disparity_px = observation.pixels_px[0, paired, 0] - observation.pixels_px[1, paired, 0]
+    if disparity_px.min() <= 0:
+        return NoFixReason("a marker's disparity is not positive")
+    return None
+
+
+def _on_a_line(points: Array) -> bool:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= _COLLINEAR_FRACTION * spread[0])

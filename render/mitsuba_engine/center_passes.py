@@ -1,0 +1,103 @@
+"""Part id, depth, normal and amodal counts by the rays through the pixel centres."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.frame import FrameSpec
+from geometry.stereo import Eye
+from render.mitsuba_engine.camera_rays import CameraRays
+from render.mitsuba_engine.scene import DrogueScene
+from render.mitsuba_engine.traced import TracedEye, amodal_counts
+
+CENTER = (0.5, 0.5)
+# Next to the centre by a thousandth of a pixel, off any axis: for rays that slip through a seam at the centre itself.
+ASIDE = (0.501, 0.5007)
+
+
+class CenterPasses:
+    """Part id, depth and normal by the rays through the pixel centres of one eye."""
+
+    def __init__(self, frame: FrameSpec, eye: Eye, scene: DrogueScene) -> None:
+        self._rays = CameraRays(frame, eye)
+        self._scene = scene
+        camera = frame.rig.camera
+        self._shape = (camera.height_px, camera.width_px)
+
+    def _center_rays(self, pixel: Any, moment: float = 0.5, place: tuple[float, float] = CENTER) -> Any:
+        return self._rays.rays(pixel, mi.Point2f(*place), dr.opaque(mi.Float, moment))
+
+    def part_ids(self, s: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """(H, W) part ids and distances [m] at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""
+        pixel = dr.arange(mi.UInt32, self._shape[0] * self._shape[1])
+        ids, distance = self._hits(self._scene.scene, self._center_rays(pixel, (s + 1) / 2))
+        return ids.reshape(self._shape), distance.reshape(self._shape)
+
+    @staticmethod
+    def _hits(scene: Any, ray: Any) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        hit = scene.ray_intersect_preliminary(ray, coherent=True)
+        registry: Any = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
+        registry_ids = np.array(registry)
+        table = np.zeros(int(registry_ids.max()) + 1, dtype=np.uint32)
+        for index, shape in zip(registry_ids, scene.shapes(), strict=True):
+            table[index] = int(shape.id().removeprefix("part_"))
+        of_hit: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
+        ids = dr.gather(mi.UInt32, mi.UInt32(table), of_hit, hit.is_valid())
+        dr.eval(ids, hit.t)
+        return np.array(ids).astype(np.uint8), np.array(hit.t)
+
+    def traced_eye(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> TracedEye:
+        """The passes at mid-exposure, without radiance yet."""
+        depth = np.full(self._shape, np.inf, dtype=np.float32)
+        normal = np.zeros((*self._shape, 3), dtype=np.float32)
+        covered = np.flatnonzero(part_id)
+        if len(covered):
+            points, normals, leaked = self._surface(covered, CENTER)
+            if leaked.any():
+                aside = covered[leaked]
+                points[leaked], normals[leaked], _ = self._surface(aside, ASIDE)
+                ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=ASIDE))
+                part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
+            pose = self._rays.pose_at_middle
+            met = part_id.reshape(-1)[covered] > 0
+            depth.reshape(-1)[covered[met]] = np.einsum("pi,i->p", points[met] - pose[:, 3], pose[:, 2])
+            normal.reshape(-1, 3)[covered[met]] = np.einsum("pi,ij->pj", normals[met], pose[:, :3])
+        return TracedEye(
+            part_id,
+            depth,
+            normal,
+            self._amodal(part_id, distance_m),
+            np.zeros(0, dtype=np.int64),
+            np.zeros((0, 3), dtype=np.float32),
+            np.zeros(0, dtype=np.float32),
+        )
+
+    def _surface(
+        self, pixel: NDArray[np.int64], place: tuple[float, float]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        """(P, 3) points and normals in the drogue frame, and (P,) which rays slipped into a part through a seam.
+
+        All parts are closed: a surface that looks away from the camera is seen from inside, by a ray that passed
+        exactly between two triangles.
+        """
+        ray = self._center_rays(mi.UInt32(pixel), place=place)
+        hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
+        inside = hit.is_valid() & (dr.dot(hit.n, ray.d) > 0)
+        dr.eval(hit.p, hit.n, inside)
+        return np.array(hit.p).T, np.array(hit.n).T, np.array(inside)
+
+    def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
+        """Pixel centres that each marker and the hub would cover alone, on the image's grid."""
+        rows, columns = np.flatnonzero(part_id.any(axis=1)), np.flatnonzero(part_id.any(axis=0))
+        if not len(rows):
+            return {}
+        # Where a hidden feature would be, something else is seen: what is covered bounds the features too.
+        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        pixel = np.arange(part_id.size, dtype=np.uint32).reshape(self._shape)[window].ravel()
+        alone_id, alone_m = self._hits(self._scene.features, self._center_rays(mi.UInt32(pixel)))
+        return amodal_counts(part_id[window].ravel(), distance_m[window].ravel(), alone_id, alone_m)
