@@ -19,7 +19,10 @@ from droguekit.benchmark.number_text import plain_number
 from droguekit.benchmark.result import BenchmarkResult, MethodResult, ReferenceBin
 
 # Mid-tones, our choice: each stands out on white and on black, and neighbours differ in lightness as well as in hue.
-_COLORS = ("#1f78c8", "#e0660a", "#12946a", "#c2589c", "#b58900", "#3ba7d6", "#8a63d2", "#d03a3a", "#9a6a3a", "#7f8890")
+_COLORS = (
+    *("#1f78c8", "#e0660a", "#12946a", "#c2589c", "#b58900", "#3ba7d6", "#8a63d2", "#d03a3a", "#9a6a3a", "#7f8890"),
+    *("#7aa61e", "#e58fb0", "#3d5ba9"),
+)
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*", "d")
 
 # Stands for the page's own text colour while matplotlib draws.
@@ -37,7 +40,11 @@ _STYLE = {
     "ytick.color": _INK,
 }
 
-_WIDTH_IN, _HEIGHT_IN = 4.4, 3.3
+_PANEL_IN = (4.4, 3.3)
+
+# With more methods than this, panels are larger and intervals fainter, or nothing could be told apart.
+FEW_METHODS = 6
+_LARGE_PANEL_IN = (6.6, 5.0)
 
 
 @dataclass(frozen=True)
@@ -76,8 +83,11 @@ class MethodStyle:
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, MethodStyle]:
-    """Colour and marker of each method; no two of the first 130 share both."""
-    return {name: MethodStyle(_COLORS[k % len(_COLORS)], _MARKERS[k % len(_MARKERS)]) for k, name in enumerate(methods)}
+    """Colour and marker of each method; no two of the first 13 share either, nor of the first 169 both."""
+    return {
+        name: MethodStyle(_COLORS[k % len(_COLORS)], _MARKERS[(k + k // len(_COLORS)) % len(_MARKERS)])
+        for k, name in enumerate(methods)
+    }
 
 
 def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
@@ -86,14 +96,17 @@ def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
     Returns:
         An `<svg>` element.
     """
-    with _drawing() as (figure, axes):
-        names = list(result.methods)
+    names = list(result.methods)
+    few = len(names) <= FEW_METHODS
+    with _drawing(_PANEL_IN if few else _LARGE_PANEL_IN) as (figure, axes):
         styles = method_styles(names)
         # A little apart, so that methods do not cover each other, and all within an eighth of the true distance.
         step = min(1.03, 1.25 ** (1 / len(names)))
         for k, name in enumerate(names):
             shift = step ** (k - (len(names) - 1) / 2)
-            _draw_method(axes, result.methods[name], quantity, styles[name], shift)
+            bars = _draw_method(axes, result.methods[name], quantity, styles[name], shift)
+            if bars is not None and not few:
+                bars.set(alpha=0.35, linewidth=0.7)
         _draw_bound(axes, result.reference, quantity)
         _finish_axes(axes, quantity)
         return _svg(figure, quantity.key, f"{quantity.title} against distance, by method")
@@ -165,7 +178,7 @@ def _middle(low_m: float, high_m: float) -> float:
 
 
 @contextmanager
-def _drawing(size_in: tuple[float, float] = (_WIDTH_IN, _HEIGHT_IN)) -> Iterator[tuple[Figure, Axes]]:
+def _drawing(size_in: tuple[float, float]) -> Iterator[tuple[Figure, Axes]]:
     """A figure of its own, without pyplot and without a trace in matplotlib's settings."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size_in, layout="constrained" if size_in[1] > 1 else None)

@@ -13,6 +13,7 @@ from datasets_manifest.estimates import read_estimates
 from datasets_manifest.manifest import Manifest
 from datasets_manifest.reader import Dataset
 from drogue_models.marker_layout import marker_layout
+from droguekit.benchmark.check_tables import check_tables
 from droguekit.benchmark.contact_sheet import contact_tiles
 from droguekit.benchmark.figures import QUANTITIES, error_panel, legend_key, method_styles
 from droguekit.benchmark.narrative import result_sentences
@@ -55,7 +56,13 @@ def write_report(dataset: Path, estimates: Path, result: BenchmarkResult, out_ht
         panels=[Markup(error_panel(result, quantity)) for quantity in QUANTITIES],
         legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
         bound_key=Markup(legend_key(None)),
-        tables=[overall_table(result), position_table(result), *component_tables(result), centroid_table(result)],
+        tables=[
+            overall_table(result),
+            position_table(result),
+            *component_tables(result),
+            *check_tables(result),
+            centroid_table(result),
+        ],
         times=stage_times_ms(estimates),
     )
     write_text_atomic(out_html, page)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from droguekit.benchmark.number_text import distance_text, interval_text, millimetres, percent, three_digits
 from droguekit.benchmark.pose_errors import COMPONENTS
-from droguekit.benchmark.result import BenchmarkResult, BinRow, Row
+from droguekit.benchmark.result import BenchmarkResult, Row
 
 TITLES = {
     "x": "X, to the right [mm]",
@@ -65,7 +65,7 @@ def position_table(result: BenchmarkResult) -> Table:
     columns = ["pairs", "pose found", "mean", "95 % interval", "RMS", "95 % interval", "transverse RMS", "p95", "p99"]
     columns += ["max", "bound"]
 
-    def cells(row: BinRow) -> list[str]:
+    def cells(row: Row) -> list[str]:
         return [
             str(row.n),
             percent(row.fix_fraction),
@@ -90,7 +90,7 @@ def centroid_table(result: BenchmarkResult) -> Table:
     columns = ["centroids", "RMS", "bias right", "bias down", "bias outward", "hub RMS", "mistaken"]
     columns += ["position from centroids [mm]", "share"]
 
-    def cells(row: BinRow) -> list[str]:
+    def cells(row: Row) -> list[str]:
         c = row.centroids
         biases = (c.bias_u_px, c.bias_v_px, c.bias_outward_px)
         return [
@@ -117,7 +117,7 @@ def _component_table(result: BenchmarkResult, name: str) -> Table:
     def ends(row: Row, key: str) -> str:
         return interval_text(row.intervals.get(f"{name}_{key}_{unit}"), scale)
 
-    def cells(row: BinRow) -> list[str]:
+    def cells(row: Row) -> list[str]:
         bound = getattr(row.bound, f"{name}_{unit}") * scale if row.bound else None
         ratio = getattr(row.bound_ratio, name) if row.bound_ratio else None
         return [
@@ -144,5 +144,5 @@ def with_overall(result: BenchmarkResult, names: Sequence[str], cells: Callable[
     return groups
 
 
-def _by_distance(result: BenchmarkResult, cells: Callable[[BinRow], list[str]]) -> list[Group]:
+def _by_distance(result: BenchmarkResult, cells: Callable[[Row], list[str]]) -> list[Group]:
     return with_overall(result, list(result.methods), cells)[1:]

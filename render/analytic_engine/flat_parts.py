@@ -62,8 +62,8 @@ def flat_drogue(drogue: DrogueParameters) -> FlatDrogue:
         behind.append(FlatRing(int(Part.HUB), (0.0, 0.0, depth_m), hub.outer_radius_m, hub.inner_radius_m))
     opening_m, face_outer_m = drogue.face_inner_radius_m, drogue.rim_radius_m - tube_m
     front = [
-        FlatRing(int(Part.RIM), (0.0, 0.0, tube_m), drogue.rim_radius_m, face_outer_m - tube_m),
         FlatRing(int(Part.FACE), (0.0, 0.0, FACE_THICKNESS_M), face_outer_m, opening_m),
+        FlatRing(int(Part.RIM), (0.0, 0.0, tube_m), drogue.rim_radius_m, face_outer_m - tube_m),
         FlatRing(int(Part.FACE), (0.0, 0.0, 0.0), face_outer_m, opening_m),
     ]
     markers = [

@@ -45,7 +45,8 @@ def pixel_coverage(areas: Sequence[Any], width_px: int, height_px: int) -> Pixel
     """
     image = shapely.box(-0.5, -0.5, width_px - 0.5, height_px - 0.5)
     inside = [area if shapely.covers(image, area) else shapely.intersection(area, image) for area in areas]
-    bounds = np.array([shapely.bounds(area) for area in inside if not shapely.is_empty(area)])
+    # An area that only touches the image leaves a line or a point of it.
+    bounds = np.array([shapely.bounds(area) for area in inside if shapely.area(area) > 0])
     if not len(bounds):
         return None
     # From here on pixel i is the interval from i to i + 1 of the window.

@@ -14,7 +14,7 @@ from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
-from render.mitsuba_engine.scene import DrogueScene, scene_key
+from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.traced import (
     Traced,
     TracedEye,
@@ -39,7 +39,7 @@ class ScalarTracer:
 
     def __init__(self) -> None:
         dr.set_thread_count(1)
-        self._key: str | None = None
+        self._scenes = SceneCache()
         self._scene: DrogueScene
 
     def trace(self, frame: FrameSpec, settings: RenderSettings, around: Surroundings) -> Traced:
@@ -47,9 +47,7 @@ class ScalarTracer:
         assert frame.drogue is not None
         stage_s: dict[str, float] = {}
         started = time.process_time()
-        if scene_key(frame) != self._key:
-            self._scene, self._key = DrogueScene(frame.drogue, frame), scene_key(frame)
-        self._scene.set_frame(frame, around)
+        self._scene = self._scenes.scene_of(frame, around)
         stage_s["scene"], started = time.process_time() - started, time.process_time()
         moves_px = blur_px(frame)
         moments = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)

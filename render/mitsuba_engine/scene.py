@@ -65,13 +65,6 @@ def _front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
 
 
-def scene_key(frame: FrameSpec) -> str:
-    """Equal for frames that can share a scene: same drogue, same topology of what hangs on it."""
-    assert frame.drogue is not None
-    nodes = 0 if frame.hose_nodes_left_m is None else len(frame.hose_nodes_left_m)
-    return f"{frame.drogue.model_dump_json()} {nodes} {frame.left_from_tanker is not None}"
-
-
 class DrogueScene:
     """The scene of one drogue, set up anew for each frame.
 
@@ -172,3 +165,27 @@ def _homogeneous(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _any_up(direction: NDArray[np.float64]) -> list[float]:
     return [0.0, 0.0, 1.0] if abs(direction[2]) < 0.9 else [0.0, 1.0, 0.0]
+
+
+def _scene_key(frame: FrameSpec) -> str:
+    """Equal for frames that can share a scene: same drogue, same topology of what hangs on it."""
+    assert frame.drogue is not None
+    nodes = 0 if frame.hose_nodes_left_m is None else len(frame.hose_nodes_left_m)
+    return f"{frame.drogue.model_dump_json()} {nodes} {frame.left_from_tanker is not None}"
+
+
+class SceneCache:
+    """Keeps the scene of the last drogue."""
+
+    def __init__(self) -> None:
+        self._key: str | None = None
+        self._scene: DrogueScene
+
+    def scene_of(self, frame: FrameSpec, around: Surroundings) -> DrogueScene:
+        """The scene as this frame has it; built anew when the drogue has changed."""
+        assert frame.drogue is not None
+        key = _scene_key(frame)
+        if key != self._key:
+            self._scene, self._key = DrogueScene(frame.drogue, frame), key
+        self._scene.set_frame(frame, around)
+        return self._scene
