@@ -7,12 +7,9 @@ from collections.abc import Iterator, Sequence
 from datasets_manifest.blind import BlindDataset
 from datasets_manifest.estimates import Estimate
 from nav.navigator import Navigator
-from nav.pose.registry import METHODS, pose_method
+from nav.pose.registry import method_names, pose_method
 
-
-def method_names() -> tuple[str, ...]:
-    """Names of the pose methods."""
-    return tuple(METHODS)
+__all__ = ["method_names", "navigate"]
 
 
 def navigate(dataset: BlindDataset, methods: Sequence[str]) -> Iterator[Estimate]:

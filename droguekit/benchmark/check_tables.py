@@ -70,7 +70,7 @@ def flip_table(result: BenchmarkResult) -> Table:
         return _flip_cells(row.flips) + _flip_cells(row.sight_flips)
 
     columns = ["clear tilts", "mirrored", "share", "95 % interval", "law"]
-    columns += ["by line of sight: clear tilts", "mirrored", "share", "95 % interval", "law"]
+    columns += ["clear by sight", "mirrored", "share", "95 % interval", "law"]
     return Table("flips", "Mirrored tilts", columns, with_overall(result, list(result.methods), cells))
 
 

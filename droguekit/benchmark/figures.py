@@ -12,6 +12,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -104,9 +105,7 @@ def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
         step = min(1.03, 1.25 ** (1 / len(names)))
         for k, name in enumerate(names):
             shift = step ** (k - (len(names) - 1) / 2)
-            bars = _draw_method(axes, result.methods[name], quantity, styles[name], shift)
-            if bars is not None and not few:
-                bars.set(alpha=0.35, linewidth=0.7)
+            _draw_method(axes, result.methods[name], quantity, styles[name], (shift, 1.0 if few else 0.3))
         _draw_bound(axes, result.reference, quantity)
         _finish_axes(axes, quantity)
         return _svg(figure, quantity.key, f"{quantity.title} against distance, by method")
@@ -125,7 +124,11 @@ def legend_key(style: MethodStyle | None) -> str:
         return _svg(figure, "key", "")
 
 
-def _draw_method(axes: Axes, method: MethodResult, quantity: Quantity, style: MethodStyle, shift: float) -> None:
+def _draw_method(
+    axes: Axes, method: MethodResult, quantity: Quantity, style: MethodStyle, place: tuple[float, float]
+) -> None:
+    """One line; `place` is its shift in distance and the opacity of its intervals."""
+    shift, opacity = place
     rows = [(row, row.value(quantity.key)) for row in method.bins]
     # A logarithmic axis has no place for an error of exactly nothing.
     points = [(row, value) for row, value in rows if value is not None and value > 0]
@@ -140,11 +143,12 @@ def _draw_method(axes: Axes, method: MethodResult, quantity: Quantity, style: Me
         y * quantity.scale,
         yerr=bars * quantity.scale,
         color=style.color,
+        ecolor=to_rgba(style.color, opacity),
         marker=style.marker,
         markersize=5,
         linewidth=1.2,
         elinewidth=0.9,
-        capsize=2,
+        capsize=2 if opacity == 1 else 0,
     )
 
 
@@ -153,7 +157,8 @@ def _draw_bound(axes: Axes, reference: Sequence[ReferenceBin], quantity: Quantit
     drawn = [(x, y * quantity.scale) for x, y in places if y > 0]
     if drawn:
         # A single distance has no line: a cross stands for it.
-        axes.plot(*zip(*drawn, strict=True), color=_INK, linestyle=(0, (4, 2)), linewidth=1.4, marker="+", markersize=5)
+        x, y = zip(*drawn, strict=True)
+        axes.plot(x, y, color=_INK, linestyle=(0, (4, 2)), linewidth=1.6, marker="+", markersize=5, zorder=5)
 
 
 def _finish_axes(axes: Axes, quantity: Quantity) -> None:

@@ -15,7 +15,7 @@ from datasets_manifest.reader import Dataset
 from drogue_models.marker_layout import marker_layout
 from droguekit.benchmark.check_tables import check_tables
 from droguekit.benchmark.contact_sheet import contact_tiles
-from droguekit.benchmark.figures import QUANTITIES, error_panel, legend_key, method_styles
+from droguekit.benchmark.figures import FEW_METHODS, QUANTITIES, error_panel, legend_key, method_styles
 from droguekit.benchmark.narrative import result_sentences
 from droguekit.benchmark.number_text import plain_number, three_digits
 from droguekit.benchmark.report_tables import centroid_table, component_tables, overall_table, position_table
@@ -55,6 +55,7 @@ def write_report(dataset: Path, estimates: Path, result: BenchmarkResult, out_ht
         tiles=[(tile, plain_number(tile.distance_m)) for tile in contact_tiles(data)],
         panels=[Markup(error_panel(result, quantity)) for quantity in QUANTITIES],
         legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
+        many_methods=len(styles) > FEW_METHODS,
         bound_key=Markup(legend_key(None)),
         tables=[
             overall_table(result),

@@ -31,7 +31,7 @@ _PACKAGES = (
 def doctor() -> None:
     """Show what is installed here, which engines work, and what is missing.
 
-    Exits with 1 when no engine works; labels, navigation and benchmark work without any.
+    Exits with 1 when the path tracer does not work; labels, navigation and benchmark work without any.
     """
     _show_machine()
     _show_packages()
@@ -61,9 +61,10 @@ def _show_packages() -> None:
 
 
 def _show_engines() -> bool:
-    """Try each engine; returns whether one works."""
+    """Try each engine; returns whether Mitsuba works (the analytic one needs nothing)."""
     from render.mitsuba_engine.variant import probe_variant
 
+    typer.echo("engine     analytic works: flat discs without path tracing, for estimators")
     missing = _missing_libraries()
     for name, remedy in missing:
         typer.echo(f"library    {name} is missing; {remedy}")

@@ -15,10 +15,12 @@ Model = Callable[[Array], tuple[Array32, Array32]]
 
 _FIRST_DAMPING = 1e-4
 _SMALLEST_DAMPING = 1e-9
-# A step that moves the centre by less than this changes no digit that matters. [px]
-_SMALL_STEP_PX = 2e-4
 # Keeps a parameter that no pixel tells of where it is.
 _TINY_CURVATURE = 1e-12
+# Of a normal matrix with unit diagonal: what single precision leaves uncertain.
+_RIDGE = 1e-6
+# Relative to the cost, below which single precision tells no better from worse.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,30 +55,39 @@ class Minimum:
         return leverages
 
 
-def minimise(model: Model, data: Array32, weights: Array32, start: Array, most_steps: int) -> Minimum:
+def evaluate(model: Model, data: Array32, weights: Array32, parameters: Array) -> Minimum:
+    """Where an iteration starts: the model at (N, P) parameters; other arguments as for `minimise`."""
+    values, jacobian = model(parameters)
+    residuals = data - values
+    normal = _normal_matrices(jacobian, weights)
+    return Minimum(parameters, residuals, jacobian, normal, np.zeros(len(parameters), np.bool_))
+
+
+def minimise(
+    model: Model, data: Array32, weights: Array32, start: Minimum, most_steps: int, small_step_px: float
+) -> Minimum:
     """Weighted least squares of `data - model`; the first two parameters are a place in pixels.
 
     Args:
         model: values and derivatives.
         data: (N, K).
         weights: (N, K), 0 for padding.
-        start: (N, P).
-        most_steps: evaluations of the model after the first.
+        start: an evaluated start, or the end of an iteration with other weights.
+        most_steps: evaluations of the model at most.
+        small_step_px: the iteration ends when no place moves more.
     """
-    parameters = start
-    values, jacobian = model(parameters)
-    residuals = data - values
+    parameters, residuals, jacobian = start.parameters, start.residuals, start.jacobian
     cost = _cost(residuals, weights)
-    damping = np.full(len(start), _FIRST_DAMPING)
-    converged = np.zeros(len(start), np.bool_)
-    normal, gradient = _normal_equations(jacobian, residuals, weights)
+    damping = np.full(len(parameters), _FIRST_DAMPING)
+    converged = np.zeros(len(parameters), np.bool_)
+    normal = _normal_matrices(jacobian, weights)
     for _ in range(most_steps):
-        step = _step(normal, gradient, damping)
+        step = _step(normal, np.matmul(jacobian, (weights * residuals)[:, :, None])[..., 0].astype(np.float64), damping)
         tried = parameters + step
         values, new_jacobian = model(tried)
         new_residuals = data - values
         new_cost = _cost(new_residuals, weights)
-        better = new_cost <= cost * (1 + 1e-6)
+        better = new_cost <= cost * (1 + _ROUNDING)
         if better.all():
             parameters, cost, residuals, jacobian = tried, new_cost, new_residuals, new_jacobian
         else:
@@ -85,8 +96,8 @@ def minimise(model: Model, data: Array32, weights: Array32, start: Array, most_s
             residuals = np.where(better[:, None], new_residuals, residuals)
             jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
         damping = np.where(better, np.maximum(damping / 10, _SMALLEST_DAMPING), damping * 10)
-        converged = np.abs(step[:, :2]).max(axis=1) < _SMALL_STEP_PX
-        normal, gradient = _normal_equations(jacobian, residuals, weights)
+        converged = np.abs(step[:, :2]).max(axis=1) < small_step_px
+        normal = _normal_matrices(jacobian, weights)
         if converged.all():
             break
     return Minimum(parameters, residuals, jacobian, normal, converged)
@@ -97,11 +108,9 @@ def _cost(residuals: Array32, weights: Array32) -> Array:
     return np.where(np.isfinite(cost), cost, np.inf)
 
 
-def _normal_equations(jacobian: Array32, residuals: Array32, weights: Array32) -> tuple[Array, Array]:
-    weighted = jacobian * weights[:, None]
-    normal = np.matmul(weighted, jacobian.transpose(0, 2, 1)).astype(np.float64)
-    gradient = np.matmul(weighted, residuals[:, :, None])[..., 0].astype(np.float64)
-    return normal, gradient
+def _normal_matrices(jacobian: Array32, weights: Array32) -> Array:
+    normal: Array = np.matmul(jacobian * weights[:, None], jacobian.transpose(0, 2, 1)).astype(np.float64)
+    return normal
 
 
 def _scales(normal: Array) -> Array:
@@ -114,7 +123,7 @@ def _scales(normal: Array) -> Array:
 def _scaled(normal: Array, scale: Array) -> Array:
     """Normal matrices with a unit diagonal, kept invertible where single precision would not."""
     scaled: Array = normal * scale[:, :, None] * scale[:, None, :]
-    return scaled + 1e-6 * np.eye(normal.shape[1])
+    return scaled + _RIDGE * np.eye(normal.shape[1])
 
 
 def _step(normal: Array, gradient: Array, damping: Array) -> Array:

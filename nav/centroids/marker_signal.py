@@ -80,9 +80,7 @@ def _window(ellipses: Ellipses, size_px: tuple[int, int]) -> tuple[int, int, int
     return left, top, int(np.clip(high[0], left + 2, width)), int(np.clip(high[1], top + 2, height))
 
 
-def _image_signal(
-    images: StereoImages, eye: Eye, window: tuple[int, int, int, int], color: int | None
-) -> MarkerSignal:
+def _image_signal(images: StereoImages, eye: Eye, window: tuple[int, int, int, int], color: int | None) -> MarkerSignal:
     left, top, right, bottom = window
     image = images.left if eye == "left" else images.right
     part = image[top:bottom, left:right]
@@ -96,9 +94,7 @@ def _image_signal(
     return MarkerSignal(values.astype(np.float32), clipped, (float(left), float(top)), 1, is_difference)
 
 
-def _mosaic_signal(
-    images: StereoImages, mosaic: Pixels, window: tuple[int, int, int, int], color: int
-) -> MarkerSignal:
+def _mosaic_signal(images: StereoImages, mosaic: Pixels, window: tuple[int, int, int, int], color: int) -> MarkerSignal:
     left, top, right, bottom = window
     part = mosaic[top : top + (bottom - top) // 2 * 2, left : left + (right - left) // 2 * 2]
     row, column = _FIRST_SITE[color]

@@ -51,20 +51,21 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
 
     Args:
         shapes_px: (N, 2, 2).
-        x_px, y_px: (N, ...).
+        x_px, y_px: (N, ...), of shapes that fit each other.
     """
     inverse = np.linalg.inv(shapes_px).astype(np.float32)
     a, b, c = (inverse[:, i, j].reshape((-1,) + (1,) * (x_px.ndim - 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
     radii = np.sqrt(np.linalg.det(shapes_px)).astype(np.float32).reshape(a.shape)
+    # Of x (N, 1, W) and y (N, H, 1) only what needs both is computed on the whole grid.
     w0, w1 = a * x_px + b * y_px, b * x_px + c * y_px
     distances: Array32 = radii * (1 - np.sqrt(w0 * w0 + w1 * w1))
     return distances
 
 
-def disc_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
-    """Pixels in and around discs."""
+def disc_pixels(signals: Sequence[MarkerSignal], discs: Ellipses, everything: bool = False) -> PixelSet:
+    """Pixels in and around discs; with `everything`, those far from the edge of large discs too."""
     outer = np.float32(OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
-    whole = bool(discs.radii_px.max() <= WHOLE_RADIUS_PX)
+    whole = everything or bool(discs.radii_px.max() <= WHOLE_RADIUS_PX)
 
     def choose(x: Array32, y: Array32, thin: NDArray[np.bool_]) -> NDArray[np.bool_]:
         distance = edge_distances(discs.shapes_px, x, y)
@@ -81,10 +82,10 @@ def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
     outer = np.float32(OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
 
     def choose(x: Array32, y: Array32, thin: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        chosen: NDArray[np.bool_] = thin & (edge_distances(discs.shapes_px, x, y) >= -outer)
+        chosen: NDArray[np.bool_] = edge_distances(discs.shapes_px, x, y) >= -outer
         return chosen
 
-    return _gather(signals, discs, float(outer), choose)
+    return _gather(signals, discs, float(outer), choose, _THIN)
 
 
 def annulus_pixels(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses) -> PixelSet:
@@ -101,38 +102,46 @@ def annulus_pixels(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Elli
     return _gather(signals, outer, float(reach), choose)
 
 
-def _gather(signals: Sequence[MarkerSignal], outlines: Ellipses, reach_px: float, choose: _Chooser) -> PixelSet:
+def _gather(
+    signals: Sequence[MarkerSignal], outlines: Ellipses, reach_px: float, choose: _Chooser, every: int = 1
+) -> PixelSet:
     """Pixels of squares around the outlines that `choose` takes; it is given places and a sparse grid."""
     pitch = signals[0].pitch_px
     extents = np.sqrt(np.einsum("mij,mij->mi", outlines.shapes_px, outlines.shapes_px)) + reach_px
     half = int(np.ceil(extents.max() / pitch)) + 1
-    steps = np.arange(-half, half + 1)
+    steps = np.arange(-half, half + 1, every)
     firsts = np.array([signal.first_px for signal in signals])[outlines.eyes]
     middles = np.rint((outlines.centers_px - firsts) / pitch).astype(np.int64)
     starts = (firsts + pitch * middles - outlines.centers_px).astype(np.float32)
     along = (pitch * steps).astype(np.float32)
-    x, y = np.broadcast_arrays(
-        starts[:, 0, None, None] + along[None, None, :], starts[:, 1, None, None] + along[None, :, None]
-    )
-    chosen = choose(x, y, (steps[:, None] % _THIN == 0) & (steps[None, :] % _THIN == 0))
-    patch, row, column = np.nonzero(chosen)
+    x, y = starts[:, 0, None, None] + along[:, None].T, starts[:, 1, None, None] + along[:, None]
+    chosen = choose(x, y, (steps[:, None] % _THIN == 0) & (steps % _THIN == 0))
+    patch, cell = np.divmod(np.flatnonzero(chosen), len(steps) ** 2)
+    row, column = np.divmod(cell, len(steps))
     columns, rows = middles[patch, 0] + steps[column], middles[patch, 1] + steps[row]
-    sizes = np.array([signal.values.shape for signal in signals])[outlines.eyes[patch]]
-    seen = (columns >= 0) & (rows >= 0) & (columns < sizes[:, 1]) & (rows < sizes[:, 0])
+    heights, widths = np.array([signal.values.shape for signal in signals]).T
+    eye = outlines.eyes[patch]
+    seen = (columns >= 0) & (rows >= 0) & (columns < widths[eye]) & (rows < heights[eye])
     truncated = np.bincount(patch[~seen], minlength=len(outlines)) > 0
-    patch, row, column, rows, columns = (index[seen] for index in (patch, row, column, rows, columns))
+    if truncated.any():
+        patch, eye, row, column, rows, columns = (i[seen] for i in (patch, eye, row, column, rows, columns))
     counts = np.bincount(patch, minlength=len(outlines))
-    place = np.arange(len(patch)) - (np.cumsum(counts) - counts)[patch]
-    shape = (len(outlines), max(1, int(counts.max())))
-    arrays = {name: np.zeros(shape, np.float32) for name in ("x", "y", "values", "present")}
-    clipped = np.zeros(shape, np.bool_)
-    arrays["x"][patch, place], arrays["y"][patch, place] = x[patch, row, column], y[patch, row, column]
-    arrays["present"][patch, place] = 1
-    for eye, signal in enumerate(signals):
-        mine = outlines.eyes[patch] == eye
-        site = rows[mine], columns[mine]
-        arrays["values"][patch[mine], place[mine]] = signal.values[site]
-        clipped[patch[mine], place[mine]] = signal.clipped[site]
+    length = max(1, int(counts.max()))
+    place = np.arange(len(patch)) + (length * np.arange(len(outlines)) - np.cumsum(counts) + counts)[patch]
+    # Both eyes' pixels in one row: what lies at (row, column) of the right eye comes after all of the left.
+    site = rows * widths[eye] + columns + eye * (heights[0] * widths[0])
+
+    def padded(values: Array32) -> Array32:
+        array = np.zeros(len(outlines) * length, np.float32)
+        array[place] = values
+        return array.reshape(-1, length)
+
     return PixelSet(
-        arrays["x"], arrays["y"], arrays["values"], arrays["present"], clipped, outlines.centers_px, truncated
+        padded(starts[patch, 0] + along[column]),
+        padded(starts[patch, 1] + along[row]),
+        padded(np.concatenate([signal.values.ravel() for signal in signals])[site]),
+        padded(np.ones(len(patch), np.float32)),
+        padded(np.concatenate([signal.clipped.ravel() for signal in signals])[site]) > 0,
+        outlines.centers_px,
+        truncated,
     )

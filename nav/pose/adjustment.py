@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from geometry.se3 import Array
@@ -90,7 +91,7 @@ def information_at(features: Features, rotations: Array, translations_m: Array) 
     return linearise(features, State(rotations, translations_m, np.ones(len(rotations)))).information
 
 
-def inverse_information(information: Array) -> tuple[Array, Array]:
+def inverse_information(information: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Covariances of the pose.
 
     Args:
@@ -138,7 +139,7 @@ def _moved(state: State, steps: Array) -> State:
     return State(rotations, state.translations_m + steps[:, :3], scales)
 
 
-def _chosen(better: Array, trial: State, state: State) -> State:
+def _chosen(better: NDArray[np.bool_], trial: State, state: State) -> State:
     if better.all():
         return trial
     return State(
@@ -148,7 +149,7 @@ def _chosen(better: Array, trial: State, state: State) -> State:
     )
 
 
-def _kept(better: Array, ahead: Linearised, now: Linearised) -> Linearised:
+def _kept(better: NDArray[np.bool_], ahead: Linearised, now: Linearised) -> Linearised:
     if better.all():
         return ahead
     return Linearised(
@@ -158,7 +159,7 @@ def _kept(better: Array, ahead: Linearised, now: Linearised) -> Linearised:
     )
 
 
-def _store(result: Adjusted, where: Array, state: State, now: Linearised, which: Array) -> None:
+def _store(result: Adjusted, where: NDArray[np.int64], state: State, now: Linearised, which: NDArray[np.bool_]) -> None:
     result.rotations[where], result.translations_m[where] = state.rotations[which], state.translations_m[which]
     result.scales[where], result.costs[where] = state.scales[which], now.costs[which]
     result.information[where] = now.information[which]

@@ -61,17 +61,13 @@ def _bad_numbers(observation: Observation, pixels: Array, cov: Array, eye: int, 
     if outside.any():
         index = int(np.argmax(outside))
         x, y = pixels[index]
-        return NoFixReason(
-            f"{what} {index} of the {EYES[eye]} eye lies far outside the image, at ({x:g}, {y:g}) px"
-        )
+        return NoFixReason(f"{what} {index} of the {EYES[eye]} eye lies far outside the image, at ({x:g}, {y:g}) px")
     # A product of huge or infinite entries is not a number, and then not a positive covariance either.
     with np.errstate(invalid="ignore", over="ignore"):
         determinant = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] * cov[:, 1, 0]
         sound = np.isfinite(cov).all(axis=(1, 2)) & (cov[:, 0, 0] > 0) & (determinant > 0) & np.isfinite(determinant)
     if (seen & ~sound).any():
-        return NoFixReason(
-            f"{what} {int(np.argmax(seen & ~sound))} of the {EYES[eye]} eye has no positive covariance"
-        )
+        return NoFixReason(f"{what} {int(np.argmax(seen & ~sound))} of the {EYES[eye]} eye has no positive covariance")
     return None
 
 

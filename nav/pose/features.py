@@ -53,7 +53,7 @@ class Features:
         return replace(self, measured=self.measured[:, frames])
 
     def without(self, mask: NDArray[np.bool_]) -> Features:
-        """The same frames with fewer measurements: those of `mask` (B, E, F), or of its broadcast shape, are dropped."""
+        """The same frames without the measurements of `mask`, (B, E, F) or what broadcasts to it."""
         return replace(self, measured=np.where(mask, 0.0, self.measured))
 
 
@@ -80,7 +80,7 @@ def stack_features(
     if ring_tolerance_m > 0 and layout.ring_radius_m is None:
         raise ValueError("ring_tolerance_m: the markers lie on no circle about the origin, leave it 0")
     points, radii = layout.centers_m, np.full(layout.count, layout.radius_m)
-    if with_hub:
+    if with_hub and layout.hub_center_m is not None:
         points = np.vstack([points, layout.hub_center_m, layout.hub_center_m])
         radii = np.append(radii, [layout.hub_inner_radius_m, layout.hub_outer_radius_m])
     return Features(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
@@ -42,11 +43,13 @@ class Triples:
         centers_m: (T, 3) circumcentres.
         normals: (T, 3) unit normals with positive z.
         radii2_m2: (T,) squared circumradii.
+        members: (T, 3) indices of the points.
     """
 
     centers_m: Array
     normals: Array
     radii2_m2: Array
+    members: NDArray[np.int64]
 
 
 def triple_circles(points_m: Array) -> Triples:
@@ -61,22 +64,43 @@ def triple_circles(points_m: Array) -> Triples:
     offset = (np.cross(across, a) * b2 + np.cross(b, across) * a2) / (2 * across2)
     normals = across / np.sqrt(across2)
     normals = np.where(normals[:, 2:] < 0, -normals, normals)
-    return Triples(p + offset, normals, (offset**2).sum(axis=1))
+    return Triples(p + offset, normals, (offset**2).sum(axis=1), triples)
 
 
-def paper(observation: Observation) -> Solution | NoFixReason:
-    """Pose by the three-sphere construction, visual reprojection and the Huber-weighted step in depth."""
-    reason = fault(observation)
-    if reason is not None:
-        return reason
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What the three-sphere construction offers for a pose.
+
+    Attributes:
+        points_m: (K, 3) triangulated markers.
+        layout: the same markers.
+        pixels_px: (2, K, 2) their measured centres.
+        origins_m: (T, 3) far intersections of the spheres about three markers each.
+        rotations: (T, 3, 3) attitudes of those markers' planes.
+        members: (T, 3) indices of those markers among the K.
+    """
+
+    points_m: Array
+    layout: MarkerLayout
+    pixels_px: Array
+    origins_m: Array
+    rotations: Array
+    members: NDArray[np.int64]
+
+    def pose_at(self, origin_m: Array) -> RigidTransform:
+        """Pose at a place, with the attitude of the plane through all markers."""
+        unrolled = rotations_with_axis(plane_normal(self.points_m)[None])
+        rotation = with_best_roll(unrolled, self.points_m, origin_m[None], self.layout.centers_m)[0]
+        return RigidTransform(rotation, origin_m)
+
+
+def three_sphere_candidates(observation: Observation) -> Candidates | NoFixReason:
+    """All candidates in front of the cameras; at least one."""
     ring_radius_m = observation.layout.ring_radius_m
     if ring_radius_m is None:
         return NoFixReason("the paper's method needs all markers on one circle about the drogue's origin")
     index, points = triangulate_pairs(observation)
     layout = MarkerLayout(observation.layout.centers_m[index], observation.layout.radius_m, None)
-    pixels = observation.pixels_px[:, index]
-    huber_px = max(_HUBER_SIGMAS * observation.sigma_px, _LEAST_HUBER_PX)
-
     circles = triple_circles(points)
     # The spheres about three markers meet twice on the circle's axis; noise leaves no real root where it is negative.
     discriminant = ring_radius_m**2 - circles.radii2_m2
@@ -86,17 +110,41 @@ def paper(observation: Observation) -> Solution | NoFixReason:
         return NoFixReason("no three markers give a place in front of the cameras")
     origins, axes = origins[sound], circles.normals[sound]
     rotations = with_best_roll(rotations_with_axis(axes), points, origins, layout.centers_m)
+    pixels = observation.pixels_px[:, index]
+    return Candidates(points, layout, pixels, origins, rotations, circles.members[sound])
+
+
+def huber_threshold_px(observation: Observation) -> float:
+    """Where the loss of the paper's visual reprojection turns from square to linear. [px]"""
+    return max(_HUBER_SIGMAS * observation.sigma_px, _LEAST_HUBER_PX)
+
+
+def reprojection_scores(observation: Observation, candidates: Candidates) -> Array:
+    """(T,) Huber losses of all markers in both eyes; infinite for a candidate that cannot be projected. [px^2]"""
+    huber_px = huber_threshold_px(observation)
     # A nearly edge-on candidate can put a marker behind a camera; its prediction is then infinite or nan, never best.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        residuals = np.linalg.norm(predict_px(observation.rig, layout, rotations, origins) - pixels, axis=-1)
-        scores = np.where(np.isfinite(residuals), _huber(residuals, huber_px), np.inf).sum(axis=(1, 2))
-    best = int(np.argmin(scores))
-    origin = _depth_steps(observation, layout, pixels, huber_px, RigidTransform(rotations[best], origins[best]))
+        predicted = predict_px(observation.rig, candidates.layout, candidates.rotations, candidates.origins_m)
+        residuals = np.linalg.norm(predicted - candidates.pixels_px, axis=-1)
+        scores: Array = np.where(np.isfinite(residuals), _huber(residuals, huber_px), np.inf).sum(axis=(1, 2))
+    return scores
+
+
+def paper(observation: Observation) -> Solution | NoFixReason:
+    """Pose by the three-sphere construction, visual reprojection and the Huber-weighted step in depth."""
+    reason = fault(observation)
+    if reason is not None:
+        return reason
+    candidates = three_sphere_candidates(observation)
+    if isinstance(candidates, NoFixReason):
+        return candidates
+    best = int(np.argmin(reprojection_scores(observation, candidates)))
+    start = RigidTransform(candidates.rotations[best], candidates.origins_m[best])
+    huber_px = huber_threshold_px(observation)
+    origin = _depth_steps(observation, candidates.layout, candidates.pixels_px, huber_px, start)
     if not (np.isfinite(origin).all() and origin[2] > 0):
         return NoFixReason("the step in depth left the space in front of the cameras")
-    unrolled = rotations_with_axis(plane_normal(points)[None])
-    rotation = with_best_roll(unrolled, points, origin[None], layout.centers_m)[0]
-    return Solution(RigidTransform(rotation, origin), used_pairs(observation))
+    return Solution(candidates.pose_at(origin), used_pairs(observation))
 
 
 def _huber(residuals_px: Array, threshold_px: float) -> Array:

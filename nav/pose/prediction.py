@@ -83,3 +83,8 @@ def with_best_roll(unrolled: Array, points_m: Array, origins_m: Array, centers_m
 def used_pairs(observation: Observation) -> NDArray[np.bool_]:
     """(2, N) mask of the measurements that both eyes made."""
     return np.stack([observation.paired, observation.paired])
+
+
+def used_left(observation: Observation) -> NDArray[np.bool_]:
+    """(2, N) mask of the measurements that the left eye made."""
+    return np.stack([observation.seen[0], np.zeros(observation.layout.count, dtype=bool)])

@@ -97,23 +97,21 @@ def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Lineari
     return Linearised(jacobian, residuals, np.where(in_front & np.isfinite(costs), costs, np.inf))
 
 
+def predicted_px(features: Features, state: State) -> Array:
+    """(S, E, F, 2) ellipse centres that the poses would show. [px]"""
+    _, _, x_z, y_z, _ = _images(features, state)
+    u = features.camera.fx_px * x_z + features.camera.cx_px
+    v = features.camera.fy_px * y_z + features.camera.cy_px
+    return np.stack([u, np.broadcast_to(v, u.shape)], axis=-1)
+
+
 def _fill_features(features: Features, state: State, jacobian: Array, residuals: Array) -> Array:
     """Write the features' part of both arrays; (S,) whether all features lie in front of the cameras."""
     u, v, a, b, c = features.measured
     camera = features.camera
     rows = jacobian.reshape(*jacobian.shape[:2], 2, *u.shape[1:])
-    arms = features.points_m @ np.swapaxes(state.rotations, 1, 2)
-    if features.ring_sigma > 0:
-        arms *= (1 + (state.scales[:, None] - 1) * features.ring)[..., None]
+    arms, depth, x_z, y_z, z = _images(features, state)
     ax, ay, az = (arms[:, None, :, axis] for axis in range(3))
-    tx, ty, tz = (state.translations_m[:, axis, None, None] for axis in range(3))
-    nx, ny, nz = (state.rotations[:, axis, 2, None, None] for axis in range(3))
-    depth = az + tz
-    # The ellipse centre is the image of `t - (r^2 / t_z) (e_z - n_z n)` (geometry.circles).
-    shift = features.radii_m**2 / depth
-    z = depth - shift * (1 - nz * nz)
-    x_z = (ax + tx - features.eye_x_m[:, None] + shift * (nz * nx)) / z
-    y_z = (ay + ty + shift * (nz * ny)) / z
     off_u = camera.fx_px * x_z + camera.cx_px - u
     off_v = camera.fy_px * y_z + camera.cy_px - v
     both = residuals.reshape(len(residuals), 2, *u.shape[1:])
@@ -133,6 +131,27 @@ def _fill_features(features: Features, state: State, jacobian: Array, residuals:
         rows[:, 6, 1] = share * (ax * vx + ay * vy + az * vz)
     in_front: Array = (depth > 0).all(axis=(1, 2))
     return in_front
+
+
+def _images(features: Features, state: State) -> tuple[Array, Array, Array, Array, Array]:
+    """Where the features are and where their ellipse centres appear.
+
+    Returns:
+        arms (S, F, 3) from the drogue's origin [m], depths (S, 1, F) [m], slopes x/z (S, E, F) and y/z (S, 1, F) of the
+        ellipse centres, and the depths (S, 1, F) that belong to them [m]. Rectified eyes share depth and y.
+    """
+    arms = features.points_m @ np.swapaxes(state.rotations, 1, 2)
+    if features.ring_sigma > 0:
+        arms *= (1 + (state.scales[:, None] - 1) * features.ring)[..., None]
+    tx, ty, tz = (state.translations_m[:, axis, None, None] for axis in range(3))
+    nx, ny, nz = (state.rotations[:, axis, 2, None, None] for axis in range(3))
+    depth = arms[:, None, :, 2] + tz
+    # The ellipse centre is the image of `t - (r^2 / t_z) (e_z - n_z n)` (geometry.circles).
+    shift = features.radii_m**2 / depth
+    z = depth - shift * (1 - nz * nz)
+    x_z = (arms[:, None, :, 0] + tx - features.eye_x_m[:, None] + shift * (nz * nx)) / z
+    y_z = (arms[:, None, :, 1] + ty + shift * (nz * ny)) / z
+    return arms, depth, x_z, y_z, z
 
 
 def _weigh(jacobian: Array, residuals: Array, threshold: float, features: Features) -> Array:

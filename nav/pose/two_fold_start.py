@@ -30,7 +30,7 @@ def two_fold_start(features: Features) -> tuple[Array, Array]:
     direction = camera.rays(center_px)
     scale = np.linalg.svd(linear, compute_uv=False)[:, 0]
     # Markers in one point have no scale; any will do, the adjustment's cost then tells.
-    scale = np.maximum(scale, np.finfo(np.float64).tiny**0.5)
+    scale = np.maximum(scale, np.finfo(np.float64).tiny ** 0.5)
     translation = direction / scale[:, None]
     translation[:, 0] += features.eye_x_m.mean()
 

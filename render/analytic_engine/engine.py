@@ -19,7 +19,7 @@ from render.analytic_engine.painting import paint
 from render.analytic_engine.passes import empty_passes, pixel_passes
 from render.background import background
 from render.engine import EyeRadiance, StereoRadiance
-from render.mitsuba_engine.traced import blur_px
+from render.motion import blur_px
 from render.version import RENDER_VERSION
 from scenes.surroundings import surroundings
 

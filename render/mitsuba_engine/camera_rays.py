@@ -11,7 +11,7 @@ import numpy as np
 from datasets_manifest.frame import FrameSpec
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye
-from render.mitsuba_engine.traced import pose_polynomial
+from render.motion import pose_polynomial
 
 
 class CameraRays:

@@ -20,11 +20,11 @@ from render.mitsuba_engine.sun_sky_paths import trace_paths
 from render.mitsuba_engine.traced import (
     Traced,
     TracedEye,
-    blur_px,
     inside_one_part,
     pixels_to_trace,
     settings_by_plan,
 )
+from render.motion import blur_px
 from scenes.seeding import generator
 from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import Surroundings

@@ -19,12 +19,11 @@ from render.mitsuba_engine.traced import (
     Traced,
     TracedEye,
     amodal_counts,
-    blur_px,
     inside_one_part,
     pixels_to_trace,
-    pose_polynomial,
     settings_by_plan,
 )
+from render.motion import blur_px, pose_polynomial
 from scenes.seeding import generator
 from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import Surroundings

@@ -8,11 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
 from drogue_models.parts import FIRST_MARKER_ID, Part, drogue_part_ids
-from geometry.se3 import exp_twist
-from geometry.stereo import Eye
 from render.engine import EyeRadiance
 
 # Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
@@ -69,31 +66,6 @@ class Traced:
     eyes: dict[Eye, TracedEye]
     monte_carlo_noise_fraction: float
     stage_s: dict[str, float]
-
-
-def pose_polynomial(frame: FrameSpec, eye: Eye) -> NDArray[np.float64]:
-    """Pose of an eye in the drogue frame over the exposure.
-
-    Returns:
-        (3, 3, 4) coefficients c of `drogue_from_eye(s) = c[0] + c[1] s + c[2] s^2`, s from -1 (shutter opens) to 1
-        (it closes); exact at both ends and the middle, the rest is of third order in the motion.
-    """
-    half_s = frame.exposure.time_s / 2
-    eye_from_left = exp_twist(np.concatenate([-frame.rig.eye_offset_m(eye), np.zeros(3)]))
-    opened, middle, closed = (
-        (eye_from_left @ frame.left_from_drogue_at(offset_s)).inverse().as_matrix()[:3]
-        for offset_s in (-half_s, 0.0, half_s)
-    )
-    return np.stack([middle, (closed - opened) / 2, (closed + opened) / 2 - middle])
-
-
-def blur_px(frame: FrameSpec) -> float:
-    """Largest movement of the drogue's image from mid-exposure to either end. [px]"""
-    half_s = frame.exposure.time_s / 2
-    assert frame.drogue is not None
-    reach = frame.drogue.rim_radius_m * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
-    seen = [frame.rig.camera.project(frame.left_from_drogue_at(s).apply(reach)) for s in (-half_s, 0.0, half_s)]
-    return float(max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[2] - seen[1]).max()))
 
 
 def amodal_counts(

@@ -10,10 +10,11 @@ import pytest
 from datasets_manifest.estimates import NoFix, PoseEstimate, write_estimates
 from datasets_manifest.records import PairRecord
 from droguekit.benchmark.benchmark import run_benchmark, score
+from droguekit.benchmark.centroid_errors import centroid_errors
 from droguekit.benchmark.frame_truth import drogue_truth
 from droguekit.benchmark.pose_errors import by_method
 from droguekit.benchmark.result import BenchmarkResult, DatasetFacts
-from geometry.se3 import RigidTransform
+from geometry.se3 import RigidTransform, exp_twist
 
 DatasetFixture = tuple[Path, list[PairRecord]]
 
@@ -54,6 +55,76 @@ def test_the_json_has_the_fixed_keys(
             assert set(row["bound_ratio"]) == {"x", "y", "z", "pitch", "yaw"}
         assert all({"low_m", "high_m"} <= set(row) for row in method["bins"])
     assert BenchmarkResult.model_validate(table) == result
+
+
+def test_the_json_compares_with_the_best_method_and_with_the_papers(
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    folder, records = dataset
+    write_estimates(tmp_path / "e.jsonl", build.estimates(records, {"joint": 1.0, "paper": 8.0, "mean": 3.0}, rng))
+    table = json.loads(run_benchmark(folder, tmp_path / "e.jsonl").to_json())
+    pairs = {(row["method"], row["against"]): row for row in table["comparisons"]}
+    assert list(pairs) == [("paper", "joint"), ("mean", "joint"), ("joint", "paper"), ("mean", "paper")]
+    ratios = [pairs[pair]["overall"]["position"] for pair in (("paper", "joint"), ("joint", "paper"))]
+    # The same frames both ways: rounding.
+    assert ratios[0] * ratios[1] == pytest.approx(1, rel=1e-12)
+    assert all(len(row["bins"]) == 3 for row in table["comparisons"])
+
+
+def test_normalized_errors_and_nees_are_one_for_least_squares(build: SimpleNamespace, rng: np.random.Generator) -> None:
+    """Poses that least squares makes of markers alone reach their own bound, not that of markers and hub."""
+    records, sigma = build.records([2.0, 9.0], 200, rng), 0.02
+    estimates = []
+    for record in records:
+        truth = drogue_truth(record)
+        features = tuple(
+            f.model_copy(update={"used": f.index != "hub"})
+            for f in build.features(record, lambda: rng.normal(0, sigma, 2))
+        )
+        rows = truth.jacobian[:, :8, :, :6].reshape(-1, 6)
+        offsets = centroid_errors(truth, features).offset_px.reshape(2, 9, 2)[:, :8]
+        twist = np.linalg.lstsq(rows, offsets.ravel(), rcond=None)[0]
+        rotation = exp_twist(np.r_[0, 0, 0, twist[3:]]).rotation @ truth.left_from_drogue.rotation
+        pose = RigidTransform(rotation, truth.left_from_drogue.translation_m + twist[:3])
+        estimate = build.estimate(record.frame_index, pose, "markers", features)
+        covariance = sigma**2 * np.linalg.inv(rows.T @ rows)
+        estimates.append(estimate.model_copy(update={"covariance": covariance}))
+    method = score_records(records, estimates).methods["markers"]
+    for row in (method.overall, *method.bins):
+        # Relative standard error of a root mean square 1 / sqrt(2 n); four of those.
+        tolerance = 4 / np.sqrt(2 * row.n)
+        own = row.normalized_own.nrms
+        assert [own.x, own.y, own.z, own.pitch, own.yaw] == pytest.approx([1] * 5, abs=tolerance)
+        # Standard error of the mean of chi-square over its freedom; four of those.
+        assert row.nees.position.per_freedom == pytest.approx(1, abs=4 * np.sqrt(2 / (3 * row.n)))
+        assert row.nees.attitude.per_freedom == pytest.approx(1, abs=4 * np.sqrt(2 / (2 * row.n)))
+        assert (row.nees.n, row.nees.unusable, row.flips.flips) == (row.n, 0, 0)
+    # The hub knows the tilt of a far drogue better than the ring does.
+    assert method.bins[1].normalized.nrms.pitch > 1.5
+
+
+def test_the_hub_counts_at_its_own_noise(build: SimpleNamespace, rng: np.random.Generator) -> None:
+    records = build.records([5.0], 20, rng)
+    estimates = []
+    for record in records:
+        noisy = build.features(record, lambda: rng.normal(0, 0.05, 2))
+        coarse = build.features(record, lambda: rng.normal(0, 0.2, 2))
+        mixed = tuple(c if c.index == "hub" else f for f, c in zip(noisy, coarse, strict=True))
+        estimates.append(build.estimate(record.frame_index, record.left_from_drogue, "joint-hub", mixed))
+    place = score_records(records, estimates).reference[0]
+    assert (place.centroid_method, place.hub_method) == ("joint-hub", "joint-hub")
+    # 640 and 80 coordinates know their noise to 3 and 8 %; three of those.
+    assert place.centroid_sigma_px == pytest.approx(0.05, rel=0.09)
+    assert place.hub_sigma_px == pytest.approx(0.2, rel=0.24)
+
+
+def test_a_failure_counts_with_the_spread_of_the_truth(build: SimpleNamespace, rng: np.random.Generator) -> None:
+    records = build.records([3.0, 12.0], 5, rng)
+    poses = [build.estimate(r.frame_index, r.left_from_drogue) for r in records[:8]]
+    row = score_records(records, poses).methods["joint"].overall
+    assert (row.failures, row.z_rmse_m) == (2, 0)
+    # Half of the pairs at 3 m and half at 12 m: standard deviation 4.5 m, in 2 of 10.
+    assert row.rmse_with_failures.z_m == pytest.approx(4.5 * np.sqrt(0.2), rel=1e-9)
 
 
 def test_a_known_shift_is_told_as_it_is(build: SimpleNamespace, rng: np.random.Generator) -> None:

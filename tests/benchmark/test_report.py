@@ -94,6 +94,10 @@ def test_the_page_has_every_figure_picture_and_table(
     assert text.count("data:image/jpeg") == 9
     for name in ("overall", "position", "x", "y", "z", "pitch", "yaw", "centroids", "times"):
         assert f'id="table-{name}"' in text
+    for name in ("against-0", "against-1", "normalized", "normalized-own", "flips", "failures"):
+        assert f'id="table-{name}"' in text
+    # No method of the file reports a covariance.
+    assert 'id="table-nees"' not in text
     assert result.dataset.sha256 in text
     assert "prefers-color-scheme: dark" in text
     assert "@media print" in text
@@ -154,8 +158,40 @@ def test_panels_are_well_formed_and_leave_no_trace(scored: tuple[Path, Path, Ben
 def test_every_method_looks_different() -> None:
     names = [f"method-{k}" for k in range(13)]
     styles = method_styles(names)
-    assert len({(style.color, style.marker) for style in styles.values()}) == 13
+    assert len({style.color for style in styles.values()}) == 13
     assert len({style.marker for style in styles.values()}) == 13
+
+
+def test_many_methods_still_look_different() -> None:
+    styles = method_styles([f"method-{k}" for k in range(169)])
+    assert len({(style.color, style.marker) for style in styles.values()}) == 169
+
+
+def test_thirteen_methods_get_larger_panels_with_the_bound(
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    folder, records = dataset
+    estimates = tmp_path / "estimates.jsonl"
+    write_estimates(estimates, build.estimates(records, {f"method-{k}": 1.0 + k for k in range(13)}, rng))
+    result = run_benchmark(folder, estimates)
+    write_report(folder, estimates, result, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert '<div class="panels large">' in text
+    panel = error_panel(result, QUANTITIES[0])
+    assert all(style.color in panel for style in method_styles(list(result.methods)).values())
+    # The bound is the one dashed line.
+    assert panel.count("stroke-dasharray: ") == 1
+
+
+def test_a_method_with_covariances_gets_a_table_of_them(
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    folder, records = dataset
+    estimates = tmp_path / "estimates.jsonl"
+    plain = [estimate for estimate in build.estimates(records, {"joint": 1.0}, rng) if estimate.status == "fix"]
+    write_estimates(estimates, [e.model_copy(update={"covariance": 1e-6 * np.eye(6)}) for e in plain])
+    write_report(folder, estimates, run_benchmark(folder, estimates), tmp_path / "report.html")
+    assert 'id="table-nees"' in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_sentences_name_the_best_method(scored: tuple[Path, Path, BenchmarkResult]) -> None:

@@ -1,0 +1,204 @@
+"""The joint adjustment of many frames at once: both tilts, their weights, and what to report of them.
+
+Where the ring alone cannot tell which way the drogue is tilted, the report is the posterior's mean over both tilts,
+with the covariance of the mixture. Elsewhere it is the minimum with the lower cost, with the inverse information.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from drogue_models.marker_layout import MarkerLayout
+from geometry.se3 import Array
+from geometry.stereo import StereoRig
+from nav.pose.adjustment import Adjusted, adjust, information_at, inverse_information
+from nav.pose.features import Features, stack_features
+from nav.pose.reprojection import SQUARES, Loss
+from nav.pose.two_fold_start import sight_rotations, two_fold_start
+
+# Standard deviation of pitch and of yaw, of drogues that swing within 10 degrees uniformly: 5.8 degrees.
+TILT_PRIOR_RAD = np.radians(6.0)
+# The sign of a tilt is told when the tilt exceeds this many of its deviations at the frontal pose: wrong in 0.1 %.
+_RELIABLE_SIGMAS = 3.0
+# Two starts that end this near each other found one minimum.
+_SAME_TURN_RAD = 1e-4
+# Poses that are adjusted together; their derivatives then fit into a core's cache.
+_CHUNK = 256
+
+
+@dataclass(frozen=True, eq=False)
+class JointBatch:
+    """Poses of B frames.
+
+    Attributes:
+        rotations: (B, 3, 3) `left_from_drogue`.
+        translations_m: (B, 3).
+        covariances: (B, 6, 6) in the tangent of `datasets_manifest.estimates`.
+        sound: (B,) whether there is a pose in front of the cameras that the measurements determine; nothing else of a
+            frame means anything where not.
+        tilt_sign_reliable: (B,) whether the tilt is large enough for its sign to be told.
+        mode_rotations: (B, 2, 3, 3) the poses that both starts led to, the best first.
+        mode_translations_m: (B, 2, 3).
+        mode_costs: (B, 2) half the sum of squared residuals in standard deviations, priors included.
+        mode_weights: (B, 2) shares of the posterior; the second is 0 where both starts led to one pose.
+    """
+
+    rotations: Array
+    translations_m: Array
+    covariances: Array
+    sound: NDArray[np.bool_]
+    tilt_sign_reliable: NDArray[np.bool_]
+    mode_rotations: Array
+    mode_translations_m: Array
+    mode_costs: Array
+    mode_weights: Array
+
+
+def solve_joint_batch(
+    rig: StereoRig, layout: MarkerLayout, pixels_px: Array, cov_px2: Array, ring_tolerance_m: float = 0.0
+) -> JointBatch:
+    """Methods `joint` and, with the hub's edges among the pixels, `joint-hub`, for many frames of one drogue.
+
+    Args:
+        rig: the stereo rig.
+        layout: the drogue's markers and hub.
+        pixels_px: (B, E, F, 2) measured ellipse centres, nan where there is none; E = 1 (left eye) or 2, F = N markers,
+            or N + 2 with the hub's inner and outer edge.
+        cov_px2: (B, E, F, 2, 2) their covariances, or what broadcasts to it.
+        ring_tolerance_m: standard deviation of the ring's radius about the layout's, 0 for one exactly as built.
+
+    Raises:
+        ValueError: an array of another shape.
+    """
+    return solve_features(stack_features(rig, layout, pixels_px, cov_px2, ring_tolerance_m))
+
+
+def solve_features(features: Features) -> JointBatch:
+    """As `solve_joint_batch`, from stacked features."""
+    parts = [_solve(features.take(slice(i, i + _CHUNK))) for i in range(0, features.frames, _CHUNK)]
+    if len(parts) == 1:
+        return parts[0]
+    return JointBatch(*(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True)))
+
+
+def solve_from(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARES) -> Adjusted:
+    """Adjust (B, 2) starts; the results lie frame by frame, two after each other."""
+    twice = features.take(np.repeat(np.arange(features.frames), 2))
+    return adjust(twice, rotations.reshape(-1, 3, 3), translations_m.reshape(-1, 3), loss)
+
+
+def _solve(features: Features) -> JointBatch:
+    frames = np.arange(features.frames)
+    found = _Pairs.of(solve_from(features, *two_fold_start(features)))
+    order = np.argsort(found.costs, axis=1, kind="stable")
+    found = found.ordered(order)
+    best_rotation, best_translation = found.rotations[:, 0], found.translations_m[:, 0]
+    covariance, sound = inverse_information(found.information[:, 0])
+    sound &= np.isfinite(found.costs[:, 0]) & (best_rotation[:, 2, 2] > 0) & (best_translation[:, 2] > 0)
+    weights = _weights(found, TILT_PRIOR_RAD)
+    reliable = _tilt_sign_reliable(features, best_rotation, best_translation) | ~sound
+
+    rotations, translations = best_rotation.copy(), best_translation.copy()
+    doubtful = frames[~reliable]
+    if len(doubtful):
+        prior = Loss(tilt_prior_rad=TILT_PRIOR_RAD)
+        starts = (found.rotations[doubtful], found.translations_m[doubtful])
+        drawn = _Pairs.of(solve_from(features.take(doubtful), *starts, prior))
+        shares = _weights(drawn, np.inf)
+        order = np.argsort(-shares, axis=1, kind="stable")
+        drawn, shares = drawn.ordered(order), np.take_along_axis(shares, order, axis=1)
+        mean = _mixture(drawn, shares)
+        rotations[doubtful], translations[doubtful], covariance[doubtful] = mean
+        found.replace(doubtful, drawn)
+        weights[doubtful] = shares
+    return JointBatch(
+        rotations,
+        translations,
+        covariance,
+        sound,
+        reliable & sound,
+        found.rotations,
+        found.translations_m,
+        found.costs,
+        weights,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """What both starts of B frames led to, (B, 2, ...)."""
+
+    rotations: Array
+    translations_m: Array
+    costs: Array
+    information: Array
+
+    @staticmethod
+    def of(adjusted: Adjusted) -> _Pairs:
+        size = adjusted.information.shape[-1]
+        return _Pairs(
+            adjusted.rotations.reshape(-1, 2, 3, 3),
+            adjusted.translations_m.reshape(-1, 2, 3),
+            adjusted.costs.reshape(-1, 2),
+            adjusted.information.reshape(-1, 2, size, size),
+        )
+
+    def ordered(self, order: NDArray[np.int64]) -> _Pairs:
+        rows = np.arange(len(order))[:, None]
+        return _Pairs(*(values[rows, order] for values in vars(self).values()))
+
+    def replace(self, frames: NDArray[np.int64], other: _Pairs) -> None:
+        for mine, theirs in zip(vars(self).values(), vars(other).values(), strict=True):
+            mine[frames] = theirs
+
+
+def _weights(pairs: _Pairs, prior_rad: float) -> Array:
+    """(B, 2) shares of the posterior by Laplace's approximation, `exp(-cost) |information|^(-1/2)` times a tilt prior.
+
+    A pose behind the cameras has no share, and neither has the second of two equal poses.
+    """
+    axes = pairs.rotations[..., 2]
+    with np.errstate(invalid="ignore"):
+        log_weights = -pairs.costs - np.linalg.slogdet(pairs.information)[1] / 2
+    log_weights -= (axes[..., :2] ** 2).sum(axis=-1) / (2 * prior_rad**2)
+    possible = np.isfinite(log_weights) & (axes[..., 2] > 0) & (pairs.translations_m[..., 2] > 0)
+    possible[:, 1] &= np.linalg.norm(axes[:, 0] - axes[:, 1], axis=-1) > _SAME_TURN_RAD
+    # Whoever has only impossible poses keeps the first; it is not sound.
+    possible[:, 0] |= ~possible.any(axis=1)
+    log_weights = np.where(possible, np.nan_to_num(log_weights, nan=0.0), -np.inf)
+    weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+    shares: Array = weights / weights.sum(axis=1, keepdims=True)
+    return shares
+
+
+def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Array) -> NDArray[np.bool_]:
+    """(B,) whether the tilt against the line of sight exceeds three deviations that it would have at zero."""
+    middle = np.array([features.eye_x_m.mean(), 0.0, 0.0])
+    frontal = sight_rotations(translations_m - middle)
+    covariance, determined = inverse_information(information_at(features, frontal, translations_m))
+    variance = (covariance[:, 3, 3] + covariance[:, 4, 4]) / 2
+    # 1 - cos loses small tilts to rounding; the cross product does not.
+    tilt = np.linalg.norm(np.cross(rotations[:, :, 2], frontal[:, :, 2]), axis=1)
+    reliable: NDArray[np.bool_] = determined & (tilt > _RELIABLE_SIGMAS * np.sqrt(variance))
+    return reliable
+
+
+def _mixture(pairs: _Pairs, weights: Array) -> tuple[Array, Array, Array]:
+    """Mean rotations (B, 3, 3), translations (B, 3) and covariances (B, 6, 6) of two weighted Gaussians each."""
+    count, size = len(weights), pairs.information.shape[-1]
+    first = pairs.rotations[:, 0]
+    apart = Rotation.from_matrix(pairs.rotations[:, 1] @ np.swapaxes(first, 1, 2)).as_rotvec()
+    turn = np.zeros((count, 2, 3))
+    turn[:, 1] = np.where(weights[:, 1:] > 0, apart, 0.0)
+    places = np.concatenate([pairs.translations_m, turn], axis=-1)
+    mean = (weights[..., None] * places).sum(axis=1)
+    away = np.where(weights[..., None] > 0, places - mean[:, None], 0.0)
+    spreads, _ = inverse_information(pairs.information.reshape(-1, size, size))
+    spreads = spreads.reshape(count, 2, 6, 6) + away[..., :, None] * away[..., None, :]
+    covariance = (weights[..., None, None] * spreads).sum(axis=1)
+    rotations = Rotation.from_rotvec(mean[:, 3:]).as_matrix() @ first
+    return rotations, mean[:, :3], covariance

@@ -1,0 +1,100 @@
+"""Method `joint-robust`: the joint adjustment on those features that agree with each other."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.se3 import Array
+from nav.pose.adjustment import adjust
+from nav.pose.batched import solve_from
+from nav.pose.faults import fault, hub_fault
+from nav.pose.features import Features, observed_features
+from nav.pose.interface import NoFixReason, Observation, Solution
+from nav.pose.joint import hub_note, solve_one
+from nav.pose.reprojection import Loss, State, linearise
+from nav.pose.two_fold_start import two_fold_start
+
+_HUBER = Loss(huber_sigmas=2.0)
+# A feature in both eyes has four residuals; chance exceeds this once in 2000.
+_LARGEST_CHI2 = 20.0
+# Two features can be told from the rest when at least five more remain.
+_LEAST_FOR_TWO_OUT = 7
+# Four markers overdetermine the plane that three fix.
+_LEAST_INLIERS = 4
+
+
+def joint_robust(observation: Observation) -> Solution | NoFixReason:
+    """Huber's loss first; if any feature then stands out, every set without one or two features is tried.
+
+    The set whose pose explains the features best, each counted up to a limit, tells which are wrong; the answer is that
+    of `joint-hub` (or `joint`, where no hub was measured) without them. An edge of the hub counts as a feature.
+    """
+    reason = fault(observation) or hub_fault(observation)
+    if reason is not None:
+        return reason
+    features = observed_features(observation, with_hub=True)
+    good = _inliers(features)
+    count = observation.layout.count
+    markers = int((good & observed_any(features))[:count].sum())
+    if not good.all() and markers < _LEAST_INLIERS:
+        return NoFixReason(f"only {markers} markers agree with each other, {_LEAST_INLIERS} are needed")
+    used, used_hub = observation.seen & good[:count], observation.hub_seen & _hub_part(good, count)
+    paired = used.all(axis=0)
+    if paired.sum() < 3:
+        return NoFixReason(f"only {int(paired.sum())} markers that both eyes see agree with each other, 3 are needed")
+    note = hub_note(observation)
+    if not note and not used_hub.any():
+        note = "the hub does not agree with the markers: the tilt rests on the markers alone"
+    return solve_one(features.without(~good), used, used_hub if used_hub.any() else None, note)
+
+
+def observed_any(features: Features) -> NDArray[np.bool_]:
+    """(F,) which features any eye of the first frame measured."""
+    seen: NDArray[np.bool_] = features.seen[0].any(axis=0)
+    return seen
+
+
+def _hub_part(good: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    return good[count:] if len(good) > count else np.zeros(2, dtype=bool)
+
+
+def _inliers(features: Features) -> NDArray[np.bool_]:
+    """(F,) which features agree with the pose that most of them share; unmeasured ones count as agreeing."""
+    found = solve_from(features, *two_fold_start(features), _HUBER)
+    best = int(np.argmin(found.costs))
+    first = _chi2(features, found.rotations[best : best + 1], found.translations_m[best : best + 1])[0]
+    if (first < _LARGEST_CHI2).all():
+        return np.ones(len(first), dtype=bool)
+    sets = features.take(np.zeros(2 * len(_left_out(features)), dtype=np.int64))
+    mask = np.repeat(_left_out(features), 2, axis=0)
+    fewer = sets.without(mask[:, None])
+    starts = two_fold_start(fewer.take(slice(0, None, 2)))
+    tried = adjust(fewer, starts[0].reshape(-1, 3, 3), starts[1].reshape(-1, 3))
+    chi2 = np.vstack([_chi2(sets, tried.rotations, tried.translations_m), first])
+    scores = np.minimum(chi2, _LARGEST_CHI2).sum(axis=1)
+    inliers: NDArray[np.bool_] = chi2[np.argmin(scores)] < _LARGEST_CHI2
+    return inliers
+
+
+def _left_out(features: Features) -> NDArray[np.bool_]:
+    """(L, F) every choice of one measured feature to leave out, and of two where enough remain."""
+    measured = np.flatnonzero(observed_any(features))
+    choices: list[tuple[int, ...]] = [(int(i),) for i in measured]
+    if len(measured) >= _LEAST_FOR_TWO_OUT:
+        choices += combinations(measured.tolist(), 2)
+    mask = np.zeros((len(choices), len(features.points_m)), dtype=bool)
+    for row, choice in enumerate(choices):
+        mask[row, list(choice)] = True
+    return mask
+
+
+def _chi2(features: Features, rotations: Array, translations_m: Array) -> Array:
+    """(S, F) squared residuals of every feature in both eyes, in variances; infinite where they are no numbers."""
+    state = State(rotations, translations_m, np.ones(len(rotations)))
+    size = 2 * features.measured.shape[2] * len(features.points_m)
+    residuals = linearise(features, state).residuals[:, :size]
+    squares = (residuals.reshape(len(rotations), -1, len(features.points_m)) ** 2).sum(axis=1)
+    return np.where(np.isfinite(squares), squares, np.inf)
