@@ -12,6 +12,7 @@ from datasets_manifest.estimates import Feature
 from drogue_models.marker_layout import MarkerLayout
 from droguekit.benchmark.bounds import pose_covariance
 from droguekit.benchmark.frame_truth import DrogueTruth
+from droguekit.benchmark.result_parts import Centroids
 from geometry.se3 import Array
 from geometry.stereo import EYES
 
@@ -37,29 +38,6 @@ class CentroidErrors:
     is_hub: NDArray[np.bool_]
     used: NDArray[np.bool_]
     weight: Array
-    mistaken: int
-
-
-@dataclass(frozen=True)
-class CentroidStatistics:
-    """Noise of many centroids.
-
-    Attributes:
-        count: how many marker centroids.
-        sigma_px: root mean square error of the markers' coordinates, None without any. [px]
-        bias_u_px, bias_v_px: mean errors to the right and down. [px]
-        bias_outward_px: mean error away from the drogue's middle. [px]
-        hub_count, hub_sigma_px: the same of the hub.
-        mistaken: measurements of something else.
-    """
-
-    count: int
-    sigma_px: float | None
-    bias_u_px: float | None
-    bias_v_px: float | None
-    bias_outward_px: float | None
-    hub_count: int
-    hub_sigma_px: float | None
     mistaken: int
 
 
@@ -112,14 +90,14 @@ def symmetric_orders(layout: MarkerLayout) -> list[NDArray[np.intp]]:
     return orders
 
 
-def centroid_statistics(errors: Sequence[CentroidErrors]) -> CentroidStatistics:
+def centroid_statistics(errors: Sequence[CentroidErrors]) -> Centroids:
     """Noise and bias over many pairs."""
     offsets = np.concatenate([e.offset_px for e in errors] or [np.zeros((0, 2))])
     outward = np.concatenate([e.outward_px for e in errors] or [np.zeros(0)])
     hub = np.concatenate([e.is_hub for e in errors] or [np.zeros(0, dtype=np.bool_)])
     markers = offsets[~hub]
     some = len(markers) > 0
-    return CentroidStatistics(
+    return Centroids(
         count=len(markers),
         sigma_px=_coordinate_rms(markers),
         bias_u_px=float(markers[:, 0].mean()) if some else None,

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from droguekit.benchmark.bounds import FeatureNoise, component_deviations, pose_covariance
-from droguekit.benchmark.centroid_errors import CentroidErrors, CentroidStatistics, centroid_statistics
+from droguekit.benchmark.centroid_errors import CentroidErrors, centroid_statistics
 from droguekit.benchmark.distance_bins import DistanceBin, distance_bins
 from droguekit.benchmark.frame_truth import DrogueTruth
 from droguekit.benchmark.result import ReferenceBin
+from droguekit.benchmark.result_parts import Centroids
 from droguekit.benchmark.summary import mean_bound
 from geometry.se3 import Array, angles_from_axis
 
@@ -91,7 +92,7 @@ def feature_noise(marker_px: float | None, hub_px: float | None) -> FeatureNoise
     return FeatureNoise(marker_px, marker_px if hub_px is None else hub_px)
 
 
-def _reference_bin(place: DistanceBin, count: int, found: Mapping[str, CentroidStatistics]) -> ReferenceBin:
+def _reference_bin(place: DistanceBin, count: int, found: Mapping[str, Centroids]) -> ReferenceBin:
     method, sigma = _best(found, lambda s: (s.count, s.sigma_px))
     hub_method, hub_sigma = _best(found, lambda s: (s.hub_count, s.hub_sigma_px))
     return ReferenceBin(
@@ -107,7 +108,7 @@ def _reference_bin(place: DistanceBin, count: int, found: Mapping[str, CentroidS
 
 
 def _best(
-    found: Mapping[str, CentroidStatistics], kind: Callable[[CentroidStatistics], tuple[int, float | None]]
+    found: Mapping[str, Centroids], kind: Callable[[Centroids], tuple[int, float | None]]
 ) -> tuple[str | None, float | None]:
     """The method with the least noise among those that measured enough features of a kind, and that noise. [px]"""
     kinds = {name: kind(statistics) for name, statistics in found.items()}

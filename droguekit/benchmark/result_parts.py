@@ -33,7 +33,16 @@ class Bound(ResultModel):
 
 
 class Centroids(ResultModel):
-    """Measured minus true ellipse centres of a method's features; see `CentroidStatistics`."""
+    """Measured minus true ellipse centres of many features.
+
+    Attributes:
+        count: how many marker centroids.
+        sigma_px: root mean square error of the markers' coordinates, None without any. [px]
+        bias_u_px, bias_v_px: mean errors to the right and down. [px]
+        bias_outward_px: mean error away from the drogue's middle. [px]
+        hub_count, hub_sigma_px: the same of the hub.
+        mistaken: measurements of something else.
+    """
 
     count: int
     sigma_px: float | None

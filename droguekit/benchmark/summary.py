@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from droguekit.benchmark.consistency import nees, normalized_errors
 from droguekit.benchmark.flips import FlipTrials, flip_row
 from droguekit.benchmark.pose_errors import COMPONENTS, PoseError
 from droguekit.benchmark.result import Row
-from droguekit.benchmark.result_parts import Bound, Centroids, ComponentErrors, ComponentRatios
+from droguekit.benchmark.result_parts import Bound, ComponentErrors, ComponentRatios
 from droguekit.benchmark.statistics import (
     Interval,
     bootstrap_intervals,
@@ -90,7 +90,7 @@ def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Ro
             "intervals": intervals,
             "bound": bound,
             "bound_ratio": _ratios(bounded, bound),
-            "centroids": Centroids(**asdict(centroid_statistics([score.centroids for score in scores]))),
+            "centroids": centroid_statistics([score.centroids for score in scores]),
             **_centroid_share(fixed),
             **_checks(poses),
             "failures": len(scores) - len(poses),

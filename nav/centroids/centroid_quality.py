@@ -122,7 +122,8 @@ def residual_spread(
     index = (sectors + count * np.arange(len(residuals))[:, None]).ravel()
 
     def by_sector(values: Array32) -> Array:
-        return np.bincount(index, values.ravel(), len(residuals) * count).reshape(len(residuals), count)
+        sums = np.bincount(index, values.ravel(), len(residuals) * count)
+        return sums.reshape(len(residuals), count).astype(np.float64)
 
     weight = np.maximum(by_sector(weights), 1e-12)
     summed = by_sector(weights * residuals)

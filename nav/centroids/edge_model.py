@@ -32,6 +32,8 @@ FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX = 0.03, 0.003
 # Tuning constant of Cauchy's weights for 95 % efficiency on normal residuals.
 _CAUCHY_SIGMA = 2.385
 _LEAST_CONTRAST_SIGMA = 4.0
+# Share of a pixel's light that comes from within.
+_ON_THE_DISC = 0.05
 # Of a disc's own pixels; a wholly clipped disc keeps its middle, one clipped in part does not.
 _MOST_CLIPPED_FRACTION = 0.05
 _LARGEST_CHI2 = 4.0
@@ -134,10 +136,12 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool) -
     inside = first.jacobian[:, LEVEL]
     noise = _noise(first, pixels, inside)
     weights = pixels.present / noise.variances(inside, _contrast(first).astype(np.float32)[:, None])
-    final, weights = _weighted(model, pixels, first, weights, plain)
+    final = _weighted(model, pixels, first, weights, plain)
+    # What a plain picture shows beside a disc says nothing about the disc.
+    judged = weights * (final.jacobian[:, LEVEL] > _ON_THE_DISC) if plain else weights
     contrast = _contrast(final)
     sectors = sector_index(pixels.x_px, pixels.y_px, SECTORS)
-    spread = residual_spread(final.residuals, weights, sectors, contrast, final.parameters.shape[1])
+    spread = residual_spread(final.residuals, judged, sectors, contrast, final.parameters.shape[1])
     cov = final.covariance()[:, :2, :2] * spread.inflation[:, None, None]
     reasons = _reasons(discs, pixels, final, inside, cov, noise, spread)
     return DiscFits(
@@ -185,17 +189,15 @@ def _noise(fit: Minimum, pixels: PixelSet, inside: Array32) -> NoiseModel:
     return measure_noise(fit.residuals**2 / (1 - leverages), pixels.present, inside, _contrast(fit))
 
 
-def _weighted(
-    model: Model, pixels: PixelSet, first: Minimum, weights: Array32, robust: bool
-) -> tuple[Minimum, Array32]:
+def _weighted(model: Model, pixels: PixelSet, first: Minimum, weights: Array32, robust: bool) -> Minimum:
     """Fit with inverse variances; on a plain picture, where a bright sky may enter the window, with Cauchy's loss."""
     if not robust:
-        return minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX), weights
-    fit, cautious = first, weights
+        return minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
+    fit = first
     for _ in range(2):
         cautious = weights / (1 + fit.residuals**2 * weights / np.float32(_CAUCHY_SIGMA**2))
         fit = minimise(model, pixels.values, cautious, fit, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
-    return fit, cautious
+    return fit
 
 
 def _reasons(

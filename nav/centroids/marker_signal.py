@@ -87,11 +87,9 @@ def _image_signal(images: StereoImages, eye: Eye, window: tuple[int, int, int, i
     values = marker_channel(replace(images, left=part, right=part, left_mosaic=None, right_mosaic=None), "left", color)
     full = 2**images.bits - 1
     is_difference = color is not None and image.ndim == 3
-    if is_difference:
-        clipped = part[..., color] >= full
-    else:
-        clipped = (part if part.ndim == 2 else part.max(axis=2)) >= full
-    return MarkerSignal(values.astype(np.float32), clipped, (float(left), float(top)), 1, is_difference)
+    if part.ndim == 3:
+        part = part.max(axis=2) if color is None else part[..., color]
+    return MarkerSignal(values.astype(np.float32), part >= full, (float(left), float(top)), 1, is_difference)
 
 
 def _mosaic_signal(images: StereoImages, mosaic: Pixels, window: tuple[int, int, int, int], color: int) -> MarkerSignal:

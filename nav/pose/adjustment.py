@@ -18,8 +18,8 @@ _DAMPING_FRACTION = 1e-9
 _LARGEST_TURN_RAD = 0.35
 _LARGEST_MOVE_FRACTION = 0.3
 _LARGEST_RESCALE = 0.1
-# The cost is known to be minimal when a step would lower it by less: it then moves no parameter by 2e-6 deviations.
-_CONVERGED = 1e-12
+# The last step would lower the cost by less, so it moves no parameter by more than 5e-5 deviations, and is still taken.
+_CONVERGED = 1e-9
 # A start whose steps had to be shortened to this share is stuck at its minimum's rounding.
 _LEAST_REACH = 1e-4
 # Poses that are done leave the batch when they are more than this share of it; copying costs less than computing then.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe import RenderSettings
 from drogue_models.parts import FIRST_MARKER_ID, Part, drogue_part_ids
+from geometry.stereo import Eye
 from render.engine import EyeRadiance
 
 # Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.

@@ -52,8 +52,8 @@ def test_the_hub_law_agrees_with_the_numeric_bound(
     noise = FeatureNoise(1.0, noise_factor)
     pitch = facing_bound(build, points(8, 0.25), distance_m, noise=noise)[3]
     law = ring(8, distance_m).hub_tilt_rad(0.25, noise_factor)
-    # The hub is h farther away than the ring, which the law leaves out, as it does the ring's own part: 1.5 h / Z.
-    assert law == pytest.approx(np.deg2rad(pitch), rel=1.5 * 0.25 / distance_m)
+    # The law leaves out that the hub is h farther away than the ring, and the ring's own knowledge of tilt: 2 %.
+    assert law == pytest.approx(np.deg2rad(pitch), rel=0.25 / distance_m + 0.02)
 
 
 @pytest.mark.parametrize("sigma_px", [0.005, 0.02, 0.1])

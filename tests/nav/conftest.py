@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from datasets_manifest.images import StereoImages
-from drogue_models.parameters import DrogueParameters
-from geometry.se3 import RigidTransform, rotation_from_angles
-from geometry.stereo import EYES, StereoRig
+from drogue_models.marker_layout import MarkerLayout
+from drogue_models.parameters import DrogueParameters, even_ring
+from geometry.circles import project_disc_centers
+from geometry.se3 import RigidTransform, angles_from_axis, exp_twist, log_twist, rotation_from_angles
+from geometry.stereo import EYES, StereoRig, paper_rig
+from nav.pose.interface import Observation
 
 SAMPLES = 8
 READ_NOISE_DN = 1.0
@@ -123,3 +127,92 @@ def draw_pair(
 def draw() -> Callable[..., StereoImages]:
     """`draw(rig, drogue, left_from_drogue, rng, kind=..., hidden=..., extra_discs=...)`."""
     return draw_pair
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Measured ellipse centres of many poses: pixels (B, 2, F, 2), markers first, then the hub's edges if there are any."""
+
+    rig: StereoRig
+    layout: MarkerLayout
+    sigma_px: float
+    places: list[RigidTransform]
+    exact_px: np.ndarray
+    pixels_px: np.ndarray
+
+    def observation(self, index: int, hub: bool = True, pixels_px: np.ndarray | None = None) -> Observation:
+        count = self.layout.count
+        pixels = self.pixels_px[index] if pixels_px is None else pixels_px
+        cov = np.broadcast_to(self.sigma_px**2 * np.eye(2), (*pixels.shape, 2))
+        if not hub or pixels.shape[1] == count:
+            return Observation(self.rig, self.layout, pixels[:, :count], cov[:, :count])
+        return Observation(self.rig, self.layout, pixels[:, :count], cov[:, :count], pixels[:, count:], cov[:, count:])
+
+    def errors(self, index: int, rotation: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
+        """(8,) errors in X, Y, Z [m], pitch, yaw [rad] and rotation vector [rad]."""
+        true = self.places[index]
+        angles = np.subtract(angles_from_axis(rotation[:, 2]), angles_from_axis(true.rotation[:, 2]))
+        turn = log_twist(RigidTransform(rotation @ true.rotation.T, np.zeros(3)))[3:]
+        return np.concatenate([translation_m - true.translation_m, angles, turn])
+
+    def bound(self, index: int, features: int) -> np.ndarray:
+        """(5,) Cramer-Rao bounds of X, Y, Z [m], pitch and yaw [rad] by differences of the exact projection."""
+        steps = np.diag([1e-6] * 6)
+        centers, radii = drogue_features(self.layout)
+        pixels, derived = [], []
+        for step in np.concatenate([steps, -steps]):
+            true = self.places[index]
+            rotation = exp_twist([0, 0, 0, *step[3:]]).rotation @ true.rotation
+            moved = RigidTransform(rotation, true.translation_m + step[:3])
+            seen = [
+                project_disc_centers(self.rig, moved, centers[:features], radii[:features], eye)
+                for eye in EYES[: self.exact_px.shape[1]]
+            ]
+            pixels.append(np.ravel(seen))
+            derived.append([*moved.translation_m, *angles_from_axis(rotation[:, 2])])
+        jacobian = (np.array(pixels[:6]) - pixels[6:]) / 2e-6
+        outputs = (np.array(derived[:6]) - derived[6:]) / 2e-6
+        covariance = outputs.T @ np.linalg.inv(jacobian @ jacobian.T) @ outputs
+        return self.sigma_px * np.sqrt(np.diag(covariance))
+
+
+def drogue_features(layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
+    """Centres and radii of the markers and of the hub's inner and outer edge. [m]"""
+    radii = np.full(layout.count, layout.radius_m)
+    if layout.hub_center_m is None:
+        return layout.centers_m, radii
+    centers = np.vstack([layout.centers_m, layout.hub_center_m, layout.hub_center_m])
+    return centers, np.append(radii, [layout.hub_inner_radius_m, layout.hub_outer_radius_m])
+
+
+def draw_measurements(
+    rng: np.random.Generator,
+    count: int,
+    z_m: float | tuple[float, float],
+    sigma_px: float,
+    markers: int = 8,
+    tilt_deg: tuple[float, float] = (0.0, 10.0),
+    ring_sigma_m: float = 0.0,
+) -> Draws:
+    """Poses with pitch and yaw of random signs, with the ring of 0.28 m for which the published figures hold."""
+    rig = paper_rig()
+    centers = np.column_stack([np.array(even_ring(markers, 0.28)), np.zeros(markers)])
+    layout = MarkerLayout(centers, 0.05, np.array([0.0, 0.0, 0.25]), 0.05, 0.075)
+    places, exact = [], []
+    for _ in range(count):
+        depth = z_m if isinstance(z_m, float) else rng.uniform(*z_m)
+        tilts = rng.uniform(*tilt_deg, 2) * rng.choice([-1, 1], 2)
+        x, y = rng.uniform(-0.03, 0.03, 2) * depth
+        places.append(make_left_from_drogue(0.06 + x, y, depth, *tilts, rng.uniform(-22.5, 22.5)))
+        points, radii = drogue_features(layout)
+        points = points * np.append(np.full(markers, 1 + ring_sigma_m / 0.28 * rng.standard_normal()), [1, 1])[:, None]
+        exact.append([project_disc_centers(rig, places[-1], points, radii, eye) for eye in EYES])
+    exact_px = np.array(exact)
+    noise = sigma_px * rng.standard_normal(exact_px.shape)
+    return Draws(rig, layout, sigma_px, places, exact_px, exact_px + noise)
+
+
+@pytest.fixture
+def draw_poses() -> Callable[..., Draws]:
+    """`draw_poses(rng, count, z_m, sigma_px, markers=8, tilt_deg=(0, 10), ring_sigma_m=0)`."""
+    return draw_measurements

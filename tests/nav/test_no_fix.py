@@ -87,7 +87,11 @@ def broken(make_pose, corrupt) -> Observation:
     return Observation(RIG, LAYOUT, pixels, cov)
 
 
-@pytest.mark.parametrize("method", METHODS)
+# Methods of the left eye answer without the right one; tests/nav/test_pose_bad_input.py has what turns them down.
+STEREO_METHODS = [name for name in METHODS if not name.startswith("mono-")]
+
+
+@pytest.mark.parametrize("method", STEREO_METHODS)
 @pytest.mark.parametrize("corrupt", FAULTS, ids=lambda corrupt: corrupt.__name__)
 def test_every_method_gives_the_reason(make_pose, method, corrupt):
     answer = METHODS[method](broken(make_pose, corrupt))

@@ -1,0 +1,182 @@
+"""Accuracy at the level of centroids: drawn poses, exact centres, noise, and what a method makes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+from scipy.stats import norm
+
+from drogue_models.marker_layout import MarkerLayout, marker_layout
+from drogue_models.presets import load_drogue
+from droguekit.bars.batch_scores import bound_deviations, flipped, pose_errors, sight_tilts, squared_errors
+from droguekit.bars.corruption import CLEAN, Corruption, draw_shifts
+from droguekit.bars.drawn_poses import Poses, cell_generator, draw_poses, ellipse_centers_px
+from droguekit.bars.solvers import Measured, Solved, solve
+from droguekit.bars.tolerances import AS_BUILT, Tolerances, draw_features
+from droguekit.benchmark.bounds import feature_points
+from droguekit.benchmark.closed_forms import FacingRing
+from geometry.se3 import Array
+from geometry.stereo import paper_rig
+
+# Noise of an evenly lit hub's centre over that of a marker's: between 1.3 and 1.5 on rendered frames.
+HUB_NOISE_FACTOR = 1.5
+# Above so many deviations of the flip law a tilt has a sign.
+CLEAR_TILT_SCALES = 3.0
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One set of draws and the method that is tried on it.
+
+    Attributes:
+        method: its name.
+        markers: 5, 7 or 8: which shipped drogue.
+        distance_m: nearest and farthest. [m]
+        sigma_px: noise of the markers' centres.
+        draws: how many frames.
+        corruption, tolerances: what is wrong with centroids, drogue and cameras.
+        ring_tolerance_m: of the ring's radius, as the method is told.
+        seed: of the draws.
+    """
+
+    method: str
+    markers: int
+    distance_m: tuple[float, float]
+    sigma_px: float
+    draws: int
+    seed: int
+    corruption: Corruption = CLEAN
+    tolerances: Tolerances = field(default=AS_BUILT)
+    ring_tolerance_m: float = 0.0
+
+    @property
+    def stream(self) -> str:
+        """Key of the draws: cells that differ in method or number of markers see the same poses."""
+        return f"{self.distance_m[0]:g}-{self.distance_m[1]:g} m, {self.draws} draws"
+
+
+class CellResult(BaseModel):
+    """What came out of a cell.
+
+    Attributes:
+        n, fixes: frames, and those with a pose.
+        position_mean_m, position_sd_m: lengths of the position errors. [m]
+        z_rms_m: [m]
+        nrms: root mean square of X, Y, Z, pitch and yaw errors, each over the bound of its frame.
+        clear_n, clear_nrms: the same of pitch and yaw where the true tilt is clear of the flip law.
+        nees_n, nees: frames with a covariance, and mean normalised square error over its five degrees of freedom.
+        flips, flip_law: mirrored tilts, and their share by the law.
+        stereo_z_rms_m: error of the mean of the triangulated markers. [m]
+
+    A frame without a pose counts with the standard deviation of the drawn poses.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    n: int
+    fixes: int
+    position_mean_m: float
+    position_sd_m: float
+    z_rms_m: float
+    nrms: tuple[float, float, float, float, float]
+    clear_n: int
+    clear_nrms: tuple[float, float] | None
+    nees_n: int
+    nees: float | None
+    flips: int
+    flip_law: float
+    stereo_z_rms_m: float
+
+
+def run_cell(cell: Cell) -> CellResult:
+    """Draw, measure, solve and score one cell.
+
+    Raises:
+        ValueError: a method that does not exist, or a distance at which the drogue is not in view.
+    """
+    rig, drogue = paper_rig(), load_drogue(f"red-{cell.markers}")
+    layout = marker_layout(drogue)
+    poses = draw_poses(
+        cell_generator(cell.seed, cell.stream, "poses"), rig, drogue.rim_radius_m, cell.distance_m, cell.draws
+    )
+    measured = _measure(cell, layout, poses)
+    solved = solve(cell.method, measured)
+    errors = np.where(solved.fixed[:, None], pose_errors(solved.poses, poses), _prior(poses))
+    centers, radii = feature_points(layout)
+    noise = np.append(np.full(layout.count, cell.sigma_px), HUB_NOISE_FACTOR * cell.sigma_px)
+    used = slice(None) if cell.method == "joint-hub" else slice(layout.count)
+    ratios = errors / bound_deviations(rig, poses, centers[used], radii[used], noise[used])
+    tilts, scales = sight_tilts(rig, poses, poses), _tilt_scales(layout, cell, poses)
+    sizes = np.linalg.norm(tilts, axis=1) / scales
+    clear = sizes > CLEAR_TILT_SCALES
+    mirrored = flipped(sight_tilts(rig, solved.best, poses), tilts) & solved.fixed
+    squares = _squares(solved, errors)
+    position = np.linalg.norm(errors[:, :3], axis=1)
+    stereo_m = rig.triangulate(measured.markers_px[:, 0], measured.markers_px[:, 1])[..., 2].mean(axis=1)
+    return CellResult(
+        n=cell.draws,
+        fixes=int(solved.fixed.sum()),
+        position_mean_m=float(position.mean()),
+        position_sd_m=float(position.std()),
+        z_rms_m=_rms(errors[:, 2]),
+        nrms=(_rms(ratios[:, 0]), _rms(ratios[:, 1]), _rms(ratios[:, 2]), _rms(ratios[:, 3]), _rms(ratios[:, 4])),
+        clear_n=int(clear.sum()),
+        clear_nrms=(_rms(ratios[clear, 3]), _rms(ratios[clear, 4])) if clear.any() else None,
+        nees_n=len(squares),
+        nees=float(squares.mean()) / 5 if len(squares) else None,
+        flips=int(mirrored.sum()),
+        flip_law=float(norm.sf(sizes).mean()),
+        stereo_z_rms_m=_rms(np.nan_to_num(stereo_m, nan=0.0) - poses.translations_m[:, 2]),
+    )
+
+
+def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> Measured:
+    key = f"{cell.stream}, {cell.markers} markers, {cell.sigma_px:g} px, {cell.corruption}, {cell.tolerances}"
+    true = draw_features(cell_generator(cell.seed, key, "features"), layout, cell.tolerances, cell.draws)
+    _, radii = feature_points(layout)
+    exact = ellipse_centers_px(paper_rig(), poses, true.centers_m, radii, true.right)
+    # The same noise with and without bad markers, so that their effect stands out.
+    noise_key = f"{cell.stream}, {cell.markers} markers, {cell.sigma_px:g} px"
+    noise = cell_generator(cell.seed, noise_key, "noise").standard_normal(exact.shape)
+    hub_sigma_px = HUB_NOISE_FACTOR * cell.sigma_px
+    count = layout.count
+    shifts = draw_shifts(cell_generator(cell.seed, key, "shifts"), cell.corruption, cell.draws, count)
+    return Measured(
+        rig=paper_rig(),
+        layout=layout,
+        markers_px=exact[:, :, :count] + cell.sigma_px * noise[:, :, :count] + shifts,
+        hub_px=exact[:, :, count] + hub_sigma_px * noise[:, :, count] if cell.method == "joint-hub" else None,
+        sigma_px=cell.sigma_px,
+        hub_sigma_px=hub_sigma_px,
+        ring_tolerance_m=cell.ring_tolerance_m,
+    )
+
+
+def _tilt_scales(layout: MarkerLayout, cell: Cell, poses: Poses) -> Array:
+    """(n,) scale of the flip law. [rad]"""
+    rig, radius_m = paper_rig(), layout.ring_radius_m
+    assert radius_m is not None
+    one = FacingRing(rig.camera.fx_px, rig.baseline_m, radius_m, layout.count, 1.0).tilt_rad
+    scales: Array = cell.sigma_px * one * poses.translations_m[:, 2] ** 2
+    return scales
+
+
+def _squares(solved: Solved, errors: Array) -> Array:
+    if solved.covariances is None:
+        return np.zeros(0)
+    chosen = solved.fixed
+    poses = Poses(solved.poses.rotations[chosen], solved.poses.translations_m[chosen])
+    return squared_errors(poses, solved.covariances[chosen], errors[chosen])
+
+
+def _prior(poses: Poses) -> Array:
+    """(5,) standard deviations of the drawn X, Y, Z [m], pitch and yaw [deg]."""
+    level = Poses(np.broadcast_to(np.eye(3), poses.rotations.shape), np.zeros_like(poses.translations_m))
+    spread: Array = pose_errors(poses, level).std(axis=0)
+    return spread
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

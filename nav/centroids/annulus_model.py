@@ -1,0 +1,109 @@
+"""The picture of an annulus: two blurred edges, between them light that changes with the azimuth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.se3 import Array
+from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_profile, ellipse_parameters
+from nav.centroids.ellipses import Ellipses
+from nav.centroids.least_squares import Minimum, Model
+from nav.centroids.marker_signal import Array32
+from nav.centroids.patches import PixelSet, edge_distances
+
+# Places in the vector of parameters.
+OUTER = slice(0, ELLIPSE_PARAMETERS)
+INNER = slice(ELLIPSE_PARAMETERS, 2 * ELLIPSE_PARAMETERS)
+WIDTH, BACKGROUND, HOLE, AMPLITUDE = (2 * ELLIPSE_PARAMETERS + i for i in range(4))
+CENTERS = np.array([0, 1, ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS + 1])
+
+
+def annulus_model(pixels: PixelSet, turns: Array32) -> Model:
+    """`I = b (1 - So) + A(azimuth) (So - Si) + b' Si`.
+
+    Args:
+        pixels: where.
+        turns: (N, T, K) functions of the azimuth whose sum is A.
+    """
+    x, y = pixels.x_px, pixels.y_px
+
+    def model(parameters: Array) -> tuple[Array32, Array32]:
+        width = parameters[:, WIDTH]
+        outer = edge_profile(parameters[:, OUTER], width, x, y)
+        inner = edge_profile(parameters[:, INNER], width, x, y)
+        rest = parameters[:, BACKGROUND:].astype(np.float32)
+        background, hole = rest[:, 0, None], rest[:, 1, None]
+        light = np.matmul(rest[:, None, 2:], turns)[:, 0]
+        jacobian = np.empty((len(x), parameters.shape[1], x.shape[1]), np.float32)
+        up, down = (light - background) * outer.density, (hole - light) * inner.density
+        np.multiply(outer.slopes, up[:, None], out=jacobian[:, OUTER])
+        np.multiply(inner.slopes, down[:, None], out=jacobian[:, INNER])
+        spread = up * outer.distance_px + down * inner.distance_px
+        jacobian[:, WIDTH] = -spread / width[:, None].astype(np.float32)
+        jacobian[:, BACKGROUND], jacobian[:, HOLE] = 1 - outer.inside, inner.inside
+        between = outer.inside - inner.inside
+        np.multiply(turns, between[:, None], out=jacobian[:, AMPLITUDE:])
+        return background * (1 - outer.inside) + light * between + hole * inner.inside, jacobian
+
+    return model
+
+
+def azimuth_basis(pixels: PixelSet, order: int) -> Array32:
+    """(N, 2 order + 1, K): one, then cosines and sines of multiples of the azimuth."""
+    angle = np.arctan2(pixels.y_px, pixels.x_px)
+    rows = [np.ones_like(angle)]
+    for multiple in range(1, order + 1):
+        rows += [np.cos(multiple * angle), np.sin(multiple * angle)]
+    return np.stack(rows, axis=1)
+
+
+def annulus_start(pixels: PixelSet, outer: Ellipses, inner: Ellipses, turn_count: int) -> Array:
+    """(N, P) parameters of the predicted edges with the mean levels outside, on and within the annulus."""
+    parameters = np.zeros((len(outer), AMPLITUDE + turn_count))
+    shift = inner.centers_px - outer.centers_px
+    parameters[:, OUTER] = ellipse_parameters(np.zeros((len(outer), 2)), outer.shapes_px)
+    parameters[:, INNER] = ellipse_parameters(shift, inner.shapes_px)
+    parameters[:, WIDTH] = START_WIDTH_PX
+    to_outer = edge_distances(outer.shapes_px, pixels.x_px, pixels.y_px)
+    x, y = (pixels.x_px - shift[:, :1], pixels.y_px - shift[:, 1:])
+    to_inner = edge_distances(inner.shapes_px, x.astype(np.float32), y.astype(np.float32))
+    sides = ((BACKGROUND, to_outer < -1), (HOLE, to_inner > 1), (AMPLITUDE, (to_outer > 0) & (to_inner < 0)))
+    for column, side in sides:
+        weight = pixels.present * side
+        parameters[:, column] = (weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
+    return parameters
+
+
+def free_to_all(start: Array, thin: bool) -> Array:
+    """(N, P, Q) how the model's parameters follow the free ones.
+
+    Of thin annuli a common shift and a common scale of both edges are free, of others all that the model has.
+    """
+    count = start.shape[1]
+    ties = np.broadcast_to(np.eye(count), (len(start), count, count))
+    if not thin:
+        return ties
+    moved = np.zeros((len(start), count, 3))
+    moved[:, CENTERS, [0, 1, 0, 1]] = 1
+    for edge in (OUTER, INNER):
+        moved[:, edge.start + 2 : edge.stop, 2] = start[:, edge.start + 2 : edge.stop]
+    return np.concatenate([moved, ties[:, :, WIDTH:]], axis=2)
+
+
+def in_free_parameters(model: Model, start: Array, ties: Array) -> Model:
+    """The model in its free parameters, counted from the start."""
+    if ties.shape[1] == ties.shape[2]:
+        return lambda free: model(start + free)
+    across = ties.transpose(0, 2, 1).astype(np.float32)
+
+    def in_free(free: Array) -> tuple[Array32, Array32]:
+        values, jacobian = model(start + np.einsum("npq,nq->np", ties, free))
+        return values, np.matmul(across, jacobian)
+
+    return in_free
+
+
+def all_parameters(start: Array, ties: Array, fit: Minimum) -> Array:
+    """(N, P) the model's parameters where a fit in the free ones ended."""
+    parameters: Array = start + np.einsum("npq,nq->np", ties, fit.parameters)
+    return parameters

@@ -1,0 +1,222 @@
+"""Edge-model centroids against exact pictures of discs with the sensor's noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.images import StereoImages
+from drogue_models.marker_layout import marker_layout
+from drogue_models.presets import PRESETS
+from droguekit.benchmark.centroid_bounds import PixelLight, center_bound_px, outline_coverage
+from geometry.circles import project_disc_centers
+from geometry.stereo import EYES, paper_rig
+from nav.centroids.disc_model import disc_model
+from nav.centroids.edge_model import fit_discs
+from nav.centroids.edge_profile import START_WIDTH_PX, ellipse_parameters
+from nav.centroids.ellipses import Ellipses, circles
+from nav.centroids.grey_centroid import grey_centroids
+from nav.centroids.marker_signal import MarkerSignal, marker_signals
+from nav.centroids.patches import disc_pixels
+
+DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
+DUSK = PixelLight(60, 240, 4.8, 11_700 / 255 / 16, 0.5, 0.01)
+COUNT = 8
+
+
+def tilted_shape(radius_px, rng, ratio=0.97):
+    angle = rng.uniform(0, np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return turn @ np.diag([radius_px, ratio * radius_px]) @ turn.T
+
+
+def coverage(shape, center, grid):
+    count = int(8 * 2 * np.pi * np.linalg.norm(shape)) + 64
+    angle = 2 * np.pi * np.arange(count) / count
+    arms = np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ shape
+    tangents = np.stack([-np.sin(angle), np.cos(angle)], axis=-1) @ shape * (2 * np.pi / count)
+    return outline_coverage(center + arms, tangents, grid, grid, 0.5)
+
+
+def expose(light, mean_e, rng):
+    if rng is None:
+        return (mean_e / light.step_e).astype(np.float32)
+    gains = 1 + light.prnu_fraction * rng.standard_normal(mean_e.shape)
+    electrons = rng.poisson(mean_e) * gains + light.read_noise_e * rng.standard_normal(mean_e.shape)
+    return np.round(electrons / light.step_e).astype(np.float32)
+
+
+def draw_discs(radius_px, light, rng, shading=0.0, noisy=True, spoil=None, difference=True):
+    """Signals of COUNT discs in each eye, and their true outlines; `spoil(light of one disc, x, y, number)`."""
+    cell = int(2 * radius_px + 18)
+    grid = np.arange(cell, dtype=np.float64)
+    signals, centers, shapes = [], [], []
+    for eye in range(2):
+        mean_e = np.zeros((cell, cell * COUNT))
+        for number in range(COUNT):
+            center, shape = cell / 2 + rng.uniform(-0.5, 0.5, 2), tilted_shape(radius_px, rng)
+            x, y = grid[None, :] - center[0], grid[:, None] - center[1]
+            slope = shading * x / radius_px
+            lit = light.background_e + light.contrast_e * (1 + slope) * coverage(shape, center, grid)
+            if spoil is not None and eye == 0:
+                lit = spoil(lit, x, y, number)
+            mean_e[:, number * cell : (number + 1) * cell] = lit
+            centers.append(center + [number * cell, 0])
+            shapes.append(shape)
+        values = expose(light, mean_e, rng if noisy else None)
+        signals.append(MarkerSignal(values, values >= 255, (0.0, 0.0), 1, difference))
+    return signals, Ellipses(np.repeat([0, 1], COUNT), np.array(centers), np.array(shapes))
+
+
+def rough_start(truth, rng):
+    """Circles of the right area, as far off as binary centroids are."""
+    return circles(truth.eyes, truth.centers_px + rng.normal(0, 0.1, (len(truth), 2)), 1.02 * truth.radii_px)
+
+
+@pytest.mark.parametrize("light", [DAY, DUSK], ids=["day", "dusk"])
+@pytest.mark.parametrize("z_m", [2, 5, 10, 20, 40])
+def test_error_reaches_the_bound_and_the_covariance_tells_it(light, z_m):
+    radius, rng = 2133.333 * 0.05 / z_m, np.random.default_rng([5, z_m])
+    errors, covariances, radial = [], [], []
+    for _ in range(8):
+        signals, truth = draw_discs(radius, light, rng)
+        fits = fit_discs(signals, rough_start(truth, rng))
+        assert fits.accepted.all()
+        errors.append(fits.ellipses.centers_px - truth.centers_px)
+        covariances.append(fits.cov_px2)
+        radial.append(fits.ellipses.radii_px - truth.radii_px)
+    error, cov = np.concatenate(errors), np.concatenate(covariances)
+    rms, bound = np.sqrt(np.mean(error**2)), center_bound_px(0.985 * radius, light)
+    # 256 errors know their rms to 4.4 %; the plane of shading, fitted down to 7.5 px, costs up to a fifth.
+    assert 0.88 < rms / bound < 1.35
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 2
+    # Chi-square of 256: standard deviation of the mean square 0.088.
+    assert 0.7 < nees < 1.3
+    # Four standard errors of the mean of 128.
+    assert np.abs(error.mean(axis=0)).max() < 4 * rms / np.sqrt(128)
+    # A curved edge blurred by s moves inwards by s^2 / (2 r), all around, and so leaves the centre.
+    assert np.mean(np.concatenate(radial)) == pytest.approx(-(START_WIDTH_PX**2) / (2 * radius), abs=0.02)
+
+
+@pytest.mark.parametrize("z_m", [2, 5, 10])
+def test_shading_moves_grey_centroids_but_not_the_fit(z_m):
+    radius, rng = 2133.333 * 0.05 / z_m, np.random.default_rng(6)
+    signals, truth = draw_discs(radius, DAY, rng, shading=0.1, noisy=False)
+    start = rough_start(truth, rng)
+    fitted = fit_discs(signals, start).ellipses.centers_px - truth.centers_px
+    grey = grey_centroids(signals, truth) - truth.centers_px
+    # Light 1 + 0.1 x / r on a disc has its centre of mass at 0.1 r / 4, times the squared ratio of its axes.
+    np.testing.assert_allclose(grey[:, 0], 0.025 * radius, rtol=0.07, atol=0.01)
+    # Terms beyond the plane: curvature of the edge over its blur.
+    assert np.abs(fitted).max() < 2e-3
+
+
+def test_grey_centroids_of_even_discs_are_true():
+    rng = np.random.default_rng(7)
+    signals, truth = draw_discs(6.0, DAY, rng, noisy=False)
+    # The window cuts the tail of the blur where it ends, within 2.5 px: 1e-3 of the light of the outermost pixels.
+    np.testing.assert_allclose(grey_centroids(signals, truth), truth.centers_px, atol=2e-3)
+
+
+def spoil_first(kind, light):
+    def spoil(lit, x, y, number):
+        if number != 0:
+            return lit
+        if kind == "shadow":
+            return np.where(x + 0 * y > 3, light.background_e + 0.4 * (lit - light.background_e), lit)
+        if kind == "hidden":
+            return np.where(np.abs(x - 4) + 0 * y < 2, light.background_e, lit)
+        if kind == "clipped":
+            return np.where(x + 0 * y > 2, 20_000.0, lit)
+        return np.full_like(lit, light.background_e)
+
+    return spoil
+
+
+@pytest.mark.parametrize("difference", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "reason"), [("shadow", "uneven"), ("hidden", "uneven"), ("clipped", "clipped"), ("gone", "no contrast")]
+)
+def test_spoilt_discs_are_rejected_with_a_reason(kind, reason, difference):
+    rng = np.random.default_rng(8)
+    signals, truth = draw_discs(10.0, DAY, rng, spoil=spoil_first(kind, DAY), difference=difference)
+    start = rough_start(truth, rng)
+    fits = fit_discs(signals, start)
+    assert reason in str(fits.reasons[0])
+    assert fits.accepted[1:].all()
+    np.testing.assert_array_equal(fits.ellipses.centers_px[0], start.centers_px[0])
+    error = (fits.ellipses.centers_px - truth.centers_px)[1:]
+    # The good ones stay good: 30 errors, 1.25 of the bound, know their rms to 13 %.
+    assert np.sqrt(np.mean(error**2)) < 1.8 * center_bound_px(10.0, DAY)
+
+
+def test_discs_over_the_images_edge_are_rejected():
+    rng = np.random.default_rng(9)
+    signals, truth = draw_discs(10.0, DAY, rng)
+    cut = [MarkerSignal(s.values[:, 12:], s.clipped[:, 12:], (12.0, 0.0), 1, True) for s in signals]
+    fits = fit_discs(cut, rough_start(truth, rng))
+    assert [i for i, reason in enumerate(fits.reasons) if reason is not None] == [0, COUNT]
+    assert "edge of the image" in str(fits.reasons[0])
+    assert np.isnan(grey_centroids(cut, truth)[[0, COUNT]]).all()
+
+
+def test_no_discs_no_fits():
+    nothing = circles(np.zeros(0), np.zeros((0, 2)), np.zeros(0))
+    signals, _ = draw_discs(5.0, DAY, np.random.default_rng(1))
+    assert fit_discs(signals, nothing).reasons == ()
+    assert grey_centroids(signals, nothing).shape == (0, 2)
+
+
+def test_derivatives_are_those_of_the_picture():
+    rng = np.random.default_rng(10)
+    signals, truth = draw_discs(9.0, DAY, rng)
+    pixels = disc_pixels(signals, truth)
+    model = disc_model(pixels, True, True)
+    parameters = np.column_stack(
+        [ellipse_parameters(rng.normal(0, 0.1, (len(truth), 2)), truth.shapes_px), np.tile([0.6, 50, 150], (16, 1))]
+    )
+    parameters = np.column_stack([parameters, rng.normal(0, 0.5, (16, 4))])
+    _, jacobian = model(parameters)
+    for place in range(parameters.shape[1]):
+        step = np.zeros(parameters.shape[1])
+        step[place] = 2e-3 if 2 <= place < 5 else 0.02
+        slope = (model(parameters + step)[0] - model(parameters - step)[0]) / (2 * step[place])
+        # Third derivatives of an edge of 0.6 px over a step of 0.02 px, and single precision.
+        scale = np.abs(jacobian[:, place]).max()
+        np.testing.assert_allclose(jacobian[:, place] / scale, slope / scale, atol=5e-3)
+
+
+@pytest.mark.parametrize("color", [0, 2])
+def test_mosaic_sites_keep_their_places(color):
+    rng = np.random.default_rng(11)
+    signals, truth = draw_discs(10.0, DAY, rng)
+    mosaics = []
+    for signal in signals:
+        even = signal.values[: signal.values.shape[0] // 2 * 2]
+        # Other colours see a dark picture.
+        mosaic = np.full(even.shape, 20, np.uint8)
+        mosaic[color // 2 :: 2, color // 2 :: 2] = even[color // 2 :: 2, color // 2 :: 2]
+        mosaics.append(mosaic)
+    blank = [np.zeros((*mosaic.shape, 3), np.uint8) for mosaic in mosaics]
+    images = StereoImages(*blank, 0.0, 1e-3, left_mosaic=mosaics[0], right_mosaic=mosaics[1])
+    fits = fit_discs(marker_signals(images, color, truth), rough_start(truth, rng))
+    error = fits.ellipses.centers_px - truth.centers_px
+    # A quarter of the pixels doubles the noise; 32 errors know their rms to 13 %.
+    assert np.sqrt(np.mean(error**2)) < 2 * 1.6 * center_bound_px(10.0, DAY)
+    assert fits.accepted.all()
+
+
+@pytest.mark.parametrize("kind", ["sky", "cloud"])
+@pytest.mark.parametrize("z_m", [2.0, 10.0, 40.0])
+def test_drawn_drogue_is_measured_at_its_ellipse_centres(draw, make_pose, kind, z_m):
+    rig, drogue = paper_rig(), PRESETS["red-8"]
+    layout, rng = marker_layout(drogue), np.random.default_rng([12, int(z_m)])
+    place = make_pose(0.06, 0.002, z_m, 7, -6, 10)
+    images = draw(rig, drogue, place, rng, kind=kind)
+    truth = np.concatenate([project_disc_centers(rig, place, layout.centers_m, layout.radius_m, eye) for eye in EYES])
+    radius = rig.camera.fx_px * layout.radius_m / z_m
+    start = circles(np.repeat([0, 1], 8), truth + rng.normal(0, 0.1, truth.shape), np.full(16, radius))
+    fits = fit_discs(marker_signals(images, 0, start), start)
+    assert fits.accepted.all()
+    # The drawing's eight samples a pixel jitter an edge pixel by 1/8/sqrt(12) px, 1/sqrt(2 pi r) of that for a disc.
+    assert np.sqrt(np.mean((fits.ellipses.centers_px - truth) ** 2)) < 0.012
