@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
 # where the folder lies.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint bench clean
+.PHONY: help setup demo test test-slow lint bench bars-nav-a bars-nav-b bars-nav-c bars-nav-d clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -36,6 +36,22 @@ lint: setup ## formatting, style, types, walls between the packages
 bench: ## CPU seconds per stereo pair by distance and stage
 	@scripts/setup mitsuba
 	@$(BIN)/droguekit bench
+
+bars-nav-a: ## accuracy bars, tier A: analytic images, day and dusk, 400 pairs a distance (hours; goes on where it stopped)
+	@scripts/setup mitsuba
+	@$(BIN)/droguekit bars a --out out/bars/a
+
+bars-nav-b: ## accuracy bars, tier B: path-traced images, day and dusk, 64 pairs a distance (hours; goes on where it stopped)
+	@scripts/setup mitsuba
+	@$(BIN)/droguekit bars b --out out/bars/b
+
+bars-nav-c: ## accuracy bars, tier C: noise, flips, covariances and tolerances at the level of centroids (minutes)
+	@scripts/setup mitsuba
+	@$(BIN)/droguekit bars c --out out/bars/c
+
+bars-nav-d: ## accuracy bars, tier D: markers measured wrongly, at the level of centroids (minutes)
+	@scripts/setup mitsuba
+	@$(BIN)/droguekit bars d --out out/bars/d
 
 clean: ## remove the environment, caches and build results; out/ stays
 	rm -rf .venv .bootstrap build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,10 +1,15 @@
-"""One stereo pair through detector, centroids and correspondence, then through every method on the same markers."""
+"""One stereo pair through detector, centroids and correspondence, then through every method.
+
+Methods that belong to the paper's chain work on its binary centroids, the others on edge-fitted ones; every method can
+be given either, so that estimators are compared on equal measurements too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +18,23 @@ from datasets_manifest.estimates import Estimate, Feature, Mode, NoFix, PoseEsti
 from datasets_manifest.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
-from geometry.stereo import EYES, StereoRig
+from geometry.se3 import Array
+from geometry.stereo import EYES, Eye, StereoRig
 from nav.centroids.binary_chain import Centroids, binary_centroids
 from nav.channels import marker_channel, marker_color
 from nav.correspondence import correspond
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.interface import Detector
-from nav.pose.interface import NoFixReason, Observation
+from nav.pose.interface import OUTER_EDGE, NoFixReason, Observation
 from nav.pose.registry import pose_method
+from nav.refinement import refine
+
+CentroidChoice = Literal["own", "binary", "edge"]
+CENTROID_CHOICES: tuple[CentroidChoice, ...] = ("own", "binary", "edge")
+# What the paper and the methods that it compares itself with measure on.
+BINARY_METHODS = frozenset(
+    {"paper", "paper-literal", "circle-fit", "mono-circle", "mean-plane", "disparity-plane", "constant"}
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +53,21 @@ class Sighting:
 class Navigator:
     """Finds one known drogue with one rig."""
 
-    def __init__(self, rig: StereoRig, drogue: DrogueParameters, detector: Detector | None = None) -> None:
+    def __init__(
+        self,
+        rig: StereoRig,
+        drogue: DrogueParameters,
+        detector: Detector | None = None,
+        centroids: CentroidChoice = "own",
+    ) -> None:
+        self._centroids = centroids
         self._rig = rig
         self._layout = marker_layout(drogue)
         self._color = marker_color(drogue)
         self._detector: Detector = ColorBlobDetector(drogue) if detector is None else detector
 
     def observe(self, images: StereoImages) -> Sighting:
-        """Measure the markers of one pair and match them."""
+        """Measure the markers of one pair by the binary chain and match them."""
         size_px = (self._rig.camera.width_px, self._rig.camera.height_px)
         if images.size_px != size_px:
             got, want = ("x".join(map(str, size)) for size in (images.size_px, size_px))
@@ -73,8 +94,21 @@ class Navigator:
         Raises:
             ValueError: a method that does not exist.
         """
-        sighting = self.observe(images)
-        return [estimate_pose(frame_index, sighting, method) for method in methods]
+        rough = self.observe(images)
+        wants_edges = {method: self._wants_edges(method) for method in methods}
+        fine = self.refine(images, rough) if any(wants_edges.values()) else rough
+        return [estimate_pose(frame_index, fine if wants_edges[method] else rough, method) for method in methods]
+
+    def refine(self, images: StereoImages, sighting: Sighting) -> Sighting:
+        """The same markers by the edge model, with the hub."""
+        if isinstance(sighting.observation, NoFixReason):
+            return sighting
+        start = perf_counter()
+        observation = refine(images, self._color, sighting.observation)
+        return Sighting(observation, {**sighting.stage_s, "refine": perf_counter() - start})
+
+    def _wants_edges(self, method: str) -> bool:
+        return self._centroids == "edge" or (self._centroids == "own" and method not in BINARY_METHODS)
 
 
 def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate:
@@ -91,26 +125,41 @@ def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate
     solution = solve(observation)
     stage_s = {**sighting.stage_s, "pose": perf_counter() - start}
     if isinstance(solution, NoFixReason):
-        features = _features(observation, np.zeros_like(observation.seen))
-        return NoFix(frame_index=frame_index, method=method, reason=solution.reason, features=features, stage_s=stage_s)
+        return NoFix(
+            frame_index=frame_index,
+            method=method,
+            reason=solution.reason,
+            features=_features(observation, np.zeros_like(observation.seen), None),
+            stage_s=stage_s,
+        )
     return PoseEstimate(
         frame_index=frame_index,
         method=method,
         left_from_drogue=solution.left_from_drogue,
         covariance=solution.covariance,
         modes=tuple(Mode(left_from_drogue=mode.left_from_drogue, weight=mode.weight) for mode in solution.modes),
-        features=_features(observation, solution.used),
+        features=_features(observation, solution.used, solution.used_hub),
         stage_s=stage_s,
     )
 
 
-def _features(observation: Observation, used: NDArray[np.bool_]) -> tuple[Feature, ...]:
+def _features(
+    observation: Observation, used: NDArray[np.bool_], used_hub: NDArray[np.bool_] | None
+) -> tuple[Feature, ...]:
+    """Markers of both eyes, then the hub's outer edge."""
     features = []
-    for eye, pixels, covariances, mask in zip(EYES, observation.pixels_px, observation.cov_px2, used, strict=True):
-        for index in np.flatnonzero(np.isfinite(pixels).all(axis=1)):
-            (a, b), (c, d) = covariances[index].tolist()
-            x, y = pixels[index].tolist()
-            features.append(
-                Feature(eye=eye, index=int(index), center_px=(x, y), cov_px2=((a, b), (c, d)), used=bool(mask[index]))
-            )
+    assert observation.hub_px is not None and observation.hub_cov_px2 is not None
+    for eye in range(len(EYES)):
+        for index in np.flatnonzero(observation.seen[eye]):
+            place = observation.pixels_px[eye, index], observation.cov_px2[eye, index]
+            features.append(_feature(EYES[eye], int(index), place, bool(used[eye, index])))
+        if observation.hub_seen[eye, OUTER_EDGE]:
+            place = observation.hub_px[eye, OUTER_EDGE], observation.hub_cov_px2[eye, OUTER_EDGE]
+            hub_used = used_hub is not None and bool(used_hub[eye, OUTER_EDGE])
+            features.append(_feature(EYES[eye], "hub", place, hub_used))
     return tuple(features)
+
+
+def _feature(eye: Eye, index: int | Literal["hub"], place: tuple[Array, Array], used: bool) -> Feature:
+    (x, y), ((a, b), (c, d)) = place[0].tolist(), place[1].tolist()
+    return Feature(eye=eye, index=index, center_px=(x, y), cov_px2=((a, b), (c, d)), used=used)

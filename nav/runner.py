@@ -6,18 +6,19 @@ from collections.abc import Iterator, Sequence
 
 from datasets_manifest.blind import BlindDataset
 from datasets_manifest.estimates import Estimate
-from nav.navigator import Navigator
+from nav.navigator import CENTROID_CHOICES, CentroidChoice, Navigator
 from nav.pose.registry import method_names, pose_method
 
-__all__ = ["method_names", "navigate"]
+__all__ = ["CENTROID_CHOICES", "method_names", "navigate"]
 
 
-def navigate(dataset: BlindDataset, methods: Sequence[str]) -> Iterator[Estimate]:
+def navigate(dataset: BlindDataset, methods: Sequence[str], centroids: CentroidChoice = "own") -> Iterator[Estimate]:
     """Estimates of all methods for all pairs, frame by frame.
 
     Args:
         dataset: images, rig and drogue.
         methods: names from `method_names`.
+        centroids: `own` for what each method measures on, `binary` or `edge` for all on the same.
 
     Yields:
         One estimate a frame and method, in that order.
@@ -27,10 +28,11 @@ def navigate(dataset: BlindDataset, methods: Sequence[str]) -> Iterator[Estimate
     """
     for method in methods:
         pose_method(method)
-    return _navigate(dataset, methods)
+    return _navigate(dataset, methods, centroids)
 
 
-def _navigate(dataset: BlindDataset, methods: Sequence[str]) -> Iterator[Estimate]:
+def _navigate(dataset: BlindDataset, methods: Sequence[str], centroids: CentroidChoice) -> Iterator[Estimate]:
     for index in dataset.frame_indices:
         pair = dataset.pair(index)
-        yield from Navigator(pair.rig, pair.drogue).estimate(pair.frame_index, pair.images, methods)
+        navigator = Navigator(pair.rig, pair.drogue, centroids=centroids)
+        yield from navigator.estimate(pair.frame_index, pair.images, methods)

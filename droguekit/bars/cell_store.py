@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from datasets_manifest.atomic import write_text_atomic
 from droguekit.bars.monte_carlo import Cell, CellResult, run_cell
 from droguekit.bars.reporter import Reporter
@@ -59,10 +57,12 @@ def _read(path: Path, code: str, report: Reporter) -> dict[str, CellResult]:
         return {}
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-        made_by, cells = table["code"], table["cells"]
-        known = {key: CellResult.model_validate(value) for key, value in cells.items()} if made_by == code else {}
-    except (ValueError, KeyError, TypeError, AttributeError, ValidationError) as error:
-        raise ValueError(f"{path}: does not hold cells of this command; move it away or choose another --out") from error
-    if made_by != code:
-        report.say(f"{path} was made by other code: its cells are made again")
-    return known
+        made_by, cells = str(table["code"]), dict(table["cells"].items())
+        if made_by == code:
+            return {key: CellResult.model_validate(value) for key, value in cells.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path}: does not hold cells of this command; move it away or choose another --out"
+        ) from error
+    report.say(f"{path} was made by other code: its cells are made again")
+    return {}

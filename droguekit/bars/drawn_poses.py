@@ -98,7 +98,9 @@ def ellipse_centers_px(
     Returns:
         (n, 2, F, 2) left before right. [px]
     """
-    points = np.einsum("nij,...nfj->nfi", poses.rotations, np.broadcast_to(centers_m, (len(poses.rotations), *centers_m.shape[-2:])))
+    points = np.einsum(
+        "nij,...nfj->nfi", poses.rotations, np.broadcast_to(centers_m, (len(poses.rotations), *centers_m.shape[-2:]))
+    )
     points = points + poses.translations_m[:, None]
     axes = np.broadcast_to(poses.rotations[:, None, :, 2], points.shape)
     images = []

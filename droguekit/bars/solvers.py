@@ -18,6 +18,7 @@ from nav.pose.registry import pose_method
 from nav.pose.two_fold_start import two_fold_start
 
 BATCHED = ("joint", "joint-hub")
+# Frames that are solved together: their derivatives then fit into a core's cache.
 _CHUNK = 256
 
 
@@ -110,7 +111,7 @@ def _batched(method: str, measured: Measured) -> Solved:
 
 
 def _best(features: Features) -> Poses:
-    """Of the two poses that both starts lead to, the one with the smaller residuals, in chunks that fit into a cache."""
+    """Of the two poses that both starts lead to, the one with the smaller residuals."""
     parts = []
     for low in range(0, features.frames, _CHUNK):
         some = features.take(slice(low, low + _CHUNK))

@@ -48,11 +48,11 @@ def bars_speed(out: Path, seed: int, draws: int | None, report: Reporter) -> lis
     return [
         at_most("16", "joint-hub, one frame, median [ms]", 5.0, (float(np.median(hub)),) * 2, count),
         at_most("16", "joint-hub, batched, a frame [ms]", 0.3, (batched, batched), len(good.markers_px)),
-        at_most("16", "joint-robust, two bad markers, slowest [ms]", 60.0, (float(hub_max(robust)),) * 2, count, note),
+        at_most("16", "joint-robust, two bad markers, slowest [ms]", 60.0, (_slowest(robust),) * 2, count, note),
     ]
 
 
-def hub_max(times_ms: list[float]) -> float:
+def _slowest(times_ms: list[float]) -> float:
     """The slowest call after the first tenth, which warms caches up."""
     return max(times_ms[len(times_ms) // 10 :])
 

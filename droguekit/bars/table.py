@@ -83,9 +83,7 @@ class BarTable(BaseModel):
 _HEADINGS = ["bar", "quantity", "must be", "measured", "95 % limit", "n", "met", "note"]
 
 
-def at_most(
-    bar: str, quantity: str, high: float, measured: tuple[float, float], n: int, note: str = ""
-) -> BarRow:
+def at_most(bar: str, quantity: str, high: float, measured: tuple[float, float], n: int, note: str = "") -> BarRow:
     """A quantity that must not exceed `high`; `measured` is its value and upper limit."""
     value, limit = measured
     return BarRow(

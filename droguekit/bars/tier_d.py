@@ -60,9 +60,7 @@ def bars_tier_d(out: Path, seed: int, draws: int | None, report: Reporter) -> li
     ]
 
 
-def _against_clean(
-    counts: tuple[int, ...], bad: int, bar: float, cell: CellMaker, results: Results
-) -> BarRow:
+def _against_clean(counts: tuple[int, ...], bad: int, bar: float, cell: CellMaker, results: Results) -> BarRow:
     """Mean position error of the robust method with bad markers over that with good ones, worst case."""
     rows = []
     for markers in counts:
@@ -93,9 +91,7 @@ def _literal(cell: CellMaker, results: Results) -> BarRow:
     rows = [
         (
             f"{sigma:g} px",
-            *mean_ratio(
-                results[cell("paper", 8, sigma, _ONE_EYE)], results[cell("paper-literal", 8, sigma, _ONE_EYE)]
-            ),
+            *mean_ratio(results[cell("paper", 8, sigma, _ONE_EYE)], results[cell("paper-literal", 8, sigma, _ONE_EYE)]),
         )
         for sigma in _ORDER_SIGMAS_PX
     ]

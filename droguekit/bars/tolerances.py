@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from droguekit.bars.drawn_poses import RightEyeErrors
 from drogue_models.marker_layout import MarkerLayout
+from droguekit.bars.drawn_poses import RightEyeErrors
 from geometry.se3 import Array
 
 
@@ -50,9 +50,7 @@ class TrueFeatures:
     right: RightEyeErrors
 
 
-def draw_features(
-    rng: np.random.Generator, layout: MarkerLayout, tolerances: Tolerances, count: int
-) -> TrueFeatures:
+def draw_features(rng: np.random.Generator, layout: MarkerLayout, tolerances: Tolerances, count: int) -> TrueFeatures:
     """True features of `count` drogues and cameras.
 
     Args:

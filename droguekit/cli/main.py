@@ -25,6 +25,7 @@ COMMANDS = {
     "benchmark": "Compare estimates with the truth: numbers and a report.",
     "model": "Write the drogue as a mesh.",
     "demo": "Render a small dataset, navigate on it, and report.",
+    "bars": "Measure the accuracy bars of a tier: reached or not.",
     "bench": "Measure the CPU time of a pair by distance and stage.",
     "doctor": "Show what is installed and which engines work.",
 }

@@ -14,6 +14,7 @@ from droguekit.cli.pipelines import navigate_dataset
 EXAMPLES = (
     "droguekit navigate data/demo --out estimates.jsonl",
     "droguekit navigate data/demo --method paper --method joint --out estimates.jsonl",
+    "droguekit navigate data/demo --centroids binary --out estimates.jsonl",
 )
 
 
@@ -23,8 +24,16 @@ def navigate(
     method: Annotated[
         list[str] | None, typer.Option("--method", metavar="NAME", help="May be repeated; all methods unless given.")
     ] = None,
+    centroids: Annotated[
+        str,
+        typer.Option(
+            "--centroids",
+            metavar="own|binary|edge",
+            help="What methods measure on: each its own (the paper's chain for its kin, edge fits for ours), or all one.",
+        ),
+    ] = "own",
 ) -> None:
     """Estimate the drogue's pose in every pair of a dataset, from images, rig and drogue alone."""
-    for fixes in navigate_dataset(dataset, method or (), out, progress_report()):
+    for fixes in navigate_dataset(dataset, method or (), out, progress_report(), centroids):
         typer.echo(f"{fixes.method:<16} {fixes.fixes} fixes in {fixes.pairs} pairs")
     typer.echo(f"wrote {out}")

@@ -15,20 +15,17 @@ from nav.centroids.annulus_model import (
     CENTERS,
     INNER,
     OUTER,
-    WIDTH,
     all_parameters,
     annulus_model,
     annulus_start,
     azimuth_basis,
+    both_edges,
     free_to_all,
     in_free_parameters,
 )
 from nav.centroids.centroid_quality import NoiseModel, residual_spread, sector_index
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
-from nav.centroids.edge_profile import (
-    edge_profile,
-    parameter_shapes,
-)
+from nav.centroids.edge_profile import parameter_shapes
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.least_squares import Minimum, evaluate, minimise
 from nav.centroids.marker_signal import Array32, MarkerSignal
@@ -143,9 +140,7 @@ def _center_covariance(fit: Minimum, ties: Array, thin: bool) -> Array:
 
 def _lit(parameters: Array, pixels: PixelSet, turns: Array32) -> tuple[Array32, Array32]:
     """Share of each pixel that lies on the annulus, and the annulus's light above the background there."""
-    width = parameters[:, WIDTH]
-    outer = edge_profile(parameters[:, OUTER], width, pixels.x_px, pixels.y_px)
-    inner = edge_profile(parameters[:, INNER], width, pixels.x_px, pixels.y_px)
+    outer, inner = both_edges(parameters, pixels.x_px, pixels.y_px)
     rest = parameters[:, BACKGROUND:].astype(np.float32)
     return outer.inside - inner.inside, np.matmul(rest[:, None, 2:], turns)[:, 0] - rest[:, 0, None]
 

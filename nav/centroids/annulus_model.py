@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_profile, ellipse_parameters
+from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, Edge, edge_profile, ellipse_parameters
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.least_squares import Minimum, Model
 from nav.centroids.marker_signal import Array32
@@ -29,8 +29,7 @@ def annulus_model(pixels: PixelSet, turns: Array32) -> Model:
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         width = parameters[:, WIDTH]
-        outer = edge_profile(parameters[:, OUTER], width, x, y)
-        inner = edge_profile(parameters[:, INNER], width, x, y)
+        outer, inner = both_edges(parameters, x, y)
         rest = parameters[:, BACKGROUND:].astype(np.float32)
         background, hole = rest[:, 0, None], rest[:, 1, None]
         light = np.matmul(rest[:, None, 2:], turns)[:, 0]
@@ -46,6 +45,15 @@ def annulus_model(pixels: PixelSet, turns: Array32) -> Model:
         return background * (1 - outer.inside) + light * between + hole * inner.inside, jacobian
 
     return model
+
+
+def both_edges(parameters: Array, x_px: Array32, y_px: Array32) -> tuple[Edge, Edge]:
+    """Outer and inner edge of (N, P) parameters at (N, K) places, in one go: small arrays cost by the call."""
+    count = len(parameters)
+    ellipses = np.concatenate([parameters[:, OUTER], parameters[:, INNER]])
+    widths = np.tile(parameters[:, WIDTH], 2)
+    edges = edge_profile(ellipses, widths, np.concatenate([x_px, x_px]), np.concatenate([y_px, y_px]))
+    return edges.take(slice(None, count)), edges.take(slice(count, None))
 
 
 def azimuth_basis(pixels: PixelSet, order: int) -> Array32:

@@ -36,7 +36,8 @@ _LEAST_CONTRAST_SIGMA = 4.0
 _ON_THE_DISC = 0.05
 # Of a disc's own pixels; a wholly clipped disc keeps its middle, one clipped in part does not.
 _MOST_CLIPPED_FRACTION = 0.05
-_LARGEST_CHI2 = 4.0
+# Residuals of twice the frame's noise and of more than this share of the contrast are those of another thing.
+_LARGEST_CHI2, _ROUGH_SHARE = 4.0, 0.04
 # An outline that ends this far from its start, as a share of its radius, is another thing's.
 _LARGEST_MOVE_FRACTION = 0.5
 _LARGEST_SCALE = 1.6
@@ -215,6 +216,7 @@ def _reasons(
     bright = noise.dark_dn2 + noise.per_signal_dn * np.maximum(contrast, 0)
     moved = np.hypot(*(fit.parameters[:, :2] + pixels.origins_px - discs.centers_px).T)
     scale = np.sqrt(np.abs(np.linalg.det(parameter_shapes(fit.parameters)))) / discs.radii_px
+    rough = (spread.chi2_per_dof > _LARGEST_CHI2) & (spread.chi2_per_dof * bright > (_ROUGH_SHARE * contrast) ** 2)
     lost = ~np.isfinite(fit.parameters).all(axis=1) | ~np.isfinite(cov_px2).all(axis=(1, 2))
     astray = (moved > 1 + _LARGEST_MOVE_FRACTION * discs.radii_px) | ~(
         (scale > 1 / _LARGEST_SCALE) & (scale < _LARGEST_SCALE)
@@ -224,8 +226,7 @@ def _reasons(
         (clipped > _MOST_CLIPPED_FRACTION, "clipped: brighter than the sensor's range"),
         (~(contrast > _LEAST_CONTRAST_SIGMA * np.sqrt(bright)), "no contrast"),
         (lost | astray, "the fit left the disc"),
-        (spread.uneven, "uneven: cut by a shadow or hidden in part"),
-        (spread.chi2_per_dof > _LARGEST_CHI2, "does not look like a disc"),
+        (spread.uneven | rough, "uneven: cut by a shadow or hidden in part"),
     )
     return tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
 

@@ -37,6 +37,10 @@ class Edge:
     distance_px: Array32
     slopes: Array32
 
+    def take(self, patches: slice) -> Edge:
+        """The edge at some of the patches."""
+        return Edge(self.inside[patches], self.density[patches], self.distance_px[patches], self.slopes[patches])
+
 
 def edge_profile(ellipse: Array, width_px: Array, x_px: Array32, y_px: Array32) -> Edge:
     """`S = (1 + erf(D / (sqrt2 s))) / 2` with `D = (1 - q) / |grad q|`, `q = |L (x - c)|`.

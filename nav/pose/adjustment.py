@@ -115,9 +115,9 @@ def _steps(now: Linearised, state: State) -> tuple[Array, Array]:
     """(S, K) Gauss-Newton steps of limited length, (S,) by how much the linearised cost would sink."""
     normal = now.information
     size = normal.shape[1]
-    trace = np.trace(normal, axis1=1, axis2=2)
+    diagonal = np.diagonal(normal, axis1=1, axis2=2)
     # Where nothing was measured, any positive number keeps the equations solvable; the step is zero there.
-    normal[:, np.arange(size), np.arange(size)] += (_DAMPING_FRACTION * trace + (trace == 0))[:, None]
+    normal[:, np.arange(size), np.arange(size)] += _DAMPING_FRACTION * diagonal + (diagonal == 0)
     sound = np.isfinite(now.costs)
     if not sound.all():
         normal = np.where(sound[:, None, None], normal, np.eye(size))

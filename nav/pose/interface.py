@@ -14,6 +14,7 @@ from geometry.stereo import StereoRig
 
 # The hub annulus has an inner and an outer edge, in this order; each has its own ellipse centre.
 HUB_EDGES = 2
+INNER_EDGE, OUTER_EDGE = range(HUB_EDGES)
 
 
 @dataclass(frozen=True, eq=False)

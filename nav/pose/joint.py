@@ -53,9 +53,9 @@ def solve_one(
     batch = solve_features(features)
     if not batch.sound[0]:
         return NoFixReason("the adjustment found no pose in front of the cameras")
-    miss_px, limit_px = _miss_px(features, batch.mode_rotations[0, 0], batch.mode_translations_m[0, 0])
-    if not miss_px <= limit_px:
-        return NoFixReason(f"the markers do not fit the drogue: they miss their places by {miss_px:.1f} px (rms)")
+    reason = misfit(features, batch.mode_rotations[0, 0], batch.mode_translations_m[0, 0])
+    if reason is not None:
+        return reason
     pose = RigidTransform(batch.rotations[0], batch.translations_m[0])
     return Solution(pose, used, batch.covariances[0], _modes(batch), used_hub, note)
 
@@ -71,9 +71,12 @@ def _modes(batch: JointBatch) -> tuple[PoseMode, ...]:
     )
 
 
-def _miss_px(features: Features, rotation: Array, translation_m: Array) -> tuple[float, float]:
-    """Root mean square residual, and the largest that is believed. [px]"""
+def misfit(features: Features, rotation: Array, translation_m: Array) -> NoFixReason | None:
+    """Why one frame's features cannot be the drogue's in a pose, or None when they can."""
     predicted = predicted_px(features, State(rotation[None], translation_m[None], np.ones(1)))
     residual = np.linalg.norm(predicted - np.moveaxis(features.measured[:2], 0, -1), axis=-1)[features.seen]
     radius_px = features.camera.fx_px * features.radii_m[0] / translation_m[2]
-    return float(np.sqrt(np.mean(residual**2))), max(_LEAST_MISS_PX, _LARGEST_MISS_FRACTION * float(radius_px))
+    miss_px = float(np.sqrt(np.mean(residual**2)))
+    if miss_px <= max(_LEAST_MISS_PX, _LARGEST_MISS_FRACTION * float(radius_px)):
+        return None
+    return NoFixReason(f"the markers do not fit the drogue: they miss their places by {miss_px:.1f} px (rms)")

@@ -13,8 +13,9 @@ from geometry.se3 import Array, RigidTransform
 from nav.pose.adjustment import Adjusted, adjust, inverse_information
 from nav.pose.circle_pose import circle_poses, conic_through
 from nav.pose.faults import hub_fault, left_fault
-from nav.pose.features import Features, stack_features
+from nav.pose.features import Features, left_features, stack_features
 from nav.pose.interface import NoFixReason, Observation, Solution
+from nav.pose.joint import misfit
 from nav.pose.prediction import predict_px, rotations_with_axis, used_left, with_best_roll
 from nav.pose.reprojection import State, linearise
 
@@ -45,6 +46,9 @@ def mono_circle(observation: Observation) -> Solution | NoFixReason:
     rotation, translation = adjusted.rotations[best], adjusted.translations_m[best]
     if not (determined[0] and translation[2] > 0 and rotation[2, 2] > 0):
         return NoFixReason("the ellipse gives no pose in front of the camera")
+    reason = misfit(left_features(observation), rotation, translation)
+    if reason is not None:
+        return reason
     used_hub = np.stack([observation.hub_seen[0], [False, False]])
     return Solution(RigidTransform(rotation, translation), used_left(observation), covariance[0], used_hub=used_hub)
 

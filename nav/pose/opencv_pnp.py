@@ -16,6 +16,7 @@ from nav.pose.adjustment import information_at, inverse_information
 from nav.pose.faults import left_fault
 from nav.pose.features import left_features
 from nav.pose.interface import NoFixReason, Observation, PoseMode, Solution
+from nav.pose.joint import misfit
 from nav.pose.mono import LEAST_MARKERS
 from nav.pose.prediction import predict_px, used_left
 from nav.pose.reprojection import State, linearise
@@ -76,19 +77,25 @@ def _disc_shift_px(observation: Observation, pose: RigidTransform) -> Array:
     return shift
 
 
-def _best_of(observation: Observation, poses: list[RigidTransform]) -> Solution:
+def _best_of(observation: Observation, poses: list[RigidTransform]) -> Solution | NoFixReason:
     """The pose with the lowest reprojection cost, its covariance, and all as modes with Laplace weights."""
     features = left_features(observation).take(np.zeros(len(poses), dtype=np.int64))
     rotations = np.stack([pose.rotation for pose in poses])
     translations = np.stack([pose.translation_m for pose in poses])
     costs = linearise(features, State(rotations, translations, np.ones(len(poses)))).costs
+    order = np.flatnonzero(np.isfinite(costs))
+    order = order[np.argsort(costs[order], kind="stable")]
+    if not len(order):
+        return NoFixReason("the solver found no pose in front of the camera")
+    best = int(order[0])
+    reason = misfit(features.take(slice(0, 1)), rotations[best], translations[best])
+    if reason is not None:
+        return reason
     information = information_at(features, rotations, translations)
     covariances, determined = inverse_information(information)
     log_weights = -costs - np.linalg.slogdet(information)[1] / 2
-    order = np.argsort(costs, kind="stable")
-    weights = np.exp(log_weights - log_weights.max())
+    weights = np.exp(log_weights[order] - log_weights[order].max())
     weights /= weights.sum()
-    modes = tuple(PoseMode(poses[i], float(costs[i]), float(weights[i])) for i in order)
-    best = int(order[0])
+    modes = tuple(PoseMode(poses[i], float(costs[i]), float(weight)) for i, weight in zip(order, weights, strict=True))
     covariance = covariances[best] if determined[best] else None
     return Solution(poses[best], used_left(observation), covariance, modes)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.pose.adjustment import adjust
+from nav.pose.adjustment import Adjusted, adjust
 from nav.pose.batched import solve_from
 from nav.pose.faults import fault, hub_fault
 from nav.pose.features import Features, observed_features
@@ -38,7 +38,7 @@ def joint_robust(observation: Observation) -> Solution | NoFixReason:
     features = observed_features(observation, with_hub=True)
     good = _inliers(features)
     count = observation.layout.count
-    markers = int((good & observed_any(features))[:count].sum())
+    markers = int((good & _measured(features))[:count].sum())
     if not good.all() and markers < _LEAST_INLIERS:
         return NoFixReason(f"only {markers} markers agree with each other, {_LEAST_INLIERS} are needed")
     used, used_hub = observation.seen & good[:count], observation.hub_seen & _hub_part(good, count)
@@ -51,12 +51,6 @@ def joint_robust(observation: Observation) -> Solution | NoFixReason:
     return solve_one(features.without(~good), used, used_hub if used_hub.any() else None, note)
 
 
-def observed_any(features: Features) -> NDArray[np.bool_]:
-    """(F,) which features any eye of the first frame measured."""
-    seen: NDArray[np.bool_] = features.seen[0].any(axis=0)
-    return seen
-
-
 def _hub_part(good: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     return good[count:] if len(good) > count else np.zeros(2, dtype=bool)
 
@@ -65,7 +59,7 @@ def _inliers(features: Features) -> NDArray[np.bool_]:
     """(F,) which features agree with the pose that most of them share; unmeasured ones count as agreeing."""
     found = solve_from(features, *two_fold_start(features), _HUBER)
     best = int(np.argmin(found.costs))
-    first = _chi2(features, found.rotations[best : best + 1], found.translations_m[best : best + 1])[0]
+    first = _chi2(features.take(np.zeros(2, dtype=np.int64)), found)[best]
     if (first < _LARGEST_CHI2).all():
         return np.ones(len(first), dtype=bool)
     sets = features.take(np.zeros(2 * len(_left_out(features)), dtype=np.int64))
@@ -73,7 +67,7 @@ def _inliers(features: Features) -> NDArray[np.bool_]:
     fewer = sets.without(mask[:, None])
     starts = two_fold_start(fewer.take(slice(0, None, 2)))
     tried = adjust(fewer, starts[0].reshape(-1, 3, 3), starts[1].reshape(-1, 3))
-    chi2 = np.vstack([_chi2(sets, tried.rotations, tried.translations_m), first])
+    chi2 = np.vstack([_chi2(sets, tried), first])
     scores = np.minimum(chi2, _LARGEST_CHI2).sum(axis=1)
     inliers: NDArray[np.bool_] = chi2[np.argmin(scores)] < _LARGEST_CHI2
     return inliers
@@ -81,7 +75,7 @@ def _inliers(features: Features) -> NDArray[np.bool_]:
 
 def _left_out(features: Features) -> NDArray[np.bool_]:
     """(L, F) every choice of one measured feature to leave out, and of two where enough remain."""
-    measured = np.flatnonzero(observed_any(features))
+    measured = np.flatnonzero(_measured(features))
     choices: list[tuple[int, ...]] = [(int(i),) for i in measured]
     if len(measured) >= _LEAST_FOR_TWO_OUT:
         choices += combinations(measured.tolist(), 2)
@@ -91,10 +85,16 @@ def _left_out(features: Features) -> NDArray[np.bool_]:
     return mask
 
 
-def _chi2(features: Features, rotations: Array, translations_m: Array) -> Array:
+def _chi2(features: Features, adjusted: Adjusted) -> Array:
     """(S, F) squared residuals of every feature in both eyes, in variances; infinite where they are no numbers."""
-    state = State(rotations, translations_m, np.ones(len(rotations)))
+    state = State(adjusted.rotations, adjusted.translations_m, adjusted.scales)
     size = 2 * features.measured.shape[2] * len(features.points_m)
     residuals = linearise(features, state).residuals[:, :size]
-    squares = (residuals.reshape(len(rotations), -1, len(features.points_m)) ** 2).sum(axis=1)
+    squares = (residuals.reshape(len(residuals), -1, len(features.points_m)) ** 2).sum(axis=1)
     return np.where(np.isfinite(squares), squares, np.inf)
+
+
+def _measured(features: Features) -> NDArray[np.bool_]:
+    """(F,) which features any eye of the first frame measured."""
+    seen: NDArray[np.bool_] = features.seen[0].any(axis=0)
+    return seen

@@ -131,7 +131,7 @@ def draw() -> Callable[..., StereoImages]:
 
 @dataclass(frozen=True)
 class Draws:
-    """Measured ellipse centres of many poses: pixels (B, 2, F, 2), markers first, then the hub's edges if there are any."""
+    """Measured ellipse centres of many poses: pixels (B, 2, F, 2), the markers and then the hub's two edges."""
 
     rig: StereoRig
     layout: MarkerLayout

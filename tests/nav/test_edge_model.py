@@ -61,7 +61,7 @@ def draw_discs(radius_px, light, rng, shading=0.0, noisy=True, spoil=None, diffe
             if spoil is not None and eye == 0:
                 lit = spoil(lit, x, y, number)
             mean_e[:, number * cell : (number + 1) * cell] = lit
-            centers.append(center + [number * cell, 0])
+            centers.append(center + np.array([number * cell, 0]))
             shapes.append(shape)
         values = expose(light, mean_e, rng if noisy else None)
         signals.append(MarkerSignal(values, values >= 255, (0.0, 0.0), 1, difference))
@@ -179,9 +179,9 @@ def test_derivatives_are_those_of_the_picture():
     _, jacobian = model(parameters)
     for place in range(parameters.shape[1]):
         step = np.zeros(parameters.shape[1])
-        step[place] = 2e-3 if 2 <= place < 5 else 0.02
+        step[place] = 4e-4 if 2 <= place < 5 else 0.02
         slope = (model(parameters + step)[0] - model(parameters - step)[0]) / (2 * step[place])
-        # Third derivatives of an edge of 0.6 px over a step of 0.02 px, and single precision.
+        # Third derivatives of an edge of 0.6 px over steps of up to 0.03 px, and single precision.
         scale = np.abs(jacobian[:, place]).max()
         np.testing.assert_allclose(jacobian[:, place] / scale, slope / scale, atol=5e-3)
 
@@ -218,5 +218,7 @@ def test_drawn_drogue_is_measured_at_its_ellipse_centres(draw, make_pose, kind, 
     start = circles(np.repeat([0, 1], 8), truth + rng.normal(0, 0.1, truth.shape), np.full(16, radius))
     fits = fit_discs(marker_signals(images, 0, start), start)
     assert fits.accepted.all()
-    # The drawing's eight samples a pixel jitter an edge pixel by 1/8/sqrt(12) px, 1/sqrt(2 pi r) of that for a disc.
-    assert np.sqrt(np.mean((fits.ellipses.centers_px - truth) ** 2)) < 0.012
+    # The drawing has no lens: at 5 px across its edges within one pixel do not look like the blurred ones of the model.
+    # Nearer, its eight samples a pixel and the noise leave 0.01 px.
+    limit_px = 0.012 if z_m <= 10 else 0.025
+    assert np.sqrt(np.mean((fits.ellipses.centers_px - truth) ** 2)) < limit_px

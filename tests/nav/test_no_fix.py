@@ -160,7 +160,7 @@ def test_a_reason_of_the_method_keeps_the_features(make_pose):
 
 
 def test_unknown_method():
-    with pytest.raises(ValueError, match="method: there is no pose method named 'best'; there are paper, joint"):
+    with pytest.raises(ValueError, match="method: there is no pose method named 'best'; there are paper, paper-lit"):
         pose_method("best")
 
 

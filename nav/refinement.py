@@ -1,0 +1,109 @@
+"""From roughly placed, matched markers to edge-fitted ones, and to the hub that they lead to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from datasets_manifest.images import StereoImages
+from drogue_models.marker_layout import MarkerLayout
+from geometry.circles import disc_outline, project_disc_centers
+from geometry.se3 import Array, RigidTransform
+from geometry.stereo import EYES, StereoRig
+from nav.centroids.annulus_edges import fit_annuli
+from nav.centroids.centroid_quality import NoiseModel
+from nav.centroids.edge_model import fit_discs
+from nav.centroids.ellipses import Ellipses, circles, outline_shapes
+from nav.centroids.marker_signal import MarkerSignal, marker_signals
+from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation
+from nav.pose.joint import joint
+
+_OUTLINE_POINTS = 24
+# A second pose is followed to its hub when it is this likely, and shows the hub this far from the first one's.
+_LEAST_WEIGHT = 0.01
+_LEAST_STEP_PX = 0.5
+# Fewer fitted markers than a pose needs with one to spare: then all of them stay as they were found.
+_LEAST_MARKERS = 4
+
+
+def refine(images: StereoImages, color: int | None, observation: Observation) -> Observation:
+    """The same markers by the edge model, and the hub where it can be seen.
+
+    Args:
+        images: the pair.
+        color: see `nav.channels.marker_color`.
+        observation: matched markers, placed to half a pixel or so.
+
+    Returns:
+        Edge-fitted markers; those that the fit rejects (clipped, cut, shadowed, occluded) are left out. Where too few
+        fit, the markers as they were. Hub edges are measured where the pose of the markers shows them.
+    """
+    rough = joint(observation)
+    if isinstance(rough, NoFixReason):
+        return observation
+    rig, layout = observation.rig, observation.layout
+    eyes, index = np.nonzero(observation.seen)
+    depth_m = rough.left_from_drogue.translation_m[2]
+    radius_px = rig.camera.fx_px * layout.radius_m / depth_m
+    discs = circles(eyes, observation.pixels_px[eyes, index], np.full(len(eyes), radius_px))
+    hubs = [hub for mode in rough.modes for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
+    signals = marker_signals(images, color, _together([discs, *hubs]))
+    fits = fit_discs(signals, discs)
+    good = fits.accepted
+    if min(np.bincount(eyes[good], minlength=2)) < min(_LEAST_MARKERS, layout.count) or fits.noise is None:
+        return observation
+    pixels = np.full_like(observation.pixels_px, np.nan)
+    cov = np.full_like(observation.cov_px2, np.nan)
+    pixels[eyes[good], index[good]] = fits.ellipses.centers_px[good]
+    cov[eyes[good], index[good]] = fits.cov_px2[good]
+    refined = replace(observation, pixels_px=pixels, cov_px2=cov)
+    return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise)
+
+
+def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> list[Ellipses]:
+    """The hub's inner and outer edge in both eyes as a pose shows them; nothing without a hub or with it behind."""
+    if layout.hub_center_m is None or pose.apply(layout.hub_center_m)[2] <= 0:
+        return []
+    edges = []
+    for radius_m in (layout.hub_inner_radius_m, layout.hub_outer_radius_m):
+        outline = disc_outline(pose, layout.hub_center_m, radius_m, _OUTLINE_POINTS)
+        points = np.stack([rig.project(outline, eye) for eye in EYES])
+        place = layout.hub_center_m[None], np.array([radius_m])
+        centers = np.concatenate([project_disc_centers(rig, pose, *place, eye) for eye in EYES])
+        shapes = outline_shapes(points - points.mean(axis=1, keepdims=True))
+        edges.append(Ellipses(np.array([0, 1]), centers, shapes))
+    return edges
+
+
+def _together(groups: list[Ellipses]) -> Ellipses:
+    return Ellipses(
+        np.concatenate([group.eyes for group in groups]),
+        np.concatenate([group.centers_px for group in groups]),
+        np.concatenate([group.shapes_px for group in groups]),
+    )
+
+
+def _with_hub(observation: Observation, signals: tuple[MarkerSignal, MarkerSignal], noise: NoiseModel) -> Observation:
+    """The hub's outer edge, looked for where the markers' pose shows it, and where its mirror image would."""
+    solution = joint(observation)
+    if isinstance(solution, NoFixReason):
+        return observation
+    tried: list[Array] = []
+    for mode in solution.modes:
+        edges = _hub_edges(observation.rig, observation.layout, mode.left_from_drogue)
+        if not edges or (tried and mode.weight < _LEAST_WEIGHT):
+            continue
+        centers = edges[OUTER_EDGE].centers_px
+        if any(np.abs(centers - other).max() < _LEAST_STEP_PX for other in tried):
+            continue
+        tried.append(centers)
+        fits = fit_annuli(signals, edges[OUTER_EDGE], edges[INNER_EDGE], noise)
+        if fits.accepted.any():
+            outer, outer_cov = fits.outer_given_offset(edges[INNER_EDGE].centers_px - centers)
+            pixels = np.full((len(EYES), HUB_EDGES, 2), np.nan)
+            cov = np.full((len(EYES), HUB_EDGES, 2, 2), np.nan)
+            pixels[fits.accepted, OUTER_EDGE] = outer[fits.accepted]
+            cov[fits.accepted, OUTER_EDGE] = outer_cov[fits.accepted]
+            return replace(observation, hub_px=pixels, hub_cov_px2=cov)
+    return observation

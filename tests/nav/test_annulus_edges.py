@@ -1,0 +1,133 @@
+"""Both edges of annuli, evenly lit and cut by a shadow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from droguekit.benchmark.centroid_bounds import PixelLight, outline_coverage
+from nav.centroids.annulus_edges import AnnulusFits, fit_annuli
+from nav.centroids.annulus_model import annulus_model, annulus_start, azimuth_basis
+from nav.centroids.centroid_quality import NoiseModel
+from nav.centroids.ellipses import Ellipses, circles
+from nav.centroids.marker_signal import MarkerSignal
+from nav.centroids.patches import annulus_pixels
+
+DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
+STEP_PX = np.array([0.03, -0.02])
+# Shot noise of the background, and its growth; what discs of the same light would have told.
+NOISE = NoiseModel(2300 / DAY.step_e**2 + 1 / 12, 1 / DAY.step_e * 2, 0.0)
+
+
+def coverage(shape, center, grid):
+    count = int(8 * 2 * np.pi * np.linalg.norm(shape)) + 64
+    angle = 2 * np.pi * np.arange(count) / count
+    arms = np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ shape
+    tangents = np.stack([-np.sin(angle), np.cos(angle)], axis=-1) @ shape * (2 * np.pi / count)
+    return outline_coverage(center + arms, tangents, grid, grid, DAY.psf_sigma_px)
+
+
+def draw_annuli(outer_px, rng, shadow=0.0, contrast_e=DAY.contrast_e):
+    """Signals of an annulus in each eye with their true edges; `shadow` takes a share of the light beyond a line."""
+    cell = int(2 * outer_px + 16)
+    grid = np.arange(cell, dtype=np.float64)
+    signals, centers = [], []
+    shape = np.diag([1.0, 0.97])
+    for _ in range(2):
+        center = cell / 2 + rng.uniform(-0.5, 0.5, 2)
+        share = coverage(shape * outer_px, center, grid) - coverage(shape * outer_px / 1.5, center + STEP_PX, grid)
+        toward = rng.uniform(0, 2 * np.pi)
+        along = (grid[None, :] - center[0]) * np.cos(toward) + (grid[:, None] - center[1]) * np.sin(toward)
+        mean_e = DAY.background_e + contrast_e * share * (1 - shadow * (along > 0.3 * outer_px))
+        electrons = rng.poisson(mean_e) * (1 + DAY.prnu_fraction * rng.standard_normal(mean_e.shape))
+        values = np.round(electrons / DAY.step_e).astype(np.float32)
+        signals.append(MarkerSignal(values, values >= 255, (0.0, 0.0), 1, True))
+        centers.append(center)
+    eyes, middle = np.arange(2), np.array(centers)
+    outer = Ellipses(eyes, middle, np.tile(shape * outer_px, (2, 1, 1)))
+    return signals, outer, Ellipses(eyes, middle + STEP_PX, np.tile(shape * outer_px / 1.5, (2, 1, 1)))
+
+
+def off(edges, shift):
+    """The edges as a markers-only pose predicts them."""
+    return Ellipses(edges.eyes, edges.centers_px + shift, 1.004 * edges.shapes_px)
+
+
+def fit_many(outer_px, shadow, draws=30):
+    """Errors of both centres, and of the outer one with the step known, over their covariances."""
+    rng = np.random.default_rng([3, int(outer_px)])
+    both, one, errors, inflation = [], [], [], []
+    for _ in range(draws):
+        signals, outer, inner = draw_annuli(outer_px, rng, shadow)
+        shift = rng.normal(0, 0.3, (2, 2))
+        fits = fit_annuli(signals, off(outer, shift), off(inner, shift), NOISE)
+        assert fits.accepted.all(), fits.reasons
+        error = (fits.centers_px - np.stack([outer.centers_px, inner.centers_px], axis=1)).reshape(-1, 4)
+        both.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.cov_px2), error) / 4)
+        center, cov = fits.outer_given_offset(np.tile(STEP_PX, (2, 1)))
+        single = center - outer.centers_px
+        one.append(np.einsum("ni,nij,nj->n", single, np.linalg.inv(cov), single) / 2)
+        errors.append(single)
+        inflation.append(fits.inflation)
+    return (np.mean(array) for array in (both, one, np.square(errors), inflation))
+
+
+@pytest.mark.parametrize("outer_px", [30.0, 15.0, 8.0])
+def test_edges_of_even_annuli_are_as_good_as_their_covariance(outer_px):
+    both, one, variance, _ = fit_many(outer_px, 0.0)
+    # 240 and 120 squared errors: standard deviations 0.09 and 0.13; the noise model given is a rough one.
+    assert 0.65 < both < 1.4
+    assert 0.6 < one < 1.6
+    # More edge than a marker of two thirds of the radius, whose bound is 0.0036 sqrt(10.7 / r).
+    assert np.sqrt(variance) < 0.0045 * np.sqrt(16 / outer_px)
+
+
+def test_thin_annuli_keep_the_predicted_step():
+    _, one, variance, _ = fit_many(4.0, 0.0)
+    assert 0.6 < one < 1.6
+    # The bound of a disc of 4 px is 0.007 px.
+    assert np.sqrt(variance) < 0.0085
+
+
+@pytest.mark.parametrize("outer_px", [30.0, 15.0])
+def test_shadow_edges_widen_the_covariance_as_much_as_they_move_the_centre(outer_px):
+    _, one, variance, inflation = fit_many(outer_px, 0.5)
+    assert inflation > 5
+    # What the azimuthal terms cannot follow is no noise: only the order of magnitude is asked for.
+    assert 0.2 < one < 2.5
+    assert np.sqrt(variance) < 0.02
+
+
+def test_annuli_that_are_not_there_or_dark_give_reasons():
+    rng = np.random.default_rng(4)
+    signals, outer, inner = draw_annuli(15.0, rng, contrast_e=0.0)
+    fits = fit_annuli(signals, outer, inner, NOISE)
+    assert fits.reasons == ("no contrast", "no contrast")
+    np.testing.assert_array_equal(fits.centers_px[:, 0], outer.centers_px)
+    signals, outer, inner = draw_annuli(15.0, rng)
+    fits = fit_annuli(signals, off(outer, 12.0), off(inner, 12.0), NOISE)
+    assert not fits.accepted.any()
+
+
+def test_derivatives_are_those_of_the_picture():
+    rng = np.random.default_rng(5)
+    signals, outer, inner = draw_annuli(12.0, rng)
+    pixels = annulus_pixels(signals, outer, inner)
+    turns = azimuth_basis(pixels, 4)
+    model = annulus_model(pixels, turns)
+    parameters = annulus_start(pixels, outer, inner, turns.shape[1])
+    parameters[:, -8:] = rng.normal(0, 5, (2, 8))
+    _, jacobian = model(parameters)
+    for place in range(parameters.shape[1]):
+        step = np.zeros(parameters.shape[1])
+        step[place] = 3e-4 if place in (2, 3, 4, 7, 8, 9) else 0.02
+        slope = (model(parameters + step)[0] - model(parameters - step)[0]) / (2 * step[place])
+        scale = np.abs(jacobian[:, place]).max()
+        # Third derivatives of an edge of 0.6 px over steps of up to 0.04 px, and single precision.
+        np.testing.assert_allclose(jacobian[:, place] / scale, slope / scale, atol=5e-3)
+
+
+def test_no_annuli_no_fits():
+    nothing = circles(np.zeros(0), np.zeros((0, 2)), np.zeros(0))
+    signals, _, _ = draw_annuli(5.0, np.random.default_rng(6))
+    assert isinstance(fit_annuli(signals, nothing, nothing, NOISE), AnnulusFits)

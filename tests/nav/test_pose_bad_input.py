@@ -1,0 +1,150 @@
+"""Measurements that cannot carry a pose, for the methods of one eye and those that use the hub."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drogue_models.marker_layout import MarkerLayout
+from nav.pose.batched import solve_joint_batch
+from nav.pose.interface import NoFixReason, Observation, Solution
+from nav.pose.registry import METHODS
+
+MONO = [name for name in METHODS if name.startswith("mono-")]
+HUB = ["joint-hub", "joint-robust"]
+
+
+@pytest.fixture
+def draws(draw_poses):
+    return draw_poses(np.random.default_rng(71), 1, 5.0, 0.05, tilt_deg=(6.0, 8.0))
+
+
+def changed(draws, change) -> Observation:
+    good = draws.observation(0)
+    arrays = [np.array(a) for a in (good.pixels_px, good.cov_px2, good.hub_px, good.hub_cov_px2)]
+    change(*arrays)
+    return Observation(good.rig, good.layout, *arrays)
+
+
+def reason_of(method, observation) -> str:
+    answer = METHODS[method](observation)
+    assert isinstance(answer, NoFixReason)
+    return answer.reason
+
+
+@pytest.mark.parametrize("method", MONO)
+def test_the_left_eye_is_enough(draws, method):
+    def right_eye_lost(pixels, cov, hub, hub_cov):
+        pixels[1], hub[1] = np.nan, np.nan
+
+    solution = METHODS[method](changed(draws, right_eye_lost))
+    assert isinstance(solution, Solution)
+    both = METHODS[method](draws.observation(0))
+    np.testing.assert_array_equal(solution.left_from_drogue.as_matrix(), both.left_from_drogue.as_matrix())
+    assert solution.used.sum(axis=1).tolist() == [8, 0]
+
+
+def left_eye_lost(pixels, cov, hub, hub_cov):
+    pixels[0] = np.nan
+
+
+def three_left(pixels, cov, hub, hub_cov):
+    pixels[0, 3:] = np.nan
+
+
+def on_one_line(pixels, cov, hub, hub_cov):
+    pixels[0, :, 1] = 300.0
+
+
+def huge(pixels, cov, hub, hub_cov):
+    pixels[0, 3] = 1e300
+
+
+def huge_covariance(pixels, cov, hub, hub_cov):
+    cov[0, 2] = 1e300 * np.eye(2)
+
+
+def not_a_number(pixels, cov, hub, hub_cov):
+    cov[0, 2, 0, 0] = np.nan
+
+
+@pytest.mark.parametrize("method", MONO)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (left_eye_lost, "0 markers in the left eye"),
+        (three_left, "3 markers in the left eye"),
+        (on_one_line, "on one line"),
+        (huge, "marker 3 of the left eye lies far outside"),
+        (huge_covariance, "marker 2 of the left eye has no positive covariance"),
+        (not_a_number, "marker 2 of the left eye has no positive covariance"),
+    ],
+)
+def test_reasons_of_single_eye_methods(draws, method, change, reason):
+    assert reason in reason_of(method, changed(draws, change))
+
+
+@pytest.mark.parametrize("method", [*MONO, "joint", "joint-hub"])
+def test_a_wrong_order_of_markers(draws, method):
+    def shuffled(pixels, cov, hub, hub_cov):
+        pixels[:] = pixels[:, [0, 4, 1, 5, 2, 6, 3, 7]]
+
+    reason = reason_of(method, changed(draws, shuffled))
+    assert "do not fit" in reason or "no pose in front of the camera" in reason
+
+
+@pytest.mark.parametrize("method", HUB)
+def test_reasons_of_a_bad_hub(draws, method):
+    def far_away(pixels, cov, hub, hub_cov):
+        hub[1, 0] = np.inf
+
+    def no_covariance(pixels, cov, hub, hub_cov):
+        hub_cov[0, 1] = 0
+
+    assert "hub edge 0 of the right eye lies far outside" in reason_of(method, changed(draws, far_away))
+    assert "hub edge 1 of the left eye has no positive covariance" in reason_of(method, changed(draws, no_covariance))
+
+
+def test_another_thing_taken_for_the_hub(draws):
+    def elsewhere(pixels, cov, hub, hub_cov):
+        hub += 300.0
+
+    assert "do not fit the drogue" in reason_of("joint-hub", changed(draws, elsewhere))
+    assert isinstance(METHODS["joint-robust"](changed(draws, elsewhere)), Solution)
+
+
+def test_robust_says_when_too_few_agree(draws):
+    def scattered(pixels, cov, hub, hub_cov):
+        pixels += np.random.default_rng(72).uniform(-15, 15, pixels.shape)
+
+    assert "agree with each other" in reason_of("joint-robust", changed(draws, scattered))
+
+
+def test_observation_checks_the_hub(draws):
+    good = draws.observation(0)
+    with pytest.raises(ValueError, match="hub_px, hub_cov_px2: give both or neither"):
+        Observation(good.rig, good.layout, good.pixels_px, good.cov_px2, good.hub_px)
+    with pytest.raises(ValueError, match=r"hub_px: must have shape \(2, 2, 2\)"):
+        Observation(good.rig, good.layout, good.pixels_px, good.cov_px2, np.zeros((2, 2)), good.hub_cov_px2)
+    bare = MarkerLayout(good.layout.centers_m, 0.05, None)
+    with pytest.raises(ValueError, match="hub_px: the drogue has no hub"):
+        Observation(good.rig, bare, good.pixels_px, good.cov_px2, good.hub_px, good.hub_cov_px2)
+    with pytest.raises(ValueError, match="ring_tolerance_m: must be 0 or more"):
+        Observation(good.rig, good.layout, good.pixels_px, good.cov_px2, ring_tolerance_m=-1e-3)
+
+
+def test_arrays_of_the_batch(draws):
+    with pytest.raises(ValueError, match=r"pixels_px: must have shape \(B, 1 or 2, 8, 2\), got \(1, 2, 7, 2\)"):
+        solve_joint_batch(draws.rig, draws.layout, draws.pixels_px[:, :, :7], np.eye(2))
+    crooked = MarkerLayout(draws.layout.centers_m * np.linspace(1, 1.1, 8)[:, None], 0.05, None)
+    with pytest.raises(ValueError, match="ring_tolerance_m: the markers lie on no circle"):
+        solve_joint_batch(draws.rig, crooked, draws.pixels_px[:, :, :8], np.eye(2), 5e-4)
+
+
+def test_a_batch_marks_frames_that_have_no_pose(draws):
+    frames = np.repeat(draws.pixels_px, 4, axis=0)
+    frames[1] = np.nan
+    frames[2, :, 2:] = np.nan
+    batch = solve_joint_batch(draws.rig, draws.layout, frames, 0.0025 * np.eye(2))
+    assert batch.sound.tolist() == [True, False, False, True]
+    np.testing.assert_array_equal(batch.translations_m[0], batch.translations_m[3])
