@@ -155,11 +155,12 @@ def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> Measured:
 
 
 def _tilt_scales(layout: MarkerLayout, cell: Cell, poses: Poses) -> Array:
-    """(n,) scale of the flip law. [rad]"""
+    """(n,) scale of the flip law, at the distance along the line of sight, about which a tilt is mirrored. [rad]"""
     rig, radius_m = paper_rig(), layout.ring_radius_m
     assert radius_m is not None
     one = FacingRing(rig.camera.fx_px, rig.baseline_m, radius_m, layout.count, 1.0).tilt_rad
-    scales: Array = cell.sigma_px * one * poses.translations_m[:, 2] ** 2
+    sight = poses.translations_m - np.array([rig.baseline_m / 2, 0.0, 0.0])
+    scales: Array = cell.sigma_px * one * (sight**2).sum(axis=1)
     return scales
 
 
