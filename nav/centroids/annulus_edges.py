@@ -35,9 +35,9 @@ from nav.centroids.patches import PixelSet, annulus_pixels
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5
 # How well the step between the centres of both edges is known where it is not fitted: it is below this itself. [px]
 _OFFSET_SIGMA_PX = 0.005
-# What the light model cannot follow, as found on path-traced daylight frames of seed 1: shadows of ribs across the hub
-# move its centre by this share of its radius where the residuals hang together, and by this much where it is thin.
-_SHADOWED_INFLATION, _SHADOW_SHIFT_FRACTION, _THIN_SHIFT_PX = 8.0, 0.0045, 0.03
+# Shadows of ribs across the hub move its centre more than the residuals that they leave tell: by twice as much, as found
+# on path-traced daylight frames of seed 1, where the inflation for residuals that hang together is above this.
+_SHADOWED_INFLATION, _SHADOWED_VARIANCE = 8.0, 4.0
 _FIRST_STEPS, _SECOND_STEPS = 6, 3
 _SECTORS = 16
 _LEAST_CONTRAST_SIGMA = 4.0
@@ -125,9 +125,7 @@ def fit_annuli(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses
     spread = residual_spread(final.residuals, weights, sectors, contrast, ties.shape[2])
     inflation = np.maximum(spread.inflation, spread.chi2_per_dof)
     cov = _center_covariance(final, ties, thin) * inflation[:, None, None]
-    shift_px = np.where(inflation > _SHADOWED_INFLATION, _SHADOW_SHIFT_FRACTION * outer.radii_px, 0.0)
-    # Shadows move both edges together.
-    cov += np.kron(np.ones((2, 2)), np.eye(2)) * (shift_px**2 + thin * _THIN_SHIFT_PX**2)[:, None, None]
+    cov *= np.where(inflation > _SHADOWED_INFLATION, _SHADOWED_VARIANCE, 1.0)[:, None, None]
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from datasets_manifest.blind import BlindDataset
 from datasets_manifest.estimates import PoseEstimate, read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.se3 import angles_from_rotation
 from geometry.stereo import EYES, paper_rig
-from nav.navigator import Navigator
+from nav.navigator import CENTROID_CHOICES, Navigator
 from nav.pose.interface import NoFixReason
 from nav.runner import method_names, navigate
 
@@ -97,27 +97,44 @@ def test_hidden_markers_and_false_discs(draw, make_pose):
 
 
 def test_estimates_survive_the_disk(draw, make_pose, tmp_path):
-    place = make_pose(0.06, 0, 10, 6, 3, 5)
-    pair = SimpleNamespace(frame_index=3, images=draw(RIG, DROGUE, place, None), rig=RIG, drogue=DROGUE)
-    empty = SimpleNamespace(frame_index=5, images=draw(RIG, None, place, None), rig=RIG, drogue=DROGUE)
-    pairs = {3: pair, 5: empty}
-    dataset = SimpleNamespace(frame_indices=(3, 5), pair=pairs.__getitem__)
-    estimates = list(navigate(dataset, method_names()))
+    pairs = {3: draw(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None), 5: draw(RIG, None, make_pose(0, 0, 9), None)}
+    estimates = [e for frame, images in pairs.items() for e in NAVIGATOR.estimate(frame, images, method_names())]
     assert [(e.frame_index, e.method) for e in estimates] == [(i, m) for i in (3, 5) for m in method_names()]
-    assert [e.status for e in estimates] == ["fix"] * len(method_names()) + ["no_fix"] * len(method_names())
-    fix = next(e for e in estimates if e.method == "joint")
-    assert set(fix.stage_s) == {"detect", "centroids", "correspond", "pose"}
-    assert len(fix.features) == 16
-    assert sum(mode.weight for mode in fix.modes) == pytest.approx(1)
+    assert {e.status for e in estimates if e.frame_index == 3} == {"fix"}
+    assert {e.status for e in estimates if e.frame_index == 5} == {"no_fix"}
+    fixes = {e.method: e for e in estimates if e.frame_index == 3}
+    assert set(fixes["paper"].stage_s) == {"detect", "centroids", "correspond", "pose"}
+    assert set(fixes["joint"].stage_s) == {"detect", "centroids", "correspond", "refine", "pose"}
+    assert sum(f.index != "hub" for f in fixes["joint"].features) == 16
+    assert sum(mode.weight for mode in fixes["joint"].modes) == pytest.approx(1)
     path = tmp_path / "estimates.jsonl"
-    assert write_estimates(path, estimates) == 2 * len(method_names())
+    assert write_estimates(path, estimates) == len(estimates)
     for written, read in zip(estimates, read_estimates(path), strict=True):
         assert read.model_dump_json() == written.model_dump_json()
 
 
-def test_runner_refuses_unknown_methods_before_it_reads():
+def test_centroids_can_be_the_same_for_all_methods(draw, make_pose):
+    images = draw(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), np.random.default_rng(7))
+    places = {}
+    for choice in CENTROID_CHOICES:
+        estimates = Navigator(RIG, DROGUE, centroids=choice).estimate(0, images, ["paper", "joint"])
+        places[choice] = [tuple(f.center_px for f in e.features if f.index != "hub") for e in estimates]
+    assert places["own"] == [places["binary"][0], places["edge"][1]]
+    assert places["binary"][0] == places["binary"][1] != places["edge"][0] == places["edge"][1]
+
+
+@pytest.mark.mitsuba
+def test_runner_goes_through_a_dataset_on_disk(smoke_dataset):
+    blind = BlindDataset(smoke_dataset)
+    estimates = list(navigate(blind, ["joint", "paper"]))
+    assert [e.frame_index for e in estimates] == [i for i in blind.frame_indices for _ in range(2)]
+    assert all(e.status == "fix" for e in estimates)
+
+
+@pytest.mark.mitsuba
+def test_runner_refuses_unknown_methods_before_it_reads(smoke_dataset):
     with pytest.raises(ValueError, match="method: there is no pose method named 'magic'"):
-        navigate(SimpleNamespace(frame_indices=(0,), pair=None), ["joint", "magic"])
+        navigate(BlindDataset(smoke_dataset), ["joint", "magic"])
 
 
 def test_the_same_picture_gives_the_same_answer(draw, make_pose):
@@ -137,7 +154,7 @@ import nav.runner
 from datasets_manifest.images import StereoImages
 from drogue_models.presets import PRESETS
 from geometry.stereo import paper_rig
-from nav.navigator import Navigator
+from nav.navigator import CENTROID_CHOICES, Navigator
 image = np.zeros((960, 1280, 3), np.uint8)
 images = StereoImages(image, image, 0.0, 1.0)
 estimates = Navigator(paper_rig(), PRESETS["red-8"]).estimate(0, images, nav.runner.method_names())

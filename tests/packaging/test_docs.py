@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from datasets_manifest.estimates import read_estimates
 from datasets_manifest.recipe import load_recipe
+from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from droguekit.cli.main import COMMANDS, load_command
+from geometry.se3 import RigidTransform
+from geometry.stereo import EYES, paper_rig
+from nav.navigator import BINARY_METHODS
+from nav.pose.interface import Observation, Solution
+from nav.pose.registry import ENTRY_POINT_GROUP
 from nav.runner import method_names
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -78,6 +87,41 @@ def test_the_example_of_a_recipe_can_be_read(tmp_path: Path) -> None:
     (tmp_path / "my-recipe.toml").write_text(example, encoding="utf-8")
     (tmp_path / "my-drogue.toml").write_text(text("drogue_models/examples/seven-markers.toml"), encoding="utf-8")
     assert load_recipe(str(tmp_path / "my-recipe.toml"))[0].drogue.name == "seven-markers"
+
+
+def test_the_example_of_a_method_finds_a_pose() -> None:
+    (entry,) = code_blocks(REPOSITORY / "docs/adding-an-estimator.md", "toml")
+    (example,) = code_blocks(REPOSITORY / "docs/adding-an-estimator.md", "python")
+    (name,) = tomllib.loads(entry)["project"]["entry-points"][ENTRY_POINT_GROUP]
+    namespace: dict[str, Any] = {}
+    exec(compile(example, "adding-an-estimator.md", "exec", dont_inherit=True), namespace)
+    rig, layout = paper_rig(), marker_layout(PRESETS["red-8"])
+    points = RigidTransform(np.eye(3), np.array([0.06, 0.0, 5.0])).apply(layout.centers_m)
+    pixels = np.stack([rig.project(points, eye) for eye in EYES])
+    answer = namespace[name](Observation(rig, layout, pixels, np.tile(0.01 * np.eye(2), (2, layout.count, 1, 1))))
+    assert isinstance(answer, Solution)
+    # Centres of facing discs are those of their images; pixels of 1e3 in float64.
+    np.testing.assert_allclose(answer.left_from_drogue.translation_m, [0.06, 0.0, 5.0], atol=1e-9)
+
+
+def test_every_test_named_for_the_paper_exists() -> None:
+    named = set(re.findall(r"`(test_\w+)`", text("docs/paper.md")))
+    there = set(re.findall(r"^def (test_\w+)", "".join(p.read_text() for p in REPOSITORY.glob("tests/*/*.py")), re.M))
+    assert named and named <= there
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/benchmark.md"])
+def test_tables_of_methods_name_their_centroids(page: str) -> None:
+    rows = re.findall(r"^\| (`[a-z]+[^|]*) \|.* \| (binary|edge) \|$", text(page), re.MULTILINE)
+    centroids = {name: kind for names, kind in rows for name in re.findall(r"`([^`]+)`", names)}
+    assert centroids == {name: "binary" if name in BINARY_METHODS else "edge" for name in method_names()}
+
+
+@pytest.mark.parametrize(
+    "recipe", sorted((REPOSITORY / "datasets_manifest/recipes").glob("*.toml")), ids=lambda p: p.stem
+)
+def test_recipes_that_ship_are_documented(recipe: Path) -> None:
+    assert f"`{recipe.stem}`" in text("README.md")
 
 
 def test_methods_and_drogues_that_ship_are_documented() -> None:
