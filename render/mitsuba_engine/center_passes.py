@@ -13,11 +13,9 @@ from datasets_manifest.frame import FrameSpec
 from geometry.stereo import Eye
 from render.mitsuba_engine.camera_rays import CameraRays
 from render.mitsuba_engine.scene import DrogueScene
-from render.mitsuba_engine.traced import TracedEye, amodal_counts
+from render.mitsuba_engine.traced import ASIDE, TracedEye, amodal_counts
 
 CENTER = (0.5, 0.5)
-# Next to the centre by a thousandth of a pixel, off any axis: for rays that slip through a seam at the centre itself.
-ASIDE = (0.501, 0.5007)
 
 
 class CenterPasses:
@@ -58,10 +56,13 @@ class CenterPasses:
         covered = np.flatnonzero(part_id)
         if len(covered):
             points, normals, leaked = self._surface(covered, CENTER)
-            if leaked.any():
-                aside = covered[leaked]
-                points[leaked], normals[leaked], _ = self._surface(aside, ASIDE)
-                ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=ASIDE))
+            for place in ASIDE:
+                if not leaked.any():
+                    break
+                again = np.flatnonzero(leaked)
+                aside = covered[again]
+                points[again], normals[again], leaked[again] = self._surface(aside, place)
+                ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=place))
                 part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
             pose = self._rays.pose_at_middle
             met = part_id.reshape(-1)[covered] > 0

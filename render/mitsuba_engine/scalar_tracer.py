@@ -16,6 +16,7 @@ from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.traced import (
+    ASIDE,
     Traced,
     TracedEye,
     amodal_counts,
@@ -184,18 +185,19 @@ class _View:
         return part_id, depth, normal
 
     def _mend_leaks(self, scene: Any, pose: Array, passes: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
-        """Look again, a thousandth of a pixel aside, where a ray slipped between two triangles into a closed part."""
+        """Look again, a little aside, where a ray slipped between two triangles into a closed part."""
         part_id, values = passes
         towards = values[..., 1:4] - pose[:3, 3]
         for v, u in np.argwhere((part_id > 0) & ((values[..., 4:] * towards).sum(axis=-1) > 0)):
-            direction = pose[:3, :3] @ self._camera.rays(np.array([u + 0.001, v + 0.0007]))
-            ray = mi.Ray3f(
-                mi.Point3f(pose[:3, 3].tolist()), mi.Vector3f((direction / np.linalg.norm(direction)).tolist())
-            )
-            hit = scene.ray_intersect(ray)
-            if hit.is_valid():
-                part_id[v, u] = int(hit.shape.id().removeprefix("part_"))
-                values[v, u, 1:] = [*hit.p, *hit.n]
+            for place in ASIDE:
+                ray_px = np.array([u + place[0] - 0.5, v + place[1] - 0.5])
+                direction = pose[:3, :3] @ self._camera.rays(ray_px)
+                direction /= np.linalg.norm(direction)
+                hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(pose[:3, 3].tolist()), mi.Vector3f(direction.tolist())))
+                if hit.is_valid() and np.array(hit.n) @ direction < 0:
+                    part_id[v, u] = int(hit.shape.id().removeprefix("part_"))
+                    values[v, u, 1:] = [*hit.p, *hit.n]
+                    break
 
     def radiance(
         self, scene: DrogueScene, what: tuple[NDArray[np.int64], float, int, int], seed: int

@@ -13,6 +13,8 @@ from drogue_models.parts import FIRST_MARKER_ID, Part, drogue_part_ids
 from geometry.stereo import Eye
 from render.engine import EyeRadiance
 
+# Next to the centre, a little farther each time and off any one line: for rays that slip through a seam at the centre.
+ASIDE = ((0.501, 0.5007), (0.496, 0.503), (0.507, 0.489))
 # Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
 _SEAM_DEPTH_FRACTION = 1e-5
 
