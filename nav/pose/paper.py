@@ -2,7 +2,7 @@
 
 Every three triangulated markers give a candidate for the drogue's origin; the candidate whose reprojection into both
 eyes fits all markers best is taken and shifted along its line of sight. Attitude: the plane through all markers.
-Source: the seed paper, section 3.3, eqs. 1-16; docs/conventions.md lists what is corrected.
+Source: the seed paper, section 3.3, eqs. 1-16; docs/paper.md lists what is corrected.
 """
 
 from __future__ import annotations
