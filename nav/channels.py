@@ -13,6 +13,11 @@ from geometry.stereo import Eye
 # leads by 0.95, white by 0.
 _SATURATED_FRACTION = 0.5
 
+# How much of the other colours is taken off. A low sun makes haze so warm that its red leads too; then more is taken:
+# haze of an orange horizon has a third more red than green, red paint twenty times as much.
+PLAIN, AGAINST_WARM_SKY = 1.0, 1.4
+OTHERS_WEIGHTS = (PLAIN, AGAINST_WARM_SKY)
+
 # Where the first site of each colour lies in an RGGB cell; the mean of both greens lies between them. [px]
 _SITE_OFFSET_PX = (0.0, 0.5, 1.0)
 
@@ -26,7 +31,7 @@ def marker_color(drogue: DrogueParameters) -> int | None:
     return strongest if rgb[strongest] - others > _SATURATED_FRACTION * rgb[strongest] else None
 
 
-def marker_channel(images: StereoImages, eye: Eye, color: int | None) -> Pixels:
+def marker_channel(images: StereoImages, eye: Eye, color: int | None, others_weight: float = PLAIN) -> Pixels:
     """Linear picture of how much a pixel looks like a marker.
 
     With a colour it is `max(c - max(the other two), 0)`, the paper's subtraction of channels; sites of that colour in a
@@ -37,13 +42,14 @@ def marker_channel(images: StereoImages, eye: Eye, color: int | None) -> Pixels:
         images: the pair.
         eye: which of the two.
         color: see `marker_color`.
+        others_weight: how much of the stronger of the other two colours is taken off.
 
     Returns:
         (H, W) of unsigned integers on the image's own grid, proportional to light above the black level.
     """
     image, mosaic = (images.left, images.left_mosaic) if eye == "left" else (images.right, images.right_mosaic)
     if color is not None and mosaic is not None:
-        return _from_mosaic(mosaic, color)
+        return _from_mosaic(mosaic, color, others_weight)
     linear = _linear(image, images)
     if linear.ndim == 2:
         return linear
@@ -51,7 +57,15 @@ def marker_channel(images: StereoImages, eye: Eye, color: int | None) -> Pixels:
     if color is None:
         return np.asarray(cv2.min(cv2.min(planes[0], planes[1]), planes[2]))
     first, second = (planes[index] for index in range(3) if index != color)
-    return np.asarray(cv2.subtract(planes[color], cv2.max(first, second)))
+    return _lead(planes[color], cv2.max(first, second), others_weight)
+
+
+def _lead(own: Pixels, others: Pixels, others_weight: float) -> Pixels:
+    """`max(own - weight others, 0)` in the integers of the image."""
+    if others_weight == PLAIN:
+        return np.asarray(cv2.subtract(own, others))
+    weighted = np.minimum(others * np.float32(others_weight), np.iinfo(own.dtype).max)
+    return np.asarray(cv2.subtract(own, weighted.astype(own.dtype)))
 
 
 def _linear(image: Pixels, images: StereoImages) -> Pixels:
@@ -73,14 +87,14 @@ def _srgb_to_linear(
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
-def _from_mosaic(mosaic: Pixels, color: int) -> Pixels:
+def _from_mosaic(mosaic: Pixels, color: int, others_weight: float) -> Pixels:
     """Difference of the sites of one RGGB cell, brought bilinearly to the full grid at the colour's own place."""
     height, width = mosaic.shape
     even = mosaic[: height // 2 * 2, : width // 2 * 2]
     green = cv2.addWeighted(even[0::2, 1::2], 0.5, even[1::2, 0::2], 0.5, 0)
     planes = (np.ascontiguousarray(even[0::2, 0::2]), green, np.ascontiguousarray(even[1::2, 1::2]))
     first, second = (planes[index] for index in range(3) if index != color)
-    difference = cv2.subtract(planes[color], cv2.max(first, second))
+    difference = _lead(planes[color], cv2.max(first, second), others_weight)
     shift = -_SITE_OFFSET_PX[color] / 2
     full_to_site = np.array([[0.5, 0.0, shift], [0.0, 0.5, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -7,7 +7,7 @@ be given either, so that estimators are compared on equal measurements too.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Literal
 
@@ -20,8 +20,8 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_chain import Centroids, binary_centroids
-from nav.channels import marker_channel, marker_color
+from nav.centroids.binary_chain import binary_centroids
+from nav.channels import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
 from nav.correspondence import correspond
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.interface import Detector
@@ -29,6 +29,7 @@ from nav.pose.interface import OUTER_EDGE, NoFixReason, Observation
 from nav.pose.registry import pose_method
 from nav.refinement import refine
 
+Box = tuple[float, float, float, float]
 CentroidChoice = Literal["own", "binary", "edge"]
 CENTROID_CHOICES: tuple[CentroidChoice, ...] = ("own", "binary", "edge")
 # What the paper and the methods that it compares itself with measure on.
@@ -44,10 +45,12 @@ class Sighting:
     Attributes:
         observation: the matched markers, or why there are none.
         stage_s: seconds by stage. [s]
+        others_weight: of the channel that it was measured in, see `nav.channels`.
     """
 
     observation: Observation | NoFixReason
     stage_s: dict[str, float]
+    others_weight: float = PLAIN
 
 
 class Navigator:
@@ -76,17 +79,30 @@ class Navigator:
         detection = self._detector.detect(images)
         detected = perf_counter()
         stage_s = {"detect": detected - start}
-        centroids: list[Centroids] = []
+        boxes = []
         for eye in EYES:
             found = detection.of(eye)
             if found is None:
                 return Sighting(NoFixReason(f"no drogue detected in the {eye} image"), stage_s)
-            channel = marker_channel(images, eye, self._color)
-            centroids.append(binary_centroids(channel, found.box_xywh_px, self._layout))
+            boxes.append(found.box_xywh_px)
+        best = self._matched(images, boxes, PLAIN)
+        for weight in OTHERS_WEIGHTS[1:]:
+            if _paired(best) == self._layout.count:
+                break
+            best = max(best, self._matched(images, boxes, weight), key=_paired)
+        return replace(best, stage_s={**stage_s, **best.stage_s})
+
+    def _matched(self, images: StereoImages, boxes: list[Box], others_weight: float) -> Sighting:
+        """Binary centroids within the boxes, matched."""
+        start = perf_counter()
+        left, right = (
+            binary_centroids(marker_channel(images, eye, self._color, others_weight), box, self._layout)
+            for eye, box in zip(EYES, boxes, strict=True)
+        )
         measured = perf_counter()
-        observation = correspond(centroids[0], centroids[1], self._rig, self._layout)
-        stage_s |= {"centroids": measured - detected, "correspond": perf_counter() - measured}
-        return Sighting(observation, stage_s)
+        observation = correspond(left, right, self._rig, self._layout)
+        stage_s = {"centroids": measured - start, "correspond": perf_counter() - measured}
+        return Sighting(observation, stage_s, others_weight)
 
     def estimate(self, frame_index: int, images: StereoImages, methods: Sequence[str]) -> list[Estimate]:
         """Answers of every method on the same measurements, in the order of `methods`.
@@ -104,11 +120,19 @@ class Navigator:
         if isinstance(sighting.observation, NoFixReason):
             return sighting
         start = perf_counter()
-        observation = refine(images, self._color, sighting.observation)
-        return Sighting(observation, {**sighting.stage_s, "refine": perf_counter() - start})
+        observation = refine(images, self._color, sighting.observation, sighting.others_weight)
+        return replace(
+            sighting, observation=observation, stage_s={**sighting.stage_s, "refine": perf_counter() - start}
+        )
 
     def _wants_edges(self, method: str) -> bool:
         return self._centroids == "edge" or (self._centroids == "own" and method not in BINARY_METHODS)
+
+
+def _paired(sighting: Sighting) -> int:
+    """How many markers both eyes measured."""
+    observation = sighting.observation
+    return 0 if isinstance(observation, NoFixReason) else int(observation.paired.sum())
 
 
 def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate:

@@ -16,6 +16,7 @@ from nav.centroids.centroid_quality import NoiseModel
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.ellipses import Ellipses, circles, outline_shapes
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
+from nav.channels import PLAIN
 from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation
 from nav.pose.joint import joint
 
@@ -27,13 +28,16 @@ _LEAST_STEP_PX = 0.5
 _LEAST_MARKERS = 4
 
 
-def refine(images: StereoImages, color: int | None, observation: Observation) -> Observation:
+def refine(
+    images: StereoImages, color: int | None, observation: Observation, others_weight: float = PLAIN
+) -> Observation:
     """The same markers by the edge model, and the hub where it can be seen.
 
     Args:
         images: the pair.
         color: see `nav.channels.marker_color`.
         observation: matched markers, placed to half a pixel or so.
+        others_weight: see `nav.channels.marker_channel`.
 
     Returns:
         Edge-fitted markers; those that the fit rejects (clipped, cut, shadowed, occluded) are left out. Where too few
@@ -48,7 +52,7 @@ def refine(images: StereoImages, color: int | None, observation: Observation) ->
     radius_px = rig.camera.fx_px * layout.radius_m / depth_m
     discs = circles(eyes, observation.pixels_px[eyes, index], np.full(len(eyes), radius_px))
     hubs = [hub for mode in rough.modes for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
-    signals = marker_signals(images, color, _together([discs, *hubs]))
+    signals = marker_signals(images, color, _together([discs, *hubs]), others_weight)
     fits = fit_discs(signals, discs)
     good = fits.accepted
     if min(np.bincount(eyes[good], minlength=2)) < min(_LEAST_MARKERS, layout.count) or fits.noise is None:

@@ -35,8 +35,8 @@ from nav.centroids.patches import PixelSet, annulus_pixels
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5
 # How well the step between the centres of both edges is known where it is not fitted: it is below this itself. [px]
 _OFFSET_SIGMA_PX = 0.005
-# Shadows of ribs across the hub move its centre more than the residuals that they leave tell: by twice as much, as found
-# on path-traced daylight frames of seed 1, where the inflation for residuals that hang together is above this.
+# Shadows of ribs across the hub move its centre more than the residuals that they leave tell: by twice as much, as
+# found on path-traced daylight frames of seed 1, where the inflation for residuals that hang together is above this.
 _SHADOWED_INFLATION, _SHADOWED_VARIANCE = 8.0, 4.0
 _FIRST_STEPS, _SECOND_STEPS = 6, 3
 _SECTORS = 16

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from datasets_manifest.images import Pixels, StereoImages
 from geometry.stereo import EYES, Eye
 from nav.centroids.ellipses import Ellipses
-from nav.channels import marker_channel
+from nav.channels import PLAIN, marker_channel
 
 Array32 = NDArray[np.float32]
 
@@ -46,7 +46,9 @@ class MarkerSignal:
     is_difference: bool
 
 
-def marker_signals(images: StereoImages, color: int | None, ellipses: Ellipses) -> tuple[MarkerSignal, MarkerSignal]:
+def marker_signals(
+    images: StereoImages, color: int | None, ellipses: Ellipses, others_weight: float = PLAIN
+) -> tuple[MarkerSignal, MarkerSignal]:
     """Signals of the left and the right eye around the given outlines.
 
     From a mosaic only the sites of the markers' colour are taken, with the means of their neighbours for the other two
@@ -56,15 +58,16 @@ def marker_signals(images: StereoImages, color: int | None, ellipses: Ellipses) 
         images: the pair.
         color: see `nav.channels.marker_color`.
         ellipses: where to look; outlines over the image's edge are allowed.
+        others_weight: see `nav.channels.marker_channel`.
     """
     signals = []
     for index, eye in enumerate(EYES):
         window = _window(ellipses.take(ellipses.eyes == index), images.size_px)
         mosaic = images.left_mosaic if eye == "left" else images.right_mosaic
         if color is not None and mosaic is not None:
-            signals.append(_mosaic_signal(images, mosaic, window, color))
+            signals.append(_mosaic_signal(images, mosaic, window, (color, others_weight)))
         else:
-            signals.append(_image_signal(images, eye, window, color))
+            signals.append(_image_signal(images, eye, window, (color, others_weight)))
     return signals[0], signals[1]
 
 
@@ -80,11 +83,15 @@ def _window(ellipses: Ellipses, size_px: tuple[int, int]) -> tuple[int, int, int
     return left, top, int(np.clip(high[0], left + 2, width)), int(np.clip(high[1], top + 2, height))
 
 
-def _image_signal(images: StereoImages, eye: Eye, window: tuple[int, int, int, int], color: int | None) -> MarkerSignal:
+def _image_signal(
+    images: StereoImages, eye: Eye, window: tuple[int, int, int, int], channel: tuple[int | None, float]
+) -> MarkerSignal:
+    color, others_weight = channel
     left, top, right, bottom = window
     image = images.left if eye == "left" else images.right
     part = image[top:bottom, left:right]
-    values = marker_channel(replace(images, left=part, right=part, left_mosaic=None, right_mosaic=None), "left", color)
+    cut = replace(images, left=part, right=part, left_mosaic=None, right_mosaic=None)
+    values = marker_channel(cut, "left", color, others_weight)
     full = 2**images.bits - 1
     is_difference = color is not None and image.ndim == 3
     if part.ndim == 3:
@@ -92,7 +99,10 @@ def _image_signal(images: StereoImages, eye: Eye, window: tuple[int, int, int, i
     return MarkerSignal(values.astype(np.float32), part >= full, (float(left), float(top)), 1, is_difference)
 
 
-def _mosaic_signal(images: StereoImages, mosaic: Pixels, window: tuple[int, int, int, int], color: int) -> MarkerSignal:
+def _mosaic_signal(
+    images: StereoImages, mosaic: Pixels, window: tuple[int, int, int, int], channel: tuple[int, float]
+) -> MarkerSignal:
+    color, others_weight = channel
     left, top, right, bottom = window
     part = mosaic[top : top + (bottom - top) // 2 * 2, left : left + (right - left) // 2 * 2]
     row, column = _FIRST_SITE[color]
@@ -101,6 +111,6 @@ def _mosaic_signal(images: StereoImages, mosaic: Pixels, window: tuple[int, int,
     first, second = (
         cv2.filter2D(part, cv2.CV_32F, kernel)[row::2, column::2] for kernel in _NEIGHBOURS[color == _GREEN]
     )
-    values = np.maximum(own - np.maximum(first, second), np.float32(0))
+    values = np.maximum(own - np.float32(others_weight) * np.maximum(first, second), np.float32(0))
     clipped = own >= 2**images.bits - 1
     return MarkerSignal(values, clipped, (float(left + column), float(top + row)), 2, True)

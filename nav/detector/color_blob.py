@@ -12,7 +12,7 @@ from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import Eye
 from nav.blobs import disc_like_blobs
-from nav.channels import marker_channel, marker_color
+from nav.channels import OTHERS_WEIGHTS, marker_channel, marker_color
 from nav.detector.interface import Detection, StereoDetection
 from nav.ring_match import RingMatch, match_ring
 
@@ -46,19 +46,27 @@ class ColorBlobDetector:
         return StereoDetection(self._detect_eye(images, "left"), self._detect_eye(images, "right"))
 
     def _detect_eye(self, images: StereoImages, eye: Eye) -> Detection | None:
-        channel = cv2.blur(marker_channel(images, eye, self._color), (3, 3))
         best: RingMatch | None = None
-        for level in _levels(channel):
-            mask: NDArray[np.uint8] = (channel > level).view(np.uint8)
-            match = match_ring(disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS), self._layout)
-            if match is not None and (best is None or match.count > best.count):
-                best = match
+        for weight in OTHERS_WEIGHTS:
+            best = self._best_ring(marker_channel(images, eye, self._color, weight), best)
             if best is not None and best.count == self._layout.count:
                 break
         if best is None:
             return None
         score = best.count / self._layout.count * max(0.0, 1 - best.rms_fraction)
         return Detection(_circle_box(best.affine, self._rim_radius_m), score)
+
+    def _best_ring(self, channel: Pixels, best: RingMatch | None) -> RingMatch | None:
+        """The ring with the most markers over all thresholds of a channel, or the one that is known already."""
+        smooth = cv2.blur(channel, (3, 3))
+        for level in _levels(smooth):
+            mask: NDArray[np.uint8] = (smooth > level).view(np.uint8)
+            match = match_ring(disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS), self._layout)
+            if match is not None and (best is None or match.count > best.count):
+                best = match
+            if best is not None and best.count == self._layout.count:
+                break
+        return best
 
 
 def _levels(channel: Pixels) -> list[float]:

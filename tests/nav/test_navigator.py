@@ -10,6 +10,7 @@ import pytest
 
 from datasets_manifest.blind import BlindDataset
 from datasets_manifest.estimates import PoseEstimate, read_estimates, write_estimates
+from datasets_manifest.recipe import load_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
@@ -18,6 +19,9 @@ from geometry.stereo import EYES, paper_rig
 from nav.navigator import CENTROID_CHOICES, Navigator
 from nav.pose.interface import NoFixReason
 from nav.runner import method_names, navigate
+from render.engine import load_engine
+from render.sensor import expose
+from scenes.sampler import sample_frame
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]
@@ -163,3 +167,18 @@ print(len(estimates), estimates[0].status)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [str(len(method_names())), "no_fix"]
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize("frame_index", [24, 125])
+def test_haze_of_a_low_sun_is_not_taken_for_red_paint(frame_index):
+    """Frames against the sun at 20 and 40 m, whose orange haze has more red over the other colours than the markers."""
+    recipe, _ = load_recipe("pose-tier-b")
+    frame = sample_frame(recipe, frame_index)
+    settings = recipe.render.model_copy(update={"samples_per_px": 16})
+    images = expose(frame, load_engine("mitsuba").render(frame, settings))
+    (estimate,) = Navigator(recipe.rig, recipe.drogue).estimate(frame_index, images, ["joint-hub"])
+    assert estimate.status == "fix"
+    truth_m = frame.left_from_drogue.translation_m
+    # 0.1 px of every centroid is 0.2 % of the depth at 40 m.
+    assert np.linalg.norm(estimate.left_from_drogue.translation_m - truth_m) < 0.002 * truth_m[2]
