@@ -254,7 +254,7 @@ class Recipe(FrozenModel):
         limit = self.rig.nearest_full_view_m(self.drogue.rim_radius_m)
         if nearest < limit:
             raise ValueError(
-                f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue just fits into both views"
+                f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue fits both views"
             )
         return self
 

@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
 
-from labelgen.export.coco import write_coco
 from pebble import ProcessExpired
 
 from datasets_manifest import layout
@@ -21,6 +20,7 @@ from droguekit.batch.frame_task import FrameFaultError, FrameReport, FrameTask
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.resume import open_dataset, sort_frames
 from droguekit.batch.workers import MAX_ATTEMPTS, Attempt, run_tasks
+from labelgen.export.coco import write_coco
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scene
 

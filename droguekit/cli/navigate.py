@@ -29,7 +29,7 @@ def navigate(
         typer.Option(
             "--centroids",
             metavar="own|binary|edge",
-            help="What methods measure on: each its own (the paper's chain for its kin, edge fits for ours), or all one.",
+            help="Measured points: each method's own (the paper's chain, or edge fits), or one kind for all.",
         ),
     ] = "own",
 ) -> None:
