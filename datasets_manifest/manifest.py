@@ -213,7 +213,7 @@ def _read_entry(dataset: Path, frame_index: int, split_of_scene: Callable[[int],
             empty=table["left_from_drogue"] is None,
             record_sha256=hashlib.sha256(data).hexdigest(),
         )
-        engine = f"{table['engine']} {table['engine_version']}"
+        engine = str(table["engine_version"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{path}: is not a whole record; delete the frame's folder and render it again") from error
     if entry.frame_index != frame_index:

@@ -74,6 +74,20 @@ def engine_names() -> tuple[str, ...]:
     return ("mitsuba", "analytic")
 
 
+def engine_notice(name: str) -> str | None:
+    """What the user should know before the engine starts, in one line: that it will be slow, and why.
+
+    Raises:
+        ValueError: the engine's packages are missing.
+    """
+    if name != "mitsuba":
+        return None
+    from render.mitsuba_engine.variant import probe_variant
+
+    variant = probe_variant()
+    return None if variant.library is not None else f"engine mitsuba runs as {variant.variant}: {variant.reason}"
+
+
 def load_engine(name: str) -> RenderEngine:
     """The engine named `name`, ready to render.
 

@@ -53,10 +53,14 @@ def render_frames(
     """
     from droguekit.batch.local import render_dataset
     from droguekit.batch.workers import default_workers
+    from render.engine import engine_notice
 
     chosen = default_workers() if workers is None else workers
     if chosen < 0:
         raise ValueError(f"workers: must not be negative, got {chosen}")
+    notice = engine_notice(recipe.render.engine)
+    if notice is not None:
+        report.say(notice)
     return render_dataset(recipe, text, out, frames, chosen, report)
 
 

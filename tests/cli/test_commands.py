@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -89,3 +92,13 @@ def test_demo_goes_from_a_recipe_to_a_report_and_keeps_what_is_there(
     assert result["dataset"]["sha256"] == read_manifest(smoke_dataset).dataset_sha256
     assert set(result["methods"]) == set(method_names())
     assert "<svg" in (out / "report.html").read_text()
+
+
+@pytest.mark.mitsuba
+def test_the_slow_variant_is_announced(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "droguekit.cli.main", "render", "smoke", "--out", str(tmp_path / "out")]
+    # A library that is not there leaves the scalar variant.
+    environment = {**os.environ, "DRJIT_LIBLLVM_PATH": "/nonexistent/libLLVM.so"}
+    done = subprocess.run([*command, "--frames", "0:1"], env=environment, capture_output=True, text=True, check=True)
+    assert "engine mitsuba runs as scalar_rgb" in done.stdout + done.stderr
+    assert (tmp_path / "out" / "frames" / "000000" / "record.json").is_file()

@@ -114,7 +114,7 @@ def make_record(recipe: Recipe, frame_index: int, empty: bool = False) -> PairRe
             monte_carlo_noise_fraction=0.01,
         ),
         engine="mitsuba",
-        engine_version="3",
+        engine_version="mitsuba 3",
         image_black_level_dn=4.0,
         file_sha256={},
         frame=frame,
