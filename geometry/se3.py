@@ -145,8 +145,10 @@ def angles_from_axis(axis: ArrayLike) -> tuple[Array, Array]:
 
     Source: the seed paper's eqs. 10 and 11 in arctangent form.
     """
-    n = np.asarray(axis, dtype=np.float64)
-    return np.arctan2(-n[..., 1], np.hypot(n[..., 0], n[..., 2])), np.arctan2(n[..., 0], n[..., 2])
+    # On strided input, numpy's arctangent takes one of two ways, by where memory happens to lie, and they differ in the
+    # last bit; a copy is not strided.
+    x, y, z = np.moveaxis(np.asarray(axis, dtype=np.float64), -1, 0).copy()
+    return np.arctan2(-y, np.hypot(x, z)), np.arctan2(x, z)
 
 
 def skew(vectors: ArrayLike) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -20,8 +19,6 @@ EXAMPLES = (
     "droguekit bars speed --out /tmp/speed",
 )
 _IMAGE_TIERS = ("a", "b")
-# Timing and draws alike are per thread; more threads only fight over small matrices.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def bars(
@@ -54,8 +51,6 @@ def bars(
         raise ValueError("--pairs-per-station: is for tiers a and b; the others take --draws")
     if draws is not None and draws < 2:
         raise ValueError(f"--draws: must be at least 2, got {draws}")
-    for name in _THREADS:
-        os.environ.setdefault(name, "1")
     table = run_bars(BarsOrder(tier, seed, pairs_per_station, draws, workers), out, progress_report())
     for line in table.to_lines():
         typer.echo(line)
