@@ -27,6 +27,8 @@ from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.interface import Detector
 from nav.pose.interface import OUTER_EDGE, NoFixReason, Observation
 from nav.pose.registry import pose_method
+from nav.pose.tolerances import EXACT, StatedTolerances
+from nav.real_eyes import ideal_centroids, real_observation_px
 from nav.refinement import refine
 
 Box = tuple[float, float, float, float]
@@ -62,8 +64,10 @@ class Navigator:
         drogue: DrogueParameters,
         detector: Detector | None = None,
         centroids: CentroidChoice = "own",
+        tolerances: StatedTolerances = EXACT,
     ) -> None:
         self._centroids = centroids
+        self._tolerances = tolerances
         self._rig = rig
         self._layout = marker_layout(drogue)
         self._color = marker_color(drogue)
@@ -96,11 +100,17 @@ class Navigator:
         """Binary centroids within the boxes, matched."""
         start = perf_counter()
         left, right = (
-            binary_centroids(marker_channel(images, eye, self._color, others_weight), box, self._layout)
+            ideal_centroids(
+                binary_centroids(marker_channel(images, eye, self._color, others_weight), box, self._layout),
+                self._rig,
+                eye,
+            )
             for eye, box in zip(EYES, boxes, strict=True)
         )
         measured = perf_counter()
         observation = correspond(left, right, self._rig, self._layout)
+        if isinstance(observation, Observation):
+            observation = replace(observation, tolerances=self._tolerances)
         stage_s = {"centroids": measured - start, "correspond": perf_counter() - measured}
         return Sighting(observation, stage_s, others_weight)
 
@@ -170,15 +180,16 @@ def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate
 def _features(
     observation: Observation, used: NDArray[np.bool_], used_hub: NDArray[np.bool_] | None
 ) -> tuple[Feature, ...]:
-    """Markers of both eyes, then the hub's outer edge."""
+    """Markers of both eyes, then the hub's outer edge, where the images show them."""
     features = []
-    assert observation.hub_px is not None and observation.hub_cov_px2 is not None
+    assert observation.hub_cov_px2 is not None
+    markers_px, hub_px = real_observation_px(observation)
     for eye in range(len(EYES)):
         for index in np.flatnonzero(observation.seen[eye]):
-            place = observation.pixels_px[eye, index], observation.cov_px2[eye, index]
+            place = markers_px[eye, index], observation.cov_px2[eye, index]
             features.append(_feature(EYES[eye], int(index), place, bool(used[eye, index])))
         if observation.hub_seen[eye, OUTER_EDGE]:
-            place = observation.hub_px[eye, OUTER_EDGE], observation.hub_cov_px2[eye, OUTER_EDGE]
+            place = hub_px[eye, OUTER_EDGE], observation.hub_cov_px2[eye, OUTER_EDGE]
             hub_used = used_hub is not None and bool(used_hub[eye, OUTER_EDGE])
             features.append(_feature(EYES[eye], "hub", place, hub_used))
     return tuple(features)

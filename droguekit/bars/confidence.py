@@ -51,15 +51,17 @@ def percentile_limit(values: ArrayLike, percent: float) -> Limited:
     return float(np.percentile(ordered, percent)), float(ordered[min(rank, ordered.size - 1)])
 
 
-def ratio_limit(above: tuple[float, float, int], below: tuple[float, float, int]) -> Limited:
-    """Ratio of two positive means, each given as mean, standard deviation and number of values.
+def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> Limited:
+    """Ratio of two positive means over the same frames, by Student's law of its logarithm to first order.
 
-    By the first-order law of the ratio's logarithm, as if the two were independent: on the same draws, whose errors go
-    together, the limit is on the safe side.
+    Args:
+        above, below: sums over the same independent blocks of frames, two or more.
     """
-    ratio = above[0] / below[0]
-    variance = sum((spread / mean) ** 2 / count for mean, spread, count in (above, below))
-    return ratio, ratio * float(np.exp(norm.ppf(CONFIDENCE) * np.sqrt(variance)))
+    first, second = (np.asarray(values, dtype=np.float64) for values in (above, below))
+    ratio, blocks = float(first.sum() / second.sum()), len(first)
+    shares = blocks * (first / first.sum() - second / second.sum())
+    error = shares.std(ddof=1) / np.sqrt(blocks)
+    return ratio, ratio * float(np.exp(t.ppf(CONFIDENCE, blocks - 1) * error))
 
 
 def rms_ratio_limit(above: tuple[float, int], below: tuple[float, int]) -> Limited:
@@ -67,6 +69,20 @@ def rms_ratio_limit(above: tuple[float, int], below: tuple[float, int]) -> Limit
     ratio = above[0] / below[0]
     variance = sum(1 / (2 * count) for _, count in (above, below))
     return ratio, ratio * float(np.exp(norm.ppf(CONFIDENCE) * np.sqrt(variance)))
+
+
+def paired_rms_ratio_limit(above: float, below: float, correlation: float, count: int) -> Limited:
+    """Ratio of root mean squares of two normal errors in the same frames.
+
+    The logarithms of two such root mean squares have a difference of variance `(1 - correlation^2) / count`.
+
+    Args:
+        above, below: the root mean squares.
+        correlation: of the errors, about zero.
+        count: of frames.
+    """
+    ratio = above / below
+    return ratio, ratio * float(np.exp(norm.ppf(CONFIDENCE) * np.sqrt(max(0.0, 1 - correlation**2) / count)))
 
 
 def nees_limits(per_freedom: float, freedom: int) -> tuple[float, float, float]:

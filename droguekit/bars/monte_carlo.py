@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -13,15 +13,19 @@ from drogue_models.presets import load_drogue
 from droguekit.bars.batch_scores import bound_deviations, flipped, pose_errors, sight_tilts, squared_errors
 from droguekit.bars.corruption import CLEAN, Corruption, draw_shifts
 from droguekit.bars.drawn_poses import Poses, cell_generator, draw_poses, ellipse_centers_px
+from droguekit.bars.one_thread import one_thread
 from droguekit.bars.solvers import Measured, Solved, solve
 from droguekit.bars.tolerances import AS_BUILT, Tolerances, draw_features
 from droguekit.benchmark.bounds import feature_points
 from droguekit.benchmark.closed_forms import FacingRing
 from geometry.se3 import Array
 from geometry.stereo import paper_rig
+from nav.pose.tolerances import EXACT, StatedTolerances
 
 # Noise of an evenly lit hub's centre over that of a marker's: between 1.3 and 1.5 on rendered frames.
 HUB_NOISE_FACTOR = 1.5
+# Enough for a variance good to 16 %, which shifts a 95 % limit by little.
+BLOCKS = 40
 # Above so many deviations of the flip law a tilt has a sign.
 CLEAR_TILT_SCALES = 3.0
 
@@ -37,7 +41,7 @@ class Cell:
         sigma_px: noise of the markers' centres.
         draws: how many frames.
         corruption, tolerances: what is wrong with centroids, drogue and cameras.
-        ring_tolerance_m: of the ring's radius, as the method is told.
+        stated: tolerances as the method is told.
         seed: of the draws.
     """
 
@@ -49,7 +53,7 @@ class Cell:
     seed: int
     corruption: Corruption = CLEAN
     tolerances: Tolerances = field(default=AS_BUILT)
-    ring_tolerance_m: float = 0.0
+    stated: StatedTolerances = EXACT
 
     @property
     def stream(self) -> str:
@@ -57,18 +61,33 @@ class Cell:
         return f"{self.distance_m[0]:g}-{self.distance_m[1]:g} m, {self.draws} draws"
 
 
+class DepthRival(BaseModel):
+    """Another way to the depth, on the same draws.
+
+    Attributes:
+        z_rms_m: of its errors. [m]
+        correlation: of its errors with those of the cell's method, about zero.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    z_rms_m: float
+    correlation: float
+
+
 class CellResult(BaseModel):
     """What came out of a cell.
 
     Attributes:
         n, fixes: frames, and those with a pose.
-        position_mean_m, position_sd_m: lengths of the position errors. [m]
+        position_sums_m: lengths of the position errors, summed over consecutive blocks of draws. [m]
         z_rms_m: [m]
         nrms: root mean square of X, Y, Z, pitch and yaw errors, each over the bound of its frame.
         clear_n, clear_nrms: the same of pitch and yaw where the true tilt is clear of the flip law.
         nees_n, nees: frames with a covariance, and mean normalised square error over its five degrees of freedom.
         flips, flip_law: mirrored tilts, and their share by the law.
-        stereo_z_rms_m: error of the mean of the triangulated markers. [m]
+        stereo: the mean of the triangulated markers.
+        untold: the same method, told of no tolerances; None where it was told of none anyway.
 
     A frame without a pose counts with the standard deviation of the drawn poses.
     """
@@ -77,8 +96,7 @@ class CellResult(BaseModel):
 
     n: int
     fixes: int
-    position_mean_m: float
-    position_sd_m: float
+    position_sums_m: tuple[float, ...]
     z_rms_m: float
     nrms: tuple[float, float, float, float, float]
     clear_n: int
@@ -87,15 +105,26 @@ class CellResult(BaseModel):
     nees: float | None
     flips: int
     flip_law: float
-    stereo_z_rms_m: float
+    stereo: DepthRival
+    untold: DepthRival | None
+
+    @property
+    def position_mean_m(self) -> float:
+        """Mean position error. [m]"""
+        return sum(self.position_sums_m) / self.n
 
 
 def run_cell(cell: Cell) -> CellResult:
-    """Draw, measure, solve and score one cell.
+    """Draw, measure, solve and score one cell, the same to the last bit every time.
 
     Raises:
         ValueError: a method that does not exist, or a distance at which the drogue is not in view.
     """
+    with one_thread():
+        return _result(cell)
+
+
+def _result(cell: Cell) -> CellResult:
     rig, drogue = paper_rig(), load_drogue(f"red-{cell.markers}")
     layout = marker_layout(drogue)
     poses = draw_poses(
@@ -114,12 +143,16 @@ def run_cell(cell: Cell) -> CellResult:
     mirrored = flipped(sight_tilts(rig, solved.best, poses), tilts) & solved.fixed
     squares = _squares(solved, errors)
     position = np.linalg.norm(errors[:, :3], axis=1)
+    depth = poses.translations_m[:, 2]
     stereo_m = rig.triangulate(measured.markers_px[:, 0], measured.markers_px[:, 1])[..., 2].mean(axis=1)
+    untold = None
+    if cell.stated != EXACT:
+        plain = solve(cell.method, replace(measured, tolerances=EXACT))
+        untold = _rival(plain.poses.translations_m[:, 2] - depth, errors[:, 2])
     return CellResult(
         n=cell.draws,
         fixes=int(solved.fixed.sum()),
-        position_mean_m=float(position.mean()),
-        position_sd_m=float(position.std()),
+        position_sums_m=tuple(float(part.sum()) for part in np.array_split(position, min(BLOCKS, cell.draws))),
         z_rms_m=_rms(errors[:, 2]),
         nrms=(_rms(ratios[:, 0]), _rms(ratios[:, 1]), _rms(ratios[:, 2]), _rms(ratios[:, 3]), _rms(ratios[:, 4])),
         clear_n=int(clear.sum()),
@@ -128,7 +161,8 @@ def run_cell(cell: Cell) -> CellResult:
         nees=float(squares.mean()) / 5 if len(squares) else None,
         flips=int(mirrored.sum()),
         flip_law=float(norm.sf(sizes).mean()),
-        stereo_z_rms_m=_rms(np.nan_to_num(stereo_m, nan=0.0) - poses.translations_m[:, 2]),
+        stereo=_rival(np.nan_to_num(stereo_m, nan=0.0) - depth, errors[:, 2]),
+        untold=untold,
     )
 
 
@@ -150,7 +184,7 @@ def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> Measured:
         hub_px=exact[:, :, count] + hub_sigma_px * noise[:, :, count] if cell.method == "joint-hub" else None,
         sigma_px=cell.sigma_px,
         hub_sigma_px=hub_sigma_px,
-        ring_tolerance_m=cell.ring_tolerance_m,
+        tolerances=cell.stated,
     )
 
 
@@ -162,6 +196,11 @@ def _tilt_scales(layout: MarkerLayout, cell: Cell, poses: Poses) -> Array:
     sight = poses.translations_m - np.array([rig.baseline_m / 2, 0.0, 0.0])
     scales: Array = cell.sigma_px * one * (sight**2).sum(axis=1)
     return scales
+
+
+def _rival(others: Array, own: Array) -> DepthRival:
+    z_rms_m = _rms(others)
+    return DepthRival(z_rms_m=z_rms_m, correlation=float(np.mean(others * own)) / (z_rms_m * _rms(own)))
 
 
 def _squares(solved: Solved, errors: Array) -> Array:

@@ -9,6 +9,8 @@ MARKER_COUNTS = (5, 7, 8)
 DOCKING_RANGE_M = (1.7, 10.0)
 # Draws of a cell for methods that are solved in batches, and for those that are not.
 BATCHED_DRAWS = 10_000
-SINGLE_DRAWS = 400
-# The order of 5, 7 and 8 markers differs by some percent in the mean: so many draws tell it.
-ORDER_DRAWS = 4000
+SINGLE_DRAWS = 1000
+# The order of 5, 7 and 8 markers differs by two percent in the mean at least: so many draws tell it.
+ORDER_DRAWS = 16_000
+# By ten and more for the robust method, which takes longer.
+ROBUST_ORDER_DRAWS = 2000

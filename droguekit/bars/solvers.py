@@ -15,6 +15,7 @@ from nav.pose.batched import solve_from, solve_joint_batch
 from nav.pose.features import Features, stack_features
 from nav.pose.interface import NoFixReason, Observation
 from nav.pose.registry import pose_method
+from nav.pose.tolerances import EXACT, StatedTolerances
 from nav.pose.two_fold_start import two_fold_start
 
 BATCHED = ("joint", "joint-hub")
@@ -31,7 +32,7 @@ class Measured:
         markers_px: (n, 2, N, 2).
         hub_px: (n, 2, 2) centres of the hub's outer edge, or None where no hub is measured.
         sigma_px, hub_sigma_px: standard deviations that the estimator is told.
-        ring_tolerance_m: as the estimator is told, 0 for a ring exactly as built.
+        tolerances: as the estimator is told.
     """
 
     rig: StereoRig
@@ -40,7 +41,7 @@ class Measured:
     hub_px: Array | None
     sigma_px: float
     hub_sigma_px: float
-    ring_tolerance_m: float = 0.0
+    tolerances: StatedTolerances = EXACT
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ def observations(measured: Measured) -> list[Observation]:
             cov,
             None if hub is None else hub[index],
             hub_cov,
-            measured.ring_tolerance_m,
+            measured.tolerances,
         )
         for index, pixels in enumerate(measured.markers_px)
     ]
@@ -105,8 +106,8 @@ def _batched(method: str, measured: Measured) -> Solved:
     if method == "joint-hub":
         hub, hub_cov = hub_edges(measured)
         pixels, cov = np.concatenate([pixels, hub], axis=2), np.concatenate([cov, hub_cov], axis=1)
-    found = solve_joint_batch(measured.rig, measured.layout, pixels, cov, measured.ring_tolerance_m)
-    features = stack_features(measured.rig, measured.layout, pixels, cov, measured.ring_tolerance_m)
+    found = solve_joint_batch(measured.rig, measured.layout, pixels, cov, measured.tolerances)
+    features = stack_features(measured.rig, measured.layout, pixels, cov, measured.tolerances)
     return Solved(Poses(found.rotations, found.translations_m), _best(features), found.covariances, found.sound)
 
 

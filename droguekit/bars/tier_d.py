@@ -7,10 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from droguekit.bars.cell_store import run_cells
-from droguekit.bars.confidence import Limited, ratio_limit
+from droguekit.bars.confidence import Limited, paired_ratio_limit
 from droguekit.bars.corruption import CLEAN, Corruption
 from droguekit.bars.monte_carlo import Cell, CellResult
-from droguekit.bars.protocol import DOCKING_RANGE_M, MARKER_COUNTS, ORDER_DRAWS, SIGMAS_PX, SINGLE_DRAWS
+from droguekit.bars.protocol import (
+    DOCKING_RANGE_M,
+    MARKER_COUNTS,
+    ORDER_DRAWS,
+    ROBUST_ORDER_DRAWS,
+    SIGMAS_PX,
+    SINGLE_DRAWS,
+)
 from droguekit.bars.reporter import Reporter
 from droguekit.bars.table import BarRow, at_most, worst
 
@@ -33,13 +40,13 @@ def bars_tier_d(out: Path, seed: int, draws: int | None, report: Reporter) -> li
 
     Arguments and errors as `tier_c.bars_tier_c`.
     """
-    single, order = (SINGLE_DRAWS, ORDER_DRAWS) if draws is None else (draws, draws)
 
     def robust(method: str, markers: int, sigma_px: float, corruption: Corruption) -> Cell:
-        return Cell(method, markers, DOCKING_RANGE_M, sigma_px, single, seed, corruption)
+        return Cell(method, markers, DOCKING_RANGE_M, sigma_px, draws or SINGLE_DRAWS, seed, corruption)
 
     def ordered(method: str, markers: int, sigma_px: float, corruption: Corruption) -> Cell:
-        return replace(robust(method, markers, sigma_px, corruption), draws=order)
+        many = ROBUST_ORDER_DRAWS if method == "joint-robust" else ORDER_DRAWS
+        return replace(robust(method, markers, sigma_px, corruption), draws=draws or many)
 
     planned = [
         robust("joint-robust", markers, _SIGMA_PX, corruption)
@@ -47,7 +54,7 @@ def bars_tier_d(out: Path, seed: int, draws: int | None, report: Reporter) -> li
         for corruption in (CLEAN, *_BAD[1], *(_BAD[2] if markers > 5 else ()))
     ]
     planned += [ordered("paper", markers, sigma, _ONE_EYE) for sigma in _ORDER_SIGMAS_PX for markers in MARKER_COUNTS]
-    planned += [robust("joint-robust", markers, sigma, _ONE_EYE) for sigma in SIGMAS_PX for markers in MARKER_COUNTS]
+    planned += [ordered("joint-robust", markers, sigma, _ONE_EYE) for sigma in SIGMAS_PX for markers in MARKER_COUNTS]
     planned += [ordered("paper-literal", 8, sigma, _ONE_EYE) for sigma in _ORDER_SIGMAS_PX]
     results = run_cells(planned, out, report)
     return [
@@ -55,7 +62,7 @@ def bars_tier_d(out: Path, seed: int, draws: int | None, report: Reporter) -> li
         _against_clean((7, 8), 2, 1.5, robust, results),
         _against_clean((5,), 1, 1.5, robust, results),
         _order("paper", _ORDER_SIGMAS_PX, ordered, results),
-        _order("joint-robust", SIGMAS_PX, robust, results),
+        _order("joint-robust", SIGMAS_PX, ordered, results),
         _literal(ordered, results),
     ]
 
@@ -101,9 +108,8 @@ def _literal(cell: CellMaker, results: Results) -> BarRow:
 
 
 def mean_ratio(above: CellResult, below: CellResult) -> Limited:
-    """Ratio of mean position errors, with its upper limit."""
-    first, second = ((r.position_mean_m, r.position_sd_m, r.n) for r in (above, below))
-    return ratio_limit(first, second)
+    """Ratio of mean position errors in the same poses, with its upper limit."""
+    return paired_ratio_limit(above.position_sums_m, below.position_sums_m)
 
 
 def _n(results: Results) -> int:

@@ -1,4 +1,4 @@
-"""Drogues and cameras that are not exactly as built; the estimator knows the nominal ones."""
+"""Drogues and cameras that are not exactly as built; the estimator knows the nominal ones, and what is stated."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 from drogue_models.marker_layout import MarkerLayout
 from droguekit.bars.drawn_poses import RightEyeErrors
 from geometry.se3 import Array
+from geometry.stereo import StereoRig
+from nav.pose.tolerances import StatedTolerances
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,18 @@ class Tolerances:
 AS_BUILT = Tolerances()
 RING_ONLY = Tolerances(ring_radius_m=0.5e-3)
 TOLERANCED = Tolerances(0.5e-3, 0.3e-3, 0.002, 1e-3, 0.005, 0.05)
+
+
+def stated_tolerances(tolerances: Tolerances, rig: StereoRig) -> StatedTolerances:
+    """The same, as a user would state it to an estimator."""
+    yaw_px = rig.camera.fx_px * float(np.radians(tolerances.right_yaw_deg))
+    return StatedTolerances(
+        ring_radius_m=tolerances.ring_radius_m,
+        ellipticity=tolerances.ellipticity,
+        placement_m=tolerances.placement_m,
+        hub_lateral_m=tolerances.hub_lateral_m,
+        disparity_px=float(np.hypot(yaw_px, tolerances.right_cx_px)),
+    )
 
 
 @dataclass(frozen=True, eq=False)

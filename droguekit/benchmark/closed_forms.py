@@ -78,17 +78,23 @@ class FacingRing:
         shift = math.sqrt((noise_factor**2 + 1 / self.count) / 2)
         return self.distance_m / (self.focal_px * depth_m) * shift
 
-    def toleranced_depth_m(self, sigma_px: float, scale_sd: float) -> float:
-        """Depth where the ring's size is known only within a tolerance: stereo and size, each with its own weight. [m]
+    def toleranced_depth_m(
+        self, sigma_px: float, scale_sd: float, disparity_sd_px: float = 0.0, placement_sd_m: float = 0.0
+    ) -> float:
+        """Depth where drogue and rig are known within tolerances: stereo and size, each with its own weight. [m]
 
         Not proportional to the noise, and so not per pixel.
 
         Args:
             sigma_px: centroid noise, above zero. [px]
             scale_sd: standard deviation of the ring's radius over the radius.
+            disparity_sd_px: of the disparity that all markers share. [px]
+            placement_sd_m: of every marker along the ring's radius, which both eyes see alike. [m]
         """
-        by_stereo = sigma_px * self.stereo_depth_m
-        by_size = math.hypot(sigma_px * self.size_depth_m, self.distance_m * scale_sd)
+        by_disparity = self.distance_m**2 / (self.focal_px * self.baseline_m) * disparity_sd_px
+        by_stereo = math.hypot(sigma_px * self.stereo_depth_m, by_disparity)
+        mean_radius = placement_sd_m / (self.ring_radius_m * math.sqrt(self.count))
+        by_size = math.hypot(sigma_px * self.size_depth_m, self.distance_m * math.hypot(scale_sd, mean_radius))
         return 1 / math.hypot(1 / by_stereo, 1 / by_size)
 
 

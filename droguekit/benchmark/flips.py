@@ -53,8 +53,8 @@ def flip_trials(
         covariance: (6, 6) Cramer-Rao bound of the pose. [m, rad]
         tilt_scale_rad: of the flip law (`ring_tilt_scale`), None where the law does not hold. [rad]
     """
-    between_eyes = truth.left_from_drogue.translation_m - np.array([truth.rig.baseline_m / 2, 0.0, 0.0])
-    sight = between_eyes / np.linalg.norm(between_eyes)
+    sight = _sight_m(truth)
+    sight = sight / np.linalg.norm(sight)
     optical, along = (
         _trial(estimate, truth.left_from_drogue, covariance, direction, tilt_scale_rad)
         for direction in (_OPTICAL_AXIS, sight)
@@ -64,6 +64,8 @@ def flip_trials(
 
 def ring_tilt_scale(truth: DrogueTruth, centroids: CentroidErrors, sigma_px: float) -> float | None:
     """Scale of the flip law for the markers that a pose rests on, None where it rests on more or less than a ring.
+
+    With the distance along the line of sight, about which a tilt is mirrored, in place of the depth.
 
     Args:
         truth: the drogue.
@@ -76,7 +78,8 @@ def ring_tilt_scale(truth: DrogueTruth, centroids: CentroidErrors, sigma_px: flo
         return None
     camera = truth.rig.camera
     focal_px = float(np.sqrt(camera.fx_px * camera.fy_px))
-    ring = FacingRing(focal_px, truth.rig.baseline_m, layout.ring_radius_m, round(float(both.mean())), truth.distance_m)
+    distance_m = float(np.linalg.norm(_sight_m(truth)))
+    ring = FacingRing(focal_px, truth.rig.baseline_m, layout.ring_radius_m, round(float(both.mean())), distance_m)
     return sigma_px * ring.tilt_rad
 
 
@@ -91,6 +94,12 @@ def flip_row(trials: Sequence[FlipTrial]) -> Flips:
         interval=fraction_interval(hits, count) if count else None,
         predicted=float(np.mean(predicted)) if count and len(predicted) == count else None,
     )
+
+
+def _sight_m(truth: DrogueTruth) -> Array:
+    """(3,) from the middle of the eyes to the drogue."""
+    sight: Array = truth.left_from_drogue.translation_m - np.array([truth.rig.baseline_m / 2, 0.0, 0.0])
+    return sight
 
 
 def _trial(

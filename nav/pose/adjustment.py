@@ -17,7 +17,7 @@ _ITERATIONS = 20
 _DAMPING_FRACTION = 1e-9
 _LARGEST_TURN_RAD = 0.35
 _LARGEST_MOVE_FRACTION = 0.3
-_LARGEST_RESCALE = 0.1
+_LARGEST_DEPARTURE_SIGMAS = 10.0
 # The last step would lower the cost by less, so it moves no parameter by more than 5e-5 deviations, and is still taken.
 _CONVERGED = 1e-9
 # A start whose steps had to be shortened to this share is stuck at its minimum's rounding.
@@ -33,14 +33,14 @@ class Adjusted:
     Attributes:
         rotations: (S, 3, 3) `left_from_drogue`.
         translations_m: (S, 3).
-        scales: (S,) radius of the ring over that of the layout.
+        departures: (S, G) from the nominal drogue and rig, see `State`.
         costs: (S,) half the sum of squared whitened residuals, with priors.
-        information: (S, K, K) in the tangent of `datasets_manifest.estimates`, and the ring's scale where it is free.
+        information: (S, K, K) in the tangent of `datasets_manifest.estimates`, and the departures.
     """
 
     rotations: Array
     translations_m: Array
-    scales: Array
+    departures: Array
     costs: Array
     information: Array
 
@@ -57,10 +57,14 @@ def adjust(features: Features, rotations: Array, translations_m: Array, loss: Lo
         loss: how residuals count.
     """
     count = len(rotations)
-    state = State(rotations.copy(), translations_m.copy(), np.ones(count))
-    size = 7 if features.ring_sigma > 0 else 6
+    state = State.nominal(features, rotations.copy(), translations_m.copy())
+    size = 6 + features.departures
     result = Adjusted(
-        rotations.copy(), translations_m.copy(), np.ones(count), np.empty(count), np.empty((count, size, size))
+        rotations.copy(),
+        translations_m.copy(),
+        np.zeros_like(state.departures),
+        np.empty(count),
+        np.empty((count, size, size)),
     )
     now = linearise(features, state, loss)
     active, reach = np.arange(count), np.ones(count)
@@ -80,7 +84,7 @@ def adjust(features: Features, rotations: Array, translations_m: Array, loss: Lo
             left = ~done
             active, reach, done = active[left], reach[left], done[left]
             features = features.take(np.flatnonzero(left))
-            state = State(state.rotations[left], state.translations_m[left], state.scales[left])
+            state = State(state.rotations[left], state.translations_m[left], state.departures[left])
             now = Linearised(now.jacobian[left], now.residuals[left], now.costs[left])
     _store(result, active, state, now, np.ones(len(active), dtype=bool))
     return result
@@ -88,14 +92,14 @@ def adjust(features: Features, rotations: Array, translations_m: Array, loss: Lo
 
 def information_at(features: Features, rotations: Array, translations_m: Array) -> Array:
     """(S, K, K) information that the features of S frames hold in given poses; see `Adjusted`."""
-    return linearise(features, State(rotations, translations_m, np.ones(len(rotations)))).information
+    return linearise(features, State.nominal(features, rotations, translations_m)).information
 
 
 def inverse_information(information: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Covariances of the pose.
 
     Args:
-        information: (S, K, K), K = 6 or 7; whatever follows the pose is marginalised.
+        information: (S, K, K), K = 6 or more; whatever follows the pose is marginalised.
 
     Returns:
         (S, 6, 6) covariances, (S,) whether the measurements determine the whole pose; the covariance of others is zero.
@@ -129,14 +133,13 @@ def _steps(now: Linearised, state: State) -> tuple[Array, Array]:
     turn = np.sqrt((steps[:, 3:6] ** 2).sum(axis=1)) / _LARGEST_TURN_RAD
     steps[:, :3] /= np.maximum(1.0, move)[:, None]
     steps[:, 3:6] /= np.maximum(1.0, turn)[:, None]
-    np.clip(steps[:, 6:], -_LARGEST_RESCALE, _LARGEST_RESCALE, out=steps[:, 6:])
+    np.clip(steps[:, 6:], -_LARGEST_DEPARTURE_SIGMAS, _LARGEST_DEPARTURE_SIGMAS, out=steps[:, 6:])
     return steps, gain
 
 
 def _moved(state: State, steps: Array) -> State:
     rotations = Rotation.from_rotvec(steps[:, 3:6]).as_matrix() @ state.rotations
-    scales = state.scales + steps[:, 6] if steps.shape[1] > 6 else state.scales
-    return State(rotations, state.translations_m + steps[:, :3], scales)
+    return State(rotations, state.translations_m + steps[:, :3], state.departures + steps[:, 6:])
 
 
 def _chosen(better: NDArray[np.bool_], trial: State, state: State) -> State:
@@ -145,7 +148,7 @@ def _chosen(better: NDArray[np.bool_], trial: State, state: State) -> State:
     return State(
         np.where(better[:, None, None], trial.rotations, state.rotations),
         np.where(better[:, None], trial.translations_m, state.translations_m),
-        np.where(better, trial.scales, state.scales),
+        np.where(better[:, None], trial.departures, state.departures),
     )
 
 
@@ -161,5 +164,5 @@ def _kept(better: NDArray[np.bool_], ahead: Linearised, now: Linearised) -> Line
 
 def _store(result: Adjusted, where: NDArray[np.int64], state: State, now: Linearised, which: NDArray[np.bool_]) -> None:
     result.rotations[where], result.translations_m[where] = state.rotations[which], state.translations_m[which]
-    result.scales[where], result.costs[where] = state.scales[which], now.costs[which]
+    result.departures[where], result.costs[where] = state.departures[which], now.costs[which]
     result.information[where] = now.information[which]

@@ -18,6 +18,7 @@ from geometry.stereo import StereoRig
 from nav.pose.adjustment import Adjusted, adjust, information_at, inverse_information
 from nav.pose.features import Features, stack_features
 from nav.pose.reprojection import SQUARES, Loss
+from nav.pose.tolerances import EXACT, StatedTolerances
 from nav.pose.two_fold_start import sight_rotations, two_fold_start
 
 # Standard deviation of pitch and of yaw, of drogues that swing within 10 degrees uniformly: 5.8 degrees.
@@ -59,7 +60,7 @@ class JointBatch:
 
 
 def solve_joint_batch(
-    rig: StereoRig, layout: MarkerLayout, pixels_px: Array, cov_px2: Array, ring_tolerance_m: float = 0.0
+    rig: StereoRig, layout: MarkerLayout, pixels_px: Array, cov_px2: Array, tolerances: StatedTolerances = EXACT
 ) -> JointBatch:
     """Methods `joint` and, with the hub's edges among the pixels, `joint-hub`, for many frames of one drogue.
 
@@ -69,12 +70,12 @@ def solve_joint_batch(
         pixels_px: (B, E, F, 2) measured ellipse centres, nan where there is none; E = 1 (left eye) or 2, F = N markers,
             or N + 2 with the hub's inner and outer edge.
         cov_px2: (B, E, F, 2, 2) their covariances, or what broadcasts to it.
-        ring_tolerance_m: standard deviation of the ring's radius about the layout's, 0 for one exactly as built.
+        tolerances: of drogue and rig.
 
     Raises:
         ValueError: an array of another shape.
     """
-    return solve_features(stack_features(rig, layout, pixels_px, cov_px2, ring_tolerance_m))
+    return solve_features(stack_features(rig, layout, pixels_px, cov_px2, tolerances))
 
 
 def solve_features(features: Features) -> JointBatch:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
+from nav.pose.tolerances import EXACT, StatedTolerances
 
 # The hub annulus has an inner and an outer edge, in this order; each has its own ellipse centre.
 HUB_EDGES = 2
@@ -29,7 +30,7 @@ class Observation:
         hub_px: (2, 2, 2) ellipse centres of the hub's inner and outer edge in each eye, nan where not measured; None
             stands for no hub at all.
         hub_cov_px2: (2, 2, 2, 2) their covariances; None where `hub_px` is None.
-        ring_tolerance_m: standard deviation of the ring's radius about the layout's; 0 for a drogue exactly as built.
+        tolerances: how far drogue and rig may depart from `layout` and `rig`.
     """
 
     rig: StereoRig
@@ -38,7 +39,7 @@ class Observation:
     cov_px2: Array
     hub_px: Array | None = None
     hub_cov_px2: Array | None = None
-    ring_tolerance_m: float = 0.0
+    tolerances: StatedTolerances = EXACT
 
     def __post_init__(self) -> None:
         if (self.hub_px is None) != (self.hub_cov_px2 is None):
@@ -46,8 +47,6 @@ class Observation:
         if self.hub_px is None:
             object.__setattr__(self, "hub_px", np.full((2, HUB_EDGES, 2), np.nan))
             object.__setattr__(self, "hub_cov_px2", np.full((2, HUB_EDGES, 2, 2), np.nan))
-        if not (np.isfinite(self.ring_tolerance_m) and self.ring_tolerance_m >= 0):
-            raise ValueError(f"ring_tolerance_m: must be 0 or more, got {self.ring_tolerance_m}")
         count = self.layout.count
         for name, shape in (
             ("pixels_px", (2, count, 2)),

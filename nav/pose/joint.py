@@ -73,7 +73,7 @@ def _modes(batch: JointBatch) -> tuple[PoseMode, ...]:
 
 def misfit(features: Features, rotation: Array, translation_m: Array) -> NoFixReason | None:
     """Why one frame's features cannot be the drogue's in a pose, or None when they can."""
-    predicted = predicted_px(features, State(rotation[None], translation_m[None], np.ones(1)))
+    predicted = predicted_px(features, State.nominal(features, rotation[None], translation_m[None]))
     residual = np.linalg.norm(predicted - np.moveaxis(features.measured[:2], 0, -1), axis=-1)[features.seen]
     radius_px = features.camera.fx_px * features.radii_m[0] / translation_m[2]
     miss_px = float(np.sqrt(np.mean(residual**2)))

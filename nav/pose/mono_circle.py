@@ -94,7 +94,7 @@ def _across_only(observation: Observation, rotations: Array, translations_m: Arr
     wide = (_ALONG**2 * variance)[..., None, None] * tangent[..., :, None] * tangent[..., None, :]
     pixels = np.stack([observation.pixels_px[:1]] * 2)
     cov = observation.cov_px2[0] + wide
-    return stack_features(observation.rig, layout, pixels, cov[:, None], observation.ring_tolerance_m)
+    return stack_features(observation.rig, layout, pixels, cov[:, None], observation.tolerances)
 
 
 def _branch_costs(observation: Observation, adjusted: Adjusted) -> Array:
@@ -110,4 +110,4 @@ def _branch_costs(observation: Observation, adjusted: Adjusted) -> Array:
         pixels, cov = pixels[:count], cov[:count]
     both = np.stack([pixels[None]] * 2)
     features = stack_features(observation.rig, observation.layout, both, np.stack([cov[None]] * 2))
-    return linearise(features, State(adjusted.rotations, adjusted.translations_m, adjusted.scales)).costs
+    return linearise(features, State.nominal(features, adjusted.rotations, adjusted.translations_m)).costs

@@ -82,7 +82,7 @@ def _best_of(observation: Observation, poses: list[RigidTransform]) -> Solution 
     features = left_features(observation).take(np.zeros(len(poses), dtype=np.int64))
     rotations = np.stack([pose.rotation for pose in poses])
     translations = np.stack([pose.translation_m for pose in poses])
-    costs = linearise(features, State(rotations, translations, np.ones(len(poses)))).costs
+    costs = linearise(features, State.nominal(features, rotations, translations)).costs
     order = np.flatnonzero(np.isfinite(costs))
     order = order[np.argsort(costs[order], kind="stable")]
     if not len(order):

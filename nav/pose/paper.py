@@ -1,8 +1,8 @@
 """Method `paper`: the seed paper's three-sphere pose, in the reading that works.
 
 Every three triangulated markers give a candidate for the drogue's origin; the candidate whose reprojection into both
-eyes fits all markers best is taken and shifted along its line of sight. Attitude: the plane through all markers.
-Source: the seed paper, section 3.3, eqs. 1-16; docs/paper.md lists what is corrected.
+eyes fits all markers best is taken. Attitude: the plane through all markers.
+Source: the seed paper, section 3.3, eqs. 1-13; docs/paper.md lists what is corrected, and why eqs. 14-16 are left out.
 """
 
 from __future__ import annotations
@@ -131,7 +131,16 @@ def reprojection_scores(observation: Observation, candidates: Candidates) -> Arr
 
 
 def paper(observation: Observation) -> Solution | NoFixReason:
-    """Pose by the three-sphere construction, visual reprojection and the Huber-weighted step in depth."""
+    """Pose by the three-sphere construction and visual reprojection."""
+    return _solve(observation, step_in_depth=False)
+
+
+def paper_with_step(observation: Observation) -> Solution | NoFixReason:
+    """As `paper`, with the place then moved along its line of sight; for comparison."""
+    return _solve(observation, step_in_depth=True)
+
+
+def _solve(observation: Observation, step_in_depth: bool) -> Solution | NoFixReason:
     reason = fault(observation)
     if reason is not None:
         return reason
@@ -139,11 +148,13 @@ def paper(observation: Observation) -> Solution | NoFixReason:
     if isinstance(candidates, NoFixReason):
         return candidates
     best = int(np.argmin(reprojection_scores(observation, candidates)))
-    start = RigidTransform(candidates.rotations[best], candidates.origins_m[best])
-    huber_px = huber_threshold_px(observation)
-    origin = _depth_steps(observation, candidates.layout, candidates.pixels_px, huber_px, start)
-    if not (np.isfinite(origin).all() and origin[2] > 0):
-        return NoFixReason("the step in depth left the space in front of the cameras")
+    origin = candidates.origins_m[best]
+    if step_in_depth:
+        start = RigidTransform(candidates.rotations[best], origin)
+        huber_px = huber_threshold_px(observation)
+        origin = _depth_steps(observation, candidates.layout, candidates.pixels_px, huber_px, start)
+        if not (np.isfinite(origin).all() and origin[2] > 0):
+            return NoFixReason("the step in depth left the space in front of the cameras")
     return Solution(candidates.pose_at(origin), used_pairs(observation))
 
 

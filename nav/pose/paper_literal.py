@@ -1,7 +1,7 @@
 """Method `paper-literal`: the seed paper's selection as printed, and other readings of it for comparison.
 
 Eq. 13 compares the rows of one reprojected point in both eyes. In a rectified rig they are equal for every point, so
-the printed score is zero for every candidate and chooses none; the step in depth (eq. 16) then moves nothing either.
+the printed score is zero for every candidate and chooses none; a step in depth (eq. 16) would then move nothing either.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SAME_SCORE_PX2 = 1e-18
 
 
 def paper_reading(e_v: RowReading) -> PoseMethod:
-    """The paper's method with a reading of its score, and without the step in depth.
+    """The paper's method with a reading of its score.
 
     Args:
         e_v: what the score compares.

@@ -17,12 +17,17 @@ class State:
     Attributes:
         rotations: (S, 3, 3) `left_from_drogue`.
         translations_m: (S, 3).
-        scales: (S,) radius of the ring over that of the layout.
+        departures: (S, G) from the nominal drogue and rig, in standard deviations, see `Features`.
     """
 
     rotations: Array
     translations_m: Array
-    scales: Array
+    departures: Array
+
+    @staticmethod
+    def nominal(features: Features, rotations: Array, translations_m: Array) -> State:
+        """Poses of a drogue and rig exactly as built."""
+        return State(rotations, translations_m, np.zeros((len(rotations), features.departures)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +52,7 @@ class Linearised:
 
     Attributes:
         jacobian: (S, K, M) derivatives of M weighted residuals with respect to translation [m], rotation vector [rad]
-            and, where the ring's radius is free, its scale: K = 6 or 7.
+            and the departures.
         residuals: (S, M), in standard deviations.
         costs: (S,) half the sum of squares, by Huber's loss where one is set; infinite where it is not a number.
     """
@@ -73,10 +78,9 @@ def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Lineari
         state: S poses.
         loss: how residuals count.
     """
-    count = len(state.scales)
-    size = 2 * features.measured.shape[2] * features.measured.shape[3]
-    with_tilt, with_ring = np.isfinite(loss.tilt_prior_rad), features.ring_sigma > 0
-    jacobian = np.zeros((count, 6 + with_ring, size + 2 * with_tilt + with_ring))
+    count, size = len(state.rotations), 2 * features.measured.shape[2] * features.measured.shape[3]
+    with_tilt, free = np.isfinite(loss.tilt_prior_rad), features.departures
+    jacobian = np.zeros((count, 6 + free, size + 2 * with_tilt + free))
     residuals = np.empty((count, jacobian.shape[2]))
     # A trial step may put a feature at a camera's own depth; its infinite cost turns the step down.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -90,9 +94,9 @@ def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Lineari
             residuals[:, size : size + 2] = axes[:, :2]
             jacobian[:, 4, size], jacobian[:, 5, size] = axes[:, 2], -axes[:, 1]
             jacobian[:, 3, size + 1], jacobian[:, 5, size + 1] = -axes[:, 2], axes[:, 0]
-        if with_ring:
-            residuals[:, -1] = (state.scales - 1) / features.ring_sigma
-            jacobian[:, 6, -1] = 1 / features.ring_sigma
+        if free:
+            residuals[:, -free:] = state.departures
+            jacobian[:, 6:, -free:] = np.eye(free)
         costs += (residuals[:, size:] ** 2).sum(axis=1) / 2
     return Linearised(jacobian, residuals, np.where(in_front & np.isfinite(costs), costs, np.inf))
 
@@ -113,6 +117,8 @@ def _fill_features(features: Features, state: State, jacobian: Array, residuals:
     arms, depth, x_z, y_z, z = _images(features, state)
     ax, ay, az = (arms[:, None, :, axis] for axis in range(3))
     off_u = camera.fx_px * x_z + camera.cx_px - u
+    if features.disparity_sigma_px > 0:
+        off_u[:, 1] += features.disparity_sigma_px * state.departures[:, -1:]
     off_v = camera.fy_px * y_z + camera.cy_px - v
     both = residuals.reshape(len(residuals), 2, *u.shape[1:])
     both[:, 0] = a * off_u
@@ -125,10 +131,18 @@ def _fill_features(features: Features, state: State, jacobian: Array, residuals:
     rows[:, 0, 1], rows[:, 1, 1], rows[:, 2, 1] = vx, vy, vz
     rows[:, 3, 0], rows[:, 4, 0], rows[:, 5, 0] = ay * uz, az * ux - ax * uz, -ay * ux
     rows[:, 3, 1], rows[:, 4, 1], rows[:, 5, 1] = ay * vz - az * vy, az * vx - ax * vz, ax * vy - ay * vx
-    if features.ring_sigma > 0:
-        share = features.ring / state.scales[:, None, None]
-        rows[:, 6, 0] = share * (ax * ux + az * uz)
-        rows[:, 6, 1] = share * (ax * vx + ay * vy + az * vz)
+    if len(features.shifts_m):
+        turned = features.shifts_m @ np.swapaxes(state.rotations, 1, 2)[:, None]
+        sx, sy, sz = (turned[:, :, None, :, axis] for axis in range(3))
+        shifted = rows[:, 6 : 6 + len(features.shifts_m)]
+        shifted[:, :, 0] = sx * ux[:, None] + sz * uz[:, None]
+        shifted[:, :, 1] = sx * vx[:, None] + sy * vy[:, None] + sz * vz[:, None]
+    if features.disparity_sigma_px > 0:
+        rows[:, -1, 0, 1] = features.disparity_sigma_px * a[:, 1]
+        rows[:, -1, 1, 1] = features.disparity_sigma_px * b[:, 1]
+    if features.coupling is not None and len(features.eye_x_m) > 1:
+        _couple(both, features.coupling)
+        _couple(rows, features.coupling[:, :, None])
     in_front: Array = (depth > 0).all(axis=(1, 2))
     return in_front
 
@@ -140,9 +154,11 @@ def _images(features: Features, state: State) -> tuple[Array, Array, Array, Arra
         arms (S, F, 3) from the drogue's origin [m], depths (S, 1, F) [m], slopes x/z (S, E, F) and y/z (S, 1, F) of the
         ellipse centres, and the depths (S, 1, F) that belong to them [m]. Rectified eyes share depth and y.
     """
-    arms = features.points_m @ np.swapaxes(state.rotations, 1, 2)
-    if features.ring_sigma > 0:
-        arms *= (1 + (state.scales[:, None] - 1) * features.ring)[..., None]
+    points = features.points_m
+    if len(features.shifts_m):
+        shared = state.departures[:, : len(features.shifts_m)] @ features.shifts_m.reshape(len(features.shifts_m), -1)
+        points = points + shared.reshape(-1, *points.shape)
+    arms = points @ np.swapaxes(state.rotations, 1, 2)
     tx, ty, tz = (state.translations_m[:, axis, None, None] for axis in range(3))
     nx, ny, nz = (state.rotations[:, axis, 2, None, None] for axis in range(3))
     depth = arms[:, None, :, 2] + tz
@@ -152,6 +168,13 @@ def _images(features: Features, state: State) -> tuple[Array, Array, Array, Arra
     x_z = (arms[:, None, :, 0] + tx - features.eye_x_m[:, None] + shift * (nz * nx)) / z
     y_z = (arms[:, None, :, 1] + ty + shift * (nz * ny)) / z
     return arms, depth, x_z, y_z, z
+
+
+def _couple(rows: Array, coupling: Array) -> None:
+    """Add the first eye's whitened rows (..., 2, E, F), times the coupling (4, ..., F), to the second's in place."""
+    first, second = rows[..., 0, 0, :], rows[..., 1, 0, :]
+    rows[..., 0, 1, :] += coupling[0] * first + coupling[1] * second
+    rows[..., 1, 1, :] += coupling[2] * first + coupling[3] * second
 
 
 def _weigh(jacobian: Array, residuals: Array, threshold: float, features: Features) -> Array:

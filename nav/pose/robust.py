@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from geometry.se3 import Array
 from nav.pose.adjustment import Adjusted, adjust
@@ -20,6 +21,8 @@ from nav.pose.two_fold_start import two_fold_start
 _HUBER = Loss(huber_sigmas=2.0)
 # A feature in both eyes has four residuals; chance exceeds this once in 2000.
 _LARGEST_CHI2 = 20.0
+# Below such a chance residuals are not noise.
+_LEAST_CHANCE = 1e-4
 # Two features can be told from the rest when at least five more remain.
 _LEAST_FOR_TWO_OUT = 7
 # Four markers overdetermine the plane that three fix.
@@ -64,13 +67,27 @@ def _inliers(features: Features) -> NDArray[np.bool_]:
         return np.ones(len(first), dtype=bool)
     sets = features.take(np.zeros(2 * len(_left_out(features)), dtype=np.int64))
     mask = np.repeat(_left_out(features), 2, axis=0)
-    fewer = sets.without(mask[:, None])
+    fewer = sets.without(mask)
     starts = two_fold_start(fewer.take(slice(0, None, 2)))
     tried = adjust(fewer, starts[0].reshape(-1, 3, 3), starts[1].reshape(-1, 3))
     chi2 = np.vstack([_chi2(sets, tried), first])
     scores = np.minimum(chi2, _LARGEST_CHI2).sum(axis=1)
     inliers: NDArray[np.bool_] = chi2[np.argmin(scores)] < _LARGEST_CHI2
+    if (inliers & features.is_marker & _measured(features)).sum() < _LEAST_INLIERS:
+        least = int(np.argmin(np.where(mask, 0.0, chi2[:-1]).sum(axis=1)))
+        kept: NDArray[np.bool_] = ~mask[least]
+        if _explains(features, kept, chi2[least]):
+            return kept
     return inliers
+
+
+def _explains(features: Features, kept: NDArray[np.bool_], chi2: Array) -> bool:
+    """Whether the residuals of the kept features are together no larger than by chance.
+
+    Among four markers, one in 500 is cut off by chance though all are right; their sum then tells.
+    """
+    freedom = 2 * int(features.seen[0][:, kept].sum()) - 6
+    return freedom > 0 and float(chdtrc(freedom, chi2[kept].sum())) > _LEAST_CHANCE
 
 
 def _left_out(features: Features) -> NDArray[np.bool_]:
@@ -87,7 +104,7 @@ def _left_out(features: Features) -> NDArray[np.bool_]:
 
 def _chi2(features: Features, adjusted: Adjusted) -> Array:
     """(S, F) squared residuals of every feature in both eyes, in variances; infinite where they are no numbers."""
-    state = State(adjusted.rotations, adjusted.translations_m, adjusted.scales)
+    state = State(adjusted.rotations, adjusted.translations_m, adjusted.departures)
     size = 2 * features.measured.shape[2] * len(features.points_m)
     residuals = linearise(features, state).residuals[:, :size]
     squares = (residuals.reshape(len(residuals), -1, len(features.points_m)) ** 2).sum(axis=1)

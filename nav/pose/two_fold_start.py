@@ -55,7 +55,7 @@ def sight_rotations(directions: Array) -> Array:
 
 def _affine(features: Features) -> tuple[Array, Array]:
     """(B, 2, 2) linear parts and (B, 2) images of the drogue's origin, of the maps from rim plane to mean image."""
-    paired = (features.seen.all(axis=1) & (features.ring > 0)).astype(np.float64)
+    paired = (features.seen.all(axis=1) & features.is_marker).astype(np.float64)
     cyclopean = np.moveaxis(features.measured[:2].mean(axis=2), 0, -1)
     total = np.maximum(paired.sum(axis=1), 1)[:, None]
     places = features.points_m[:, :2]

@@ -44,15 +44,29 @@ def test_the_limit_of_a_percentile_covers_it_in_19_of_20_samples() -> None:
     assert covered >= 0.95 - 0.02
 
 
-def test_the_limit_of_a_ratio_covers_it_in_19_of_20_samples() -> None:
+def test_the_limit_of_a_ratio_in_the_same_frames_covers_it_in_19_of_20_samples() -> None:
     draws = rng(4)
-    above, below = draws.exponential(2.0, (4000, 200)), draws.exponential(1.0, (4000, 300))
-    limits = [
-        confidence.ratio_limit((a.mean(), a.std(), a.size), (b.mean(), b.std(), b.size))[1]
-        for a, b in zip(above, below, strict=True)
-    ]
-    # First order in 1/n, and four standard errors of 4000 trials: 1.4 %.
-    assert np.mean(np.array(limits) >= 2.0) == pytest.approx(0.95, abs=0.02)
+    place = draws.exponential(1.0, (4000, 40, 10))
+    above, below = (size * (place * draws.exponential(1.0, place.shape)).sum(axis=2) for size in (2.0, 1.0))
+    limits = np.array([confidence.paired_ratio_limit(a, b)[1] for a, b in zip(above, below, strict=True)])
+    # First order in the number of blocks, and four standard errors of 4000 trials: 1.4 %.
+    assert np.mean(limits >= 2.0) == pytest.approx(0.95, abs=0.025)
+
+
+def test_what_two_errors_share_does_not_widen_the_limit_of_their_ratio() -> None:
+    draws = rng(7)
+    below = draws.normal(0, 1.0, (4000, 300))
+    # Uncorrelated with `below - above`, as an optimal estimate is with what another adds; of variance 0.9.
+    above = 0.9 * below + np.sqrt(0.9 * 0.1) * draws.normal(0, 1.0, below.shape)
+    limits = []
+    for a, b in zip(above, below, strict=True):
+        sizes = np.sqrt(np.mean(a**2)), np.sqrt(np.mean(b**2))
+        correlation = np.mean(a * b) / (sizes[0] * sizes[1])
+        limits.append(confidence.paired_rms_ratio_limit(*sizes, correlation, a.size)[1])
+    # As above.
+    assert np.mean(np.array(limits) >= np.sqrt(0.9)) == pytest.approx(0.95, abs=0.02)
+    # Taken as independent the limit would be 7 % above the ratio.
+    assert np.mean(limits) < 1.035 * np.sqrt(0.9)
 
 
 def test_the_limit_of_a_ratio_of_root_mean_squares_covers_it_in_19_of_20_samples() -> None:

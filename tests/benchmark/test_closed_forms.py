@@ -69,6 +69,20 @@ def test_the_fusion_law_agrees_with_the_numeric_bound(
     assert ring(8, distance_m).toleranced_depth_m(sigma_px, scale_sd) == expected
 
 
+@pytest.mark.parametrize("distance_m", [2.0, 10.0])
+def test_each_tolerance_weakens_its_own_source_of_depth(distance_m: float) -> None:
+    limit, sigma_px = ring(8, distance_m), 0.01
+    exact = limit.toleranced_depth_m(sigma_px, 0.0)
+    assert exact == pytest.approx(sigma_px * limit.depth_m, rel=1e-12)
+    # A source that knows nothing leaves the other one.
+    assert limit.toleranced_depth_m(sigma_px, 1e6) == pytest.approx(sigma_px * limit.stereo_depth_m, rel=1e-6)
+    size_alone = limit.toleranced_depth_m(sigma_px, 0.0, disparity_sd_px=1e9)
+    assert size_alone == pytest.approx(sigma_px * limit.size_depth_m, rel=1e-6)
+    # Nothing but placement: the mean of eight radial errors is the radius's.
+    placed = limit.toleranced_depth_m(1e-9, 0.0, 1e9, 3e-4)
+    assert placed == pytest.approx(limit.toleranced_depth_m(1e-9, 3e-4 / (RING_M * np.sqrt(8)), 1e9), rel=1e-12)
+
+
 def test_size_and_disparity_make_up_the_known_ring() -> None:
     limit = ring()
     # Rounding: independent sources of information add up.

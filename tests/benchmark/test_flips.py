@@ -74,6 +74,14 @@ def test_the_law_is_that_of_the_markers_used(build: SimpleNamespace) -> None:
         assert trial.predicted == pytest.approx(flip_probability(np.deg2rad(6), scale), rel=1e-6)
 
 
+def test_off_the_axis_the_law_takes_the_distance_along_the_line_of_sight(build: SimpleNamespace) -> None:
+    truth = truth_of(build, MIDDLE_M + 5, 2, 20, 6, 0, 0)
+    features = build.features(build.record(0, truth.left_from_drogue, build.drogue()), lambda: (0.0, 0.0))
+    away_m = float(np.linalg.norm([5.0, 2.0, 20.0]))
+    expected = 0.1 * FacingRing(build.rig.camera.fx_px, 0.12, 0.27, 8, away_m).tilt_rad
+    assert ring_tilt_scale(truth, centroid_errors(truth, features), 0.1) == pytest.approx(expected, rel=1e-9)
+
+
 def test_the_law_says_nothing_of_a_hub_or_one_eye(build: SimpleNamespace) -> None:
     truth = drogue_truth(build.record(0, build.pose(MIDDLE_M, 0, 20, 6)))
     features = build.features(build.record(0, truth.left_from_drogue), lambda: (0.0, 0.0))
