@@ -23,6 +23,8 @@ class MarkerLayout:
         radius_m: radius of every marker. [m]
         hub_center_m: (3,) centre of the hub annulus, or None. [m]
         hub_inner_radius_m, hub_outer_radius_m: its edges, 0 without a hub. [m]
+        face_inner_radius_m, face_outer_radius_m: edges of the dark face around the markers, 0 where unknown. [m]
+        collar_radius_m: edge of what surrounds the hub, 0 where unknown. [m]
     """
 
     centers_m: Array
@@ -30,6 +32,9 @@ class MarkerLayout:
     hub_center_m: Array | None
     hub_inner_radius_m: float = 0.0
     hub_outer_radius_m: float = 0.0
+    face_inner_radius_m: float = 0.0
+    face_outer_radius_m: float = 0.0
+    collar_radius_m: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centers_m", read_only(self.centers_m, (-1, 3), "centers_m"))
@@ -64,12 +69,14 @@ def marker_layout(drogue: DrogueParameters) -> MarkerLayout:
     """The features of a drogue."""
     centers = np.zeros((drogue.marker_count, 3))
     centers[:, :2] = drogue.marker_positions_m
-    if drogue.hub is None:
-        return MarkerLayout(centers, drogue.marker_radius_m, None)
+    hub = drogue.hub
     return MarkerLayout(
         centers,
         drogue.marker_radius_m,
-        np.array([0.0, 0.0, drogue.hub.depth_m]),
-        drogue.hub.inner_radius_m,
-        drogue.hub.outer_radius_m,
+        None if hub is None else np.array([0.0, 0.0, hub.depth_m]),
+        0.0 if hub is None else hub.inner_radius_m,
+        0.0 if hub is None else hub.outer_radius_m,
+        drogue.face_inner_radius_m,
+        drogue.rim_radius_m,
+        drogue.coupling_radius_m,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from datasets_manifest.images import Pixels, StereoImages
 from drogue_models.parameters import DrogueParameters
@@ -58,6 +59,25 @@ def marker_channel(images: StereoImages, eye: Eye, color: int | None, others_wei
         return np.asarray(cv2.min(cv2.min(planes[0], planes[1]), planes[2]))
     first, second = (planes[index] for index in range(3) if index != color)
     return _lead(planes[color], cv2.max(first, second), others_weight)
+
+
+def signed_lead(images: StereoImages, eye: Eye, color: int, others_weight: float = PLAIN) -> NDArray[np.float32]:
+    """As `marker_channel` of a colour image, below zero where another colour leads.
+
+    Light of a blue sky that the lens spreads over a marker's edge takes from the marker's lead; cut off at zero it
+    would move the edge and leave no trace beside it.
+
+    Returns:
+        (H, W)
+    """
+    image = images.left if eye == "left" else images.right
+    # The difference needs no subtraction of the black level beforehand, which would cut off noise below it.
+    linear, black = (image, images.black_level_dn) if images.encoding == "linear" else (_linear(image, images), 0.0)
+    planes = cv2.split(linear)
+    first, second = (planes[index] for index in range(3) if index != color)
+    others = cv2.max(first, second)
+    offset = black * (others_weight - 1)
+    return np.asarray(cv2.addWeighted(planes[color], 1.0, others, -others_weight, offset, dtype=cv2.CV_32F))
 
 
 def _lead(own: Pixels, others: Pixels, others_weight: float) -> Pixels:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datasets_manifest.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout
-from geometry.circles import disc_outline, project_disc_centers
+from geometry.circles import disc_image_centers, disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from nav.centroids.annulus_edges import fit_annuli
@@ -16,9 +17,12 @@ from nav.centroids.centroid_quality import NoiseModel
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.ellipses import Ellipses, circles, outline_shapes
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
+from nav.centroids.patches import OUTER_DIFFERENCE_PX
+from nav.centroids.surroundings import Surroundings
 from nav.channels import PLAIN
 from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation
 from nav.pose.joint import joint
+from nav.real_eyes import ideal_places, real_places
 
 _OUTLINE_POINTS = 24
 # A second pose is followed to its hub when it is this likely, and shows the hub this far from the first one's.
@@ -26,6 +30,8 @@ _LEAST_WEIGHT = 0.01
 _LEAST_STEP_PX = 0.5
 # Fewer fitted markers than a pose needs with one to spare: then all of them stay as they were found.
 _LEAST_MARKERS = 4
+# What begins this near a disc may be seen in its window, which lies about the rough place, and through the blur. [px]
+_SEEN_PX = OUTER_DIFFERENCE_PX + 2.0
 
 
 def refine(
@@ -50,10 +56,13 @@ def refine(
     eyes, index = np.nonzero(observation.seen)
     depth_m = rough.left_from_drogue.translation_m[2]
     radius_px = rig.camera.fx_px * layout.radius_m / depth_m
-    discs = circles(eyes, observation.pixels_px[eyes, index], np.full(len(eyes), radius_px))
+    sizes = np.broadcast_to(radius_px * np.eye(2), (layout.count, 2, 2))
+    seen = zip(EYES, observation.pixels_px, strict=True)
+    rough_px = np.stack([real_places(rig, eye, places, sizes) for eye, places in seen])
+    discs = circles(eyes, rough_px[eyes, index], np.full(len(eyes), radius_px))
     hubs = [hub for mode in rough.modes for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
     signals = marker_signals(images, color, _together([discs, *hubs]), others_weight)
-    fits = fit_discs(signals, discs)
+    fits = fit_discs(signals, discs, _surroundings(layout, index, radius_px / layout.radius_m))
     good = fits.accepted
     if min(np.bincount(eyes[good], minlength=2)) < min(_LEAST_MARKERS, layout.count) or fits.noise is None:
         return observation
@@ -61,8 +70,23 @@ def refine(
     cov = np.full_like(observation.cov_px2, np.nan)
     pixels[eyes[good], index[good]] = fits.ellipses.centers_px[good]
     cov[eyes[good], index[good]] = fits.cov_px2[good]
+    shapes = np.full_like(cov, np.nan)
+    shapes[eyes[good], index[good]] = fits.ellipses.shapes_px[good]
+    for side, eye in enumerate(EYES):
+        pixels[side], cov[side] = ideal_places(rig, eye, pixels[side], shapes[side], cov[side])
     refined = replace(observation, pixels_px=pixels, cov_px2=cov)
     return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise)
+
+
+def _surroundings(layout: MarkerLayout, index: NDArray[np.int64], scale_px_per_m: float) -> Surroundings | None:
+    """The face, where it is so narrow around the markers that their windows reach beyond it."""
+    places_m = layout.centers_m[:, :2]
+    edges_m = layout.face_inner_radius_m, layout.face_outer_radius_m
+    out_m = np.hypot(places_m[:, 0], places_m[:, 1])
+    margin_m = min((edges_m[1] - out_m).min(), (out_m - edges_m[0]).min()) - layout.radius_m
+    if edges_m[1] == 0 or margin_m * scale_px_per_m > _SEEN_PX:
+        return None
+    return Surroundings(places_m[index], edges_m)
 
 
 def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> list[Ellipses]:
@@ -72,9 +96,9 @@ def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> li
     edges = []
     for radius_m in (layout.hub_inner_radius_m, layout.hub_outer_radius_m):
         outline = disc_outline(pose, layout.hub_center_m, radius_m, _OUTLINE_POINTS)
-        points = np.stack([rig.project(outline, eye) for eye in EYES])
+        points = np.stack([rig.image(outline, eye) for eye in EYES])
         place = layout.hub_center_m[None], np.array([radius_m])
-        centers = np.concatenate([project_disc_centers(rig, pose, *place, eye) for eye in EYES])
+        centers = np.concatenate([disc_image_centers(rig, pose, *place, eye) for eye in EYES])
         shapes = outline_shapes(points - points.mean(axis=1, keepdims=True))
         edges.append(Ellipses(np.array([0, 1]), centers, shapes))
     return edges
@@ -102,12 +126,16 @@ def _with_hub(observation: Observation, signals: tuple[MarkerSignal, MarkerSigna
         if any(np.abs(centers - other).max() < _LEAST_STEP_PX for other in tried):
             continue
         tried.append(centers)
-        fits = fit_annuli(signals, edges[OUTER_EDGE], edges[INNER_EDGE], noise)
+        collar_factor = observation.layout.collar_radius_m / observation.layout.hub_outer_radius_m
+        fits = fit_annuli(signals, edges[OUTER_EDGE], edges[INNER_EDGE], noise, collar_factor)
         if fits.accepted.any():
             outer, outer_cov = fits.outer_given_offset(edges[INNER_EDGE].centers_px - centers)
             pixels = np.full((len(EYES), HUB_EDGES, 2), np.nan)
             cov = np.full((len(EYES), HUB_EDGES, 2, 2), np.nan)
             pixels[fits.accepted, OUTER_EDGE] = outer[fits.accepted]
             cov[fits.accepted, OUTER_EDGE] = outer_cov[fits.accepted]
+            shapes = np.stack([edges[OUTER_EDGE].shapes_px] * HUB_EDGES, axis=1)
+            for side, eye in enumerate(EYES):
+                pixels[side], cov[side] = ideal_places(observation.rig, eye, pixels[side], shapes[side], cov[side])
             return replace(observation, hub_px=pixels, hub_cov_px2=cov)
     return observation

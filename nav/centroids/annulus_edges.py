@@ -15,6 +15,7 @@ from nav.centroids.annulus_model import (
     CENTERS,
     INNER,
     OUTER,
+    SLOPE_TURNS,
     all_parameters,
     annulus_model,
     annulus_start,
@@ -22,22 +23,27 @@ from nav.centroids.annulus_model import (
     both_edges,
     free_to_all,
     in_free_parameters,
+    radial_slopes,
 )
 from nav.centroids.centroid_quality import NoiseModel, residual_spread, sector_index
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
-from nav.centroids.edge_profile import parameter_shapes
+from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.least_squares import Minimum, evaluate, minimise
 from nav.centroids.marker_signal import Array32, MarkerSignal
 from nav.centroids.patches import PixelSet, annulus_pixels
+from nav.centroids.surroundings import share_outside
 
 # Azimuthal order of the light on the annulus; a thin one has too few pixels to tell high orders from its outline.
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5
+# Light this uneven about the azimuth, as a share of its mean, changes across the annulus too, which one this wide
+# shows; evenly lit ones, within 0.015 of the mean on path-traced daylight frames, are better off without.
+_UNEVEN_SHARE, _WIDE_PX = 0.02, 5.0
+# Ribs and sky around the hub are many and small, their light by the azimuth is fitted: more of it is taken than beside
+# a marker.
+_MOST_BEYOND = 0.8
 # How well the step between the centres of both edges is known where it is not fitted: it is below this itself. [px]
 _OFFSET_SIGMA_PX = 0.005
-# Shadows of ribs across the hub move its centre more than the residuals that they leave tell: by twice as much, as
-# found on path-traced daylight frames of seed 1, where the inflation for residuals that hang together is above this.
-_SHADOWED_INFLATION, _SHADOWED_VARIANCE = 8.0, 4.0
 _FIRST_STEPS, _SECOND_STEPS = 6, 3
 _SECTORS = 16
 _LEAST_CONTRAST_SIGMA = 4.0
@@ -92,7 +98,13 @@ class AnnulusFits:
         return centers, cov
 
 
-def fit_annuli(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses, noise: NoiseModel) -> AnnulusFits:
+def fit_annuli(
+    signals: Sequence[MarkerSignal],
+    outer: Ellipses,
+    inner: Ellipses,
+    noise: NoiseModel,
+    collar_factor: float = 0.0,
+) -> AnnulusFits:
     """Fit every annulus of both eyes.
 
     Annuli too thin to show each edge by itself keep the predicted shapes up to a common scale and the predicted step
@@ -103,18 +115,24 @@ def fit_annuli(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses
         outer: predicted outer edges, within a third of their radius.
         inner: predicted inner edges, of the same annuli.
         noise: of the frame's pixels, from `fit_discs`.
+        collar_factor: radius of the dark collar around the annulus over that of its outer edge, 0 where unknown. What
+            lies beyond is left out, and its blur fitted.
     """
     if len(outer) == 0:
         nothing = np.zeros(0)
         return AnnulusFits(np.zeros((0, 2, 2)), np.zeros((0, 4, 4)), nothing, nothing, nothing, ())
-    thin = bool((outer.radii_px - inner.radii_px).min() < _THIN_PX)
-    pixels = annulus_pixels(signals, outer, inner)
+    width_px = float((outer.radii_px - inner.radii_px).min())
+    thin = width_px < _THIN_PX
+    pixels, beyond = _within_collar(annulus_pixels(signals, outer, inner), outer, collar_factor)
     turns = azimuth_basis(pixels, _ORDER_THIN if thin else _ORDER)
     start = annulus_start(pixels, outer, inner, turns.shape[1])
+    first = _first_fit(pixels, (turns, beyond), start, thin)
+    if width_px > _WIDE_PX and _unevenness(start + first.parameters) > _UNEVEN_SHARE:
+        turns = np.concatenate([turns, radial_slopes(pixels, turns, outer, inner)], axis=1)
+        start = np.pad(start + first.parameters, ((0, 0), (0, SLOPE_TURNS)))
+        first = _first_fit(pixels, (turns, beyond), start, thin)
     ties = free_to_all(start, thin)
-    model = in_free_parameters(annulus_model(pixels, turns), start, ties)
-    begin = evaluate(model, pixels.values, pixels.present, np.zeros((len(outer), ties.shape[2])))
-    first = minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
+    model = in_free_parameters(annulus_model(pixels, turns, beyond), start, ties)
     between, light = _lit(all_parameters(start, ties, first), pixels, turns)
     weights = pixels.present / noise.variances(between, light)
     final = minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
@@ -124,14 +142,37 @@ def fit_annuli(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses
     sectors = sector_index(pixels.x_px, pixels.y_px, _SECTORS)
     spread = residual_spread(final.residuals, weights, sectors, contrast, ties.shape[2])
     inflation = np.maximum(spread.inflation, spread.chi2_per_dof)
-    cov = _center_covariance(final, ties, thin) * inflation[:, None, None]
-    cov *= np.where(inflation > _SHADOWED_INFLATION, _SHADOWED_VARIANCE, 1.0)[:, None, None]
+    # Both eyes see the same shadow: what it adds does not average out between them, and so counts twice.
+    cov = _center_covariance(final, ties, thin) * (2 * inflation - 1)[:, None, None]
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
     predicted = np.stack([outer.centers_px, inner.centers_px], axis=1)
     fitted = pixels.origins_px[:, None] + parameters[:, CENTERS].reshape(-1, 2, 2)
     return AnnulusFits(np.where(good[:, None, None], fitted, predicted), cov, contrast, lit, inflation, reasons)
+
+
+def _first_fit(pixels: PixelSet, light: tuple[Array32, Array32], start: Array, thin: bool) -> Minimum:
+    """The fit of equal weights, for the noise by what each pixel sees; `light` is that on the annulus and beyond."""
+    ties = free_to_all(start, thin)
+    model = in_free_parameters(annulus_model(pixels, *light), start, ties)
+    begin = evaluate(model, pixels.values, pixels.present, np.zeros((len(start), ties.shape[2])))
+    return minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
+
+
+def _unevenness(parameters: Array) -> float:
+    """Root mean square of the light's change with the azimuth over its mean, of the less even annulus."""
+    turns = parameters[:, AMPLITUDE:]
+    mean = np.maximum(turns[:, 0] - parameters[:, BACKGROUND], np.finfo(float).tiny)
+    return float((np.sqrt((turns[:, 1:] ** 2).sum(axis=1) / 2) / mean).max())
+
+
+def _within_collar(pixels: PixelSet, outer: Ellipses, collar_factor: float) -> tuple[PixelSet, Array32]:
+    """The pixels without those beyond the collar, and the share of what lies beyond it in each."""
+    if collar_factor == 0:
+        return pixels, np.zeros_like(pixels.x_px)
+    beyond = share_outside(collar_factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX)
+    return pixels.only(beyond < _MOST_BEYOND), beyond
 
 
 def _center_covariance(fit: Minimum, ties: Array, thin: bool) -> Array:
@@ -146,7 +187,8 @@ def _lit(parameters: Array, pixels: PixelSet, turns: Array32) -> tuple[Array32, 
     """Share of each pixel that lies on the annulus, and the annulus's light above the background there."""
     outer, inner = both_edges(parameters, pixels.x_px, pixels.y_px)
     rest = parameters[:, BACKGROUND:].astype(np.float32)
-    return outer.inside - inner.inside, np.matmul(rest[:, None, 2:], turns)[:, 0] - rest[:, 0, None]
+    light = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
+    return outer.inside - inner.inside, light - rest[:, 0, None]
 
 
 def _reasons(

@@ -14,17 +14,24 @@ from nav.centroids.patches import PixelSet, edge_distances
 # Places in the vector of parameters.
 OUTER = slice(0, ELLIPSE_PARAMETERS)
 INNER = slice(ELLIPSE_PARAMETERS, 2 * ELLIPSE_PARAMETERS)
-WIDTH, BACKGROUND, HOLE, AMPLITUDE = (2 * ELLIPSE_PARAMETERS + i for i in range(4))
+WIDTH, BACKGROUND, HOLE = (2 * ELLIPSE_PARAMETERS + i for i in range(3))
+# What lies beyond is lighter towards one side than towards another: a constant and the first two orders of the azimuth.
+BEYOND_TURNS = 5
+BEYOND = slice(HOLE + 1, HOLE + 1 + BEYOND_TURNS)
+AMPLITUDE = BEYOND.stop
+SLOPE_TURNS = 5
 CENTERS = np.array([0, 1, ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS + 1])
 
 
-def annulus_model(pixels: PixelSet, turns: Array32) -> Model:
-    """`I = b (1 - So) + A(azimuth) (So - Si) + b' Si`.
+def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
+    """`I = b (1 - So) + A(azimuth) (So - Si) + b' Si + k(azimuth) F`.
 
     Args:
         pixels: where.
         turns: (N, T, K) functions of the azimuth whose sum is A.
+        beyond: (N, K) share F of what lies beyond the annulus's surroundings and is lighter by k than they are.
     """
+    further = turns[:, :BEYOND_TURNS] * beyond[:, None]
     x, y = pixels.x_px, pixels.y_px
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
@@ -32,17 +39,19 @@ def annulus_model(pixels: PixelSet, turns: Array32) -> Model:
         outer, inner = both_edges(parameters, x, y)
         rest = parameters[:, BACKGROUND:].astype(np.float32)
         background, hole = rest[:, 0, None], rest[:, 1, None]
-        light = np.matmul(rest[:, None, 2:], turns)[:, 0]
+        light = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
         jacobian = np.empty((len(x), parameters.shape[1], x.shape[1]), np.float32)
         up, down = (light - background) * outer.density, (hole - light) * inner.density
         np.multiply(outer.slopes, up[:, None], out=jacobian[:, OUTER])
         np.multiply(inner.slopes, down[:, None], out=jacobian[:, INNER])
         spread = up * outer.distance_px + down * inner.distance_px
         jacobian[:, WIDTH] = -spread / width[:, None].astype(np.float32)
-        jacobian[:, BACKGROUND], jacobian[:, HOLE] = 1 - outer.inside, inner.inside
+        jacobian[:, BACKGROUND], jacobian[:, HOLE], jacobian[:, BEYOND] = 1 - outer.inside, inner.inside, further
         between = outer.inside - inner.inside
         np.multiply(turns, between[:, None], out=jacobian[:, AMPLITUDE:])
-        return background * (1 - outer.inside) + light * between + hole * inner.inside, jacobian
+        picture = background * (1 - outer.inside) + light * between + hole * inner.inside
+        picture += np.matmul(parameters[:, None, BEYOND].astype(np.float32), further)[:, 0]
+        return picture, jacobian
 
     return model
 
@@ -63,6 +72,17 @@ def azimuth_basis(pixels: PixelSet, order: int) -> Array32:
     for multiple in range(1, order + 1):
         rows += [np.cos(multiple * angle), np.sin(multiple * angle)]
     return np.stack(rows, axis=1)
+
+
+def radial_slopes(pixels: PixelSet, turns: Array32, outer: Ellipses, inner: Ellipses) -> Array32:
+    """(N, 5, K): the first two orders of the azimuth, growing outwards from nothing in the annulus's middle.
+
+    Without them a slope of light across the annulus, steeper at the outer edge than at the inner one, moves both.
+    """
+    middle = ((outer.radii_px + inner.radii_px) / 2).astype(np.float32)[:, None]
+    outwards = np.hypot(pixels.x_px, pixels.y_px) / middle - 1
+    slopes: Array32 = outwards[:, None] * turns[:, :SLOPE_TURNS]
+    return slopes
 
 
 def annulus_start(pixels: PixelSet, outer: Ellipses, inner: Ellipses, turn_count: int) -> Array:

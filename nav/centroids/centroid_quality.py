@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
+from nav.centroids.least_squares import Minimum
 from nav.centroids.marker_signal import Array32
 
 # Rounding to integers. [DN^2]
@@ -16,9 +17,13 @@ _QUANTISATION_DN2 = 1 / 12
 _ONE_SIDE, _EDGE = 0.03, (0.2, 0.8)
 # Of an outline whose residuals are so much above the usual, none tells of the sensor.
 _ODD_FACTOR = 3.0
-# Noise beside a marker may be cut off by the difference of channels; on the way up the edge it is not.
-_LEAST_DARK_SHARE = 0.25
+# Of the noise on a marker, what is left beside it at least: coarse numbers may hide the noise of a dark background.
+_LEAST_DARK_SHARE = 0.05
 SECTORS = 8
+# Of an outline; twice as many as the fit of an ellipse follows leave enough to tell.
+_PIECES = 16
+_STEEP_SHARE = 0.03
+_TINY = 1e-12
 # A shadow or a thing before the disc leaves residuals beyond so many deviations of a sector's mean, and beyond this
 # share of the contrast; what is smaller moves the centre by less than the noise of one edge pixel.
 _SECTOR_SIGMA = 4.0
@@ -139,6 +144,41 @@ def residual_spread(
         np.take_along_axis(share, worst, 1)[:, 0],
         (summed**2 / weight).mean(axis=1),
     )
+
+
+def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array32) -> float:
+    """How much more the outlines of a frame move about, piece by piece, than uncorrelated noise lets them.
+
+    Noise that a lens has spread over neighbouring pixels, as that of a renderer, is stronger along an outline than
+    pixel by pixel. Every piece's own shift, against what its pixels' variances and the fit's freedom lead one to
+    expect, tells.
+
+    Args:
+        fit: of N outlines; its first two parameters are the centre.
+        weights: (N, K) inverse variances, 0 for padding. [1/DN^2]
+        x_px, y_px: (N, K) places about the centres.
+
+    Returns:
+        Factor in the variance of the frame's outlines, 1 or more.
+    """
+    # Along the outline the derivative by the centre is as steep as the edge; elsewhere no pixel tells of its place.
+    steepness = np.hypot(fit.jacobian[:, 0], fit.jacobian[:, 1])
+    patch, pixel = np.nonzero(steepness * (weights > 0) > _STEEP_SHARE * steepness.max(axis=1, keepdims=True))
+    piece = sector_index(x_px[patch, pixel], y_px[patch, pixel], _PIECES) + _PIECES * patch
+    steep, jacobian = steepness[patch, pixel], fit.jacobian[patch, :, pixel]
+    weighted = weights[patch, pixel] * steep
+
+    def by_piece(values: Array32) -> Array:
+        sums = np.bincount(piece, weighted * values, len(weights) * _PIECES)
+        return sums.reshape(-1, _PIECES).astype(np.float64)
+
+    shift, alone = by_piece(fit.residuals[patch, pixel]), np.maximum(by_piece(steep), _TINY)
+    coupled = np.stack([by_piece(column) for column in jacobian.T], axis=2)
+    swallowed = np.einsum("nsp,nsp->ns", np.matmul(coupled, fit.covariance()), coupled)
+    found = (shift**2 / alone).sum(axis=1)
+    expected = np.maximum((1 - swallowed / alone).sum(axis=1), 1.0)
+    usual = found / expected <= _ODD_FACTOR * np.median(found / expected)
+    return max(1.0, float(found[usual].sum() / expected[usual].sum()))
 
 
 def sector_index(x_px: Array32, y_px: Array32, count: int) -> NDArray[np.int64]:

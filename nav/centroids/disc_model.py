@@ -17,16 +17,18 @@ _PLAIN_COUNT = ELLIPSE_PARAMETERS + 3
 _CLEAR_PX = 1.0
 
 
-def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool) -> Model:
-    """`I = (b + g.x) (1 - S) + (A + h.x) S`.
+def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, further: Array32 | None = None) -> Model:
+    """`I = (b + g.x) (1 - S) + (A + h.x) S + k.F`.
 
     Args:
         pixels: where.
         slope_outside: whether the background's plane g is fitted.
         slope_inside: whether the disc's plane h is fitted.
+        further: (N, E, K) shares F of other backgrounds, whose lights k above b are fitted, the last parameters.
     """
     x, y = pixels.x_px, pixels.y_px
-    count = _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside
+    own_count = _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside
+    count = own_count + (0 if further is None else further.shape[1])
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         edge = edge_profile(parameters[:, :ELLIPSE_PARAMETERS], parameters[:, WIDTH], x, y)
@@ -46,14 +48,18 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool) -> Mod
         np.multiply(edge.slopes, steep[:, None], out=jacobian[:, :ELLIPSE_PARAMETERS])
         jacobian[:, WIDTH] = -steep * edge.distance_px / parameters[:, WIDTH, None].astype(np.float32)
         jacobian[:, BACKGROUND], jacobian[:, LEVEL] = outside, inside
-        return dark + (bright - dark) * inside, jacobian
+        picture = dark + (bright - dark) * inside
+        if further is not None:
+            jacobian[:, own_count:] = further
+            picture += np.matmul(parameters[:, None, own_count:].astype(np.float32), further)[:, 0]
+        return picture, jacobian
 
     return model
 
 
-def disc_start(pixels: PixelSet, shapes_px: Array, slope_outside: bool, slope_inside: bool) -> Array:
-    """(N, P) parameters of the initial outlines with the mean levels on either side of them."""
-    parameters = np.zeros((len(shapes_px), _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside))
+def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
+    """(N, P) parameters of the initial outlines with the mean levels on either side of them, all further ones zero."""
+    parameters = np.zeros((len(shapes_px), _PLAIN_COUNT + further_count))
     parameters[:, :ELLIPSE_PARAMETERS] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
     parameters[:, WIDTH] = START_WIDTH_PX
     distance = edge_distances(shapes_px, pixels.x_px, pixels.y_px)

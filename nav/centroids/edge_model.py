@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,20 @@ from nav.centroids.centroid_quality import (
     SECTORS,
     NoiseModel,
     ResidualSpread,
+    edge_noise_factor,
     measure_noise,
     residual_spread,
     sector_index,
 )
 from nav.centroids.disc_model import BACKGROUND, LEVEL, WIDTH, disc_model, disc_start
-from nav.centroids.edge_profile import parameter_shapes
+from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses, moment_shapes
 from nav.centroids.least_squares import Minimum, Model, evaluate, minimise
 from nav.centroids.marker_signal import Array32, MarkerSignal
 from nav.centroids.patches import WHOLE_RADIUS_PX, PixelSet, coarse_pixels, disc_pixels, edge_distances
+from nav.centroids.pixel_response import without_pixel_response
+from nav.centroids.single_color import with_even_others
+from nav.centroids.surroundings import MOST_BEYOND, Surroundings, shares_beyond
 
 # Shading of a smaller disc can hardly be told from a shift of it: fitting it adds 30 % of noise here, 100 % at 4 px.
 _LEAST_RADIUS_FOR_SHADING_PX = 7.5
@@ -74,12 +78,13 @@ class DiscFits:
         return np.array([reason is None for reason in self.reasons], dtype=np.bool_)
 
 
-def fit_discs(signals: Sequence[MarkerSignal], discs: Ellipses) -> DiscFits:
+def fit_discs(signals: Sequence[MarkerSignal], discs: Ellipses, around: Surroundings | None = None) -> DiscFits:
     """Fit every disc of both eyes.
 
     Args:
         signals: left and right, around the discs (`nav.centroids.marker_signal.marker_signals`).
         discs: where they are to half a pixel or so; circles will do.
+        around: the face that they lie on, where it is narrow enough for their edges to see beyond.
 
     Returns:
         Centres with covariances, or reasons. Noise is the frame's own: the residuals of all discs together tell the
@@ -89,7 +94,8 @@ def fit_discs(signals: Sequence[MarkerSignal], discs: Ellipses) -> DiscFits:
     shaded = discs.radii_px >= _LEAST_RADIUS_FOR_SHADING_PX
     for index in (np.flatnonzero(~shaded), np.flatnonzero(shaded)):
         if len(index):
-            fits = _merged(fits, index, _fit_group(signals, discs.take(index), bool(shaded[index[0]])))
+            seen = None if around is None else around.take(index)
+            fits = _merged(fits, index, _fit_group(signals, discs.take(index), bool(shaded[index[0]]), seen))
     return fits
 
 
@@ -125,17 +131,34 @@ def _merged(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscFit
     )
 
 
-def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool) -> DiscFits:
+def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, around: Surroundings | None) -> DiscFits:
     """Fit discs that are all modelled alike."""
     plain = not signals[0].is_difference
     start = located(signals, discs)
     pixels = disc_pixels(signals, start)
-    model = disc_model(pixels, plain, shaded)
-    begin = evaluate(model, pixels.values, pixels.present, disc_start(pixels, start.shapes_px, plain, shaded))
+    further = None if around is None else shares_beyond(around, start, pixels, START_WIDTH_PX)
+    if further is not None:
+        pixels = pixels.only((further < MOST_BEYOND).all(axis=1))
+    model = disc_model(pixels, plain, shaded, further)
+    count = 2 * plain + 2 * shaded + (0 if further is None else further.shape[1])
+    begin = evaluate(model, pixels.values, pixels.present, disc_start(pixels, start.shapes_px, count))
     first = minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
+    if around is not None and further is not None and not shaded:
+        # The markers' own places now show the face to hundredths of a pixel; around larger discs it is so wide that
+        # tenths do.
+        found = _fitted(start, pixels, first, (None,) * len(start))
+        width_px = float(np.median(first.parameters[:, WIDTH]))
+        model = disc_model(pixels, plain, shaded, shares_beyond(around, found, pixels, width_px))
+        first = evaluate(model, pixels.values, pixels.present, first.parameters)
     # The derivative by the disc's level is the share of light from within.
     inside = first.jacobian[:, LEVEL]
-    noise = _noise(first, pixels, inside)
+    if not plain:
+        first, beyond_gaussian = without_pixel_response(first, pixels, inside, _contrast(first))
+        pixels = replace(pixels, values=pixels.values - beyond_gaussian)
+    lead_noise = noise = _noise(first, pixels, inside)
+    if shaded and not plain:
+        first, pixels = with_even_others(first, pixels, lead_noise, _contrast(first))
+        noise = _noise(first, pixels, inside)
     weights = pixels.present / noise.variances(inside, _contrast(first).astype(np.float32)[:, None])
     final = _weighted(model, pixels, first, weights, plain)
     # What a plain picture shows beside a disc says nothing about the disc.
@@ -143,7 +166,8 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool) -
     contrast = _contrast(final)
     sectors = sector_index(pixels.x_px, pixels.y_px, SECTORS)
     spread = residual_spread(final.residuals, judged, sectors, contrast, final.parameters.shape[1])
-    cov = final.covariance()[:, :2, :2] * spread.inflation[:, None, None]
+    factor = edge_noise_factor(final, judged, pixels.x_px, pixels.y_px)
+    cov = final.covariance()[:, :2, :2] * factor * spread.inflation[:, None, None]
     reasons = _reasons(discs, pixels, final, inside, cov, noise, spread)
     return DiscFits(
         _fitted(discs, pixels, final, reasons),
@@ -154,7 +178,7 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool) -
         spread.chi2_per_dof,
         spread.inflation,
         reasons,
-        noise,
+        lead_noise,
     )
 
 

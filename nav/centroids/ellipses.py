@@ -76,6 +76,11 @@ def moment_shapes(second_moments_px2: Array) -> Array:
     return _square_roots(4 * second_moments_px2)
 
 
+def plane_shapes(maps: Array) -> Array:
+    """Shapes of the images of the unit circle under (M, 2, 2) linear maps."""
+    return _square_roots(maps @ np.swapaxes(maps, 1, 2))
+
+
 def _square_roots(squares: Array) -> Array:
     values, vectors = np.linalg.eigh(squares)
     roots: Array = np.einsum("mik,mk,mjk->mij", vectors, np.sqrt(np.maximum(values, 0)), vectors)

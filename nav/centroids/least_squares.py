@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,13 @@ class Minimum:
         inverse: Array = np.linalg.inv(_scaled(self.normal, scale)) * scale[:, :, None] * scale[:, None, :]
         return inverse
 
+    def given(self, residuals: Array32, weights: Array32) -> Minimum:
+        """Where one undamped step ends from here if the residuals were these; (N, K) each."""
+        gradient = np.matmul(self.jacobian, (weights * residuals)[:, :, None]).astype(np.float64)
+        step = np.matmul(self.covariance(), gradient)[..., 0]
+        left = residuals - np.matmul(step[:, None].astype(np.float32), self.jacobian)[:, 0]
+        return replace(self, parameters=self.parameters + step, residuals=left)
+
     def leverages(self, covariance: Array, weights: Array32) -> Array32:
         """(N, K) share of each pixel's noise that its own fit swallows."""
         root = np.linalg.cholesky(covariance).astype(np.float32)
@@ -84,9 +91,11 @@ def minimise(
     for _ in range(most_steps):
         step = _step(normal, np.matmul(jacobian, (weights * residuals)[:, :, None])[..., 0].astype(np.float64), damping)
         tried = parameters + step
-        values, new_jacobian = model(tried)
-        new_residuals = data - values
-        new_cost = _cost(new_residuals, weights)
+        # A step gone astray may overflow: its cost is infinite then, and it is not taken.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            values, new_jacobian = model(tried)
+            new_residuals = data - values
+            new_cost = _cost(new_residuals, weights)
         better = new_cost <= cost * (1 + _ROUNDING)
         if better.all():
             parameters, cost, residuals, jacobian = tried, new_cost, new_residuals, new_jacobian

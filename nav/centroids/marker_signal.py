@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from datasets_manifest.images import Pixels, StereoImages
 from geometry.stereo import EYES, Eye
 from nav.centroids.ellipses import Ellipses
-from nav.channels import PLAIN, marker_channel
+from nav.channels import PLAIN, marker_channel, signed_lead
 
 Array32 = NDArray[np.float32]
 
@@ -32,11 +32,12 @@ class MarkerSignal:
     """Part of one image.
 
     Attributes:
-        values: (H, W) linear signal.
+        values: (H, W) linear signal; of a difference also below zero.
         clipped: (H, W) where the sensor's range ended.
         first_px: x and y of the first site in the image. [px]
         pitch_px: from site to site; 2 on one colour of a mosaic. [px]
         is_difference: a colour's lead over the others, dark beside the markers, or a plain picture.
+        own: (H, W) the colour of a difference, in the same numbers up to a constant, None where that is not at hand.
     """
 
     values: Array32
@@ -44,6 +45,7 @@ class MarkerSignal:
     first_px: tuple[float, float]
     pitch_px: int
     is_difference: bool
+    own: Pixels | None = None
 
 
 def marker_signals(
@@ -91,12 +93,17 @@ def _image_signal(
     image = images.left if eye == "left" else images.right
     part = image[top:bottom, left:right]
     cut = replace(images, left=part, right=part, left_mosaic=None, right_mosaic=None)
-    values = marker_channel(cut, "left", color, others_weight)
     full = 2**images.bits - 1
     is_difference = color is not None and image.ndim == 3
+    if color is not None and image.ndim == 3:
+        values: Pixels | Array32 = signed_lead(cut, "left", color, others_weight)
+    else:
+        values = marker_channel(cut, "left", color, others_weight)
     if part.ndim == 3:
         part = part.max(axis=2) if color is None else part[..., color]
-    return MarkerSignal(values.astype(np.float32), part >= full, (float(left), float(top)), 1, is_difference)
+    own = part if is_difference and images.encoding == "linear" else None
+    signal = values.astype(np.float32, copy=False)
+    return MarkerSignal(signal, part >= full, (float(left), float(top)), 1, is_difference, own)
 
 
 def _mosaic_signal(
@@ -111,6 +118,6 @@ def _mosaic_signal(
     first, second = (
         cv2.filter2D(part, cv2.CV_32F, kernel)[row::2, column::2] for kernel in _NEIGHBOURS[color == _GREEN]
     )
-    values = np.maximum(own - np.float32(others_weight) * np.maximum(first, second), np.float32(0))
+    values = own - np.float32(others_weight) * np.maximum(first, second)
     clipped = own >= 2**images.bits - 1
     return MarkerSignal(values, clipped, (float(left + column), float(top + row)), 2, True)

@@ -1,0 +1,96 @@
+"""Navigation through real lenses: centres are measured where the light fell, and poses are as good as ideal eyes'."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.estimates import PoseEstimate
+from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.rigs import resolve_rig
+from geometry.circles import disc_image_centers, disc_outline, project_disc_centers
+from geometry.se3 import RigidTransform, rotation_from_angles
+from geometry.stereo import EYES, paper_rig
+from labelgen.frame_labels import label_frame
+from nav.centroids.ellipses import outline_shapes
+from nav.navigator import Navigator
+from nav.real_eyes import ideal_places, real_places
+from render.engine import load_engine
+from render.sensor import expose
+from scenes.sampler import sample_frame
+
+TABLE = """
+name = "real-eyes"
+seed = 3
+rig = "paper-real"
+[frames]
+count = 10
+[distance]
+law = "stations"
+stations_m = [2.0, 6.0]
+[environment]
+sun_elevation_deg = [30, 60]
+sun_azimuth_deg = [120, 240]
+[render]
+engine = "analytic"
+"""
+DISCS = 5.0 * np.stack([np.eye(2)] * 2)
+RIG, _ = resolve_rig("paper-real", 3)
+POSE = RigidTransform(rotation_from_angles(0.1, -0.1, 0.3), np.array([0.2, -0.15, 1.8]))
+
+
+def shapes_of(project, centers_m, eye):
+    outlines = np.stack([project(disc_outline(POSE, center, 0.05, 64), eye) for center in centers_m])
+    return outline_shapes(outlines - outlines.mean(axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_centres_of_discs_go_back_and_forth(eye):
+    """Against polygons through the discs' true edges; a lens shifts a centre otherwise than a point."""
+    centers_m = np.array([[0.27, 0.0, 0.0], [0.0, 0.27, 0.0], [-0.27, 0.0, 0.0]])
+    radii_m = np.full(3, 0.05)
+    ideal = project_disc_centers(RIG, POSE, centers_m, radii_m, eye)
+    real = disc_image_centers(RIG, POSE, centers_m, radii_m, eye)
+    cov = np.broadcast_to(np.eye(2), (3, 2, 2))
+    # What is left is of the third order in the disc's size: perspective within it, and higher slopes of the lens.
+    np.testing.assert_allclose(real_places(RIG, eye, ideal, shapes_of(RIG.project, centers_m, eye)), real, atol=3e-3)
+    found, moved = ideal_places(RIG, eye, real, shapes_of(RIG.image, centers_m, eye), cov)
+    np.testing.assert_allclose(found, ideal, atol=3e-3)
+    outline = disc_outline(POSE, centers_m[0], 0.05, 64)
+    growth = np.ptp(RIG.project(outline, eye), axis=0) / np.ptp(RIG.image(outline, eye), axis=0)
+    # Sizes of the disc in both images against the slopes that errors are moved by, without their cross terms.
+    np.testing.assert_allclose(np.sqrt(np.diagonal(moved[0])), growth, rtol=3e-3)
+
+
+def test_what_was_not_measured_stays_so():
+    centers = np.array([[np.nan, np.nan], [600.0, 300.0]])
+    found, cov = ideal_places(RIG, "right", centers, DISCS, np.full((2, 2, 2), np.nan))
+    assert np.isnan(found[0]).all() and np.isfinite(found[1]).all() and np.isnan(cov[0]).all()
+    assert np.isnan(real_places(RIG, "right", centers, DISCS)[0]).all()
+
+
+def test_ideal_eyes_change_nothing():
+    centers, cov = np.array([[10.0, 20.0]]), np.ones((1, 2, 2))
+    assert ideal_places(paper_rig(), "left", centers, DISCS[:1], cov) == (centers, cov)
+    assert real_places(paper_rig(), "left", centers, DISCS[:1]) is centers
+
+
+def test_poses_through_real_lenses():
+    recipe = parse_recipe(TABLE)
+    engine, navigator = load_engine("analytic"), Navigator(recipe.rig, recipe.drogue)
+    for index in range(4):
+        frame = sample_frame(recipe, index)
+        radiance = engine.render(frame, recipe.render)
+        images = expose(frame, radiance)
+        record = label_frame(frame, radiance, images)
+        (answer,) = navigator.estimate(index, images, ["joint-hub"])
+        assert isinstance(answer, PoseEstimate), answer
+        error_m = answer.left_from_drogue.translation_m - frame.left_from_drogue.translation_m
+        # Five of the estimate's own deviations; a pixel of distortion left in would be hundreds.
+        assert (np.abs(error_m) < 5 * np.sqrt(np.diag(answer.covariance)[:3]) + 2e-6).all()
+        for feature in answer.features:
+            view = record.views.left if feature.eye == "left" else record.views.right
+            truth = view.hub if feature.index == "hub" else view.markers[feature.index]
+            # Measured centres are told in the delivered image; the hub's are some three times as noisy.
+            limit_px = 0.06 if feature.index == "hub" else 0.02
+            np.testing.assert_allclose(feature.center_px, truth.center_ellipse_px, atol=limit_px)
