@@ -9,6 +9,7 @@ import numpy as np
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.layout import CALIBRATION_FOLDER
+from geometry.distortion import Lens
 from geometry.se3 import Array
 from geometry.stereo import StereoRig
 
@@ -16,17 +17,18 @@ OPENCV_STEREO_FILE = "opencv_stereo.yaml"
 
 
 def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
-    """A rectified rig in the names and conventions of `cv2.stereoRectify`.
+    """A rig in the names and conventions of `cv2.stereoRectify`: the truth, which no calibration would find exactly.
 
     Returns:
-        M1, M2: (3, 3) intrinsics [px]; D1, D2: (1, 5) zero distortion; R, T: right from left [m]; R1, R2: rectifying
-        rotations; P1, P2: (3, 4) projections; Q: (4, 4) from (u, v, disparity, 1) to homogeneous points [m].
+        M1, M2: (3, 3) intrinsics of the delivered images [px]; D1, D2: (1, 5) their distortion; R, T: right from left
+        [m]; R1, R2: rectifying rotations; P1, P2: (3, 4) projections of the rectified images; Q: (4, 4) from
+        (u, v, disparity, 1) of those to homogeneous points [m].
 
     Source: OpenCV's documentation of `stereoRectify`; its pixels too count from the centre of the top-left one.
     """
     camera, baseline_m = rig.camera, rig.baseline_m
-    matrix, none = camera.matrix(), np.zeros((1, 5))
-    left = np.hstack([matrix, np.zeros((3, 1))])
+    first, second = rig.lenses or (Lens(camera), Lens(camera))
+    left = np.hstack([camera.matrix(), np.zeros((3, 1))])
     right = left.copy()
     right[0, 3] = -camera.fx_px * baseline_m
     # A pixel's row counts in units of fy, its disparity in units of fx.
@@ -40,14 +42,14 @@ def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
         ]
     )
     return {
-        "M1": matrix,
-        "D1": none,
-        "M2": matrix,
-        "D2": none,
-        "R": np.eye(3),
-        "T": np.array([[-baseline_m], [0.0], [0.0]]),
-        "R1": np.eye(3),
-        "R2": np.eye(3),
+        "M1": first.camera.matrix(),
+        "D1": first.distortion.coefficients()[None],
+        "M2": second.camera.matrix(),
+        "D2": second.distortion.coefficients()[None],
+        "R": second.ideal_from_real.T @ first.ideal_from_real,
+        "T": second.ideal_from_real.T @ np.array([[-baseline_m], [0.0], [0.0]]),
+        "R1": np.array(first.ideal_from_real),
+        "R2": np.array(second.ideal_from_real),
         "P1": left,
         "P2": right,
         "Q": reprojection,

@@ -8,6 +8,9 @@ from numpy.typing import ArrayLike
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
 
+# Evenly spaced on a circle: the polygon shrinks about the same centre.
+_OUTLINE_POINTS = 256
+
 
 def ellipse_center_points(centers_m: ArrayLike, normals: ArrayLike, radii_m: ArrayLike) -> Array:
     """Virtual points whose ordinary projection is the centre of the image ellipse of a disc.
@@ -48,6 +51,34 @@ def project_disc_centers(
     centers = left_from_drogue.apply(centers_drogue_m) - rig.eye_offset_m(eye)
     normals = np.broadcast_to(left_from_drogue.rotation[:, 2], centers.shape)
     return rig.camera.project(ellipse_center_points(centers, normals, radii_m))
+
+
+def disc_image_centers(
+    rig: StereoRig, left_from_drogue: RigidTransform, centers_drogue_m: ArrayLike, radii_m: ArrayLike, eye: Eye
+) -> Array:
+    """Centres of gravity of the areas that discs cover in the delivered image; arguments as `project_disc_centers`.
+
+    In an ideal eye they are the centres of the image ellipses. Behind a lens that distorts, an image of a disc is no
+    ellipse; its centre is that of a polygon through its edge.
+
+    Returns:
+        (N, 2) pixel coordinates. [px]
+    """
+    if rig.lens(eye) is None:
+        return project_disc_centers(rig, left_from_drogue, centers_drogue_m, radii_m, eye)
+    places = zip(np.atleast_2d(centers_drogue_m), np.atleast_1d(radii_m), strict=True)
+    outlines = [disc_outline(left_from_drogue, center, radius, _OUTLINE_POINTS) for center, radius in places]
+    return np.stack([_center_of_gravity(rig.image(outline, eye)) for outline in outlines])
+
+
+def _center_of_gravity(corners: Array) -> Array:
+    """(2,) centre of the area of a polygon with (M, 2) corners."""
+    origin = corners.mean(axis=0)
+    start = corners - origin
+    end = np.roll(start, -1, axis=0)
+    cross = start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0]
+    center: Array = origin + ((start + end) * cross[:, None]).sum(axis=0) / (3.0 * cross.sum())
+    return center
 
 
 def disc_outline(left_from_drogue: RigidTransform, center_drogue_m: ArrayLike, radius_m: float, count: int) -> Array:

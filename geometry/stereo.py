@@ -1,4 +1,8 @@
-"""The rectified stereo rig: two equal pinholes, the right one `baseline_m` along +x of the left."""
+"""The stereo rig: two equal rectified pinholes, the right one `baseline_m` along +x of the left, and real eyes if any.
+
+`camera`, `project`, `triangulate` speak of the ideal, rectified images. Where the images that the sensors deliver are
+not those, the rig has lenses, and `real_px` and `ideal_px` go from one to the other.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geometry.distortion import Lens, border_px
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, read_only
 
@@ -23,10 +28,11 @@ class StereoRig:
     """Two equal rectified cameras on the receiver.
 
     Attributes:
-        camera: intrinsics of both eyes.
+        camera: intrinsics of both rectified eyes.
         baseline_m: distance of the right eye from the left, along x.
         body_from_left: left camera frame to the receiver's body axes (forward, right, down).
         probe_tip_body_m: (3,) tip of the refuelling probe in body axes.
+        lenses: the real left and right eye, with images of the same size, or None for ideal ones.
     """
 
     camera: PinholeCamera
@@ -35,11 +41,18 @@ class StereoRig:
         default_factory=lambda: RigidTransform(BODY_FROM_OPTICAL_ROTATION, np.zeros(3))
     )
     probe_tip_body_m: Array = field(default_factory=lambda: np.array([1.0, 0.45, 0.35]))
+    lenses: tuple[Lens, Lens] | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.baseline_m) and self.baseline_m > 0):
             raise ValueError(f"baseline_m: must be positive, got {self.baseline_m}")
         object.__setattr__(self, "probe_tip_body_m", read_only(self.probe_tip_body_m, (3,), "probe_tip_body_m"))
+        size = (self.camera.width_px, self.camera.height_px)
+        for lens in self.lenses or ():
+            if (lens.camera.width_px, lens.camera.height_px) != size:
+                raise ValueError(
+                    f"lenses: images must be {size} px, got {lens.camera.width_px}x{lens.camera.height_px}"
+                )
 
     def eye_offset_m(self, eye: Eye) -> Array:
         """(3,) centre of the eye in the left camera frame. [m]"""
@@ -48,6 +61,35 @@ class StereoRig:
     def project(self, points_left_m: ArrayLike, eye: Eye) -> Array:
         """(..., 2) image in one eye of (..., 3) points given in the left camera frame. [px]"""
         return self.camera.project(np.asarray(points_left_m, dtype=np.float64) - self.eye_offset_m(eye))
+
+    def lens(self, eye: Eye) -> Lens | None:
+        """The real eye, or None where it is ideal."""
+        return None if self.lenses is None else self.lenses[EYES.index(eye)]
+
+    def real_px(self, ideal_px: ArrayLike, eye: Eye) -> Array:
+        """(..., 2) pixels of the delivered image that see the rays of (..., 2) pixels of the ideal one. [px]"""
+        ideal, lens = np.asarray(ideal_px, dtype=np.float64), self.lens(eye)
+        return ideal if lens is None else lens.project_rays(self.camera.rays(ideal))
+
+    def ideal_px(self, real_px: ArrayLike, eye: Eye) -> Array:
+        """(..., 2) pixels of the ideal image that see the rays of (..., 2) pixels of the delivered one. [px]"""
+        return self.camera.project(self.rays(real_px, eye))
+
+    def rays(self, real_px: ArrayLike, eye: Eye) -> Array:
+        """(..., 3) directions through (..., 2) pixels of the delivered image, in the rig's axes, scaled to z = 1."""
+        lens = self.lens(eye)
+        return self.camera.rays(real_px) if lens is None else lens.rays(real_px)
+
+    def image(self, points_left_m: ArrayLike, eye: Eye) -> Array:
+        """(..., 2) where the delivered image shows (..., 3) points given in the left camera frame. [px]"""
+        return self.real_px(self.project(points_left_m, eye), eye)
+
+    def largest_shift_px(self) -> float:
+        """How far lenses move what stands on the border of an ideal image, at most; 0 for ideal eyes. [px]"""
+        if self.lenses is None:
+            return 0.0
+        border = border_px(self.camera)
+        return max(float(np.linalg.norm(self.real_px(border, eye) - border, axis=-1).max()) for eye in EYES)
 
     def triangulate(self, left_px: ArrayLike, right_px: ArrayLike) -> Array:
         """Maximum-likelihood points for equal isotropic noise in both eyes.

@@ -15,6 +15,7 @@ from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
+from labelgen.part_pixels import is_one_of
 
 
 @lru_cache(maxsize=8)
@@ -42,17 +43,14 @@ def full_box(drogue: DrogueParameters, rig: StereoRig, left_from_drogue: RigidTr
         raise ValueError(
             f"left_from_drogue: all of the drogue must be in front of the camera, got {points[:, 2].min():g} m"
         )
-    image = rig.project(points, eye)
+    image = rig.image(points, eye)
     low, high = image.min(axis=0), image.max(axis=0)
     return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
 
 
 def visible_mask(part_id: NDArray[np.uint8], marker_count: int) -> NDArray[np.bool_]:
     """(H, W) whether a pixel centre sees a part that belongs to the drogue's box."""
-    belongs = np.zeros(256, dtype=np.bool_)
-    belongs[drogue_part_ids(marker_count)] = True
-    mask: NDArray[np.bool_] = belongs[part_id]
-    return mask
+    return is_one_of(part_id, drogue_part_ids(marker_count))
 
 
 def visible_box(mask: NDArray[np.bool_]) -> PixelBox | None:

@@ -106,8 +106,11 @@ def _annotation_faults(annotation: dict[str, Any], record: PairRecord, eye: Eye)
     if annotation["area"] != view.visible_drogue_px:
         faults.append(f"area: is {annotation['area']}, the record gives {view.visible_drogue_px}")
     points = np.array(annotation["keypoints"], dtype=np.float64).reshape(-1, 3)
-    centers = np.array([marker.center_proj_px for marker in view.markers]) + 0.5
     shown = points[:, 2] > 0
+    if len(points) < len(view.markers) or shown[len(view.markers) :].any():
+        return [*faults, f"keypoints: {len(points)} do not fit the record's {len(view.markers)} markers"]
+    centers = np.zeros((len(points), 2))
+    centers[: len(view.markers)] = np.array([marker.center_proj_px for marker in view.markers]) + 0.5
     if np.abs(points[shown, :2] - centers[shown]).max(initial=0.0) > _TOLERANCE_PX or points[~shown].any():
         faults.append("keypoints: differ from the record's markers")
     if annotation["num_keypoints"] != int(shown.sum()):

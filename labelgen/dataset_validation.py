@@ -19,8 +19,10 @@ from datasets_manifest.records import PairRecord
 from datasets_manifest.writer import leftovers
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import drogue_part_ids
+from geometry.distortion import Lens
 from geometry.stereo import EYES, Eye
 from labelgen.coco_validation import CocoFiles
+from labelgen.part_pixels import FeaturePixels, is_one_of
 from labelgen.validation import check_boxes, check_empty, check_unoccluded_marker, named_features
 
 # Two ways to project in float64 agree far better; a pixel convention that is wrong does not.
@@ -183,7 +185,7 @@ def _stray_files(folder: Path, record: PairRecord) -> list[str]:
 
 
 def _projection_faults(record: PairRecord) -> list[str]:
-    """Centres against OpenCV's projection of the pose, and row against row of the rectified pair."""
+    """Centres against OpenCV's projection of the pose, and row against row of the pair once rectified."""
     pose, drogue = record.left_from_drogue, record.frame.drogue
     if pose is None or drogue is None:
         return []
@@ -191,16 +193,21 @@ def _projection_faults(record: PairRecord) -> list[str]:
     centers_m = layout.centers_m
     if layout.hub_center_m is not None:
         centers_m = np.vstack([centers_m, layout.hub_center_m])
-    turn, _ = cv2.Rodrigues(pose.rotation)
     faults, labels = [], {}
     for eye in EYES:
         named = named_features(record, layout, pose, eye)
         if len(named) != len(centers_m):
             return [f"{eye}: has {len(named)} features, the drogue {len(centers_m)}"]
         offset = pose.translation_m - rig.eye_offset_m(eye)
-        want, _ = cv2.projectPoints(centers_m, turn, offset, rig.camera.matrix(), None)
-        labels[eye] = np.array([view.center_proj_px for _, view, _ in named])
-        error = np.abs(labels[eye] - want[:, 0]).max(axis=1)
+        lens = rig.lens(eye) or Lens(rig.camera)
+        real_from_ideal = lens.ideal_from_real.T
+        turn, _ = cv2.Rodrigues(real_from_ideal @ pose.rotation)
+        want, _ = cv2.projectPoints(
+            centers_m, turn, real_from_ideal @ offset, lens.camera.matrix(), lens.distortion.coefficients()
+        )
+        labelled = np.array([view.center_proj_px for _, view, _ in named])
+        error = np.abs(labelled - want[:, 0]).max(axis=1)
+        labels[eye] = rig.ideal_px(labelled, eye)
         for index in np.flatnonzero(error > _PROJECTION_TOLERANCE_PX):
             faults.append(f"{eye}: {named[index][0]}: center_proj_px: is {error[index]:.3g} px off the pose's image")
     gap = float(np.abs(labels["left"][:, 1] - labels["right"][:, 1]).max())
@@ -215,14 +222,15 @@ def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> l
     if pose is None or drogue is None:
         return check_empty(view, part_id)
     layout = marker_layout(drogue)
-    faults = check_boxes(view, np.isin(part_id, drogue_part_ids(layout.count)))
+    faults = check_boxes(view, is_one_of(part_id, drogue_part_ids(layout.count)))
+    pixels = FeaturePixels(part_id)
     if len(view.markers) != layout.count:
         return [*faults, f"markers: {len(view.markers)} are labelled, the drogue has {layout.count}"]
     for name, feature, disc in named_features(record, layout, pose, eye):
-        if (feature.visible_fraction > 0) != bool((part_id == disc.part).any()):
+        if (feature.visible_fraction > 0) != (pixels.count(disc.part) > 0):
             faults.append(f"{name}: visible_fraction: is {feature.visible_fraction}, the part ids say otherwise")
         elif name != "hub" and feature.in_image and feature.visible_fraction == 1:
-            faults += [f"{name}: {fault}" for fault in check_unoccluded_marker(feature, disc, part_id)]
+            faults += [f"{name}: {fault}" for fault in check_unoccluded_marker(feature, disc, part_id, pixels)]
     return faults
 
 

@@ -9,9 +9,13 @@ from numpy.typing import ArrayLike
 
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parts import Part, marker_id
+from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
+
+# Their lowest and highest fall short of the curve's by 8e-5 of the radius.
+_OUTLINE_POINTS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +27,8 @@ class DiscInEye:
         center_m: (3,) [m]
         normal: (3,) unit vector.
         radius_m: [m]
-        camera: the eye's intrinsics.
+        camera: the intrinsics of the eye's ideal image.
+        lens: the real eye, or None where it is ideal.
     """
 
     part: int
@@ -31,6 +36,11 @@ class DiscInEye:
     normal: Array
     radius_m: float
     camera: PinholeCamera
+    lens: Lens | None = None
+
+    def rays(self, pixels_px: ArrayLike) -> Array:
+        """(..., 3) directions through (..., 2) pixels of the delivered image, scaled to z = 1."""
+        return self.camera.rays(pixels_px) if self.lens is None else self.lens.rays(pixels_px)
 
     def dual_conic(self) -> Array:
         """(3, 3) dual conic D of the image ellipse: lines l touch it where l^T D l = 0.
@@ -44,15 +54,25 @@ class DiscInEye:
         return conic
 
     def extent_px(self) -> tuple[float, float, float, float]:
-        """Lowest u, lowest v, highest u, highest v of the image ellipse. [px]"""
+        """Lowest u, lowest v, highest u, highest v of the disc's image. [px]"""
+        if self.lens is not None:
+            return self._extent_through(self.lens)
         d = self.dual_conic() / self.dual_conic()[2, 2]
         center = d[:2, 2]
         half = np.sqrt(center**2 - np.diag(d)[:2])
         low, high = center - half, center + half
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
+    def _extent_through(self, lens: Lens) -> tuple[float, float, float, float]:
+        across = np.linalg.svd(self.normal[None])[2][1:]
+        angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
+        edge_m = self.center_m + self.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ across
+        image = lens.project_rays(edge_m)
+        (u_low, v_low), (u_high, v_high) = image.min(axis=0).tolist(), image.max(axis=0).tolist()
+        return u_low, v_low, u_high, v_high
+
     def semi_axes_px(self) -> tuple[float, float]:
-        """Longer and shorter semi-axis of the image ellipse. [px]"""
+        """Longer and shorter semi-axis of the ellipse in the ideal image. [px]"""
         d = self.dual_conic() / self.dual_conic()[2, 2]
         shape = np.outer(d[:2, 2], d[:2, 2]) - d[:2, :2]
         shorter, longer = np.sqrt(np.maximum(np.linalg.eigvalsh(shape), 0.0))
@@ -60,12 +80,12 @@ class DiscInEye:
 
     def plane_depth_m(self, pixels_px: ArrayLike) -> Array:
         """(...) planar depth at which rays through (..., 2) pixel coordinates meet the disc's plane. [m]"""
-        depth: Array = (self.center_m @ self.normal) / (self.camera.rays(pixels_px) @ self.normal)
+        depth: Array = (self.center_m @ self.normal) / (self.rays(pixels_px) @ self.normal)
         return depth
 
     def distance_m(self, pixels_px: ArrayLike) -> Array:
         """(...) distance from the disc's centre at which rays through (..., 2) pixels meet its plane. [m]"""
-        points = self.camera.rays(pixels_px) * self.plane_depth_m(pixels_px)[..., None]
+        points = self.rays(pixels_px) * self.plane_depth_m(pixels_px)[..., None]
         distance: Array = np.linalg.norm(points - self.center_m, axis=-1)
         return distance
 
@@ -75,7 +95,8 @@ def marker_discs(layout: MarkerLayout, rig: StereoRig, pose: RigidTransform, eye
     centers = pose.apply(layout.centers_m) - rig.eye_offset_m(eye)
     axis = pose.rotation[:, 2]
     return [
-        DiscInEye(marker_id(index), center, axis, layout.radius_m, rig.camera) for index, center in enumerate(centers)
+        DiscInEye(marker_id(index), center, axis, layout.radius_m, rig.camera, rig.lens(eye))
+        for index, center in enumerate(centers)
     ]
 
 
@@ -87,7 +108,7 @@ def hub_discs(
         return None
     center = pose.apply(layout.hub_center_m) - rig.eye_offset_m(eye)
     outer, inner = (
-        DiscInEye(int(Part.HUB), center, pose.rotation[:, 2], radius_m, rig.camera)
+        DiscInEye(int(Part.HUB), center, pose.rotation[:, 2], radius_m, rig.camera, rig.lens(eye))
         for radius_m in (layout.hub_outer_radius_m, layout.hub_inner_radius_m)
     )
     return outer, inner

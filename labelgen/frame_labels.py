@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from datasets_manifest.frame import FrameSpec
@@ -56,6 +57,7 @@ def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages
             sun_elevation_deg=frame.environment.sun_elevation_deg,
             background_luminance_cd_m2=_background_luminance_cd_m2(radiance),
             monte_carlo_noise_fraction=radiance.monte_carlo_noise_fraction,
+            monte_carlo_over_sensor_noise=radiance.monte_carlo_over_sensor_noise,
         ),
         engine=radiance.engine,
         engine_version=radiance.engine_version,
@@ -114,7 +116,15 @@ def _view(frame: FrameSpec, pose: RigidTransform | None, eye: Eye, seen: EyeRadi
 
 def _background_luminance_cd_m2(radiance: StereoRadiance) -> float:
     """Mean luminance of the pixels of both eyes that see no part; of all pixels where every one sees some part."""
-    light = np.concatenate([eye.radiance_cd_m2.reshape(-1, 3) for eye in (radiance.left, radiance.right)])
-    open_sky = np.concatenate([eye.part_id.ravel() == Part.SKY for eye in (radiance.left, radiance.right)])
-    chosen = light[open_sky] if open_sky.any() else light
-    return float(chosen.mean(axis=0, dtype=np.float64) @ REC709_LUMINANCE)
+    eyes = (radiance.left, radiance.right)
+    masks = [(eye.part_id == Part.SKY).view(np.uint8) for eye in eyes]
+    counts = np.array([np.count_nonzero(mask) for mask in masks], dtype=np.float64)
+    if not counts.any():
+        masks, counts = (
+            [np.ones_like(mask) for mask in masks],
+            np.array([mask.size for mask in masks], dtype=np.float64),
+        )
+    means = np.array(
+        [cv2.mean(eye.radiance_cd_m2, mask)[:3] for eye, mask in zip(eyes, masks, strict=True)], dtype=np.float64
+    )
+    return float(np.average(means, axis=0, weights=counts) @ REC709_LUMINANCE)

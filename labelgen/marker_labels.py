@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.records import FeatureView, HubView
 from drogue_models.marker_layout import MarkerLayout
-from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, Part
-from geometry.circles import project_disc_centers
+from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, SURROUNDING_PARTS, Part
+from geometry.circles import disc_image_centers
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye
 from labelgen.boxes import leaves_image
@@ -34,8 +34,8 @@ def marker_views(
         seen: its radiance and passes.
     """
     radii = np.full(layout.count, layout.radius_m)
-    ellipse = project_disc_centers(frame.rig, pose, layout.centers_m, radii, eye)
-    proj = frame.rig.project(pose.apply(layout.centers_m), eye)
+    ellipse = disc_image_centers(frame.rig, pose, layout.centers_m, radii, eye)
+    proj = frame.rig.image(pose.apply(layout.centers_m), eye)
     return tuple(
         _feature_view(frame, disc, seen, proj[index], ellipse[index])
         for index, disc in enumerate(marker_discs(layout, frame.rig, pose, eye))
@@ -50,8 +50,8 @@ def hub_view(
     if discs is None or layout.hub_center_m is None:
         return None
     center = layout.hub_center_m[None]
-    outer, inner = (project_disc_centers(frame.rig, pose, center, np.array([disc.radius_m]), eye)[0] for disc in discs)
-    view = _feature_view(frame, discs[0], seen, frame.rig.project(pose.apply(center), eye)[0], outer)
+    outer, inner = (disc_image_centers(frame.rig, pose, center, np.array([disc.radius_m]), eye)[0] for disc in discs)
+    view = _feature_view(frame, discs[0], seen, frame.rig.image(pose.apply(center), eye)[0], outer)
     return HubView(**view.model_dump(), center_ellipse_inner_px=_point(inner))
 
 
@@ -110,7 +110,7 @@ def _electrons(frame: FrameSpec, radiance_cd_m2: NDArray[np.float32]) -> Array:
 def _is_structure(part_id: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Whether pixels see a part of the drogue that is no marker and no hub."""
     is_marker = (part_id >= FIRST_MARKER_ID) & (part_id < FIRST_MARKER_ID + MAX_MARKERS)
-    others: NDArray[np.bool_] = ~is_marker & ~np.isin(part_id, (Part.SKY, Part.HUB, Part.HOSE, Part.TANKER))
+    others: NDArray[np.bool_] = ~is_marker & ~np.isin(part_id, (Part.SKY, Part.HUB, *SURROUNDING_PARTS))
     return others
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +13,7 @@ from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye
 from labelgen.discs import DiscInEye, hub_discs, marker_discs
+from labelgen.part_pixels import FeaturePixels, is_one_of
 from render.engine import EyeRadiance, StereoRadiance
 
 # Root mean square distance between the centroid of the pixel centres in a disc and the disc's own centre is this times
@@ -69,11 +71,10 @@ def check_boxes(view: ViewRecord, mask: NDArray[np.bool_]) -> list[str]:
     if (box is None) != (count == 0):
         faults.append(f"box_visible_xywh_px: is {box} with {count} visible pixels")
     elif box is not None:
-        rows, columns = np.nonzero(mask)
-        low_u, low_v = columns.min() - 0.5, rows.min() - 0.5
-        want = (low_u, low_v, columns.max() + 0.5 - low_u, rows.max() + 0.5 - low_v)
+        column, row, width, height = cv2.boundingRect(mask.view(np.uint8))
+        want = (column - 0.5, row - 0.5, float(width), float(height))
         if box != want:
-            faults.append(f"box_visible_xywh_px: is {box}, the part ids have {tuple(map(float, want))}")
+            faults.append(f"box_visible_xywh_px: is {box}, the part ids have {want}")
         full = view.box_full_xywh_px
         # A pixel reaches half a pixel beyond its centre on either side.
         if full is None or not _contains(full, box, margin_px=1.0):
@@ -81,8 +82,10 @@ def check_boxes(view: ViewRecord, mask: NDArray[np.bool_]) -> list[str]:
     return faults
 
 
-def check_unoccluded_marker(view: FeatureView, disc: DiscInEye, part_id: NDArray[np.uint8]) -> list[str]:
-    """Faults of a marker that is wholly visible, against the part ids."""
+def check_unoccluded_marker(
+    view: FeatureView, disc: DiscInEye, part_id: NDArray[np.uint8], pixels: FeaturePixels
+) -> list[str]:
+    """Faults of a marker that is wholly visible, against the part ids and its pixels among them."""
     faults = []
     if not disc.camera.contains(view.center_proj_px):
         return [f"in_image: is true, center_proj_px {view.center_proj_px} is not on the image"]
@@ -91,7 +94,7 @@ def check_unoccluded_marker(view: FeatureView, disc: DiscInEye, part_id: NDArray
     inside = float(disc.distance_m(np.array([column, row]))) < 0.9 * disc.radius_m
     if inside and part_id[row, column] != disc.part:
         faults.append(f"center_proj_px: pixel {column}, {row} sees part {part_id[row, column]}, not {disc.part}")
-    error_px, rms_px = centroid_error(view, disc, part_id == disc.part)
+    error_px, rms_px = centroid_error(view, disc, pixels)
     if np.hypot(*error_px) > _LATTICE_LIMIT_RMS * rms_px:
         faults.append(
             f"center_ellipse_px: is {np.hypot(*error_px):.3f} px from the centroid of part {disc.part}, "
@@ -100,14 +103,14 @@ def check_unoccluded_marker(view: FeatureView, disc: DiscInEye, part_id: NDArray
     return faults
 
 
-def centroid_error(view: FeatureView, disc: DiscInEye, mask: NDArray[np.bool_]) -> tuple[Array, float]:
+def centroid_error(view: FeatureView, disc: DiscInEye, pixels: FeaturePixels) -> tuple[Array, float]:
     """Centroid of a marker's pixels less `center_ellipse_px`.
 
     Returns:
         (2,) error [px], and the root mean square length that the pixel lattice alone gives it [px].
     """
     longer, shorter = disc.semi_axes_px()
-    rows, columns = np.nonzero(mask)
+    rows, columns = pixels.places(disc.part)
     error = np.array([columns.mean(), rows.mean()]) - np.array(view.center_ellipse_px)
     return error, LATTICE_RMS * float(np.sqrt(longer)) / shorter
 
@@ -120,12 +123,14 @@ def _check_drogue(
     layout = marker_layout(drogue)
     if len(view.markers) != layout.count or (view.hub is None) != (layout.hub_center_m is None):
         return [f"markers, hub: {len(view.markers)} markers are labelled, the drogue has {layout.count}"]
-    faults = check_boxes(view, np.isin(seen.part_id, drogue_part_ids(layout.count)))
+    pixels = FeaturePixels(seen.part_id)
+    faults = check_boxes(view, is_one_of(seen.part_id, drogue_part_ids(layout.count)))
     for name, feature, disc in named_features(record, layout, pose, eye):
         hole_m = layout.hub_inner_radius_m if name == "hub" else 0.0
-        found = _check_visibility(feature, disc, seen) + _check_pixels(disc, hole_m, seen)
+        found = _check_visibility(feature, pixels.count(disc.part), seen.amodal_px.get(disc.part, 0))
+        found += _check_pixels(disc, hole_m, seen, pixels)
         if name != "hub" and feature.in_image and feature.visible_fraction == 1:
-            found += check_unoccluded_marker(feature, disc, seen.part_id)
+            found += check_unoccluded_marker(feature, disc, seen.part_id, pixels)
         faults += [f"{name}: {fault}" for fault in found]
     return faults
 
@@ -147,20 +152,18 @@ def named_features(
     return named
 
 
-def _check_visibility(feature: FeatureView, disc: DiscInEye, seen: EyeRadiance) -> list[str]:
-    visible = int(np.count_nonzero(seen.part_id == disc.part))
-    amodal = seen.amodal_px.get(disc.part, 0)
+def _check_visibility(feature: FeatureView, visible: int, amodal: int) -> list[str]:
     if visible > amodal:
         return [f"{visible} pixels are visible of only {amodal}"]
     want = visible / amodal if amodal else 0.0
     return [] if feature.visible_fraction == want else [f"visible_fraction: is {feature.visible_fraction}, not {want}"]
 
 
-def _check_pixels(disc: DiscInEye, hole_m: float, seen: EyeRadiance) -> list[str]:
+def _check_pixels(disc: DiscInEye, hole_m: float, seen: EyeRadiance, pixels: FeaturePixels) -> list[str]:
     """Every pixel of a feature around a hole: whether it lies on it, and its depth against the feature's plane."""
-    rows, columns = np.nonzero(seen.part_id == disc.part)
-    pixels = np.stack([columns, rows], axis=-1).astype(np.float64)
-    distance_m = disc.distance_m(pixels)
+    rows, columns = pixels.places(disc.part)
+    places_px = np.stack([columns, rows], axis=-1).astype(np.float64)
+    distance_m = disc.distance_m(places_px)
     faults = []
     beyond = int(np.count_nonzero(distance_m > disc.radius_m * (1 + _OUTLINE_TOLERANCE)))
     if beyond:
@@ -169,9 +172,9 @@ def _check_pixels(disc: DiscInEye, hole_m: float, seen: EyeRadiance) -> list[str
     on_face = (distance_m > hole_m * (1 + _OUTLINE_TOLERANCE)) & (distance_m < disc.radius_m * (1 - _OUTLINE_TOLERANCE))
     if not on_face.any():
         return faults
-    rows, columns, pixels = rows[on_face], columns[on_face], pixels[on_face]
-    error_m = np.abs(seen.depth_m[rows, columns].astype(np.float64) - disc.plane_depth_m(pixels))
-    rays = disc.camera.rays(pixels)
+    rows, columns, places_px = rows[on_face], columns[on_face], places_px[on_face]
+    error_m = np.abs(seen.depth_m[rows, columns].astype(np.float64) - disc.plane_depth_m(places_px))
+    rays = disc.rays(places_px)
     slant = np.abs(rays @ disc.normal) / np.linalg.norm(rays, axis=-1)
     reach_m = float(np.linalg.norm(disc.center_m)) + disc.radius_m
     limit_m = _DEPTH_ROUNDINGS * float(np.finfo(np.float32).eps) * reach_m / slant

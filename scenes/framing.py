@@ -45,15 +45,16 @@ def room_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[float, floa
     z = depth_m + points_m[:, 2]
     if z.min() <= 0:
         return None
-    left = (_MARGIN_PX - 0.5 - c.cx_px) / c.fx_px * z - points_m[:, 0]
-    right = (c.width_px - 0.5 - _MARGIN_PX - c.cx_px) / c.fx_px * z - points_m[:, 0]
-    up = (_MARGIN_PX - 0.5 - c.cy_px) / c.fy_px * z - points_m[:, 1]
-    down = (c.height_px - 0.5 - _MARGIN_PX - c.cy_px) / c.fy_px * z - points_m[:, 1]
+    margin_px = _MARGIN_PX + rig.largest_shift_px()
+    left = (margin_px - 0.5 - c.cx_px) / c.fx_px * z - points_m[:, 0]
+    right = (c.width_px - 0.5 - margin_px - c.cx_px) / c.fx_px * z - points_m[:, 0]
+    up = (margin_px - 0.5 - c.cy_px) / c.fy_px * z - points_m[:, 1]
+    down = (c.height_px - 0.5 - margin_px - c.cy_px) / c.fy_px * z - points_m[:, 1]
     x_low, x_high, y_low, y_high = left.max() + rig.baseline_m, right.min(), up.max(), down.min()
     return None if x_low > x_high or y_low > y_high else (float(x_low), float(x_high), float(y_low), float(y_high))
 
 
-def sample_pose(rng: np.random.Generator, recipe: Recipe, depth_m: float) -> RigidTransform:
+def sample_pose(rng: np.random.Generator, recipe: Recipe, drogue: DrogueParameters, depth_m: float) -> RigidTransform:
     """`left_from_drogue` at one depth: attitude from the recipe's ranges, place uniform in the common field of view.
 
     An attitude that does not fit into both views at this depth is drawn again.
@@ -61,7 +62,7 @@ def sample_pose(rng: np.random.Generator, recipe: Recipe, depth_m: float) -> Rig
     Raises:
         ValueError: no attitude of the ranges fits.
     """
-    points = outline(recipe.drogue)
+    points = outline(drogue)
     for _ in range(_MOST_TRIES):
         pitch, yaw, roll = np.radians(
             [draw(rng, limits) for limits in (recipe.pose.pitch_deg, recipe.pose.yaw_deg, recipe.pose.roll_deg)]

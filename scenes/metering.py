@@ -9,17 +9,23 @@ from datasets_manifest.recipe import ExposureLaw
 from drogue_models.parameters import WHITE_PAINT
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
-from scenes.surroundings import luminance, surroundings
+from scenes.light import luminance
+from scenes.surroundings import surroundings
 
 _METER_COLUMNS, _METER_ROWS = 16, 12
+_DARKEST_CD_M2 = 1e-9  # a millionth of a starlit sky; both limits are reached long before
 
 
 def meter(
     law: ExposureLaw, environment: Environment, camera: PinholeCamera, world_from_left: RigidTransform, sensor: Sensor
 ) -> Exposure:
-    """Exposure that puts the brighter of the view's mean and a white plate facing the camera at the law's level."""
-    if law.time_s is not None:
-        return Exposure(time_s=law.time_s, f_number=law.f_number)
+    """Exposure that puts the brighter of the view's mean and a white plate facing the camera at the law's level.
+
+    Time comes first, for it makes signal; gain only makes up for what the limits of time leave.
+    """
+    gain = law.auto_gain
+    if law.time_s is not None and gain.low == gain.high:
+        return Exposure(time_s=law.time_s, f_number=law.f_number, gain=gain.low)
     around = surroundings(environment)
     u, v = np.meshgrid(
         (np.arange(_METER_COLUMNS) + 0.5) * camera.width_px / _METER_COLUMNS,
@@ -28,7 +34,12 @@ def meter(
     rays = world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1)))
     view = around.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
     plate = around.plate_illuminance_lux(-world_from_left.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
-    brightest = max(float(luminance(view).mean()), float(luminance(plate)))
+    brightest = max(float(luminance(view).mean()), float(luminance(plate)), _DARKEST_CD_M2)
     one_second = Exposure(time_s=1.0, f_number=law.f_number)
     wanted_s = law.auto_level_fraction * sensor.full_well_e / (sensor.electrons_per_cd_m2(one_second) * brightest)
-    return Exposure(time_s=float(np.clip(wanted_s, law.auto_time_s.low, law.auto_time_s.high)), f_number=law.f_number)
+    time_s = law.time_s
+    if time_s is None:
+        nearest_to_one = min(max(1.0, gain.low), gain.high)
+        time_s = float(np.clip(wanted_s / nearest_to_one, law.auto_time_s.low, law.auto_time_s.high))
+    gain_used = float(np.clip(wanted_s / time_s, gain.low, gain.high))
+    return Exposure(time_s=time_s, f_number=law.f_number, gain=gain_used)

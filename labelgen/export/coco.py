@@ -63,6 +63,10 @@ def write_coco(dataset: Path, out: Path) -> list[Path]:
             for eye in EYES:
                 image = coco_image(record, eye, split)
                 annotation = coco_annotation(record, eye, source.part_ids(frame_index, eye))
+                if annotation is not None:
+                    # COCO wants as many keypoints of every drogue as the category has.
+                    missing = most_markers(source.manifest) * 3 - len(annotation["keypoints"])
+                    annotation["keypoints"] += [0.0] * missing
                 for name in ("all", split):
                     writers[name].add(image, annotation)
         for writer in writers.values():
@@ -146,9 +150,15 @@ def clockwise_order(view: ViewRecord) -> list[int]:
     return [int(index) for index in np.argsort((from_top - from_top[first]) % (2 * np.pi), kind="stable")]
 
 
+def most_markers(manifest: Manifest) -> int:
+    """Number of markers of the drogue that has most of them."""
+    recipe = manifest.recipe
+    return max([recipe.drogue.marker_count, *(variant.drogue.marker_count for variant in recipe.variants)])
+
+
 def coco_header(manifest: Manifest) -> dict[str, Any]:
     """The file's `info`, `licenses` and `categories`."""
-    count = manifest.recipe.drogue.marker_count
+    count = most_markers(manifest)
     return {
         "info": {
             "description": f"droguekit dataset {manifest.name}: stereo pairs of a refuelling drogue",

@@ -17,9 +17,10 @@ from render.analytic_engine.flat_parts import flat_drogue, ring_radiance
 from render.analytic_engine.outlines import EyeView, seen_areas
 from render.analytic_engine.painting import paint
 from render.analytic_engine.passes import empty_passes, pixel_passes
-from render.background import background
+from render.background import backgrounds
 from render.engine import EyeRadiance, StereoRadiance
 from render.motion import blur_px
+from render.surfaces import missing_parts
 from render.version import RENDER_VERSION
 from scenes.surroundings import surroundings
 
@@ -32,7 +33,7 @@ _MOST_BLUR_MOMENTS = 32
 class AnalyticEngine:
     """Evenly lit discs and rings with exact edges: the clean room for estimators, and an opinion on other engines.
 
-    There are no shadows, no light between parts, no canopy, ribs, hose and tanker.
+    There are no shadows, no light between parts, no canopy, ribs, hose, tanker and bystanders; dirt is spread evenly.
     """
 
     name = "analytic"
@@ -52,10 +53,10 @@ class AnalyticEngine:
         """
         stage_s = {"sky": 0.0, "light": 0.0, "passes": 0.0, "outlines": 0.0, "composite": 0.0}
         with _timed(stage_s, "sky"):
-            behind = background(frame)
+            behind = backgrounds(frame)
         if frame.drogue is None or frame.left_from_drogue is None:
-            return self._stereo({eye: _empty_eye(frame, behind) for eye in EYES}, stage_s)
-        flat = flat_drogue(frame.drogue)
+            return self._stereo({eye: _empty_eye(frame, behind[eye]) for eye in EYES}, stage_s)
+        flat = flat_drogue(frame.drogue, missing_parts(frame))
         with _timed(stage_s, "light"):
             light = ring_radiance(frame, surroundings(frame.environment), flat.back_to_front)
         eyes = {}
@@ -66,7 +67,7 @@ class AnalyticEngine:
                 views = [EyeView(frame.rig, eye, frame.left_from_drogue_at(offset_s)) for offset_s in _moments_s(frame)]
                 moments = [seen_areas(flat, view) for view in views]
             with _timed(stage_s, "composite"):
-                eyes[eye] = EyeRadiance(*paint(moments, light, behind), **vars(passes))
+                eyes[eye] = EyeRadiance(*paint(moments, light, behind[eye]), **vars(passes))
         return self._stereo(eyes, stage_s)
 
     def _stereo(self, eyes: dict[Eye, EyeRadiance], stage_s: dict[str, float]) -> StereoRadiance:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
 from datasets_manifest.frame import FrameSpec
-from drogue_models.materials import part_reflectance_rgb
 from drogue_models.meshes import FACE_THICKNESS_M
 from drogue_models.parameters import DrogueParameters
-from drogue_models.parts import FIRST_MARKER_ID, Part, marker_id
+from drogue_models.parts import Part, marker_id
 from geometry.se3 import Array
-from scenes.sky import REC709_LUMINANCE
+from render.surfaces import lamp_radiance_rgb, mean_reflectance_rgb
 from scenes.surroundings import Surroundings
 
 
@@ -53,11 +53,11 @@ class FlatDrogue:
         return self.behind + self.front + self.markers
 
 
-def flat_drogue(drogue: DrogueParameters) -> FlatDrogue:
-    """The flat rings of a drogue with its dimensions."""
+def flat_drogue(drogue: DrogueParameters, gone: Collection[int] = ()) -> FlatDrogue:
+    """The flat rings of a drogue with its dimensions, less the markers and the hub whose part ids are `gone`."""
     depth_m, tube_m = drogue.hub_depth_m, drogue.rim_tube_radius_m
     behind = [FlatRing(int(Part.COUPLING), (0.0, 0.0, depth_m), drogue.coupling_radius_m)]
-    if drogue.hub is not None:
+    if drogue.hub is not None and int(Part.HUB) not in gone:
         hub = drogue.hub
         behind.append(FlatRing(int(Part.HUB), (0.0, 0.0, depth_m), hub.outer_radius_m, hub.inner_radius_m))
     opening_m, face_outer_m = drogue.face_inner_radius_m, drogue.rim_radius_m - tube_m
@@ -69,6 +69,7 @@ def flat_drogue(drogue: DrogueParameters) -> FlatDrogue:
     markers = [
         FlatRing(marker_id(index), (x, y, 0.0), drogue.marker_radius_m)
         for index, (x, y) in enumerate(drogue.marker_positions_m)
+        if marker_id(index) not in gone
     ]
     return FlatDrogue(tuple(behind), tuple(front), tuple(markers))
 
@@ -77,24 +78,22 @@ def ring_radiance(frame: FrameSpec, around: Surroundings, rings: tuple[FlatRing,
     """Radiance of each ring at the camera, the same all over it.
 
     Light falls on every ring as on the open rim plane, `L = reflectance E / pi`, lamps add their own, and the air takes
-    its share over the planar depth of the ring's centre and adds the horizon's. Rings with one part id stand for one
+    its share over the way to the ring's centre and adds its own. Rings with one part id stand for one
     part; the last one counts.
 
     Returns:
         (3,) luminance-scaled linear Rec. 709 by part id. [cd/m2]
     """
-    drogue, pose = frame.drogue, frame.left_from_drogue
-    assert drogue is not None and pose is not None
+    pose = frame.left_from_drogue
+    assert pose is not None
     towards_camera = -np.sign(pose.translation_m @ pose.rotation[:, 2]) * pose.rotation[:, 2]
     illuminance_lux = around.plate_illuminance_lux(frame.world_from_left.rotate(towards_camera))
-    emission = np.array(drogue.marker_emission_rgb)
-    lamp = drogue.marker_luminance_cd_m2 * emission / (emission @ REC709_LUMINANCE)
-    air = around.horizon_radiance
+    towards_drogue = pose.translation_m / np.linalg.norm(pose.translation_m)
+    air = around.airlight(frame.world_from_left.rotate(towards_drogue)).astype(np.float64)
+    slant = 1.0 / towards_drogue[2]
     radiance: dict[int, Array] = {}
     for ring in rings:
-        sent = np.array(part_reflectance_rgb(drogue, ring.part)) * illuminance_lux / np.pi
-        if ring.part >= FIRST_MARKER_ID:
-            sent = sent + lamp
-        clear = np.exp(-frame.environment.extinction_per_m * pose.apply(ring.center_m)[2])
+        sent = mean_reflectance_rgb(frame, ring.part) * illuminance_lux / np.pi + lamp_radiance_rgb(frame, ring.part)
+        clear = np.exp(-around.extinction_per_m * slant * pose.apply(ring.center_m)[2])
         radiance[ring.part] = sent * clear + air * (1.0 - clear)
     return radiance

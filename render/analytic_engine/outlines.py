@@ -83,4 +83,4 @@ def _outline_px(ring: FlatRing, radius_m: float, view: EyeView) -> Array:
     radius_px = max(view.rig.camera.fx_px, view.rig.camera.fy_px) * radius_m / nearest_m
     sides = max(int(np.ceil(np.pi * np.sqrt(radius_px / (3 * _OUTLINE_ERROR_PX)))), _FEWEST_SIDES)
     corners_m = disc_outline(view.left_from_drogue, ring.center_m, area_radius_m(radius_m, sides), sides)
-    return view.rig.project(corners_m, view.eye)
+    return view.rig.image(corners_m, view.eye)

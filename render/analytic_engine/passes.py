@@ -11,6 +11,7 @@ from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from render.analytic_engine.flat_parts import FlatDrogue, FlatRing
+from render.analytic_engine.lens_passes import RingPixels, lens_ring_pixels
 from render.analytic_engine.outlines import EyeView
 
 
@@ -42,33 +43,42 @@ def empty_passes(camera: PinholeCamera) -> PixelPasses:
 
 def pixel_passes(flat: FlatDrogue, view: EyeView) -> PixelPasses:
     """What the rays through the pixel centres of one eye meet first."""
-    camera = view.rig.camera
-    passes = empty_passes(camera)
+    passes = empty_passes(view.rig.camera)
     axis = view.left_from_drogue.rotation[:, 2]
+    lens = view.rig.lens(view.eye)
     for ring in flat.back_to_front:
-        spans = _disc_spans(ring, ring.outer_radius_m, view)
-        if not len(spans.first):
+        met = _ideal_ring_pixels(ring, view) if lens is None else lens_ring_pixels(ring, view, lens)
+        if met is None:
             continue
-        rows = slice(spans.top, spans.top + len(spans.first))
-        left, right = int(spans.first.min()), int(spans.last.max()) + 1
-        columns = np.arange(left, right)
-        inside = (columns >= spans.first[:, None]) & (columns <= spans.last[:, None])
-        if ring.inner_radius_m > 0:
-            hole = _disc_spans(ring, ring.inner_radius_m, view)
-            here = slice(hole.top - spans.top, hole.top - spans.top + len(hole.first))
-            inside[here] &= (columns < hole.first[:, None]) | (columns > hole.last[:, None])
-        count = int(np.count_nonzero(inside))
+        count = int(np.count_nonzero(met.inside))
         if count and (ring.part >= FIRST_MARKER_ID or ring.part == Part.HUB):
             passes.amodal_px[ring.part] = count
         if view.sees_front or ring in flat.front:
-            depth = _plane_depth_m(view.center_m(ring), axis, camera, rows, columns)
-            np.copyto(passes.part_id[rows, left:right], np.uint8(ring.part), where=inside)
-            np.copyto(passes.depth_m[rows, left:right], depth, where=inside)
+            window = met.rows, met.columns
+            np.copyto(passes.part_id[window], np.uint8(ring.part), where=met.inside)
+            np.copyto(passes.depth_m[window], met.depth_m, where=met.inside)
     normal = (-axis if view.sees_front else axis).astype(np.float32)
     covered = passes.part_id != Part.SKY
     for row in np.flatnonzero(covered.any(axis=1)):
         passes.normal[row, covered[row]] = normal
     return passes
+
+
+def _ideal_ring_pixels(ring: FlatRing, view: EyeView) -> RingPixels | None:
+    """The pixel centres of an ideal eye whose rays meet a ring, or None where there are none."""
+    spans = _disc_spans(ring, ring.outer_radius_m, view)
+    if not len(spans.first):
+        return None
+    rows = slice(spans.top, spans.top + len(spans.first))
+    columns = slice(int(spans.first.min()), int(spans.last.max()) + 1)
+    u = np.arange(columns.start, columns.stop)
+    inside = (u >= spans.first[:, None]) & (u <= spans.last[:, None])
+    if ring.inner_radius_m > 0:
+        hole = _disc_spans(ring, ring.inner_radius_m, view)
+        here = slice(hole.top - spans.top, hole.top - spans.top + len(hole.first))
+        inside[here] &= (u < hole.first[:, None]) | (u > hole.last[:, None])
+    axis = view.left_from_drogue.rotation[:, 2]
+    return RingPixels(rows, columns, inside, _plane_depth_m(view.center_m(ring), axis, view.rig.camera, rows, u))
 
 
 def _plane_depth_m(

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets_manifest.calibration import opencv_stereo_matrices, write_calibration
+from datasets_manifest.json_types import write_rig
+from datasets_manifest.recipe import Recipe, parse_recipe
+from datasets_manifest.rigs import resolve_rig
+from geometry.stereo import EYES
+
+TABLE = """
+name = "rig-test"
+frames = { count = 1 }
+distance = { law = "stations", stations_m = [5.0] }
+render = { engine = "analytic" }
+"""
+
+
+def test_ideal_presets_have_no_lenses():
+    for name in ("rgb-ideal", "paper-colour", "mono"):
+        rig, _ = resolve_rig(name, 3)
+        assert rig.lenses is None and "lenses" not in write_rig(rig)
+
+
+def test_real_eyes_are_drawn_by_the_seed():
+    one, again, other = (write_rig(resolve_rig("paper-real", seed)[0])["lenses"] for seed in (1, 1, 2))
+    assert one == again != other
+    left, right = one
+    assert np.array_equal(left["ideal_from_real"], np.eye(3))
+    assert not np.array_equal(right["ideal_from_real"], np.eye(3))
+    assert left["distortion"] != right["distortion"]
+
+
+def test_ranges_of_a_table_hold():
+    rig, _ = resolve_rig({"preset": "mono", "eyes": {"k1": [-0.1, -0.05], "k3": 0.01, "right_rotation_deg": 0.5}}, 9)
+    for lens in rig.lenses:
+        assert -0.1 <= lens.distortion.k1 <= -0.05
+        assert lens.distortion.k3 == 0.01 and lens.distortion.p1 == 0
+        assert lens.camera == rig.camera
+    turn, _ = cv2.Rodrigues(np.array(rig.lenses[1].ideal_from_real))
+    # Each of three axes up to the limit.
+    assert 0 < np.degrees(np.linalg.norm(turn)) <= 0.5 * np.sqrt(3)
+
+
+def test_json_gives_the_rig_back():
+    recipe = parse_recipe(TABLE + 'rig = "paper-real"', seed=4)
+    again = Recipe.model_validate_json(recipe.model_dump_json())
+    assert again.model_dump_json() == recipe.model_dump_json()
+    pixels = np.array([[10.0, 20.0], [1200.0, 900.0]])
+    for eye in EYES:
+        assert np.array_equal(again.rig.real_px(pixels, eye), recipe.rig.real_px(pixels, eye))
+
+
+def test_calibration_rectifies_the_real_images(tmp_path):
+    """OpenCV, given the written file alone, takes real pixels to the ideal rig's."""
+    rig, _ = resolve_rig("paper-real", 6)
+    (path,) = write_calibration(tmp_path, rig)
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    m = {name: storage.getNode(name).mat() for name in opencv_stereo_matrices(rig)}
+    points = np.random.default_rng(2).uniform([-0.2, -0.15, 1], [0.2, 0.15, 1], (50, 3)) * 8.0
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
+    for eye, number in zip(EYES, "12", strict=True):
+        matrix, distortion, rotation, projection = (m[letter + number] for letter in "MDRP")
+        seen = rig.image(points, eye).reshape(-1, 1, 2)
+        found = cv2.undistortPointsIter(seen, matrix, distortion, rotation, projection[:, :3], stop)
+        # 16 digits in the file and OpenCV's own iteration.
+        np.testing.assert_allclose(found[:, 0], rig.project(points, eye), atol=1e-8)
+    in_left = m["R1"].T @ points.T
+    in_right = (m["R"] @ in_left + m["T"]).T
+    wanted, _ = cv2.projectPoints(in_right, np.zeros(3), np.zeros(3), m["M2"], m["D2"])
+    np.testing.assert_allclose(rig.image(points, "right"), wanted[:, 0], atol=1e-8)
+
+
+def test_engines_without_lenses_are_named():
+    with pytest.raises(ValueError, match=r"render\.engine: blender draws ideal eyes only"):
+        parse_recipe(TABLE.replace("analytic", "blender") + 'rig = "paper-real"')
+
+
+@pytest.mark.parametrize(
+    "eyes", ["{ k1 = 3.0 }", "{ k9 = 0.1 }", "{ k1 = -1.9, k2 = -2.0 }", "{ right_rotation_deg = -1 }"]
+)
+def test_wrong_eyes_are_refused(eyes):
+    with pytest.raises(ValueError, match="rig: "):
+        parse_recipe(TABLE + f'rig = {{ preset = "mono", focal_px = 600.0, eyes = {eyes} }}')

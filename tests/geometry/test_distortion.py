@@ -1,0 +1,117 @@
+"""Lens distortion and misaligned eyes: round trips, and OpenCV's own projection as the judge."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geometry.circles import disc_image_centers, disc_outline, project_disc_centers
+from geometry.distortion import BrownConrady, Lens, border_px
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import RigidTransform, exp_twist, rotation_from_angles
+from geometry.stereo import EYES, StereoRig, paper_rig
+
+IDEAL = paper_rig()
+LEFT = Lens(PinholeCamera(1280, 960, 2140.0, 2136.0, 634.0, 484.5), BrownConrady(-0.08, 0.03, 2e-4, -1e-4, 0.01))
+RIGHT = Lens(
+    PinholeCamera(1280, 960, 2130.0, 2131.0, 645.0, 472.0),
+    BrownConrady(-0.05, 0.0, -1e-4, 2e-4),
+    exp_twist([0, 0, 0, 0.003, -0.004, 0.005]).rotation,
+)
+RIG = StereoRig(IDEAL.camera, IDEAL.baseline_m, lenses=(LEFT, RIGHT))
+
+
+def sample_points_m(count: int) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-0.25, -0.2, 1.5], [0.25, 0.2, 40.0], size=(count, 3))
+    points[:, :2] *= points[:, 2:]
+    return points
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.tuples(*(st.floats(-limit, limit) for limit in (0.2, 0.1, 2e-3, 2e-3, 0.05))),
+    st.floats(-0.35, 0.35),
+    st.floats(-0.35, 0.35),
+)
+def test_undistort_inverts_distort(coefficients, x, y):
+    model = BrownConrady(*coefficients)
+    # Newton's method ends at rounding.
+    np.testing.assert_allclose(model.undistort(model.distort([x, y])), [x, y], atol=1e-12)
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_images_are_opencv_s(eye):
+    points, lens = sample_points_m(200), RIG.lens(eye)
+    real_from_ideal = lens.ideal_from_real.T
+    turn, _ = cv2.Rodrigues(real_from_ideal)
+    shift = -real_from_ideal @ RIG.eye_offset_m(eye)
+    wanted, _ = cv2.projectPoints(points, turn, shift, lens.camera.matrix(), lens.distortion.coefficients())
+    # A handful of roundings at 1e3 px; Rodrigues and back costs most of them.
+    np.testing.assert_allclose(RIG.image(points, eye), wanted[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_real_and_ideal_pixels_go_back_and_forth(eye):
+    ideal = np.random.default_rng(3).uniform(-0.5, [1279.5, 959.5], (300, 2))
+    real = RIG.real_px(ideal, eye)
+    assert np.abs(real - ideal).max() > 3
+    np.testing.assert_allclose(RIG.ideal_px(real, eye), ideal, atol=1e-9)
+    np.testing.assert_allclose(RIG.image(RIG.rays(real, eye) * 7.0 + RIG.eye_offset_m(eye), eye), real, atol=1e-9)
+
+
+def test_rectified_places_triangulate_to_the_point():
+    points = sample_points_m(100)
+    left, right = (RIG.ideal_px(RIG.image(points, eye), eye) for eye in EYES)
+    np.testing.assert_allclose(left[:, 1], right[:, 1], atol=1e-9)
+    # At 40 m a disparity of 6.4 px is held to 1e-11 px.
+    np.testing.assert_allclose(RIG.triangulate(left, right), points, rtol=1e-9)
+
+
+def test_ideal_rig_changes_nothing():
+    pixels = np.array([[3.25, 700.5], [1000.0, 12.0]])
+    for eye in EYES:
+        assert np.array_equal(IDEAL.real_px(pixels, eye), pixels)
+        assert np.array_equal(IDEAL.image([[0.1, 0.2, 5.0]], eye), IDEAL.project([[0.1, 0.2, 5.0]], eye))
+    assert IDEAL.largest_shift_px() == 0.0
+
+
+def test_largest_shift_bounds_every_pixel_of_the_border():
+    u = np.linspace(-0.5, 1279.5, 500)
+    edge = np.stack([u, np.full(500, -0.5)], axis=-1)
+    shifts = [np.linalg.norm(RIG.real_px(edge, eye) - edge, axis=-1).max() for eye in EYES]
+    # The border is sampled every 41 px, over which a shift changes by less than a tenth of a pixel.
+    assert max(shifts) <= RIG.largest_shift_px() + 0.1
+    border = border_px(IDEAL.camera)
+    assert border.min(axis=0).tolist() == [-0.5, -0.5] and border.max(axis=0).tolist() == [1279.5, 959.5]
+
+
+def test_disc_centres_are_the_ellipse_s_without_and_the_area_s_with_a_lens():
+    pose = RigidTransform(rotation_from_angles(0.2, -0.3, 0.4), np.array([0.3, -0.2, 1.9]))
+    centers, radii = np.array([[0.27, 0, 0], [0, -0.27, 0]]), np.array([0.05, 0.05])
+    bare = Lens(IDEAL.camera)
+    through_nothing = StereoRig(IDEAL.camera, IDEAL.baseline_m, lenses=(bare, bare))
+    for eye in EYES:
+        wanted = project_disc_centers(IDEAL, pose, centers, radii, eye)
+        # Polygons of 256 sides against the closed form.
+        np.testing.assert_allclose(disc_image_centers(through_nothing, pose, centers, radii, eye), wanted, atol=1e-4)
+        for center, radius, found in zip(
+            centers, radii, disc_image_centers(RIG, pose, centers, radii, eye), strict=True
+        ):
+            outline = RIG.image(disc_outline(pose, center, radius, 2000), eye)
+            moments = cv2.moments(((outline - found) * 1.0).astype(np.float32))
+            # float32 of places within 60 px of the centre.
+            assert abs(moments["m10"] / moments["m00"]) < 1e-4 and abs(moments["m01"] / moments["m00"]) < 1e-4
+
+
+def test_a_fold_and_a_foreign_size_are_refused():
+    with pytest.raises(ValueError, match="folds the image over"):
+        Lens(PinholeCamera(1280, 960, 500.0, 500.0, 639.5, 479.5), BrownConrady(k1=-0.6))
+    with pytest.raises(ValueError, match="finite"):
+        BrownConrady(k1=float("nan"))
+    small = Lens(PinholeCamera(640, 480, 1000.0, 1000.0, 319.5, 239.5))
+    with pytest.raises(ValueError, match="lenses: images must be"):
+        StereoRig(IDEAL.camera, 0.12, lenses=(small, small))

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from render.engine import EyeRadiance
+from render.glare import glare_spread_per_sr, sun_glare
+from scenes.light import luminance
+from scenes.sampler import sample_frame
+from scenes.surroundings import surroundings
+
+
+def with_sun(make_recipe, elevation_deg, azimuth_deg):
+    frame = sample_frame(make_recipe(scale=0.25), 0)
+    environment = frame.environment.model_copy(
+        update={"sun_elevation_deg": elevation_deg, "sun_azimuth_deg": azimuth_deg, "clouds": ()}
+    )
+    return frame.model_copy(update={"environment": environment})
+
+
+def eye(frame, coverage=0.0):
+    shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)
+    nothing = np.zeros((*shape, 3), dtype=np.float32)
+    full = np.full(shape, coverage, dtype=np.float32)
+    return EyeRadiance(nothing, full, np.zeros(shape, dtype=np.uint8), full, nothing, {})
+
+
+def test_one_percent_of_the_light_is_scattered():
+    """Integral of the spread over small angles up to a right angle, in closed form and by quadrature."""
+    angle = np.geomspace(1e-5, np.pi / 2, 20_000)
+    integrand = 2 * np.pi * angle * glare_spread_per_sr(angle.astype(np.float32))
+    total = float(np.sum(0.5 * (integrand[1:] + integrand[:-1]) * np.diff(angle)))
+    assert total == pytest.approx(0.01, rel=0.01)  # quadrature in steps of 0.06 %, float32
+
+
+def test_veil_falls_with_the_square_of_the_angle(make_recipe):
+    frame = with_sun(make_recipe, 14.0, 0.0)
+    veil = luminance(sun_glare(frame, eye(frame)))
+    camera = frame.rig.camera
+    v, u = np.unravel_index(np.arange(0, veil.size, 997), veil.shape)
+    rays = frame.world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1).astype(float)))
+    cosine = rays @ surroundings(frame.environment).beam_direction / np.linalg.norm(rays, axis=-1)
+    angle = np.arccos(cosine)
+    far = angle > 0.06
+    slope = np.polyfit(np.log(angle[far]), np.log(veil[v, u][far]), 1)[0]
+    # 1 / (a^2 + theta^2) with a = 0.01: the core flattens the slope by a^2 / theta^2, below 3 % here.
+    assert slope == pytest.approx(-2.0, abs=0.05)
+    # A clear day's veil ten degrees from the sun is a fraction of the sky's own thousands of cd/m2.
+    assert 100 < np.median(veil) < 5000
+
+
+def test_no_veil_from_behind_at_night_or_from_a_hidden_sun(make_recipe):
+    behind = with_sun(make_recipe, 20.0, 180.0)
+    assert sun_glare(behind, eye(behind)) is None
+    night = with_sun(make_recipe, -30.0, 0.0)
+    assert sun_glare(night, eye(night)) is None
+    inside = with_sun(make_recipe, 3.0, 0.0)
+    assert sun_glare(inside, eye(inside)) is not None
+    assert sun_glare(inside, eye(inside, coverage=1.0)) is None
