@@ -8,7 +8,7 @@ from pathlib import Path
 from datasets_manifest.images import StereoImages
 from datasets_manifest.layout import frame_folder
 from datasets_manifest.manifest import read_manifest
-from datasets_manifest.reader import read_images, read_shutter
+from datasets_manifest.reader import read_images, read_shutter, read_sought
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import StereoRig
 
@@ -43,6 +43,7 @@ class BlindDataset:
         self._path = path
         self._rig: StereoRig = manifest.recipe.rig
         self._drogue = manifest.recipe.drogue
+        self._has_variants = bool(manifest.recipe.variants)
         self._sensor = manifest.recipe.sensor
         self.frame_indices: tuple[int, ...] = tuple(sorted(entry.frame_index for entry in manifest.frames))
 
@@ -55,4 +56,5 @@ class BlindDataset:
         shutter = read_shutter(self._path, frame_index)
         folder = frame_folder(self._path, frame_index)
         images = read_images(folder, self._rig.camera, self._sensor, shutter)
-        return BlindPair(frame_index, images, self._rig, self._drogue)
+        drogue = read_sought(self._path, frame_index, self._drogue) if self._has_variants else self._drogue
+        return BlindPair(frame_index, images, self._rig, drogue)

@@ -7,67 +7,65 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from datasets_manifest.environment_map import EnvironmentMap
+from datasets_manifest.ground import GroundKind
 from datasets_manifest.json_types import FrozenModel, Points3, Rig, Transform, Vector6
+from datasets_manifest.target import Bystander, DrogueCondition
+from datasets_manifest.weather import CloudLayer, Mist, Moon
 from drogue_models.parameters import DrogueParameters, ReflectanceRgb
 from geometry.se3 import RigidTransform, exp_twist
 
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 
 
-class CloudLayer(FrozenModel):
-    """A flat layer of broken cloud.
-
-    Attributes:
-        height_above_camera_m: negative when the receiver flies above it. [m]
-        cover_fraction: share of the layer that is cloud.
-        feature_size_m: size of the largest clouds. [m]
-        optical_depth: in the thick parts, vertically.
-        texture_seed: of its pattern.
-    """
-
-    height_above_camera_m: float = Field(ge=-15000, le=15000)
-    cover_fraction: float = Field(ge=0, le=1)
-    feature_size_m: float = Field(gt=0, le=1e5)
-    optical_depth: float = Field(gt=0, le=200)
-    texture_seed: int = Field(ge=0)
-
-    @model_validator(mode="after")
-    def _not_inside(self) -> Self:
-        if abs(self.height_above_camera_m) < 100:
-            raise ValueError("height_above_camera_m: the camera must stay 100 m clear of a layer without thickness")
-        return self
-
-
 class Environment(FrozenModel):
     """Sky, sun, air and ground of one scene, in world axes (x east, y north, z up).
 
     Attributes:
-        sun_elevation_deg, sun_azimuth_deg: direction to the sun; azimuth from east towards north. [deg]
+        sun_elevation_deg, sun_azimuth_deg: direction to the sun; azimuth from east towards north. Below the horizon
+            there is twilight, then night. [deg]
         turbidity: Linke-like turbidity of Preetham's model, 2 very clear to 6 hazy.
         visibility_m: meteorological range (2 % contrast), which sets the extinction of the air. [m]
         altitude_m: of the camera above ground. [m]
-        ground_reflectance_rgb: mean diffuse reflectance of the ground or sea.
-        ground_texture_seed: of its pattern.
-        cloud: a cloud layer, or none.
+        ground: what lies below; `town` runs out into fields.
+        ground_reflectance_rgb: mean diffuse reflectance of the ground, of a coast's land, or of the water under the
+            surface of the sea.
+        ground_texture_seed: of its pattern, shoreline and ships.
+        wind_speed_m_s: over the sea, which sets waves, glint and foam. [m/s]
+        clouds: cloud layers, in any order.
+        mist: thin cloud around the camera, or none.
+        moon: or none.
+        map: a picture of sky and ground that takes the place of all the others but the visibility, or none.
     """
 
-    sun_elevation_deg: float = Field(ge=1, le=90)
+    sun_elevation_deg: float = Field(ge=-90, le=90)
     sun_azimuth_deg: float = Field(ge=-360, le=360)
     turbidity: float = Field(ge=1.9, le=10)
     visibility_m: float = Field(ge=500, le=400_000)
     altitude_m: float = Field(ge=10, le=20_000)
+    ground: GroundKind = "fields"
     ground_reflectance_rgb: ReflectanceRgb
     ground_texture_seed: int = Field(ge=0)
-    cloud: CloudLayer | None = None
+    wind_speed_m_s: float = Field(default=7.0, ge=0, le=40)
+    clouds: tuple[CloudLayer, ...] = Field(default=(), max_length=6)
+    mist: Mist | None = None
+    moon: Moon | None = None
+    map: EnvironmentMap | None = None
 
     @property
     def extinction_per_m(self) -> float:
-        """Extinction coefficient of the air near the camera (Koschmieder, contrast 2 %). [1/m]"""
+        """Extinction coefficient of the clear air, without mist (Koschmieder, contrast 2 %). [1/m]"""
         return 3.912 / self.visibility_m
 
 
 class Exposure(FrozenModel):
-    """Shutter and aperture of both eyes."""
+    """Shutter, aperture and amplification of both eyes.
+
+    Attributes:
+        time_s: how long the shutter is open. [s]
+        f_number: focal length over aperture.
+        gain: of the amplifier before the converter; at 1 a full well is the highest number.
+    """
 
     time_s: float = Field(gt=0, le=1)
     f_number: float = Field(ge=0.5, le=64)
@@ -82,8 +80,25 @@ class Exposure(FrozenModel):
         return math.pi / (4.0 * self.f_number**2)
 
 
+class Optics(FrozenModel):
+    """What the lens does besides its point spread; as given here it does nothing.
+
+    Attributes:
+        natural_vignetting: light falls off with the fourth power of the cosine of the angle from the axis.
+        mechanical_falloff_fraction: of the light that the lens barrel takes besides in the corners of the image; it
+            grows with the fourth power of the distance from the principal point.
+        focus_distance_m: planar depth that is sharp; without it everything is. [m]
+        pixel_pitch_um: with the focal length in pixels it gives the one in metres, and so the aperture. [um]
+    """
+
+    natural_vignetting: bool = False
+    mechanical_falloff_fraction: float = Field(default=0.0, ge=0, lt=1)
+    focus_distance_m: float | None = Field(default=None, gt=0.05, le=1e6)
+    pixel_pitch_um: float = Field(default=3.75, ge=0.5, le=100)
+
+
 class Sensor(FrozenModel):
-    """What turns radiance into numbers.
+    """What turns radiance into numbers, with the lens before it.
 
     Attributes:
         name: the preset's name.
@@ -95,6 +110,7 @@ class Sensor(FrozenModel):
         adc_bits, output_bits: of the converter and of the stored image.
         black_level_dn: added before the converter clips. [DN of adc_bits]
         encoding: `linear`, or `gamma` (the sRGB curve).
+        optics: vignetting and focus.
     """
 
     name: str = Field(min_length=1, max_length=80)
@@ -108,6 +124,7 @@ class Sensor(FrozenModel):
     output_bits: Literal[8, 12] = 8
     black_level_dn: int = Field(ge=0, le=1000)
     encoding: Literal["linear", "gamma"] = "linear"
+    optics: Optics = Optics()
 
     def electrons_per_cd_m2(self, exposure: Exposure) -> float:
         """Electrons of one pixel per luminance of the scene. [e- m2/cd]"""
@@ -125,6 +142,9 @@ class FrameSpec(FrozenModel):
         sequence_id: which sequence, or None for single frames.
         time_s: mid-exposure. [s]
         drogue: what hangs there, or None for an empty frame.
+        sought: in an empty frame of a dataset with several drogues, the one that navigation is told to look for.
+        condition: state of the drogue's surfaces, or None when it is as new.
+        bystanders: what else stands in the picture.
         left_from_drogue: pose at mid-exposure, or None for an empty frame.
         world_from_left: world axes are x east, y north, z up; origin at the left eye.
         left_twist_per_s, drogue_twist_per_s: (6,) body twists over the exposure, each in its own frame, relative to
@@ -141,6 +161,9 @@ class FrameSpec(FrozenModel):
     sequence_id: int | None = Field(default=None, ge=0)
     time_s: float
     drogue: DrogueParameters | None
+    sought: DrogueParameters | None = None
+    condition: DrogueCondition | None = None
+    bystanders: tuple[Bystander, ...] = ()
     left_from_drogue: Transform | None
     world_from_left: Transform
     left_twist_per_s: Vector6
@@ -156,6 +179,11 @@ class FrameSpec(FrozenModel):
     def _drogue_has_a_pose(self) -> Self:
         if (self.drogue is None) != (self.left_from_drogue is None):
             raise ValueError("left_from_drogue: must be given exactly when there is a drogue")
+        states = self.condition.markers if self.condition is not None else ()
+        if self.condition is not None and self.drogue is None:
+            raise ValueError("condition: an empty frame has none")
+        if self.drogue is not None and states and len(states) != self.drogue.marker_count:
+            raise ValueError(f"condition.markers: must be {self.drogue.marker_count} or none, got {len(states)}")
         return self
 
     def left_from_drogue_at(self, offset_s: float) -> RigidTransform:
@@ -170,6 +198,16 @@ class FrameSpec(FrozenModel):
         drogue_moved = exp_twist(offset_s * self.drogue_twist_per_s)
         pose: RigidTransform = camera_moved @ self.left_from_drogue @ drogue_moved
         return pose
+
+    def left_from_stage_at(self, offset_s: float) -> RigidTransform:
+        """Pose of the axes in which everything that is drawn stands still, `offset_s` after mid-exposure.
+
+        They are the drogue's; without one the left camera's own at mid-exposure, flying along with the tanker.
+        """
+        if self.left_from_drogue is not None:
+            return self.left_from_drogue_at(offset_s)
+        moved: RigidTransform = exp_twist(-offset_s * self.left_twist_per_s)
+        return moved
 
     def world_from_left_at(self, offset_s: float) -> RigidTransform:
         """Pose of the left camera in the world, `offset_s` after mid-exposure."""

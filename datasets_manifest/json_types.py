@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, InstanceOf, PlainSerializer
 
+from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, read_only
 from geometry.stereo import StereoRig
@@ -55,26 +57,41 @@ def _read_rig(value: Any) -> StereoRig:
             baseline_m=value["baseline_m"],
             body_from_left=RigidTransform.from_matrix(value["body_from_left"]),
             probe_tip_body_m=value["probe_tip_body_m"],
+            lenses=_read_lenses(value.get("lenses")),
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"rig: missing or unknown key: {error}") from error
 
 
+def _read_lenses(value: list[dict[str, Any]] | None) -> tuple[Lens, Lens] | None:
+    if value is None:
+        return None
+    if len(value) != 2:
+        raise ValueError(f"rig: lenses must be the left and the right one, got {len(value)}")
+    return _read_lens(value[0]), _read_lens(value[1])
+
+
+def _read_lens(value: dict[str, Any]) -> Lens:
+    return Lens(PinholeCamera(**value["camera"]), BrownConrady(**value["distortion"]), value["ideal_from_real"])
+
+
 def write_rig(rig: StereoRig) -> dict[str, Any]:
-    """The rig as plain JSON values."""
-    camera = rig.camera
+    """The rig as plain JSON values; without `lenses` where its eyes are ideal."""
+    lenses = {} if rig.lenses is None else {"lenses": [_write_lens(lens) for lens in rig.lenses]}
     return {
-        "camera": {
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "fx_px": camera.fx_px,
-            "fy_px": camera.fy_px,
-            "cx_px": camera.cx_px,
-            "cy_px": camera.cy_px,
-        },
+        "camera": asdict(rig.camera),
         "baseline_m": rig.baseline_m,
         "body_from_left": rig.body_from_left.as_matrix().tolist(),
         "probe_tip_body_m": rig.probe_tip_body_m.tolist(),
+        **lenses,
+    }
+
+
+def _write_lens(lens: Lens) -> dict[str, Any]:
+    return {
+        "camera": asdict(lens.camera),
+        "distortion": asdict(lens.distortion),
+        "ideal_from_real": lens.ideal_from_real.tolist(),
     }
 
 

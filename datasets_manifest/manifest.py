@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -147,6 +147,13 @@ def build_manifest(
         "dataset_sha256": dataset_sha256(recipe, (entry.record_sha256 for entry in entries)),
         "frames": [entry.model_dump(mode="json") for entry in entries],
     }
+    return Manifest.model_validate({**content, "manifest_sha256": _content_sha256(content)})
+
+
+def made_with(manifest: Manifest, software: Mapping[str, str], cpu_features: Sequence[str]) -> Manifest:
+    """The manifest with the versions and processor features of the machines that made the frames."""
+    content = manifest.model_dump(mode="json", exclude={"manifest_sha256"})
+    content.update(software=dict(software), cpu_features=list(cpu_features))
     return Manifest.model_validate({**content, "manifest_sha256": _content_sha256(content)})
 
 

@@ -13,19 +13,25 @@ from datasets_manifest.images import Pixels
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
-# Level 1 takes a quarter of the default level's time for images a tenth larger.
-_COMPRESSION_LEVEL = 1
+# Noise has no repeats to search for: Huffman codes alone take half the time of level 1 and a sixth less room. Part ids
+# are runs. Without a level given, OpenCV filters every row by the difference to the left, which is the cheapest.
+_OF_NOISE = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
+_OF_RUNS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 
 
-def encode_png(pixels: Pixels) -> bytes:
+def encode_png(pixels: Pixels, of_areas: bool = False) -> bytes:
     """PNG of an (H, W) or (H, W, 3) image; 12-bit values stay as they are in 16-bit samples.
+
+    Args:
+        pixels: the image.
+        of_areas: its values are even over areas, as part ids are, instead of noisy as a picture; for size and speed.
 
     Raises:
         ValueError: the image cannot be encoded.
     """
     # OpenCV's channel order is blue, green, red.
     image = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-    done, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _COMPRESSION_LEVEL])
+    done, data = cv2.imencode(".png", image, _OF_RUNS if of_areas else _OF_NOISE)
     if not done:
         raise ValueError(f"image: cannot be written as PNG, got {pixels.shape} {pixels.dtype}")
     return data.tobytes()

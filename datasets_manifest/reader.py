@@ -19,6 +19,7 @@ from datasets_manifest.manifest import Manifest, read_manifest
 from datasets_manifest.png import decode_png
 from datasets_manifest.records import PairRecord
 from datasets_manifest.writer import is_plain_name
+from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
@@ -107,6 +108,15 @@ class Dataset:
         return faults
 
 
+def read_frame_bytes(dataset: Path, frame_index: int, name: str) -> bytes:
+    """The contents of a file of a pair.
+
+    Raises:
+        ValueError: it is missing, leads elsewhere or cannot be read; names the file.
+    """
+    return _read_bytes(frame_folder(dataset, frame_index), name)
+
+
 def read_record_table(dataset: Path, frame_index: int) -> dict[str, Any]:
     """The JSON object in a pair's record, unchecked.
 
@@ -136,6 +146,28 @@ def read_shutter(dataset: Path, frame_index: int) -> Shutter:
         return Shutter(*(float(value) for value in values))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{frame_folder(dataset, frame_index) / RECORD_FILE}: no valid time_s or exposure") from error
+
+
+def read_sought(dataset: Path, frame_index: int, usual: DrogueParameters) -> DrogueParameters:
+    """The drogue that a receiver would look for in a pair; whether it is there is not told.
+
+    Args:
+        dataset: folder.
+        frame_index: which pair.
+        usual: the recipe's drogue, for datasets with one.
+
+    Raises:
+        ValueError: the record is missing, truncated or wrong; names the file.
+    """
+    frame = read_record_table(dataset, frame_index).get("frame")
+    given = (frame.get("drogue") or frame.get("sought")) if isinstance(frame, dict) else None
+    if given is None:
+        return usual
+    try:
+        return DrogueParameters.model_validate(given)
+    except ValidationError as error:
+        path = frame_folder(dataset, frame_index) / RECORD_FILE
+        raise ValueError(f"{path}: drogue: {explain(error)}") from error
 
 
 def read_images(folder: Path, camera: PinholeCamera, sensor: Sensor, shutter: Shutter) -> StereoImages:

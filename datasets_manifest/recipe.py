@@ -5,49 +5,23 @@ from __future__ import annotations
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from datasets_manifest.environment_map import pin_map
+from datasets_manifest.environment_ranges import EnvironmentRanges
+from datasets_manifest.families import fill_families
 from datasets_manifest.frame import Sensor
 from datasets_manifest.json_types import FrozenModel, Rig
+from datasets_manifest.ranges import Fraction, Range
 from datasets_manifest.rigs import resolve_rig
+from datasets_manifest.target_ranges import DrogueVariant, TargetRanges
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 
-Fraction = Annotated[float, Field(ge=0, le=1)]
 MAX_SEED = 2**63 - 1
-
-
-class Range(FrozenModel):
-    """A uniform draw between `low` and `high`; equal ends give a constant. In TOML also `[low, high]` or a number."""
-
-    low: float
-    high: float
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_forms(cls, value: object) -> object:
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            return {"low": value, "high": value}
-        if isinstance(value, list | tuple) and len(value) == 2:
-            return {"low": value[0], "high": value[1]}
-        return value
-
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        if self.low > self.high:
-            raise ValueError(f"low end {self.low:g} is above high end {self.high:g}")
-        return self
-
-    def within(self, low: float, high: float, name: str) -> None:
-        """Check that the whole range lies in [low, high].
-
-        Raises:
-            ValueError: it does not.
-        """
-        if not (low <= self.low and self.high <= high):
-            raise ValueError(f"{name}: must lie in [{low:g}, {high:g}], got [{self.low:g}, {self.high:g}]")
+_ENGINES_WITH_LENSES = ("analytic", "mitsuba")
 
 
 class FrameCounts(FrozenModel):
@@ -118,70 +92,26 @@ class Pose(FrozenModel):
         return self
 
 
-class Clouds(FrozenModel):
-    """The cloud layer, where a scene has one.
-
-    Attributes:
-        scene_fraction: share of scenes with a layer.
-        cover_fraction, feature_size_m, optical_depth: see `CloudLayer`.
-        height_above_camera_m: see `CloudLayer`.
-    """
-
-    scene_fraction: Fraction = 0.0
-    cover_fraction: Range = Range(low=0.15, high=0.55)
-    height_above_camera_m: Range = Range(low=800, high=3000)
-    feature_size_m: Range = Range(low=1500, high=4000)
-    optical_depth: Range = Range(low=4, high=14)
-
-    @model_validator(mode="after")
-    def _ranges(self) -> Self:
-        height = self.height_above_camera_m
-        height.within(-15000, 15000, "height_above_camera_m")
-        if height.low < 100 and height.high > -100:
-            raise ValueError("height_above_camera_m: the whole range must lie above 100 m or below -100 m")
-        self.cover_fraction.within(0, 1, "cover_fraction")
-        self.feature_size_m.within(10, 1e5, "feature_size_m")
-        self.optical_depth.within(0.01, 200, "optical_depth")
-        return self
-
-
-class EnvironmentRanges(FrozenModel):
-    """From what each scene's environment is drawn; units and meaning as in `Environment`."""
-
-    sun_elevation_deg: Range = Range(low=15, high=65)
-    sun_azimuth_deg: Range = Range(low=-180, high=180)
-    turbidity: Range = Range(low=2.2, high=4)
-    visibility_m: Range = Range(low=20_000, high=80_000)
-    altitude_m: Range = Range(low=1500, high=6000)
-    clouds: Clouds = Clouds()
-
-    @model_validator(mode="after")
-    def _ranges(self) -> Self:
-        self.sun_elevation_deg.within(1, 90, "sun_elevation_deg")
-        self.sun_azimuth_deg.within(-360, 360, "sun_azimuth_deg")
-        self.turbidity.within(1.9, 10, "turbidity")
-        self.visibility_m.within(500, 400_000, "visibility_m")
-        self.altitude_m.within(10, 20_000, "altitude_m")
-        return self
-
-
 class ExposureLaw(FrozenModel):
-    """How the exposure is set.
+    """How the exposure is set: by the meter, first with the time, then, when that is at its limit, with the gain.
 
     Attributes:
         time_s: fixed exposure time; without it the meter chooses within `auto_time_s`. [s]
+        auto_gain: what the meter may amplify by; a single number is a fixed gain.
         auto_level_fraction: where the meter puts the brighter of sky and a white plate facing the camera, as a share of
-            the full well.
+            the full well, or at other gains of what fills the converter.
     """
 
     time_s: float | None = Field(default=None, gt=0, le=1)
     auto_time_s: Range = Range(low=20e-6, high=20e-3)
+    auto_gain: Range = Range(low=1, high=1)
     auto_level_fraction: float = Field(default=0.7, gt=0, le=2)
     f_number: float = Field(default=2.8, ge=0.5, le=64)
 
     @model_validator(mode="after")
     def _ranges(self) -> Self:
         self.auto_time_s.within(1e-6, 1, "auto_time_s")
+        self.auto_gain.within(0.1, 64, "auto_gain")
         return self
 
 
@@ -190,13 +120,18 @@ class RenderSettings(FrozenModel):
 
     Attributes:
         engine: its name.
-        samples_per_px: paths through each pixel that sees the drogue.
+        samples_per_px: paths through each pixel of the drogue, but for those of the next two.
+        open_samples_per_px: the same inside markers, face and rim, where hardly anything hides the sky.
+        edge_samples_per_px: rays to the surfaces in each pixel where parts or shadows meet, and paths through each
+            pixel on hub and coupling; `samples_per_px` if that is more.
         surround_samples_per_px: the same for hose and tanker.
         max_depth: longest path, counted in segments.
     """
 
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)
     samples_per_px: int = Field(default=16, ge=1, le=65536)
+    open_samples_per_px: int = Field(default=4, ge=1, le=65536)
+    edge_samples_per_px: int = Field(default=64, ge=1, le=65536)
     surround_samples_per_px: int = Field(default=4, ge=1, le=65536)
     max_depth: int = Field(default=4, ge=2, le=64)
 
@@ -222,14 +157,32 @@ class Split(FrozenModel):
         return self
 
 
+class Family(FrozenModel):
+    """Conditions of a share of a recipe's scenes.
+
+    Attributes:
+        name: written into the scenes' frames.
+        weight: its share of the scenes, against the other families' weights.
+        pose, target, environment, exposure: as in `Recipe`; in TOML only the keys that differ from the recipe's.
+    """
+
+    name: str = Field(min_length=1, max_length=40, pattern=r"^[a-z0-9][a-z0-9-]*$")
+    weight: float = Field(default=1.0, gt=0, le=1e6)
+    pose: Pose = Pose()
+    target: TargetRanges = TargetRanges()
+    environment: EnvironmentRanges = EnvironmentRanges()
+    exposure: ExposureLaw = ExposureLaw()
+
+
 class Recipe(FrozenModel):
     """What dataset to make, with every reference to presets and files replaced by its contents.
 
     Attributes:
         name: of the dataset.
-        family: what kind of conditions, for tables.
+        family: what kind of conditions, for tables; of recipes without `families`.
         seed: of everything random.
         drogue, rig, sensor: in TOML names of presets (`drogue` also a TOML file).
+        families: over which the scenes are spread, each with its own conditions; or none.
     """
 
     name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -242,16 +195,41 @@ class Recipe(FrozenModel):
     sensor: Sensor
     distance: DistanceLaw
     pose: Pose = Pose()
+    target: TargetRanges = TargetRanges()
     environment: EnvironmentRanges = EnvironmentRanges()
     exposure: ExposureLaw = ExposureLaw()
     render: RenderSettings = RenderSettings()
     outputs: Outputs = Outputs()
     split: Split = Split()
+    families: tuple[Family, ...] = Field(default=(), max_length=100)
+
+    @property
+    def variants(self) -> tuple[DrogueVariant, ...]:
+        """All drogues of all families that scenes may have instead of the recipe's own."""
+        targets = [family.target for family in self.families] or [self.target]
+        return tuple(variant for target in targets for variant in target.variants)
+
+    @model_validator(mode="after")
+    def _families_differ(self) -> Self:
+        names = [family.name for family in self.families]
+        if len(set(names)) < len(names):
+            raise ValueError(f"families: each needs a name of its own, got {', '.join(names)}")
+        return self
+
+    @model_validator(mode="after")
+    def _engine_knows_lenses(self) -> Self:
+        if self.rig.lenses is not None and self.render.engine not in _ENGINES_WITH_LENSES:
+            raise ValueError(
+                f"render.engine: {self.render.engine} draws ideal eyes only, and the rig has real lenses; use "
+                f"{' or '.join(_ENGINES_WITH_LENSES)}, or a rig without eyes"
+            )
+        return self
 
     @model_validator(mode="after")
     def _nearest_distance_is_visible(self) -> Self:
         nearest = self.distance.nearest_m
-        limit = self.rig.nearest_full_view_m(self.drogue.rim_radius_m)
+        drogues = [variant.drogue for variant in self.variants] or [self.drogue]
+        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m) for drogue in drogues)
         if nearest < limit:
             raise ValueError(
                 f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue fits both views"
@@ -314,10 +292,29 @@ def parse_recipe(text: str, base: Path | None = None, seed: int | None = None) -
     if not isinstance(drogue, str):
         raise ValueError("drogue: must be the name of a preset or a .toml file")
     table["drogue"] = load_drogue(drogue, base)
+    fill_families(table)
+    for part in (table, *table.get("families", ())):
+        _load_variants(part.get("target"), base)
+        if isinstance(part.get("environment"), dict):
+            pin_map(part["environment"], base or Path())
     if "sensor" in table:
         raise ValueError("sensor: unknown key; it belongs to rig")
-    table["rig"], table["sensor"] = resolve_rig(table.get("rig", "rgb-ideal"))
+    table["rig"], table["sensor"] = resolve_rig(table.get("rig", "rgb-ideal"), _seed(table))
     try:
         return Recipe.model_validate(table)
     except ValidationError as error:
         raise ValueError(explain(error)) from error
+
+
+def _load_variants(target: object, base: Path | None) -> None:
+    """Replace the names of drogues in `target.variants` by their contents; other types are left to the schema."""
+    variants = target.get("variants") if isinstance(target, dict) else None
+    for variant in variants if isinstance(variants, list) else ():
+        if isinstance(variant, dict) and isinstance(variant.get("drogue"), str):
+            variant["drogue"] = load_drogue(variant["drogue"], base)
+
+
+def _seed(table: dict[str, Any]) -> int:
+    """The seed of a recipe's table; a wrong one, which the schema will name, counts as none."""
+    seed = table.get("seed", Recipe.model_fields["seed"].default)
+    return seed if type(seed) is int and 0 <= seed <= MAX_SEED else 0

@@ -73,6 +73,7 @@ class Conditions(FrozenModel):
     sun_elevation_deg: float
     background_luminance_cd_m2: float
     monte_carlo_noise_fraction: float
+    monte_carlo_over_sensor_noise: float | None = None
 
 
 class PairRecord(FrozenModel):

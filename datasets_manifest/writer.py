@@ -48,7 +48,7 @@ def encode_files(images: StereoImages, part_ids: Mapping[Eye, NDArray[np.uint8]]
                 f"part_ids[{eye!r}]: must be {image.shape[:2]} of uint8, got {parts.shape} of {parts.dtype}"
             )
         files[image_file(eye)] = encode_png(image)
-        files[parts_file(eye)] = encode_png(parts)
+        files[parts_file(eye)] = encode_png(parts, of_areas=True)
         if mosaic is not None:
             files[mosaic_file(eye)] = encode_png(mosaic)
     return files

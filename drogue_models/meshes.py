@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 
 from drogue_models.body_mesh import load_body_mesh
+from drogue_models.bystanders import SECTIONS, BystanderShape
 from drogue_models.hose import hose_mesh
 from drogue_models.parameters import DrogueParameters, HubParameters
 from drogue_models.parts import Part, marker_id
@@ -13,7 +14,7 @@ from drogue_models.solids import area_radius_m, bar, circle_m, plate, pocketed_p
 from drogue_models.tanker import tanker_mesh
 from geometry.se3 import Array
 
-__all__ = ["drogue_meshes", "hose_mesh", "tanker_mesh"]
+__all__ = ["bystander_mesh", "drogue_meshes", "hose_mesh", "tanker_mesh"]
 
 # Markers and hub: outlines within 10 um of the circle.
 MARKER_SECTIONS = 128
@@ -66,6 +67,11 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
     for index in range(drogue.marker_count):
         meshes[marker_id(index)] = plate(_marker_outline_m(drogue, index), [], MARKER_THICKNESS_M)
     return meshes
+
+
+def bystander_mesh(shape: BystanderShape) -> trimesh.Trimesh:
+    """A closed mesh of a bystander in its own frame. [m]"""
+    return revolve(shape.profile_m(), SECTIONS)
 
 
 def _marker_outline_m(drogue: DrogueParameters, index: int) -> Array:

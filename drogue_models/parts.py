@@ -20,9 +20,14 @@ class Part(IntEnum):
     HUB = 6
     HOSE = 16
     TANKER = 17
+    PROBE = 18
+    OBSTACLE = 19
+    DISTRACTOR = 20
 
 
-# What the drogue's box covers besides the markers: not the hose, not the tanker.
+# What hangs on the drogue or stands around it; none of it belongs to the drogue's box.
+SURROUNDING_PARTS = (Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
+# What the drogue's box covers besides the markers.
 DROGUE_PARTS = (Part.FACE, Part.RIM, Part.CANOPY, Part.RIBS, Part.COUPLING, Part.HUB)
 
 

@@ -1,18 +1,28 @@
-"""The surroundings at camera resolution: one image serves both eyes, for a rectified pair shares its ray directions."""
+"""The surroundings at camera resolution: one image serves both ideal eyes, for they share their ray directions."""
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
+from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
+from geometry.stereo import Eye, StereoRig
+from render.stars import add_stars
 from scenes.surroundings import Surroundings, surroundings
 
 # The clear sky varies over many degrees; the paper's camera has 37 px a degree.
 _COARSE_STEP_PX = 8
 _MOST_BLUR_SAMPLES = 8
+# By day stars drown in the sky. [deg]
+_STARS_BELOW_DEG = -5.0
+# The air's own light varies over tens of degrees.
+_AIR_STEP_PX = 32
+_MOST_PLACES = 32_000
 
 
 def _directions(camera: PinholeCamera, rotation: NDArray[np.float64], u: NDArray, v: NDArray) -> NDArray[np.float32]:  # type: ignore[type-arg]
@@ -27,12 +37,41 @@ def _directions(camera: PinholeCamera, rotation: NDArray[np.float64], u: NDArray
     return out
 
 
+def _directions_through(lens: Lens, rotation: NDArray[np.float64], step_px: int) -> NDArray[np.float32]:
+    """The same through the pixels of a real eye; `step_px` as in `_real_rays`."""
+    directions: NDArray[np.float32] = np.einsum("ij,hwj->hwi", rotation.astype(np.float32), _real_rays(lens, step_px))
+    return directions
+
+
+@lru_cache(maxsize=4)
+def _real_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
+    """(h, w, 3) unit directions in the eye's ideal axes, through every pixel or the places of `_grid_px`."""
+    camera = lens.camera
+    u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))
+    rays = lens.rays(np.stack(np.meshgrid(u, v), axis=-1))
+    result: NDArray[np.float32] = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return result
+
+
+def _grid_px(size_px: int, step_px: int) -> NDArray[np.float64]:
+    """Coordinates of all pixels, or of every so many of them with one more step before and two behind. [px]"""
+    if step_px == 1:
+        return np.arange(size_px, dtype=float)
+    return (np.arange(size_px // step_px + 4) - 1.0) * step_px
+
+
 def _sharp_background(
-    around: Surroundings, camera: PinholeCamera, rotation: NDArray[np.float64]
+    around: Surroundings, rig: StereoRig, eye: Eye, rotation: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    step = _COARSE_STEP_PX
-    columns, rows = camera.width_px // step + 4, camera.height_px // step + 4
-    coarse = _directions(camera, rotation, (np.arange(columns) - 1.0) * step, (np.arange(rows) - 1.0) * step)
+    camera, lens, step = rig.camera, rig.lens(eye), _COARSE_STEP_PX
+
+    def through(step_px: int) -> NDArray[np.float32]:
+        if lens is not None:
+            return _directions_through(lens, rotation, step_px)
+        u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))
+        return _directions(camera, rotation, u, v)
+
+    coarse = through(step)
     # Full pixel u lies at coarse coordinate u / step + 1.
     to_coarse = np.array([[1 / step, 0.0, 1.0], [0.0, 1 / step, 1.0]])
     size = (camera.width_px, camera.height_px)
@@ -40,16 +79,49 @@ def _sharp_background(
         np.maximum(cv2.warpAffine(image, to_coarse, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP), 0.0)
         for image in around.clear_radiance(coarse)
     )
-    directions = _directions(
-        camera, rotation, np.arange(camera.width_px, dtype=float), np.arange(camera.height_px, dtype=float)
-    )
+    if around.environment.sun_elevation_deg < _STARS_BELOW_DEG:
+        add_stars(sky, rig, eye, rotation)
+    directions = through(1)
     image = around.radiance(directions, sky, horizon)
-    around.sky.add_sun_disc(image, directions)
+    around.add_discs(image, directions)
     return image
 
 
-def background(frame: FrameSpec) -> NDArray[np.float32]:
-    """What both eyes see where nothing stands before the surroundings.
+def air_before(frame: FrameSpec, pixel: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What the air in front of things does at pixel centres, the same in both eyes.
+
+    Args:
+        frame: with its air, at mid-exposure.
+        pixel: (P,) flat indices.
+
+    Returns:
+        (P, 3) radiance of endless air in the pixel's direction [cd/m2], and (P,) optical depth per planar depth. [1/m]
+    """
+    around, camera, step = surroundings(frame.environment), frame.rig.camera, _AIR_STEP_PX
+    columns, rows = camera.width_px // step + 2, camera.height_px // step + 2
+    rotation = frame.world_from_left.rotation
+    coarse = around.airlight(_directions(camera, rotation, np.arange(columns) * step, np.arange(rows) * step))
+    v, u = (index.astype(np.float32) for index in np.divmod(pixel, camera.width_px))
+    scale = np.float32(1 / step)
+    # remap takes no more than 2^15 rows or columns of places.
+    light = np.empty((len(pixel), 3), dtype=np.float32)
+    for first in range(0, len(pixel), _MOST_PLACES):
+        part = slice(first, first + _MOST_PLACES)
+        places = (u[part] * scale)[:, None], (v[part] * scale)[:, None]
+        light[part] = cv2.remap(coarse, *places, cv2.INTER_LINEAR)[:, 0]
+    x, y = (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px
+    per_depth = around.extinction_per_m * np.sqrt(1.0 + x * x + y * y)
+    return light, per_depth.astype(np.float32)
+
+
+def backgrounds(frame: FrameSpec) -> dict[Eye, NDArray[np.float32]]:
+    """`background` of both eyes; one array where both are ideal."""
+    left = background(frame, "left")
+    return {"left": left, "right": left if frame.rig.lenses is None else background(frame, "right")}
+
+
+def background(frame: FrameSpec, eye: Eye = "left") -> NDArray[np.float32]:
+    """What an eye sees where nothing stands before the surroundings; ideal eyes see the same.
 
     Returns:
         (H, W, 3) radiance at pixel centres, averaged over the exposure when the camera turns. [cd/m2]
@@ -60,7 +132,7 @@ def background(frame: FrameSpec) -> NDArray[np.float32]:
     total: NDArray[np.float32] | None = None
     for index in range(samples):
         offset_s = ((index + 0.5) / samples - 0.5) * frame.exposure.time_s
-        image = _sharp_background(around, frame.rig.camera, frame.world_from_left_at(offset_s).rotation)
+        image = _sharp_background(around, frame.rig, eye, frame.world_from_left_at(offset_s).rotation)
         total = image if total is None else total + image
     assert total is not None
     return total / np.float32(samples)

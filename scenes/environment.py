@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.frame import CloudLayer, Environment
-from datasets_manifest.recipe import Clouds, EnvironmentRanges, Range
+from datasets_manifest.environment_map import EnvironmentMap, MapRanges
+from datasets_manifest.environment_ranges import EnvironmentRanges
+from datasets_manifest.frame import Environment
+from datasets_manifest.ground import GroundKind
+from datasets_manifest.ranges import Range
+from datasets_manifest.weather import CloudLayer, Mist, Moon
+from datasets_manifest.weather_ranges import Clouds, MistRanges, MoonRanges
 from drogue_models.parameters import ReflectanceRgb
+from scenes.environment_map import load_map
+from scenes.ground import MEAN_REFLECTANCE
 from scenes.seeding import generator
 
-# Mean diffuse reflectances in linear Rec. 709, our choice within published ranges: sea, forest, fields, dry land.
-GROUND_COVERS: tuple[ReflectanceRgb, ...] = (
-    (0.020, 0.032, 0.045),
-    (0.035, 0.050, 0.028),
-    (0.105, 0.105, 0.060),
-    (0.200, 0.165, 0.115),
-)
+# How much brighter or darker, and how much redder or bluer, the ground of a scene is than its kind's mean.
+_GROUND_SPREAD, _GROUND_TINT = 0.25, 0.06
 
 
 def draw(rng: np.random.Generator, limits: Range) -> float:
@@ -24,31 +26,95 @@ def draw(rng: np.random.Generator, limits: Range) -> float:
 
 
 def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) -> Environment:
-    """The environment of a scene: a function of seed and scene alone."""
-    return sample_environment(generator(seed, scene_id, "environment"), ranges)
+    """The environment of a scene: a function of seed and scene alone.
 
-
-def sample_environment(rng: np.random.Generator, ranges: EnvironmentRanges) -> Environment:
-    """Sky, sun, air, ground and cloud drawn from their ranges."""
-    return Environment(
-        sun_elevation_deg=draw(rng, ranges.sun_elevation_deg),
-        sun_azimuth_deg=draw(rng, ranges.sun_azimuth_deg),
-        turbidity=draw(rng, ranges.turbidity),
-        visibility_m=draw(rng, ranges.visibility_m),
-        altitude_m=draw(rng, ranges.altitude_m),
-        ground_reflectance_rgb=GROUND_COVERS[int(rng.integers(len(GROUND_COVERS)))],
-        ground_texture_seed=int(rng.integers(2**31)),
-        cloud=sample_cloud(rng, ranges.clouds),
+    The streams are named apart, so that a scene keeps its sky when a layer, mist or a moon is added to the recipe.
+    """
+    rng = generator(seed, scene_id, "environment")
+    sky = {
+        "sun_elevation_deg": draw(rng, ranges.sun_elevation_deg),
+        "sun_azimuth_deg": draw(rng, ranges.sun_azimuth_deg),
+        "turbidity": draw(rng, ranges.turbidity),
+        "visibility_m": draw(rng, ranges.visibility_m),
+        "altitude_m": draw(rng, ranges.altitude_m),
+    }
+    ground = ranges.ground[int(rng.integers(len(ranges.ground)))]
+    ground_texture_seed = int(rng.integers(2**31))
+    ground_rng = generator(seed, scene_id, "ground")
+    # The first layer is drawn from the scene's main stream, each other one from its own.
+    of_layer = [rng] + [generator(seed, scene_id, f"cloud layer {index}") for index in range(1, len(ranges.clouds))]
+    layers = [
+        sample_cloud(stream, generator(seed, scene_id, f"cloud shape {index}"), clouds)
+        for index, (stream, clouds) in enumerate(zip(of_layer, ranges.clouds, strict=False))
+    ]
+    environment = Environment(
+        **sky,
+        ground=ground,
+        ground_reflectance_rgb=_sample_reflectance(ground_rng, ground),
+        ground_texture_seed=ground_texture_seed,
+        wind_speed_m_s=draw(ground_rng, ranges.wind_speed_m_s),
+        clouds=tuple(layer for layer in layers if layer is not None),
+        mist=sample_mist(generator(seed, scene_id, "mist"), ranges.mist),
+        moon=sample_moon(generator(seed, scene_id, "moon"), ranges.moon),
     )
+    return environment if ranges.map is None else _mapped(environment, ranges.map, generator(seed, scene_id, "map"))
 
 
-def sample_cloud(rng: np.random.Generator, clouds: Clouds) -> CloudLayer | None:
-    """A cloud layer, or none."""
+def _mapped(environment: Environment, ranges: MapRanges, rng: np.random.Generator) -> Environment:
+    """The environment with a map for its sky and ground; the sun, if the map has one, is where it is in the map."""
+    environment_map = EnvironmentMap(
+        path=ranges.path,
+        sha256=ranges.sha256,
+        folder=ranges.folder,
+        cd_m2_per_unit=ranges.cd_m2_per_unit,
+        horizontal_illuminance_lux=ranges.horizontal_illuminance_lux,
+        rotation_deg=draw(rng, ranges.rotation_deg),
+    )
+    changes: dict[str, object] = {"clouds": (), "mist": None, "moon": None, "map": environment_map}
+    light = load_map(environment_map)
+    if light.sun_lux.max() > 0:
+        x, y, z = light.sun_direction
+        changes["sun_elevation_deg"] = float(np.degrees(np.arcsin(z)))
+        changes["sun_azimuth_deg"] = float(np.degrees(np.arctan2(y, x)))
+    return environment.model_copy(update=changes)
+
+
+def _sample_reflectance(rng: np.random.Generator, ground: GroundKind) -> ReflectanceRgb:
+    brightness, tint = 1.0 + _GROUND_SPREAD * rng.uniform(-1, 1), _GROUND_TINT * rng.uniform(-1, 1)
+    red, green, blue = MEAN_REFLECTANCE[ground]
+    return red * brightness * (1.0 + tint), green * brightness, blue * brightness * (1.0 - tint)
+
+
+def sample_cloud(rng: np.random.Generator, shape_rng: np.random.Generator, clouds: Clouds) -> CloudLayer | None:
+    """A cloud layer, or none; how thick it is and how it is drawn out comes from `shape_rng`."""
     layer = CloudLayer(
+        kind=clouds.kind,
         height_above_camera_m=draw(rng, clouds.height_above_camera_m),
         cover_fraction=draw(rng, clouds.cover_fraction),
         feature_size_m=draw(rng, clouds.feature_size_m),
         optical_depth=draw(rng, clouds.optical_depth),
         texture_seed=int(rng.integers(2**31)),
+        thickness_m=draw(shape_rng, clouds.thickness_m),
+        heading_deg=draw(shape_rng, clouds.heading_deg),
     )
     return layer if rng.random() < clouds.scene_fraction else None
+
+
+def sample_mist(rng: np.random.Generator, ranges: MistRanges) -> Mist | None:
+    """Mist around the camera, or none."""
+    mist = Mist(
+        visibility_m=draw(rng, ranges.visibility_m),
+        above_m=draw(rng, ranges.above_m),
+        below_m=draw(rng, ranges.below_m),
+    )
+    return mist if rng.random() < ranges.scene_fraction else None
+
+
+def sample_moon(rng: np.random.Generator, ranges: MoonRanges) -> Moon | None:
+    """A moon, or none."""
+    moon = Moon(
+        elevation_deg=draw(rng, ranges.elevation_deg),
+        azimuth_deg=draw(rng, ranges.azimuth_deg),
+        phase_angle_deg=draw(rng, ranges.phase_angle_deg),
+    )
+    return moon if rng.random() < ranges.scene_fraction else None

@@ -8,13 +8,16 @@ import numpy as np
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import Recipe
+from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from scenes.distance import sample_distance_m
 from scenes.environment import draw, environment_of_scene
+from scenes.families import recipe_of_scene
 from scenes.framing import sample_pose
 from scenes.metering import meter
 from scenes.seeding import generator
 from scenes.suspension import sample_suspension
+from scenes.target import condition_of_scene, drogue_of_scene, sample_bystanders
 
 SplitName = Literal["train", "val", "test"]
 SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
@@ -53,15 +56,16 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         raise ValueError(f"frame: must be in [0, {recipe.frames.count}), got {frame_index}")
     seed = recipe.seed
     scene_id = scene_of_frame(recipe, frame_index)
+    recipe = recipe_of_scene(recipe, scene_id)
     environment = environment_of_scene(seed, scene_id, recipe.environment)
     world_from_left = _sample_receiver(generator(seed, frame_index, "receiver"), recipe)
-    empty = generator(seed, frame_index, "empty").random() < recipe.frames.empty_fraction
-    left_from_drogue, left_from_tanker, nodes = None, None, None
-    if not empty:
-        distance_m = sample_distance_m(generator(seed, frame_index, "distance"), recipe.distance, frame_index)
-        left_from_drogue = sample_pose(generator(seed, frame_index, "pose"), recipe, distance_m)
+    drogue = drogue_of_scene(recipe, scene_id)
+    left_from_drogue = _pose_of_frame(recipe, drogue, frame_index)
+    empty = left_from_drogue is None
+    left_from_tanker, nodes = None, None
+    if left_from_drogue is not None:
         left_from_tanker, nodes = sample_suspension(
-            generator(seed, frame_index, "suspension"), recipe.drogue, left_from_drogue, world_from_left
+            generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
         )
     left_twist, drogue_twist = _sample_motion(generator(seed, frame_index, "motion"), recipe)
     return FrameSpec(
@@ -70,7 +74,10 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         scene_id=scene_id,
         family=recipe.family,
         time_s=frame_index * FRAME_PERIOD_S,
-        drogue=None if empty else recipe.drogue,
+        drogue=None if empty else drogue,
+        sought=drogue if empty and recipe.target.variants else None,
+        condition=None if empty else condition_of_scene(recipe, scene_id, drogue),
+        bystanders=sample_bystanders(generator(seed, frame_index, "bystanders"), recipe, left_from_drogue),
         left_from_drogue=left_from_drogue,
         world_from_left=world_from_left,
         left_twist_per_s=left_twist,
@@ -82,6 +89,25 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         exposure=meter(recipe.exposure, environment, recipe.rig.camera, world_from_left, recipe.sensor),
         environment=environment,
     )
+
+
+def sample_left_from_drogue(recipe: Recipe, frame_index: int) -> RigidTransform | None:
+    """The pose of `sample_frame` alone, without light and exposure; None without a drogue.
+
+    Raises:
+        ValueError: a pose that cannot be framed.
+    """
+    scene_id = scene_of_frame(recipe, frame_index)
+    recipe = recipe_of_scene(recipe, scene_id)
+    return _pose_of_frame(recipe, drogue_of_scene(recipe, scene_id), frame_index)
+
+
+def _pose_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> RigidTransform | None:
+    """`left_from_drogue`, or None without a drogue; the recipe is that of the scene."""
+    if generator(recipe.seed, frame_index, "empty").random() < recipe.frames.empty_fraction:
+        return None
+    distance_m = sample_distance_m(generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
+    return sample_pose(generator(recipe.seed, frame_index, "pose"), recipe, drogue, distance_m)
 
 
 def _sample_receiver(rng: np.random.Generator, recipe: Recipe) -> RigidTransform:

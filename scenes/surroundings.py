@@ -6,35 +6,45 @@ The same function is the background of the images and, as a map, the light on th
 from __future__ import annotations
 
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
-from datasets_manifest.frame import CloudLayer, Environment
-from scenes.sky import REC709_LUMINANCE, ClearSky, Radiance
-from scenes.texture import sample_texture
+from datasets_manifest.frame import Environment
+from datasets_manifest.weather import CloudLayer
+from scenes.air import HORIZON_ELEVATION_RAD, LayeredAir
+from scenes.cloud_march import enlarge
+from scenes.clouds import band_limited, see_cloud
+from scenes.environment_map import load_map
+from scenes.ground import Ground
+from scenes.ground_view import FARTHEST_M, pixel_angle_rad
+from scenes.light import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
+from scenes.sea import GroundLight
+from scenes.sky import ClearSky
 
 _LIGHT_MAP_HEIGHT_PX = 128
-_HORIZON_ELEVATION_RAD = 0.01
-# Amplitude spectra: clouds follow roughly k^-5/3 in variance along a line; fields and forests are rougher.
-_CLOUD_SLOPE, _GROUND_SLOPE = 1.6, 1.3
-_GROUND_PATCH_M = 900.0
-_GROUND_CONTRAST = 0.22
-_CLOUD_ASYMMETRY = 0.85  # of the droplets' phase function
-_FARTHEST_M = 4e5  # beyond this the haze has hidden everything
+# Clouds of a large picture are seen on every second pixel, 5 m at 5 km, which is less than their edges are wide.
+_CLOUD_STEP_PX, _MANY_RAYS = 2, 60_000
 
 
 class Surroundings:
-    """Radiance by direction for one environment."""
+    """Radiance by direction for one environment.
+
+    Attributes:
+        environment: what it is.
+        sky: clear sky with sun and moon.
+        air: light between the layers.
+    """
 
     def __init__(self, environment: Environment) -> None:
         self.environment = environment
         self.sky = ClearSky(environment)
+        self.air = LayeredAir(environment, self.sky)
 
     def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
-        """The parts that vary slowly: clear sky, and the horizon's radiance at the same azimuth.
+        """The parts that vary slowly: clear sky, and endless air at the same azimuth.
 
         Args:
             directions: (..., 3) unit vectors in world axes.
@@ -42,11 +52,7 @@ class Surroundings:
         Returns:
             Two (..., 3) radiances. [cd/m2]
         """
-        flat = np.array(directions, dtype=np.float64)
-        horizontal = np.maximum(np.hypot(flat[..., 0], flat[..., 1]), 1e-9) / np.cos(_HORIZON_ELEVATION_RAD)
-        flat[..., :2] /= horizontal[..., None]
-        flat[..., 2] = np.sin(_HORIZON_ELEVATION_RAD)
-        return self.sky.radiance(directions), self.sky.radiance(flat)
+        return self.air.sky_and_air(directions)
 
     def radiance(
         self, directions: NDArray[np.float32], sky: Radiance | None = None, horizon: Radiance | None = None
@@ -63,88 +69,100 @@ class Surroundings:
         if sky is None or horizon is None:
             sky, horizon = self.clear_radiance(directions)
         total = sky.copy()
+        layers = sorted(self.environment.clouds, key=lambda layer: -abs(layer.height_above_camera_m))
+        parts = [_rows_with(directions[..., 2] * np.sign(layer.height_above_camera_m) > 0) for layer in layers]
+        pictures = [
+            self._cloud(layer, directions[rows], horizon[rows]) for layer, rows in zip(layers, parts, strict=True)
+        ]
         rows = _rows_with(directions[..., 2] < 0)
-        self._put_ground(total[rows], directions[rows], horizon[rows])
-        cloud = self.environment.cloud
-        if cloud is not None:
-            rows = _rows_with(directions[..., 2] * np.sign(cloud.height_above_camera_m) > 0)
-            self._put_cloud(cloud, total[rows], directions[rows])
+        uncovered = np.ones(directions.shape[:2], dtype=np.float32)
+        for layer, part, picture in zip(layers, parts, pictures, strict=True):
+            if not layer.is_above:
+                uncovered[part] *= 1.0 - picture[..., 3]
+        self._put_ground(total[rows], directions[rows], horizon[rows], uncovered[rows])
+        for part, picture in zip(parts, pictures, strict=True):
+            total[part] *= 1.0 - picture[..., 3:]
+            total[part] += picture[..., :3]
+        if self.environment.mist is not None:
+            hidden = self.air.mist_opacity(directions[..., 2])[..., None]
+            total += hidden * (self.air.mist_light(directions) - total)
         return total
 
+    def add_discs(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
+        """Add the discs of sun and moon behind cloud and mist, in place, to (H, W, 3) radiance along directions."""
+        self.sky.add_discs(radiance, directions, self.air.beam_share)
+
     @property
-    def horizon_radiance(self) -> NDArray[np.float64]:
-        """(3,) mean radiance of the horizon: the air's own light. [cd/m2]"""
-        azimuth = np.linspace(0, 2 * np.pi, 36, endpoint=False)
-        around = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(36, _HORIZON_ELEVATION_RAD)], axis=-1)
-        mean: NDArray[np.float64] = self.sky.radiance(around).mean(axis=0).astype(np.float64)
-        return mean
+    def beam_direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector in world axes towards what casts the shadows: the sun, or at night the moon."""
+        return self.sky.beam.direction
+
+    @property
+    def beam_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a plane at the camera that faces it, through air, cloud and mist. [lux]"""
+        return self.air.beam_illuminance_lux
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of air and mist around the camera. [1/m]"""
+        mist = self.environment.mist
+        return self.environment.extinction_per_m + (mist.extinction_per_m if mist is not None else 0.0)
+
+    def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """Radiance of endless air and mist, which things fade into.
+
+        Args:
+            directions: (..., 3) unit vectors in world axes.
+
+        Returns:
+            (..., 3) radiance. [cd/m2]
+        """
+        _, air = self.air.sky_and_air(directions)
+        if self.environment.mist is None:
+            return air
+        droplets = self.environment.mist.extinction_per_m / self.extinction_per_m
+        result: Radiance = air + np.float32(droplets) * (self.air.mist_light(directions) - air)
+        return result
+
+    @property
+    def ground_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of level ground by everything above it, by channel. [lux]"""
+        return self.air.ground_illuminance_lux
 
     @cached_property
-    def ground_illuminance_lux(self) -> NDArray[np.float64]:
-        """(3,) illuminance of level ground by sun and clear sky, by channel. [lux]"""
-        elevation = (np.arange(45) + 0.5) * np.pi / 90
-        azimuth = np.arange(72) * np.pi / 36
-        e, a = np.meshgrid(elevation, azimuth, indexing="ij")
-        directions = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
-        weight = np.cos(e) * np.sin(e) * (np.pi / 90) * (np.pi / 36)
-        from_sky = (self.sky.radiance(directions) * weight[..., None]).sum(axis=(0, 1))
-        from_sun = self.sky.sun_illuminance_lux * max(self.sky.sun_direction[2], 0.0)
-        result: NDArray[np.float64] = from_sky + from_sun
-        return result
+    def ground(self) -> Ground:
+        """What lies below, in the light that comes down to it."""
+        beam_lux, to_beam = self.air.ground_beam_lux, self.beam_direction
+        sky_lux = np.maximum(self.ground_illuminance_lux - beam_lux * max(float(to_beam[2]), 0.0), 0.0)
+        return Ground(self.environment, GroundLight(sky_lux, to_beam, beam_lux, self.radiance))
 
-    def _put_ground(self, total: Radiance, directions: NDArray[np.float32], horizon: Radiance) -> None:
-        """Cover the lower half, in place, with ground that fades into the horizon."""
-        environment = self.environment
-        down = np.maximum(-directions[..., 2], np.float32(environment.altitude_m / _FARTHEST_M))
-        distance_m = np.float32(environment.altitude_m) / down
-        per_patch = distance_m / np.float32(_GROUND_PATCH_M)
-        texture = sample_texture(
-            environment.ground_texture_seed,
-            _GROUND_SLOPE,
-            directions[..., 0] * per_patch,
-            directions[..., 1] * per_patch,
-        )
-        brightness = np.maximum(1.0 + np.float32(_GROUND_CONTRAST) * texture, 0.15)
-        reflected = self.ground_illuminance_lux * np.array(environment.ground_reflectance_rgb) / np.pi
-        ground = brightness[..., None] * reflected.astype(np.float32)
-        clear = np.exp(-distance_m * np.float32(environment.extinction_per_m))[..., None]
-        np.copyto(total, horizon + (ground - horizon) * clear, where=(directions[..., 2] < 0)[..., None])
+    def _put_ground(
+        self, total: Radiance, directions: NDArray[np.float32], horizon: Radiance, uncovered: NDArray[np.float32]
+    ) -> None:
+        """Cover the lower half, in place, with ground that fades into the horizon; `uncovered` of it will be seen."""
+        if directions.size == 0:
+            return
+        altitude_m = np.float32(self.environment.altitude_m)
+        distance_m = altitude_m / np.maximum(-directions[..., 2], altitude_m / np.float32(FARTHEST_M))
+        clear = np.exp(-distance_m * np.float32(self.environment.extinction_per_m))[..., None]
+        seen = horizon + (self.ground.radiance(directions, uncovered) - horizon) * clear
+        np.copyto(total, seen, where=(directions[..., 2] < 0)[..., None])
 
-    def _put_cloud(self, cloud: CloudLayer, total: Radiance, directions: NDArray[np.float32]) -> None:
-        """Blend the cloud layer over what lies behind it, in place."""
-        height_m = cloud.height_above_camera_m
-        rise = directions[..., 2] * np.float32(np.sign(height_m))
-        distance_m = np.float32(abs(height_m)) / np.maximum(rise, np.float32(abs(height_m) / _FARTHEST_M))
-        per_blob = distance_m / np.float32(cloud.feature_size_m)
-        x, y = directions[..., 0] * per_blob, directions[..., 1] * per_blob
-        texture = sample_texture(cloud.texture_seed, _CLOUD_SLOPE, x, y)
-        threshold = float(ndtri(np.clip(1.0 - cloud.cover_fraction, 1e-4, 1 - 1e-4)))
-        thickness = np.clip((texture - np.float32(threshold)) / np.float32(0.9), 0.0, 1.5)
-        depth = np.float32(cloud.optical_depth) * thickness * thickness
-        alpha = 1.0 - np.exp(-depth / np.maximum(rise, np.float32(0.15)))
-        alpha *= np.exp(-distance_m * np.float32(self.environment.extinction_per_m))
-        alpha[rise <= 0] = 0.0
-        lit = self._cloud_light(cloud, depth, x, y, texture)
-        total += alpha[..., None] * (lit - total)
-
-    def _cloud_light(
-        self,
-        cloud: CloudLayer,
-        depth: NDArray[np.float32],
-        x: NDArray[np.float32],
-        y: NDArray[np.float32],
-        texture: NDArray[np.float32],
-    ) -> Radiance:
-        """Radiance of the cloud itself: two-stream reflection above, transmission below, and its own shade."""
-        back = np.float32((1 - _CLOUD_ASYMMETRY) / 2) * depth
-        reflected = back / (1 + back)
-        seen = reflected if cloud.height_above_camera_m < 0 else 1 - reflected
-        towards_sun = self.sky.sun_direction[:2].astype(np.float32) * np.float32(0.12)
-        ahead = sample_texture(cloud.texture_seed, _CLOUD_SLOPE, x + towards_sun[0], y + towards_sun[1])
-        shade = np.clip(1.0 + 0.55 * (texture - ahead), 0.55, 1.35)
-        light = (self.ground_illuminance_lux / np.pi).astype(np.float32)
-        result: Radiance = (seen * shade)[..., None] * light
-        return result
+    def _cloud(self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance) -> Radiance:
+        """(H, W, 4) light of a cloud layer, itself behind haze, times its opacity, and its opacity."""
+        if directions.size == 0:
+            return np.zeros((*directions.shape[:2], 4), dtype=np.float32)
+        many = directions.shape[0] * directions.shape[1] >= _MANY_RAYS
+        every = _CLOUD_STEP_PX if many else 1
+        chosen, behind_air = directions[::every, ::every], air[::every, ::every]
+        seen = see_cloud(layer, chosen, self.air.light_on(layer), every)
+        clear = np.exp(seen.distance_m * np.float32(-self.environment.extinction_per_m))[..., None]
+        light = behind_air + clear * (seen.radiance - behind_air)
+        # Light times opacity is interpolated: light where there is no cloud means nothing.
+        layered: Radiance = np.concatenate([light * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
+        if not many:
+            return layered
+        return enlarge(band_limited(layered, layer, chosen), every, (directions.shape[0], directions.shape[1]))
 
     @cached_property
     def light_map(self) -> Radiance:
@@ -178,7 +196,7 @@ class Surroundings:
             * (2 * np.pi / width)
         )
         diffuse = (light * weight[..., None]).sum(axis=(0, 1))
-        direct = self.sky.sun_illuminance_lux * max(float(self.sky.sun_direction @ normal), 0.0)
+        direct = self.beam_illuminance_lux * max(float(self.beam_direction @ normal), 0.0)
         result: NDArray[np.float64] = diffuse + direct
         return result
 
@@ -189,17 +207,69 @@ def _rows_with(mask: NDArray[np.bool_]) -> slice:
     return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
 
 
-@lru_cache(maxsize=16)
-def _cached(key: str) -> Surroundings:
-    return Surroundings(Environment.model_validate_json(key))
+class MappedSurroundings(Surroundings):
+    """Radiance by direction as a user's map has it: sky, ground and sun of an environment are not used."""
+
+    def __init__(self, environment: Environment) -> None:
+        assert environment.map is not None
+        self.environment = environment
+        self._light = load_map(environment.map)
+        self._coarse = self._light.shrunk(_LIGHT_MAP_HEIGHT_PX)
+
+    def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
+        """Coarse radiance, and endless air at the same azimuth; see `Surroundings.clear_radiance`."""
+        return self._coarse.radiance(directions), self.airlight(directions)
+
+    def radiance(
+        self, directions: NDArray[np.float32], sky: Radiance | None = None, horizon: Radiance | None = None
+    ) -> Radiance:
+        """Radiance of everything but the sun's disc; rays that lie far apart see the map averaged."""
+        fine = pixel_angle_rad(directions) < np.pi / _LIGHT_MAP_HEIGHT_PX / 2
+        return (self._light if fine else self._coarse).radiance(directions)
+
+    def add_discs(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
+        """Add the sun's disc, in place, to (H, W, 3) radiance along directions."""
+        cosine = np.einsum("...i,i->...", directions, self.beam_direction.astype(np.float32))
+        radiance[cosine > np.cos(SUN_RADIUS_RAD)] += (self.beam_illuminance_lux / SUN_SOLID_ANGLE_SR).astype(np.float32)
+
+    @property
+    def beam_direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector in world axes towards the map's sun."""
+        return self._light.sun_direction
+
+    @property
+    def beam_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a plane that faces the map's sun; zeros when it has none. [lux]"""
+        return self._light.sun_lux
+
+    @property
+    def ground_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of level ground by the map, by channel. [lux]"""
+        return self.plate_illuminance_lux(np.array([0.0, 0.0, 1.0]))
+
+    def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """Radiance of endless air: the map's own horizon at the same azimuth; see `Surroundings.airlight`."""
+        level = np.array(directions, dtype=np.float32)
+        length = np.maximum(np.hypot(level[..., 0], level[..., 1]), np.float32(1e-9))
+        level[..., :2] /= length[..., None]
+        level[..., 2] = np.float32(HORIZON_ELEVATION_RAD)
+        return self._coarse.radiance(level.reshape(1, -1, 3)).reshape(level.shape)
+
+
+# A recipe visits its scenes in turn; one takes half a megabyte.
+@lru_cache(maxsize=128)
+def _cached(key: str, folder: Path | None) -> Surroundings:
+    environment = Environment.model_validate_json(key)
+    if environment.map is None:
+        return Surroundings(environment)
+    placed = environment.map.model_copy(update={"folder": folder})
+    return MappedSurroundings(environment.model_copy(update={"map": placed}))
 
 
 def surroundings(environment: Environment) -> Surroundings:
-    """The surroundings of an environment; the same object for equal environments, as frames share scenes."""
-    return _cached(environment.model_dump_json())
+    """The surroundings of an environment; the same object for equal environments, as frames share scenes.
 
-
-def luminance(radiance: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """(...) luminance of (..., 3) radiance. [cd/m2]"""
-    result: NDArray[np.float64] = np.einsum("...c,c->...", np.asarray(radiance, dtype=np.float64), REC709_LUMINANCE)
-    return result
+    Raises:
+        ValueError: the environment's map cannot be read, or has changed.
+    """
+    return _cached(environment.model_dump_json(), environment.map.folder if environment.map is not None else None)

@@ -11,7 +11,8 @@ import pytest
 import shapely
 from scipy.special import j1
 
-from datasets_manifest.recipe import Range, load_recipe
+from datasets_manifest.ranges import Range
+from datasets_manifest.recipe import load_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from droguekit.batch.local import render_dataset
@@ -48,7 +49,9 @@ def with_drogue(frame, **changes):
 
 def clear_fraction(frame, center_m):
     """What the air lets through from a place of the drogue."""
-    return np.exp(-frame.environment.extinction_per_m * frame.left_from_drogue.apply(center_m)[2])
+    drogue_m = frame.left_from_drogue.translation_m
+    slant = np.linalg.norm(drogue_m) / drogue_m[2]
+    return np.exp(-frame.environment.extinction_per_m * slant * frame.left_from_drogue.apply(center_m)[2])
 
 
 def difference(analytic, recipe, bright, dark):
@@ -188,7 +191,9 @@ def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic, make_recipe
         values = np.unique(seen.radiance_cd_m2[1:-1, 1:-1][deep], axis=0)
         assert len(values) == 1
         clear = clear_fraction(frame, center_m)
-        want = np.array(reflectance) * plate / np.pi * clear + around.horizon_radiance * (1 - clear)
+        drogue_m = frame.left_from_drogue.translation_m
+        air = around.airlight(frame.world_from_left.rotate(drogue_m / np.linalg.norm(drogue_m)))
+        want = np.array(reflectance) * plate / np.pi * clear + air * (1 - clear)
         # float32.
         np.testing.assert_allclose(values[0], want, rtol=1e-6)
 

@@ -2,7 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from datasets_manifest.weather import CloudLayer
+from geometry.se3 import RigidTransform
 from render.background import background
+from render.stars import add_stars
+from scenes.light import luminance
+from scenes.night import star_catalogue
 from scenes.sampler import sample_frame
 from scenes.surroundings import surroundings
 
@@ -43,7 +48,7 @@ def test_turning_camera_blurs_the_sky(make_recipe):
 def test_the_sun_is_drawn_where_it_stands(make_recipe):
     frame = sample_frame(make_recipe(scale=1.0), 0)
     environment = frame.environment.model_copy(
-        update={"sun_elevation_deg": 6.0, "sun_azimuth_deg": 4.0, "visibility_m": 4e5, "cloud": None}
+        update={"sun_elevation_deg": 6.0, "sun_azimuth_deg": 4.0, "visibility_m": 4e5, "clouds": ()}
     )
     image = background(frame.model_copy(update={"environment": environment})).max(axis=-1)
     disc = image > 1e7
@@ -54,3 +59,43 @@ def test_the_sun_is_drawn_where_it_stands(make_recipe):
     np.testing.assert_allclose([u.mean(), v.mean()], expected, atol=0.5)
     # 0.533 degrees of 37.2 px each, give or take a pixel's lattice.
     assert abs(np.sqrt(4 * disc.sum() / np.pi) - 0.5332 * np.pi / 180 * 2133.33) < 1.0
+
+
+def test_stars_shine_with_all_their_light_and_stay_behind_clouds(make_recipe):
+    """Light of the picture with stars less that of the sky alone, over the pixels' solid angles, is theirs in lux."""
+    frame = sample_frame(make_recipe(scale=0.5), 0)
+    environment = frame.environment.model_copy(update={"sun_elevation_deg": -40.0, "clouds": ()})
+    camera, rotation = frame.rig.camera, world_from_camera_up()
+    stars = np.zeros((camera.height_px, camera.width_px, 3), dtype=np.float32)
+    add_stars(stars, frame.rig, "left", rotation)
+    u, v = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+    rays = camera.rays(np.stack([u, v], axis=-1))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    directions, lux = star_catalogue()
+    places = camera.project(directions @ rotation)
+    inside = ((directions @ rotation)[:, 2] > 0.5) & camera.contains(places)
+    # Overhead the air takes at most 2 %; stars on the border lose some; a pixel's solid angle goes with cos^3.
+    got = (luminance(stars) * rays[..., 2] ** 3).sum() / (camera.fx_px * camera.fy_px)
+    assert inside.sum() > 20
+    assert abs(got / lux[inside].sum() - 1) < 0.05
+    overcast = CloudLayer(
+        kind="stratus",
+        height_above_camera_m=500,
+        cover_fraction=1.0,
+        feature_size_m=2000,
+        optical_depth=60,
+        texture_seed=2,
+    )
+    looking_up = frame.model_copy(
+        update={
+            "environment": environment.model_copy(update={"clouds": (overcast,)}),
+            "world_from_left": RigidTransform(rotation, np.zeros(3)),
+        }
+    )
+    covered = luminance(background(looking_up))
+    assert covered.max() < 3 * np.median(covered) < luminance(stars).max()
+
+
+def world_from_camera_up():
+    """Camera axes that look at the zenith."""
+    return np.eye(3)

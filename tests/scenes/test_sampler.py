@@ -8,7 +8,7 @@ from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES
 from scenes.distance import sample_distance_m
-from scenes.sampler import sample_frame, scene_of_frame, split_of_scene
+from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scene
 from scenes.seeding import bulk_generator, generator
 
 BASE = """
@@ -76,9 +76,9 @@ def test_the_whole_drogue_is_in_both_views(distance_m):
 
 
 def test_places_fill_the_common_field():
-    frames = [sample_frame(recipe('law = "stations"\nstations_m = [10.0]'), index) for index in range(200)]
-    places = np.array([frame.left_from_drogue.translation_m[:2] for frame in frames])
-    x_low, x_high, y_low, y_high = frames[0].rig.common_field_m(10.0, 0.33)
+    drawn = recipe('law = "stations"\nstations_m = [10.0]')
+    places = np.array([sample_left_from_drogue(drawn, index).translation_m[:2] for index in range(200)])
+    x_low, x_high, y_low, y_high = drawn.rig.common_field_m(10.0, 0.33)
     # Uniform: of 200 draws the extremes lie within 4 % of the ends (0.96^200 = 3e-4).
     assert places[:, 0].min() < x_low + 0.04 * (x_high - x_low) + 0.1
     assert places[:, 0].max() > x_high - 0.04 * (x_high - x_low) - 0.1
@@ -131,9 +131,19 @@ def test_scenes_are_visited_evenly_and_split_whole():
 
 def test_empty_frames_have_no_drogue():
     drawn = recipe(empty=0.25)
-    empty = sum(sample_frame(drawn, index).drogue is None for index in range(400))
+    empty = sum(sample_left_from_drogue(drawn, index) is None for index in range(400))
     # Binomial of 400 draws: standard deviation 8.7; four of them.
     assert abs(empty - 100) < 35
+
+
+def test_a_pose_drawn_alone_is_that_of_the_frame():
+    drawn = recipe(empty=0.25)
+    for index in range(12):
+        alone, frame = sample_left_from_drogue(drawn, index), sample_frame(drawn, index)
+        assert (alone is None) == (frame.drogue is None)
+        if alone is not None:
+            np.testing.assert_array_equal(alone.translation_m, frame.left_from_drogue.translation_m)
+            np.testing.assert_array_equal(alone.rotation, frame.left_from_drogue.rotation)
 
 
 def test_hose_runs_from_the_coupling_to_the_pod():

@@ -3,9 +3,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import CloudLayer, Environment
+from datasets_manifest.frame import Environment
+from datasets_manifest.weather import CloudLayer, Moon
+from scenes.light import REC709_FROM_XYZ, hemisphere, luminance
+from scenes.night import moon_illuminance_lux, star_catalogue
 from scenes.sky import ClearSky, direction_from_angles
-from scenes.surroundings import Surroundings, luminance
+from scenes.surroundings import Surroundings
 from scenes.texture import sample_texture
 
 
@@ -29,6 +32,26 @@ def test_zenith_luminance_is_the_published_formula():
     expected = (4.0453 * 3 - 4.9710) * np.tan((4 / 9 - 3 / 120) * (np.pi - 2 * s)) - 0.2155 * 3 + 2.4192
     got = luminance(sky.radiance(np.array([0.0, 0.0, 1.0])))
     assert float(got) == pytest.approx(expected * 1e3, rel=2e-4)
+
+
+def colour_temperature_k(radiance):
+    """After McCamy 1992, Color Research and Application 17(2), 142; above 12,500 K it only ranks."""
+    xyz = np.linalg.inv(REC709_FROM_XYZ) @ np.asarray(radiance, dtype=float)
+    x, y = xyz[:2] / xyz.sum()
+    n = (x - 0.3320) / (0.1858 - y)
+    return 449 * n**3 + 3525 * n**2 + 6823.3 * n + 5520.33
+
+
+def test_colours_of_the_clear_sky():
+    """Blue overhead, about white towards a sun of 18 degrees, warm towards a setting one."""
+    high = ClearSky(environment(sun_elevation_deg=50.0, turbidity=2.5))
+    # Clear zeniths are measured between about 12,000 and 25,000 K; with the sun outside the air for white instead of
+    # D65, 15 reciprocal megakelvin less: 14,500 to 40,000 K.
+    assert 14_500 < colour_temperature_k(high.radiance(direction_from_angles(90.0, 0.0))) < 40_000
+    low, setting = (ClearSky(environment(sun_elevation_deg=elevation, turbidity=2.5)) for elevation in (18.0, 1.0))
+    towards = [colour_temperature_k(sky.radiance(direction_from_angles(6.0, 60.0))) for sky in (low, setting)]
+    assert 5000 < towards[0] < 7500
+    assert towards[1] < 4200
 
 
 def test_sunlight_at_the_ground_has_the_level_of_a_clear_day():
@@ -64,16 +87,17 @@ def test_blue_overhead_and_finite_everywhere():
 @pytest.mark.parametrize("cloud_height_m", [None, 1500.0, -1200.0])
 def test_no_seam_at_the_horizon(cloud_height_m):
     """Just above and just below the horizon haze has made sky, ground and cloud one."""
-    cloud = None
+    clouds = ()
     if cloud_height_m is not None:
-        cloud = CloudLayer(
+        layer = CloudLayer(
             height_above_camera_m=cloud_height_m,
             cover_fraction=0.5,
             feature_size_m=2000,
             optical_depth=8,
             texture_seed=1,
         )
-    around = Surroundings(environment(cloud=cloud))
+        clouds = (layer,)
+    around = Surroundings(environment(clouds=clouds))
     azimuth = np.linspace(0, 2 * np.pi, 200)
     rows = []
     for elevation in (-0.002, 0.002):
@@ -110,21 +134,110 @@ def test_plate_illuminance_of_level_ground_agrees_with_the_sky_integral():
     np.testing.assert_allclose(up, around.ground_illuminance_lux, rtol=0.01)
 
 
-def test_cloud_cover_is_the_stated_share():
-    fractions = []
-    for seed in range(6):
-        cloud = CloudLayer(
-            height_above_camera_m=1000, cover_fraction=0.4, feature_size_m=1500, optical_depth=10, texture_seed=seed
-        )
-        x, y = np.meshgrid(np.linspace(0, 60, 400), np.linspace(0, 60, 400))
-        texture = sample_texture(cloud.texture_seed, 1.6, x.astype(np.float32), y.astype(np.float32))
-        fractions.append(np.mean(texture > 0.2533))  # the Gaussian quantile of 0.6
-    # One tile holds some 64 independent blobs: 6 % standard deviation each, 2.5 % of the mean of six.
-    assert np.mean(fractions) == pytest.approx(0.4, abs=0.06)
-
-
 def test_texture_repeats_without_a_seam():
     x = np.linspace(0, 8, 4097, dtype=np.float32)[None]
     values = sample_texture(5, 1.6, x, np.zeros_like(x))[0]
     jumps = np.abs(np.diff(values))
     assert jumps.max() < 12 * np.median(jumps) + 0.2
+
+
+def level_illuminance_lux(sky):
+    directions, weight = hemisphere(45)
+    from_sky = float((luminance(sky.radiance(directions)) * weight).sum())
+    return from_sky + float(luminance(sky.beam.beam_illuminance_lux())) * max(sky.beam.direction[2], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("elevation_deg", "low_lux", "high_lux"),
+    [
+        (60.0, 85_000, 120_000),  # high sun, clear: 100 klux (IES handbook)
+        (10.0, 8_000, 13_500),  # 10.9 klux (Janiczek and DeYoung 1987, both terms)
+        (-0.833, 410, 585),  # sunset to -6 and -12 degrees: AMS Glossary of Meteorology, "civil twilight",
+        (-6.0, 2.0, 3.5),  # "nautical twilight" and "astronomical twilight"
+        (-12.0, 0.004, 0.008),
+        (-18.0, 0.0006, 0.002),  # starlight and airglow
+        (-50.0, 0.0006, 0.002),
+    ],
+)
+def test_light_of_the_whole_clear_sky_is_what_is_measured(elevation_deg, low_lux, high_lux):
+    assert low_lux < level_illuminance_lux(ClearSky(environment(sun_elevation_deg=elevation_deg))) < high_lux
+
+
+@pytest.mark.parametrize("elevation_deg", [0.0, -4.0, -8.0, -12.0, -25.0])
+def test_zenith_is_as_bright_as_an_even_sky_of_the_same_light_or_darker(elevation_deg):
+    """Twilight and night are brightest near the horizon: the zenith has 0.3 to 1 of E / pi."""
+    sky = ClearSky(environment(sun_elevation_deg=elevation_deg))
+    zenith = float(luminance(sky.radiance(np.array([0.0, 0.0, 1.0]))))
+    assert 0.3 < zenith * np.pi / level_illuminance_lux(sky) < 1.0
+
+
+def test_moonless_night_has_the_luminance_of_dark_sites():
+    """21.9 to 21.3 magnitudes a square arc second at the zenith, with and without the brighter stars."""
+    zenith = ClearSky(environment(sun_elevation_deg=-40.0)).radiance(np.array([0.0, 0.0, 1.0]))
+    assert 1.9e-4 < float(luminance(zenith)) < 3.3e-4
+
+
+def test_light_grows_with_the_sun_without_a_jump():
+    elevations = np.arange(-20.0, 40.0, 0.5)
+    light = np.log([level_illuminance_lux(ClearSky(environment(sun_elevation_deg=e))) for e in elevations])
+    # Fastest in nautical twilight, where it falls from 2-3.5 to 0.004-0.008 lux over 6 degrees: 0.52 in half a degree.
+    assert np.all(np.diff(light) > -1e-6) and np.diff(light).max() < 0.6
+    rng = np.random.default_rng(1)
+    directions = rng.standard_normal((100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for border in (2.0, 9.0, 4.0, 22.0):
+        below, above = (
+            ClearSky(environment(sun_elevation_deg=border + step)).radiance(directions) for step in (-0.005, 0.005)
+        )
+        # Near its horizon a hundredth of a degree of sun changes the reddest glow by a hundredth.
+        np.testing.assert_allclose(below, above, rtol=0.02)
+
+
+def test_twilight_glows_over_the_sun_and_is_blue_overhead():
+    sky = ClearSky(environment(sun_elevation_deg=-6.0))
+    towards, away = (sky.radiance(direction_from_angles(3.0, 60.0 + turn)) for turn in (0.0, 180.0))
+    zenith = sky.radiance(np.array([0.0, 0.0, 1.0]))
+    assert luminance(towards) > 1.5 * luminance(away)
+    assert towards[0] / towards[2] > 2 * zenith[0] / zenith[2]
+    assert zenith[2] > 1.5 * zenith[0]
+
+
+def test_full_moon_is_as_bright_as_measured_and_fades_with_its_phase():
+    """0.25 lux at most from a high full moon, about a tenth of it from a half one (Krisciunas and Schaefer 1991)."""
+    night = environment(sun_elevation_deg=-50.0, moon=Moon(elevation_deg=60.0, azimuth_deg=20.0))
+    sky = ClearSky(night)
+    assert sky.beam is sky.moon
+    assert 0.1 < level_illuminance_lux(sky) < 0.27
+    assert 0.07 < moon_illuminance_lux(90.0) / moon_illuminance_lux(0.0) < 0.12
+    assert moon_illuminance_lux(180.0) < 0.001
+
+
+@pytest.mark.parametrize("phase_deg", [0.0, 60.0, 90.0, 120.0])
+def test_disc_of_the_moon_sends_what_the_moon_sends(phase_deg):
+    """Radiance of the drawn disc over its solid angle is the moon's illuminance, and the sun's side is lit."""
+    moon = Moon(elevation_deg=45.0, azimuth_deg=0.0, phase_angle_deg=phase_deg)
+    sky = ClearSky(environment(sun_elevation_deg=-50.0, sun_azimuth_deg=0.0, moon=moon))
+    to_moon = sky.moon.direction
+    right, up = np.array([0.0, 1.0, 0.0]), np.cross(to_moon, [0.0, 1.0, 0.0])
+    up = up if up[2] > 0 else -up
+    offset = np.linspace(-0.006, 0.006, 241)
+    rays = to_moon + offset[None, :, None] * right + offset[:, None, None] * up
+    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    image = np.zeros(rays.shape, dtype=np.float32)
+    sky.add_discs(image, rays, 1.0)
+    light = luminance(image)
+    # The lattice of 180 points across the disc, and float32 directions of 6e-8 over 4.7e-3 rad.
+    got = light.sum() * (offset[1] - offset[0]) ** 2
+    assert got == pytest.approx(float(luminance(sky.moon.beam_illuminance_lux())), rel=0.02)
+    if phase_deg > 0:
+        assert light[:120].sum() > light[121:].sum()  # the sun stands below
+
+
+def test_there_are_as_many_stars_as_there_are():
+    """About 5000 stars to magnitude 6, some 500 to magnitude 4 and 15 to 25 to magnitude 1 on the whole sky (Allen)."""
+    directions, lux = star_catalogue()
+    magnitude = -2.5 * np.log10(lux) - 14.18
+    assert directions.shape == (len(lux), 3)
+    assert 4500 < len(lux) < 5600
+    assert 400 < np.sum(magnitude < 4) < 620
+    assert 5 < np.sum(magnitude < 1) < 35

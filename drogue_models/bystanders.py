@@ -1,0 +1,55 @@
+"""Shapes of what stands around a drogue besides hose and tanker: the receiver's probe, bars, and other round things."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from drogue_models.parameters import FrozenModel, Metres
+from geometry.se3 import Array
+
+SECTIONS = 64
+# (radius, z) of a probe's nozzle per radius of its tube: a bulb, then a waist (our choice of proportions).
+PROBE_PROFILE = ((0.55, 0.0), (0.80, 0.12), (0.95, 0.35), (0.95, 1.6), (0.62, 2.2), (0.62, 5.2), (1.0, 6.0))
+
+
+class BystanderShape(FrozenModel):
+    """A body of revolution about its own z axis.
+
+    Attributes:
+        form: `probe` (tip at the origin, body along +z), `bar` (a rod along z around the origin), `ball`, `disc` (a
+            thin round plate facing -z) or `ring` (a torus around z).
+        radius_m: largest radius; of a ring its centre line's. [m]
+        length_m: of probe and bar, thickness of a disc; without meaning for the others. [m]
+        tube_radius_m: of a ring's tube; without meaning for the others. [m]
+    """
+
+    form: Literal["probe", "bar", "ball", "disc", "ring"]
+    radius_m: Metres
+    length_m: float = Field(default=0.01, gt=0, le=50, allow_inf_nan=False)
+    tube_radius_m: Metres = 0.05
+
+    def profile_m(self) -> Array:
+        """(P, 2) corners (radius, z) of its section, counter-clockwise with the radius to the right and z up. [m]"""
+        profile: Array
+        match self.form:
+            case "probe":
+                nozzle = np.array(PROBE_PROFILE) * self.radius_m
+                end_m = max(self.length_m, 1.5 * nozzle[-1, 1])
+                profile = np.vstack([[0.0, 0.0], nozzle, [self.radius_m, end_m], [0.0, end_m]])
+            case "bar" | "disc":
+                low_m = -self.length_m / 2 if self.form == "bar" else 0.0
+                high_m = low_m + self.length_m
+                profile = np.array([[0.0, low_m], [self.radius_m, low_m], [self.radius_m, high_m], [0.0, high_m]])
+            case "ball":
+                angle = np.linspace(-np.pi / 2, np.pi / 2, SECTIONS // 2 + 1)
+                profile = self.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+                # The cosine of a right angle is not exactly 0.
+                profile[[0, -1], 0] = 0.0
+            case "ring":
+                angle = 2 * np.pi * np.arange(SECTIONS // 2) / (SECTIONS // 2)
+                tube = self.tube_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+                profile = np.array([self.radius_m, 0.0]) + tube
+        return profile

@@ -1,0 +1,72 @@
+"""What the surfaces of one frame reflect and give off: the parts' paints, aged as the frame's drogue is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.frame import FrameSpec
+from datasets_manifest.target import AS_NEW, SurfaceCondition
+from drogue_models.materials import part_reflectance_rgb
+from drogue_models.parts import FIRST_MARKER_ID, SURROUNDING_PARTS, Part
+from scenes.dirt import DIRT_RGB, dirt_map
+from scenes.sky import REC709_LUMINANCE
+
+
+def surface_condition(frame: FrameSpec, part_id: int) -> SurfaceCondition:
+    """State of a marker or the hub; other parts age as one, see `even_reflectance_rgb`."""
+    if frame.condition is None:
+        return AS_NEW
+    if part_id == Part.HUB:
+        return frame.condition.hub
+    return frame.condition.of_marker(part_id - FIRST_MARKER_ID) if part_id >= FIRST_MARKER_ID else AS_NEW
+
+
+def even_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
+    """(3,) diffuse reflectance of a part of the drogue, the hose or the tanker, without its dirt.
+
+    Raises:
+        ValueError: the frame has no such part.
+    """
+    if frame.drogue is None:
+        raise ValueError("drogue: the frame has none")
+    paint = np.array(part_reflectance_rgb(frame.drogue, part_id))
+    if part_id == Part.HUB or part_id >= FIRST_MARKER_ID:
+        return paint * surface_condition(frame, part_id).reflectance_fraction
+    worn = frame.condition is not None and (part_id == Part.HOSE or part_id not in SURROUNDING_PARTS)
+    fraction = frame.condition.body_reflectance_fraction if worn and frame.condition is not None else 1.0
+    return np.minimum(paint * fraction, 1.0)
+
+
+def reflectance_map(frame: FrameSpec, part_id: int) -> NDArray[np.float32]:
+    """(64, 64, 3) reflectance over the square around a marker or the hub; row 0 is the low y end."""
+    condition = surface_condition(frame, part_id)
+    dirt = dirt_map(condition.dirt_seed, condition.dirt_fraction)[..., None]
+    paint = even_reflectance_rgb(frame, part_id)
+    result: NDArray[np.float32] = (paint * (1.0 - dirt) + np.array(DIRT_RGB) * dirt).astype(np.float32)
+    return result
+
+
+def mean_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
+    """(3,) diffuse reflectance of a part, its dirt spread evenly over it."""
+    dirt = surface_condition(frame, part_id).dirt_fraction
+    mean: NDArray[np.float64] = even_reflectance_rgb(frame, part_id) * (1.0 - dirt) + np.array(DIRT_RGB) * dirt
+    return mean
+
+
+def lamp_radiance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
+    """(3,) radiance of a self-lit marker, 0 for anything else. [cd/m2]"""
+    if frame.drogue is None or part_id < FIRST_MARKER_ID or frame.drogue.marker_luminance_cd_m2 == 0:
+        return np.zeros(3)
+    color = np.array(frame.drogue.marker_emission_rgb)
+    luminance = frame.drogue.marker_luminance_cd_m2 * surface_condition(frame, part_id).lamp_fraction
+    radiance: NDArray[np.float64] = luminance * color / (color @ REC709_LUMINANCE)
+    return radiance
+
+
+def missing_parts(frame: FrameSpec) -> set[int]:
+    """Part ids of the markers, and maybe the hub, that have come off."""
+    if frame.drogue is None or frame.condition is None:
+        return set()
+    features = [int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)]
+    return {part for part in features if surface_condition(frame, part).missing}

@@ -1,0 +1,74 @@
+"""Koschmieder's law: the contrast of a black thing against the horizon falls with exp(-extinction x distance)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.frame import Environment
+from datasets_manifest.weather import Mist
+from drogue_models.parameters import DrogueParameters
+from drogue_models.parts import Part
+from geometry.se3 import RigidTransform
+from render.engine import load_engine
+from scenes.light import luminance
+from scenes.sampler import sample_frame
+
+BLACK = (0.0, 0.0, 0.0)
+VISIBILITY_M = 60.0
+DISTANCES_M = (5.0, 15.0, 30.0)
+
+
+def black_frame(make_recipe, distance_m):
+    """A black drogue in dense mist, in one corner of the view."""
+    recipe = make_recipe(scale=0.25, stations_m=(distance_m,), samples=4)
+    frame = sample_frame(recipe, 0)
+    drogue = DrogueParameters.model_validate(
+        frame.drogue.model_dump() | {"face_reflectance_rgb": BLACK, "marker_reflectance_rgb": BLACK}
+    )
+    environment = Environment.model_validate(
+        frame.environment.model_dump()
+        | {"visibility_m": 400_000.0, "mist": Mist(visibility_m=VISIBILITY_M, above_m=2000, below_m=2000)}
+    )
+    pose = RigidTransform(np.eye(3), [0.13 * distance_m, -0.09 * distance_m, distance_m])
+    return recipe, frame.model_copy(
+        update={"drogue": drogue, "environment": environment, "left_from_drogue": pose, "condition": None}
+    )
+
+
+def check(make_recipe, engine):
+    for distance_m in DISTANCES_M:
+        recipe, frame = black_frame(make_recipe, distance_m)
+        seen = engine.render(frame, recipe.render).left
+        light = luminance(seen.radiance_cd_m2)
+        marker = (seen.part_id == int(Part.FACE)) & (seen.coverage > 0.9999)
+        sky = seen.coverage == 0
+        contrast = 1.0 - light[marker].mean() / light[sky].mean()
+        v, u = np.nonzero(marker)
+        rays = frame.rig.camera.rays(np.stack([u, v], axis=-1).astype(float))
+        length_m = (seen.depth_m[marker] * np.linalg.norm(rays / rays[:, 2:], axis=-1)).mean()
+        expected = np.exp(-frame.environment.extinction_per_m * length_m) * np.exp(-3.912 / VISIBILITY_M * length_m)
+        # The bar of the law itself; what is left is the spread of depth over the face and float32.
+        assert contrast == pytest.approx(expected, rel=0.02)
+
+
+def test_contrast_falls_as_koschmieder_says_in_the_analytic_engine(make_recipe):
+    check(make_recipe, load_engine("analytic"))
+
+
+@pytest.mark.mitsuba
+def test_contrast_falls_as_koschmieder_says_in_mitsuba(make_recipe, engine):
+    check(make_recipe, engine)
+
+
+def test_airlight_is_the_background_where_nothing_can_be_seen(make_recipe):
+    """Endless air in front of things and the background behind them are one, in clear air and in mist."""
+    from scenes.surroundings import Surroundings
+
+    _, frame = black_frame(make_recipe, 10.0)
+    azimuth = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(90, -1e-4)], axis=-1)[None].astype(np.float32)
+    for environment in (frame.environment, frame.environment.model_copy(update={"mist": None, "visibility_m": 3e4})):
+        around = Surroundings(environment)
+        # 1e-4 rad down is endlessly far.
+        np.testing.assert_allclose(around.radiance(rays), around.airlight(rays), rtol=0.02)

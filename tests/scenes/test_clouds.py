@@ -1,0 +1,197 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.frame import Environment
+from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.weather import CloudLayer, Mist
+from scenes.cloud_density import CloudDensity
+from scenes.clouds import CloudLight, diffuse_transmission, opacity_towards, see_cloud
+from scenes.environment import environment_of_scene
+from scenes.light import luminance
+from scenes.sky import direction_from_angles
+from scenes.surroundings import Surroundings
+
+RECIPE = """
+name = "weather-test"
+[frames]
+count = 10
+scenes = 10
+[distance]
+law = "uniform"
+low_m = 3.0
+high_m = 10.0
+%s
+"""
+ONE_LAYER = "[environment.clouds]\nscene_fraction = 1.0\n"
+TWO_LAYERS = """
+[[environment.clouds]]
+scene_fraction = 1.0
+[[environment.clouds]]
+kind = "cirrus"
+scene_fraction = 1.0
+optical_depth = 0.4
+[environment.mist]
+scene_fraction = 0.5
+[environment.moon]
+scene_fraction = 1.0
+"""
+
+
+def environment(**changes):
+    values = {
+        "sun_elevation_deg": 40.0,
+        "sun_azimuth_deg": 60.0,
+        "turbidity": 2.5,
+        "visibility_m": 80_000.0,
+        "altitude_m": 3000.0,
+        "ground_reflectance_rgb": (0.1, 0.1, 0.06),
+        "ground_texture_seed": 3,
+    }
+    return Environment.model_validate(values | changes)
+
+
+def layer(**changes):
+    values = {
+        "height_above_camera_m": 1000.0,
+        "cover_fraction": 0.4,
+        "feature_size_m": 1500.0,
+        "optical_depth": 14.0,
+        "texture_seed": 1,
+    }
+    return CloudLayer.model_validate(values | changes)
+
+
+def upwards(count=128, half_width=1.2, sign=1.0):
+    """(count, count, 3) directions around the zenith or nadir."""
+    x, y = np.meshgrid(np.linspace(-half_width, half_width, count), np.linspace(-half_width, half_width, count))
+    rays = np.stack([x, y, np.full_like(x, sign)], axis=-1)
+    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize("cover", [0.2, 0.5])
+def test_cover_is_the_share_of_the_plan(cover):
+    shares = []
+    for seed in range(6):
+        cloud = layer(cover_fraction=cover, texture_seed=seed)
+        x, y = np.meshgrid(np.linspace(0, 9e4, 300), np.linspace(0, 9e4, 300))
+        places = np.stack([x, y, np.full_like(x, 1000.0 + 0.12 * cloud.thickness_m)], axis=-1).astype(np.float32)
+        shares.append(np.mean(CloudDensity(cloud).excess_at(places) > 0))
+    # Domes narrow a little with height and heaps move their edges. One tile holds some 64 bodies: 6 % standard
+    # deviation each, 2.5 % of the mean of six.
+    assert np.mean(shares) == pytest.approx(cover, abs=0.1)
+
+
+def test_no_cloud_without_cover_and_no_sky_under_an_overcast():
+    rays = upwards()
+    for kind in ("cumulus", "stratus"):
+        clear = Surroundings(environment()).radiance(rays)
+        none = Surroundings(environment(clouds=(layer(kind=kind, cover_fraction=0.0),)))
+        np.testing.assert_allclose(none.radiance(rays), clear, rtol=1e-3)
+    thick = layer(kind="stratus", cover_fraction=1.0, optical_depth=60.0)
+    assert opacity_towards(thick, direction_from_angles(40.0, 60.0)) > 0.99
+
+
+def test_cumulus_is_darker_below_than_on_its_sunny_side():
+    """Seen from above clouds send back most of the sunlight, seen from below they let a part of it through."""
+    over, under = (
+        luminance(
+            Surroundings(environment(clouds=(layer(height_above_camera_m=h, cover_fraction=0.9),))).radiance(rays)
+        )
+        for h, rays in ((-1000.0, upwards(sign=-1.0)), (1000.0, upwards()))
+    )
+    clear = Surroundings(environment())
+    facing_lux = float(luminance(clear.beam_illuminance_lux + clear.air.sky_level_lux))
+    # A white, diffuse plane that faces the sun sends 1/pi of the light back; thick cloud 0.5 to 0.9 of that.
+    assert 0.5 < np.percentile(over, 90) * np.pi / facing_lux < 0.9
+    assert np.median(under) < 0.6 * np.percentile(over, 90)
+
+
+def test_light_under_an_overcast_is_what_two_streams_let_through():
+    """Level illuminance below against that above: 1 / (1 + 0.11 depth) of it, and none of it from the sun itself."""
+    stratus = layer(kind="stratus", cover_fraction=1.0, optical_depth=30.0, thickness_m=400.0)
+    open_sky, under = Surroundings(environment()), Surroundings(environment(clouds=(stratus,)))
+    assert luminance(under.beam_illuminance_lux) < 1e-3 * luminance(open_sky.beam_illuminance_lux)
+    up = np.array([0.0, 0.0, 1.0])
+    share = float(luminance(under.plate_illuminance_lux(up)) / luminance(open_sky.plate_illuminance_lux(up)))
+    # The march shades by depth towards the sun, not by two streams: they agree to a third.
+    assert share == pytest.approx(diffuse_transmission(stratus), rel=0.35)
+
+
+def test_edges_towards_the_sun_are_lined_with_silver():
+    """Against the sun thin edges outshine the body of a cloud; with the sun in the back they do not."""
+    x, y = np.meshgrid(np.linspace(-0.2, 0.2, 160), np.linspace(0.1, 0.4, 120))
+    rays = np.stack([np.ones_like(x), -x, y], axis=-1)
+    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    ratios = []
+    for azimuth_deg in (10.0, 190.0):
+        sun = direction_from_angles(25.0, azimuth_deg)
+        light = CloudLight(sun, np.full(3, 8e4), np.full(3, 1.5e4), np.full(3, 5e3))
+        seen = see_cloud(layer(cover_fraction=0.5), rays, light)
+        brightness = luminance(seen.radiance)
+        edge = (seen.opacity > 0.2) & (seen.opacity < 0.8)
+        ratios.append(brightness[edge].mean() / brightness[seen.opacity > 0.99].mean())
+    # The forward peak at 15 degrees, 0.7 / sr, against the 0.3 / sr of everything that is scattered more often.
+    assert ratios[0] > 1.5 and ratios[1] < 1.2
+
+
+def test_coarse_march_agrees_with_every_ray():
+    """A large picture is seen on every second ray and marched on every fourth but for edges."""
+    around = Surroundings(environment(clouds=(layer(),)))
+    rays = upwards(count=320, half_width=0.2)
+    large = luminance(around.radiance(rays))
+    parts = np.concatenate([luminance(around.radiance(rays[row : row + 80])) for row in range(0, 320, 80)])
+    # Finest knobs of 2 m are 6 rays wide here; interpolation over 2 to 4 rays blunts them and edges.
+    assert np.mean(np.abs(large / parts - 1)) < 0.03
+    assert large.mean() == pytest.approx(parts.mean(), rel=0.01)
+
+
+def test_mist_hides_sun_and_sky_and_thins_out_in_the_limit():
+    rays = upwards()
+    clear = Surroundings(environment())
+    thin = Surroundings(environment(mist=Mist(visibility_m=100_000, above_m=0.1, below_m=0.1)))
+    # At most 8e-6 of the mist's light, which in red is some 20 times the bluest sky's.
+    np.testing.assert_allclose(thin.radiance(rays), clear.radiance(rays), rtol=2e-4)
+    dense = Surroundings(environment(mist=Mist(visibility_m=50, above_m=300, below_m=300)))
+    assert luminance(dense.beam_illuminance_lux) < 1e-6
+    seen = luminance(dense.radiance(rays))
+    assert seen.std() / seen.mean() < 1e-3
+    # Under optical depth 23.5 two streams leave 1 / 3.6; three quarters of it shine from all around.
+    assert float(seen.mean()) == pytest.approx(
+        0.75 / np.pi / 3.58 * float(luminance(clear.ground_illuminance_lux)), rel=0.02
+    )
+
+
+@pytest.mark.parametrize("kind", ["cumulus", "stratus", "cirrus"])
+@pytest.mark.parametrize("height_m", [800.0, -800.0])
+def test_finite_everywhere_at_any_hour(kind, height_m):
+    rng = np.random.default_rng(3)
+    rays = rng.standard_normal((20, 20, 3))
+    rays[0, 0] = [1.0, 0.0, 0.0]
+    rays[0, 1] = [0.0, 0.0, -1.0]
+    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    for elevation in (60.0, 0.5, -4.0, -30.0):
+        around = Surroundings(
+            environment(sun_elevation_deg=elevation, clouds=(layer(kind=kind, height_above_camera_m=height_m),))
+        )
+        seen = around.radiance(rays)
+        assert np.isfinite(seen).all() and (seen > 0).all()
+
+
+def test_recipes_with_one_layer_still_read_and_draw_the_same_sky():
+    one, two = (parse_recipe(RECIPE % text).environment for text in (ONE_LAYER, TWO_LAYERS))
+    assert len(one.clouds) == 1 and len(two.clouds) == 2
+    for scene in range(6):
+        first, second = environment_of_scene(1, scene, one), environment_of_scene(1, scene, two)
+        assert first.sun_azimuth_deg == second.sun_azimuth_deg
+        assert second.clouds[0] == first.clouds[0]
+        assert second.clouds[1].kind == "cirrus" and second.moon is not None
+    mists = [environment_of_scene(1, scene, two).mist for scene in range(40)]
+    # Half of them: binomial with standard deviation 3.2; four of them.
+    assert abs(sum(mist is not None for mist in mists) - 20) < 13
+
+
+def test_layers_the_camera_would_touch_are_refused():
+    with pytest.raises(ValueError, match="inside, use mist"):
+        layer(height_above_camera_m=50.0)

@@ -1,0 +1,108 @@
+"""Families of conditions: shares, stability, and what a family changes."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from datasets_manifest.recipe import load_recipe, parse_recipe
+from droguekit.batch.plan import plan_recipe
+from scenes.families import family_of_scene, recipe_of_scene, scenes_per_family
+from scenes.sampler import sample_frame, split_of_scene
+
+BASE = """
+name = "families-test"
+family = "own"
+seed = %d
+[frames]
+count = 40
+scenes = 10
+[distance]
+law = "stations"
+stations_m = [10.0]
+[environment]
+ground = "forest"
+sun_elevation_deg = [20, 50]
+[exposure]
+time_s = 1e-3
+[split]
+train = 0.7
+test = 0.3
+"""
+FAMILIES = """
+[[families]]
+name = "day"
+weight = 2
+[[families]]
+name = "sea"
+weight = 1
+[families.environment]
+ground = "sea"
+[families.exposure]
+time_s = 2e-3
+"""
+
+
+def recipe(more=FAMILIES, seed=1):
+    return parse_recipe(BASE % seed + more)
+
+
+def test_scenes_are_shared_out_by_largest_remainder():
+    assert scenes_per_family(recipe()) == [7, 3]
+    assert scenes_per_family(recipe(FAMILIES.replace("weight = 1", "weight = 6"))) == [3, 7]
+    names = [family_of_scene(recipe(), scene).name for scene in range(10)]
+    assert Counter(names) == {"day": 7, "sea": 3}
+    assert names != [family_of_scene(recipe(seed=2), scene).name for scene in range(10)]
+
+
+def test_a_family_changes_what_it_names_and_no_more():
+    drawn = recipe()
+    for index in range(10):
+        frame = sample_frame(drawn, index)
+        family = family_of_scene(drawn, frame.scene_id)
+        assert frame.family == family.name
+        assert frame.environment.ground == ("sea" if family.name == "sea" else "forest")
+        assert 20 <= frame.environment.sun_elevation_deg <= 50
+        assert frame.exposure.time_s == (2e-3 if family.name == "sea" else 1e-3)
+
+
+def test_splits_and_poses_stay_as_without_families():
+    with_families, without = recipe(), recipe("")
+    for index in range(10):
+        assert split_of_scene(with_families, index) == split_of_scene(without, index)
+        one, other = sample_frame(with_families, index), sample_frame(without, index)
+        assert one.left_from_drogue.as_matrix().tolist() == other.left_from_drogue.as_matrix().tolist()
+        assert other.family == "own"
+
+
+def test_a_recipe_without_families_is_its_own_for_every_scene():
+    drawn = recipe("")
+    assert recipe_of_scene(drawn, 3) is drawn
+
+
+def test_the_plan_counts_them():
+    assert plan_recipe(recipe()).by_family == {"day": (7, 28), "sea": (3, 12)}
+    assert plan_recipe(recipe("")).by_family == {}
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ('[[families]]\nname = "a"\n[[families]]\nname = "a"', "each needs a name of its own"),
+        ('[families]\nname = "a"', r"each begun by \[\[families\]\]"),
+        ('[[families]]\nname = "a"\nweight = 0', r"families\.0\.weight"),
+        ('[[families]]\nname = "a"\n[families.environment]\nfog = 1', r"families\.0\.environment\.fog"),
+    ],
+)
+def test_wrong_families_are_named(more, message):
+    with pytest.raises(ValueError, match=message):
+        recipe(more)
+
+
+def test_the_paper_count_ships():
+    """89 scenes and 14,298 images, as many as the paper trains on, over all families."""
+    world, _ = load_recipe("world-89")
+    assert world.frames.scenes == 89 and 2 * world.frames.count == 14_298
+    assert scenes_per_family(world) == [round(family.weight) for family in world.families]
+    assert len(world.families) >= 12

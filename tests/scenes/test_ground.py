@@ -1,0 +1,198 @@
+"""Land and sea: levels, band limits, the statistics of waves and of the sun's glint."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.frame import Environment
+from datasets_manifest.ground import GROUND_KINDS
+from scenes.ground import MEAN_REFLECTANCE, Ground, GroundLight
+from scenes.ground_view import FARTHEST_M, ground_view, pixel_angle_rad
+from scenes.land_tiles import land_tile
+from scenes.light import luminance
+from scenes.mip_tile import MipTile, power_noise
+from scenes.sea import Sea, fresnel, slope_variances
+
+
+def environment(kind, **changes):
+    values = {
+        "sun_elevation_deg": 40.0,
+        "sun_azimuth_deg": 60.0,
+        "turbidity": 2.5,
+        "visibility_m": 150_000.0,
+        "altitude_m": 3000.0,
+        "ground": kind,
+        "ground_reflectance_rgb": MEAN_REFLECTANCE[kind],
+        "ground_texture_seed": 3,
+    }
+    return Environment.model_validate(values | changes)
+
+
+def light(sky_cd_m2=2000.0, beam_lux=60_000.0, elevation_deg=40.0, azimuth_deg=0.0):
+    e, a = np.radians([elevation_deg, azimuth_deg])
+    direction = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    return GroundLight(
+        np.full(3, np.pi * sky_cd_m2),
+        direction,
+        np.full(3, beam_lux),
+        lambda directions: np.full(directions.shape, sky_cd_m2, dtype=np.float32),
+    )
+
+
+def rays(depression_deg, half_width_deg=8.0, rows=60, columns=160):
+    """A level picture whose middle looks down by so much, towards the east."""
+    azimuth = np.radians(np.linspace(half_width_deg, -half_width_deg, columns))
+    down = np.radians(depression_deg) + np.radians(np.linspace(-0.4, 0.4, rows) * half_width_deg)
+    d, a = np.meshgrid(down, azimuth, indexing="ij")
+    grid = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), -np.sin(d)], axis=-1)
+    return grid.astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", GROUND_KINDS)
+def test_is_a_function_of_environment_and_direction(kind):
+    directions = rays(12.0, rows=24)
+    one, two = (Ground(environment(kind), light()).radiance(directions) for _ in range(2))
+    assert np.isfinite(one).all() and (one >= 0).all()
+    np.testing.assert_array_equal(one, two)
+    other = Ground(environment(kind, ground_texture_seed=4), light()).radiance(directions)
+    assert not np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("kind", ["fields", "forest", "dry"])
+def test_land_reflects_what_it_should_on_average(kind):
+    """Over many kilometres the picture averages to the environment's reflectance."""
+    above = rays(50.0, 25.0)
+    lit = light()
+    mean = Ground(environment(kind), lit).radiance(above).mean(axis=(0, 1))
+    want = np.array(MEAN_REFLECTANCE[kind]) * lit.level_lux / np.pi
+    # A view of 6 km holds a few hundred parcels and hills of a few kilometres: about a tenth either way.
+    np.testing.assert_allclose(mean, want, rtol=0.15)
+
+
+def test_dark_light_makes_dark_ground_and_towns_light_up():
+    directions = rays(12.0, rows=24)
+    day, dusk = (Ground(environment("fields"), light(s, b)).radiance(directions) for s, b in ((2000, 6e4), (2, 60)))
+    np.testing.assert_allclose(luminance(dusk).mean() / luminance(day).mean(), 1e-3, rtol=1e-3)
+    night = Ground(environment("town"), light(1e-3, 0.0)).radiance(directions)
+    assert luminance(night).max() > 30 * 1e-3
+
+
+def test_a_tile_is_averaged_over_the_footprint():
+    """White noise over n texels squared keeps 1 / n of its standard deviation; bilinear steps blur on."""
+    tile = MipTile(power_noise(1, "test", 512, 0.0, 1.0)[..., None], 1.0)
+    x, y = np.meshgrid(np.linspace(0, 5000, 300, dtype=np.float32), np.linspace(0, 5000, 300, dtype=np.float32))
+    deviations = [float(tile.sample(x, y, np.full_like(x, width)).std()) for width in (4.0, 16.0)]
+    # Bilinear interpolation keeps 2/3 of the deviation on average over places; 16 texels leave 1e3 independent ones.
+    np.testing.assert_allclose(deviations, [2 / 3 / 4, 2 / 3 / 16], rtol=0.1)
+
+
+def test_a_tile_repeats_without_a_seam():
+    tile = land_tile("fields")
+    x = np.linspace(8192 - 40, 8192 + 40, 81, dtype=np.float32)[None].repeat(3, axis=0)
+    y = np.full_like(x, 777.0)
+    width = np.full_like(x, 16.0)
+    np.testing.assert_allclose(tile.sample(x, y, width), tile.sample(x - 8192, y, width), atol=1e-5)
+
+
+def test_far_ground_does_not_shimmer():
+    """Half a pixel's shift changes distant ground by less than near ground: detail is left out before it aliases."""
+    ground = Ground(environment("town", altitude_m=1000.0), light())
+    changes = []
+    for depression in (20.0, 4.0):
+        directions = rays(depression, 2.0)
+        moved = 0.5 * (directions[:, 1:] + directions[:, :-1])
+        moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
+        seen = luminance(ground.radiance(directions))
+        between = luminance(ground.radiance(moved))
+        straight = 0.5 * (seen[:, 1:] + seen[:, :-1])
+        changes.append(np.abs(between - straight).mean() / seen.mean())
+    assert changes[1] < changes[0] < 0.25
+
+
+def test_no_seam_between_bands_of_rows():
+    """Rows are worked out in bands; a flat tone must not change from one to the next."""
+    ground = Ground(environment("sea", altitude_m=6000.0, wind_speed_m_s=1.0), light(beam_lux=0.0))
+    rows = luminance(ground.radiance(rays(25.0, 6.0, rows=120))).mean(axis=1)
+    steps = np.abs(np.diff(rows)) / rows[:-1]
+    assert steps.max() < 6 * np.median(steps) + 0.01
+
+
+def test_fresnel_is_that_of_water():
+    assert float(fresnel(np.array(1.0))) == pytest.approx(((1.34 - 1) / (1.34 + 1)) ** 2)
+    assert float(fresnel(np.array(1e-6))) == pytest.approx(1.0, abs=1e-4)
+    brewster = np.arctan(1.34)
+    inside = np.arcsin(np.sin(brewster) / 1.34)
+    # At Brewster's angle one polarisation is gone.
+    want = 0.5 * (np.sin(brewster - inside) / np.sin(brewster + inside)) ** 2
+    assert float(fresnel(np.cos(brewster))) == pytest.approx(want, rel=1e-9)
+
+
+def test_slopes_are_those_of_cox_and_munk():
+    """Total mean square slope 0.003 + 0.00512 U (their equation for clean seas), within the fit's own 0.004."""
+    for wind in (2.0, 7.0, 14.0):
+        assert sum(slope_variances(wind)) == pytest.approx(0.003 + 0.00512 * wind, abs=0.004)
+
+
+def test_a_calm_sea_mirrors_the_sky():
+    """From straight above, unruffled water returns the sky's radiance times Fresnel's share."""
+    ground = Ground(environment("sea", wind_speed_m_s=0.0), light(beam_lux=0.0))
+    seen = ground.radiance(rays(85.0, 2.0)).mean(axis=(0, 1))
+    lit = light(beam_lux=0.0)
+    body = np.array(MEAN_REFLECTANCE["sea"]) * lit.level_lux / np.pi
+    want = 2000 * float(fresnel(np.array(1.0))) + body
+    # The remaining slopes of a calm sea (variance 0.004) add a little.
+    np.testing.assert_allclose(seen, want, rtol=0.03)
+
+
+def test_the_glint_holds_the_suns_light():
+    """Integrated over the half sphere of views, weighted with the sine, the glint gives back R E sin(elevation)."""
+    lit = light(beam_lux=1e5, elevation_deg=60.0)
+    sea = Sea(lit, 5.0, 0.3)
+    step = np.radians(1.0)
+    down = np.arange(20.5, 90.0, 1.0)
+    azimuth = np.arange(0.0, 360.0, 1.0)
+    d, a = np.meshgrid(np.radians(down), np.radians(azimuth), indexing="ij")
+    directions = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), -np.sin(d)], axis=-1).astype(np.float32)
+    view = ground_view(directions, 3000.0, step)
+    still = np.zeros_like(view.x_m)
+    glint = sea._glint(view, still, still, np.ones_like(still) / np.float32(0.7))[..., 0]
+    total = float((glint * np.sin(d) * np.cos(d)).sum() * step * step)
+    reflected = total / (1e5 * np.sin(np.radians(60.0)))
+    # Incidence of 30 degrees, spread by slopes of 0.12: Fresnel's share there is flat within some percent.
+    assert reflected == pytest.approx(float(fresnel(np.cos(np.radians(30.0)))), rel=0.06)
+
+
+def test_glint_lies_under_the_sun_and_widens_with_the_wind():
+    widths = []
+    for wind in (2.0, 12.0):
+        ground = Ground(environment("sea", wind_speed_m_s=wind), light(elevation_deg=30.0))
+        row = luminance(ground.radiance(rays(30.0, 40.0, rows=24, columns=321))).mean(axis=0)
+        bright = row - row.min()
+        places = np.linspace(-1, 1, 321)
+        assert abs(float((bright * places).sum() / bright.sum())) < 0.1
+        widths.append(float((bright > bright.max() / 2).mean()))
+    assert widths[1] > 1.3 * widths[0]
+
+
+def test_a_coast_has_both_and_a_bright_line_between():
+    seen = Ground(environment("coast", ground_texture_seed=5, altitude_m=1500.0), light()).radiance(rays(9.0, 16.0))
+    blue = seen[..., 2] / seen[..., 0]
+    assert (blue > 1.2).mean() > 0.05 and (blue < 0.8).mean() > 0.05
+
+
+def test_red_things_lie_about():
+    """Red roofs: what a search for red discs must not fall for."""
+    near = rays(45.0, 10.0, 400, 400)
+    for kind in ("town", "fields"):
+        shares = []
+        for seed in range(4):
+            seen = Ground(environment(kind, altitude_m=4000.0, ground_texture_seed=seed), light()).radiance(near)
+            shares.append(((seen[..., 0] > 3 * seen[..., 1]) & (seen[..., 0] > 3 * seen[..., 2])).mean())
+        assert max(shares) > 0
+
+
+def test_rays_that_miss_the_ground_see_its_rim():
+    directions = rays(0.0, 1.0)
+    view = ground_view(directions, 3000.0, pixel_angle_rad(directions))
+    assert np.isfinite(view.x_m).all() and float(view.x_m.max()) <= FARTHEST_M * 1.001
