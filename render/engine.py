@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from importlib.metadata import EntryPoint, entry_points
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
+
+ENTRY_POINT_GROUP = "droguekit.engines"
+"""Where other packages name their engines: classes that are made without arguments."""
+
+_OURS = ("mitsuba", "analytic", "blender")
 
 
 class EngineUnavailableError(ValueError):
@@ -44,10 +50,11 @@ class StereoRadiance:
 
     Attributes:
         engine, engine_version: what made it, down to the variant.
-        monte_carlo_noise_fraction: relative standard error of a pixel's luminance inside the drogue's parts, root mean
-            square over the pixels, estimated from the spread of each pixel's samples as if they were independent (they
-            are better than that); 0 for an engine without sampling.
+        monte_carlo_noise_fraction: root mean square error of luminance by the engine's sampling, over root mean square
+            luminance, on the pixels of the drogue; 0 for an engine without sampling.
         stage_s: CPU seconds by stage. [s]
+        monte_carlo_over_sensor_noise: the same error in the sensor's electrons, over the standard deviation of its shot
+            and read noise on the same pixels, both behind the lens; None for an engine that does not measure it.
     """
 
     left: EyeRadiance
@@ -56,6 +63,7 @@ class StereoRadiance:
     engine_version: str
     monte_carlo_noise_fraction: float
     stage_s: dict[str, float]
+    monte_carlo_over_sensor_noise: float | None = None
 
 
 class RenderEngine(Protocol):
@@ -70,8 +78,8 @@ class RenderEngine(Protocol):
 
 
 def engine_names() -> tuple[str, ...]:
-    """Engines that this version knows."""
-    return ("mitsuba", "analytic")
+    """Engines that ship with this version, then those of other packages."""
+    return (*_OURS, *sorted(_others()))
 
 
 def engine_notice(name: str) -> str | None:
@@ -80,6 +88,10 @@ def engine_notice(name: str) -> str | None:
     Raises:
         ValueError: the engine's packages are missing.
     """
+    if name == "blender":
+        from render.blender_engine.process import bpy_version
+
+        bpy_version()
     if name != "mitsuba":
         return None
     from render.mitsuba_engine.variant import probe_variant
@@ -96,10 +108,28 @@ def load_engine(name: str) -> RenderEngine:
     """
     if name not in engine_names():
         raise EngineUnavailableError(f"engine: no engine named {name!r}; there are {', '.join(engine_names())}")
+    if name not in _OURS:
+        return _loaded(_others()[name])
     if name == "analytic":
         from render.analytic_engine.engine import AnalyticEngine
 
         return AnalyticEngine()
+    if name == "blender":
+        from render.blender_engine.engine import BlenderEngine
+
+        return BlenderEngine()
     from render.mitsuba_engine.engine import MitsubaEngine
 
     return MitsubaEngine()
+
+
+def _others() -> dict[str, EntryPoint]:
+    """Engines of other packages; a name of ours stays ours."""
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name not in _OURS}
+
+
+def _loaded(entry: EntryPoint) -> RenderEngine:
+    try:
+        return cast(RenderEngine, entry.load()())
+    except (ImportError, AttributeError) as error:
+        raise EngineUnavailableError(f"engine: {entry.name!r} cannot be loaded from {entry.value}: {error}") from error

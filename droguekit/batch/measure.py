@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from datasets_manifest.reader import read_record_table
 from datasets_manifest.recipe import Recipe
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.workers import run_alone
 
 
+@dataclass(frozen=True)
+class MeasuredFrame:
+    """One frame as it was made.
+
+    Attributes:
+        report: what it cost.
+        noise_over_sensor: noise of the renderer over that of the sensor on the drogue, None if it was not measured.
+        memory_bytes: that the process held afterwards, None where the system does not tell.
+    """
+
+    report: FrameReport
+    noise_over_sensor: float | None
+    memory_bytes: int | None
+
+
 def measure_frames(recipe: Recipe, frames: tuple[int, ...]) -> tuple[FrameReport, ...]:
+    """What frames cost; see `measure_closely`."""
+    return tuple(measured.report for measured in measure_closely(recipe, frames))
+
+
+def measure_closely(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
     """Make frames in a temporary folder, in a process of their own with one thread.
 
     The first frame is made once more before, so that loading the engine and compiling its kernels does not count.
@@ -27,8 +50,23 @@ def measure_frames(recipe: Recipe, frames: tuple[int, ...]) -> tuple[FrameReport
     return run_alone(partial(_measure, recipe, frames))
 
 
-def _measure(recipe: Recipe, frames: tuple[int, ...]) -> tuple[FrameReport, ...]:
+def _measure(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         task = FrameTask(recipe, Path(folder))
         task(frames[0])
-        return tuple(task(frame_index) for frame_index in frames)
+        return tuple(_measured(task, frame_index) for frame_index in frames)
+
+
+def _measured(task: FrameTask, frame_index: int) -> MeasuredFrame:
+    report = task(frame_index)
+    conditions = read_record_table(task.dataset, frame_index)["conditions"]
+    return MeasuredFrame(report, conditions["monte_carlo_over_sensor_noise"], _memory_bytes())
+
+
+def _memory_bytes() -> int | None:
+    """Resident memory of this process."""
+    try:
+        resident_pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except OSError:
+        return None
+    return resident_pages * os.sysconf("SC_PAGE_SIZE")

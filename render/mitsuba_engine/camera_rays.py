@@ -1,4 +1,4 @@
-"""Rays of one eye in the drogue frame, at any place of a pixel and any time of the exposure."""
+"""Rays of one eye in the stage's axes, at any place of a pixel and any time of the exposure."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ import mitsuba as mi
 import numpy as np
 
 from datasets_manifest.frame import FrameSpec
+from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye
 from render.motion import pose_polynomial
 
 
 class CameraRays:
-    """Rays of one eye in the drogue frame."""
+    """Rays of one eye in the stage's axes, through its lens if it has one."""
 
     def __init__(self, frame: FrameSpec, eye: Eye) -> None:
         self.camera: PinholeCamera = frame.rig.camera
+        lens = frame.rig.lens(eye)
+        self._slopes = None if lens is None else _corner_slopes(lens)
         self._pose = pose_polynomial(frame, eye)
         self.pose_at_middle = self._pose[0]
         self.moves = bool(np.abs(self._pose[1:]).max() > 0)
@@ -39,15 +42,34 @@ class CameraRays:
         row = pixel // camera.width_px
         u = mi.Float(pixel - row * camera.width_px) + (place.x - 0.5)
         v = mi.Float(row) + (place.y - 0.5)
-        local = dr.normalize(
-            mi.Vector3f((u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px, mi.Float(1.0))
-        )
+        if self._slopes is None:
+            slope_x, slope_y = (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px
+        else:
+            slope_x, slope_y = (self._between_corners(slopes, pixel + row, place) for slopes in self._slopes)
+        local = dr.normalize(mi.Vector3f(slope_x, slope_y, mi.Float(1.0)))
         pose = self._pose_at(2.0 * moment - 1.0)
         direction = mi.Vector3f(*[pose[i][0] * local.x + pose[i][1] * local.y + pose[i][2] * local.z for i in range(3)])
         return mi.Ray3f(mi.Point3f(*[pose[i][3] for i in range(3)]), dr.normalize(direction))
+
+    def _between_corners(self, slopes: Any, corner: Any, place: Any) -> Any:
+        """Slopes at places of pixels, by their four corners; `corner` is the index of the first of them."""
+        low, high = corner, corner + self.camera.width_px + 1
+        first, second, third, fourth = (dr.gather(mi.Float, slopes, at) for at in (low, low + 1, high, high + 1))
+        return dr.lerp(dr.lerp(first, second, place.x), dr.lerp(third, fourth, place.x), place.y)
 
     def _pose_at(self, s: Any) -> list[list[Any]]:
         c = self._opaque_pose
         if not self.moves:
             return c[0]
         return [[c[0][i][j] + s * (c[1][i][j] + s * c[2][i][j]) for j in range(4)] for i in range(3)]
+
+
+def _corner_slopes(lens: Lens) -> tuple[Any, Any]:
+    """Slopes x / z and y / z of the rays through the corners of a real eye's pixels, row by row.
+
+    Across one pixel a lens bends them by less than 1e-7 from linear.
+    """
+    camera = lens.camera
+    u, v = np.meshgrid(np.arange(camera.width_px + 1) - 0.5, np.arange(camera.height_px + 1) - 0.5)
+    rays = lens.rays(np.stack([u, v], axis=-1)).astype(np.float32)
+    return mi.Float(rays[..., 0].ravel()), mi.Float(rays[..., 1].ravel())

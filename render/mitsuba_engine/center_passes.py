@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from datasets_manifest.frame import FrameSpec
 from geometry.stereo import Eye
 from render.mitsuba_engine.camera_rays import CameraRays
-from render.mitsuba_engine.scene import DrogueScene
-from render.mitsuba_engine.traced import ASIDE, TracedEye, amodal_counts
+from render.mitsuba_engine.scene import DrogueScene, by_shape
+from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, TracedEye, amodal_counts
 
 CENTER = (0.5, 0.5)
 
@@ -36,16 +36,24 @@ class CenterPasses:
         ids, distance = self._hits(self._scene.scene, self._center_rays(pixel, (s + 1) / 2))
         return ids.reshape(self._shape), distance.reshape(self._shape)
 
+    def sunlit(self, part_id: NDArray[np.uint8], s: float) -> NDArray[np.bool_]:
+        """(H, W) where the rays of `part_ids` at time s meet surfaces of the drogue that see the sun."""
+        sunlit = np.zeros(self._shape, dtype=np.bool_)
+        pixel = np.flatnonzero(OF_DROGUE[part_id])
+        if len(pixel):
+            to_sun, _ = self._scene.sun
+            ray = self._center_rays(mi.UInt32(pixel), (s + 1) / 2)
+            surface = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
+            faces = surface.is_valid() & (dr.dot(surface.n, to_sun) > 0)
+            sunlit.reshape(-1)[pixel] = np.array(faces & ~self._scene.scene.ray_test(surface.spawn_ray(to_sun), faces))
+        return sunlit
+
     @staticmethod
     def _hits(scene: Any, ray: Any) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
-        registry: Any = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
-        registry_ids = np.array(registry)
-        table = np.zeros(int(registry_ids.max()) + 1, dtype=np.uint32)
-        for index, shape in zip(registry_ids, scene.shapes(), strict=True):
-            table[index] = int(shape.id().removeprefix("part_"))
-        of_hit: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
-        ids = dr.gather(mi.UInt32, mi.UInt32(table), of_hit, hit.is_valid())
+        table = mi.UInt32(by_shape(scene, np.arange(256, dtype=np.uint32)))
+        number: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
+        ids = dr.gather(mi.UInt32, table, number, hit.is_valid())
         dr.eval(ids, hit.t)
         return np.array(ids).astype(np.uint8), np.array(hit.t)
 
@@ -95,7 +103,7 @@ class CenterPasses:
     def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
         """Pixel centres that each marker and the hub would cover alone, on the image's grid."""
         rows, columns = np.flatnonzero(part_id.any(axis=1)), np.flatnonzero(part_id.any(axis=0))
-        if not len(rows):
+        if not len(rows) or not self._scene.features.shapes():
             return {}
         # Where a hidden feature would be, something else is seen: what is covered bounds the features too.
         window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
-from geometry.stereo import EYES
-from render.background import background
+from geometry.stereo import EYES, Eye
+from render.background import air_before, backgrounds
 from render.engine import EyeRadiance, StereoRadiance
+from render.mitsuba_engine.noise import MonteCarloNoise, measure_noise
+from render.mitsuba_engine.traced import OF_DROGUE, Traced
 from render.mitsuba_engine.variant import probe_variant
 from render.version import RENDER_VERSION
 from scenes.surroundings import surroundings
@@ -54,25 +56,44 @@ class MitsubaEngine:
         Args:
             frame: what to render.
             settings: how.
+
+        Raises:
+            ValueError: the rig has real lenses, which the slow variant does not know.
         """
+        if frame.rig.lenses is not None and self.variant.variant == "scalar_rgb":
+            raise ValueError(f"rig: mitsuba as scalar_rgb draws ideal eyes only ({self.variant.reason}); use analytic")
         stage_s: dict[str, float] = {}
         started = time.process_time()
-        behind = background(frame)
+        behind = backgrounds(frame)
         stage_s["sky"] = time.process_time() - started
-        if frame.left_from_drogue is None:
-            empty = {eye: _empty_eye(behind) for eye in EYES}
+        if frame.drogue is None and not frame.bystanders:
+            empty = {eye: _empty_eye(behind[eye]) for eye in EYES}
             return StereoRadiance(empty["left"], empty["right"], self.name, self.version, 0.0, stage_s)
         around = surroundings(frame.environment)
         traced = self._tracer.trace(frame, settings, around)
         stage_s |= traced.stage_s
         started = time.process_time()
-        for eye in EYES:
-            traced.eyes[eye].put_behind_air(frame.environment.extinction_per_m, around.horizon_radiance)
-        eyes = {eye: traced.eyes[eye].over(behind) for eye in EYES}
+        for seen in (*traced.eyes.values(), *traced.again.values()):
+            seen.put_behind_air(*air_before(frame, seen.pixel))
+        noise = _noise(frame, traced, behind)
+        eyes = {eye: traced.eyes[eye].over(behind[eye]) for eye in EYES}
         stage_s["composite"] = time.process_time() - started
         return StereoRadiance(
-            eyes["left"], eyes["right"], self.name, self.version, traced.monte_carlo_noise_fraction, stage_s
+            eyes["left"], eyes["right"], self.name, self.version, noise.fraction, stage_s, noise.over_sensor
         )
+
+
+def _noise(frame: FrameSpec, traced: Traced, behind: dict[Eye, NDArray[np.float32]]) -> MonteCarloNoise:
+    """Noise of the pixels whose centres see the drogue, edges included."""
+    first, second = [], []
+    for eye in EYES:
+        seen, again = traced.eyes[eye], traced.again[eye]
+        place = np.zeros(seen.part_id.size, dtype=np.int64)
+        place[seen.pixel] = np.arange(len(seen.pixel))
+        of_drogue = OF_DROGUE[seen.part_id.reshape(-1)[again.pixel]] > 0
+        first.append(seen.pixels_over(behind[eye])[place[again.pixel[of_drogue]]])
+        second.append(again.pixels_over(behind[eye])[of_drogue])
+    return measure_noise(frame, np.concatenate(first), np.concatenate(second))
 
 
 def _empty_eye(behind: NDArray[np.float32]) -> EyeRadiance:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,32 +16,53 @@ from datasets_manifest.recipe import RenderSettings
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.camera_rays import CameraRays
 from render.mitsuba_engine.center_passes import CenterPasses
-from render.mitsuba_engine.scene import DrogueScene, SceneCache
-from render.mitsuba_engine.sun_sky_paths import trace_paths
-from render.mitsuba_engine.traced import (
-    Traced,
-    TracedEye,
-    inside_one_part,
-    pixels_to_trace,
-    settings_by_plan,
-)
+from render.mitsuba_engine.noise import TWICE_EVERY
+from render.mitsuba_engine.scene import DrogueScene, SceneCache, by_shape
+from render.mitsuba_engine.sky_irradiance import SkyIrradiance, as_mitsuba_reads
+from render.mitsuba_engine.sun_sky_paths import Lights, trace_first, trace_rest
+from render.mitsuba_engine.traced import IN_OPEN, SURROUND_DEPTH, Plan, Traced, TracedEye, plan_pixels
 from render.motion import blur_px
 from scenes.seeding import generator
-from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import Surroundings
 
 # Lanes of one launch: bounds memory (about 300 bytes a lane) without costing speed.
 _MOST_LANES = 2_000_000
-_PLAN = ("drogue", "surround")
 
 
 @dataclass(frozen=True, eq=False)
-class _Samples:
-    """Sums over the samples of each pixel: (P, 3) radiance, (P,) coverage, (P,) relative variance of the mean."""
+class _Job:
+    """Pixels that are traced alike.
 
-    radiance: NDArray[np.float32]
+    Attributes:
+        pixel: (P,) flat indices; those of the right eye come after all of the left.
+        count: samples a pixel.
+        max_depth: longest path in segments; 1 leaves out the light that comes by way of other surfaces.
+    """
+
+    pixel: NDArray[np.int64]
+    count: int
+    max_depth: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Light:
+    """Means over the samples of each pixel: what `trace_first` and `trace_rest` give, and coverage; (P, 3|3|1)."""
+
+    first: NDArray[np.float32]
+    rest: NDArray[np.float32]
     coverage: NDArray[np.float32]
-    variance: NDArray[np.float32]
+
+    def seen(self) -> NDArray[np.float32]:
+        """(P, 4) radiance and coverage."""
+        # The rest of a dark pixel can come out below the first part's zero.
+        return np.concatenate([np.maximum(self.first + self.rest, 0.0), self.coverage], axis=1)
+
+    def with_first_of(self, other: _Light) -> _Light:
+        """The same with what more samples say of the first surfaces."""
+        return _Light(other.first, self.rest, other.coverage)
+
+    def __getitem__(self, part: slice) -> _Light:
+        return _Light(self.first[part], self.rest[part], self.coverage[part])
 
 
 class LlvmTracer:
@@ -49,110 +71,131 @@ class LlvmTracer:
     def __init__(self) -> None:
         dr.set_thread_count(1)
         self._scenes = SceneCache()
-        self._scene: DrogueScene
 
     def trace(self, frame: FrameSpec, settings: RenderSettings, around: Surroundings) -> Traced:
         """Passes and radiance of both eyes of a frame with a drogue."""
-        assert frame.drogue is not None
         stage_s: dict[str, float] = {}
         started = time.process_time()
-        self._scene = self._scenes.scene_of(frame, around)
+        scene = self._scenes.scene_of(frame, around)
         stage_s["scene"], started = time.process_time() - started, time.process_time()
         moves_px = blur_px(frame)
         times = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
         eyes: dict[Eye, TracedEye] = {}
-        plans: dict[Eye, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
+        plans: dict[Eye, Plan] = {}
         for eye in EYES:
-            passes = CenterPasses(frame, eye, self._scene)
+            passes = CenterPasses(frame, eye, scene)
             seen = [passes.part_ids(moment) for moment in times]
+            sunlit = [passes.sunlit(ids, moment) for (ids, _), moment in zip(seen, times, strict=True)]
+            plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)))
             eyes[eye] = passes.traced_eye(*seen[0])
-            plans[eye] = pixels_to_trace(
-                [ids for ids, _ in seen], 1 + int(np.ceil(moves_px)), frame.drogue.marker_count
-            )
         stage_s["passes"], started = time.process_time() - started, time.process_time()
-        noise = self._trace_radiance(frame, settings, eyes, plans)
+        pixel, light, again, light_again = _Launches(frame, scene, around).radiance(plans, settings)
+        size = frame.rig.camera.width_px * frame.rig.camera.height_px
+        traced = Traced(
+            {eye: eyes[eye].lit_by(*_of_eye(index, size, pixel, light)) for index, eye in enumerate(EYES)},
+            {eye: eyes[eye].lit_by(*_of_eye(index, size, again, light_again)) for index, eye in enumerate(EYES)},
+            stage_s,
+        )
         stage_s["paths"] = time.process_time() - started
-        return Traced(eyes, noise, stage_s)
+        return traced
 
-    def _trace_radiance(
-        self,
-        frame: FrameSpec,
-        settings: RenderSettings,
-        eyes: dict[Eye, TracedEye],
-        plans: dict[Eye, tuple[NDArray[np.int64], NDArray[np.int64]]],
-    ) -> float:
-        """Fill in the traced pixels of both eyes; returns the relative noise of the drogue's pixels."""
-        seeds = generator(frame.seed, frame.frame_index, "mitsuba samples")
-        assert frame.drogue is not None
-        lit = frame.drogue.marker_luminance_cd_m2 > 0
-        noise: list[NDArray[np.float32]] = []
-        for eye in EYES:
-            camera = CameraRays(frame, eye)
-            parts = []
-            for name, pixel, count, depth in zip(_PLAN, plans[eye], *settings_by_plan(settings), strict=True):
-                samples = self._sample_pixels(camera, pixel, count, (depth, lit), seeds)
-                parts.append((pixel, samples))
-                if name == "drogue" and count > 1:
-                    noise.append(samples.variance[inside_one_part(eyes[eye].part_id).reshape(-1)[pixel]])
-            eyes[eye].pixel = np.concatenate([pixel for pixel, _ in parts])
-            eyes[eye].radiance_cd_m2 = np.concatenate([samples.radiance for _, samples in parts])
-            eyes[eye].coverage = np.concatenate([samples.coverage for _, samples in parts])
-        everything = np.concatenate(noise) if noise else np.zeros(0, dtype=np.float32)
-        return float(np.sqrt(everything.mean(dtype=np.float64))) if len(everything) else 1.0
 
-    def _sample_pixels(
-        self,
-        camera: CameraRays,
-        pixel: NDArray[np.int64],
-        count: int,
-        path: tuple[int, bool],
-        seeds: np.random.Generator,
-    ) -> _Samples:
-        """Mean over `count` paths through random places of each pixel, at random times of the exposure.
+def _of_eye(
+    index: int, size: int, pixel: NDArray[np.int64], light: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """One eye's part of the pixels of both, with its own indices."""
+    own = pixel // size == index
+    return pixel[own] - index * size, light[own]
 
-        Args:
-            camera: gives the rays.
-            pixel: (P,) flat indices.
-            count: paths a pixel.
-            path: the longest path, and whether lamps are lit.
-            seeds: draws the sampler's seeds.
+
+class _Launches:
+    """Sends the rays of one frame, those of both eyes together."""
+
+    def __init__(self, frame: FrameSpec, scene: DrogueScene, around: Surroundings) -> None:
+        self._scene = scene.scene
+        self._cameras = [CameraRays(frame, eye) for eye in EYES]
+        self._size = frame.rig.camera.width_px * frame.rig.camera.height_px
+        self._seeds = generator(frame.seed, frame.frame_index, "mitsuba samples")
+        to_sun, sun_lux = scene.sun
+        world_from_stage = frame.world_from_left @ frame.left_from_stage_at(0.0)
+        self._lights = Lights(
+            to_sun,
+            sun_lux,
+            SkyIrradiance(as_mitsuba_reads(around.light_map), world_from_stage.rotation),
+            mi.Float(by_shape(scene.scene, IN_OPEN)),
+            frame.drogue is not None and frame.drogue.marker_luminance_cd_m2 > 0,
+        )
+
+    def radiance(
+        self, plans: dict[Eye, Plan], settings: RenderSettings
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+        """Trace all planned pixels, and some of the drogue's once more.
+
+        Returns:
+            (P,) pixels of both eyes and their (P, 4) radiance and coverage; the same for what was traced again.
         """
-        radiance = np.empty((len(pixel), 3), dtype=np.float32)
-        coverage = np.empty(len(pixel), dtype=np.float32)
-        variance = np.zeros(len(pixel), dtype=np.float32)
-        step = max(_MOST_LANES // count, 1)
-        for first in range(0, len(pixel), step):
-            part = slice(first, min(first + step, len(pixel)))
-            seed = int(seeds.integers(2**31))
-            sums = self._launch(camera, pixel[part], count, path, seed)
-            radiance[part], coverage[part] = sums[:, :3] / count, sums[:, 3] / count
-            if count > 1:
-                luminance = np.einsum("pc,c->p", radiance[part], REC709_LUMINANCE.astype(np.float32))
-                spread = np.maximum(sums[:, 4] / count - luminance**2, 0.0) / (count - 1)
-                variance[part] = spread / np.maximum(luminance, 1e-6) ** 2
-        return _Samples(radiance, coverage, variance)
+        opened, sheltered, deep, edges, surround = (
+            np.concatenate([getattr(plans[eye], kind) + index * self._size for index, eye in enumerate(EYES)])
+            for kind in ("open", "sheltered", "deep", "edges", "surround")
+        )
+        depth, count = settings.max_depth, settings.samples_per_px
+        fine = max(count, settings.edge_samples_per_px)
+        of_open = self._trace(_Job(_and_some_again(opened), settings.open_samples_per_px, depth))
+        of_sheltered = self._trace(_Job(_and_some_again(sheltered), count, depth))
+        of_deep = self._trace(_Job(_and_some_again(deep), fine, depth))
+        of_edges = self._trace(_Job(_and_some_again(edges), count, depth))
+        if fine > count:
+            of_edges = of_edges.with_first_of(self._trace(_Job(_and_some_again(edges), fine, 1)))
+        of_surround = self._trace(_Job(surround, settings.surround_samples_per_px, SURROUND_DEPTH))
+        twice = [(opened, of_open), (sheltered, of_sheltered), (deep, of_deep), (edges, of_edges)]
+        parts = [*twice, (surround, of_surround)]
+        return (
+            np.concatenate([pixel for pixel, _ in parts]),
+            np.concatenate([light[: len(pixel)].seen() for pixel, light in parts]),
+            np.concatenate([pixel[::TWICE_EVERY] for pixel, _ in twice]),
+            np.concatenate([light[len(pixel) :].seen() for pixel, light in twice]),
+        )
 
-    def _launch(
-        self,
-        camera: CameraRays,
-        pixel: NDArray[np.int64],
-        count: int,
-        path: tuple[int, bool],
-        seed: int,
-    ) -> NDArray[np.float32]:
-        """(P, 5) sums over the paths of each pixel: red, green, blue, coverage, squared luminance."""
-        lanes = len(pixel) * count
-        sampler = mi.load_dict({"type": "multijitter", "sample_count": count})
+    def _trace(self, job: _Job) -> _Light:
+        """Means over paths through random places of each pixel, at random times of the exposure."""
+        result = np.zeros((len(job.pixel), 7), dtype=np.float32)
+        step = max(_MOST_LANES // job.count, 1)
+        for first in range(0, len(job.pixel), step):
+            part = slice(first, first + step)
+            result[part] = self._launch(job.pixel[part], job, int(self._seeds.integers(2**31)))
+        return _Light(result[:, :3], result[:, 4:], result[:, 3:4])
+
+    def _launch(self, pixel: NDArray[np.int64], job: _Job, seed: int) -> NDArray[np.float32]:
+        """(P, 7) means over the paths of each pixel: light of first surfaces, coverage, rest of the light."""
+        lanes = len(pixel) * job.count
+        sampler = mi.load_dict({"type": "multijitter", "sample_count": job.count})
         # The multijitter sampler rounds its count to a product of two near-equal factors.
-        if sampler.sample_count() != count:
-            sampler = mi.load_dict({"type": "independent", "sample_count": count})
-        sampler.set_samples_per_wavefront(count)
+        if sampler.sample_count() != job.count:
+            sampler = mi.load_dict({"type": "independent", "sample_count": job.count})
+        sampler.set_samples_per_wavefront(job.count)
         sampler.seed(seed, lanes)
-        of_pixel = dr.arange(mi.UInt32, lanes) // count
-        ray = camera.rays(dr.gather(mi.UInt32, mi.UInt32(pixel), of_pixel), sampler.next_2d(), sampler.next_1d())
-        color, hit = trace_paths(self._scene.scene, self._scene.sun, sampler, ray, path)
-        luminance = dr.dot(mi.Vector3f(color), mi.Vector3f(REC709_LUMINANCE.tolist()))
-        channels = [color[0], color[1], color[2], dr.select(hit, mi.Float(1.0), 0.0), dr.square(luminance)]
+        of_pixel = dr.arange(mi.UInt32, lanes) // job.count
+        ray = self._rays(dr.gather(mi.UInt32, mi.UInt32(pixel), of_pixel), sampler)
+        first, hit, surface, known = trace_first(self._scene, self._lights, ray)
+        channels = [*first, dr.select(hit, mi.Float(1.0), 0.0)]
+        if job.max_depth > 1:
+            channels += [*trace_rest(self._scene, self._lights, sampler, (surface, hit, known), job.max_depth)]
         # Without this every sum would trace the paths again.
         dr.eval(channels)
-        return np.stack([np.array(dr.block_sum(channel, count)) for channel in channels], axis=-1)
+        sums = np.zeros((len(pixel), 7), dtype=np.float32)
+        for index, channel in enumerate(channels):
+            sums[:, index] = np.array(dr.block_sum(channel, job.count))
+        return sums / np.float32(job.count)
+
+    def _rays(self, pixel: Any, sampler: Any) -> Any:
+        """Rays of either eye, whichever the pixels belong to."""
+        place, moment = sampler.next_2d(), sampler.next_1d()
+        is_right = pixel >= self._size
+        left, right = (
+            camera.rays(dr.select(is_right, pixel - self._size, pixel), place, moment) for camera in self._cameras
+        )
+        return mi.Ray3f(dr.select(is_right, right.o, left.o), dr.select(is_right, right.d, left.d))
+
+
+def _and_some_again(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.concatenate([pixel, pixel[::TWICE_EVERY]])

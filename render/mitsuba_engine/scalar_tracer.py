@@ -17,20 +17,21 @@ from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.traced import (
     ASIDE,
+    OF_DROGUE,
+    SURROUND_DEPTH,
+    Plan,
     Traced,
     TracedEye,
     amodal_counts,
-    inside_one_part,
-    pixels_to_trace,
-    settings_by_plan,
+    plan_pixels,
 )
 from render.motion import blur_px, pose_polynomial
 from scenes.seeding import generator
-from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import Surroundings
 
-# Motion is rendered as so many still pictures; two are enough for the noise estimate of a still scene.
-_MOVING_SLICES, _STILL_SLICES = 8, 2
+# Motion is rendered as so many still pictures.
+_MOVING_SLICES = 8
+_TILE_PX = 32
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -40,67 +41,76 @@ class ScalarTracer:
     def __init__(self) -> None:
         dr.set_thread_count(1)
         self._scenes = SceneCache()
-        self._scene: DrogueScene
 
     def trace(self, frame: FrameSpec, settings: RenderSettings, around: Surroundings) -> Traced:
         """Passes and radiance of both eyes of a frame with a drogue."""
-        assert frame.drogue is not None
-        stage_s: dict[str, float] = {}
+        stage_s = {"scene": 0.0, "passes": 0.0, "paths": 0.0}
         started = time.process_time()
-        self._scene = self._scenes.scene_of(frame, around)
+        scene = self._scenes.scene_of(frame, around)
         stage_s["scene"], started = time.process_time() - started, time.process_time()
         moves_px = blur_px(frame)
         moments = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
         seeds = generator(frame.seed, frame.frame_index, "mitsuba samples")
         eyes: dict[Eye, TracedEye] = {}
-        noise: list[float] = []
+        again: dict[Eye, TracedEye] = {}
         for eye in EYES:
             view = _View(frame, eye)
-            seen = [view.passes(self._scene.scene, moment) for moment in moments]
-            alone = view.passes(self._scene.features, 0.0)
-            stage_s["passes"] = stage_s.get("passes", 0.0) + time.process_time() - started
-            started = time.process_time()
-            plans = pixels_to_trace(
-                [part_id for part_id, _, _ in seen], 1 + int(np.ceil(moves_px)), frame.drogue.marker_count
-            )
-            eyes[eye] = _passes_of(seen[0], alone)
-            noise += self._fill_radiance(eyes[eye], view, plans, settings, (seeds, moves_px))
-            stage_s["paths"] = stage_s.get("paths", 0.0) + time.process_time() - started
-            started = time.process_time()
-        return Traced(eyes, float(np.sqrt(np.mean(np.square(noise)))) if noise else 1.0, stage_s)
+            seen = [view.passes(scene.scene, moment) for moment in moments]
+            sunlit = [view.sunlit(scene, passes, moment) for (passes, moment) in zip(seen, moments, strict=True)]
+            alone = view.passes(scene.features, 0.0)
+            plan = plan_pixels([part_id for part_id, _, _ in seen], sunlit, 1 + int(np.ceil(moves_px)))
+            stage_s["passes"], started = stage_s["passes"] + time.process_time() - started, time.process_time()
+            slices = _MOVING_SLICES if moves_px >= 0.05 else 1
+            halves = [_Half(view, scene, slices, seeds).light(plan, settings) for _ in range(2)]
+            dark, pixel = _passes_of(seen[0], alone), _in_order(plan)
+            mean, difference = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / np.float32(np.sqrt(2))
+            eyes[eye] = dark.lit_by(pixel, mean)
+            # Differs from the mean by as much as two means of so many samples would.
+            again[eye] = dark.lit_by(pixel, mean + difference)
+            stage_s["paths"], started = stage_s["paths"] + time.process_time() - started, time.process_time()
+        return Traced(eyes, again, stage_s)
 
-    def _fill_radiance(
-        self,
-        traced: TracedEye,
-        view: _View,
-        plans: tuple[NDArray[np.int64], NDArray[np.int64]],
-        settings: RenderSettings,
-        context: tuple[np.random.Generator, float],
-    ) -> list[float]:
-        """Trace the planned pixels; returns the relative noise of the drogue's pixels where it can be told."""
-        seeds, moves_px = context
-        slices = _STILL_SLICES if moves_px < 0.05 else _MOVING_SLICES
-        chunks: list[tuple[NDArray[np.int64], NDArray[np.float32]]] = []
-        noise: list[float] = []
-        for pixel, samples, depth in zip(plans, *settings_by_plan(settings), strict=True):
-            if len(pixel) == 0:
-                continue
-            pictures = []
-            for index in range(min(slices, samples)):
-                # Samples that do not divide evenly go to the first slices.
-                count = samples // min(slices, samples) + (index < samples % min(slices, samples))
-                moment = (index + 0.5) / min(slices, samples) * 2 - 1 if moves_px >= 0.05 else 0.0
-                rgba = view.radiance(self._scene, (pixel, moment, count, depth), int(seeds.integers(2**31)))
-                pictures.append(rgba.reshape(-1, 4)[pixel])
-            mean = np.mean(pictures, axis=0)
-            if pixel is plans[0] and len(pictures) > 1 and moves_px < 0.05:
-                noise.append(_relative_noise(pictures, inside_one_part(traced.part_id).reshape(-1)[pixel]))
-            chunks.append((pixel, mean.astype(np.float32)))
-        if chunks:
-            traced.pixel = np.concatenate([pixel for pixel, _ in chunks])
-            values = np.concatenate([rgba for _, rgba in chunks])
-            traced.radiance_cd_m2, traced.coverage = values[:, :3], values[:, 3]
-        return noise
+
+def _in_order(plan: Plan) -> NDArray[np.int64]:
+    return np.concatenate([plan.open, plan.sheltered, plan.deep, plan.edges, plan.surround])
+
+
+class _Half:
+    """Traces the planned pixels of one eye with half of the samples."""
+
+    def __init__(self, view: _View, scene: DrogueScene, slices: int, seeds: np.random.Generator) -> None:
+        self._view, self._scene, self._slices, self._seeds = view, scene, slices, seeds
+
+    def light(self, plan: Plan, settings: RenderSettings) -> NDArray[np.float32]:
+        """(P, 4) radiance and coverage of the pixels in the order of `_in_order`.
+
+        Mitsuba's integrator knows nothing of the sky beforehand: parts in the open take as many paths as others.
+        """
+        base = np.concatenate([plan.open, plan.sheltered])
+        fine = np.concatenate([plan.deep, plan.edges])
+        fine_count = max(settings.samples_per_px, settings.edge_samples_per_px)
+        at_fine = np.zeros((len(fine), 4), dtype=np.float32)
+        for tile in self._view.tiles(fine):
+            at_fine[tile] = self._mean(fine[tile], fine_count, settings.max_depth)
+        return np.concatenate(
+            [
+                self._mean(base, settings.samples_per_px, settings.max_depth),
+                at_fine,
+                self._mean(plan.surround, settings.surround_samples_per_px, SURROUND_DEPTH),
+            ]
+        )
+
+    def _mean(self, pixel: NDArray[np.int64], samples: int, max_depth: int) -> NDArray[np.float32]:
+        """Mean over the slices of the exposure, of which each takes at least one sample."""
+        if not len(pixel):
+            return np.zeros((0, 4), dtype=np.float32)
+        count = -(-samples // (2 * self._slices))
+        total = np.zeros((len(pixel), 4), dtype=np.float32)
+        for index in range(self._slices):
+            moment = (index + 0.5) / self._slices * 2 - 1
+            seed = int(self._seeds.integers(2**31))
+            total += self._view.radiance(self._scene, (pixel, moment, count, max_depth), seed)
+        return total / np.float32(self._slices)
 
 
 _Passes = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
@@ -110,16 +120,6 @@ def _passes_of(seen: _Passes, alone: _Passes) -> TracedEye:
     amodal = amodal_counts(seen[0], seen[1], alone[0], alone[1])
     nothing = np.zeros(0, dtype=np.float32)
     return TracedEye(*seen, amodal, np.zeros(0, dtype=np.int64), nothing.reshape(0, 3), nothing)
-
-
-def _relative_noise(pictures: list[NDArray[np.float32]], inside: NDArray[np.bool_]) -> float:
-    """Relative standard error of the mean of two pictures, from their half difference inside parts."""
-    first, second = (np.einsum("pc,c->p", picture[:, :3], REC709_LUMINANCE) for picture in pictures[:2])
-    full = inside & (first + second > 0)
-    if not full.any():
-        return 1.0
-    relative = (first[full] - second[full]) / (first[full] + second[full])
-    return float(np.sqrt(np.mean(relative**2)))
 
 
 class _View:
@@ -171,7 +171,7 @@ class _View:
         integrator = mi.load_dict({"type": "aov", "aovs": "id:shape_index,p:position,n:geo_normal"})
         values = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=1, seed=0))[..., -7:]
         # The integrator counts shapes from 1; 0 is no shape.
-        table = np.array([0, *(int(shape.id().removeprefix("part_")) for shape in scene.shapes())], dtype=np.uint8)
+        table = np.array([0, *(int(shape.id().split("_")[1]) for shape in scene.shapes())], dtype=np.uint8)
         part_id: NDArray[np.uint8] = table[values[..., 0].astype(np.int64)]
         hit = part_id > 0
         pose = self._drogue_from_eye(s)
@@ -195,14 +195,36 @@ class _View:
                 direction /= np.linalg.norm(direction)
                 hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(pose[:3, 3].tolist()), mi.Vector3f(direction.tolist())))
                 if hit.is_valid() and np.array(hit.n) @ direction < 0:
-                    part_id[v, u] = int(hit.shape.id().removeprefix("part_"))
+                    part_id[v, u] = int(hit.shape.id().split("_")[1])
                     values[v, u, 1:] = [*hit.p, *hit.n]
                     break
+
+    def sunlit(self, scene: DrogueScene, passes: _Passes, s: float) -> NDArray[np.bool_]:
+        """(H, W) where surfaces of the drogue see the sun: a render under the sun alone, one ray a pixel."""
+        part_id, depth, normal = passes
+        sunlit = np.zeros(part_id.shape, dtype=np.bool_)
+        pose, to_sun = self._drogue_from_eye(s), np.array(scene.sun[0]).ravel()
+        rows, columns = np.nonzero((OF_DROGUE[part_id] > 0) & (normal @ (pose[:3, :3].T @ to_sun) > 0))
+        places = self._camera.rays(np.stack([columns, rows], axis=-1)) * depth[rows, columns, None]
+        # A little off the surface, as float32 distances of some metres need.
+        starts = (places + 1e-4 * normal[rows, columns]) @ pose[:3, :3].T + pose[:3, 3]
+        sun = mi.Vector3f(to_sun.tolist())
+        for row, column, start in zip(rows, columns, starts, strict=True):
+            sunlit[row, column] = not scene.scene.ray_test(mi.Ray3f(mi.Point3f(start.tolist()), sun))
+        return sunlit
+
+    def tiles(self, pixel: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+        """Places in `pixel` (P,) by square tile of the image: crops around scattered pixels would be mostly waste."""
+        rows, columns = np.divmod(pixel, self._camera.width_px)
+        tile = rows // _TILE_PX * self._camera.width_px + columns // _TILE_PX
+        order = np.argsort(tile, kind="stable")
+        bounds = np.flatnonzero(np.diff(tile[order])) + 1
+        return np.split(order, bounds) if len(pixel) else []
 
     def radiance(
         self, scene: DrogueScene, what: tuple[NDArray[np.int64], float, int, int], seed: int
     ) -> NDArray[np.float32]:
-        """(H, W, 4) light from parts, weighted by coverage, and coverage.
+        """(P, 4) light from parts, weighted by coverage, and coverage.
 
         Args:
             scene: what to render.
@@ -220,12 +242,11 @@ class _View:
         }
         sensor = self._sensor(s, {"type": "independent", "sample_count": count}, "rgba", crop)
         path = {"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True}
-        total = np.zeros((self._camera.height_px, self._camera.width_px, 4), dtype=np.float32)
-        window = total[top:bottom, left:right]
-        window[:] = np.array(mi.render(scene.scene, sensor=sensor, integrator=mi.load_dict(path), spp=count, seed=seed))
+        window = np.array(mi.render(scene.scene, sensor=sensor, integrator=mi.load_dict(path), spp=count, seed=seed))
         if self._emits:
             # Hidden emitters come out black: their own light is added from a render of the features alone.
             direct = {"type": "path", "max_depth": 1}
             lit = mi.render(scene.features, sensor=sensor, integrator=mi.load_dict(direct), spp=count, seed=seed)
             window[..., :3] += np.array(lit)[..., :3]
-        return total
+        of_pixels: NDArray[np.float32] = window[rows - top, columns - left].astype(np.float32)
+        return of_pixels

@@ -1,11 +1,13 @@
-"""The Mitsuba scene of one drogue: its parts in the drogue frame, hose and tanker around it, sky and sun as lights.
+"""The Mitsuba scene of one drogue: its parts, what hangs on it and stands around it, sky and sun as lights.
 
-The drogue stands still; camera, sun and sky move around it, so that no geometry of it is ever rebuilt.
+The drogue's axes are the stage, where it stands still; camera, sun and sky move around it, so that no geometry of it is
+ever rebuilt. Without a drogue the stage is the left camera's own frame.
 """
 
 from __future__ import annotations
 
 import tempfile
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +18,22 @@ import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
-from drogue_models.materials import part_reflectance_rgb
-from drogue_models.meshes import drogue_meshes, hose_mesh, tanker_mesh
-from drogue_models.parameters import DrogueParameters
+from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from scenes.sky import REC709_LUMINANCE
+from geometry.se3 import RigidTransform
+from render.mitsuba_engine.sky_irradiance import as_mitsuba_reads
+from render.surfaces import (
+    even_reflectance_rgb,
+    lamp_radiance_rgb,
+    missing_parts,
+    reflectance_map,
+    surface_condition,
+)
+from scenes.dirt import DIRT_MAP_PX
 from scenes.surroundings import Surroundings
+
+_KEPT_SCENES = 8
+_BYSTANDER_PARTS = (Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
 
 # Curved parts get interpolated normals; the others have flat faces and sharp edges.
 _SMOOTH_PARTS = (Part.RIM, Part.HOSE)
@@ -30,34 +42,39 @@ _SMOOTH_PARTS = (Part.RIM, Part.HOSE)
 _MAP_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 
 
-def _material(reflectance_rgb: tuple[float, float, float]) -> dict[str, Any]:
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(reflectance_rgb)}}
+def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any]) -> Any:
+    """A Mitsuba shape from a mesh; `look` holds its material, and its lamp if it is one."""
+    path = folder / f"{part}.ply"
+    mesh.export(path)
+    shape = {"type": "ply", "filename": str(path), "face_normals": part not in _SMOOTH_PARTS, **look}
+    return mi.load_dict(shape)
 
 
-def _shapes(meshes: dict[int, trimesh.Trimesh], drogue: DrogueParameters) -> dict[str, Any]:
-    """Mitsuba shapes named `part_ID`."""
-    shapes: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        for part, mesh in meshes.items():
-            path = Path(folder) / f"{part}.ply"
-            mesh.export(path)
-            shape = {
-                "type": "ply",
-                "filename": str(path),
-                "face_normals": part not in _SMOOTH_PARTS,
-                "bsdf": _material(part_reflectance_rgb(drogue, part)),
-            }
-            if part >= FIRST_MARKER_ID and drogue.marker_luminance_cd_m2 > 0:
-                shape["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": _lamp_radiance(drogue)}}
-            shapes[f"part_{part}"] = mi.load_dict(shape)
-            shapes[f"part_{part}"].set_id(f"part_{part}")
-    return shapes
+def _even(reflectance_rgb: NDArray[np.float64]) -> dict[str, Any]:
+    return {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance_rgb.tolist()}}}
 
 
-def _lamp_radiance(drogue: DrogueParameters) -> list[float]:
-    color = np.array(drogue.marker_emission_rgb)
-    radiance: list[float] = (drogue.marker_luminance_cd_m2 * color / (color @ REC709_LUMINANCE)).tolist()
-    return radiance
+def _blotched() -> dict[str, Any]:
+    """A material whose map every frame replaces."""
+    bitmap = mi.Bitmap(np.zeros((DIRT_MAP_PX, DIRT_MAP_PX, 3), dtype=np.float32))
+    texture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
+    return {"bsdf": {"type": "diffuse", "reflectance": texture}}
+
+
+def _lamp(frame: FrameSpec, part: int) -> dict[str, Any]:
+    assert frame.drogue is not None
+    if part < FIRST_MARKER_ID or frame.drogue.marker_luminance_cd_m2 == 0:
+        return {}
+    radiance = lamp_radiance_rgb(frame, part).tolist()
+    return {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}}
+
+
+def _with_map_places(mesh: trimesh.Trimesh, center_m: tuple[float, float], radius_m: float) -> trimesh.Trimesh:
+    """The mesh with texture coordinates that map the square around a disc to the unit square."""
+    places = (np.asarray(mesh.vertices)[:, :2] - np.asarray(center_m)) / (2 * radius_m) + 0.5
+    mesh.vertex_attributes["s"] = places[:, 0].astype(np.float32)
+    mesh.vertex_attributes["t"] = places[:, 1].astype(np.float32)
+    return mesh
 
 
 def _front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -65,32 +82,72 @@ def _front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
 
 
+def _drogue_shapes(frame: FrameSpec, meshes: dict[int, trimesh.Trimesh]) -> dict[str, Any]:
+    """Mitsuba shapes of the drogue's parts by name; parts that are dirty have maps."""
+    assert frame.drogue is not None
+    shapes: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        for part, mesh in meshes.items():
+            look = _even(even_reflectance_rgb(frame, part))
+            if not surface_condition(frame, part).is_clean:
+                is_hub = part == Part.HUB
+                assert not is_hub or frame.drogue.hub is not None
+                center_m = (0.0, 0.0) if is_hub else frame.drogue.marker_positions_m[part - FIRST_MARKER_ID]
+                radius_m = frame.drogue.hub.outer_radius_m if is_hub else frame.drogue.marker_radius_m  # type: ignore[union-attr]
+                mesh, look = _with_map_places(mesh, center_m, radius_m), _blotched()
+            shapes[f"part_{part}"] = _shape(mesh, part, Path(folder), look | _lamp(frame, part))
+            shapes[f"part_{part}"].set_id(f"part_{part}")
+    return shapes
+
+
+def _bystander_shapes(frame: FrameSpec) -> dict[str, Any]:
+    """Mitsuba shapes of the bystanders, in their own frames for the time being."""
+    shapes: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        for index, bystander in enumerate(frame.bystanders):
+            part = int(Part[bystander.kind.upper()])
+            name = _bystander_name(index, part)
+            look = _even(np.array(bystander.reflectance_rgb))
+            shapes[name] = _shape(bystander_mesh(bystander.shape), part, Path(folder), look)
+            shapes[name].set_id(name)
+    return shapes
+
+
+def _bystander_name(index: int, part: int) -> str:
+    return f"part_{part}_{index}"
+
+
 class DrogueScene:
-    """The scene of one drogue, set up anew for each frame.
+    """The scene of one drogue, set up anew for each frame; or of bystanders alone.
 
     Attributes:
         scene: everything.
         features: markers and hub alone, for their amodal pixels.
-        sun: direction towards the sun in the drogue frame, and its illuminance of a facing plane [lux].
+        sun: direction towards the sun in the stage's axes, and its illuminance of a facing plane [lux].
     """
 
-    def __init__(self, drogue: DrogueParameters, frame: FrameSpec) -> None:
-        self._hose_radius_m = drogue.hose_radius_m
+    def __init__(self, frame: FrameSpec) -> None:
         self._has_surround = frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None
         self._tanker_vertices = np.asarray(tanker_mesh().vertices)
-        meshes = drogue_meshes(drogue)
-        if self._has_surround:
-            meshes[int(Part.HOSE)] = hose_mesh(np.asarray(self._hose_nodes(frame)), drogue.hose_radius_m)
-            meshes[int(Part.TANKER)] = tanker_mesh()
-        fronts = {
-            part: _front_faces(mesh)
-            for part, mesh in meshes.items()
-            if part == int(Part.HUB) or part >= FIRST_MARKER_ID
-        }
+        shapes, features = _bystander_shapes(frame), {}
+        if frame.drogue is not None:
+            gone = missing_parts(frame)
+            meshes = {part: mesh for part, mesh in drogue_meshes(frame.drogue).items() if part not in gone}
+            fronts = {
+                part: _front_faces(mesh)
+                for part, mesh in meshes.items()
+                if part == int(Part.HUB) or part >= FIRST_MARKER_ID
+            }
+            if self._has_surround:
+                meshes[int(Part.HOSE)] = hose_mesh(self._hose_nodes(frame), frame.drogue.hose_radius_m)
+                meshes[int(Part.TANKER)] = tanker_mesh()
+            shapes |= _drogue_shapes(frame, meshes)
+            features = _drogue_shapes(frame, fronts)
         # Merging meshes would lose the parts' identity.
-        self.scene = mi.load_dict({"type": "scene", **_shapes(meshes, drogue), **_lights()}, optimize=False)
-        self.features = mi.load_dict({"type": "scene", **_shapes(fronts, drogue)}, optimize=False)
+        self.scene = mi.load_dict({"type": "scene", **shapes, **_lights()}, optimize=False)
+        self.features = mi.load_dict({"type": "scene", **features}, optimize=False)
         self._parameters = mi.traverse(self.scene)
+        self._aged = False
 
     @staticmethod
     def _hose_nodes(frame: FrameSpec) -> NDArray[np.float64]:
@@ -99,37 +156,75 @@ class DrogueScene:
         return nodes
 
     def set_frame(self, frame: FrameSpec, around: Surroundings) -> None:
-        """Put hose, tanker, sky and sun where this frame has them."""
-        assert frame.left_from_drogue is not None
-        drogue_from_left = frame.left_from_drogue.inverse()
-        drogue_from_world = drogue_from_left @ frame.world_from_left.inverse()
+        """Put hose, tanker, bystanders, paints, lamps, sky and sun where and how this frame has them."""
+        stage_from_left = frame.left_from_stage_at(0.0).inverse()
         if self._has_surround:
-            assert frame.left_from_tanker is not None
-            hose = hose_mesh(self._hose_nodes(frame), self._hose_radius_m)
-            self._set_vertices(Part.HOSE, np.asarray(hose.vertices), np.asarray(hose.vertex_normals))
-            drogue_from_tanker = drogue_from_left @ frame.left_from_tanker
-            self._set_vertices(Part.TANKER, drogue_from_tanker.apply(self._tanker_vertices), None)
-        self._parameters["sky.to_world"] = mi.Transform4f(
-            _homogeneous(drogue_from_world.rotation @ _MAP_FROM_WORLD.T).tolist()
-        )
+            assert frame.left_from_tanker is not None and frame.drogue is not None
+            hose = hose_mesh(self._hose_nodes(frame), frame.drogue.hose_radius_m)
+            self._set_vertices(f"part_{int(Part.HOSE)}", np.asarray(hose.vertices), np.asarray(hose.vertex_normals))
+            stage_from_tanker = stage_from_left @ frame.left_from_tanker
+            self._set_vertices(f"part_{int(Part.TANKER)}", stage_from_tanker.apply(self._tanker_vertices), None)
+        self._set_bystanders(frame, stage_from_left)
+        self._set_looks(frame)
+        self._set_lights(stage_from_left @ frame.world_from_left.inverse(), around)
+        self._parameters.update()
+
+    def _set_bystanders(self, frame: FrameSpec, stage_from_left: RigidTransform) -> None:
+        for index, bystander in enumerate(frame.bystanders):
+            name = _bystander_name(index, int(Part[bystander.kind.upper()]))
+            stage_from_object = stage_from_left @ bystander.left_from_object
+            vertices = np.asarray(bystander_mesh(bystander.shape).vertices)
+            self._set_vertices(name, stage_from_object.apply(vertices), None)
+            self._parameters[f"{name}.bsdf.reflectance.value"] = mi.Color3f(list(bystander.reflectance_rgb))
+
+    def _set_looks(self, frame: FrameSpec) -> None:
+        """Paints and lamps as this frame's condition has them."""
+        if frame.condition is None and not self._aged:
+            return
+        self._aged = True
+        for name in (shape.id() for shape in self.scene.shapes()):
+            part = int(name.split("_")[1])
+            if part in _BYSTANDER_PARTS:
+                continue
+            if f"{name}.bsdf.reflectance.data" in self._parameters:
+                self._parameters[f"{name}.bsdf.reflectance.data"] = mi.TensorXf(reflectance_map(frame, part))
+            else:
+                paint = even_reflectance_rgb(frame, part).tolist()
+                self._parameters[f"{name}.bsdf.reflectance.value"] = mi.Color3f(paint)
+            if f"{name}.emitter.radiance.value" in self._parameters:
+                light = lamp_radiance_rgb(frame, part).tolist()
+                self._parameters[f"{name}.emitter.radiance.value"] = mi.Color3f(light)
+
+    def _set_lights(self, stage_from_world: RigidTransform, around: Surroundings) -> None:
+        rotation = stage_from_world.rotation @ _MAP_FROM_WORLD.T
+        self._parameters["sky.to_world"] = mi.Transform4f(_homogeneous(rotation).tolist())
         self._parameters["sky.data"] = _map_tensor(around.light_map)
-        to_sun = drogue_from_world.rotate(around.sky.sun_direction)
-        self.sun = (_opaque(mi.Vector3f, to_sun), _opaque(mi.Color3f, around.sky.sun_illuminance_lux))
+        to_sun = stage_from_world.rotate(around.beam_direction)
+        self.sun = (_opaque(mi.Vector3f, to_sun), _opaque(mi.Color3f, around.beam_illuminance_lux))
         away_from_sun = -to_sun
         self._parameters["sun.to_world"] = mi.Transform4f().look_at(
             origin=[0.0, 0.0, 0.0], target=away_from_sun.tolist(), up=_any_up(away_from_sun)
         )
-        self._parameters["sun.irradiance.value"] = mi.Color3f(around.sky.sun_illuminance_lux.tolist())
-        self._parameters.update()
+        self._parameters["sun.irradiance.value"] = mi.Color3f(around.beam_illuminance_lux.tolist())
 
-    def _set_vertices(self, part: Part, vertices_m: NDArray[np.float64], normals: NDArray[np.float64] | None) -> None:
-        self._set_buffer(f"part_{int(part)}.vertex_positions", vertices_m)
+    def _set_vertices(self, name: str, vertices_m: NDArray[np.float64], normals: NDArray[np.float64] | None) -> None:
+        self._set_buffer(f"{name}.vertex_positions", vertices_m)
         if normals is not None:
-            self._set_buffer(f"part_{int(part)}.vertex_normals", normals)
+            self._set_buffer(f"{name}.vertex_normals", normals)
 
     def _set_buffer(self, key: str, rows: NDArray[np.float64]) -> None:
         # The buffer's type depends on the variant.
         self._parameters[key] = type(self._parameters[key])(rows.astype(np.float32).ravel())
+
+
+def by_shape(scene: Any, of_part: NDArray[Any]) -> NDArray[Any]:
+    """A table by the shapes' registry numbers from one by part ids."""
+    registry: Any = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
+    numbers = np.array(registry)
+    table = np.zeros(int(numbers.max()) + 1, dtype=of_part.dtype)
+    for number, shape in zip(numbers, scene.shapes(), strict=True):
+        table[number] = of_part[int(shape.id().split("_")[1])]
+    return table
 
 
 def _opaque(kind: Any, values: NDArray[np.float64]) -> Any:
@@ -153,7 +248,7 @@ def _lights() -> dict[str, Any]:
 
 def _map_tensor(light_map: NDArray[np.float32]) -> mi.TensorXf:
     """The map with its columns reversed and one wrapped column on either side, as Mitsuba keeps it."""
-    reversed_map = light_map[:, ::-1]
+    reversed_map = as_mitsuba_reads(light_map)[:, ::-1]
     return mi.TensorXf(np.concatenate([reversed_map[:, -1:], reversed_map, reversed_map[:, :1]], axis=1))
 
 
@@ -168,24 +263,28 @@ def _any_up(direction: NDArray[np.float64]) -> list[float]:
 
 
 def _scene_key(frame: FrameSpec) -> str:
-    """Equal for frames that can share a scene: same drogue, same topology of what hangs on it."""
-    assert frame.drogue is not None
+    """Equal for frames that can share a scene: same drogue, same topology and kinds of surface of all that is drawn."""
+    drogue = "" if frame.drogue is None else frame.drogue.model_dump_json()
     nodes = 0 if frame.hose_nodes_left_m is None else len(frame.hose_nodes_left_m)
-    return f"{frame.drogue.model_dump_json()} {nodes} {frame.left_from_tanker is not None}"
+    count = 0 if frame.drogue is None else frame.drogue.marker_count
+    features = (int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + count))
+    dirty = [part for part in features if not surface_condition(frame, part).is_clean]
+    bystanders = [(bystander.kind, bystander.shape.form) for bystander in frame.bystanders]
+    return f"{drogue} {nodes} {frame.left_from_tanker is not None} {dirty} {sorted(missing_parts(frame))} {bystanders}"
 
 
 class SceneCache:
-    """Keeps the scene of the last drogue."""
+    """Keeps the scenes of the last few drogues, conditions and sets of bystanders."""
 
     def __init__(self) -> None:
-        self._key: str | None = None
-        self._scene: DrogueScene
+        self._scenes: OrderedDict[str, DrogueScene] = OrderedDict()
 
     def scene_of(self, frame: FrameSpec, around: Surroundings) -> DrogueScene:
-        """The scene as this frame has it; built anew when the drogue has changed."""
-        assert frame.drogue is not None
+        """The scene as this frame has it; built anew when none of the kept ones fits."""
         key = _scene_key(frame)
-        if key != self._key:
-            self._scene, self._key = DrogueScene(frame.drogue, frame), key
-        self._scene.set_frame(frame, around)
-        return self._scene
+        scene = self._scenes.pop(key, None) or DrogueScene(frame)
+        self._scenes[key] = scene
+        if len(self._scenes) > _KEPT_SCENES:
+            self._scenes.popitem(last=False)
+        scene.set_frame(frame, around)
+        return scene

@@ -1,0 +1,50 @@
+"""The noise that frames say the renderer left in them, against what it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drogue_models.parts import MAX_MARKERS, drogue_part_ids
+from geometry.stereo import EYES
+from scenes.light import REC709_LUMINANCE
+from scenes.sampler import sample_frame
+
+pytestmark = pytest.mark.mitsuba
+
+
+def test_stated_noise_is_the_difference_of_two_renders(engine, make_recipe):
+    recipe = make_recipe(scale=0.5, stations_m=(2.5,))
+    frame = sample_frame(recipe, 0)
+    first, second = (engine.render(frame.model_copy(update={"seed": seed}), recipe.render) for seed in (1, 2))
+    error, total = [], []
+    for eye in EYES:
+        a, b = getattr(first, eye), getattr(second, eye)
+        of_drogue = np.isin(a.part_id, drogue_part_ids(MAX_MARKERS))
+        error.append(((a.radiance_cd_m2 - b.radiance_cd_m2) @ REC709_LUMINANCE)[of_drogue] / np.sqrt(2))
+        total.append(((a.radiance_cd_m2 + b.radiance_cd_m2) @ REC709_LUMINANCE)[of_drogue] / 2)
+    measured = np.sqrt(np.mean(np.concatenate(error) ** 2) / np.mean(np.concatenate(total) ** 2))
+    stated = np.mean([first.monte_carlo_noise_fraction, second.monte_carlo_noise_fraction])
+    # Each states it from a sixteenth of 30,000 pixels; a few edge pixels make up most of the sum.
+    assert stated == pytest.approx(measured, rel=0.25)
+
+
+def test_more_samples_leave_less_noise(engine, make_recipe):
+    frame_recipe = make_recipe(scale=0.5, stations_m=(3.0,))
+    frame = sample_frame(frame_recipe, 0)
+    few, many = (
+        engine.render(
+            frame,
+            frame_recipe.render.model_copy(update={"samples_per_px": n, "edge_samples_per_px": 4 * n}),
+        )
+        for n in (16, 64)
+    )
+    # Independent samples would halve it; stratified ones do better, and 0.6 leaves room for the estimate's own noise.
+    assert many.monte_carlo_over_sensor_noise < 0.6 * few.monte_carlo_over_sensor_noise
+    # Ten times the light's electrons have three times its shot noise.
+    longer = frame.model_copy(
+        update={"exposure": frame.exposure.model_copy(update={"time_s": 10 * frame.exposure.time_s})}
+    )
+    assert engine.render(longer, frame_recipe.render).monte_carlo_over_sensor_noise == pytest.approx(
+        few.monte_carlo_over_sensor_noise * np.sqrt(10), rel=0.1
+    )
