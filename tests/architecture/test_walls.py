@@ -34,6 +34,8 @@ TRESPASSES = [
     ("light", "droguekit/benchmark/trespass.py", "import trimesh"),
     ("renderers", "labelgen/trespass.py", "import mitsuba"),
     ("renderers", "droguekit/cli/trespass.py", "import drjit"),
+    ("blender", "render/blender_engine/engine.py", "import render.blender_engine.blender_scene"),
+    ("blender", "droguekit/batch/trespass.py", "import bpy"),
     ("dimensions", "drogue_models/parameters.py", "import trimesh"),
     ("torch", "nav/pose/trespass.py", "import torch"),
     ("torch", "droguekit/benchmark/trespass.py", "import torch"),

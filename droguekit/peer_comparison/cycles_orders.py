@@ -1,0 +1,36 @@
+"""What Blender's process of the comparison is told."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from render.blender_engine.messages import CameraPath, FrameSetup, Window
+
+
+@dataclass(frozen=True, eq=False)
+class DenoisedPicture:
+    """One eye, denoised.
+
+    Attributes:
+        window: what of the image, as a camera of its own.
+        path: the camera at one moment.
+        samples: paths through each pixel.
+        bounces: how often light may be thrown on after the first surface.
+        seed: of the samples.
+        file: where it is written, without `.exr`.
+    """
+
+    window: Window
+    path: CameraPath
+    samples: int
+    bounces: int
+    seed: int
+    file: str
+
+
+@dataclass(frozen=True, eq=False)
+class CyclesOrder:
+    """A scene, and the pictures to take of it one after the other."""
+
+    setup: FrameSetup
+    pictures: tuple[DenoisedPicture, ...]

@@ -1,0 +1,107 @@
+"""Noise of a renderer from pictures of one view with different seeds, and the samples that reach a given noise."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Noise that is measured on a few hundred pixels is itself known to some percent.
+_CLOSE_ENOUGH = 0.1
+_MOST_ATTEMPTS = 5
+
+
+@dataclass(frozen=True)
+class NoiseAt:
+    """What a renderer's pictures are like with so many samples.
+
+    Attributes:
+        samples: paths through each pixel.
+        noise: root mean square error of luminance over its mean, on the drogue's pixels.
+        noise_inside: the same on those that see one part alone, edges left out.
+        mean_cd_m2: mean luminance of the drogue's pixels. [cd/m2]
+        is_carried_on: by the law of independent samples from fewer, as these would have taken too long.
+    """
+
+    samples: int
+    noise: float
+    noise_inside: float
+    mean_cd_m2: float
+    is_carried_on: bool = False
+
+    def with_samples(self, samples: int) -> NoiseAt:
+        """What so many samples would give: errors fall with their square root."""
+        down = float(np.sqrt(samples / self.samples))
+        return NoiseAt(samples, self.noise / down, self.noise_inside / down, self.mean_cd_m2, True)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Time of a whole pair.
+
+    Attributes:
+        cpu_s: user and system time. [s]
+        is_least: it was taken with fewer samples, and would have been more.
+    """
+
+    cpu_s: float
+    is_least: bool = False
+
+
+def cpu_seconds() -> float:
+    """User and system time of this process and of its children that have ended. [s]"""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def relative_noise(
+    first: NDArray[np.floating[Any]], second: NDArray[np.floating[Any]], mask: NDArray[np.bool_]
+) -> float:
+    """Root mean square error of one of two equally noisy pictures over their mean, on the pixels of a mask."""
+    one, other = first[mask].astype(np.float64), second[mask].astype(np.float64)
+    return float(np.sqrt(np.mean(np.square(one - other)) / 2) / np.mean((one + other) / 2))
+
+
+def noise_of(
+    samples: int,
+    pictures: tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]],
+    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+) -> NoiseAt:
+    """Noise from two pictures with different seeds, on the drogue's pixels and inside its parts."""
+    one, other = pictures
+    drogue, inside = masks
+    mean = float((one[drogue].mean(dtype=np.float64) + other[drogue].mean(dtype=np.float64)) / 2)
+    return NoiseAt(samples, relative_noise(one, other, drogue), relative_noise(one, other, inside), mean)
+
+
+def samples_for(measured: NoiseAt, noise: float) -> int:
+    """Samples with which the noise would be reached if it falls with their square root."""
+    # Rounding of the square must not ask for one more.
+    return max(1, int(np.ceil(measured.samples * (measured.noise / noise) ** 2 - 1e-6)))
+
+
+def reach_noise(measure: Callable[[int], NoiseAt], noise: float, pilot: int, most_samples: int) -> NoiseAt:
+    """Samples that give a noise, found by the square-root law and verified.
+
+    Args:
+        measure: renders with so many samples; may take a few more.
+        noise: to be reached.
+        pilot: samples of the first attempt.
+        most_samples: of an attempt; beyond these the law is taken at its word.
+
+    Returns:
+        The attempt whose noise comes nearest, by ratio. Less noise than asked for with a single sample stands.
+    """
+    tried: dict[int, NoiseAt] = {}
+    samples = pilot
+    while len(tried) < _MOST_ATTEMPTS and samples not in tried:
+        tried[samples] = measure(samples)
+        best = min(tried.values(), key=lambda each: abs(np.log(each.noise / noise)))
+        if abs(best.noise / noise - 1) <= _CLOSE_ENOUGH:
+            return best
+        samples = min(samples_for(best, noise), most_samples)
+    return best.with_samples(samples_for(best, noise)) if best.noise > noise else best

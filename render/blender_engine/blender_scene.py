@@ -1,0 +1,159 @@
+"""The Blender scenes of one stage: everything in light, everything for its passes, and the features alone.
+
+The stage stands still; camera, sun and sky move around it. Imported only in Blender's own process.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from render.blender_engine.blender_surfaces import Surface, replace_image
+from render.blender_engine.messages import (
+    FEATURES,
+    LIGHT,
+    NORMAL_PASS,
+    PASSES,
+    FrameSetup,
+    Light,
+    PartMesh,
+    StageThings,
+)
+
+
+class BlenderScene:
+    """The three scenes, and the objects in them.
+
+    Attributes:
+        scenes: by kind of picture.
+        camera: the one camera of all of them.
+    """
+
+    def __init__(self) -> None:
+        first = bpy.data.scenes[0]
+        for thing in [*first.objects]:
+            bpy.data.objects.remove(thing)
+        first.name = LIGHT
+        self.scenes: dict[str, Any] = {LIGHT: first}
+        for kind in (PASSES, FEATURES):
+            self.scenes[kind] = bpy.data.scenes.new(kind)
+        self.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+        self.camera.rotation_mode = "QUATERNION"
+        self._sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+        self._sun.rotation_mode = "QUATERNION"
+        self._sun.data.angle = 0.0
+        self._sky = _Sky()
+        self._things: dict[str, Any] = {}
+        self._surfaces: dict[str, Surface] = {}
+        probe = _probe_material()
+        for kind, scene in self.scenes.items():
+            scene.collection.objects.link(self.camera)
+            scene.camera = self.camera
+            if kind == LIGHT:
+                scene.collection.objects.link(self._sun)
+                scene.world = self._sky.world
+            else:
+                layer = scene.view_layers[0]
+                layer.material_override = probe
+                layer.use_pass_z = layer.use_pass_object_index = True
+                layer.aovs.add().name = NORMAL_PASS
+
+    def set_frame(self, setup: FrameSetup) -> None:
+        """Put everything where and how a frame has it."""
+        if setup.stage is not None:
+            self._replace_things(setup.stage)
+        for name, vertices_m in setup.moved_m.items():
+            mesh = self._things[name].data
+            mesh.vertices.foreach_set("co", vertices_m.ravel())
+            mesh.update()
+        for name, look in setup.looks.items():
+            self._surfaces[name].set(look, setup.light.unit_cd_m2)
+        self._set_light(setup.light)
+
+    def _replace_things(self, stage: StageThings) -> None:
+        bpy.data.batch_remove([*self._things.values(), *self.scenes[FEATURES].collection.objects.values()[1:]])
+        bpy.data.batch_remove([*bpy.data.meshes, *(surface.material for surface in self._surfaces.values())])
+        self._things, self._surfaces = {}, {}
+        for name, part in stage.things.items():
+            self._things[name] = _mesh_object(name, part)
+            self._surfaces[name] = Surface(name, part.map_places is not None)
+            self._things[name].data.materials.append(self._surfaces[name].material)
+            for kind in (LIGHT, PASSES):
+                self.scenes[kind].collection.objects.link(self._things[name])
+        for name, part in stage.features.items():
+            self.scenes[FEATURES].collection.objects.link(_mesh_object(name, part))
+
+    def _set_light(self, light: Light) -> None:
+        self._sky.set(light)
+        # A sun lamp shines along its own -z.
+        towards, _ = Rotation.align_vectors([light.to_sun], [[0.0, 0.0, 1.0]])
+        self._sun.rotation_quaternion = towards.as_quat(scalar_first=True)
+        strength = float(light.sun.max())
+        self._sun.data.energy = strength
+        self._sun.data.color = (light.sun / strength).tolist() if strength > 0 else (0.0, 0.0, 0.0)
+
+
+class _Sky:
+    """The map around everything, in the stage's axes."""
+
+    def __init__(self) -> None:
+        self.world = bpy.data.worlds.new("sky")
+        # The sky is where paths end, as in the other engine: it is so even that no lot needs to be drawn for it.
+        self.world.cycles.sampling_method = "NONE"
+        nodes, links = self.world.node_tree.nodes, self.world.node_tree.links
+        nodes.clear()
+        direction = nodes.new("ShaderNodeTexCoord")
+        self._turn = nodes.new("ShaderNodeMapping")
+        self._turn.vector_type = "VECTOR"
+        self._texture = nodes.new("ShaderNodeTexEnvironment")
+        background, output = nodes.new("ShaderNodeBackground"), nodes.new("ShaderNodeOutputWorld")
+        links.new(direction.outputs["Generated"], self._turn.inputs["Vector"])
+        links.new(self._turn.outputs["Vector"], self._texture.inputs["Vector"])
+        links.new(self._texture.outputs["Color"], background.inputs["Color"])
+        links.new(background.outputs["Background"], output.inputs["Surface"])
+
+    def set(self, light: Light) -> None:
+        """Replace the map and turn it."""
+        # Blender's map runs from the nadir up; its middle column looks along +x, and the next ones turn to -y.
+        turned = np.roll(light.sky[::-1, ::-1], -light.sky.shape[1] // 2, axis=1)
+        replace_image(self._texture, turned)
+        angles = Rotation.from_matrix(light.world_from_stage).as_euler("xyz")
+        self._turn.inputs["Rotation"].default_value = angles.tolist()
+
+
+def _mesh_object(name: str, part: PartMesh) -> Any:
+    mesh = bpy.data.meshes.new(name)
+    count = len(part.faces)
+    mesh.vertices.add(len(part.vertices_m))
+    mesh.vertices.foreach_set("co", part.vertices_m.ravel())
+    mesh.loops.add(3 * count)
+    mesh.loops.foreach_set("vertex_index", part.faces.ravel())
+    mesh.polygons.add(count)
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
+    mesh.polygons.foreach_set("use_smooth", np.full(count, part.smooth))
+    if part.map_places is not None:
+        layer = mesh.uv_layers.new(name="map")
+        layer.uv.foreach_set("vector", part.map_places[part.faces.ravel()].ravel())
+    mesh.update()
+    thing = bpy.data.objects.new(name, mesh)
+    thing.pass_index = part.part_id
+    # Lifts shadow rays off coarse smooth meshes; here the meshes are fine, and the other engine does nothing like it.
+    thing.cycles.shadow_terminator_geometry_offset = 0.0
+    return thing
+
+
+def _probe_material() -> Any:
+    """A surface that writes the normal of its face, and where paths end."""
+    material = bpy.data.materials.new("probe")
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    # One that neither shines nor reflects would be taken for a hole.
+    output, shine = nodes.new("ShaderNodeOutputMaterial"), nodes.new("ShaderNodeEmission")
+    geometry, written = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeOutputAOV")
+    written.aov_name = NORMAL_PASS
+    links.new(shine.outputs["Emission"], output.inputs["Surface"])
+    links.new(geometry.outputs["True Normal"], written.inputs["Color"])
+    return material

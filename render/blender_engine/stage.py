@@ -1,0 +1,148 @@
+"""What stands in a frame, as plain arrays in the axes in which all of it stands still: the stage's."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from datasets_manifest.frame import FrameSpec
+from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
+from drogue_models.parts import FIRST_MARKER_ID, Part, part_name
+from render.blender_engine.messages import FrameSetup, Light, Look, PartMesh, StageThings
+from render.surfaces import (
+    even_reflectance_rgb,
+    lamp_radiance_rgb,
+    missing_parts,
+    reflectance_map,
+    surface_condition,
+)
+from scenes.surroundings import Surroundings
+
+# Curved parts get interpolated normals; the others have flat faces and sharp edges.
+_SMOOTH_PARTS = (Part.RIM, Part.HOSE)
+
+
+class Stage:
+    """The things of the last frame: meshes that stay are sent to Blender once.
+
+    Attributes:
+        drogue_m: (V, 3) vertices of the drogue's own parts. [m]
+        around_m: (V, 3) vertices of every other thing. [m]
+    """
+
+    def __init__(self) -> None:
+        self._key: str | None = None
+        self.drogue_m: NDArray[np.float32] = np.zeros((0, 3), dtype=np.float32)
+        self.around_m: list[NDArray[np.float32]] = []
+
+    def set_frame(self, frame: FrameSpec, around: Surroundings) -> FrameSetup:
+        """What Blender has to be told for this frame."""
+        moved = _moved_meshes(frame)
+        key = _stage_key(frame, moved)
+        stage = None
+        if key != self._key:
+            fixed = _fixed_meshes(frame)
+            stage = StageThings(
+                {name: _part_mesh(frame, part, mesh) for name, (part, mesh) in (fixed | moved).items()},
+                {
+                    f"alone_{name}": _part_mesh(frame, part, _front_faces(mesh))
+                    for name, (part, mesh) in fixed.items()
+                    if part == Part.HUB or part >= FIRST_MARKER_ID
+                },
+            )
+            corners = [stage.things[name].vertices_m for name in fixed]
+            self.drogue_m = np.concatenate(corners) if corners else np.zeros((0, 3), dtype=np.float32)
+            self._looks = {name: part for name, (part, _) in fixed.items()}
+            self._key = key
+        vertices = {name: np.asarray(mesh.vertices, dtype=np.float32) for name, (_, mesh) in moved.items()}
+        self.around_m = [*vertices.values()]
+        looks = {name: _look(frame, part) for name, part in self._looks.items()} | _moved_looks(frame, moved)
+        return FrameSetup(stage, vertices, looks, _light(frame, around))
+
+    def forget(self) -> None:
+        """Send everything again: Blender's process is a new one."""
+        self._key = None
+
+
+_Meshes = dict[str, tuple[int, trimesh.Trimesh]]
+
+
+def _moved_meshes(frame: FrameSpec) -> _Meshes:
+    """Hose, tanker and bystanders in the stage's axes, by name with their part ids. [m]"""
+    stage_from_left = frame.left_from_stage_at(0.0).inverse()
+    meshes: _Meshes = {}
+    if frame.drogue is not None and frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None:
+        nodes = stage_from_left.apply(frame.hose_nodes_left_m)
+        meshes["hose"] = int(Part.HOSE), hose_mesh(nodes, frame.drogue.hose_radius_m)
+        meshes["tanker"] = int(Part.TANKER), tanker_mesh()
+        meshes["tanker"][1].apply_transform((stage_from_left @ frame.left_from_tanker).as_matrix())
+    for index, bystander in enumerate(frame.bystanders):
+        mesh = bystander_mesh(bystander.shape)
+        mesh.apply_transform((stage_from_left @ bystander.left_from_object).as_matrix())
+        meshes[f"bystander_{index}"] = int(Part[bystander.kind.upper()]), mesh
+    return meshes
+
+
+def _fixed_meshes(frame: FrameSpec) -> _Meshes:
+    """The drogue's own parts that have not come off."""
+    if frame.drogue is None:
+        return {}
+    gone = missing_parts(frame)
+    return {part_name(part): (part, mesh) for part, mesh in drogue_meshes(frame.drogue).items() if part not in gone}
+
+
+def _stage_key(frame: FrameSpec, moved: _Meshes) -> str:
+    """Equal for frames that can share meshes and kinds of surface."""
+    drogue = "" if frame.drogue is None else frame.drogue.model_dump_json()
+    count = 0 if frame.drogue is None else frame.drogue.marker_count
+    features = (int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + count))
+    dirty = [part for part in features if not surface_condition(frame, part).is_clean]
+    sizes = [(name, part, len(mesh.vertices), len(mesh.faces)) for name, (part, mesh) in moved.items()]
+    return f"{drogue} {dirty} {sorted(missing_parts(frame))} {sizes}"
+
+
+def _front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """What of a flat feature can be seen from the front; its side walls are sunk in the part around it."""
+    return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
+
+
+def _part_mesh(frame: FrameSpec, part: int, mesh: trimesh.Trimesh) -> PartMesh:
+    vertices = np.asarray(mesh.vertices, dtype=np.float32)
+    places = None
+    if not surface_condition(frame, part).is_clean:
+        assert frame.drogue is not None
+        if part == Part.HUB:
+            assert frame.drogue.hub is not None
+            center_m, radius_m = np.zeros(2), frame.drogue.hub.outer_radius_m
+        else:
+            center_m = np.asarray(frame.drogue.marker_positions_m[part - FIRST_MARKER_ID])
+            radius_m = frame.drogue.marker_radius_m
+        places = ((vertices[:, :2] - center_m) / (2 * radius_m) + 0.5).astype(np.float32)
+    return PartMesh(part, vertices, np.asarray(mesh.faces, dtype=np.int32), part in _SMOOTH_PARTS, places)
+
+
+def _look(frame: FrameSpec, part: int) -> Look:
+    clean = surface_condition(frame, part).is_clean
+    reflectance = even_reflectance_rgb(frame, part) if clean else reflectance_map(frame, part)
+    return Look(reflectance, lamp_radiance_rgb(frame, part))
+
+
+def _moved_looks(frame: FrameSpec, moved: _Meshes) -> dict[str, Look]:
+    looks = {name: _look(frame, part) for name, (part, _) in moved.items() if name in ("hose", "tanker")}
+    for index, bystander in enumerate(frame.bystanders):
+        looks[f"bystander_{index}"] = Look(np.array(bystander.reflectance_rgb), np.zeros(3))
+    return looks
+
+
+def _light(frame: FrameSpec, around: Surroundings) -> Light:
+    world_from_stage = (frame.world_from_left @ frame.left_from_stage_at(0.0)).rotation
+    light_map = around.light_map
+    unit_cd_m2 = max(float(light_map.mean()), 1e-12)
+    return Light(
+        (light_map / np.float32(unit_cd_m2)).astype(np.float32),
+        world_from_stage,
+        world_from_stage.T @ around.beam_direction,
+        around.beam_illuminance_lux / unit_cd_m2,
+        unit_cd_m2,
+    )

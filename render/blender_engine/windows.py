@@ -1,0 +1,103 @@
+"""Which part of the image a picture covers, and where its camera is while the shutter is open."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datasets_manifest.frame import FrameSpec
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import RigidTransform, exp_twist
+from geometry.stereo import Eye
+from render.blender_engine.messages import CameraPath, Window
+
+_SHARP_BELOW_PX = 0.05
+_MOMENTS = 5
+# Beyond what the corners reach: their own rounding, and the pixel that holds them.
+_MARGIN_PX = 2
+# Nearer than this a corner's projection means nothing and the whole image is taken.
+_NEAREST_M = 0.05
+_BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
+
+
+class EyePath:
+    """One eye of a frame in the stage's axes.
+
+    Attributes:
+        middle: `stage_from_eye` at mid-exposure.
+        still: the camera at mid-exposure.
+        moving: the camera at five moments, or at one when nothing moves by a twentieth of a pixel.
+    """
+
+    def __init__(self, frame: FrameSpec, eye: Eye, corners_m: NDArray[np.float32]) -> None:
+        self._camera = frame.rig.camera
+        eye_from_left = exp_twist(np.concatenate([-frame.rig.eye_offset_m(eye), np.zeros(3)]))
+        half_s = frame.exposure.time_s / 2
+        moments_s = np.linspace(-half_s, half_s, _MOMENTS)
+        poses = [(eye_from_left @ frame.left_from_stage_at(float(offset_s))).inverse() for offset_s in moments_s]
+        self.middle = poses[_MOMENTS // 2]
+        self._poses = poses if self._moves(poses, corners_m) else [self.middle]
+        self.still, self.moving = _camera_path([self.middle]), _camera_path(self._poses)
+
+    def _moves(self, poses: list[RigidTransform], corners_m: NDArray[np.float32]) -> bool:
+        """Whether any corner's image is elsewhere when the shutter opens or closes than in the middle."""
+        seen = [poses[index].inverse().apply(corners_m) for index in (0, _MOMENTS // 2, -1)]
+        front = np.min([points[:, 2] for points in seen], axis=0) > _NEAREST_M
+        opened, middle, closed = (self._camera.project(points[front]) for points in seen)
+        return bool(max(np.abs(end - middle).max(initial=0.0) for end in (opened, closed)) >= _SHARP_BELOW_PX)
+
+    def window(self, corners_m: NDArray[np.float32]) -> Window | None:
+        """What of the image holds the parts with these corners while the shutter is open; None when nothing does.
+
+        Args:
+            corners_m: (V, 3) in the stage's axes. [m]
+        """
+        camera = self._camera
+        low, high = np.full(2, np.inf), np.full(2, -np.inf)
+        for pose in self._poses:
+            points = pose.inverse().apply(corners_m)
+            if not len(points) or points[:, 2].max() < _NEAREST_M:
+                continue
+            if points[:, 2].min() < _NEAREST_M:
+                low, high = np.zeros(2), np.array([camera.width_px, camera.height_px], dtype=np.float64)
+                break
+            seen = camera.project(points)
+            low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
+        size = np.array([camera.width_px, camera.height_px])
+        first = np.clip(np.floor(low) - _MARGIN_PX, 0, size)
+        end = np.clip(np.ceil(high) + _MARGIN_PX + 1, 0, size)
+        if (first >= end).any():
+            return None
+        return _window(camera, first.astype(int), end.astype(int))
+
+
+def holds(outer: Window | None, inner: Window) -> bool:
+    """Whether one window holds all of another."""
+    return (
+        outer is not None
+        and outer.left_px <= inner.left_px
+        and outer.top_px <= inner.top_px
+        and outer.left_px + outer.width_px >= inner.left_px + inner.width_px
+        and outer.top_px + outer.height_px >= inner.top_px + inner.height_px
+    )
+
+
+def _window(camera: PinholeCamera, first: NDArray[np.int_], end: NDArray[np.int_]) -> Window:
+    if camera.fx_px != camera.fy_px:
+        raise ValueError(
+            f"rig: engine blender needs square pixels (fx_px = fy_px), got {camera.fx_px:g} and {camera.fy_px:g}; "
+            "engine mitsuba renders others"
+        )
+    size = end - first
+    return Window(int(first[0]), int(first[1]), int(size[0]), int(size[1]), camera.fx_px, (camera.cx_px, camera.cy_px))
+
+
+def _camera_path(poses: list[RigidTransform]) -> CameraPath:
+    quaternions = Rotation.from_matrix([pose.rotation @ _BLENDER_FROM_OPENCV for pose in poses]).as_quat(
+        scalar_first=True
+    )
+    for index in range(1, len(quaternions)):
+        if quaternions[index] @ quaternions[index - 1] < 0:
+            quaternions[index] *= -1
+    return CameraPath(np.stack([pose.translation_m for pose in poses]), quaternions)
