@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
 # where the folder lies.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow lint bench bars-nav-a bars-nav-b bars-nav-c bars-nav-d clean
+.PHONY: help setup demo test test-slow torture lint bench bench-engines bench-peers bars-nav-a bars-nav-b bars-nav-c bars-nav-d clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -24,7 +24,10 @@ test: setup lint ## linters, types and the fast tests
 
 test-slow: setup ## the tests that render for longer
 	@echo "test-slow: pytest, the slow tests"
-	@$(BIN)/python -m pytest -m slow
+	@$(BIN)/python -m pytest -m "slow and not torture"
+
+torture: setup ## kill a run 50 times on its way through 200 pairs, and compare with an undisturbed one (minutes)
+	@$(BIN)/python -m pytest tests/batch -m torture --capture=no
 
 lint: setup ## formatting, style, types, walls between the packages
 	@echo "lint: ruff, import-linter, mypy"
@@ -32,6 +35,14 @@ lint: setup ## formatting, style, types, walls between the packages
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/mypy
+
+bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (most of an hour; installs Blender)
+	@scripts/setup all
+	@$(BIN)/python -m droguekit.engine_agreement --out out/engine-agreement
+
+bench-peers: ## CPU seconds per pair of our path, plain Cycles and plain Mitsuba at equal noise (hours; installs Blender; goes on where it stopped)
+	@scripts/setup all
+	@$(BIN)/python -m droguekit.peer_comparison --out out/peer-comparison
 
 bench: ## CPU seconds per stereo pair by distance and stage
 	@scripts/setup mitsuba

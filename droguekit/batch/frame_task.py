@@ -30,6 +30,10 @@ class FrameFaultError(ValueError):
     """Labels and rendered passes of a frame contradict each other; the frame is not written."""
 
 
+class OtherBuildError(ValueError):
+    """What runs here is not what made, or makes, the other frames of the dataset."""
+
+
 @dataclass(frozen=True)
 class FrameTask:
     """Makes frames of one recipe and writes them into one dataset; calling it with an index makes that frame.
@@ -49,12 +53,13 @@ class FrameTask:
 
         Raises:
             FrameFaultError: its labels contradict its passes.
-            ValueError: the engine cannot be used, or is not the one that made the other frames.
+            EngineUnavailableError: the engine cannot be used.
+            OtherBuildError: it is not the one that made the other frames.
             OSError: the frame could not be written; nothing of it is left.
         """
         engine = _engine(self.recipe.render.engine)
         if self.engine_version not in (None, engine.version):
-            raise ValueError(
+            raise OtherBuildError(
                 f"{self.dataset}: its frames were made by {self.engine_version}, but here runs {engine.version}, whose "
                 "pixels differ; go on where they were made, or render into a new folder"
             )

@@ -13,8 +13,13 @@ from datasets_manifest.recipe import Recipe
 from droguekit.batch.frame_task import FrameReport
 from droguekit.batch.measure import measure_frames
 from geometry.se3 import Array
-from scenes.sampler import sample_frame, scene_of_frame, split_of_scene
+from scenes.families import family_of_scene
+from scenes.sampler import sample_left_from_drogue, scene_of_frame, split_of_scene
 
+# A worker may have to load its engine and compile kernels within its first frame.
+_START_S = 300.0
+# Ten times what the slowest variant of an engine was seen to take for one sample of one pixel.
+_S_PER_SAMPLE = 20e-6
 # Enough for shares to within 2 % and a histogram without holes; more only takes time.
 _MOST_SAMPLED = 1000
 
@@ -26,12 +31,14 @@ class Plan:
     Attributes:
         by_split: pairs in each split.
         by_scene: pairs in each scene.
+        by_family: scenes and pairs of each family, in the recipe's order; empty without families.
         sampled: indices of the frames that were drawn for the distances.
         distances_m: of those with a drogue, NaN for those without. [m]
     """
 
     by_split: dict[str, int]
     by_scene: dict[int, int]
+    by_family: dict[str, tuple[int, int]]
     sampled: tuple[int, ...]
     distances_m: Array
 
@@ -66,12 +73,25 @@ def plan_recipe(recipe: Recipe) -> Plan:
     by_split: Counter[str] = Counter()
     for scene_id, pairs in by_scene.items():
         by_split[split_of_scene(recipe, scene_id)] += pairs
+    by_family = {family.name: (0, 0) for family in recipe.families}
+    for scene_id, pairs in by_scene.items():
+        family = family_of_scene(recipe, scene_id)
+        if family is not None:
+            scenes, total = by_family[family.name]
+            by_family[family.name] = scenes + 1, total + pairs
     sampled = tuple(sorted({int(index) for index in np.linspace(0, count - 1, min(count, _MOST_SAMPLED))}))
     distances = []
     for frame_index in sampled:
-        pose = sample_frame(recipe, frame_index).left_from_drogue
+        pose = sample_left_from_drogue(recipe, frame_index)
         distances.append(np.nan if pose is None else float(pose.translation_m[2]))
-    return Plan(dict(by_split), dict(by_scene), sampled, np.array(distances))
+    return Plan(dict(by_split), dict(by_scene), by_family, sampled, np.array(distances))
+
+
+def frame_timeout_s(recipe: Recipe) -> float:
+    """How long a frame may take before it counts as hung: far more than any engine needs here. [s]"""
+    camera = recipe.rig.camera
+    samples = 2 * camera.width_px * camera.height_px * recipe.render.samples_per_px
+    return _START_S + float(round(_S_PER_SAMPLE * samples))
 
 
 def probe_cost(recipe: Recipe, plan: Plan) -> Cost:

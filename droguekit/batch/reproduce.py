@@ -23,7 +23,13 @@ from droguekit.batch.workers import run_alone
 # differ in their last bits between instruction sets.
 _RELATIVE_TOLERANCE = 1e-9
 # What follows from the pixels, which are the same only for the same engine, packages and processor features.
-_FROM_PIXELS = {"file_sha256", "monte_carlo_noise_fraction", "signal_to_noise", "background_luminance_cd_m2"}
+_FROM_PIXELS = {
+    "file_sha256",
+    "monte_carlo_noise_fraction",
+    "monte_carlo_over_sensor_noise",
+    "signal_to_noise",
+    "background_luminance_cd_m2",
+}
 _FROM_HERE = {"engine", "engine_version"}
 
 

@@ -8,6 +8,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -112,22 +113,42 @@ def differing_keys(first: Any, second: Any, where: str = "") -> list[str]:
     return [] if first == second else [where]
 
 
-def sort_frames(dataset: Path, manifest: Manifest) -> tuple[dict[int, PairRecord], list[int]]:
+@dataclass(frozen=True)
+class Found:
+    """The frames that a folder holds.
+
+    Attributes:
+        whole: indices of those that are as they were written.
+        damaged: indices of the others, ascending.
+        engine_version: that made the whole ones; None when there are none.
+    """
+
+    whole: frozenset[int]
+    damaged: tuple[int, ...]
+    engine_version: str | None
+
+
+def sort_frames(dataset: Path, manifest: Manifest) -> Found:
     """Tell the frames that are there as they were written from the damaged ones.
 
-    Returns:
-        Records of the whole ones by index, and the indices of the damaged ones, ascending.
+    Raises:
+        ValueError: whole frames were made by different engine versions.
     """
     vouched = {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
-    whole: dict[int, PairRecord] = {}
+    whole: list[int] = []
     damaged: list[int] = []
+    versions: dict[str, int] = {}
     for frame_index in layout.frame_indices(dataset):
         record = _read_whole(layout.frame_folder(dataset, frame_index), vouched.get(frame_index))
         if record is None or record.frame_index != frame_index:
             damaged.append(frame_index)
         else:
-            whole[frame_index] = record
-    return whole, damaged
+            whole.append(frame_index)
+            versions.setdefault(record.engine_version, frame_index)
+    if len(versions) > 1:
+        shown = ", ".join(f"frame {index} by {version}" for version, index in versions.items())
+        raise ValueError(f"{dataset}: its frames were made by different engines: {shown}; delete those of one")
+    return Found(frozenset(whole), tuple(damaged), next(iter(versions), None))
 
 
 def _read_whole(folder: Path, record_sha256: str | None) -> PairRecord | None:

@@ -1,31 +1,47 @@
-"""Worker processes: one task at a time each, one thread each, and a killed one costs one attempt of one task."""
+"""Many tasks in worker processes: an accident costs one attempt of one task, and the others go on."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from queue import SimpleQueue
-from typing import Generic, TypeVar, cast
+from multiprocessing.connection import wait
+from typing import Any, Generic, TypeVar, cast
 
-from pebble import ProcessExpired, ProcessPool
+from droguekit.batch.stop import StopRequest
+from droguekit.batch.worker_process import READY, TaskTimeoutError, Worker, WorkerDiedError
 
 T = TypeVar("T")
 
 MAX_ATTEMPTS = 3
-# Renderers keep some memory with every frame; a fresh process gives it back.
-TASKS_PER_PROCESS = 200
-# A worker with the engine loaded and a 1280 x 960 pair in work stays below this.
-GIB_PER_WORKER = 1.5
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a worker may take.
+
+    Attributes:
+        timeout_s: for one task, from its start; None for any. [s]
+        tasks_per_process: before a fresh process takes over: renderers keep some memory with every frame.
+        process_gib: a process that holds more after a task is replaced; None for any. [GiB]
+    """
+
+    timeout_s: float | None = None
+    tasks_per_process: int = 200
+    process_gib: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: one is not positive.
+        """
+        for name in ("timeout_s", "tasks_per_process", "process_gib"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name}: must be above 0, got {value:g}")
 
 
 @dataclass(frozen=True)
@@ -36,7 +52,7 @@ class Attempt(Generic[T]):
         index: of the task.
         number: 1 for the first attempt.
         value: what the task returned, or None.
-        error: what it raised, or `ProcessExpired` when its process died.
+        error: what it raised, `WorkerDiedError` when its process died, `TaskTimeoutError` when it took too long.
         final: whether the task is not tried again.
     """
 
@@ -47,90 +63,44 @@ class Attempt(Generic[T]):
     final: bool
 
 
-def available_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+def is_accident(error: BaseException | None) -> bool:
+    """Whether an attempt failed in a way that another one may not."""
+    return isinstance(error, WorkerDiedError | TaskTimeoutError | MemoryError)
 
 
-def available_memory_gib() -> float:
-    """Memory that is free for new processes, by the kernel's and the container's account. [GiB]"""
-    free = [_meminfo_available()]
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = (group / "memory.max").read_text(encoding="ascii").strip()
-        if limit != "max":
-            free.append(int(limit) - int((group / "memory.current").read_text(encoding="ascii")))
-    except (OSError, ValueError):
-        pass  # no container limit is in force
-    return max(0.0, min(free) / 2**30)
-
-
-def _meminfo_available() -> float:
-    for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-        if line.startswith("MemAvailable:"):
-            return float(line.split()[1]) * 1024
-    raise ValueError("/proc/meminfo: names no MemAvailable")
-
-
-def default_workers() -> int:
-    """As many workers as there are cores, and as the memory holds."""
-    return max(1, min(available_cores(), int(available_memory_gib() / GIB_PER_WORKER)))
-
-
-@contextmanager
-def _children_with_one_thread() -> Iterator[None]:
-    """Let processes that start meanwhile use one thread each; libraries read these variables when they load."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _end_with_parent() -> None:
-    """Make this worker end at once when the process that started it does, even by a kill."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        raise ValueError("worker: must run in a process of its own")
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True, name="end-with-parent").start()
-
-
-def run_tasks(function: Callable[[int], T], indices: Iterable[int], workers: int) -> Generator[Attempt[T], None, None]:
+def run_tasks(
+    function: Callable[[int], T],
+    indices: Iterable[int],
+    workers: int,
+    limits: Limits | None = None,
+    stop: StopRequest | None = None,
+) -> Generator[Attempt[T], None, None]:
     """Run `function(index)` for every index in worker processes, and report each attempt as it ends.
 
-    An attempt whose process dies is repeated, up to `MAX_ATTEMPTS`; one that raises is not. Closing the iterator ends
-    the workers.
+    An attempt whose process dies or that takes too long is repeated, up to `MAX_ATTEMPTS`; one that raises is not.
+    Closing the iterator kills the workers.
 
     Args:
         function: can be pickled.
         indices: of the tasks, without repetition.
-        workers: number of processes; 0 runs in this process, for debugging.
+        workers: number of processes; 0 runs in this process, for debugging, without limits.
+        limits: what a worker may take.
+        stop: once it is requested, no more tasks begin, and the iterator ends with those that are running.
+
+    Raises:
+        OSError: worker processes cannot be started.
     """
     if workers == 0:
-        yield from (_attempt_here(function, index) for index in indices)
+        for index in indices:
+            if stop is None or not stop.is_requested:
+                yield _attempt_here(function, index)
         return
-    waiting = deque(indices)
-    deaths: Counter[int] = Counter()
-    pools_left = MAX_ATTEMPTS
-    with _children_with_one_thread():
-        while waiting:
-            try:
-                yield from _run_in_one_pool(function, waiting, deaths, workers)
-            except BrokenProcessPool:
-                # A worker died between two tasks, which leaves the pool unusable but costs no task.
-                pools_left -= 1
-                if pools_left == 0:
-                    raise
+    crew = _Crew(function, deque(indices), workers, limits or Limits())
+    try:
+        while crew.fill(stop is not None and stop.is_requested):
+            yield from crew.attempts(stop)
+    finally:
+        crew.kill()
 
 
 def _attempt_here(function: Callable[[int], T], index: int) -> Attempt[T]:
@@ -140,51 +110,110 @@ def _attempt_here(function: Callable[[int], T], index: int) -> Attempt[T]:
         return Attempt(index, 1, None, error, final=True)
 
 
-def _run_in_one_pool(
-    function: Callable[[int], T], waiting: deque[int], deaths: Counter[int], workers: int
-) -> Iterator[Attempt[T]]:
-    """Work through `waiting` until it is empty; what is unfinished stays in it."""
-    pool = ProcessPool(
-        max_workers=workers,
-        max_tasks=TASKS_PER_PROCESS,
-        initializer=_end_with_parent,
-        context=multiprocessing.get_context("spawn"),
-    )
-    ended: SimpleQueue[tuple[int, Future[T]]] = SimpleQueue()
-    running: set[int] = set()
-    try:
-        while waiting or running:
-            # One task more than workers, so that none waits for the next.
-            while waiting and len(running) <= workers:
-                index = waiting.popleft()
-                running.add(index)
-                future: Future[T] = pool.schedule(function, args=[index])
-                future.add_done_callback(lambda future, index=index: ended.put((index, future)))  # type: ignore[misc]
-            index, future = ended.get()
-            error = future.exception()
-            if isinstance(error, BrokenProcessPool):
-                raise error
-            running.discard(index)
-            final = True
-            if isinstance(error, ProcessExpired):
-                deaths[index] += 1
-                final = deaths[index] >= MAX_ATTEMPTS
-                if not final:
-                    waiting.append(index)
-            value = None if error is not None else future.result()
-            number = deaths[index] + (0 if isinstance(error, ProcessExpired) else 1)
-            yield Attempt(index, number, value, error, final)
-    finally:
-        waiting.extend(sorted(running))
-        pool.stop()
-        pool.join()
+class _Crew(Generic[T]):
+    """The workers of one run, the tasks that wait, and how often each task has failed."""
+
+    def __init__(self, function: Callable[[int], T], waiting: deque[int], size: int, limits: Limits) -> None:
+        self._function, self._waiting, self._size, self._limits = function, waiting, size, limits
+        self._workers: list[Worker] = []
+        self._failures: Counter[int] = Counter()
+        self._deaths_at_start = 0
+
+    def fill(self, stopping: bool) -> bool:
+        """Give every worker that has none a task, and start the workers that are missing.
+
+        Returns:
+            Whether there is anything to wait for.
+        """
+        if stopping:
+            self._waiting.clear()
+        for worker in [worker for worker in self._workers if worker.is_ready and worker.index is None]:
+            if self._waiting:
+                worker.give(self._waiting.popleft())
+        starting = sum(not worker.is_ready for worker in self._workers)
+        for _ in range(min(self._size - len(self._workers), len(self._waiting) - starting)):
+            self._workers.append(Worker(self._function))
+        return bool(self._waiting) or any(worker.index is not None for worker in self._workers)
+
+    def attempts(self, stop: StopRequest | None) -> Iterator[Attempt[T]]:
+        """Wait until something happens, and report the attempts that have ended with it."""
+        busy = [worker for worker in self._workers if worker.index is not None]
+        awaited: list[Any] = [worker.connection for worker in self._workers]
+        if stop is not None and not stop.is_requested:
+            awaited.append(stop.fileno())
+        patience_s = None
+        if self._limits.timeout_s is not None and busy:
+            patience_s = max(0.0, min(worker.seconds_left(self._limits.timeout_s) for worker in busy))
+        ready = wait(awaited, patience_s)
+        if stop is not None and stop.fileno() in ready:
+            stop.acknowledge(len(busy))
+        for worker in [worker for worker in self._workers if worker.connection in ready]:
+            yield from self._hear(worker)
+        for worker in [worker for worker in busy if worker in self._workers and worker.index is not None]:
+            if self._limits.timeout_s is not None and worker.seconds_left(self._limits.timeout_s) <= 0:
+                yield self._fail(worker, TaskTimeoutError(self._limits.timeout_s))
+
+    def _hear(self, worker: Worker) -> Iterator[Attempt[T]]:
+        try:
+            message = worker.receive()
+        except WorkerDiedError as error:
+            if worker.index is not None:
+                yield self._fail(worker, error)
+            else:
+                self._lose_idle(worker, error)
+            return
+        if message == READY:
+            worker.is_ready = True
+            self._deaths_at_start = 0
+            return
+        value, raised, resident_gib = message
+        index = cast(int, worker.index)
+        if is_accident(raised):
+            yield self._fail(worker, raised)
+            return
+        worker.index = None
+        worker.tasks_done += 1
+        if worker.tasks_done >= self._limits.tasks_per_process or (
+            self._limits.process_gib is not None and resident_gib > self._limits.process_gib
+        ):
+            self._workers.remove(worker)
+            worker.dismiss()
+        yield Attempt(index, self._failures[index] + 1, value, raised, final=True)
+
+    def _fail(self, worker: Worker, error: BaseException) -> Attempt[T]:
+        """End a worker by whose accident a task has failed; the task waits for its next attempt if it has one."""
+        index = cast(int, worker.index)
+        self._workers.remove(worker)
+        worker.kill()
+        self._failures[index] += 1
+        final = self._failures[index] >= MAX_ATTEMPTS
+        if not final:
+            self._waiting.append(index)
+        return Attempt(index, self._failures[index], None, error, final)
+
+    def _lose_idle(self, worker: Worker, error: WorkerDiedError) -> None:
+        """A death without a task costs none; but workers that die before their first one are no accident.
+
+        Raises:
+            OSError: they die again and again.
+        """
+        self._workers.remove(worker)
+        self._deaths_at_start += not worker.is_ready
+        if self._deaths_at_start >= max(MAX_ATTEMPTS, self._size):
+            raise OSError(f"worker processes end before their first task; the last: {error}") from error
+
+    def kill(self) -> None:
+        """End all workers at once."""
+        for worker in self._workers:
+            worker.kill()
+        self._workers.clear()
 
 
 def run_alone(function: Callable[[], T]) -> T:
     """Run one function in a worker process of its own and return what it returns.
 
     Raises:
-        Exception: what the function raises, or `ProcessExpired` when its process dies again and again.
+        Exception: what the function raises, or `WorkerDiedError` when its process dies again and again.
     """
     with closing(run_tasks(partial(_call, function), [0], workers=1)) as attempts:
         last = [*attempts][-1]

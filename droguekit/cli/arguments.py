@@ -37,10 +37,29 @@ def parse_frames(text: str | None, count: int) -> range:
     return range(first, last)
 
 
+def parse_shard(text: str | None, frames: range) -> range:
+    """Every n-th of the frames, from the i-th on, by `i/n`; all of them by None.
+
+    Neighbours go to different shards, so that all take about as long.
+
+    Raises:
+        ValueError: not of that form, or a shard without frames.
+    """
+    if text is None:
+        return frames
+    low, slash, high = text.partition("/")
+    if not slash or not low.isdecimal() or not high.isdecimal() or not int(low) < int(high):
+        raise ValueError(f"--shard: must be i/n with i from 0 to n - 1, such as 0/4, got {text!r}")
+    shard = frames[int(low) :: int(high)]
+    if not shard:
+        raise ValueError(f"--shard: {text} has none of the {len(frames)} frames; take fewer shards")
+    return shard
+
+
 def human_size(size_bytes: float) -> str:
     """A size for people."""
-    for unit in ("B", "kB", "MB"):
+    for unit in ("B", "kB", "MB", "GB"):
         if size_bytes < 1000:
             return f"{size_bytes:.0f} {unit}" if unit == "B" else f"{size_bytes:.3g} {unit}"
         size_bytes /= 1000
-    return f"{size_bytes:.3g} GB"
+    return f"{size_bytes:.3g} TB"

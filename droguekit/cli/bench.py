@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from droguekit.cli.arguments import EngineOption
-from droguekit.cli.pipelines import open_bench_recipe
+from droguekit.cli.pipelines import BENCH_QUALITIES, open_bench_recipe, open_uniform_bench_recipe
 
 if TYPE_CHECKING:
     from droguekit.batch.frame_task import FrameReport
+    from droguekit.batch.measure import MeasuredFrame
 
-EXAMPLES = ("droguekit bench", "droguekit bench --repeat 5")
+EXAMPLES = ("droguekit bench", "droguekit bench --repeat 5", "droguekit bench --pairs 500")
 
 
 def bench(
     repeat: Annotated[int, typer.Option("--repeat", help="Pairs at each distance.")] = 2,
+    pairs: Annotated[int, typer.Option("--pairs", help="Pairs over the uniform law, for each quality.")] = 20,
     engine: EngineOption = None,
 ) -> None:
     """Measure the CPU time of a full-size pair by distance and stage, everything included.
 
-    One process with one thread, 16 samples a pixel, after one pair that is not counted.
+    One process with one thread, 16 samples a pixel, after one pair that is not counted. Then the mean over distances
+    uniform from 2 to 40 m, with 16 and with 64 samples, the renderer's noise on the drogue against the sensor's (root
+    mean square over pairs), and how much more memory the process holds after the last pair than after the first fifth.
     """
-    from droguekit.batch.measure import measure_frames
+    from droguekit.batch.measure import measure_closely, measure_frames
 
     recipe = open_bench_recipe(repeat, engine)
     stations = recipe.distance.stations_m or ()
@@ -39,6 +44,10 @@ def bench(
     typer.echo(f"{'':>21}  {' '.join(f'{stage:>9}' for stage in stages)}")
     for station, measured in by_station.items():
         typer.echo(_row(station, measured, stages))
+    typer.echo(f"\n{'2 to 40 m':>9} {'CPU s/pair':>11} {'noise/sensor':>13} {'memory [MB]':>12} {'growth':>8}")
+    for quality in BENCH_QUALITIES:
+        uniform = open_uniform_bench_recipe(pairs, quality, engine)
+        typer.echo(_mean_row(quality, measure_closely(uniform, tuple(range(pairs)))))
 
 
 def _is_at(distance_m: float, station_m: float) -> bool:
@@ -52,3 +61,12 @@ def _row(station_m: float, reports: list[FrameReport], stages: list[str]) -> str
     cpu_s = sum(total.values())
     shares = " ".join(f"{100 * total[stage] / cpu_s:9.1f}" for stage in stages)
     return f"{station_m:7g} m {cpu_s / len(reports):11.2f}  {shares}"
+
+
+def _mean_row(quality: str, frames: tuple[MeasuredFrame, ...]) -> str:
+    cpu_s = sum(sum(frame.report.stage_s.values()) for frame in frames) / len(frames)
+    noise = [frame.noise_over_sensor for frame in frames if frame.noise_over_sensor is not None]
+    over_sensor = f"{math.sqrt(sum(value**2 for value in noise) / len(noise)):.2f}" if noise else "-"
+    early, late = frames[(len(frames) - 1) // 5].memory_bytes, frames[-1].memory_bytes
+    memory = f"{late / 1e6:12.0f} {late / early - 1:8.1%}" if early and late else f"{'-':>12} {'-':>8}"
+    return f"{quality:>9} {cpu_s:11.2f} {over_sensor:>13} {memory}"

@@ -15,6 +15,7 @@ from droguekit.benchmark.label_drawing import Picture, display_picture, draw_box
 
 _HUB_RGB = (255, 120, 220)
 _TEXT_RGB = (255, 255, 255)
+_PAPER = 24
 _GAP_PX = 4
 _CAPTION_PX = 22
 
@@ -38,12 +39,66 @@ def draw_contact_sheet(dataset: Dataset, frames: Sequence[int], columns: int, ti
     height_px, width_px = tiles[0].shape[:2]
     rows = math.ceil(len(tiles) / columns)
     shape = (rows * (height_px + _GAP_PX) + _GAP_PX, columns * (width_px + _GAP_PX) + _GAP_PX, 3)
-    sheet = np.full(shape, 24, dtype=np.uint8)
+    sheet = np.full(shape, _PAPER, dtype=np.uint8)
     for place, tile in enumerate(tiles):
         row, column = divmod(place, columns)
         top, left = _GAP_PX + row * (height_px + _GAP_PX), _GAP_PX + column * (width_px + _GAP_PX)
         sheet[top : top + height_px, left : left + width_px] = tile
     return sheet
+
+
+def draw_family_sheet(dataset: Dataset, count: int, columns: int, tile_width_px: int) -> tuple[Picture, int]:
+    """Left images without labels, a row for each family of conditions, with the distance of the drogue in a corner.
+
+    Args:
+        dataset: where they come from.
+        count: tiles in all, at most; every family gets as many as the others as long as it has pairs.
+        columns: families side by side.
+        tile_width_px: width of a tile; its height follows the images.
+
+    Returns:
+        (H, W, 3) in the order red, green, blue, and how many pairs it shows.
+
+    Raises:
+        ValueError: an image or a record cannot be read.
+    """
+    families: dict[str, list[int]] = {}
+    for index in dataset.frame_indices:
+        families.setdefault(dataset.record(index).conditions.family, []).append(index)
+    per_row = max(1, count // len(families))
+    blocks = [
+        _family_row(dataset, name, indices[:per_row], per_row, tile_width_px) for name, indices in families.items()
+    ]
+    height_px, width_px = blocks[0].shape[:2]
+    rows = math.ceil(len(blocks) / columns)
+    sheet = np.full((rows * (height_px + _GAP_PX), columns * (width_px + _GAP_PX), 3), _PAPER, dtype=np.uint8)
+    for place, block in enumerate(blocks):
+        column, row = divmod(place, rows)
+        top, left = row * (height_px + _GAP_PX), column * (width_px + _GAP_PX)
+        sheet[top : top + height_px, left : left + width_px] = block
+    return sheet, sum(min(per_row, len(indices)) for indices in families.values())
+
+
+def _family_row(dataset: Dataset, name: str, frames: Sequence[int], length: int, width_px: int) -> Picture:
+    """A caption with the family's name over its tiles, from left to right."""
+    tiles = [_plain_tile(dataset.images(index), dataset.record(index), width_px) for index in frames]
+    height_px = tiles[0].shape[0]
+    row = np.full((_CAPTION_PX + height_px, length * (width_px + _GAP_PX), 3), _PAPER, dtype=np.uint8)
+    cv2.putText(row, name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
+    for place, tile in enumerate(tiles):
+        left = place * (width_px + _GAP_PX)
+        row[_CAPTION_PX:, left : left + width_px] = tile
+    return row
+
+
+def _plain_tile(images: StereoImages, record: PairRecord, width_px: int) -> Picture:
+    picture, _ = resized(display_picture(images), width_px)
+    distance_m = record.conditions.distance_m
+    text = "no drogue" if distance_m is None else f"{distance_m:.1f} m"
+    foot = (6, picture.shape[0] - 7)
+    for color, thickness in (((0, 0, 0), 3), (_TEXT_RGB, 1)):
+        cv2.putText(picture, text, foot, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, thickness, cv2.LINE_AA)
+    return picture
 
 
 def _draw_tile(images: StereoImages, record: PairRecord, width_px: int) -> Picture:

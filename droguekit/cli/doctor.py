@@ -21,11 +21,21 @@ _PACKAGES = (
     "pycocotools",
     "trimesh",
     "matplotlib",
-    "pebble",
     "typer",
     "mitsuba",
     "drjit",
+    "bpy",
 )
+# What Blender's Python package loads from the system, and Debian's packages of them.
+_BLENDER_LIBRARIES = {
+    "libX11.so.6": "libx11-6",
+    "libXrender.so.1": "libxrender1",
+    "libXfixes.so.3": "libxfixes3",
+    "libXi.so.6": "libxi6",
+    "libxkbcommon.so.0": "libxkbcommon0",
+    "libSM.so.6": "libsm6",
+    "libGL.so.1": "libgl1",
+}
 
 
 def doctor() -> None:
@@ -41,7 +51,7 @@ def doctor() -> None:
 
 def _show_machine() -> None:
     from datasets_manifest.provenance import cpu_features
-    from droguekit.batch.workers import available_cores, available_memory_gib, default_workers
+    from droguekit.batch.machine import available_cores, available_memory_gib, default_workers
 
     typer.echo(f"python     {platform.python_version()}, {sys.executable}")
     typer.echo(f"system     {platform.platform()}")
@@ -65,6 +75,7 @@ def _show_engines() -> bool:
     from render.mitsuba_engine.variant import probe_variant
 
     typer.echo("engine     analytic works: flat discs without path tracing, for estimators")
+    _show_blender()
     missing = _missing_libraries()
     for name, remedy in missing:
         typer.echo(f"library    {name} is missing; {remedy}")
@@ -80,6 +91,35 @@ def _show_engines() -> bool:
     return True
 
 
+def _show_blender() -> None:
+    """Start Blender, which is optional: nothing else needs it."""
+    from render.blender_engine.process import BlenderProcess, bpy_version
+
+    try:
+        found = bpy_version()
+    except ValueError as error:
+        typer.echo(f"engine     blender is optional: {error}")
+        return
+    missing = [package for library, package in _BLENDER_LIBRARIES.items() if not _loads(library)]
+    if missing:
+        typer.echo(f"engine     blender does not work: apt-get install {' '.join(missing)}")
+        return
+    try:
+        BlenderProcess().close()
+    except ValueError as error:
+        typer.echo(f"engine     blender does not work: {error}")
+        return
+    typer.echo(f"engine     blender works: bpy {found}, Cycles on the CPU, in a process of its own")
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
 _LIBATOMIC = ("libatomic.so.1", "apt-get install libatomic1")
 
 
@@ -88,9 +128,7 @@ def _missing_libraries() -> list[tuple[str, str]]:
     from render.mitsuba_engine.variant import llvm_libraries
 
     missing = []
-    try:
-        ctypes.CDLL(_LIBATOMIC[0])
-    except OSError:
+    if not _loads(_LIBATOMIC[0]):
         missing.append(_LIBATOMIC)
     if not any(library.exists() for library in llvm_libraries()):
         missing.append(("LLVM >= 15", "apt-get install libllvm15 (or newer), or name one in DRJIT_LIBLLVM_PATH"))

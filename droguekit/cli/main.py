@@ -17,6 +17,7 @@ DONE, FAULT, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 COMMANDS = {
     "plan": "Show what a recipe will make, how long it takes and how large it gets.",
     "render": "Make a dataset from a recipe; goes on where it stopped.",
+    "merge": "Join shards of a dataset that were made apart.",
     "validate": "Check a dataset: files, hashes, labels against part ids.",
     "reproduce": "Make one frame of a dataset again and compare.",
     "export": "Write a dataset's labels in another format.",

@@ -28,13 +28,13 @@ def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tupl
     Raises:
         ValueError: no such recipe, wrong keys, or no such engine.
     """
-    from datasets_manifest.recipe import Recipe, load_recipe
+    from datasets_manifest.recipe import load_recipe
     from render.engine import EngineUnavailableError, engine_names
 
     recipe, text = load_recipe(name_or_path, seed)
     if engine is not None:
         settings = recipe.render.model_copy(update={"engine": engine})
-        recipe = Recipe.model_validate(recipe.model_copy(update={"render": settings}).model_dump())
+        recipe = recipe.model_copy(update={"render": settings})
     if recipe.render.engine not in engine_names():
         raise EngineUnavailableError(
             f"engine: no engine named {recipe.render.engine!r}; there are {', '.join(engine_names())}"
@@ -42,26 +42,46 @@ def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tupl
     return recipe, text
 
 
+@dataclass(frozen=True)
+class RenderOrder:
+    """Who makes frames, and how long each may take.
+
+    Attributes:
+        workers: processes of this machine, as many as it holds when None.
+        timeout_s: for one frame, by the recipe when None. [s]
+        scheduler: address of a Dask scheduler whose workers do it instead, or None.
+    """
+
+    workers: int | None = None
+    timeout_s: float | None = None
+    scheduler: str | None = None
+
+
 def render_frames(
-    recipe: Recipe, text: str, out: Path, frames: Sequence[int], workers: int | None, report: ProgressReport
+    recipe: Recipe, text: str, out: Path, frames: Sequence[int], order: RenderOrder, report: ProgressReport
 ) -> RunSummary:
-    """Make frames of a recipe into a dataset, with as many workers as the machine holds when `workers` is None.
+    """Make frames of a recipe into a dataset.
 
     Raises:
         ValueError: a folder of another recipe, or an engine that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
     """
-    from droguekit.batch.local import render_dataset
-    from droguekit.batch.workers import default_workers
+    from droguekit.batch.local import Spread, render_dataset
+    from droguekit.batch.machine import default_workers
     from render.engine import engine_notice
 
-    chosen = default_workers() if workers is None else workers
-    if chosen < 0:
-        raise ValueError(f"workers: must not be negative, got {chosen}")
+    workers = default_workers() if order.workers is None else order.workers
+    if workers < 0:
+        raise ValueError(f"workers: must not be negative, got {workers}")
+    if order.timeout_s is not None and not order.timeout_s > 0:
+        raise ValueError(f"--timeout: must be above 0 s, got {order.timeout_s:g}")
+    if order.scheduler is not None and order.workers is not None:
+        raise ValueError("--workers: means processes of this machine; with --scheduler leave it out")
     notice = engine_notice(recipe.render.engine)
     if notice is not None:
         report.say(notice)
-    return render_dataset(recipe, text, out, frames, chosen, report)
+    spread = Spread(workers, order.timeout_s, order.scheduler)
+    return render_dataset(recipe, text, out, frames, spread, report)
 
 
 @dataclass(frozen=True)
@@ -151,7 +171,7 @@ def run_demo(recipe_name: str, out: Path, workers: int | None, report: ProgressR
     recipe, text = open_recipe(recipe_name, None, None)
     count = recipe.frames.count
     report.say(f"1 of 3: rendering {count} stereo pairs into {files.dataset}")
-    summary = render_frames(recipe, text, files.dataset, range(count), workers, report)
+    summary = render_frames(recipe, text, files.dataset, range(count), RenderOrder(workers), report)
     report.say("2 of 3: navigating on them, without the truth, by every method")
     navigate_dataset(files.dataset, (), files.estimates, report)
     report.say("3 of 3: comparing the estimates with the truth")
@@ -162,21 +182,45 @@ def run_demo(recipe_name: str, out: Path, workers: int | None, report: ProgressR
 _BENCH_STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
 
 
+_BENCH_SAMPLES = {
+    "corpus": {"samples_per_px": 16, "open_samples_per_px": 4, "edge_samples_per_px": 64},
+    "benchmark": {"samples_per_px": 64, "open_samples_per_px": 8, "edge_samples_per_px": 400},
+}
+BENCH_QUALITIES = tuple(_BENCH_SAMPLES)
+
+
 def open_bench_recipe(repeat: int, engine: str | None) -> Recipe:
     """The recipe by which speed is measured: `repeat` full-size pairs at each of five distances.
 
     Raises:
         ValueError: fewer than one pair, or no such engine.
     """
-    from datasets_manifest.recipe import Recipe
-
     if repeat < 1:
         raise ValueError(f"--repeat: must be at least 1, got {repeat}")
+    distance: dict[str, object] = {"law": "stations", "stations_m": _BENCH_STATIONS_M}
+    return _bench_recipe(repeat * len(_BENCH_STATIONS_M), distance, "corpus", engine)
+
+
+def open_uniform_bench_recipe(pairs: int, quality: str, engine: str | None) -> Recipe:
+    """The recipe by which a corpus's mean speed is measured: distances uniform from 2 to 40 m.
+
+    Raises:
+        ValueError: fewer than one pair, or no such engine.
+    """
+    if pairs < 1:
+        raise ValueError(f"--pairs: must be at least 1, got {pairs}")
+    distance: dict[str, object] = {"law": "uniform", "low_m": _BENCH_STATIONS_M[0], "high_m": _BENCH_STATIONS_M[-1]}
+    return _bench_recipe(pairs, distance, quality, engine)
+
+
+def _bench_recipe(count: int, distance: dict[str, object], quality: str, engine: str | None) -> Recipe:
+    from datasets_manifest.recipe import Recipe
+
     demo, _ = open_recipe("demo", None, engine)
     changes = {
-        "frames": {"count": repeat * len(_BENCH_STATIONS_M)},
-        "distance": {"law": "stations", "stations_m": _BENCH_STATIONS_M},
-        "render": {**demo.render.model_dump(), "samples_per_px": 16},
+        "frames": {"count": count},
+        "distance": distance,
+        "render": {**demo.render.model_dump(), **_BENCH_SAMPLES[quality]},
     }
     return Recipe.model_validate({**demo.model_dump(), **changes})
 
@@ -245,7 +289,9 @@ def _tier_data(order: BarsOrder, light: Literal["day", "dusk"], out: Path, repor
     folder = out / light
     estimates = folder / "estimates.jsonl"
     report.say(f"{light}: rendering {stations * pairs} pairs of {recipe.name} into {folder / 'dataset'}")
-    summary = render_frames(recipe, text, folder / "dataset", range(stations * pairs), order.workers, report)
+    summary = render_frames(
+        recipe, text, folder / "dataset", range(stations * pairs), RenderOrder(order.workers), report
+    )
     if is_navigated(estimates, summary.dataset_sha256, METHODS):
         report.say(f"{light}: {estimates} is there already")
     else:

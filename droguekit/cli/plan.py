@@ -34,13 +34,14 @@ def plan(
     engine: EngineOption = None,
 ) -> None:
     """Show what a recipe will make, how long it will take and how large it will get, without making it."""
-    from droguekit.batch.plan import plan_recipe, probe_cost
-    from droguekit.batch.workers import default_workers
+    from droguekit.batch.machine import default_workers
+    from droguekit.batch.plan import frame_timeout_s, plan_recipe, probe_cost
 
     chosen, _ = open_recipe(recipe, seed, engine)
     planned = plan_recipe(chosen)
     _show_counts(chosen, planned)
     _show_distances(chosen, planned)
+    typer.echo(f"a frame that is at work for {duration(frame_timeout_s(chosen))} counts as hung and is tried again")
     if probe:
         _show_cost(probe_cost(chosen, planned), default_workers() if workers is None else max(1, workers))
 
@@ -53,6 +54,8 @@ def _show_counts(recipe: Recipe, planned: Plan) -> None:
     )
     splits = ", ".join(f"{name} {planned.by_split.get(name, 0)}" for name in ("train", "val", "test"))
     typer.echo(f"by split: {splits}")
+    for name, (family_scenes, pairs) in planned.by_family.items():
+        typer.echo(f"  {name:<16} {family_scenes:4d} scenes {pairs:7d} pairs")
     scenes = list(planned.by_scene.items())
     shown = ", ".join(f"{scene_id}: {pairs}" for scene_id, pairs in scenes[:_MOST_LINES])
     more = f" and {len(scenes) - _MOST_LINES} more" if len(scenes) > _MOST_LINES else ""

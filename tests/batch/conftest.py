@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from datasets_manifest.layout import EVENTS_FILE
 from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import RunSummary, render_dataset
+from droguekit.batch.local import RunSummary, Spread, render_dataset
 from droguekit.batch.progress import PlainProgress
 
 TINY_RECIPE = """
@@ -38,12 +39,91 @@ train = 0.5
 test = 0.5
 """
 
+# A real engine that other packages could bring: the analytic one, with accidents on frames that the environment names.
+TROUBLED_ENGINE = """
+import ctypes, json, os, resource
+from pathlib import Path
+from render.analytic_engine.engine import AnalyticEngine
+
+class TroubledEngine(AnalyticEngine):
+    def render(self, frame, settings):
+        for trouble, frames in json.loads(os.environ.get("TROUBLES", "{}")).items():
+            if frame.frame_index in frames:
+                getattr(self, trouble)(frame.frame_index)
+        return super().render(frame, settings)
+
+    def abort(self, index):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        os.abort()
+
+    def abort_once(self, index):
+        if self._first("abort", index):
+            self.abort(index)
+
+    def hang(self, index):
+        ctypes.PyDLL(None).pause()  # holds Python's lock: nothing in this process can end it
+
+    def hang_once(self, index):
+        if self._first("hang", index):
+            self.hang(index)
+
+    def refuse(self, index):
+        raise RuntimeError(f"frame {index} is\\nbeyond me")
+
+    def no_space(self, index):
+        raise OSError(28, "No space left on device", "/scratch")
+
+    def wait(self, index):
+        # Opening a pipe waits for its other end: tells that the frame is begun, and goes on when it is told.
+        with open(os.environ["TROUBLE_BEGUN"], "w") as stream:
+            stream.write(f"{index}\\n")
+        with open(os.environ["TROUBLE_GO_ON"]) as stream:
+            stream.read()
+
+    def _first(self, name, index):
+        mark = Path(os.environ["TROUBLE_MARKS"]) / f"{name}-{index}"
+        known = mark.exists()
+        mark.touch()
+        return not known
+"""
+
+# Pairs of 160 x 120 pixels without a renderer.
+QUICK_RECIPE = """
+name = "quick"
+seed = 5
+[rig]
+preset = "rgb-ideal"
+width_px = 160
+height_px = 120
+focal_px = 266.0
+[frames]
+count = 8
+scenes = 2
+[distance]
+law = "log-uniform"
+low_m = 3.0
+high_m = 12.0
+[render]
+engine = "troubled"
+[split]
+train = 0.5
+test = 0.5
+"""
+
 Make = Callable[..., RunSummary]
 Hashes = Callable[[Path], dict[str, str]]
 
 
-def _make(out: Path, frames: Sequence[int] = range(4), workers: int = 1, text: str = TINY_RECIPE) -> RunSummary:
-    return render_dataset(parse_recipe(text), text, out, frames, workers, PlainProgress(io.StringIO()))
+def _make(
+    out: Path,
+    frames: Sequence[int] | None = None,
+    workers: int | Spread = 1,
+    text: str = TINY_RECIPE,
+    told: io.StringIO | None = None,
+) -> RunSummary:
+    recipe = parse_recipe(text)
+    chosen = range(recipe.frames.count) if frames is None else frames
+    return render_dataset(recipe, text, out, chosen, workers, PlainProgress(told or io.StringIO()))
 
 
 @pytest.fixture(scope="session")
@@ -54,7 +134,7 @@ def tiny_recipe() -> str:
 
 @pytest.fixture(scope="session")
 def make() -> Make:
-    """Renders frames of a recipe, without a word: `make(out, frames, workers, text)`."""
+    """Renders frames of a recipe, without a word: `make(out, frames, workers, text, told)`."""
     return _make
 
 
@@ -74,3 +154,36 @@ def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("tiny") / "dataset"
     assert _make(out).drops == ()
     return out
+
+
+@pytest.fixture
+def troubled(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Installs the engine `troubled`, for this process and those that it starts, with accidents by name and frame."""
+    site = tmp_path_factory.mktemp("site")
+    (site / "troubled_engine.py").write_text(TROUBLED_ENGINE)
+    information = site / "troubled_engine-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: troubled-engine\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[droguekit.engines]\ntroubled = troubled_engine:TroubledEngine\n")
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    monkeypatch.setenv("TROUBLE_MARKS", str(site))
+
+    def set_troubles(**frames: Sequence[int]) -> Path:
+        monkeypatch.setenv("TROUBLES", json.dumps(frames))
+        return site
+
+    set_troubles()
+    return set_troubles
+
+
+@pytest.fixture
+def quick_recipe() -> str:
+    """Eight pairs by the engine `troubled`, as TOML."""
+    return QUICK_RECIPE
+
+
+@pytest.fixture(scope="session")
+def analytic_recipe() -> str:
+    """The same pairs by the engine that ships, as TOML."""
+    return QUICK_RECIPE.replace('"troubled"', '"analytic"')

@@ -38,7 +38,7 @@ def test_a_whole_dataset_is_left_as_it_is(tiny_dataset: Path, make: Make, hashes
     shutil.copytree(tiny_dataset, out)
     before = {path: path.stat().st_mtime_ns for path in (out / layout.FRAMES_FOLDER).rglob("*")}
     summary = make(out)
-    assert (summary.made, summary.kept, summary.pairs, summary.planned) == ({}, 4, 4, 4)
+    assert (summary.totals.made, summary.kept, summary.pairs, summary.planned) == ([], 4, 4, 4)
     assert {path: path.stat().st_mtime_ns for path in (out / layout.FRAMES_FOLDER).rglob("*")} == before
     assert hashes(out) == hashes(tiny_dataset)
 
@@ -54,7 +54,7 @@ def test_missing_truncated_and_changed_frames_are_made_again(
     record = layout.frame_folder(out, 2) / layout.RECORD_FILE
     record.write_text(record.read_text().replace('"family":"clear"', '"family":"foggy"'))
     summary = make(out)
-    assert set(summary.made) == {0, 1, 2}
+    assert set(summary.totals.made) == {0, 1, 2}
     assert summary.kept == 1
     assert hashes(out) == hashes(tiny_dataset)
 

@@ -11,13 +11,14 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from pebble import ProcessExpired
 
-from droguekit.batch.workers import MAX_ATTEMPTS, default_workers, run_alone, run_tasks
+from droguekit.batch.machine import available_cores, available_memory_gib, default_workers
+from droguekit.batch.worker_process import TaskTimeoutError, WorkerDiedError
+from droguekit.batch.workers import MAX_ATTEMPTS, Limits, run_alone, run_tasks
 
 # Workers are fresh processes: what they run must be importable there, which a test module is not.
 TASKS = """
-import os, signal, threading
+import ctypes, os, signal, threading
 from pathlib import Path
 
 def square(index):
@@ -42,6 +43,27 @@ def refuse(victim, index):
 
 def threads():
     return [os.environ[name] for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")]
+
+def process_of(index):
+    return os.getpid()
+
+def grow(index):
+    held.append(bytearray(2**20))
+    held[-1][::4096] = bytes([1]) * len(held[-1][::4096])
+    return os.getpid()
+
+held = []
+
+def hang(index):
+    # A C function that holds Python's lock: no signal handler and no thread of this process ever runs again.
+    ctypes.PyDLL(None).pause()
+
+def raise_odd_error(index):
+    raise OddError(1, 2)
+
+class OddError(Exception):
+    def __init__(self, first, second):
+        super().__init__(f"{first} and {second}")
 
 def tell_and_wait(pipe, index):
     with open(pipe, "w") as stream:
@@ -71,7 +93,7 @@ def test_a_killed_worker_costs_one_attempt_of_one_task(tasks: ModuleType, tmp_pa
     attempts = [*run_tasks(partial(tasks.die_once, str(tmp_path), 2), range(5), 2)]
     failed = [attempt for attempt in attempts if attempt.error is not None]
     assert [(attempt.index, attempt.number, attempt.final) for attempt in failed] == [(2, 1, False)]
-    assert isinstance(failed[0].error, ProcessExpired)
+    assert isinstance(failed[0].error, WorkerDiedError)
     assert {attempt.index: attempt.value for attempt in attempts if attempt.final} == {i: i * i for i in range(5)}
     assert next(attempt.number for attempt in attempts if attempt.index == 2 and attempt.final) == 2
 
@@ -129,6 +151,64 @@ def test_workers_end_with_the_process_that_started_them(tasks: ModuleType, tmp_p
     ended, _, _ = select.select([worker], [], [], 60)  # a process handle is readable once the process has ended
     os.close(worker)
     assert ended
+
+
+def test_a_task_that_hangs_is_stopped_and_given_up(tasks: ModuleType) -> None:
+    attempts = [*run_tasks(tasks.hang, [4], 1, Limits(timeout_s=0.5))]
+    assert [(attempt.number, attempt.final) for attempt in attempts] == [(1, False), (2, False), (3, True)]
+    assert all(isinstance(attempt.error, TaskTimeoutError) for attempt in attempts)
+
+
+def test_a_process_is_replaced_after_its_number_of_tasks(tasks: ModuleType) -> None:
+    processes = [attempt.value for attempt in run_tasks(tasks.process_of, range(5), 1, Limits(tasks_per_process=2))]
+    assert len(set(processes)) == 3
+    assert processes[0] == processes[1]
+    assert processes[2] == processes[3]
+
+
+def test_a_process_is_replaced_when_it_holds_too_much_memory(tasks: ModuleType) -> None:
+    # No Python process is as small as the first limit, and none here as large as the second.
+    for limit_gib, processes in ((1e-6, 4), (100.0, 1)):
+        made = [attempt.value for attempt in run_tasks(tasks.grow, range(4), 1, Limits(process_gib=limit_gib))]
+        assert len(set(made)) == processes
+
+
+def test_an_error_that_cannot_cross_processes_says_the_same(tasks: ModuleType) -> None:
+    with pytest.raises(ValueError, match="OddError: 1 and 2") as caught:
+        run_alone(partial(tasks.raise_odd_error, 0))
+    assert "raise OddError(1, 2)" in "".join(caught.value.__notes__)
+
+
+def test_workers_that_cannot_start_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "broken_tasks.py").write_text(
+        "import os, sys\nif '--multiprocessing-fork' in sys.orig_argv: os._exit(3)\ndef task(index): return 0\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    import broken_tasks  # type: ignore[import-not-found]
+
+    with pytest.raises(OSError, match=r"end before their first task; the last: .*exit code 3"):
+        list(run_tasks(broken_tasks.task, range(100), 2))
+
+
+@pytest.mark.parametrize("wrong", [{"timeout_s": 0}, {"tasks_per_process": 0}, {"process_gib": -1.0}])
+def test_limits_must_be_positive(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}: must be above 0"):
+        Limits(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_containers_share_counts(tmp_path: Path) -> None:
+    free_gib, cores = available_memory_gib(tmp_path), available_cores(tmp_path)
+    (tmp_path / "cpu.max").write_text("100000 100000\n")
+    (tmp_path / "memory.max").write_text(f"{3 * 2**20}\n")
+    (tmp_path / "memory.current").write_text(f"{2 * 2**20}\n")
+    (tmp_path / "memory.stat").write_text(f"anon 5\ninactive_file {2**20}\n")
+    assert available_cores(tmp_path) == 1
+    assert available_memory_gib(tmp_path) == 2 / 1024
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    (tmp_path / "memory.max").write_text("max\n")
+    assert available_cores(tmp_path) == cores
+    # Other processes take and give memory meanwhile; a limit of MiB would show.
+    assert available_memory_gib(tmp_path) > min(1.0, free_gib / 2)
 
 
 def test_there_is_always_a_worker() -> None:

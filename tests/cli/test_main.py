@@ -12,7 +12,7 @@ import pytest
 
 from droguekit.cli.main import COMMANDS, DONE, INTERRUPTED, WRONG_INPUT, run
 
-HEAVY = ("numpy", "scipy", "cv2", "pydantic", "mitsuba", "trimesh", "matplotlib", "pebble", "OpenEXR")
+HEAVY = ("numpy", "scipy", "cv2", "pydantic", "mitsuba", "trimesh", "matplotlib", "distributed", "OpenEXR")
 
 
 def _run(*arguments: str) -> subprocess.CompletedProcess[str]:

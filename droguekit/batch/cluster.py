@@ -1,0 +1,211 @@
+"""Frames made by the workers of a Dask scheduler, which spreads them, restarts what dies and survives lost nodes."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections import deque
+from collections.abc import Generator, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any
+
+from datasets_manifest.layout import EVENTS_FILE
+from datasets_manifest.provenance import cpu_features, software_versions
+from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
+from droguekit.batch.stop import StopRequest
+from droguekit.batch.workers import Attempt, run_alone
+from render.engine import load_engine
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+# Nodes that are taken away are no fault of the frames on them.
+ALLOWED_FAILURES = 20
+# Enough that no worker waits for the client, and few enough that the scheduler stays small whatever the recipe's size.
+_FRAMES_PER_WORKER = 2
+_CONNECT_S = 30
+
+
+@dataclass(frozen=True)
+class Build:
+    """What pixels and labels depend on besides the recipe."""
+
+    software: tuple[tuple[str, str], ...]
+    cpu_features: frozenset[str]
+
+
+@cache
+def build_here() -> Build:
+    """The build of this process."""
+    return Build(tuple(sorted(software_versions().items())), frozenset(cpu_features()))
+
+
+@dataclass(frozen=True)
+class ClusterTask:
+    """A frame on a Dask worker, which must be of the same build as the client and see the same storage.
+
+    Attributes:
+        task: makes the frame.
+        build: of the client.
+        timeout_s: after which the worker's process ends; Dask starts another and gives it the frame again. [s]
+    """
+
+    task: FrameTask
+    build: Build
+    timeout_s: float
+
+    def __call__(self, frame_index: int) -> FrameReport:
+        """Make and write frame `frame_index`.
+
+        Raises:
+            OtherBuildError: other packages or another processor than the client's.
+            OSError: the dataset's folder is not there.
+        """
+        from distributed import get_worker
+
+        worker = get_worker()
+        where = f"Dask worker {worker.address}"
+        _same_build(self.build, build_here(), where)
+        if worker.state.nthreads != 1:
+            raise OtherBuildError(
+                f"{where}: must have one thread, has {worker.state.nthreads}; start with --nthreads 1"
+            )
+        if not (self.task.dataset / EVENTS_FILE).exists():
+            raise FileNotFoundError(f"{where}: does not see {self.task.dataset}; give a folder on shared storage")
+        # The kernel's default for this signal ends the process, whatever hangs in it, by a clock that nobody sets.
+        signal.setitimer(signal.ITIMER_REAL, self.timeout_s)
+        try:
+            return self.task(frame_index)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def run_on_cluster(
+    task: FrameTask, indices: Sequence[int], address: str, timeout_s: float, stop: StopRequest
+) -> Generator[Attempt[FrameReport], None, None]:
+    """Let the workers of a scheduler make frames, and report each as it ends.
+
+    Workers may come and go meanwhile. A few frames for each worker are with the scheduler at any time.
+
+    Args:
+        task: makes a frame; its folder must be on storage that all workers share.
+        indices: of the frames, without repetition.
+        address: of the scheduler.
+        timeout_s: for one frame. [s]
+        stop: once it is requested, no more frames begin, and the iterator ends with those that are running.
+
+    Raises:
+        ValueError: `distributed` is missing.
+        OSError: no scheduler answers there, or it has ended.
+    """
+    version = task.engine_version or run_alone(partial(_engine_version, task.recipe.render.engine))
+    shared = replace(task, dataset=Path(task.dataset).resolve(), engine_version=version)
+    client = _connect(address)
+    try:
+        client.run_on_scheduler(_allow_failures, count=ALLOWED_FAILURES)
+        yield from _Window(client, ClusterTask(shared, build_here(), timeout_s), deque(indices)).attempts(stop)
+    finally:
+        client.close()
+
+
+class _Window:
+    """The frames that wait, and the few that are with the scheduler."""
+
+    def __init__(self, client: Client, task: ClusterTask, waiting: deque[int]) -> None:
+        self._client, self._task, self._waiting = client, task, waiting
+        self._running: dict[int, Future] = {}
+        # Futures end in a thread of Dask's, and a request to stop comes in a signal handler: both only put.
+        self._ended: SimpleQueue[int | None] = SimpleQueue()
+
+    def attempts(self, stop: StopRequest) -> Generator[Attempt[FrameReport], None, None]:
+        """Report each frame as it ends; frames that the caller does not wait for any more are cancelled."""
+        stop.wake = lambda: self._ended.put(None)
+        try:
+            while self._fill(stop.is_requested):
+                index = self._ended.get()
+                if index is None:
+                    stop.acknowledge(len(self._running))
+                    continue
+                future = self._running.pop(index)
+                yield _attempt(index, future)
+                future.release()
+        finally:
+            self._client.cancel([*self._running.values()])
+
+    def _fill(self, stopping: bool) -> bool:
+        """Hand out frames up to the window's size.
+
+        Returns:
+            Whether there is anything to wait for.
+        """
+        size = _FRAMES_PER_WORKER * max(1, sum(self._client.nthreads().values()))
+        while self._waiting and not stopping and len(self._running) < size:
+            index = self._waiting.popleft()
+            future = self._client.submit(self._task, index, pure=False)
+            self._running[index] = future
+            future.add_done_callback(partial(self._put, index))
+        return bool(self._running)
+
+    def _put(self, index: int, _: Any) -> None:
+        self._ended.put(index)
+
+
+def _attempt(index: int, future: Future) -> Attempt[FrameReport]:
+    """How a frame ended.
+
+    Raises:
+        OSError: the scheduler has ended.
+    """
+    from distributed import KilledWorker
+
+    try:
+        return Attempt(index, 1, future.result(), None, final=True)
+    except CancelledError as error:
+        raise OSError("the Dask scheduler has ended; start it and the same command again to go on") from error
+    except KilledWorker:
+        lost = RuntimeError(f"more than {ALLOWED_FAILURES} Dask workers died or ran out of time with it")
+        return Attempt(index, ALLOWED_FAILURES + 1, None, lost, final=True)
+    except Exception as error:
+        return Attempt(index, 1, None, error, final=True)
+
+
+def _connect(address: str) -> Client:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ValueError("--scheduler: Dask is missing: pip install 'droguekit[cluster]'") from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is reported by frame
+    try:
+        return Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f"--scheduler: no Dask scheduler answers at {address}: {error}") from error
+
+
+def _engine_version(name: str) -> str:
+    return load_engine(name).version
+
+
+def _allow_failures(count: int, dask_scheduler: Any) -> None:
+    dask_scheduler.allowed_failures = count
+
+
+def _same_build(wanted: Build, here: Build, where: str) -> None:
+    """See that frames made here are those that the client would make.
+
+    Raises:
+        OtherBuildError: they are not; names what differs.
+    """
+    for name in sorted({name for name, _ in (*wanted.software, *here.software)}):
+        there, mine = dict(wanted.software).get(name, "missing"), dict(here.software).get(name, "missing")
+        if there != mine:
+            raise OtherBuildError(f"{where}: has {name} {mine}, the client {there}; give both the same environment")
+    odd = sorted(wanted.cpu_features ^ here.cpu_features)
+    if odd:
+        raise OtherBuildError(
+            f"{where}: its processor differs from the client's in {', '.join(odd)}, and so would last digits; run the "
+            "client on a node of the same kind"
+        )

@@ -1,0 +1,61 @@
+"""What this machine, or the share of it that a container or a job was given, can carry."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+# A worker with the engine loaded and a 1280 x 960 pair in work stays below this.
+GIB_PER_WORKER = 1.5
+_GROUP = Path("/sys/fs/cgroup")
+
+
+def available_cores(group: Path = _GROUP) -> int:
+    """Cores that this process may use, by its affinity and by its container's quota.
+
+    Args:
+        group: folder of the control group.
+    """
+    cores = len(os.sched_getaffinity(0))
+    try:
+        quota, period = (group / "cpu.max").read_text(encoding="ascii").split()
+        return cores if quota == "max" else max(1, min(cores, int(quota) // int(period)))
+    except (OSError, ValueError):
+        return cores  # no container limit is in force
+
+
+def available_memory_gib(group: Path = _GROUP) -> float:
+    """Memory that is free for new processes, by the kernel's and the container's account. [GiB]
+
+    Args:
+        group: folder of the control group.
+    """
+    free = [_number_after("MemAvailable:", Path("/proc/meminfo")) * 1024]
+    try:
+        limit = (group / "memory.max").read_text(encoding="ascii").strip()
+        if limit != "max":
+            used = int((group / "memory.current").read_text(encoding="ascii"))
+            # Files in the cache count as used, and go when memory is asked for.
+            free.append(int(limit) - used + _number_after("inactive_file", group / "memory.stat"))
+    except (OSError, ValueError):
+        pass  # no container limit is in force
+    return max(0.0, min(free) / 2**30)
+
+
+def default_workers() -> int:
+    """As many workers as there are cores, and as the memory holds."""
+    return max(1, min(available_cores(), int(available_memory_gib() / GIB_PER_WORKER)))
+
+
+def resident_gib() -> float:
+    """Memory that this process holds now. [GiB]"""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**30
+
+
+def _number_after(name: str, path: Path) -> float:
+    for line in path.read_text(encoding="ascii").splitlines():
+        words = line.split()
+        if words[0] == name:
+            return float(words[1])
+    raise ValueError(f"{path}: names no {name}")

@@ -1,0 +1,64 @@
+"""Ctrl-C once to finish what is in hand, twice to stop at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Any, Self
+
+# A cluster asks a job to end with SIGTERM.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopRequest:
+    """While it is entered, the first Ctrl-C or SIGTERM is a request, and the second raises `KeyboardInterrupt`.
+
+    It can be waited for like a connection: it becomes readable with the request.
+
+    Attributes:
+        is_requested: whether the first has come.
+        wake: called then, in the signal handler, for those who wait in another way.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        """With the function that tells the user that the request was heard."""
+        self.is_requested = False
+        self.wake: Callable[[], object] | None = None
+        self._say = say
+        self._before: dict[signal.Signals, Any] = {}
+        self._reader = self._writer = -1
+
+    def __enter__(self) -> Self:
+        """Take over the signals; outside the main thread Python gives them to nobody, and nothing changes."""
+        self._reader, self._writer = os.pipe()
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._hear) for number in _SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Give the signals back."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        os.close(self._reader)
+        os.close(self._writer)
+
+    def fileno(self) -> int:
+        """The descriptor that becomes readable."""
+        return self._reader
+
+    def acknowledge(self, in_hand: int) -> None:
+        """Tell the user what happens now."""
+        self._say(
+            f"stopping: frames in hand ({in_hand}) are finished first; once more stops at once and loses only those"
+        )
+
+    def _hear(self, number: int, frame: FrameType | None) -> None:
+        if self.is_requested:
+            raise KeyboardInterrupt
+        self.is_requested = True
+        os.write(self._writer, b"!")
+        if self.wake is not None:
+            self.wake()

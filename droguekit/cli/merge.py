@@ -1,0 +1,34 @@
+"""`droguekit merge`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from droguekit.batch.progress import progress_report
+from droguekit.cli.arguments import human_size
+from droguekit.cli.main import FAULT
+
+EXAMPLES = ("droguekit merge data/demo data/demo-0 data/demo-1",)
+
+
+def merge(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The dataset's folder; made if missing.")],
+    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="Folders that `render --shard` has made.")],
+) -> None:
+    """Join shards of one recipe to the dataset that one run would have made.
+
+    Refuses shards of different recipes, versions or processors, and shards that lack frames or hold damaged ones.
+    """
+    from droguekit.batch.merge import merge_shards
+
+    summary = merge_shards(out, shards, progress_report())
+    size = human_size(summary.totals.size_bytes)
+    typer.echo(f"{out}: joined {len(summary.totals.made)} pairs ({size}), kept {summary.kept}")
+    typer.echo(f"{summary.pairs} of {summary.planned} pairs are there; dataset sha256 {summary.dataset_sha256}")
+    for drop in summary.drops:
+        typer.echo(f"frame {drop.frame_index} is missing: {drop.reason}", err=True)
+    if summary.drops:
+        raise typer.Exit(FAULT)

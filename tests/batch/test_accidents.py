@@ -1,0 +1,234 @@
+"""Engines that abort, hang and refuse: each costs its own frame, and everything else is as without them."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+from datasets_manifest import layout
+from datasets_manifest.manifest import read_manifest
+from datasets_manifest.writer import leftovers
+from droguekit.batch.local import RunSummary, Spread
+from droguekit.cli.main import INTERRUPTED
+
+Make = Callable[..., RunSummary]
+Hashes = Callable[[Path], dict[str, str]]
+Troubled = Callable[..., Path]
+
+
+def test_an_engine_that_aborts_once_is_forgiven(
+    troubled: Troubled, quick_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    calm = make(tmp_path / "calm", text=quick_recipe)
+    assert (calm.drops, calm.totals.retries) == ((), 0)
+    troubled(abort_once=[2, 5])
+    stormy = make(tmp_path / "stormy", workers=2, text=quick_recipe)
+    assert (stormy.drops, stormy.totals.retries, sorted(stormy.totals.made)) == ((), 2, list(range(8)))
+    assert hashes(tmp_path / "stormy") == hashes(tmp_path / "calm")
+
+
+def test_frames_that_abort_always_are_reported_and_made_later(
+    troubled: Troubled, quick_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    calm = make(tmp_path / "calm", text=quick_recipe)
+    troubled(abort=[3])
+    told = io.StringIO()
+    out = tmp_path / "stormy"
+    stormy = make(out, workers=2, text=quick_recipe, told=told)
+    reason = "its worker process died (SIGABRT), attempt 3 of 3"
+    assert [(drop.frame_index, drop.reason) for drop in stormy.drops] == [(3, reason)]
+    assert read_manifest(out).drops == stormy.drops
+    assert (stormy.pairs, stormy.totals.retries) == (7, 2)
+    assert "frame 3: its worker process died (SIGABRT), attempt 1 of 3; it is tried again" in told.getvalue()
+    events = [json.loads(line)["event"] for line in (out / layout.EVENTS_FILE).read_text().splitlines()]
+    assert (events.count("frame"), events.count("retry"), events.count("drop")) == (7, 2, 1)
+    # Accidents of an earlier run do not count in the next one.
+    troubled()
+    assert make(out, text=quick_recipe).dataset_sha256 == calm.dataset_sha256
+    assert hashes(out) == hashes(tmp_path / "calm")
+
+
+@pytest.mark.slow  # for as long as the time that the frame is given
+def test_a_frame_that_hangs_is_stopped_and_tried_again(
+    troubled: Troubled, quick_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    make(tmp_path / "calm", [1], text=quick_recipe)
+    troubled(hang_once=[1])
+    told = io.StringIO()
+    # The frame takes about 50 ms; on a crowded machine its second attempt too may run out of time, which is no fault.
+    summary = make(tmp_path / "stormy", [1], Spread(1, timeout_s=20.0), quick_recipe, told)
+    assert (summary.drops, summary.totals.made) == ((), [1])
+    assert summary.totals.retries >= 1
+    assert "frame 1: it was still at work after 20 s and was stopped, attempt 1 of 3; it is tried" in told.getvalue()
+    assert hashes(tmp_path / "stormy") == hashes(tmp_path / "calm")
+
+
+def test_a_frame_that_is_refused_is_dropped_at_once_with_its_reason(
+    troubled: Troubled, quick_recipe: str, make: Make, tmp_path: Path
+) -> None:
+    troubled(refuse=[6])
+    summary = make(tmp_path / "out", text=quick_recipe)
+    assert [(drop.frame_index, drop.reason) for drop in summary.drops] == [(6, "frame 6 is beyond me")]
+    assert (summary.pairs, summary.totals.retries) == (7, 0)
+
+
+def test_an_error_of_all_frames_ends_the_run(troubled: Troubled, quick_recipe: str, make: Make, tmp_path: Path) -> None:
+    troubled(refuse=[*range(8)])
+    with pytest.raises(RuntimeError, match="beyond me"):
+        make(tmp_path / "out", text=quick_recipe)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_ends_the_run_and_the_rest_goes_on_later(
+    troubled: Troubled, quick_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    make(tmp_path / "calm", text=quick_recipe)
+    troubled(no_space=[4])
+    with pytest.raises(OSError, match="frame 4: cannot be made: /scratch: No space left on device"):
+        make(tmp_path / "out", text=quick_recipe)
+    assert layout.frame_indices(tmp_path / "out") == [0, 1, 2, 3]
+    troubled()
+    assert make(tmp_path / "out", text=quick_recipe).kept == 4
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "calm")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[str], object]]:
+    """A file system of its own in `tmp_path/disk`; the function that it is gives it other options."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", disk], capture_output=True).returncode:
+        pytest.skip("mounting a file system of its own takes rights that this process does not have")
+    yield lambda options: subprocess.run(["mount", "-o", f"remount,{options}", disk], check=True)
+    subprocess.run(["umount", "--lazy", disk], check=True)
+
+
+def test_a_disk_that_is_full_and_one_that_is_read_only(
+    small_disk: Callable[[str], object], analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    make(tmp_path / "calm", text=analytic_recipe)
+    out = tmp_path / "disk" / "out"
+    with pytest.raises(OSError, match="No space left on device"):
+        make(out, text=analytic_recipe)
+    there = layout.frame_indices(out)
+    assert 0 < len(there) < 8
+    assert leftovers(out) == []
+    small_disk("ro,size=50m")
+    with pytest.raises(OSError, match="Read-only file system"):
+        make(out, text=analytic_recipe)
+    small_disk("rw,size=50m")
+    assert make(out, text=analytic_recipe).kept == len(there)
+    assert hashes(out) == hashes(tmp_path / "calm")
+
+
+@pytest.fixture
+def waiting_run(
+    troubled: Troubled, quick_recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[], subprocess.Popen[str]]:
+    """Starts `render` with one worker in a process of its own, and returns when it is within frame 2."""
+    troubled(wait=[2])
+    for name in ("begun", "go-on"):
+        os.mkfifo(tmp_path / name)
+    monkeypatch.setenv("TROUBLE_BEGUN", str(tmp_path / "begun"))
+    monkeypatch.setenv("TROUBLE_GO_ON", str(tmp_path / "go-on"))
+    (tmp_path / "quick.toml").write_text(quick_recipe)
+
+    def start() -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "droguekit.cli.main", "render", str(tmp_path / "quick.toml")]
+        options = ["--out", str(tmp_path / "out"), "--workers", "1"]
+        process = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, text=True)
+        assert (tmp_path / "begun").read_text() == "2\n"
+        return process
+
+    return start
+
+
+def await_line(stream: IO[str], beginning: str) -> None:
+    """Read until a line begins so; on a slow machine lines of progress come before it."""
+    assert any(line.startswith(beginning) for line in stream)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
+    waiting_run: Callable[[], subprocess.Popen[str]],
+    number: signal.Signals,
+    troubled: Troubled,
+    quick_recipe: str,
+    make: Make,
+    tmp_path: Path,
+) -> None:
+    with waiting_run() as process:
+        assert process.stderr is not None
+        process.send_signal(number)
+        await_line(process.stderr, "stopping: frames in hand (1) are finished first")
+        (tmp_path / "go-on").write_text("")
+        told = process.stderr.read().splitlines()
+    assert process.returncode == INTERRUPTED
+    assert told[-2:] == [
+        "stopped after 3 of 8 pairs, all of which are whole",
+        "droguekit: interrupted; the same command goes on with what is finished",
+    ]
+    out = tmp_path / "out"
+    assert layout.frame_indices(out) == [0, 1, 2]
+    assert leftovers(out) == []
+    troubled()
+    assert make(out, text=quick_recipe).kept == 3
+
+
+def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
+    waiting_run: Callable[[], subprocess.Popen[str]], troubled: Troubled, quick_recipe: str, make: Make, tmp_path: Path
+) -> None:
+    with waiting_run() as process:
+        assert process.stderr is not None
+        process.send_signal(signal.SIGINT)
+        await_line(process.stderr, "stopping: ")
+        process.send_signal(signal.SIGINT)
+        told = process.stderr.read()
+    assert process.returncode == INTERRUPTED
+    assert "Traceback" not in told
+    out = tmp_path / "out"
+    assert layout.frame_indices(out) == [0, 1]
+    troubled()
+    assert make(out, text=quick_recipe).kept == 2
+
+
+def test_a_jump_of_the_clock_changes_nothing(
+    troubled: Troubled, quick_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    make(tmp_path / "calm", text=quick_recipe)
+    library = tmp_path / "jumping_clock.so"
+    source = tmp_path / "jumping_clock.c"
+    # The time of day jumps a day back or forth with every look at it; the monotonic clock stays.
+    source.write_text(
+        "#define _GNU_SOURCE\n#include <time.h>\n#include <sys/time.h>\n#include <unistd.h>\n#include <sys/syscall.h>\n"
+        "static long n;\n"
+        "int clock_gettime(clockid_t id, struct timespec *t) {\n"
+        "  int r = syscall(SYS_clock_gettime, id, t);\n"
+        "  if (id == CLOCK_REALTIME) t->tv_sec += (n++ % 2 ? 86400 : -86400);\n"
+        "  return r;\n}\n"
+        "time_t time(time_t *out) { struct timespec t; clock_gettime(CLOCK_REALTIME, &t);\n"
+        "  if (out) *out = t.tv_sec; return t.tv_sec; }\n"
+    )
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None:
+        pytest.skip("needs a C compiler to set another clock under the process")
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source], check=True)
+    (tmp_path / "quick.toml").write_text(quick_recipe)
+    command = [sys.executable, "-m", "droguekit.cli.main", "render", str(tmp_path / "quick.toml")]
+    subprocess.run(
+        [*command, "--out", str(tmp_path / "out"), "--workers", "2", "--timeout", "600"],
+        env={**os.environ, "LD_PRELOAD": str(library)},
+        check=True,
+        capture_output=True,
+    )
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "calm")

@@ -1,0 +1,190 @@
+"""A real Dask scheduler with workers as processes on loopback: lost and late workers change nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from datasets_manifest import layout
+from droguekit.batch.cluster import Build, ClusterTask, build_here
+from droguekit.batch.frame_task import FrameTask, OtherBuildError
+from droguekit.batch.local import RunSummary, Spread
+from droguekit.cli.main import WRONG_INPUT, run
+
+distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
+
+Make = Callable[..., RunSummary]
+Hashes = Callable[[Path], dict[str, str]]
+Start = Callable[..., subprocess.Popen[bytes]]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Starts Dask processes, `start("scheduler", ...)`, and ends them with the test."""
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def launch(*arguments: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
+        with (tmp_path / "dask.log").open("ab") as log:
+            processes.append(subprocess.Popen(command, stdout=log, stderr=log, cwd=tmp_path, start_new_session=True))
+        return processes[-1]
+
+    yield launch
+    for process in processes:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+@pytest.fixture
+def scheduler(start: Start, tmp_path: Path) -> str:
+    """Address of a scheduler on loopback."""
+    file = tmp_path / "scheduler.json"
+    process = start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
+    while not file.exists() or not file.read_text().endswith("}"):
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.05)
+    return str(json.loads(file.read_text())["address"])
+
+
+def worker(start: Start, address: str, *options: str) -> subprocess.Popen[bytes]:
+    return start("worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny", *options)
+
+
+class OnFrame:
+    """Hears how a run goes, and does something when a number of frames is finished."""
+
+    def __init__(self, number: int, action: Callable[[], object]) -> None:
+        self._left, self._action = number, action
+        self.told: list[str] = []
+
+    def begin(self, what: str, total: int) -> None:
+        """Nothing to do."""
+
+    def advance(self) -> None:
+        self._left -= 1
+        if self._left == 0:
+            self._action()
+
+    def say(self, text: str) -> None:
+        self.told.append(text)
+
+    def end(self) -> None:
+        """Nothing to do."""
+
+
+def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
+    start: Start, scheduler: str, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    from datasets_manifest.recipe import parse_recipe
+    from droguekit.batch.local import render_dataset
+
+    text = analytic_recipe.replace("count = 8", "count = 24")
+    make(tmp_path / "calm", text=text)
+    workers = [worker(start, scheduler) for _ in range(3)]
+
+    def change_the_crew() -> None:
+        workers[0].kill()
+        worker(start, scheduler)
+
+    report = OnFrame(3, change_the_crew)
+    out = tmp_path / "out"
+    summary = render_dataset(parse_recipe(text), text, out, range(24), Spread(0, scheduler=scheduler), report)
+    assert summary.drops == ()
+    assert hashes(out) == hashes(tmp_path / "calm")
+    lines = [json.loads(line) for line in (out / layout.EVENTS_FILE).read_text().splitlines()]
+    assert [line["frame"] for line in lines if line["event"] == "frame"].count(0) == 1
+
+
+def test_a_request_to_stop_finishes_the_frames_in_hand(
+    start: Start, scheduler: str, analytic_recipe: str, tmp_path: Path
+) -> None:
+    from datasets_manifest.recipe import parse_recipe
+    from droguekit.batch.local import render_dataset
+
+    text = analytic_recipe.replace("count = 8", "count = 24")
+    worker(start, scheduler)
+    report = OnFrame(2, lambda: os.kill(os.getpid(), signal.SIGINT))
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        render_dataset(parse_recipe(text), text, out, range(24), Spread(0, scheduler=scheduler), report)
+    made = len(layout.frame_indices(out))
+    # Two were finished, and at most two more were with the one worker.
+    assert 2 <= made <= 4
+    assert report.told[-1] == f"stopped after {made} of 24 pairs, all of which are whole"
+
+
+def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
+    start: Start,
+    analytic_recipe: str,
+    make: Make,
+    hashes: Hashes,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    jobqueue = pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is missing: pip install 'droguekit[cluster]'")
+    make(tmp_path / "calm", text=analytic_recipe)
+    # What SLURM does with a job, on this machine: runs its script, tells its number, and ends it when told.
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name, script in {
+        "sbatch": 'cp "$1" "$JOBS/script-$$" && setsid sh "$JOBS/script-$$" >"$JOBS/log-$$" 2>&1 &\n'
+        'echo $! >>"$JOBS/started"\necho "Submitted batch job $!"\n',
+        "scancel": 'kill -9 -"$1"\n',
+    }.items():
+        (programs / name).write_text("#!/bin/sh\n" + script)
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    monkeypatch.setenv("JOBS", str(tmp_path))
+    with jobqueue.SLURMCluster(
+        cores=1,
+        processes=1,
+        memory="2GB",
+        interface="lo",
+        nanny=False,
+        log_directory=str(tmp_path),
+        worker_extra_args=["--no-dashboard"],
+        scheduler_options={"dashboard": False},
+    ) as cluster:
+        cluster.scale(jobs=2)
+        summary = make(tmp_path / "out", workers=Spread(0, scheduler=cluster.scheduler_address), text=analytic_recipe)
+    assert len((tmp_path / "started").read_text().split()) >= 1
+    assert summary.drops == ()
+    assert hashes(tmp_path / "out") == hashes(tmp_path / "calm")
+
+
+def test_workers_of_another_build_are_refused(
+    start: Start, scheduler: str, analytic_recipe: str, tmp_path: Path
+) -> None:
+    from datasets_manifest.recipe import parse_recipe
+
+    worker(start, scheduler)
+    here = build_here()
+    builds = {
+        "has numpy .*, the client 0.9": Build((*here.software, ("numpy", "0.9")), here.cpu_features),
+        "processor differs from the client's in AVX4096": Build(here.software, here.cpu_features | {"AVX4096"}),
+    }
+    (tmp_path / layout.EVENTS_FILE).touch()
+    with distributed.Client(scheduler, set_as_default=False) as client:
+        for message, build in builds.items():
+            task = FrameTask(parse_recipe(analytic_recipe), tmp_path)
+            with pytest.raises(OtherBuildError, match=message):
+                client.submit(ClusterTask(task, build, 600.0), 0, pure=False).result()
+        lost = ClusterTask(FrameTask(parse_recipe(analytic_recipe), tmp_path / "elsewhere"), here, 600.0)
+        with pytest.raises(FileNotFoundError, match=r"does not see .*elsewhere; give a folder on shared storage"):
+            client.submit(lost, 0, pure=False).result()
+        late = ClusterTask(FrameTask(parse_recipe(analytic_recipe), tmp_path, "analytic 0.1"), here, 600.0)
+        with pytest.raises(OtherBuildError, match=r"made by analytic 0\.1, but here runs"):
+            client.submit(late, 0, pure=False).result()
+
+
+def test_workers_and_scheduler_exclude_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"]
+    assert run(["render", "smoke", "--engine", "analytic", "--out", str(tmp_path / "out"), *options]) == WRONG_INPUT
+    assert "--workers: means processes of this machine" in capsys.readouterr().err

@@ -1,0 +1,121 @@
+"""SIGKILL at random instants, to a worker, to the run or to all of its processes: the dataset is as without them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets_manifest import layout
+from datasets_manifest.manifest import read_manifest
+from datasets_manifest.writer import leftovers
+from droguekit.batch.local import RunSummary
+from labelgen.dataset_validation import validate_dataset
+
+Make = Callable[..., RunSummary]
+Hashes = Callable[[Path], dict[str, str]]
+
+# A look at the folder this often; what is awaited may take as long as the machine needs.
+_LOOK_EVERY_S = 0.02
+
+
+class KilledRun:
+    """A run in processes of its own that is killed now and then, and started again whenever it has ended."""
+
+    def __init__(self, recipe: Path, out: Path, rng: np.random.Generator) -> None:
+        self._command = [sys.executable, "-m", "droguekit.cli.main", "render", str(recipe), "--out", str(out)]
+        self._out, self._rng = out, rng
+        self._process: subprocess.Popen[bytes] | None = None
+        self.kills = 0
+
+    def go_on_for(self, frames: int) -> bool:
+        """Let it run until so many more frames are there, and a random moment longer.
+
+        Returns:
+            Whether it is still at work.
+        """
+        if self._process is None or self._process.poll() is not None:
+            command = [*self._command, "--workers", "2"]
+            self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        goal = len(layout.frame_indices(self._out)) + frames
+        while len(layout.frame_indices(self._out)) < goal and not self._ends_within(_LOOK_EVERY_S):
+            pass
+        return not self._ends_within(float(self._rng.uniform(0, 0.3)))
+
+    def kill(self) -> None:
+        """Kill a random worker, the run, or the run and its workers."""
+        assert self._process is not None
+        run = self._process.pid
+        children = Path(f"/proc/{run}/task/{run}/children").read_text().split()
+        workers = [int(child) for child in children]
+        victims = {"worker": [*self._rng.permutation(workers)][:1], "run": [run], "tree": [run, *workers]}
+        chosen = str(self._rng.choice(list(victims)))
+        for victim in victims[chosen]:
+            with suppress(ProcessLookupError):
+                os.kill(int(victim), signal.SIGKILL)
+        self.kills += bool(victims[chosen])
+        if chosen != "worker":
+            self._process.wait()
+
+    def end(self) -> None:
+        """Kill what is left of it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def _ends_within(self, seconds: float) -> bool:
+        assert self._process is not None
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+
+def torture(recipe_text: str, kills: int, make: Make, hashes: Hashes, folder: Path) -> None:
+    """Kill a run so often on its way through a recipe, and compare with an undisturbed one."""
+    calm, out, recipe = folder / "calm", folder / "out", folder / "recipe.toml"
+    recipe.write_text(recipe_text)
+    planned = make(calm, text=recipe_text).planned
+    rng = np.random.Generator(np.random.Philox(8))
+    run = KilledRun(recipe, out, rng)
+    try:
+        while run.kills < kills:
+            # Together some two thirds of the frames: the last kill still meets a run at work.
+            if run.go_on_for(int(rng.integers(0, max(1, round(4 / 3 * planned / kills)) + 1))):
+                run.kill()
+            elif len(layout.frame_indices(out)) == planned:
+                break
+    finally:
+        run.end()
+    print(
+        f"{run.kills} kills, {len(layout.frame_indices(out))} of {planned} pairs there, {len(leftovers(out))} leftovers"
+    )
+    assert run.kills >= kills // 2  # frames that were in hand of other workers finish meanwhile
+    summary = make(out, text=recipe_text)
+    assert summary.drops == ()
+    assert leftovers(out) == []
+    assert summary.dataset_sha256 == read_manifest(calm).dataset_sha256
+    assert hashes(out) == hashes(calm)
+    assert validate_dataset(out).passed
+
+
+def test_kills_at_random_instants_change_nothing(
+    analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    torture(analytic_recipe.replace("count = 8", "count = 16"), 3, make, hashes, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.torture
+def test_fifty_kills_over_two_hundred_pairs_change_nothing(
+    analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+) -> None:
+    torture(analytic_recipe.replace("count = 8", "count = 200"), 50, make, hashes, tmp_path)

@@ -1,0 +1,148 @@
+"""Shards made apart and joined are the dataset that one run makes; shards that do not fit are refused."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from datasets_manifest import layout
+from datasets_manifest.manifest import made_with, read_manifest, write_manifest
+from droguekit.batch.local import RunSummary
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+from labelgen.dataset_validation import validate_dataset
+
+Make = Callable[..., RunSummary]
+Hashes = Callable[[Path], dict[str, str]]
+
+
+@pytest.fixture(scope="module")
+def recipe_file(tmp_path_factory: pytest.TempPathFactory, analytic_recipe: str) -> Path:
+    path = tmp_path_factory.mktemp("recipe") / "quick.toml"
+    path.write_text(analytic_recipe)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, analytic_recipe: str, make: Make) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "dataset"
+    make(out, text=analytic_recipe)
+    return out
+
+
+@pytest.fixture(scope="module")
+def made_shards(tmp_path_factory: pytest.TempPathFactory, recipe_file: Path) -> tuple[Path, ...]:
+    folder = tmp_path_factory.mktemp("shards")
+    for number in range(3):
+        out = ["--out", str(folder / str(number)), "--shard", f"{number}/3", "--workers", "1"]
+        assert run(["render", str(recipe_file), *out]) == DONE
+    return tuple(folder / str(number) for number in range(3))
+
+
+@pytest.fixture
+def shards(made_shards: tuple[Path, ...], tmp_path: Path) -> tuple[Path, ...]:
+    """Copies that a test may spoil."""
+    for shard in made_shards:
+        shutil.copytree(shard, tmp_path / shard.name)
+    return tuple(tmp_path / shard.name for shard in made_shards)
+
+
+def merge(out: Path, *shards: Path) -> int:
+    return run(["merge", str(out), *map(str, shards)])
+
+
+def test_shards_are_the_dataset_that_one_run_makes(
+    made_shards: tuple[Path, ...], whole: Path, hashes: Hashes, tmp_path: Path
+) -> None:
+    assert [layout.frame_indices(shard) for shard in made_shards] == [[0, 3, 6], [1, 4, 7], [2, 5]]
+    assert merge(tmp_path / "out", *made_shards[::-1]) == DONE
+    assert hashes(tmp_path / "out") == hashes(whole)
+    assert validate_dataset(tmp_path / "out").passed
+
+
+def test_a_merge_goes_on_where_it_stopped(
+    made_shards: tuple[Path, ...], whole: Path, hashes: Hashes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert merge(out, *made_shards) == DONE
+    shutil.rmtree(layout.frame_folder(out, 4))
+    image = layout.frame_folder(out, 5) / "left.png"
+    image.write_bytes(image.read_bytes()[:-1])
+    capsys.readouterr()
+    assert merge(out, *made_shards) == DONE
+    assert "joined 2 pairs" in capsys.readouterr().out
+    assert hashes(out) == hashes(whole)
+
+
+def test_missing_frames_are_named(
+    made_shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert merge(tmp_path / "out", *made_shards[:2]) == WRONG_INPUT
+    assert "2 of 8 frames are in none of them: 2, 5; start the commands of their shards" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_damaged_frame_is_not_joined(
+    shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = layout.frame_folder(shards[1], 1) / "right.png"
+    image.write_bytes(image.read_bytes() + b"\0")
+    assert merge(tmp_path / "out", *shards) == WRONG_INPUT
+    assert "000001/right.png: was changed" in capsys.readouterr().err
+
+
+def test_a_shard_of_another_recipe_is_refused(
+    made_shards: tuple[Path, ...], make: Make, analytic_recipe: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make(tmp_path / "other", [2, 5], text=analytic_recipe.replace("seed = 5", "seed = 6"))
+    assert merge(tmp_path / "out", *made_shards[:2], tmp_path / "other") == WRONG_INPUT
+    assert "other: is of another recipe than" in (told := capsys.readouterr().err)
+    assert "differs in seed" in told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("what", ["numpy", "processor features"])
+def test_a_shard_made_with_something_else_is_refused(
+    what: str, shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    manifest = read_manifest(shards[2])
+    software, features = dict(manifest.software), list(manifest.cpu_features)
+    if what == "numpy":
+        software["numpy"] = "0.9"
+    else:
+        features.append("AVX4096")
+    write_manifest(shards[2], made_with(manifest, software, features))
+    assert merge(tmp_path / "out", *shards) == WRONG_INPUT
+    told = capsys.readouterr().err
+    assert f"was made with {what} {'0.9' if what == 'numpy' else 'AVX4096'}" in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_frames_of_one_index_are_refused(
+    shards: tuple[Path, ...], made_shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = read_manifest(shards[0]).model_dump(mode="json")
+    from datasets_manifest.manifest import Manifest, dataset_sha256
+
+    table["frames"][0]["record_sha256"] = "0" * 64
+    manifest = Manifest.model_construct(**read_manifest(shards[0]).__dict__)
+    hashes = [entry["record_sha256"] for entry in table["frames"]]
+    changed = manifest.model_copy(
+        update={
+            "frames": tuple(type(manifest.frames[0]).model_validate(entry) for entry in table["frames"]),
+            "dataset_sha256": dataset_sha256(manifest.recipe, hashes),
+        }
+    )
+    write_manifest(shards[0], made_with(changed, changed.software, changed.cpu_features))
+    assert merge(tmp_path / "out", *shards, made_shards[0]) == WRONG_INPUT
+    assert "its frame 0 is not the one of" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("shard", "message"), [("3/3", "i from 0 to n - 1"), ("1", "i/n"), ("8/9", "none of the 8")])
+def test_wrong_shards(
+    shard: str, message: str, recipe_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["render", str(recipe_file), "--out", str(tmp_path / "out"), "--shard", shard]) == WRONG_INPUT
+    assert message in capsys.readouterr().err
