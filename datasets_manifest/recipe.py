@@ -5,16 +5,18 @@ from __future__ import annotations
 import tomllib
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from datasets_manifest.environment_map import pin_map
 from datasets_manifest.environment_ranges import EnvironmentRanges
+from datasets_manifest.exposure_law import ExposureLaw
 from datasets_manifest.families import fill_families
 from datasets_manifest.frame import Sensor
 from datasets_manifest.json_types import FrozenModel, Rig
-from datasets_manifest.ranges import Fraction, Range
+from datasets_manifest.pose_ranges import DistanceLaw, Pose
+from datasets_manifest.ranges import Fraction
 from datasets_manifest.rigs import resolve_rig
 from datasets_manifest.target_ranges import DrogueVariant, TargetRanges
 from drogue_models.parameters import DrogueParameters
@@ -30,89 +32,6 @@ class FrameCounts(FrozenModel):
     count: int = Field(ge=1, le=10_000_000)
     scenes: int = Field(default=1, ge=1, le=1_000_000)
     empty_fraction: Fraction = 0.0
-
-
-class DistanceLaw(FrozenModel):
-    """How the distance of the rim centre along the optical axis is drawn.
-
-    Attributes:
-        law: `uniform`, `log-uniform`, `uniform-image-size` (uniform in 1/distance) between `low_m` and `high_m`, or
-            `stations`, which frame by frame go through `stations_m`.
-    """
-
-    law: Literal["uniform", "log-uniform", "uniform-image-size", "stations"]
-    low_m: float | None = Field(default=None, gt=0, le=1000)
-    high_m: float | None = Field(default=None, gt=0, le=1000)
-    stations_m: tuple[Annotated[float, Field(gt=0, le=1000)], ...] | None = Field(default=None, min_length=1)
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        if self.law == "stations":
-            if self.stations_m is None or self.low_m is not None or self.high_m is not None:
-                raise ValueError("stations_m: the law 'stations' takes stations_m, and neither low_m nor high_m")
-        elif self.low_m is None or self.high_m is None or self.stations_m is not None:
-            raise ValueError(f"low_m, high_m: the law '{self.law}' takes both, and no stations_m")
-        elif self.low_m > self.high_m:
-            raise ValueError(f"low_m: {self.low_m:g} is above high_m, {self.high_m:g}")
-        return self
-
-    @property
-    def nearest_m(self) -> float:
-        """Nearest distance that can be drawn. [m]"""
-        return min(self.stations_m) if self.stations_m is not None else float(self.low_m or 0.0)
-
-
-class Pose(FrozenModel):
-    """Attitude of drogue and receiver, and the motion that blurs.
-
-    Attributes:
-        pitch_deg, yaw_deg, roll_deg: of the drogue in the camera.
-        on_axis: the drogue's centre on the rig's axis instead of anywhere in the common field of view.
-        camera_pitch_deg, camera_bank_deg: of the receiver against the horizon.
-        speed_m_s: largest component of the drogue's velocity. [m/s]
-        rate_deg_s: largest component of the angular velocities of drogue and receiver. [deg/s]
-    """
-
-    pitch_deg: Range = Range(low=-10, high=10)
-    yaw_deg: Range = Range(low=-10, high=10)
-    roll_deg: Range = Range(low=-22.5, high=22.5)
-    on_axis: bool = False
-    camera_pitch_deg: Range = Range(low=-4, high=4)
-    camera_bank_deg: Range = Range(low=-5, high=5)
-    speed_m_s: float = Field(default=0.0, ge=0, le=100)
-    rate_deg_s: float = Field(default=0.0, ge=0, le=360)
-
-    @model_validator(mode="after")
-    def _ranges(self) -> Self:
-        self.pitch_deg.within(-60, 60, "pitch_deg")
-        self.yaw_deg.within(-60, 60, "yaw_deg")
-        self.roll_deg.within(-180, 180, "roll_deg")
-        self.camera_pitch_deg.within(-45, 45, "camera_pitch_deg")
-        self.camera_bank_deg.within(-90, 90, "camera_bank_deg")
-        return self
-
-
-class ExposureLaw(FrozenModel):
-    """How the exposure is set: by the meter, first with the time, then, when that is at its limit, with the gain.
-
-    Attributes:
-        time_s: fixed exposure time; without it the meter chooses within `auto_time_s`. [s]
-        auto_gain: what the meter may amplify by; a single number is a fixed gain.
-        auto_level_fraction: where the meter puts the brighter of sky and a white plate facing the camera, as a share of
-            the full well, or at other gains of what fills the converter.
-    """
-
-    time_s: float | None = Field(default=None, gt=0, le=1)
-    auto_time_s: Range = Range(low=20e-6, high=20e-3)
-    auto_gain: Range = Range(low=1, high=1)
-    auto_level_fraction: float = Field(default=0.7, gt=0, le=2)
-    f_number: float = Field(default=2.8, ge=0.5, le=64)
-
-    @model_validator(mode="after")
-    def _ranges(self) -> Self:
-        self.auto_time_s.within(1e-6, 1, "auto_time_s")
-        self.auto_gain.within(0.1, 64, "auto_gain")
-        return self
 
 
 class RenderSettings(FrozenModel):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from datasets_manifest.exposure_law import ExposureLaw
 from datasets_manifest.frame import Environment, Exposure, Sensor
-from datasets_manifest.recipe import ExposureLaw
 from drogue_models.parameters import WHITE_PAINT
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform

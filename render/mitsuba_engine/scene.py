@@ -6,21 +6,19 @@ ever rebuilt. Without a drogue the stage is the left camera's own frame.
 
 from __future__ import annotations
 
-import tempfile
 from collections import OrderedDict
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
+from render.mitsuba_engine.shapes import bystander_name, bystander_shapes, drogue_shapes, front_faces
 from render.mitsuba_engine.sky_irradiance import as_mitsuba_reads
 from render.surfaces import (
     even_reflectance_rgb,
@@ -29,92 +27,14 @@ from render.surfaces import (
     reflectance_map,
     surface_condition,
 )
-from scenes.dirt import DIRT_MAP_PX
 from scenes.surroundings import Surroundings
 
 _KEPT_SCENES = 8
 _BYSTANDER_PARTS = (Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
 
-# Curved parts get interpolated normals; the others have flat faces and sharp edges.
-_SMOOTH_PARTS = (Part.RIM, Part.HOSE)
 # Mitsuba's map has +y up, its first column looks along -z and the next ones turn towards +x; ours starts in the east
 # (+x) and turns towards north (+y), the other way round: the columns are reversed and the axes follow.
 _MAP_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
-
-
-def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any]) -> Any:
-    """A Mitsuba shape from a mesh; `look` holds its material, and its lamp if it is one."""
-    path = folder / f"{part}.ply"
-    mesh.export(path)
-    shape = {"type": "ply", "filename": str(path), "face_normals": part not in _SMOOTH_PARTS, **look}
-    return mi.load_dict(shape)
-
-
-def _even(reflectance_rgb: NDArray[np.float64]) -> dict[str, Any]:
-    return {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance_rgb.tolist()}}}
-
-
-def _blotched() -> dict[str, Any]:
-    """A material whose map every frame replaces."""
-    bitmap = mi.Bitmap(np.zeros((DIRT_MAP_PX, DIRT_MAP_PX, 3), dtype=np.float32))
-    texture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
-    return {"bsdf": {"type": "diffuse", "reflectance": texture}}
-
-
-def _lamp(frame: FrameSpec, part: int) -> dict[str, Any]:
-    assert frame.drogue is not None
-    if part < FIRST_MARKER_ID or frame.drogue.marker_luminance_cd_m2 == 0:
-        return {}
-    radiance = lamp_radiance_rgb(frame, part).tolist()
-    return {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}}
-
-
-def _with_map_places(mesh: trimesh.Trimesh, center_m: tuple[float, float], radius_m: float) -> trimesh.Trimesh:
-    """The mesh with texture coordinates that map the square around a disc to the unit square."""
-    places = (np.asarray(mesh.vertices)[:, :2] - np.asarray(center_m)) / (2 * radius_m) + 0.5
-    mesh.vertex_attributes["s"] = places[:, 0].astype(np.float32)
-    mesh.vertex_attributes["t"] = places[:, 1].astype(np.float32)
-    return mesh
-
-
-def _front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """What of a flat feature can be seen from the front; its side walls are sunk in the part around it."""
-    return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
-
-
-def _drogue_shapes(frame: FrameSpec, meshes: dict[int, trimesh.Trimesh]) -> dict[str, Any]:
-    """Mitsuba shapes of the drogue's parts by name; parts that are dirty have maps."""
-    assert frame.drogue is not None
-    shapes: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        for part, mesh in meshes.items():
-            look = _even(even_reflectance_rgb(frame, part))
-            if not surface_condition(frame, part).is_clean:
-                is_hub = part == Part.HUB
-                assert not is_hub or frame.drogue.hub is not None
-                center_m = (0.0, 0.0) if is_hub else frame.drogue.marker_positions_m[part - FIRST_MARKER_ID]
-                radius_m = frame.drogue.hub.outer_radius_m if is_hub else frame.drogue.marker_radius_m  # type: ignore[union-attr]
-                mesh, look = _with_map_places(mesh, center_m, radius_m), _blotched()
-            shapes[f"part_{part}"] = _shape(mesh, part, Path(folder), look | _lamp(frame, part))
-            shapes[f"part_{part}"].set_id(f"part_{part}")
-    return shapes
-
-
-def _bystander_shapes(frame: FrameSpec) -> dict[str, Any]:
-    """Mitsuba shapes of the bystanders, in their own frames for the time being."""
-    shapes: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        for index, bystander in enumerate(frame.bystanders):
-            part = int(Part[bystander.kind.upper()])
-            name = _bystander_name(index, part)
-            look = _even(np.array(bystander.reflectance_rgb))
-            shapes[name] = _shape(bystander_mesh(bystander.shape), part, Path(folder), look)
-            shapes[name].set_id(name)
-    return shapes
-
-
-def _bystander_name(index: int, part: int) -> str:
-    return f"part_{part}_{index}"
 
 
 class DrogueScene:
@@ -129,20 +49,20 @@ class DrogueScene:
     def __init__(self, frame: FrameSpec) -> None:
         self._has_surround = frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None
         self._tanker_vertices = np.asarray(tanker_mesh().vertices)
-        shapes, features = _bystander_shapes(frame), {}
+        shapes, features = bystander_shapes(frame), {}
         if frame.drogue is not None:
             gone = missing_parts(frame)
             meshes = {part: mesh for part, mesh in drogue_meshes(frame.drogue).items() if part not in gone}
             fronts = {
-                part: _front_faces(mesh)
+                part: front_faces(mesh)
                 for part, mesh in meshes.items()
                 if part == int(Part.HUB) or part >= FIRST_MARKER_ID
             }
             if self._has_surround:
                 meshes[int(Part.HOSE)] = hose_mesh(self._hose_nodes(frame), frame.drogue.hose_radius_m)
                 meshes[int(Part.TANKER)] = tanker_mesh()
-            shapes |= _drogue_shapes(frame, meshes)
-            features = _drogue_shapes(frame, fronts)
+            shapes |= drogue_shapes(frame, meshes)
+            features = drogue_shapes(frame, fronts)
         # Merging meshes would lose the parts' identity.
         self.scene = mi.load_dict({"type": "scene", **shapes, **_lights()}, optimize=False)
         self.features = mi.load_dict({"type": "scene", **features}, optimize=False)
@@ -171,7 +91,7 @@ class DrogueScene:
 
     def _set_bystanders(self, frame: FrameSpec, stage_from_left: RigidTransform) -> None:
         for index, bystander in enumerate(frame.bystanders):
-            name = _bystander_name(index, int(Part[bystander.kind.upper()]))
+            name = bystander_name(index, int(Part[bystander.kind.upper()]))
             stage_from_object = stage_from_left @ bystander.left_from_object
             vertices = np.asarray(bystander_mesh(bystander.shape).vertices)
             self._set_vertices(name, stage_from_object.apply(vertices), None)
