@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.images import Pixels, StereoImages
 from drogue_models.parameters import DrogueParameters
+from geometry.se3 import Array
 from geometry.stereo import Eye
 
 # A paint counts as coloured when its strongest component leads the others by this share of itself; the shipped red
@@ -18,6 +19,10 @@ _SATURATED_FRACTION = 0.5
 # haze of an orange horizon has a third more red than green, red paint twenty times as much.
 PLAIN, AGAINST_WARM_SKY = 1.0, 1.4
 OTHERS_WEIGHTS = (PLAIN, AGAINST_WARM_SKY)
+# What lies beyond the rim is looked at from where the lens no longer mixes it with the rim, out to this many rims.
+_CLEAR_OF_RIM_PX, _BEYOND_RIM = 2.5, 1.4
+# Of the other colours: from blue skies to warm ones.
+_WEIGHTS = (0.0, 1.6)
 
 # Where the first site of each colour lies in an RGGB cell; the mean of both greens lies between them. [px]
 _SITE_OFFSET_PX = (0.0, 0.5, 1.0)
@@ -78,6 +83,32 @@ def signed_lead(images: StereoImages, eye: Eye, color: int, others_weight: float
     others = cv2.max(first, second)
     offset = black * (others_weight - 1)
     return np.asarray(cv2.addWeighted(planes[color], 1.0, others, -others_weight, offset, dtype=cv2.CV_32F))
+
+
+def balancing_weight(images: StereoImages, color: int, middles_px: Array, rim_px: float, usual: float = PLAIN) -> float:
+    """Weight of the other colours at which what lies beyond the rim leads as little as the dark face.
+
+    The step of light at the rim then goes from the channel, and with it what the lens spreads of the sky over a small
+    marker's edge: a blue sky would take from it, a warm one would add to it.
+
+    Args:
+        images: the pair, in colour.
+        color: of the markers.
+        middles_px: (2, 2) the drogue's middle in the left and the right image.
+        rim_px: radius of its rim.
+        usual: what to return where the images show nothing beyond the rim.
+    """
+    beyond = []
+    for image, (u, v) in zip((images.left, images.right), middles_px, strict=True):
+        reach_px = _BEYOND_RIM * rim_px + _CLEAR_OF_RIM_PX
+        left, top = (int(max(np.floor(place - reach_px), 0)) for place in (u, v))
+        part = image[top : int(np.ceil(v + reach_px)) + 1, left : int(np.ceil(u + reach_px)) + 1]
+        rows, columns = np.ogrid[top : top + part.shape[0], left : left + part.shape[1]]
+        away_px = np.hypot(columns - u, rows - v)
+        beyond.append(_linear(part, images)[(away_px > rim_px + _CLEAR_OF_RIM_PX) & (away_px < reach_px)])
+    light = np.median(np.concatenate(beyond), axis=0) if sum(map(len, beyond)) else np.zeros(3)
+    own, others = float(light[color]), float(np.delete(light, color).max())
+    return float(np.clip(own / others, *_WEIGHTS)) if others > 0 else usual
 
 
 def _lead(own: Pixels, others: Pixels, others_weight: float) -> Pixels:

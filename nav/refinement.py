@@ -19,7 +19,7 @@ from nav.centroids.ellipses import Ellipses, circles, outline_shapes
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.patches import OUTER_DIFFERENCE_PX
 from nav.centroids.surroundings import Surroundings
-from nav.channels import PLAIN
+from nav.channels import PLAIN, balancing_weight
 from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation
 from nav.pose.joint import joint
 from nav.real_eyes import ideal_places, real_places
@@ -32,6 +32,8 @@ _LEAST_STEP_PX = 0.5
 _LEAST_MARKERS = 4
 # What begins this near a disc may be seen in its window, which lies about the rough place, and through the blur. [px]
 _SEEN_PX = OUTER_DIFFERENCE_PX + 2.0
+# Markers so small that no part of their edge is clear of the rim's: the other colours are weighted so that it has none.
+_BALANCED_BELOW_PX = 8.0
 
 
 def refine(
@@ -61,8 +63,13 @@ def refine(
     rough_px = np.stack([real_places(rig, eye, places, sizes) for eye, places in seen])
     discs = circles(eyes, rough_px[eyes, index], np.full(len(eyes), radius_px))
     hubs = [hub for mode in rough.modes for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
+    around = _surroundings(layout, index, radius_px / layout.radius_m)
+    if around is not None and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
+        middles_px = np.stack([rig.image(rough.left_from_drogue.translation_m, eye) for eye in EYES])
+        rim_px = radius_px * layout.face_outer_radius_m / layout.radius_m
+        others_weight = balancing_weight(images, color, middles_px, rim_px, others_weight)
     signals = marker_signals(images, color, _together([discs, *hubs]), others_weight)
-    fits = fit_discs(signals, discs, _surroundings(layout, index, radius_px / layout.radius_m))
+    fits = fit_discs(signals, discs, around)
     good = fits.accepted
     if min(np.bincount(eyes[good], minlength=2)) < min(_LEAST_MARKERS, layout.count) or fits.noise is None:
         return observation

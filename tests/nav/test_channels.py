@@ -1,0 +1,48 @@
+"""The weight of the other colours that takes the step of light from the rim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.images import StereoImages
+from nav.channels import PLAIN, balancing_weight
+
+MIDDLES_PX = np.array([[60.0, 50.0], [58.0, 50.0]])
+RIM_PX = 12.0
+BLACK = 4
+
+
+def pictures(sky, face=(6, 6, 6), size=(100, 120)):
+    """A dark disc before an even sky, the same in both eyes. [DN above black]"""
+    rows, columns = np.ogrid[: size[0], : size[1]]
+    eyes = []
+    for u, v in MIDDLES_PX:
+        image = np.empty((*size, 3), np.uint8)
+        image[:] = np.array(sky) + BLACK
+        image[np.hypot(columns - u, rows - v) <= RIM_PX] = np.array(face) + BLACK
+        eyes.append(image)
+    return StereoImages(*eyes, 0.0, 1e-3, 8, "linear", float(BLACK), None, None)
+
+
+@pytest.mark.parametrize("sky", [(40, 80, 160), (90, 90, 90), (150, 120, 100)])
+def test_the_sky_has_no_lead_left(sky):
+    weight = balancing_weight(pictures(sky), 0, MIDDLES_PX, RIM_PX)
+    assert sky[0] - weight * max(sky[1:]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_the_drogue_itself_shows_does_not_count():
+    one, other = (
+        balancing_weight(pictures((60, 90, 120), face), 0, MIDDLES_PX, RIM_PX) for face in ((6,) * 3, (200, 0, 0))
+    )
+    assert one == other
+
+
+def test_a_sky_of_the_markers_own_colour_is_taken_off_in_part():
+    assert balancing_weight(pictures((200, 20, 10)), 0, MIDDLES_PX, RIM_PX) == 1.6
+
+
+def test_black_night_and_a_drogue_beyond_the_image_change_nothing():
+    assert balancing_weight(pictures((0, 0, 0)), 0, MIDDLES_PX, RIM_PX) == PLAIN
+    away = np.array([[500.0, 500.0], [-300.0, 40.0]])
+    assert balancing_weight(pictures((60, 90, 120)), 0, away, RIM_PX, 1.4) == 1.4
