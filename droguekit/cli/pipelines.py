@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from droguekit.cli.interrupts import interrupts_wait
+
 if TYPE_CHECKING:
     from datasets_manifest.estimates import Estimate
     from datasets_manifest.recipe import Recipe
@@ -66,9 +68,10 @@ def render_frames(
         ValueError: a folder of another recipe, or an engine that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
     """
-    from droguekit.batch.local import Spread, render_dataset
-    from droguekit.batch.machine import default_workers
-    from render.engine import engine_notice
+    with interrupts_wait():
+        from droguekit.batch.local import Spread, render_dataset
+        from droguekit.batch.machine import default_workers
+        from render.engine import engine_notice
 
     workers = default_workers() if order.workers is None else order.workers
     if workers < 0:
