@@ -18,7 +18,7 @@ from scenes.sampler import sample_left_from_drogue, scene_of_frame, split_of_sce
 
 # A worker may have to load its engine and compile kernels within its first frame.
 _START_S = 300.0
-# Ten times what the slowest variant of an engine was seen to take for one sample of one pixel.
+# Our choice, far above what an engine takes for one sample of one pixel.
 _S_PER_SAMPLE = 20e-6
 # Enough for shares to within 2 % and a histogram without holes; more only takes time.
 _MOST_SAMPLED = 1000
