@@ -14,9 +14,7 @@ def interrupts_wait() -> Iterator[None]:
     """Let Ctrl-C wait until the block is done.
 
     Mesh libraries try optional imports and catch whatever comes of them, the exception of a Ctrl-C too: it were lost.
-
-    Raises:
-        KeyboardInterrupt: at the end, when it came meanwhile.
+    At the end it goes to whoever handled it before, by default as `KeyboardInterrupt`.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -32,4 +30,4 @@ def interrupts_wait() -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, before)
     if heard:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)

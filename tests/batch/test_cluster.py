@@ -128,7 +128,9 @@ def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    interrupt = signal.getsignal(signal.SIGINT)
     jobqueue = pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is missing: pip install 'droguekit[cluster]'")
+    signal.signal(signal.SIGINT, interrupt)  # its import takes over Ctrl-C of this process, and so of all later tests
     make(tmp_path / "calm", text=analytic_recipe)
     # What SLURM does with a job, on this machine: runs its script, tells its number, and ends it when told.
     programs = tmp_path / "bin"
