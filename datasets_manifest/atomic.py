@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -58,3 +59,31 @@ def write_text_atomic(path: Path, text: str) -> None:
     """
     with open_text_atomic(path) as stream:
         stream.write(text)
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A folder beside `out` to write into, which takes that name when the block ends without an error.
+
+    Args:
+        out: must not be there yet, or be empty.
+
+    Raises:
+        ValueError: something is there already.
+        OSError: it cannot be written; one line that names it. Nothing is left behind.
+    """
+    target = out.resolve()
+    if target.exists() and not (target.is_dir() and not any(target.iterdir())):
+        raise ValueError(f"{out}: is not empty; name a new folder, or delete this one")
+    part = part_path(target)
+    try:
+        part.mkdir(parents=True)
+        yield part
+        if target.exists():
+            target.rmdir()
+        part.rename(target)
+        sync_folder(target.parent)
+    except OSError as error:
+        raise OSError(error.errno, f"{out}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
+from pydantic import Field, ValidationError
+
+from datasets_manifest.frame import Sensor
 from datasets_manifest.images import StereoImages
-from datasets_manifest.layout import frame_folder
+from datasets_manifest.json_types import FrozenModel, Rig
+from datasets_manifest.layout import BLIND_FILE, frame_folder
 from datasets_manifest.manifest import read_manifest
 from datasets_manifest.reader import read_images, read_shutter, read_sought
 from drogue_models.parameters import DrogueParameters
+from drogue_models.presets import explain
 from geometry.stereo import StereoRig
 
 
@@ -30,6 +37,53 @@ class BlindPair:
     drogue: DrogueParameters
 
 
+class BlindIndex(FrozenModel):
+    """What stands for a dataset without its truth: `blind.json` of a blind export, or what a manifest says of it.
+
+    Attributes:
+        name: of the dataset.
+        rig, sensor: the cameras.
+        drogue: what to look for.
+        drogues_differ: each pair names its own drogue instead.
+        frames: indices of the pairs, ascending.
+    """
+
+    schema_version: Literal[1] = 1
+    name: str
+    rig: Rig
+    sensor: Sensor
+    drogue: DrogueParameters
+    drogues_differ: bool
+    frames: tuple[Annotated[int, Field(ge=0)], ...]
+
+
+def read_blind_index(dataset: Path) -> BlindIndex:
+    """What may be known of the dataset in a folder, blind or not.
+
+    Raises:
+        ValueError: no such folder, or neither a manifest nor an index that can be trusted; names the file.
+    """
+    path = dataset / BLIND_FILE
+    if not path.exists():
+        manifest = read_manifest(dataset)
+        return BlindIndex(
+            name=manifest.name,
+            rig=manifest.recipe.rig,
+            sensor=manifest.recipe.sensor,
+            drogue=manifest.recipe.drogue,
+            drogues_differ=bool(manifest.recipe.variants),
+            frames=tuple(sorted(entry.frame_index for entry in manifest.frames)),
+        )
+    try:
+        return BlindIndex.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise ValueError(f"{path}: {explain(error)}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
+
+
 class BlindDataset:
     """Stereo pairs without their truth; images are read when they are asked for."""
 
@@ -37,15 +91,15 @@ class BlindDataset:
         """Open the dataset in a folder.
 
         Raises:
-            ValueError: no such folder, or no manifest that can be trusted.
+            ValueError: no such folder, or nothing in it that can be trusted.
         """
-        manifest = read_manifest(path)
+        index = read_blind_index(path)
         self._path = path
-        self._rig: StereoRig = manifest.recipe.rig
-        self._drogue = manifest.recipe.drogue
-        self._has_variants = bool(manifest.recipe.variants)
-        self._sensor = manifest.recipe.sensor
-        self.frame_indices: tuple[int, ...] = tuple(sorted(entry.frame_index for entry in manifest.frames))
+        self._rig: StereoRig = index.rig
+        self._drogue = index.drogue
+        self._has_variants = index.drogues_differ
+        self._sensor = index.sensor
+        self.frame_indices: tuple[int, ...] = index.frames
 
     def pair(self, frame_index: int) -> BlindPair:
         """One stereo pair.

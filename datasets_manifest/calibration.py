@@ -1,75 +1,53 @@
-"""The rig's calibration as other programs read it: OpenCV's stereo YAML."""
+"""The rig's calibration as other programs read it: OpenCV, Kalibr, ROS."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.calibration_kalibr import KALIBR_FILE, kalibr_camchain, kalibr_fault
+from datasets_manifest.calibration_matrices import opencv_stereo_matrices
+from datasets_manifest.calibration_ros import camera_info, camera_info_file
 from datasets_manifest.layout import CALIBRATION_FOLDER
-from geometry.distortion import Lens
-from geometry.se3 import Array
-from geometry.stereo import StereoRig
+from geometry.stereo import EYES, StereoRig
+
+__all__ = ["OPENCV_STEREO_FILE", "calibration_files", "opencv_stereo", "opencv_stereo_matrices", "write_calibration"]
 
 OPENCV_STEREO_FILE = "opencv_stereo.yaml"
 
 
-def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
-    """A rig in the names and conventions of `cv2.stereoRectify`: the truth, which no calibration would find exactly.
+def opencv_stereo(rig: StereoRig) -> str:
+    """The text of a YAML file for `cv2.FileStorage`: image size and `opencv_stereo_matrices`."""
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", rig.camera.width_px)
+    storage.write("image_height", rig.camera.height_px)
+    for name, matrix in opencv_stereo_matrices(rig).items():
+        storage.write(name, matrix)
+    text: str = storage.releaseAndGetString()
+    return text
 
-    Returns:
-        M1, M2: (3, 3) intrinsics of the delivered images [px]; D1, D2: (1, 5) their distortion; R, T: right from left
-        [m]; R1, R2: rectifying rotations; P1, P2: (3, 4) projections of the rectified images; Q: (4, 4) from
-        (u, v, disparity, 1) of those to homogeneous points [m].
 
-    Source: OpenCV's documentation of `stereoRectify`; its pixels too count from the centre of the top-left one.
-    """
-    camera, baseline_m = rig.camera, rig.baseline_m
-    first, second = rig.lenses or (Lens(camera), Lens(camera))
-    left = np.hstack([camera.matrix(), np.zeros((3, 1))])
-    right = left.copy()
-    right[0, 3] = -camera.fx_px * baseline_m
-    # A pixel's row counts in units of fy, its disparity in units of fx.
-    row_scale = camera.fx_px / camera.fy_px
-    reprojection = np.array(
-        [
-            [1.0, 0.0, 0.0, -camera.cx_px],
-            [0.0, row_scale, 0.0, -camera.cy_px * row_scale],
-            [0.0, 0.0, 0.0, camera.fx_px],
-            [0.0, 0.0, 1.0 / baseline_m, 0.0],
-        ]
-    )
-    return {
-        "M1": first.camera.matrix(),
-        "D1": first.distortion.coefficients()[None],
-        "M2": second.camera.matrix(),
-        "D2": second.distortion.coefficients()[None],
-        "R": second.ideal_from_real.T @ first.ideal_from_real,
-        "T": second.ideal_from_real.T @ np.array([[-baseline_m], [0.0], [0.0]]),
-        "R1": np.array(first.ideal_from_real),
-        "R2": np.array(second.ideal_from_real),
-        "P1": left,
-        "P2": right,
-        "Q": reprojection,
-    }
+def calibration_files(rig: StereoRig) -> dict[str, str]:
+    """Every calibration file of a rig by its name; without Kalibr's where that cannot describe the lenses."""
+    files = {OPENCV_STEREO_FILE: opencv_stereo(rig)}
+    if kalibr_fault(rig) is None:
+        files[KALIBR_FILE] = kalibr_camchain(rig)
+    return files | {camera_info_file(eye): camera_info(rig, eye) for eye in EYES}
 
 
 def write_calibration(dataset: Path, rig: StereoRig) -> list[Path]:
     """Write the rig into the dataset's calibration folder.
 
     Returns:
-        The files.
+        The files, OpenCV's first.
 
     Raises:
         OSError: they cannot be written.
     """
-    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    storage.write("image_width", rig.camera.width_px)
-    storage.write("image_height", rig.camera.height_px)
-    for name, matrix in opencv_stereo_matrices(rig).items():
-        storage.write(name, matrix)
-    path = dataset / CALIBRATION_FOLDER / OPENCV_STEREO_FILE
-    write_text_atomic(path, storage.releaseAndGetString())
-    return [path]
+    paths = []
+    for name, text in calibration_files(rig).items():
+        paths.append(dataset / CALIBRATION_FOLDER / name)
+        write_text_atomic(paths[-1], text)
+    return paths

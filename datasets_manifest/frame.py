@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from datasets_manifest.board import PlacedBoard
 from datasets_manifest.environment_map import EnvironmentMap
 from datasets_manifest.ground import GroundKind
 from datasets_manifest.json_types import FrozenModel, Points3, Rig, Transform, Vector6
@@ -145,6 +146,7 @@ class FrameSpec(FrozenModel):
         sought: in an empty frame of a dataset with several drogues, the one that navigation is told to look for.
         condition: state of the drogue's surfaces, or None when it is as new.
         bystanders: what else stands in the picture.
+        board: a calibration board instead of a drogue, or none.
         left_from_drogue: pose at mid-exposure, or None for an empty frame.
         world_from_left: world axes are x east, y north, z up; origin at the left eye.
         left_twist_per_s, drogue_twist_per_s: (6,) body twists over the exposure, each in its own frame, relative to
@@ -152,6 +154,7 @@ class FrameSpec(FrozenModel):
         left_from_tanker: tanker frame x aft, y right wing, z up at the pod's hose exit, or None.
         hose_nodes_left_m: (K, 3) centre line from coupling to pod in the left camera at mid-exposure, or None. [m]
         rig, sensor, exposure, environment: as named.
+        rangefinder_reading_m: of the distance of the rim centre along the optical axis, or None without one. [m]
     """
 
     seed: int = Field(ge=0)
@@ -164,6 +167,8 @@ class FrameSpec(FrozenModel):
     sought: DrogueParameters | None = None
     condition: DrogueCondition | None = None
     bystanders: tuple[Bystander, ...] = ()
+    # Left out where there is none, so that the hashes of other datasets do not know of boards.
+    board: PlacedBoard | None = Field(default=None, exclude_if=lambda board: board is None)
     left_from_drogue: Transform | None
     world_from_left: Transform
     left_twist_per_s: Vector6
@@ -174,11 +179,14 @@ class FrameSpec(FrozenModel):
     sensor: Sensor
     exposure: Exposure
     environment: Environment
+    rangefinder_reading_m: float | None = Field(default=None, exclude_if=lambda reading_m: reading_m is None)
 
     @model_validator(mode="after")
     def _drogue_has_a_pose(self) -> Self:
         if (self.drogue is None) != (self.left_from_drogue is None):
             raise ValueError("left_from_drogue: must be given exactly when there is a drogue")
+        if self.drogue is not None and self.board is not None:
+            raise ValueError("board: stands only in frames without a drogue")
         states = self.condition.markers if self.condition is not None else ()
         if self.condition is not None and self.drogue is None:
             raise ValueError("condition: an empty frame has none")

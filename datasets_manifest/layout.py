@@ -6,6 +6,9 @@ from pathlib import Path
 
 RECIPE_FILE = "recipe.toml"
 MANIFEST_FILE = "manifest.json"
+CARD_FILE = "README.md"
+CROISSANT_FILE = "croissant.json"
+BLIND_FILE = "blind.json"
 EVENTS_FILE = "events.jsonl"
 RECORD_FILE = "record.json"
 FRAMES_FOLDER = "frames"

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.json_types import FrozenModel
-from datasets_manifest.layout import MANIFEST_FILE, RECORD_FILE, frame_folder, frame_indices
+from datasets_manifest.layout import BLIND_FILE, MANIFEST_FILE, RECORD_FILE, frame_folder, frame_indices
 from datasets_manifest.provenance import CONVENTIONS, cpu_features, software_versions
 from datasets_manifest.recipe import Recipe
 from datasets_manifest.writer import canonical_json
@@ -180,6 +180,10 @@ def read_manifest(dataset: Path) -> Manifest:
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
+        if (dataset / BLIND_FILE).is_file():
+            raise ValueError(
+                f"{dataset}: is a blind dataset, which has no truth; take the one that it came from"
+            ) from error
         raise ValueError(f"{path}: is missing; render the recipe again into this folder to complete it") from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Collection, Mapping
 from importlib import metadata
 from typing import Any
 
@@ -42,3 +43,18 @@ def cpu_features() -> list[str]:
     report: dict[str, Any] = np.show_config(mode="dicts")  # type: ignore[call-arg, assignment, func-returns-value]
     extensions = report["SIMD Extensions"]
     return [*extensions.get("baseline", ()), *extensions.get("found", ())]
+
+
+def differing_builds(
+    there_software: Mapping[str, str],
+    there_features: Collection[str],
+    here_software: Mapping[str, str],
+    here_features: Collection[str],
+) -> list[str]:
+    """How the software and the processor of two places differ, a line each; without a difference pixels are equal."""
+    found = [
+        f"{name} {there_software.get(name, 'missing')} there, {here_software.get(name, 'missing')} here"
+        for name in sorted({*there_software, *here_software})
+        if there_software.get(name) != here_software.get(name)
+    ]
+    return found if set(there_features) == set(here_features) else [*found, "another set of processor features"]

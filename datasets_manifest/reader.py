@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from datasets_manifest.frame import Sensor
 from datasets_manifest.images import Pixels, StereoImages
+from datasets_manifest.json_types import write_rig
 from datasets_manifest.layout import RECORD_FILE, frame_folder, image_file, mosaic_file, parts_file
 from datasets_manifest.manifest import Manifest, read_manifest
 from datasets_manifest.png import decode_png
@@ -50,6 +51,10 @@ class Dataset:
         """Indices of the pairs, ascending."""
         return tuple(sorted(entry.frame_index for entry in self.manifest.frames))
 
+    @cached_property
+    def _rig_table(self) -> dict[str, Any]:
+        return write_rig(self.manifest.recipe.rig)
+
     def record(self, frame_index: int) -> PairRecord:
         """The truth of one pair.
 
@@ -64,6 +69,8 @@ class Dataset:
             raise ValueError(f"{path}: {explain(error)}") from error
         if record.frame_index != frame_index:
             raise ValueError(f"{path}: frame_index: must be {frame_index}, got {record.frame_index}")
+        if write_rig(record.frame.rig) != self._rig_table:
+            raise ValueError(f"{path}: frame.rig: differs from that of the dataset's recipe")
         for name in record.file_sha256:
             if not is_plain_name(name):
                 raise ValueError(f"{path}: file_sha256: must name files of the frame's own folder, got {name!r}")

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from datasets_manifest.board import CalibrationBoard
 from datasets_manifest.environment_map import pin_map
 from datasets_manifest.environment_ranges import EnvironmentRanges
 from datasets_manifest.exposure_law import ExposureLaw
@@ -16,14 +17,16 @@ from datasets_manifest.families import fill_families
 from datasets_manifest.frame import Sensor
 from datasets_manifest.json_types import FrozenModel, Rig
 from datasets_manifest.pose_ranges import DistanceLaw, Pose
+from datasets_manifest.rangefinder import Rangefinder
 from datasets_manifest.ranges import Fraction
 from datasets_manifest.rigs import resolve_rig
+from datasets_manifest.sequence_ranges import SequenceRanges, check_singles, fill_distance
 from datasets_manifest.target_ranges import DrogueVariant, TargetRanges
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 
 MAX_SEED = 2**63 - 1
-_ENGINES_WITH_LENSES = ("analytic", "mitsuba")
+_ENGINES_WITH_LENSES = ("analytic", "mitsuba", "blender")
 
 
 class FrameCounts(FrozenModel):
@@ -45,14 +48,18 @@ class RenderSettings(FrozenModel):
             pixel on hub and coupling; `samples_per_px` if that is more.
         surround_samples_per_px: the same for hose and tanker.
         max_depth: longest path, counted in segments.
+        denoise: whether light that reaches a matt drogue by way of other surfaces is smoothed over each surface (engine
+            mitsuba). Paths then start from pixel centres, `samples_per_px` where the smoothing is wide and up to
+            `edge_samples_per_px` where the drogue is far away; edges take the fewer rays the more pixels are inside.
     """
 
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)
     samples_per_px: int = Field(default=16, ge=1, le=65536)
     open_samples_per_px: int = Field(default=4, ge=1, le=65536)
-    edge_samples_per_px: int = Field(default=64, ge=1, le=65536)
+    edge_samples_per_px: int = Field(default=256, ge=1, le=65536)
     surround_samples_per_px: int = Field(default=4, ge=1, le=65536)
     max_depth: int = Field(default=4, ge=2, le=64)
+    denoise: bool = True
 
 
 class Outputs(FrozenModel):
@@ -101,7 +108,11 @@ class Recipe(FrozenModel):
         family: what kind of conditions, for tables; of recipes without `families`.
         seed: of everything random.
         drogue, rig, sensor: in TOML names of presets (`drogue` also a TOML file).
+        board: a calibration board that every frame shows instead of a drogue, or none; `distance` and `pose` are then
+            those of its middle.
+        rangefinder: whose readings the records hold, or none.
         families: over which the scenes are spread, each with its own conditions; or none.
+        sequence: how pairs follow each other in time; without it each stands alone.
     """
 
     name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -120,7 +131,10 @@ class Recipe(FrozenModel):
     render: RenderSettings = RenderSettings()
     outputs: Outputs = Outputs()
     split: Split = Split()
+    board: CalibrationBoard | None = Field(default=None, exclude_if=lambda board: board is None)
+    rangefinder: Rangefinder | None = Field(default=None, exclude_if=lambda rangefinder: rangefinder is None)
     families: tuple[Family, ...] = Field(default=(), max_length=100)
+    sequence: SequenceRanges | None = Field(default=None, exclude_if=lambda sequence: sequence is None)
 
     @property
     def variants(self) -> tuple[DrogueVariant, ...]:
@@ -145,9 +159,48 @@ class Recipe(FrozenModel):
         return self
 
     @model_validator(mode="after")
+    def _board_can_be_drawn(self) -> Self:
+        if self.board is None:
+            return self
+        if self.render.engine != "analytic":
+            raise ValueError(f"board: is drawn by the engine analytic only, got render.engine {self.render.engine!r}")
+        if self.frames.empty_fraction != 1 or self.families:
+            raise ValueError("board: takes the drogue's place; set frames.empty_fraction to 1, and give no families")
+        if self.pose.speed_m_s != 0 or self.pose.rate_deg_s != 0:
+            raise ValueError("board: stands still; set pose.speed_m_s and pose.rate_deg_s to 0")
+        return self
+
+    @model_validator(mode="after")
+    def _sequences_move_by_themselves(self) -> Self:
+        if self.sequence is None:
+            return self
+        if self.frames.empty_fraction > 0:
+            raise ValueError("frames.empty_fraction: must be 0 with [sequence], where every pair has the drogue")
+        for part in self.families or (self,):
+            check_singles(part.pose, part.target)
+            longest_s = part.exposure.auto_time_s.high if part.exposure.time_s is None else part.exposure.time_s
+            period_s = 1 / self.sequence.frame_rate_hz
+            if longest_s > period_s:
+                raise ValueError(
+                    f"exposure: up to {longest_s:g} s are longer than the {period_s:g} s between pairs of the "
+                    "sequence; lower time_s or auto_time_s, or frame_rate_hz"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _nearest_distance_is_visible(self) -> Self:
         nearest = self.distance.nearest_m
+        if self.board is not None:
+            limit = self.rig.nearest_plate_view_m(*self.board.size_m)
+            if nearest < limit:
+                raise ValueError(
+                    f"distance: {nearest:g} m is nearer than {limit:.2f} m, where both views hold the board"
+                )
+            return self
         drogues = [variant.drogue for variant in self.variants] or [self.drogue]
+        if self.sequence is not None:
+            self.sequence.check_view(self.rig, max(drogue.rim_radius_m for drogue in drogues))
+            return self
         limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m) for drogue in drogues)
         if nearest < limit:
             raise ValueError(
@@ -212,6 +265,7 @@ def parse_recipe(text: str, base: Path | None = None, seed: int | None = None) -
         raise ValueError("drogue: must be the name of a preset or a .toml file")
     table["drogue"] = load_drogue(drogue, base)
     fill_families(table)
+    fill_distance(table)
     for part in (table, *table.get("families", ())):
         _load_variants(part.get("target"), base)
         if isinstance(part.get("environment"), dict):

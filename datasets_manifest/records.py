@@ -48,6 +48,7 @@ class ViewRecord(FrozenModel):
         box_visible_xywh_px: around its visible pixels; None when no pixel is visible.
         visible_drogue_px: number of pixel centres that see the drogue.
         truncated: the full box leaves the image.
+        board_corners_px: images of a calibration board's inner corners, row by row; only in frames with a board.
     """
 
     markers: tuple[FeatureView, ...]
@@ -56,6 +57,7 @@ class ViewRecord(FrozenModel):
     box_visible_xywh_px: PixelBox | None
     visible_drogue_px: int = Field(ge=0)
     truncated: bool
+    board_corners_px: tuple[PixelPoint, ...] = Field(default=(), exclude_if=lambda corners: not corners)
 
 
 class StereoViews(FrozenModel):
@@ -66,7 +68,12 @@ class StereoViews(FrozenModel):
 
 
 class Conditions(FrozenModel):
-    """What the frame is sorted by in reports."""
+    """What the frame is sorted by in reports.
+
+    Attributes:
+        markers_in_view, hub_in_view: of a sequence's pair, by eye: how many markers lie wholly on the image, and
+            whether the hub does; occlusion does not count.
+    """
 
     family: str
     distance_m: float | None
@@ -74,6 +81,8 @@ class Conditions(FrozenModel):
     background_luminance_cd_m2: float
     monte_carlo_noise_fraction: float
     monte_carlo_over_sensor_noise: float | None = None
+    markers_in_view: tuple[int, int] | None = Field(default=None, exclude_if=lambda count: count is None)
+    hub_in_view: tuple[bool, bool] | None = Field(default=None, exclude_if=lambda seen: seen is None)
 
 
 class PairRecord(FrozenModel):

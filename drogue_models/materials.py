@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from drogue_models.parameters import DrogueParameters, ReflectanceRgb
+from drogue_models.parameters import DrogueParameters, ReflectanceRgb, SatinPaint
 from drogue_models.parts import FIRST_MARKER_ID, Part
 
 # Light grey of military transports, close to FS 36375 (our choice).
 TANKER_GREY: ReflectanceRgb = (0.36, 0.37, 0.38)
+
+
+def part_satin(drogue: DrogueParameters, part_id: int) -> SatinPaint | None:
+    """The sheen of a part (see `drogue_models.parts`), None where it is matt."""
+    satin = drogue.satin
+    return satin if satin is not None and part_id in {Part[name.upper()] for name in satin.parts} else None
 
 
 def part_reflectance_rgb(drogue: DrogueParameters, part_id: int) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -71,6 +71,22 @@ class BodyMesh(FrozenModel):
         return self.folder / self.path
 
 
+class SatinPaint(FrozenModel):
+    """Rough plastic: microfacets mirror a fixed share of the light, and the paint below scatters the rest.
+
+    The facets are those of Trowbridge and Reitz (GGX; B. Walter et al., EGSR 2007, doi:10.2312/EGWR/EGSR07/195-206).
+
+    Attributes:
+        parts: which parts have it; markers, face, rim and hub are matt.
+        sheen_fraction: share that the facets mirror.
+        roughness: width of the facets' distribution.
+    """
+
+    parts: tuple[Literal["canopy", "ribs", "coupling"], ...] = Field(min_length=1)
+    sheen_fraction: float = Field(default=0.05, gt=0, le=0.5)  # our choice, near what varnish mirrors head on, 0.04
+    roughness: float = Field(default=0.25, ge=0.05, le=1.0)
+
+
 class DrogueParameters(FrozenModel):
     """A drogue with round markers set into its dark face.
 
@@ -91,6 +107,7 @@ class DrogueParameters(FrozenModel):
         coupling_radius_m, coupling_length_m: the body behind the hub face. [m]
         hose_radius_m: [m]
         body_mesh: a mesh instead of canopy, ribs and coupling, or none. Its part is the coupling.
+        satin: paint with a sheen on some parts, or none.
     """
 
     name: str = Field(min_length=1, max_length=80)
@@ -111,6 +128,7 @@ class DrogueParameters(FrozenModel):
     coupling_length_m: Metres = 0.20
     hose_radius_m: Metres = 0.0335  # hose diameter 67 mm
     body_mesh: BodyMesh | None = None
+    satin: SatinPaint | None = Field(default=None, exclude_if=lambda satin: satin is None)
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:

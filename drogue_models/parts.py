@@ -23,10 +23,11 @@ class Part(IntEnum):
     PROBE = 18
     OBSTACLE = 19
     DISTRACTOR = 20
+    BOARD = 21
 
 
 # What hangs on the drogue or stands around it; none of it belongs to the drogue's box.
-SURROUNDING_PARTS = (Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
+SURROUNDING_PARTS = (Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR, Part.BOARD)
 # What the drogue's box covers besides the markers.
 DROGUE_PARTS = (Part.FACE, Part.RIM, Part.CANOPY, Part.RIBS, Part.COUPLING, Part.HUB)
 

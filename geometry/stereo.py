@@ -12,15 +12,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.distortion import Lens, border_px
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, read_only
 
 Eye = Literal["left", "right"]
 EYES: tuple[Eye, Eye] = ("left", "right")
-
-# Aviation body axes (x forward, y right, z down) seen from camera axes (x right, y down, z forward).
-BODY_FROM_OPTICAL_ROTATION = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +35,7 @@ class StereoRig:
 
     camera: PinholeCamera
     baseline_m: float
-    body_from_left: RigidTransform = field(
-        default_factory=lambda: RigidTransform(BODY_FROM_OPTICAL_ROTATION, np.zeros(3))
-    )
+    body_from_left: RigidTransform = FRD_FROM_OPTICAL
     probe_tip_body_m: Array = field(default_factory=lambda: np.array([1.0, 0.45, 0.35]))
     lenses: tuple[Lens, Lens] | None = None
 
@@ -134,10 +130,12 @@ class StereoRig:
 
     def nearest_full_view_m(self, radius_m: float) -> float:
         """Depth of the nearest facing disc of this radius that both eyes can see whole. [m]"""
+        return self.nearest_plate_view_m(2 * radius_m, 2 * radius_m)
+
+    def nearest_plate_view_m(self, width_m: float, height_m: float) -> float:
+        """Depth of the nearest facing plate, upright, of this size that both eyes can see whole. [m]"""
         c = self.camera
-        vertical = 2 * radius_m * c.fy_px / c.height_px
-        horizontal = (2 * radius_m + self.baseline_m) * c.fx_px / c.width_px
-        return max(vertical, horizontal)
+        return max(height_m * c.fy_px / c.height_px, (width_m + self.baseline_m) * c.fx_px / c.width_px)
 
 
 def paper_rig() -> StereoRig:

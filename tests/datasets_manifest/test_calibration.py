@@ -10,7 +10,7 @@ NAMES = ("M1", "D1", "M2", "D2", "R", "T", "R1", "R2", "P1", "P2", "Q")
 
 def test_opencv_reads_what_was_written(tmp_path):
     rig = paper_rig()
-    (path,) = write_calibration(tmp_path, rig)
+    path = write_calibration(tmp_path, rig)[0]
     assert path.parent == tmp_path / "calibration"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     assert (storage.getNode("image_width").real(), storage.getNode("image_height").real()) == (1280, 960)

@@ -56,7 +56,7 @@ def test_json_gives_the_rig_back():
 def test_calibration_rectifies_the_real_images(tmp_path):
     """OpenCV, given the written file alone, takes real pixels to the ideal rig's."""
     rig, _ = resolve_rig("paper-real", 6)
-    (path,) = write_calibration(tmp_path, rig)
+    path = write_calibration(tmp_path, rig)[0]
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     m = {name: storage.getNode(name).mat() for name in opencv_stereo_matrices(rig)}
     points = np.random.default_rng(2).uniform([-0.2, -0.15, 1], [0.2, 0.15, 1], (50, 3)) * 8.0
@@ -74,8 +74,8 @@ def test_calibration_rectifies_the_real_images(tmp_path):
 
 
 def test_engines_without_lenses_are_named():
-    with pytest.raises(ValueError, match=r"render\.engine: blender draws ideal eyes only"):
-        parse_recipe(TABLE.replace("analytic", "blender") + 'rig = "paper-real"')
+    with pytest.raises(ValueError, match=r"render\.engine: foreign draws ideal eyes only"):
+        parse_recipe(TABLE.replace("analytic", "foreign") + 'rig = "paper-real"')
 
 
 @pytest.mark.parametrize(

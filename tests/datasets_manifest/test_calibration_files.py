@@ -1,0 +1,86 @@
+"""The files for Kalibr and ROS, read as those programs read them: by PyYAML, and used by OpenCV."""
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from datasets_manifest.calibration import calibration_files, write_calibration
+from datasets_manifest.calibration_kalibr import kalibr_camchain
+from datasets_manifest.calibration_ros import camera_info
+from datasets_manifest.rigs import resolve_rig
+from datasets_manifest.yaml_text import yaml_number
+from geometry.stereo import EYES, paper_rig
+
+RIGS = [paper_rig(), resolve_rig("paper-real", 6)[0]]
+POINTS_M = np.random.default_rng(4).uniform([-0.2, -0.15, 1], [0.2, 0.15, 1], (30, 3)) * 7.0
+# Numbers of 16 digits, through a few products of numbers of 1e3.
+EXACT_PX = 1e-9
+
+
+def data_of(table, name):
+    matrix = table[name]
+    return np.array(matrix["data"], dtype=np.float64).reshape(matrix["rows"], matrix["cols"])
+
+
+@pytest.mark.parametrize("rig", RIGS, ids=["ideal", "real"])
+def test_kalibr_s_chain_projects_points_to_where_they_are_seen(rig):
+    chain = yaml.safe_load(kalibr_camchain(rig))
+    assert list(chain) == ["cam0", "cam1"]
+    in_camera = POINTS_M
+    if rig.lenses is not None:
+        in_camera = POINTS_M @ rig.lenses[0].ideal_from_real
+    for eye, camera in zip(EYES, chain.values(), strict=True):
+        assert (camera["camera_model"], camera["distortion_model"]) == ("pinhole", "radtan")
+        assert camera["resolution"] == [1280, 960]
+        transform = np.array(camera.get("T_cn_cnm1", np.eye(4).tolist()))
+        in_camera = in_camera @ transform[:3, :3].T + transform[:3, 3]
+        fu, fv, pu, pv = camera["intrinsics"]
+        matrix = np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1.0]])
+        image, _ = cv2.projectPoints(
+            in_camera, np.zeros(3), np.zeros(3), matrix, np.array(camera["distortion_coeffs"], dtype=np.float64)
+        )
+        np.testing.assert_allclose(image[:, 0], rig.image(POINTS_M, eye), atol=EXACT_PX)
+    shift = np.linalg.norm(np.array(chain["cam1"]["T_cn_cnm1"])[:3, 3])
+    assert shift == pytest.approx(0.12, rel=1e-12)
+
+
+@pytest.mark.parametrize("rig", RIGS, ids=["ideal", "real"])
+def test_camera_info_rectifies_what_is_seen(rig):
+    for eye in EYES:
+        table = yaml.safe_load(camera_info(rig, eye))
+        assert (table["image_width"], table["image_height"], table["camera_name"]) == (1280, 960, eye)
+        assert table["distortion_model"] == "plumb_bob"
+        projection = data_of(table, "projection_matrix")
+        # ROS's definition of the baseline: P[0, 3] = -fx B.
+        assert projection[0, 3] == (0.0 if eye == "left" else -256.0)
+        found = cv2.undistortPointsIter(
+            rig.image(POINTS_M, eye)[:, None],
+            data_of(table, "camera_matrix"),
+            data_of(table, "distortion_coefficients"),
+            data_of(table, "rectification_matrix"),
+            projection[:, :3],
+            (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14),
+        )
+        # The right eye's point in the left frame, by the whole projection matrix.
+        homogeneous = np.column_stack([POINTS_M, np.ones(len(POINTS_M))]) @ projection.T
+        np.testing.assert_allclose(found[:, 0], homogeneous[:, :2] / homogeneous[:, 2:], atol=1e-8)
+
+
+def test_a_third_radial_coefficient_has_no_place_in_kalibr(tmp_path):
+    rig, _ = resolve_rig({"preset": "paper-real", "eyes": {"k3": {"low": 0.01, "high": 0.01}}})
+    with pytest.raises(ValueError, match="no k3"):
+        kalibr_camchain(rig)
+    assert [path.name for path in write_calibration(tmp_path, rig)] == [
+        "opencv_stereo.yaml",
+        "ros_left.yaml",
+        "ros_right.yaml",
+    ]
+    assert "kalibr_camchain.yaml" in calibration_files(paper_rig())
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-5, -2.5e-300, 3e22, 0.1, 1 / 3, 2133.3333333333335])
+def test_numbers_are_read_as_numbers(value):
+    # YAML 1.1 takes 1e-05 for a word.
+    read = yaml.safe_load(yaml_number(value))
+    assert isinstance(read, float) and read == value

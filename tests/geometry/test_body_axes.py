@@ -1,0 +1,12 @@
+import numpy as np
+
+from geometry.body_axes import FLU_FROM_FRD, FRD_FROM_OPTICAL, NED_FROM_ENU
+
+
+def test_directions_keep_their_meaning():
+    right, down, forward = np.eye(3)
+    np.testing.assert_array_equal(FRD_FROM_OPTICAL.apply([forward, right, down]), np.eye(3))
+    forward, right, down = np.eye(3)
+    np.testing.assert_array_equal(FLU_FROM_FRD.apply([forward, right, down]), [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+    east, north, up = np.eye(3)
+    np.testing.assert_array_equal(NED_FROM_ENU.apply([north, east, -up]), np.eye(3))
