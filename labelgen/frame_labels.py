@@ -7,7 +7,7 @@ import numpy as np
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.images import StereoImages
-from datasets_manifest.records import Conditions, PairRecord, StereoViews, ViewRecord
+from datasets_manifest.records import Conditions, PairRecord, PixelPoint, StereoViews, ViewRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform, angles_from_rotation
@@ -36,6 +36,9 @@ def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages
     pose = frame.left_from_drogue
     half_s = frame.exposure.time_s / 2
     pitch, yaw, roll = (None, None, None) if pose is None else _angles_deg(pose)
+    views = StereoViews(
+        left=_view(frame, pose, "left", radiance.left), right=_view(frame, pose, "right", radiance.right)
+    )
     return PairRecord(
         frame_index=frame.frame_index,
         scene_id=frame.scene_id,
@@ -48,9 +51,7 @@ def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages
         yaw_deg=yaw,
         roll_deg=roll,
         roll_modulo_deg=_roll_modulo_deg(frame, roll),
-        views=StereoViews(
-            left=_view(frame, pose, "left", radiance.left), right=_view(frame, pose, "right", radiance.right)
-        ),
+        views=views,
         conditions=Conditions(
             family=frame.family,
             distance_m=None if pose is None else float(pose.translation_m[2]),
@@ -58,6 +59,8 @@ def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages
             background_luminance_cd_m2=_background_luminance_cd_m2(radiance),
             monte_carlo_noise_fraction=radiance.monte_carlo_noise_fraction,
             monte_carlo_over_sensor_noise=radiance.monte_carlo_over_sensor_noise,
+            markers_in_view=None if frame.sequence_id is None else _markers_in_view(views),
+            hub_in_view=None if frame.sequence_id is None else _hub_in_view(views),
         ),
         engine=radiance.engine,
         engine_version=radiance.engine_version,
@@ -100,6 +103,7 @@ def _view(frame: FrameSpec, pose: RigidTransform | None, eye: Eye, seen: EyeRadi
             box_visible_xywh_px=None,
             visible_drogue_px=0,
             truncated=False,
+            board_corners_px=_board_corners_px(frame, eye),
         )
     layout = marker_layout(frame.drogue)
     mask = visible_mask(seen.part_id, layout.count)
@@ -112,6 +116,24 @@ def _view(frame: FrameSpec, pose: RigidTransform | None, eye: Eye, seen: EyeRadi
         visible_drogue_px=int(np.count_nonzero(mask)),
         truncated=leaves_image(box, frame.rig.camera),
     )
+
+
+def _markers_in_view(views: StereoViews) -> tuple[int, int]:
+    left, right = (sum(marker.in_image for marker in view.markers) for view in (views.left, views.right))
+    return left, right
+
+
+def _hub_in_view(views: StereoViews) -> tuple[bool, bool] | None:
+    if views.left.hub is None or views.right.hub is None:
+        return None
+    return views.left.hub.in_image, views.right.hub.in_image
+
+
+def _board_corners_px(frame: FrameSpec, eye: Eye) -> tuple[PixelPoint, ...]:
+    if frame.board is None:
+        return ()
+    corners_px = frame.rig.image(frame.board.left_from_board.apply(frame.board.shape.corners_m()), eye)
+    return tuple((float(u), float(v)) for u, v in corners_px)
 
 
 def _background_luminance_cd_m2(radiance: StereoRadiance) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.environment_map import EnvironmentMap, read_map_file
+from datasets_manifest.passes import decode_exr
 from scenes.light import Radiance, luminance
 
 _SMALLEST_PX = 16
@@ -108,27 +108,25 @@ def _load_cached(environment_map: EnvironmentMap, folder: Path) -> MappedLight:
 
 
 def _decode_hdr(data: bytes) -> Radiance:
-    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # an empty file, or absurd dimensions
+        picture = None
     if picture is None or picture.dtype != np.float32 or picture.ndim != 3:
         raise ValueError("environment.map: the file cannot be read as Radiance HDR")
     return np.ascontiguousarray(picture[..., 2::-1])
 
 
 def _decode_exr(data: bytes, file: Path) -> Radiance:
-    import OpenEXR
-
     try:
-        # The library reads files only; these are the bytes that were checked.
-        with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-            copy = Path(folder) / "map.exr"
-            copy.write_bytes(data)
-            channels = OpenEXR.File(str(copy), separate_channels=True).channels()
-            planes = {name: np.array(channel.pixels, dtype=np.float32) for name, channel in channels.items()}
-    except (RuntimeError, ValueError, OSError) as error:
+        planes = {name: plane.astype(np.float32) for name, plane in decode_exr(data).items()}
+    except ValueError as error:
         raise ValueError(f"environment.map: {file} cannot be read as EXR: {error}") from error
     names = "RGB" if all(name in planes for name in "RGB") else "YYY"
     if names[0] not in planes:
         raise ValueError(f"environment.map: {file} must hold the channels R, G, B, or Y; it holds {', '.join(planes)}")
+    if any(planes[name].shape != planes[names[0]].shape for name in names):
+        raise ValueError(f"environment.map: {file} must have channels of one size")
     return np.stack([planes[name] for name in names], axis=-1)
 
 

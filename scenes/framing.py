@@ -54,21 +54,26 @@ def room_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[float, floa
     return None if x_low > x_high or y_low > y_high else (float(x_low), float(x_high), float(y_low), float(y_high))
 
 
-def sample_pose(rng: np.random.Generator, recipe: Recipe, drogue: DrogueParameters, depth_m: float) -> RigidTransform:
-    """`left_from_drogue` at one depth: attitude from the recipe's ranges, place uniform in the common field of view.
+def sample_pose(rng: np.random.Generator, recipe: Recipe, points_m: Array, depth_m: float) -> RigidTransform:
+    """Pose in the left camera at one depth: attitude from the recipe's ranges, place uniform in the common view.
 
     An attitude that does not fit into both views at this depth is drawn again.
+
+    Args:
+        rng: the frame's own.
+        recipe: for rig and ranges.
+        points_m: (M, 3) points around all that must be in view, in its own frame. [m]
+        depth_m: Z of that frame's origin. [m]
 
     Raises:
         ValueError: no attitude of the ranges fits.
     """
-    points = outline(drogue)
     for _ in range(_MOST_TRIES):
         pitch, yaw, roll = np.radians(
             [draw(rng, limits) for limits in (recipe.pose.pitch_deg, recipe.pose.yaw_deg, recipe.pose.roll_deg)]
         )
         rotation = rotation_from_angles(pitch, yaw, roll)
-        room = room_m(recipe.rig, points @ rotation.T, depth_m)
+        room = room_m(recipe.rig, points_m @ rotation.T, depth_m)
         place = rng.random(2)
         if room is None:
             continue
@@ -81,6 +86,6 @@ def sample_pose(rng: np.random.Generator, recipe: Recipe, drogue: DrogueParamete
         x_m, y_m = x_low + place[0] * (x_high - x_low), y_low + place[1] * (y_high - y_low)
         return RigidTransform(rotation, np.array([x_m, y_m, depth_m]))
     raise ValueError(
-        f"pose: at {depth_m:g} m no attitude within the recipe's ranges keeps the drogue in both views; "
+        f"pose: at {depth_m:g} m no attitude within the recipe's ranges keeps all in both views; "
         "widen pitch_deg and yaw_deg towards 0 or move away"
     )

@@ -6,31 +6,39 @@ from typing import Literal
 
 import numpy as np
 
+from datasets_manifest.board import PlacedBoard
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from scenes.distance import sample_distance_m
-from scenes.environment import draw, environment_of_scene
+from scenes.environment import environment_of_scene
 from scenes.families import recipe_of_scene
-from scenes.framing import sample_pose
+from scenes.framing import outline, sample_pose
 from scenes.metering import meter
+from scenes.moment import Moment
+from scenes.rangefinder import sample_reading_m
+from scenes.receiver import sample_attitude
 from scenes.seeding import generator
+from scenes.sequence import moment_of_sequence
 from scenes.suspension import sample_suspension
 from scenes.target import condition_of_scene, drogue_of_scene, sample_bystanders
 
 SplitName = Literal["train", "val", "test"]
 SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
 FRAME_PERIOD_S = 0.04  # 25 pairs a second
-# Camera axes (right, down, forward) of a receiver that flies east, in world axes (east, north, up).
-_WORLD_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def scene_of_frame(recipe: Recipe, frame_index: int) -> int:
-    """Which scene a frame belongs to: every run of as many frames as there are scenes visits each once."""
-    scenes = recipe.frames.scenes
-    order = generator(recipe.seed, frame_index // scenes, "scene order").permutation(scenes)
-    return int(order[frame_index % scenes])
+    """Which scene a frame belongs to: every run of as many frames as there are scenes visits each once.
+
+    All frames of a sequence belong to one scene: every run of as many sequences as there are scenes visits each once.
+    """
+    scenes, unit = recipe.frames.scenes, frame_index
+    if recipe.sequence is not None:
+        unit = frame_index // recipe.sequence.frames_per_sequence
+    order = generator(recipe.seed, unit // scenes, "scene order").permutation(scenes)
+    return int(order[unit % scenes])
 
 
 def split_of_scene(recipe: Recipe, scene_id: int) -> SplitName:
@@ -58,36 +66,34 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     scene_id = scene_of_frame(recipe, frame_index)
     recipe = recipe_of_scene(recipe, scene_id)
     environment = environment_of_scene(seed, scene_id, recipe.environment)
-    world_from_left = _sample_receiver(generator(seed, frame_index, "receiver"), recipe)
     drogue = drogue_of_scene(recipe, scene_id)
-    left_from_drogue = _pose_of_frame(recipe, drogue, frame_index)
-    empty = left_from_drogue is None
-    left_from_tanker, nodes = None, None
-    if left_from_drogue is not None:
-        left_from_tanker, nodes = sample_suspension(
-            generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
-        )
-    left_twist, drogue_twist = _sample_motion(generator(seed, frame_index, "motion"), recipe)
+    moment = _moment_of_frame(recipe, drogue, frame_index)
+    pose = moment.left_from_drogue
+    # What stands beside a sequence stays there all along.
+    stands = frame_index if moment.sequence_id is None else moment.sequence_id
     return FrameSpec(
         seed=seed,
         frame_index=frame_index,
         scene_id=scene_id,
         family=recipe.family,
-        time_s=frame_index * FRAME_PERIOD_S,
-        drogue=None if empty else drogue,
-        sought=drogue if empty and recipe.target.variants else None,
-        condition=None if empty else condition_of_scene(recipe, scene_id, drogue),
-        bystanders=sample_bystanders(generator(seed, frame_index, "bystanders"), recipe, left_from_drogue),
-        left_from_drogue=left_from_drogue,
-        world_from_left=world_from_left,
-        left_twist_per_s=left_twist,
-        drogue_twist_per_s=drogue_twist,
-        left_from_tanker=left_from_tanker,
-        hose_nodes_left_m=nodes,
+        sequence_id=moment.sequence_id,
+        time_s=moment.time_s,
+        drogue=None if pose is None else drogue,
+        sought=drogue if pose is None and recipe.target.variants else None,
+        condition=None if pose is None else condition_of_scene(recipe, scene_id, drogue),
+        bystanders=sample_bystanders(generator(seed, stands, "bystanders"), recipe, pose),
+        board=_place_board(recipe, frame_index),
+        left_from_drogue=pose,
+        world_from_left=moment.world_from_left,
+        left_twist_per_s=moment.left_twist_per_s,
+        drogue_twist_per_s=moment.drogue_twist_per_s,
+        left_from_tanker=moment.left_from_tanker,
+        hose_nodes_left_m=moment.hose_nodes_left_m,
         rig=recipe.rig,
         sensor=recipe.sensor,
-        exposure=meter(recipe.exposure, environment, recipe.rig.camera, world_from_left, recipe.sensor),
+        exposure=meter(recipe.exposure, environment, recipe.rig.camera, moment.world_from_left, recipe.sensor),
         environment=environment,
+        rangefinder_reading_m=_read_distance_m(recipe, frame_index, pose),
     )
 
 
@@ -99,7 +105,36 @@ def sample_left_from_drogue(recipe: Recipe, frame_index: int) -> RigidTransform 
     """
     scene_id = scene_of_frame(recipe, frame_index)
     recipe = recipe_of_scene(recipe, scene_id)
-    return _pose_of_frame(recipe, drogue_of_scene(recipe, scene_id), frame_index)
+    drogue = drogue_of_scene(recipe, scene_id)
+    if recipe.sequence is not None:
+        return moment_of_sequence(recipe, recipe.sequence, drogue, frame_index).left_from_drogue
+    return _pose_of_frame(recipe, drogue, frame_index)
+
+
+def _moment_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> Moment:
+    """Where everything is in one frame; the recipe is that of the scene."""
+    if recipe.sequence is not None:
+        return moment_of_sequence(recipe, recipe.sequence, drogue, frame_index)
+    seed = recipe.seed
+    rotation = sample_attitude(generator(seed, frame_index, "receiver"), recipe.pose)
+    world_from_left = RigidTransform(rotation, np.zeros(3))
+    left_from_drogue = _pose_of_frame(recipe, drogue, frame_index)
+    left_from_tanker, nodes = None, None
+    if left_from_drogue is not None:
+        left_from_tanker, nodes = sample_suspension(
+            generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
+        )
+    left_twist, drogue_twist = _sample_motion(generator(seed, frame_index, "motion"), recipe)
+    return Moment(
+        sequence_id=None,
+        time_s=frame_index * FRAME_PERIOD_S,
+        left_from_drogue=left_from_drogue,
+        world_from_left=world_from_left,
+        left_from_tanker=left_from_tanker,
+        left_twist_per_s=left_twist,
+        drogue_twist_per_s=drogue_twist,
+        hose_nodes_left_m=nodes,
+    )
 
 
 def _pose_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> RigidTransform | None:
@@ -107,15 +142,23 @@ def _pose_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int) -
     if generator(recipe.seed, frame_index, "empty").random() < recipe.frames.empty_fraction:
         return None
     distance_m = sample_distance_m(generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
-    return sample_pose(generator(recipe.seed, frame_index, "pose"), recipe, drogue, distance_m)
+    return sample_pose(generator(recipe.seed, frame_index, "pose"), recipe, outline(drogue), distance_m)
 
 
-def _sample_receiver(rng: np.random.Generator, recipe: Recipe) -> RigidTransform:
-    """`world_from_left` of a receiver that flies east, pitched and banked."""
-    pitch, bank = np.radians([draw(rng, recipe.pose.camera_pitch_deg), draw(rng, recipe.pose.camera_bank_deg)])
-    about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-    about_z = np.array([[np.cos(bank), -np.sin(bank), 0], [np.sin(bank), np.cos(bank), 0], [0, 0, 1]])
-    return RigidTransform(_WORLD_FROM_LEVEL_CAMERA @ about_x @ about_z, np.zeros(3))
+def _place_board(recipe: Recipe, frame_index: int) -> PlacedBoard | None:
+    """The calibration board of a frame, or None in a recipe without one."""
+    if recipe.board is None:
+        return None
+    distance_m = sample_distance_m(generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
+    pose = sample_pose(generator(recipe.seed, frame_index, "pose"), recipe, recipe.board.outline_m(), distance_m)
+    return PlacedBoard(shape=recipe.board, left_from_board=pose)
+
+
+def _read_distance_m(recipe: Recipe, frame_index: int, left_from_drogue: RigidTransform | None) -> float | None:
+    """What the recipe's rangefinder reads, or None without one or without a drogue."""
+    if recipe.rangefinder is None or left_from_drogue is None:
+        return None
+    return sample_reading_m(recipe.rangefinder, recipe.seed, frame_index, float(left_from_drogue.translation_m[2]))
 
 
 def _sample_motion(rng: np.random.Generator, recipe: Recipe) -> tuple[Array, Array]:

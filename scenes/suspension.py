@@ -14,9 +14,9 @@ _LATERAL_SPREAD_M = 0.6
 # The hose leaves the pod nearly level and steepens towards the drogue.
 _SLOPE_AT_POD = 0.2
 # Hose end inside the coupling's tail, so that no gap shows.
-_OVERLAP_M = 0.02
+HOSE_OVERLAP_M = 0.02
 # World axes of a tanker that flies east: aft, right wing, up.
-_WORLD_FROM_TANKER = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+WORLD_FROM_TANKER = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def sample_suspension(
@@ -38,7 +38,7 @@ def sample_suspension(
     left_from_world = world_from_left.inverse()
     offset_world = np.array([_TRAIL_AFT_M, rng.uniform(-_LATERAL_SPREAD_M, _LATERAL_SPREAD_M), _TRAIL_BELOW_M])
     pod = left_from_drogue.translation_m + left_from_world.rotate(offset_world)
-    tail_z_m = drogue.hub_depth_m + drogue.coupling_length_m - _OVERLAP_M
+    tail_z_m = drogue.hub_depth_m + drogue.coupling_length_m - HOSE_OVERLAP_M
     tail = left_from_drogue.apply([0.0, 0.0, tail_z_m])
     length_m = float(np.linalg.norm(pod - tail))
     start_tangent = left_from_drogue.rotation[:, 2] * length_m
@@ -52,4 +52,4 @@ def sample_suspension(
         + (3 * s**2 - 2 * s**3) * pod
         + (s**3 - s**2) * end_tangent
     )
-    return RigidTransform(left_from_world.rotation @ _WORLD_FROM_TANKER, pod), nodes
+    return RigidTransform(left_from_world.rotation @ WORLD_FROM_TANKER, pod), nodes

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from datasets_manifest.blind import BlindDataset, BlindPair
 from datasets_manifest.images import StereoImages
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
@@ -35,7 +36,20 @@ def draw_contact_sheet(dataset: Dataset, frames: Sequence[int], columns: int, ti
     Raises:
         ValueError: an image or a record cannot be read.
     """
-    tiles = [_draw_tile(dataset.images(index), dataset.record(index), tile_width_px) for index in frames]
+    return _grid([_draw_tile(dataset.images(index), dataset.record(index), tile_width_px) for index in frames], columns)
+
+
+def draw_blind_sheet(dataset: BlindDataset, frames: Sequence[int], columns: int, tile_width_px: int) -> Picture:
+    """Tiles of left images without labels, and a caption with index and time; arguments as `draw_contact_sheet`.
+
+    Raises:
+        ValueError: an image cannot be read.
+    """
+    return _grid([_draw_blind_tile(dataset.pair(index), tile_width_px) for index in frames], columns)
+
+
+def _grid(tiles: Sequence[Picture], columns: int) -> Picture:
+    """Equal tiles in rows."""
     height_px, width_px = tiles[0].shape[:2]
     rows = math.ceil(len(tiles) / columns)
     shape = (rows * (height_px + _GAP_PX) + _GAP_PX, columns * (width_px + _GAP_PX) + _GAP_PX, 3)
@@ -111,8 +125,16 @@ def _draw_tile(images: StereoImages, record: PairRecord, width_px: int) -> Pictu
         draw_crosses(picture, [view.hub.center_ellipse_px], scale, color=_HUB_RGB)
     distance_m = record.conditions.distance_m
     what = "no drogue" if distance_m is None else f"{distance_m:.2f} m"
-    caption = np.zeros((_CAPTION_PX, width_px, 3), dtype=np.uint8)
-    text = f"{record.frame_index}: {what}"
+    return _with_caption(picture, f"{record.frame_index}: {what}")
+
+
+def _draw_blind_tile(pair: BlindPair, width_px: int) -> Picture:
+    picture, _ = resized(display_picture(pair.images), width_px)
+    return _with_caption(picture, f"{pair.frame_index}: {pair.images.time_s:.2f} s")
+
+
+def _with_caption(picture: Picture, text: str) -> Picture:
+    caption = np.zeros((_CAPTION_PX, picture.shape[1], 3), dtype=np.uint8)
     cv2.putText(caption, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
     tile: Picture = np.concatenate([picture, caption])
     return tile

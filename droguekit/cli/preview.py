@@ -3,36 +3,73 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from droguekit.cli.arguments import DatasetArgument
 
+if TYPE_CHECKING:
+    from datasets_manifest.reader import Dataset
+    from droguekit.benchmark.label_drawing import Picture
+
 EXAMPLES = (
     "droguekit preview data/demo --out sheet.png",
     "droguekit preview data/demo --out sheet.jpg --count 6 --columns 2 --tile-width 640",
     "droguekit preview data/world --out sheet.jpg --by-family --count 30   (no labels, a row for each family)",
+    "droguekit preview data/docking-10m --animate docking.gif --sequence 1   (the flight from the side)",
 )
 
 
 def preview(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="A .png or .jpg file.")],
-    count: Annotated[int, typer.Option("--count", help="How many pairs, spread evenly over the dataset.")] = 20,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="A .png or .jpg file.")] = None,
+    count: Annotated[
+        int | None,
+        typer.Option("--count", help="How many pairs, spread evenly; 20, or 150 of an animation.", show_default=False),
+    ] = None,
     columns: Annotated[int, typer.Option("--columns", help="Tiles in a row, or families side by side.")] = 4,
     tile_width: Annotated[int, typer.Option("--tile-width", metavar="PX", help="Width of a tile.")] = 400,
     by_family: Annotated[
         bool, typer.Option("--by-family", help="A row for each family of conditions, without labels.")
     ] = False,
+    animate: Annotated[
+        Path | None,
+        typer.Option("--animate", metavar="FILE", help="A .gif or .mp4 file: the flight from the side, in time."),
+    ] = None,
+    sequence: Annotated[int | None, typer.Option("--sequence", help="Only this sequence, in an animation.")] = None,
 ) -> None:
-    """Draw a contact sheet of left images with the drogue's box, the features' centres and the distance."""
-    import cv2
-    import numpy as np
+    """Draw a contact sheet of left images with the drogue's box, the features' centres and the distance.
 
+    A dataset without truth, such as an imported one, is drawn without them.
+    """
     from datasets_manifest.reader import Dataset
-    from droguekit.cli.contact_sheet import draw_contact_sheet, draw_family_sheet
 
+    if (out is None) == (animate is None):
+        raise ValueError("--out, --animate: give one of them, a file for a sheet or for an animation")
+    if sequence is not None and animate is None:
+        raise ValueError("--sequence: goes with --animate; leave it out for a sheet")
+    if animate is not None:
+        _animate(Dataset(dataset), animate, 150 if count is None else count, sequence)
+    if out is not None:
+        _check_sheet(out, 20 if count is None else count, columns, tile_width)
+        sheet, shown, pairs = _draw_sheet(dataset, 20 if count is None else count, columns, tile_width, by_family)
+        _write_picture(out, sheet)
+        typer.echo(f"wrote {out}: {shown} of {pairs} pairs")
+
+
+def _animate(source: Dataset, path: Path, count: int, sequence: int | None) -> None:
+    from droguekit.cli.animation import SUFFIXES, write_animation
+
+    if not 1 <= count <= 2000:
+        raise ValueError(f"--count: must be from 1 to 2000 in an animation, got {count}")
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--animate: must end in {' or '.join(SUFFIXES)}, got {path}")
+    shown, length_s = write_animation(source, path, count, sequence)
+    typer.echo(f"wrote {path}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")
+
+
+def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:
     for name, value, low, high in (
         ("count", count, 1, 400),
         ("columns", columns, 1, 40),
@@ -42,26 +79,44 @@ def preview(
             raise ValueError(f"--{name}: must be from {low} to {high}, got {value}")
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise ValueError(f"--out: must end in .png or .jpg, got {out}")
-    source = Dataset(dataset)
-    if not source.frame_indices:
+
+
+def _draw_sheet(dataset: Path, count: int, columns: int, tile_width: int, by_family: bool) -> tuple[Picture, int, int]:
+    """The sheet, how many pairs it shows, and how many there are."""
+    import numpy as np
+
+    from datasets_manifest.blind import BlindDataset
+    from datasets_manifest.layout import BLIND_FILE
+    from datasets_manifest.reader import Dataset
+    from droguekit.cli.contact_sheet import draw_blind_sheet, draw_contact_sheet, draw_family_sheet
+
+    is_blind = (dataset / BLIND_FILE).exists()
+    if is_blind and by_family:
+        raise ValueError(f"--by-family: {dataset} has no truth, and so no families")
+    source = BlindDataset(dataset) if is_blind else Dataset(dataset)
+    pairs = len(source.frame_indices)
+    if not pairs:
         raise ValueError(f"{dataset}: holds no pairs yet")
-    if by_family:
+    if by_family and isinstance(source, Dataset):
         sheet, shown = draw_family_sheet(source, count, columns, tile_width)
-    else:
-        places = np.linspace(0, len(source.frame_indices) - 1, min(count, len(source.frame_indices))).round()
-        frames = [source.frame_indices[int(place)] for place in places]
-        sheet, shown = draw_contact_sheet(source, frames, min(columns, len(frames)), tile_width), len(frames)
-    _, data = cv2.imencode(out.suffix.lower(), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
-    _write_whole(out, data.tobytes())
-    typer.echo(f"wrote {out}: {shown} of {len(source.frame_indices)} pairs")
+        return sheet, shown, pairs
+    places = np.linspace(0, pairs - 1, min(count, pairs)).round()
+    frames = [source.frame_indices[int(place)] for place in places]
+    columns = min(columns, len(frames))
+    if isinstance(source, BlindDataset):
+        return draw_blind_sheet(source, frames, columns, tile_width), len(frames), pairs
+    return draw_contact_sheet(source, frames, columns, tile_width), len(frames), pairs
 
 
-def _write_whole(path: Path, data: bytes) -> None:
+def _write_picture(path: Path, picture: Picture) -> None:
+    import cv2
+
     from datasets_manifest.atomic import part_path
 
+    _, data = cv2.imencode(path.suffix.lower(), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     part = part_path(path)
     try:
-        part.write_bytes(data)
+        part.write_bytes(data.tobytes())
         part.replace(path)
     except OSError as error:
         raise OSError(error.errno, f"{path}: cannot be written: {error.strerror}") from error

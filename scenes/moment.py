@@ -1,0 +1,30 @@
+"""Where everything is at the time of one stereo pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from geometry.se3 import Array, RigidTransform
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One pair, without light; as in `FrameSpec`.
+
+    Attributes:
+        sequence_id: which sequence, or None for a single pair.
+        time_s: mid-exposure. [s]
+        left_from_drogue, left_from_tanker: poses, or None without a drogue.
+        world_from_left: pose.
+        left_twist_per_s, drogue_twist_per_s: (6,) body twists. [m/s, rad/s]
+        hose_nodes_left_m: (K, 3) from the coupling to the pod, or None without a drogue. [m]
+    """
+
+    sequence_id: int | None
+    time_s: float
+    left_from_drogue: RigidTransform | None
+    world_from_left: RigidTransform
+    left_from_tanker: RigidTransform | None
+    left_twist_per_s: Array
+    drogue_twist_per_s: Array
+    hose_nodes_left_m: Array | None

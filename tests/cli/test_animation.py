@@ -1,0 +1,107 @@
+"""The animation of a sequence: its pictures, its pace, and wrong orders."""
+
+from __future__ import annotations
+
+import io
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from datasets_manifest.reader import Dataset
+from datasets_manifest.recipe import parse_recipe
+from droguekit.batch.local import render_dataset
+from droguekit.batch.progress import PlainProgress
+from droguekit.cli.main import DONE, run
+from labelgen.dataset_validation import validate_dataset
+
+RECIPE = """
+name = "tiny-docking"
+seed = 3
+[rig]
+preset = "rgb-ideal"
+width_px = 160
+height_px = 120
+focal_px = 266.0
+[frames]
+count = 12
+scenes = 2
+[sequence]
+frames_per_sequence = 6
+frame_rate_hz = 2
+[sequence.receiver]
+start_m = 2.4
+end_m = 1.7
+closure_m_s = 1.0
+hold_s = 0.0
+[render]
+engine = "analytic"
+"""
+
+
+@pytest.fixture(scope="module")
+def docking(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out, told = tmp_path_factory.mktemp("docking") / "dataset", io.StringIO()
+    summary = render_dataset(parse_recipe(RECIPE), RECIPE, out, range(12), 0, PlainProgress(told))
+    assert summary.drops == (), told.getvalue()
+    return out
+
+
+def test_a_rendered_sequence_is_sound_and_says_what_is_in_view(docking: Path) -> None:
+    assert validate_dataset(docking).faults == []
+    for index in Dataset(docking).frame_indices:
+        record = Dataset(docking).record(index)
+        views = (record.views.left, record.views.right)
+        assert record.sequence_id == index // 6
+        assert record.conditions.markers_in_view == tuple(sum(m.in_image for m in view.markers) for view in views)
+        assert record.conditions.hub_in_view == tuple(view.hub is not None and view.hub.in_image for view in views)
+
+
+def test_gif_shows_a_sequence_in_its_own_time(docking: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "docking.gif"
+    assert run(["preview", str(docking), "--animate", str(out), "--sequence", "1"]) == DONE
+    with Image.open(out) as movie:
+        assert movie.n_frames == 6
+        pictures = []
+        for frame in range(6):
+            movie.seek(frame)
+            assert movie.info["duration"] == 500
+            pictures.append(np.asarray(movie.convert("RGB"), dtype=np.int16))
+    # 960 px wide: on the left the flight from the side, on the right the camera; both change from picture to picture.
+    for earlier, later in pairwise(pictures):
+        changed = np.abs(later - earlier).max(axis=-1) > 60
+        assert changed[:, :480].any() and changed[:, 480:].any()
+
+
+def test_mp4_has_all_pictures(docking: Path, tmp_path: Path) -> None:
+    out = tmp_path / "docking.mp4"
+    assert run(["preview", str(docking), "--animate", str(out), "--count", "5"]) == DONE
+    movie = cv2.VideoCapture(str(out))
+    found = 0
+    while movie.read()[0]:
+        found += 1
+    movie.release()
+    assert found == 5 and [path.name for path in tmp_path.iterdir()] == ["docking.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        (["--animate", "a.avi"], "--animate: must end in .gif or .mp4, got a.avi"),
+        (["--animate", "a.gif", "--count", "0"], "--count: must be from 1 to 2000"),
+        (["--animate", "a.gif", "--sequence", "7"], "holds no pairs of sequence 7 with drogue and tanker to animate"),
+        (["--animate", "a.gif", "--out", "a.png"], "--out, --animate: give one of them"),
+        ([], "--out, --animate: give one of them"),
+        (["--out", "a.png", "--sequence", "0"], "--sequence: goes with --animate"),
+        (["--animate", "/proc/nowhere/a.gif"], "/proc/nowhere/a.gif: cannot be written"),
+    ],
+)
+def test_wrong_orders_are_named_on_one_line(
+    docking: Path, options: list[str], fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["preview", str(docking), *options]) != DONE
+    told = capsys.readouterr().err
+    assert fault in told and told.count("\n") == 1
