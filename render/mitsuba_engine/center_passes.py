@@ -13,7 +13,8 @@ from datasets_manifest.frame import FrameSpec
 from geometry.stereo import Eye
 from render.mitsuba_engine.camera_rays import CameraRays
 from render.mitsuba_engine.scene import DrogueScene, by_shape
-from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, TracedEye, amodal_counts
+from render.mitsuba_engine.traced import ASIDE, OF_DROGUE
+from render.traced import TracedEye, amodal_counts
 
 CENTER = (0.5, 0.5)
 

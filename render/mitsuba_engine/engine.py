@@ -85,7 +85,7 @@ class MitsubaEngine:
 
 def _noise(frame: FrameSpec, traced: Traced, behind: dict[Eye, NDArray[np.float32]]) -> MonteCarloNoise:
     """Noise of the pixels whose centres see the drogue, edges included."""
-    first, second = [], []
+    first, second, shared = [], [], []
     for eye in EYES:
         seen, again = traced.eyes[eye], traced.again[eye]
         place = np.zeros(seen.part_id.size, dtype=np.int64)
@@ -93,7 +93,8 @@ def _noise(frame: FrameSpec, traced: Traced, behind: dict[Eye, NDArray[np.float3
         of_drogue = OF_DROGUE[seen.part_id.reshape(-1)[again.pixel]] > 0
         first.append(seen.pixels_over(behind[eye])[place[again.pixel[of_drogue]]])
         second.append(again.pixels_over(behind[eye])[of_drogue])
-    return measure_noise(frame, np.concatenate(first), np.concatenate(second))
+        shared.append(traced.error_again[eye][of_drogue])
+    return measure_noise(frame, np.concatenate(first), np.concatenate(second), np.concatenate(shared))
 
 
 def _empty_eye(behind: NDArray[np.float32]) -> EyeRadiance:

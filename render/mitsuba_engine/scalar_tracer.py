@@ -21,11 +21,10 @@ from render.mitsuba_engine.traced import (
     SURROUND_DEPTH,
     Plan,
     Traced,
-    TracedEye,
-    amodal_counts,
     plan_pixels,
 )
 from render.motion import blur_px, pose_polynomial
+from render.traced import TracedEye, amodal_counts
 from scenes.seeding import generator
 from scenes.surroundings import Surroundings
 
@@ -68,11 +67,12 @@ class ScalarTracer:
             # Differs from the mean by as much as two means of so many samples would.
             again[eye] = dark.lit_by(pixel, mean + difference)
             stage_s["paths"], started = stage_s["paths"] + time.process_time() - started, time.process_time()
-        return Traced(eyes, again, stage_s)
+        unknown = {eye: np.zeros((len(again[eye].pixel), 3), dtype=np.float32) for eye in EYES}
+        return Traced(eyes, again, unknown, stage_s)
 
 
 def _in_order(plan: Plan) -> NDArray[np.int64]:
-    return np.concatenate([plan.open, plan.sheltered, plan.deep, plan.edges, plan.surround])
+    return np.concatenate([plan.open, plan.sheltered, plan.deep, plan.deep_edges, plan.edges, plan.surround])
 
 
 class _Half:
@@ -87,7 +87,7 @@ class _Half:
         Mitsuba's integrator knows nothing of the sky beforehand: parts in the open take as many paths as others.
         """
         base = np.concatenate([plan.open, plan.sheltered])
-        fine = np.concatenate([plan.deep, plan.edges])
+        fine = np.concatenate([plan.deep, plan.deep_edges, plan.edges])
         fine_count = max(settings.samples_per_px, settings.edge_samples_per_px)
         at_fine = np.zeros((len(fine), 4), dtype=np.float32)
         for tile in self._view.tiles(fine):

@@ -110,7 +110,8 @@ class DrogueScene:
                 self._parameters[f"{name}.bsdf.reflectance.data"] = mi.TensorXf(reflectance_map(frame, part))
             else:
                 paint = even_reflectance_rgb(frame, part).tolist()
-                self._parameters[f"{name}.bsdf.reflectance.value"] = mi.Color3f(paint)
+                place = "bsdf" if f"{name}.bsdf.reflectance.value" in self._parameters else "bsdf.bsdf_0"
+                self._parameters[f"{name}.{place}.reflectance.value"] = mi.Color3f(paint)
             if f"{name}.emitter.radiance.value" in self._parameters:
                 light = lamp_radiance_rgb(frame, part).tolist()
                 self._parameters[f"{name}.emitter.radiance.value"] = mi.Color3f(light)

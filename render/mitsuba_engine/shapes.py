@@ -12,7 +12,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
+from drogue_models.materials import part_satin
 from drogue_models.meshes import bystander_mesh
+from drogue_models.parameters import SatinPaint
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from render.surfaces import even_reflectance_rgb, lamp_radiance_rgb, surface_condition
 from scenes.dirt import DIRT_MAP_PX
@@ -31,6 +33,15 @@ def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any])
 
 def _even(reflectance_rgb: NDArray[np.float64]) -> dict[str, Any]:
     return {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance_rgb.tolist()}}}
+
+
+def _with_sheen(look: dict[str, Any], satin: SatinPaint | None) -> dict[str, Any]:
+    """A look whose material is mixed with mirroring microfacets, if its part has such paint."""
+    if satin is None:
+        return look
+    facets = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": satin.roughness}
+    mixed = {"type": "blendbsdf", "weight": satin.sheen_fraction, "paint": look["bsdf"], "facets": facets}
+    return look | {"bsdf": mixed}
 
 
 def _blotched() -> dict[str, Any]:
@@ -67,7 +78,7 @@ def drogue_shapes(frame: FrameSpec, meshes: dict[int, trimesh.Trimesh]) -> dict[
     shapes: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         for part, mesh in meshes.items():
-            look = _even(even_reflectance_rgb(frame, part))
+            look = _with_sheen(_even(even_reflectance_rgb(frame, part)), part_satin(frame.drogue, part))
             if not surface_condition(frame, part).is_clean:
                 is_hub = part == Part.HUB
                 assert not is_hub or frame.drogue.hub is not None

@@ -26,7 +26,7 @@ samples_per_px = %d
 """
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_recipe():
     """A recipe for the paper's rig scaled down by a factor."""
 

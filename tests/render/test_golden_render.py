@@ -35,6 +35,9 @@ stations_m = [2.2]
 [environment]
 ground = "sea"
 sun_elevation_deg = { low = 40, high = 40 }
+[render]
+edge_samples_per_px = 64
+denoise = false
 """
 
 

@@ -32,19 +32,16 @@ def test_stated_noise_is_the_difference_of_two_renders(engine, make_recipe):
 def test_more_samples_leave_less_noise(engine, make_recipe):
     frame_recipe = make_recipe(scale=0.5, stations_m=(3.0,))
     frame = sample_frame(frame_recipe, 0)
-    few, many = (
-        engine.render(
-            frame,
-            frame_recipe.render.model_copy(update={"samples_per_px": n, "edge_samples_per_px": 4 * n}),
-        )
-        for n in (16, 64)
+    few_samples, many_samples = (
+        frame_recipe.render.model_copy(update={"samples_per_px": n, "edge_samples_per_px": 4 * n}) for n in (16, 64)
     )
+    few, many = (engine.render(frame, settings) for settings in (few_samples, many_samples))
     # Independent samples would halve it; stratified ones do better, and 0.6 leaves room for the estimate's own noise.
     assert many.monte_carlo_over_sensor_noise < 0.6 * few.monte_carlo_over_sensor_noise
     # Ten times the light's electrons have three times its shot noise.
     longer = frame.model_copy(
         update={"exposure": frame.exposure.model_copy(update={"time_s": 10 * frame.exposure.time_s})}
     )
-    assert engine.render(longer, frame_recipe.render).monte_carlo_over_sensor_noise == pytest.approx(
+    assert engine.render(longer, few_samples).monte_carlo_over_sensor_noise == pytest.approx(
         few.monte_carlo_over_sensor_noise * np.sqrt(10), rel=0.1
     )

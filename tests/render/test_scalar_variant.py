@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from geometry.stereo import EYES
-from render.mitsuba_engine.traced import inside_one_part
+from render.traced import inside_one_part
 
 pytestmark = pytest.mark.mitsuba
 

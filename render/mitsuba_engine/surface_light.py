@@ -1,0 +1,213 @@
+"""Light by way of other surfaces, smoothed over each surface: what `trace_rest` gives, without its noise.
+
+What a matt surface receives from other surfaces and from a partly hidden sky varies over centimetres, and neither a
+paint's colour nor an edge in the image nor a shadow of the sun is in it. So paths from what the pixel centres see are
+enough, and their mean over neighbours on the same surface is all but free of noise. Rays to edges and shadows, many to
+a pixel, then look it up. The neighbours' weights come from places and normals and never from what the paths found, so
+that the mean errs only by how much the light varies over the reach.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.parts import Part
+from render.mitsuba_engine.launches import FrameRays, means_by_pixel
+from render.mitsuba_engine.scene import by_shape
+from render.mitsuba_engine.sun_sky_paths import trace_first, trace_rest
+
+SMOOTHING_M = 0.008
+"""Standard deviation of the smoothing on a surface: ribs are this wide. [m]"""
+# The hub's light is even; the coupling has a recess of 0.1 m whose walls get darker quickly. [m]
+_SMOOTHING_BY_PART_M = {Part.HUB: 0.016, Part.COUPLING: 0.005}
+# A neighbour's plane may miss a point by this much. [m]
+_SAME_PLANE_M = 0.005
+# cos^16: half the weight at 17 degrees.
+_NORMAL_POWER = 4
+_LEAST_REFLECTANCE = 1e-4
+# Of neighbours on other surfaces: what they receive is the best guess where no other is near.
+_WEIGHT_ROUND_CORNERS = 1e-4
+# Of the part's mean light, which counts where no centre around sees the surface.
+_LEAST_WEIGHT = 1e-8
+
+
+class SurfaceLight:
+    """Irradiance over pi by way of other surfaces, on what the centres of some pixels see."""
+
+    def __init__(self, rays: FrameRays, pixel: NDArray[np.int64], looking_m: float) -> None:
+        """From the (P,) pixels whose centres see something; rays look for these within about `looking_m`. [m]"""
+        self._rays, self.pixel, self._looking_m = rays, pixel, looking_m
+        self._none = len(pixel)
+        place = np.full(2 * rays.size + 1, self._none, dtype=np.uint32)
+        place[pixel] = np.arange(len(pixel))
+        self._place = mi.UInt32(place)
+        surface = self._surface(mi.UInt32(pixel))
+        shape: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+        smoothing_m = np.full(256, SMOOTHING_M, dtype=np.float32)
+        for part, part_m in _SMOOTHING_BY_PART_M.items():
+            smoothing_m[part] = part_m
+        self._smoothing_m = dr.gather(mi.Float, mi.Float(by_shape(rays.scene, smoothing_m)), shape)
+        self._part = mi.UInt32(by_shape(rays.scene, np.arange(256, dtype=np.uint32)))
+        self._part_of_row = np.array(dr.gather(mi.UInt32, self._part, shape))
+        known = np.array(dr.gather(mi.Float, rays.lights.in_open, shape))
+        self._normal, self._point = _rows(surface.n, known), _rows(surface.p, known)
+        self._mean = self._error = self._point
+
+    def _surface(self, pixel: Any) -> Any:
+        ray = self._rays.through(pixel, mi.Point2f(0.5, 0.5), dr.opaque(mi.Float, 0.5))
+        return self._rays.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
+
+    def trace(self, chosen: list[tuple[NDArray[np.bool_], int]], max_depth: int) -> None:
+        """Trace paths and smooth what they find.
+
+        Args:
+            chosen: (P,) which of the pixels, and how many paths from each for each of two estimates.
+            max_depth: longest path in segments.
+        """
+        halves = np.zeros((2, self._none + 257, 4), dtype=np.float32)
+        for mask, count in chosen:
+            place = np.flatnonzero(mask)
+            # Twice the same pixel: samples of one pixel are spread evenly, and its halves would not be independent.
+            halves[:, place, :3] = self._traced(np.tile(self.pixel[place], 2), count, max_depth).reshape(2, -1, 3)
+        for half in halves:
+            half[self._none + 1 :] = self._by_part(half[: self._none])
+        mean, error = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / 2
+        self._mean, self._error = mi.Float(mean.ravel()), mi.Float(error.ravel())
+
+    def _by_part(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(256, 4) means by part id, 0 where no centre sees a part."""
+        total = np.zeros((256, 4), dtype=np.float64)
+        np.add.at(total, self._part_of_row, light)
+        mean: NDArray[np.float32] = total / np.maximum(np.bincount(self._part_of_row, minlength=256), 1)[:, None]
+        return mean.astype(np.float32)
+
+    def _traced(self, pixel: NDArray[np.int64], count: int, max_depth: int) -> NDArray[np.float32]:
+        """(P, 3) means over paths. [cd/m2]"""
+        if not len(pixel):
+            return np.zeros((0, 3), dtype=np.float32)
+        return np.concatenate([self._launch(part, count, max_depth) for part in self._rays.parts(pixel, count)])
+
+    def _launch(self, pixel: NDArray[np.int64], count: int, max_depth: int) -> NDArray[np.float32]:
+        rays, lanes = self._rays, len(pixel) * count
+        of_pixel = dr.gather(mi.UInt32, mi.UInt32(pixel), dr.arange(mi.UInt32, lanes) // count)
+        ray = rays.through(of_pixel, mi.Point2f(0.5, 0.5), dr.opaque(mi.Float, 0.5))
+        _, hit, surface, known = trace_first(rays.scene, rays.lights, ray)
+        rest = trace_rest(rays.scene, rays.lights, rays.sampler(lanes, count), (surface, hit, known), max_depth)
+        reflectance = surface.bsdf(ray).eval_diffuse_reflectance(surface, hit)
+        return means_by_pixel([*(rest / dr.maximum(reflectance, _LEAST_REFLECTANCE))], count)
+
+    def smooth(self, mask: NDArray[np.bool_], most_m: float, reach_px: int) -> None:
+        """Replace the light of some of the pixels by means over their neighbours.
+
+        Args:
+            mask: (P,) which.
+            most_m: largest standard deviation of the weights over the distance between places. [m]
+            reach_px: how far away neighbours may be in the image.
+        """
+        row = mi.UInt32(np.flatnonzero(mask))
+        if not len(row):
+            return
+        normal, point = (_gathered(rows, row) for rows in (self._normal, self._point))
+        pixel = mi.UInt32(self.pixel[mask])
+        sigma_m = dr.minimum(dr.gather(mi.Float, self._smoothing_m, row), dr.opaque(mi.Float, most_m))
+        mean, error = self._around(pixel, (normal, point), sigma_m, reach_px)
+        smoothed = [dr.copy(self._mean), dr.copy(self._error)]
+        for rows, values in zip(smoothed, (mean, error), strict=True):
+            dr.scatter(rows, values, row)
+        dr.eval(smoothed)
+        self._mean, self._error = smoothed
+
+    def towards(self, pixel: Any, place: Any, surface: Any, known: Any) -> tuple[Any, Any]:
+        """Light on surfaces that rays meet, by what the four nearest centres see.
+
+        Args:
+            pixel, place: where the rays go, as in `CameraRays.rays`.
+            surface, known: what they meet, as from `trace_first`.
+
+        Returns:
+            Light of those on the same surface, or the mean over its part where none of them sees it, and its error.
+            [cd/m2]
+        """
+        width, last = dr.opaque(mi.UInt32, self._rays.width_px), dr.opaque(mi.UInt32, 2 * self._rays.size)
+        per_square = dr.opaque(mi.Float, 0.5 / self._looking_m**2)
+        # Places before the first pixel wrap to beyond the last.
+        corner = pixel - dr.select(place.y < 0.5, width, 0) - dr.select(place.x < 0.5, mi.UInt32(1), 0)
+        shape: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+        part = dr.opaque(mi.UInt32, self._none + 1) + dr.gather(mi.UInt32, self._part, shape, surface.is_valid())
+        total: Any = mi.Float(_LEAST_WEIGHT)
+        mean, error = (total * _gathered(rows, part) for rows in (self._mean, self._error))
+        for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            row = dr.gather(mi.UInt32, self._place, dr.minimum(corner + down * width + right, last))
+            weight = self._weight(row, (surface.n, surface.p, known), per_square)
+            mean += weight * _gathered(self._mean, row)
+            error += weight * _gathered(self._error, row)
+            total += weight
+        return mi.Color3f(mean.xyz / total), mi.Color3f(error.xyz / total)
+
+    def at_center(self, pixel: Any) -> tuple[Any, Any]:
+        """Light on what the centres of pixels see, and its error. [cd/m2]"""
+        row = dr.gather(mi.UInt32, self._place, pixel)
+        mean, error = (_gathered(rows, row) for rows in (self._mean, self._error))
+        return mi.Color3f(mean.xyz), mi.Color3f(error.xyz)
+
+    def _around(self, pixel: Any, seen: tuple[Any, Any], sigma_m: Any, reach_px: int) -> tuple[Any, Any]:
+        """Weighted means of light and error, of the pixels around.
+
+        Args:
+            pixel: the middle ones.
+            seen: normal and known share of the sky's light of surfaces, and places on them.
+            sigma_m: standard deviation of the weights. [m]
+            reach_px: as in `smooth`.
+        """
+        normal, point = seen
+        side, width = dr.opaque(mi.UInt32, 2 * reach_px + 1), dr.opaque(mi.UInt32, self._rays.width_px)
+        reach, last = dr.opaque(mi.UInt32, reach_px), dr.opaque(mi.UInt32, 2 * self._rays.size)
+        per_square = 0.5 / (sigma_m * sigma_m)
+
+        def more(tap: Any, *_: Any) -> Any:
+            return tap < side * side
+
+        def add(tap: Any, total: Any, mean: Any, error: Any) -> tuple[Any, Any, Any, Any]:
+            down = tap // side
+            # Places before the first pixel wrap to beyond the last.
+            at = dr.minimum(pixel + (down - reach) * width + (tap - down * side) - reach, last)
+            row = dr.gather(mi.UInt32, self._place, at)
+            weight = self._weight(row, (normal.xyz, point.xyz, normal.w), per_square)
+            mean_there, error_there = (_gathered(rows, row) for rows in (self._mean, self._error))
+            return tap + 1, total + weight, mean + weight * mean_there, error + weight * error_there
+
+        nothing: Any = dr.zeros(mi.Vector4f, dr.width(pixel))
+        _, total, mean, error = dr.while_loop(
+            (mi.UInt32(0), dr.zeros(mi.Float, dr.width(pixel)), nothing, nothing), more, add
+        )
+        per_weight = 1.0 / dr.maximum(total, 1e-12)
+        return mean * per_weight, error * per_weight
+
+    def _weight(self, row: Any, seen: tuple[Any, Any, Any], per_square: Any) -> Any:
+        """How far what a centre sees is of the surface with this normal, point, and known share of the sky's light."""
+        normal, point, known = seen
+        normal_there, point_there = (_gathered(rows, row) for rows in (self._normal, self._point))
+        away = point_there.xyz - point
+        facing = dr.maximum(dr.dot(normal_there.xyz, normal), 0.0)
+        for _ in range(_NORMAL_POWER):
+            facing = facing * facing
+        off_plane = dr.dot(away, normal) / _SAME_PLANE_M
+        same = facing * dr.exp(-off_plane * off_plane) + _WEIGHT_ROUND_CORNERS
+        return dr.select(normal_there.w == known, same * dr.exp(-dr.dot(away, away) * per_square), 0.0)
+
+
+def _gathered(rows: Any, row: Any) -> Any:
+    """The four numbers of rows."""
+    return dr.gather(mi.Vector4f, rows, row)
+
+
+def _rows(vector: Any, last: NDArray[np.float32]) -> Any:
+    """(P + 1, 4) numbers in one array, by pixel; row P is of pixels whose centres see nothing, its last number -1."""
+    rows = np.full((len(last) + 1, 4), -1.0, dtype=np.float32)
+    rows[:-1, :3], rows[:-1, 3] = np.array(vector).T, last
+    return mi.Float(rows.ravel())

@@ -1,0 +1,96 @@
+"""What a path tracer hands back for one eye, and how that goes over the surroundings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.parts import FIRST_MARKER_ID, Part
+from render.engine import EyeRadiance
+
+# Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
+_SEAM_DEPTH_FRACTION = 1e-5
+
+
+@dataclass(eq=False)
+class TracedEye:
+    """Passes of all pixel centres, and radiance of the traced pixels.
+
+    Attributes:
+        part_id, depth_m, normal, amodal_px: as in `EyeRadiance`.
+        pixel: (P,) flat indices of the traced pixels.
+        radiance_cd_m2: (P, 3) light from parts alone, already weighted by coverage. [cd/m2]
+        coverage: (P,) share of the pixel that parts cover.
+    """
+
+    part_id: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    amodal_px: dict[int, int]
+    pixel: NDArray[np.int64]
+    radiance_cd_m2: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+
+    def lit_by(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> TracedEye:
+        """The same passes with these pixels, and their (P, 4) radiance and coverage."""
+        return replace(self, pixel=pixel, radiance_cd_m2=light[:, :3], coverage=light[:, 3])
+
+    def put_behind_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> None:
+        """Let the air between parts and camera take its share of their light and add its own, in place.
+
+        A pixel on an edge has the depth of its nearest neighbour; the drogue's own depth matters little to the haze.
+
+        Args:
+            air: (P, 3) radiance of endless air in the direction of each traced pixel. [cd/m2]
+            optical_depth_per_m: (P,) optical depth per planar depth. [1/m]
+        """
+        nearest = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[self.pixel]
+        clear = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))[:, None]
+        through = self.radiance_cd_m2 * clear + self.coverage[:, None] * (1.0 - clear) * air
+        self.radiance_cd_m2 = through.astype(np.float32)
+
+    def pixels_over(self, behind: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(P, 3) radiance of the traced pixels over the surroundings `behind` (H, W, 3)."""
+        through: NDArray[np.float32] = (1.0 - self.coverage)[:, None] * behind.reshape(-1, 3)[self.pixel]
+        return self.radiance_cd_m2 + through
+
+    def over(self, behind: NDArray[np.float32]) -> EyeRadiance:
+        """The traced pixels over the surroundings `behind` (H, W, 3)."""
+        radiance = behind.copy()
+        flat = radiance.reshape(-1, 3)
+        flat[self.pixel] = self.pixels_over(behind)
+        coverage = np.zeros(behind.shape[:2], dtype=np.float32)
+        coverage.reshape(-1)[self.pixel] = self.coverage
+        return EyeRadiance(radiance, coverage, self.part_id, self.depth_m, self.normal, self.amodal_px)
+
+
+def amodal_counts(
+    part_id: NDArray[np.uint8],
+    depth_m: NDArray[np.float32],
+    alone_id: NDArray[np.uint8],
+    alone_depth_m: NDArray[np.float32],
+) -> dict[int, int]:
+    """Pixel centres that each marker and the hub would cover if nothing stood before it.
+
+    A ray along the seam between a feature and the part that it is set into may fall to either; both lie at one depth,
+    and then the whole scene's verdict counts, so that an unoccluded feature has exactly as many as are seen of it.
+
+    Args:
+        part_id, depth_m: what the pixel centres see, and how far.
+        alone_id, alone_depth_m: the same with markers and hub alone; of equal shape.
+    """
+    feature = (part_id >= FIRST_MARKER_ID) | (part_id == Part.HUB)
+    with np.errstate(invalid="ignore"):
+        one_depth = np.abs(depth_m - alone_depth_m) <= _SEAM_DEPTH_FRACTION * depth_m
+    counts = np.bincount(np.where(feature | one_depth, part_id, alone_id).ravel(), minlength=256)
+    return {part: int(counts[part]) for part in (int(Part.HUB), *range(FIRST_MARKER_ID, 256)) if counts[part]}
+
+
+def inside_one_part(part_id: NDArray[np.uint8], reach_px: int = 1) -> NDArray[np.bool_]:
+    """(H, W) pixels from which all within `reach_px` see the same part: what spreads there is noise and no edge."""
+    kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
+    alone: NDArray[np.bool_] = (cv2.erode(part_id, kernel) == cv2.dilate(part_id, kernel)) & (part_id > 0)
+    return alone

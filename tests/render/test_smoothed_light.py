@@ -1,0 +1,96 @@
+"""Light smoothed over surfaces, against paths through every pixel alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids
+from geometry.stereo import EYES
+from render.optics import blur
+from scenes.sampler import sample_frame
+
+pytestmark = pytest.mark.mitsuba
+
+
+@pytest.fixture(scope="module")
+def settled(engine, make_recipe):
+    """A frame at a third of the paper's scale, its recipe, and what many paths through every pixel make of it."""
+    recipe = make_recipe(scale=1 / 3, stations_m=(3.0,))
+    frame = sample_frame(recipe, 0)
+    many = {"samples_per_px": 400, "open_samples_per_px": 36, "edge_samples_per_px": 2500, "denoise": False}
+    return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
+
+
+def reseeded(frame, seed):
+    return frame.model_copy(update={"seed": seed})
+
+
+def of_drogue(seen):
+    return np.isin(seen.part_id, drogue_part_ids(MAX_MARKERS))
+
+
+def over_sensor(frame, first, second):
+    """Rms difference of two renders over the sensor's noise on the drogue, both behind the lens."""
+    sensor, per_cd_m2 = frame.sensor, frame.sensor.electrons_per_cd_m2(frame.exposure)
+    squares, electrons = [], []
+    for eye in EYES:
+        a, b = getattr(first, eye), getattr(second, eye)
+        difference = blur(a.radiance_cd_m2, sensor.psf_sigma_px) - blur(b.radiance_cd_m2, sensor.psf_sigma_px)
+        squares.append((per_cd_m2 * difference[of_drogue(a)]) ** 2)
+        electrons.append(per_cd_m2 * b.radiance_cd_m2[of_drogue(b)])
+    return np.sqrt(np.mean(np.concatenate(squares)) / (np.mean(np.concatenate(electrons)) + sensor.read_noise_e**2))
+
+
+def test_smoothing_brings_pictures_nearer_to_the_settled_one(engine, settled):
+    recipe, frame, truth = settled
+    smoothed = engine.render(frame, recipe.render)
+    # Edges take fewer rays than their number for a drogue that is all edges: here some 100.
+    alone = engine.render(frame, recipe.render.model_copy(update={"denoise": False, "edge_samples_per_px": 64}))
+    error = over_sensor(frame, smoothed, truth)
+    # Noise and what smoothing blurs, together.
+    assert error < over_sensor(frame, alone, truth)
+
+
+def test_stated_noise_is_that_of_two_pictures(engine, settled):
+    recipe, frame, _ = settled
+    first, second = (engine.render(reseeded(frame, seed), recipe.render) for seed in (1, 2))
+    stated = np.mean([first.monte_carlo_over_sensor_noise, second.monte_carlo_over_sensor_noise])
+    # A sixteenth of the pixels states it, a few edges make up most of it, and the lens is taken to leave all of the
+    # error that neighbours share: rather too much than too little.
+    assert 0.8 < stated / (over_sensor(frame, first, second) / np.sqrt(2)) < 1.5
+
+
+@pytest.mark.parametrize("part", [Part.FACE, Part.RIBS, Part.COUPLING, Part.HUB, FIRST_MARKER_ID])
+def test_smoothing_keeps_the_mean_light_of_parts(engine, settled, part):
+    recipe, frame, truth = settled
+    smoothed = [engine.render(reseeded(frame, seed), recipe.render) for seed in (3, 4)]
+    means = [
+        np.mean(np.concatenate([getattr(seen, eye).radiance_cd_m2[getattr(seen, eye).part_id == part] for eye in EYES]))
+        for seen in (*smoothed, truth)
+    ]
+    # Means over some hundred pixels of 2 % noise; ribs are narrower than the smoothing.
+    assert np.mean(means[:2]) == pytest.approx(means[2], rel=0.01 if part != Part.RIBS else 0.03)
+
+
+def test_smoothing_moves_no_marker(engine, settled):
+    recipe, frame, truth = settled
+    smoothed = engine.render(frame, recipe.render)
+    shifts = [
+        np.linalg.norm(redness_centroid(smoothed.left, marker) - redness_centroid(truth.left, marker))
+        for marker in range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)
+    ]
+    # What the renderer may do to a marker on average.
+    assert np.mean(shifts) < 0.005
+
+
+def redness_centroid(seen, marker):
+    """Centroid of red over blue around a marker. [px]"""
+    rows, columns = np.nonzero(seen.part_id == marker)
+    window = np.s_[rows.min() - 3 : rows.max() + 4, columns.min() - 3 : columns.max() + 4]
+    red = seen.radiance_cd_m2[window][..., 0].astype(float) - seen.radiance_cd_m2[window][..., 2]
+    red -= np.median(red[[0, -1]])
+    v, u = np.indices(red.shape)
+    # Beyond the marker's own surroundings other things are bluer than the face.
+    near = (u - red.shape[1] / 2 + 0.5) ** 2 + (v - red.shape[0] / 2 + 0.5) ** 2 < (min(red.shape) / 2) ** 2
+    return np.array([np.sum((values * red)[near]) for values in (u, v)]) / np.sum(red[near])
