@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
 # where the folder lies.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow torture lint bench bench-engines bench-peers bars-nav-a bars-nav-b bars-nav-c bars-nav-d clean
+.PHONY: help setup demo test test-slow torture fuzz lint bench bench-engines bench-peers bars-nav-a bars-nav-b bars-nav-c bars-nav-d publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -29,6 +29,9 @@ test-slow: setup ## the tests that render for longer
 torture: setup ## kill a run 50 times on its way through 200 pairs, and compare with an undisturbed one (minutes)
 	@$(BIN)/python -m pytest tests/batch -m torture --capture=no
 
+fuzz: setup ## 10,000 damaged and hostile files through every reader, validate and every export (minutes)
+	@DROGUEKIT_FUZZ_TIMES=20 $(BIN)/python -m pytest tests/fuzz
+
 lint: setup ## formatting, style, types, walls between the packages
 	@echo "lint: ruff, import-linter, mypy"
 	@$(BIN)/ruff format --check --quiet . || { echo "lint: run .venv/bin/ruff format"; exit 1; }
@@ -36,7 +39,7 @@ lint: setup ## formatting, style, types, walls between the packages
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/mypy
 
-bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (most of an hour; installs Blender)
+bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (an hour; installs Blender; goes on where it stopped)
 	@scripts/setup all
 	@$(BIN)/python -m droguekit.engine_agreement --out out/engine-agreement
 
@@ -63,6 +66,11 @@ bars-nav-c: ## accuracy bars, tier C: noise, flips, covariances and tolerances a
 bars-nav-d: ## accuracy bars, tier D: markers measured wrongly, at the level of centroids (minutes)
 	@scripts/setup mitsuba
 	@$(BIN)/droguekit bars d --out out/bars/d
+
+publish: ## make the published manifests of the small recipes anew (minutes); after a change of pixels or recipes
+	@scripts/setup mitsuba
+	@rm -rf out/publish
+	@$(BIN)/python -m droguekit.batch.publish --work out/publish --out datasets_manifest/published
 
 clean: ## remove the environment, caches and build results; out/ stays
 	rm -rf .venv .bootstrap build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

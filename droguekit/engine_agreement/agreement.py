@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from droguekit.engine_agreement.measures import FrameAgreement, compare
+from droguekit.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios
 from droguekit.engine_agreement.paired_frames import PairedFrame, Rendered, render_both
 from droguekit.engine_agreement.plates import PlateLight
 from render.engine import RenderEngine
@@ -25,25 +26,18 @@ PARTS_WITH_A_BAR = ("markers", "rim", "canopy", "hose")
 
 @dataclass(frozen=True, eq=False)
 class ComparedFrame:
-    """One frame by both engines: pictures, cost and noise of either, and what differs."""
+    """One frame by both engines: pictures and cost of either, and what differs."""
 
     paired: PairedFrame
     one: Rendered
     other: Rendered
     agreement: FrameAgreement
 
-    @property
-    def cost_ratio(self) -> float:
-        """CPU time of the other engine over the first one's at equal noise."""
-        noise = self.other.plain.monte_carlo_noise_fraction / self.one.plain.monte_carlo_noise_fraction
-        return self.other.cpu_s / self.one.cpu_s * noise**2
 
-
-def compared_frames(frames: Sequence[PairedFrame], one: RenderEngine, other: RenderEngine) -> Iterator[ComparedFrame]:
-    """Render every frame by both engines and compare."""
-    for paired in frames:
-        first, second = render_both(paired, one), render_both(paired, other)
-        yield ComparedFrame(paired, first, second, compare(paired.frame, first, second))
+def compare_frame(paired: PairedFrame, one: RenderEngine, other: RenderEngine) -> ComparedFrame:
+    """Render a frame by both engines and compare."""
+    first, second = render_both(paired, one), render_both(paired, other)
+    return ComparedFrame(paired, first, second, compare(paired.frame, first, second))
 
 
 @dataclass(frozen=True)
@@ -61,13 +55,12 @@ class Bar:
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
-def bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float], plates: Sequence[PlateLight]) -> list[Bar]:
+def frame_bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -> list[Bar]:
     """What the engines are held to, over all frames.
 
     Args:
         frames: agreement of each.
         distances_m: of each frame's drogue. [m]
-        plates: light on white plates.
     """
     centroids = np.concatenate([frame.centroids_px for frame in frames])
     label, one, other = np.moveaxis(centroids, 1, 0)
@@ -81,14 +74,51 @@ def bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float], plates:
         result.append(Bar("drogue masks up to 5 m, least overlap", min(near), LEAST_DROGUE_IOU, at_least=True))
     ribs = max(frame.rib_distance_px for frame in frames)
     result.append(Bar("ribs, farthest boundary [px]", ribs, MOST_RIB_DISTANCE_PX))
-    if plates:
-        worst = max(abs(plate.ratio - 1) for plate in plates)
-        result.append(Bar("white plates, largest difference", worst, MOST_PLATE_ERROR))
     ratios = part_ratios(frames)
     for part in PARTS_WITH_A_BAR:
         if part in ratios:
             result.append(Bar(f"{part}, difference of mean luminance", abs(ratios[part] - 1), MOST_PART_ERROR))
     return result
+
+
+@dataclass(frozen=True)
+class CentroidOffset:
+    """Whether one engine's markers lie to a side of the other's: second less first, mean and standard error. [px]"""
+
+    n: int
+    mean_px: tuple[float, float]
+    error_px: tuple[float, float]
+
+
+def centroid_offset(frames: Sequence[FrameAgreement]) -> CentroidOffset | None:
+    """Over all markers of all frames; None with fewer than two."""
+    centroids = np.concatenate([frame.centroids_px for frame in frames])
+    apart = centroids[:, 2] - centroids[:, 1]
+    if len(apart) < 2:
+        return None
+    errors = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
+    return CentroidOffset(
+        len(apart), (float(apart[:, 0].mean()), float(apart[:, 1].mean())), (float(errors[0]), float(errors[1]))
+    )
+
+
+def plate_bars(plates: Sequence[PlateLight]) -> list[Bar]:
+    """What the engines are held to by light on white plates."""
+    worst = max(abs(plate.ratio - 1) for plate in plates)
+    return [Bar("white plates, largest difference", worst, MOST_PLATE_ERROR)]
+
+
+def navigation_bars(stations: Sequence[PairedErrors]) -> list[Bar]:
+    """Whether navigation errs alike: equal sizes and equal means lie within the intervals of what was measured."""
+    sizes = [
+        Bar(f"{row.of} errors, equal sizes outside their interval by", row.outside, 0.0)
+        for row in size_ratios(stations)
+    ]
+    means = [
+        Bar(f"{row.of} error, mean difference [own rms]", abs(row.mean), row.reach)
+        for row in mean_differences(stations)
+    ]
+    return sizes + means
 
 
 def part_ratios(frames: Sequence[FrameAgreement]) -> dict[str, float]:

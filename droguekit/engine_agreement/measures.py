@@ -42,6 +42,20 @@ class FrameAgreement:
     rib_distance_px: float
     part_sums: dict[str, tuple[int, float, float]]
 
+    def row(self) -> dict[str, Any]:
+        """All figures, for JSON."""
+        return vars(self) | {"centroids_px": self.centroids_px.tolist()}
+
+
+def agreement_of(row: dict[str, Any]) -> FrameAgreement:
+    """The figures as `FrameAgreement.row` has put them."""
+    return FrameAgreement(
+        np.array(row["centroids_px"], dtype=np.float64).reshape(-1, 3, 2),
+        row["drogue_iou"],
+        row["rib_distance_px"],
+        {name: tuple(sums) for name, sums in row["part_sums"].items()},
+    )
+
 
 def compare(frame: FrameSpec, one: Rendered, other: Rendered) -> FrameAgreement:
     """Measure how far two engines agree on a frame."""

@@ -37,22 +37,25 @@ class PlateLight:
         return self.one_lux / self.other_lux
 
 
-def compare_plates(one: RenderEngine, other: RenderEngine, samples: int = 256) -> list[PlateLight]:
-    """Light on the drogue's face, painted white: it shines with illuminance / pi."""
+def compare_plate(tilt_deg: tuple[float, float], samples: int, one: RenderEngine, other: RenderEngine) -> PlateLight:
+    """Light on the drogue's face, painted white: it shines with illuminance / pi.
+
+    Args:
+        tilt_deg: pitch and yaw of the plate. [deg]
+        samples: through each of its pixels.
+        one, other: engines.
+    """
     recipe = _plate_recipe(samples)
-    plates = []
-    for pitch_deg, yaw_deg in TILTS_DEG:
-        frame = _plate_frame(recipe, pitch_deg, yaw_deg)
-        got = []
-        for engine in (one, other):
-            seen = engine.render(frame, recipe.render).left
-            inside = (seen.part_id == Part.FACE) & (seen.coverage > 0.999)
-            got.append(np.pi * float(luminance(seen.radiance_cd_m2[inside]).mean()))
-        assert frame.left_from_drogue is not None
-        normal = -(frame.world_from_left @ frame.left_from_drogue).rotation[:, 2]
-        integral = luminance(surroundings(frame.environment).plate_illuminance_lux(normal))
-        plates.append(PlateLight(pitch_deg, yaw_deg, got[0], got[1], float(integral)))
-    return plates
+    frame = _plate_frame(recipe, *tilt_deg)
+    got = []
+    for engine in (one, other):
+        seen = engine.render(frame, recipe.render).left
+        inside = (seen.part_id == Part.FACE) & (seen.coverage > 0.999)
+        got.append(np.pi * float(luminance(seen.radiance_cd_m2[inside]).mean()))
+    assert frame.left_from_drogue is not None
+    normal = -(frame.world_from_left @ frame.left_from_drogue).rotation[:, 2]
+    integral = luminance(surroundings(frame.environment).plate_illuminance_lux(normal))
+    return PlateLight(*tilt_deg, got[0], got[1], float(integral))
 
 
 def _plate_recipe(samples: int) -> Recipe:

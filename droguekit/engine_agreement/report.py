@@ -1,4 +1,4 @@
-"""The agreement on paper: a table of text, the numbers as JSON, and pictures of what differs."""
+"""The agreement on paper: tables of text, the numbers as JSON, and pictures of what differs."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from droguekit.engine_agreement.agreement import Bar, ComparedFrame, part_ratios
-from droguekit.engine_agreement.measures import luminance
+from datasets_manifest.atomic import write_text_atomic
+from droguekit.engine_agreement.agreement import Bar, CentroidOffset, ComparedFrame, part_ratios
+from droguekit.engine_agreement.costs import CostAt
+from droguekit.engine_agreement.measures import FrameAgreement, luminance
+from droguekit.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios, station_rows
 from droguekit.engine_agreement.plates import PlateLight
 
 # A difference of a fortieth of the picture's white fills the scale from middle grey to black or white.
@@ -21,70 +24,103 @@ _MARGIN_PX = 12
 
 
 def frame_row(compared: ComparedFrame) -> dict[str, Any]:
-    """The figures of one frame."""
-    agreement = compared.agreement
-    label, one, other = np.moveaxis(agreement.centroids_px, 1, 0)
+    """What is kept of one frame."""
     return {
         "family": compared.paired.family,
         "distance_m": compared.paired.distance_m,
         "samples_per_px": compared.paired.settings.samples_per_px,
+        "first_cpu_s": compared.one.cpu_s,
+        "second_cpu_s": compared.other.cpu_s,
+        "agreement": compared.agreement.row(),
+    }
+
+
+def frame_figures(row: dict[str, Any], agreement: FrameAgreement) -> dict[str, Any]:
+    """The figures of one frame without its single markers."""
+    label, one, other = np.moveaxis(agreement.centroids_px, 1, 0)
+    return {name: value for name, value in row.items() if name != "agreement"} | {
         "markers": len(label),
         "centroid_rms_px": _rms(one - other),
         "first_label_rms_px": _rms(one - label),
         "second_label_rms_px": _rms(other - label),
         "drogue_iou": agreement.drogue_iou,
         "rib_distance_px": agreement.rib_distance_px,
-        "first_cpu_s": compared.one.cpu_s,
-        "second_cpu_s": compared.other.cpu_s,
-        "first_noise": compared.one.plain.monte_carlo_noise_fraction,
-        "second_noise": compared.other.plain.monte_carlo_noise_fraction,
-        "cost_ratio": compared.cost_ratio,
         "part_ratios": part_ratios([agreement]),
+        "part_pixels": {name: sums[0] for name, sums in agreement.part_sums.items()},
     }
 
 
-def table_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """One line a frame."""
-    head = f"{'family':<18}{'m':>5}{'spp':>5}{'centroids':>11}{'1st-label':>11}{'2nd-label':>11}"
-    lines = [head + f"{'IoU':>9}{'ribs':>6}{'cpu 1st':>9}{'cpu 2nd':>9}{'cost x':>8}  parts 2nd/1st"]
-    for row in rows:
-        ratios = row["part_ratios"]
-        lines.append(
-            "{family:<18}{distance_m:5g}{samples_per_px:5d}{centroid_rms_px:11.4f}{first_label_rms_px:11.4f}"
-            "{second_label_rms_px:11.4f}{drogue_iou:9.5f}{rib_distance_px:6.2f}{first_cpu_s:9.2f}{second_cpu_s:9.2f}"
-            "{cost_ratio:8.1f}  ".format(**row)
-            + " ".join(f"{name} {ratio:.3f}" for name, ratio in ratios.items())
-        )
-    return lines
+def frame_head() -> str:
+    """What stands over the lines of frames."""
+    head = f"{'family':<26}{'m':>6}{'spp':>5}{'markers':>8}{'between':>9}{'1st-label':>10}{'2nd-label':>10}"
+    return head + f"{'IoU':>9}{'ribs':>6}{'cpu 1st':>9}{'cpu 2nd':>9}  parts 2nd/1st"
+
+
+def frame_line(figures: dict[str, Any]) -> str:
+    """One line for a frame."""
+    return (
+        "{family:<26}{distance_m:6.3g}{samples_per_px:5d}{markers:8d}{centroid_rms_px:9.4f}{first_label_rms_px:10.4f}"
+        "{second_label_rms_px:10.4f}{drogue_iou:9.5f}{rib_distance_px:6.2f}{first_cpu_s:9.2f}{second_cpu_s:9.2f}  "
+    ).format(**figures) + " ".join(f"{name} {ratio:.3f}" for name, ratio in figures["part_ratios"].items())
 
 
 def bar_lines(bars: Sequence[Bar]) -> list[str]:
     """One line a bar."""
     return [
         f"{'reached' if bar.reached else 'MISSED ':<8} {bar.name}: {bar.value:.5f} "
-        f"({'at least' if bar.at_least else 'at most'} {bar.limit:g})"
+        f"({'at least' if bar.at_least else 'at most'} {bar.limit:.4g})"
         for bar in bars
     ]
 
 
-def plate_lines(plates: Sequence[PlateLight]) -> list[str]:
-    """One line a plate."""
-    return [
+def offset_line(offset: CentroidOffset) -> str:
+    """One line for the mean of what the centroids differ by."""
+    (u, v), (error_u, error_v) = offset.mean_px, offset.error_px
+    return (
+        f"centroids, second engine less first: u {u:+.5f} +- {error_u:.5f} px, v {v:+.5f} +- {error_v:.5f} px, "
+        f"mean and standard error of {offset.n}"
+    )
+
+
+def plate_line(plate: PlateLight) -> str:
+    """One line for a plate."""
+    return (
         f"plate pitch {plate.pitch_deg:+.0f} yaw {plate.yaw_deg:+.0f} deg: {plate.one_lux:.0f} lx and "
         f"{plate.other_lux:.0f} lx, ratio {plate.ratio:.4f}; by integral {plate.integral_lux:.0f} lx"
-        for plate in plates
-    ]
+    )
 
 
-def write_json(out: Path, rows: Sequence[dict[str, Any]], bars: Sequence[Bar], plates: Sequence[PlateLight]) -> None:
-    """All figures as `agreement.json`."""
-    content = {
-        "schema": 1,
-        "bars": [{**vars(bar), "reached": bar.reached} for bar in bars],
-        "plates": [vars(plate) for plate in plates],
-        "frames": list(rows),
-    }
-    (out / "agreement.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+def cost_line(cost: CostAt) -> str:
+    """One line for the costs at a distance."""
+    one, other = (
+        f"{side.cpu_s:.2f} s at {side.samples} samples and noise {side.noise:.4f}" for side in (cost.one, cost.other)
+    )
+    return f"cost at {cost.distance_m:g} m: {one}; {other}" + ("" if cost.is_reached else ", not yet as quiet")
+
+
+def navigation_lines(stations: Sequence[PairedErrors]) -> list[str]:
+    """One line a distance, then what all of them say."""
+    lines = []
+    for row in station_rows(stations):
+        sizes = " ".join(
+            f"{name} {row['first_rms'][name]:.3g}/{row['second_rms'][name]:.3g}" for name in row["first_rms"]
+        )
+        lines.append(f"joint at {row['distance_m']:g} m, {row['fixes']} of {row['pairs']} pairs, rms 1st/2nd: {sizes}")
+    for ratio in size_ratios(stations):
+        low, high = ratio.interval or (float("nan"), float("nan"))
+        lines.append(f"{ratio.of} errors 2nd/1st: {ratio.ratio:.3f} ({low:.3f} to {high:.3f}), {ratio.n} pairs")
+    means = (f"{row.of} {row.mean:+.3f} +- {row.reach:.3f}" for row in mean_differences(stations))
+    return [*lines, f"mean differences in own rms: {', '.join(means)}"]
+
+
+def write_json(out: Path, tables: dict[str, Any], bars: Sequence[Bar]) -> None:
+    """All figures as `agreement.json`.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    content = {"schema": 2, "bars": [{**vars(bar), "reached": bar.reached} for bar in bars], **tables}
+    write_text_atomic(out / "agreement.json", json.dumps(content, indent=1) + "\n")
 
 
 def write_picture(path: Path, compared: ComparedFrame) -> None:
@@ -98,6 +134,7 @@ def write_picture(path: Path, compared: ComparedFrame) -> None:
     white = float(np.percentile(values[0], 99.5)) or 1.0
     shown = [np.clip(value / white, 0.0, 1.0) ** (1 / 2.2) for value in values]
     shown.append(np.clip(0.5 + _DIFFERENCE_SCALE * (values[1] - values[0]) / white / 2, 0.0, 1.0))
+    path.parent.mkdir(parents=True, exist_ok=True)
     cv2.imwrite(str(path), (np.concatenate(shown, axis=1) * 255).astype(np.uint8))
 
 

@@ -10,8 +10,9 @@ from datasets_manifest.frame import FrameSpec
 from droguekit.peer_comparison.noise_search import Cost, NoiseAt, cpu_seconds, relative_noise
 from droguekit.peer_comparison.views import View, frame_at, recipe_at, reseeded
 from render.engine import load_engine
-from render.mitsuba_engine.traced import OF_DROGUE, inside_one_part
+from render.mitsuba_engine.traced import OF_DROGUE
 from render.sensor import expose
+from render.traced import inside_one_part
 from scenes.sky import REC709_LUMINANCE
 
 _PICTURES_FOR_NOISE = 4

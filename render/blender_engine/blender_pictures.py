@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import bpy
 import numpy as np
 
+from render.blender_engine.blender_lens import set_real_eye
 from render.blender_engine.blender_scene import BlenderScene
-from render.blender_engine.messages import LIGHT, CameraPath, Picture, Window
+from render.blender_engine.messages import LIGHT, CameraPath, Picture
 
 # Only the lens's ratio to the sensor's width counts, and Blender has no narrow sensors but lenses of any length.
 _SENSOR_WIDTH_MM = 36.0
@@ -21,7 +23,7 @@ _MIDDLE_FRAME = 1
 def take_picture(scene: BlenderScene, order: Picture) -> None:
     """Render and write one picture as EXR of 32-bit floats."""
     target = scene.scenes[order.kind]
-    _set_lens(scene.camera.data, order.window)
+    _set_lens(scene.camera.data, order)
     _set_path(scene.camera, order.path)
     _set_output(target, order)
     _set_sampling(target, order)
@@ -30,7 +32,13 @@ def take_picture(scene: BlenderScene, order: Picture) -> None:
     bpy.ops.render.render(write_still=True, scene=target.name)
 
 
-def _set_lens(camera: Any, window: Window) -> None:
+def _set_lens(camera: Any, order: Picture) -> None:
+    window = order.window
+    camera.clip_start, camera.clip_end = _NEAREST_M, _FARTHEST_M
+    if window.eye is not None:
+        set_real_eye(camera, window, window.eye, Path(order.file).parent)
+        return
+    camera.type = "PERSP"
     camera.sensor_fit = "HORIZONTAL"
     camera.sensor_width = _SENSOR_WIDTH_MM
     camera.lens = _SENSOR_WIDTH_MM * window.focal_px / window.width_px
@@ -38,7 +46,6 @@ def _set_lens(camera: Any, window: Window) -> None:
     to_right = window.center_px[0] - (window.left_px + (window.width_px - 1) / 2)
     to_down = window.center_px[1] - (window.top_px + (window.height_px - 1) / 2)
     camera.shift_x, camera.shift_y = -to_right / window.width_px, to_down / window.width_px
-    camera.clip_start, camera.clip_end = _NEAREST_M, _FARTHEST_M
 
 
 def _set_path(camera: Any, path: CameraPath) -> None:
@@ -86,7 +93,8 @@ def _set_sampling(scene: Any, order: Picture) -> None:
     # Nothing is cut off or ended by lot: what is left out would be missing from the mean or add noise.
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
     cycles.light_sampling_threshold = cycles.blur_glossy = 0.0
-    cycles.min_light_bounces = cycles.max_bounces = cycles.diffuse_bounces = order.bounces
+    cycles.min_light_bounces = cycles.max_bounces = order.bounces
+    cycles.diffuse_bounces = cycles.glossy_bounces = order.bounces
     cycles.use_light_tree = False
     if order.kind == LIGHT:
         cycles.pixel_filter_type = "BOX"

@@ -1,4 +1,4 @@
-"""Blender's materials: diffuse, even or with a map, and shining. Imported only in Blender's own process."""
+"""Blender's materials: matt, even or with a map, with a sheen, or shining. Imported only in Blender's own process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,12 @@ class Surface:
             self._map = nodes.new("ShaderNodeTexImage")
             self._map.extension = "EXTEND"
             links.new(self._map.outputs["Color"], self._diffuse.inputs["Color"])
-        links.new(self._diffuse.outputs["BSDF"], both.inputs[0])
+        self._sheen, self._facets = nodes.new("ShaderNodeMixShader"), nodes.new("ShaderNodeBsdfAnisotropic")
+        self._facets.distribution = "GGX"
+        self._facets.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+        links.new(self._diffuse.outputs["BSDF"], self._sheen.inputs[1])
+        links.new(self._facets.outputs["BSDF"], self._sheen.inputs[2])
+        links.new(self._sheen.outputs["Shader"], both.inputs[0])
         links.new(self._emission.outputs["Emission"], both.inputs[1])
         links.new(both.outputs["Shader"], output.inputs["Surface"])
 
@@ -42,6 +47,10 @@ class Surface:
             replace_image(self._map, look.reflectance)
         else:
             self._diffuse.inputs["Color"].default_value = (*look.reflectance.tolist(), 1.0)
+        fraction, roughness = look.sheen or (0.0, 1.0)
+        self._sheen.inputs["Fac"].default_value = fraction
+        # Blender's roughness is the root of the distribution's width.
+        self._facets.inputs["Roughness"].default_value = roughness**0.5
         strength = float(look.emission_cd_m2.max())
         color = look.emission_cd_m2 / strength if strength > 0 else np.zeros(3)
         self._emission.inputs["Color"].default_value = (*color.tolist(), 1.0)

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
+from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from geometry.stereo import EYES, Eye
-from render.background import air_before, background
+from render.background import air_before, backgrounds
 from render.blender_engine.messages import CENTER_SAMPLE, FEATURES, FIRST_RANDOM_SAMPLE, LIGHT, PASSES, Picture, Window
 from render.blender_engine.pixels import CenterPixels, place, read_light, read_passes
 from render.blender_engine.process import BlenderEndedError, BlenderProcess, bpy_version
 from render.blender_engine.stage import Stage
 from render.blender_engine.windows import EyePath, holds
 from render.engine import EyeRadiance, StereoRadiance
-from render.mitsuba_engine.traced import TracedEye, amodal_counts, inside_one_part
+from render.traced import TracedEye, amodal_counts
 from render.version import RENDER_VERSION
 from scenes.seeding import generator
 from scenes.sky import REC709_LUMINANCE
@@ -37,6 +38,19 @@ class _Job:
     eye: Eye
     unit_cd_m2: float
     seeds: np.random.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class _Scatter:
+    """How far two halves of the samples lie apart on the drogue's pixels of one eye.
+
+    Attributes:
+        pixel: (P,) flat indices.
+        light: (P, 4) half the difference of radiance from parts alone [cd/m2] and coverage.
+    """
+
+    pixel: NDArray[np.int64]
+    light: NDArray[np.float32]
 
 
 class BlenderEngine:
@@ -68,55 +82,51 @@ class BlenderEngine:
             settings: how.
 
         Raises:
-            ValueError: a rig with lenses or oblong pixels, or Blender ended twice.
+            ValueError: Blender ended twice, or cannot draw real lenses.
         """
-        if frame.rig.lenses is not None:
-            raise ValueError("rig: engine blender renders ideal eyes only, got lenses; engine mitsuba renders them")
         self._stage_s = dict.fromkeys(("sky", "scene", "passes", "paths", "composite"), 0.0)
         started = time.process_time()
-        behind = background(frame)
+        behind = backgrounds(frame)
         self._stage_s["sky"] = time.process_time() - started
         if frame.left_from_drogue is None and not frame.bystanders:
-            return self._stereo({eye: _empty(behind).over(behind) for eye in EYES}, 0.0)
+            return self._stereo({eye: _empty(behind[eye]).over(behind[eye]) for eye in EYES}, 0.0)
         around = surroundings(frame.environment)
         try:
-            traced, noise = self._trace(frame, settings, around)
+            traced, scatter = self._trace(frame, settings, around)
         except BlenderEndedError:
             # A process that the system has killed costs one try.
             self._process.close()
             self._process = BlenderProcess()
             self._stage.forget()
             try:
-                traced, noise = self._trace(frame, settings, around)
+                traced, scatter = self._trace(frame, settings, around)
             except BlenderEndedError as error:
                 raise ValueError(f"engine blender: {error}") from error
         started = time.process_time()
         for eye in EYES:
             traced[eye].put_behind_air(*air_before(frame, traced[eye].pixel))
-        eyes = {eye: traced[eye].over(behind) for eye in EYES}
+        eyes = {eye: traced[eye].over(behind[eye]) for eye in EYES}
         self._stage_s["composite"] += time.process_time() - started
-        return self._stereo(eyes, noise)
+        return self._stereo(eyes, _noise_fraction(scatter, eyes, behind))
 
     def _stereo(self, eyes: dict[Eye, EyeRadiance], noise: float) -> StereoRadiance:
         return StereoRadiance(eyes["left"], eyes["right"], self.name, self.version, noise, self._stage_s)
 
     def _trace(
         self, frame: FrameSpec, settings: RenderSettings, around: Surroundings
-    ) -> tuple[dict[Eye, TracedEye], float]:
-        """Both eyes, and the relative noise of the drogue's pixels."""
+    ) -> tuple[dict[Eye, TracedEye], dict[Eye, _Scatter]]:
+        """Both eyes, and what tells their noise."""
         started = time.process_time()
         setup = self._stage.set_frame(frame, around)
         self._stage_s["scene"] += time.process_time() - started + self._process.ask(setup)
         seeds = generator(frame.seed, frame.frame_index, "blender samples")
-        eyes, noise = {}, []
+        eyes, scatter = {}, {}
         for eye in EYES:
-            eyes[eye], spread = self._eye(_Job(frame, settings, eye, setup.light.unit_cd_m2, seeds))
-            noise.append(spread)
-        everything = np.concatenate(noise)
-        return eyes, float(np.sqrt(everything.mean(dtype=np.float64))) if len(everything) else 1.0
+            eyes[eye], scatter[eye] = self._eye(_Job(frame, settings, eye, setup.light.unit_cd_m2, seeds))
+        return eyes, scatter
 
-    def _eye(self, job: _Job) -> tuple[TracedEye, NDArray[np.float32]]:
-        """One eye, and the relative variances of the drogue's pixels."""
+    def _eye(self, job: _Job) -> tuple[TracedEye, _Scatter]:
+        """One eye, and how far its samples scatter."""
         camera, settings = job.frame.rig.camera, job.settings
         traced = _empty(np.zeros((camera.height_px, camera.width_px, 3), dtype=np.float32))
         path = EyePath(job.frame, job.eye, np.concatenate([self._stage.drogue_m, *self._stage.around_m]))
@@ -132,36 +142,32 @@ class BlenderEngine:
         light = np.zeros((camera.height_px, camera.width_px, 4), dtype=np.float32)
         for window in around:
             place(light, window, self._light(path, window, (0, settings.surround_samples_per_px), _AROUND_DEPTH, job))
-        spread = np.zeros(0, dtype=np.float32)
+        apart = np.zeros_like(light)
         if drogue is not None:
             traced.amodal_px.update(self._amodal(path, drogue, traced, job))
-            rgba, variance = self._light_in_halves(path, drogue, job)
+            rgba, half_difference = self._light_in_halves(path, drogue, job)
             place(light, drogue, rgba)
-            spread = (
-                variance[inside_one_part(traced.part_id)[_slices(drogue)]] if settings.samples_per_px > 1 else spread
-            )
+            place(apart, drogue, half_difference)
+        in_cd_m2 = np.array([job.unit_cd_m2, job.unit_cd_m2, job.unit_cd_m2, 1.0], dtype=np.float32)
         covered = np.flatnonzero(light[..., 3])
-        traced.pixel = covered
-        traced.radiance_cd_m2 = light.reshape(-1, 4)[covered, :3] * np.float32(job.unit_cd_m2)
-        traced.coverage = light.reshape(-1, 4)[covered, 3]
-        return traced, spread
+        of_drogue = np.flatnonzero(np.isin(traced.part_id, drogue_part_ids(MAX_MARKERS)))
+        scatter = _Scatter(of_drogue, apart.reshape(-1, 4)[of_drogue] * in_cd_m2)
+        return traced.lit_by(covered, light.reshape(-1, 4)[covered] * in_cd_m2), scatter
 
     def _light_in_halves(
         self, path: EyePath, window: Window, job: _Job
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(h, w, 4) light, and (h, w) relative variance of its luminance from two halves of the samples."""
+        """(h, w, 4) light, and half the difference between two halves of its samples."""
         samples, depth = job.settings.samples_per_px, job.settings.max_depth
         if samples == 1:
+            # One sample does not tell its error, which is about as large as the light itself.
             rgba = self._light(path, window, (0, 1), depth, job)
-            return rgba, np.zeros(rgba.shape[:2], dtype=np.float32)
+            return rgba, rgba
         first = samples // 2
         shares = (0, first), (first, samples - first)
         seed = int(job.seeds.integers(2**31))
         one, two = (self._light(path, window, share, depth, job, seed) for share in shares)
-        mean = (one * first + two * (samples - first)) / np.float32(samples)
-        luminance = np.maximum(mean[..., :3] @ REC709_LUMINANCE, 1e-6)
-        half_difference = (one - two)[..., :3] @ REC709_LUMINANCE / 2
-        return mean, np.square(half_difference / luminance).astype(np.float32)
+        return (one * first + two * (samples - first)) / np.float32(samples), (one - two) / np.float32(2)
 
     def _light(
         self,
@@ -193,6 +199,9 @@ class BlenderEngine:
         )
         started = time.process_time()
         pixels = read_passes(file.with_suffix(".exr"))
+        if window.eye is not None:
+            rays = job.frame.rig.rays(_places_px(window), job.eye)
+            pixels = replace(pixels, depth_m=pixels.depth_m / np.linalg.norm(rays, axis=-1).astype(np.float32))
         self._stage_s["passes"] += time.process_time() - started
         return pixels
 
@@ -205,6 +214,28 @@ class BlenderEngine:
             alone.part_id.ravel(),
             alone.depth_m.ravel(),
         )
+
+
+def _noise_fraction(
+    scatter: dict[Eye, _Scatter], eyes: dict[Eye, EyeRadiance], behind: dict[Eye, NDArray[np.float32]]
+) -> float:
+    """Root mean square error of luminance over root mean square luminance, on the drogue's pixels, edges included.
+
+    Halves of one sequence avoid each other's places, so that this is more than the error of their mean.
+    """
+    errors, values = [], []
+    for eye, seen in scatter.items():
+        through = seen.light[:, :3] - seen.light[:, 3:] * behind[eye].reshape(-1, 3)[seen.pixel]
+        errors.append(through @ REC709_LUMINANCE)
+        values.append(eyes[eye].radiance_cd_m2.reshape(-1, 3)[seen.pixel] @ REC709_LUMINANCE)
+    squares = [np.sum(np.square(np.concatenate(rows)), dtype=np.float64) for rows in (errors, values)]
+    return float(np.sqrt(squares[0] / max(squares[1], 1e-30)))
+
+
+def _places_px(window: Window) -> NDArray[np.float64]:
+    """(h, w, 2) pixel centres in the whole image. [px]"""
+    v, u = np.mgrid[_slices(window)].astype(np.float64)
+    return np.stack([u, v], axis=-1)
 
 
 def _slices(window: Window) -> tuple[slice, slice]:

@@ -43,10 +43,12 @@ class Look:
     Attributes:
         reflectance: (3,) diffuse reflectance, or (h, w, 3) of it as a map.
         emission_cd_m2: (3,) radiance of its own. [cd/m2]
+        sheen: share of the light that microfacets mirror, and their roughness; None for matt paint.
     """
 
     reflectance: NDArray[np.floating[Any]]
     emission_cd_m2: NDArray[np.float64]
+    sheen: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +114,29 @@ class CameraPath:
 
 
 @dataclass(frozen=True)
+class RealEye:
+    """An eye that is no pinhole with square pixels.
+
+    Attributes:
+        focal_px: of either axis. [px]
+        distortion: k1, k2, p1, p2, k3, see `geometry.distortion`.
+        ideal_from_real: (9,) rows of the rotation from its axes to the rig's.
+    """
+
+    focal_px: tuple[float, float]
+    distortion: tuple[float, ...]
+    ideal_from_real: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Window:
     """The part of the image that a picture covers, as a camera of its own.
 
     Attributes:
         left_px, top_px, width_px, height_px: in the whole image. [px]
-        focal_px: of both axes. [px]
+        focal_px: of both axes of a pinhole. [px]
         center_px: principal point in the whole image, (0, 0) the centre of the top-left pixel. [px]
+        eye: how it differs from a pinhole with square pixels, or None. Blender's depth then is along the ray.
     """
 
     left_px: int
@@ -127,6 +145,7 @@ class Window:
     height_px: int
     focal_px: float
     center_px: tuple[float, float]
+    eye: RealEye | None = None
 
 
 @dataclass(frozen=True, eq=False)

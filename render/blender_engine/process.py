@@ -57,6 +57,8 @@ class BlenderProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
+                # Who kills the engine's whole group would kill it too before it has tidied up; it ends with its input.
+                start_new_session=True,
                 # The user's own start-up file and add-ons must not change pictures.
                 env={**os.environ, "BLENDER_USER_RESOURCES": str(self.folder)},
             )

@@ -7,6 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
+from drogue_models.materials import part_satin
 from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name
 from render.blender_engine.messages import FrameSetup, Light, Look, PartMesh, StageThings
@@ -125,7 +126,9 @@ def _part_mesh(frame: FrameSpec, part: int, mesh: trimesh.Trimesh) -> PartMesh:
 def _look(frame: FrameSpec, part: int) -> Look:
     clean = surface_condition(frame, part).is_clean
     reflectance = even_reflectance_rgb(frame, part) if clean else reflectance_map(frame, part)
-    return Look(reflectance, lamp_radiance_rgb(frame, part))
+    satin = None if frame.drogue is None else part_satin(frame.drogue, part)
+    sheen = None if satin is None else (satin.sheen_fraction, satin.roughness)
+    return Look(reflectance, lamp_radiance_rgb(frame, part), sheen)
 
 
 def _moved_looks(frame: FrameSpec, moved: _Meshes) -> dict[str, Look]:

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from datasets_manifest.frame import FrameSpec
-from geometry.pinhole import PinholeCamera
+from geometry.distortion import Lens
 from geometry.se3 import RigidTransform, exp_twist
-from geometry.stereo import Eye
-from render.blender_engine.messages import CameraPath, Window
+from geometry.stereo import Eye, StereoRig
+from render.blender_engine.messages import CameraPath, RealEye, Window
 
 _SHARP_BELOW_PX = 0.05
 _MOMENTS = 5
@@ -31,7 +31,7 @@ class EyePath:
     """
 
     def __init__(self, frame: FrameSpec, eye: Eye, corners_m: NDArray[np.float32]) -> None:
-        self._camera = frame.rig.camera
+        self._camera, self._rig, self._eye = frame.rig.camera, frame.rig, eye
         eye_from_left = exp_twist(np.concatenate([-frame.rig.eye_offset_m(eye), np.zeros(3)]))
         half_s = frame.exposure.time_s / 2
         moments_s = np.linspace(-half_s, half_s, _MOMENTS)
@@ -65,11 +65,13 @@ class EyePath:
             seen = camera.project(points)
             low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
         size = np.array([camera.width_px, camera.height_px])
-        first = np.clip(np.floor(low) - _MARGIN_PX, 0, size)
-        end = np.clip(np.ceil(high) + _MARGIN_PX + 1, 0, size)
+        # Where a lens moves what stands in the ideal image.
+        margin = _MARGIN_PX + np.ceil(self._rig.largest_shift_px())
+        first = np.clip(np.floor(low) - margin, 0, size)
+        end = np.clip(np.ceil(high) + margin + 1, 0, size)
         if (first >= end).any():
             return None
-        return _window(camera, first.astype(int), end.astype(int))
+        return _window(self._rig, self._eye, first.astype(int), end.astype(int))
 
 
 def holds(outer: Window | None, inner: Window) -> bool:
@@ -83,14 +85,24 @@ def holds(outer: Window | None, inner: Window) -> bool:
     )
 
 
-def _window(camera: PinholeCamera, first: NDArray[np.int_], end: NDArray[np.int_]) -> Window:
-    if camera.fx_px != camera.fy_px:
-        raise ValueError(
-            f"rig: engine blender needs square pixels (fx_px = fy_px), got {camera.fx_px:g} and {camera.fy_px:g}; "
-            "engine mitsuba renders others"
-        )
-    size = end - first
-    return Window(int(first[0]), int(first[1]), int(size[0]), int(size[1]), camera.fx_px, (camera.cx_px, camera.cy_px))
+def _real_eye(rig: StereoRig, eye: Eye) -> RealEye | None:
+    """None for a pinhole with square pixels."""
+    camera, lens = rig.camera, rig.lens(eye)
+    if lens is None and camera.fx_px == camera.fy_px:
+        return None
+    real = lens or Lens(camera)
+    return RealEye(
+        (real.camera.fx_px, real.camera.fy_px),
+        tuple(real.distortion.coefficients().tolist()),
+        tuple(real.ideal_from_real.ravel().tolist()),
+    )
+
+
+def _window(rig: StereoRig, eye: Eye, first: NDArray[np.int_], end: NDArray[np.int_]) -> Window:
+    lens = rig.lens(eye)
+    camera = rig.camera if lens is None else lens.camera
+    left, top, width, height = (int(value) for value in (*first, *(end - first)))
+    return Window(left, top, width, height, camera.fx_px, (camera.cx_px, camera.cy_px), _real_eye(rig, eye))
 
 
 def _camera_path(poses: list[RigidTransform]) -> CameraPath:

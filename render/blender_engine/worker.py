@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def _leave_ending_to_the_engine() -> None:
-    """Ctrl-C and a kill of the whole group reach this process too; it outlives the engine just long enough to tidy up.
+    """A scheduler may signal every process of a job; this one outlives the engine just long enough to tidy up.
 
     Blender sets handlers of its own when it is imported.
     """
