@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
-from geometry.stereo import StereoRig
+from geometry.stereo import EYES, Eye, StereoRig
 from nav.centroids.binary_chain import Centroids
 from nav.pose.interface import NoFixReason, Observation
 from nav.ring_match import RingMatch, match_ring, symmetry_permutations
@@ -52,15 +52,18 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
         layout: the drogue's markers.
 
     Returns:
-        What the estimators work on, or why there is nothing to work on.
+        What the estimators work on, with one eye's places empty where only the other shows a ring; or why there is
+        nothing to work on.
     """
-    rings: list[RingMatch] = []
-    for eye, centroids in (("left", left), ("right", right)):
-        ring = match_ring(centroids.blobs, layout)
-        if ring is None:
-            return NoFixReason(f"no ring of markers among {len(centroids.blobs)} regions of the {eye} image")
-        rings.append(ring)
+    rings = [match_ring(centroids.blobs, layout) for centroids in (left, right)]
     permutations = symmetry_permutations(layout)
+    if rings[0] is None and rings[1] is None:
+        return NoFixReason(f"{no_ring(left, 'left')}, and {no_ring(right, 'right')}")
+    if rings[0] is None or rings[1] is None:
+        eye, ring, centroids = (1, rings[1], right) if rings[0] is None else (0, rings[0], left)
+        assert ring is not None
+        only = _markers(centroids, ring).turned(permutations[_turn_nearest_to_zero(ring, layout)])
+        return Observation(rig, layout, *_beside_nothing(only, eye))
     upright = permutations[_turn_nearest_to_zero(rings[0], layout)]
     first = _markers(left, rings[0]).turned(upright)
     others = [_markers(right, rings[1]).turned(permutation) for permutation in permutations]
@@ -71,6 +74,19 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
     if costs[best] > _LARGEST_COST_FRACTION * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
     return Observation(rig, layout, *_without_bad_pairs(first, others[best]))
+
+
+def no_ring(centroids: Centroids, eye: Eye) -> str:
+    """Why there are no markers of an eye."""
+    return f"no ring of markers among {len(centroids.blobs)} regions of the {eye} image"
+
+
+def _beside_nothing(only: _EyeMarkers, eye: int) -> tuple[Array, Array]:
+    """Centres (2, N, 2) and covariances (2, N, 2, 2) of one eye, nan for the other."""
+    pixels = np.full((len(EYES), *only.centers_px.shape), np.nan)
+    covariances = np.full((len(EYES), *only.cov_px2.shape), np.nan)
+    pixels[eye], covariances[eye] = only.centers_px, only.cov_px2
+    return pixels, covariances
 
 
 def _markers(centroids: Centroids, ring: RingMatch) -> _EyeMarkers:

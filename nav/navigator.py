@@ -20,9 +20,9 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_chain import binary_centroids
+from nav.centroids.binary_chain import NOTHING, Centroids, binary_centroids
 from nav.channels import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
-from nav.correspondence import correspond
+from nav.correspondence import correspond, no_ring
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.interface import Detector
 from nav.pose.interface import OUTER_EDGE, NoFixReason, Observation
@@ -48,11 +48,13 @@ class Sighting:
         observation: the matched markers, or why there are none.
         stage_s: seconds by stage. [s]
         others_weight: of the channel that it was measured in, see `nav.channels`.
+        blind_eye: why one eye shows nothing, where only the other one does.
     """
 
     observation: Observation | NoFixReason
     stage_s: dict[str, float]
     others_weight: float = PLAIN
+    blind_eye: str = ""
 
 
 class Navigator:
@@ -83,36 +85,45 @@ class Navigator:
         detection = self._detector.detect(images)
         detected = perf_counter()
         stage_s = {"detect": detected - start}
-        boxes = []
+        boxes: dict[Eye, Box] = {}
         for eye in EYES:
             found = detection.of(eye)
-            if found is None:
-                return Sighting(NoFixReason(f"no drogue detected in the {eye} image"), stage_s)
-            boxes.append(found.box_xywh_px)
+            if found is not None:
+                boxes[eye] = found.box_xywh_px
+        if not boxes:
+            return Sighting(NoFixReason("no drogue detected in the left image, nor in the right one"), stage_s)
         best = self._matched(images, boxes, PLAIN)
         for weight in OTHERS_WEIGHTS[1:]:
-            if _paired(best) == self._layout.count:
+            if _seen(best)[0] == self._layout.count:
                 break
-            best = max(best, self._matched(images, boxes, weight), key=_paired)
+            best = max(best, self._matched(images, boxes, weight), key=_seen)
         return replace(best, stage_s={**stage_s, **best.stage_s})
 
-    def _matched(self, images: StereoImages, boxes: list[Box], others_weight: float) -> Sighting:
+    def _matched(self, images: StereoImages, boxes: dict[Eye, Box], others_weight: float) -> Sighting:
         """Binary centroids within the boxes, matched."""
         start = perf_counter()
-        left, right = (
-            ideal_centroids(
+        centroids = {
+            eye: ideal_centroids(
                 binary_centroids(marker_channel(images, eye, self._color, others_weight), box, self._layout),
                 self._rig,
                 eye,
             )
-            for eye, box in zip(EYES, boxes, strict=True)
-        )
+            for eye, box in boxes.items()
+        }
         measured = perf_counter()
+        left, right = (centroids.get(eye, NOTHING) for eye in EYES)
         observation = correspond(left, right, self._rig, self._layout)
         if isinstance(observation, Observation):
             observation = replace(observation, tolerances=self._tolerances)
         stage_s = {"centroids": measured - start, "correspond": perf_counter() - measured}
-        return Sighting(observation, stage_s, others_weight)
+        return Sighting(observation, stage_s, others_weight, self._blind_eye(centroids, observation))
+
+    def _blind_eye(self, centroids: dict[Eye, Centroids], observation: Observation | NoFixReason) -> str:
+        """Why one eye shows nothing where only the other one does; else empty."""
+        if isinstance(observation, NoFixReason) or observation.seen.any(axis=1).all():
+            return ""
+        eye = EYES[int(np.argmin(observation.seen.any(axis=1)))]
+        return no_ring(centroids[eye], eye) if eye in centroids else f"no drogue detected in the {eye} image"
 
     def estimate(self, frame_index: int, images: StereoImages, methods: Sequence[str]) -> list[Estimate]:
         """Answers of every method on the same measurements, in the order of `methods`.
@@ -139,10 +150,12 @@ class Navigator:
         return self._centroids == "edge" or (self._centroids == "own" and method not in BINARY_METHODS)
 
 
-def _paired(sighting: Sighting) -> int:
-    """How many markers both eyes measured."""
+def _seen(sighting: Sighting) -> tuple[int, int]:
+    """How many markers both eyes measured, and how many measurements there are."""
     observation = sighting.observation
-    return 0 if isinstance(observation, NoFixReason) else int(observation.paired.sum())
+    return (
+        (0, 0) if isinstance(observation, NoFixReason) else (int(observation.paired.sum()), int(observation.seen.sum()))
+    )
 
 
 def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate:
@@ -162,7 +175,7 @@ def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate
         return NoFix(
             frame_index=frame_index,
             method=method,
-            reason=solution.reason,
+            reason=f"{solution.reason}: {sighting.blind_eye}" if sighting.blind_eye else solution.reason,
             features=_features(observation, np.zeros_like(observation.seen), None),
             stage_s=stage_s,
         )

@@ -22,6 +22,7 @@ from nav.centroids.surroundings import Surroundings
 from nav.channels import PLAIN, balancing_weight
 from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation
 from nav.pose.joint import joint
+from nav.pose.mono import mono_lm
 from nav.real_eyes import ideal_places, real_places
 
 _OUTLINE_POINTS = 24
@@ -51,7 +52,7 @@ def refine(
         Edge-fitted markers; those that the fit rejects (clipped, cut, shadowed, occluded) are left out. Where too few
         fit, the markers as they were. Hub edges are measured where the pose of the markers shows them.
     """
-    rough = joint(observation)
+    rough = joint(observation) if observation.seen.any(axis=1).all() else mono_lm(observation)
     if isinstance(rough, NoFixReason):
         return observation
     rig, layout = observation.rig, observation.layout
@@ -71,7 +72,8 @@ def refine(
     signals = marker_signals(images, color, _together([discs, *hubs]), others_weight)
     fits = fit_discs(signals, discs, around)
     good = fits.accepted
-    if min(np.bincount(eyes[good], minlength=2)) < min(_LEAST_MARKERS, layout.count) or fits.noise is None:
+    left_over = np.bincount(eyes[good], minlength=len(EYES))[observation.seen.any(axis=1)]
+    if left_over.min() < min(_LEAST_MARKERS, layout.count) or fits.noise is None:
         return observation
     pixels = np.full_like(observation.pixels_px, np.nan)
     cov = np.full_like(observation.cov_px2, np.nan)
@@ -136,11 +138,10 @@ def _with_hub(observation: Observation, signals: tuple[MarkerSignal, MarkerSigna
         collar_factor = observation.layout.collar_radius_m / observation.layout.hub_outer_radius_m
         fits = fit_annuli(signals, edges[OUTER_EDGE], edges[INNER_EDGE], noise, collar_factor)
         if fits.accepted.any():
-            outer, outer_cov = fits.outer_given_offset(edges[INNER_EDGE].centers_px - centers)
             pixels = np.full((len(EYES), HUB_EDGES, 2), np.nan)
             cov = np.full((len(EYES), HUB_EDGES, 2, 2), np.nan)
-            pixels[fits.accepted, OUTER_EDGE] = outer[fits.accepted]
-            cov[fits.accepted, OUTER_EDGE] = outer_cov[fits.accepted]
+            pixels[fits.accepted, OUTER_EDGE] = fits.centers_px[fits.accepted]
+            cov[fits.accepted, OUTER_EDGE] = fits.cov_px2[fits.accepted]
             shapes = np.stack([edges[OUTER_EDGE].shapes_px] * HUB_EDGES, axis=1)
             for side, eye in enumerate(EYES):
                 pixels[side], cov[side] = ideal_places(observation.rig, eye, pixels[side], shapes[side], cov[side])

@@ -12,7 +12,6 @@ from geometry.se3 import Array
 from nav.centroids.annulus_model import (
     AMPLITUDE,
     BACKGROUND,
-    CENTERS,
     INNER,
     OUTER,
     SLOPE_TURNS,
@@ -20,32 +19,35 @@ from nav.centroids.annulus_model import (
     annulus_model,
     annulus_start,
     azimuth_basis,
-    both_edges,
-    free_to_all,
     in_free_parameters,
     radial_slopes,
+    share_and_light,
+    tied_to_pose,
 )
-from nav.centroids.centroid_quality import NoiseModel, residual_spread, sector_index
+from nav.centroids.annulus_response import RESPONSE_PICTURES, response_pictures, with_pictures
+from nav.centroids.centroid_quality import NoiseModel, measure_noise, residual_spread, sector_index
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.least_squares import Minimum, evaluate, minimise
+from nav.centroids.least_squares import Minimum, Model, evaluate, minimise
 from nav.centroids.marker_signal import Array32, MarkerSignal
 from nav.centroids.patches import PixelSet, annulus_pixels
 from nav.centroids.surroundings import share_outside
 
 # Azimuthal order of the light on the annulus; a thin one has too few pixels to tell high orders from its outline.
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5
-# Light this uneven about the azimuth, as a share of its mean, changes across the annulus too, which one this wide
-# shows; evenly lit ones, within 0.015 of the mean on path-traced daylight frames, are better off without.
-_UNEVEN_SHARE, _WIDE_PX = 0.02, 5.0
+# Light this uneven about the azimuth, as a share of its mean, changes across the annulus too; evenly lit ones, within
+# 0.015 of the mean on path-traced daylight frames, are better off without.
+_UNEVEN_SHARE = 0.02
 # Ribs and sky around the hub are many and small, their light by the azimuth is fitted: more of it is taken than beside
 # a marker.
 _MOST_BEYOND = 0.8
-# How well the step between the centres of both edges is known where it is not fitted: it is below this itself. [px]
-_OFFSET_SIGMA_PX = 0.005
-_FIRST_STEPS, _SECOND_STEPS = 6, 3
+_FIRST_STEPS, _RESPONSE_STEPS, _SECOND_STEPS = 6, 2, 3
+_MOST_LEVERAGE = np.float32(0.9)
 _SECTORS = 16
+# Both eyes see the same shadow: what it adds does not average out between them, and so counts twice; and the light's
+# azimuthal terms hide two thirds of it from the residuals (path-traced frames of partly shaded hubs, 1.7 to 5 m).
+_SHADOW_FACTOR = 6.0
 _LEAST_CONTRAST_SIGMA = 4.0
 # So much of the annulus must be lit: less does not tell where its middle is.
 _LEAST_LIT_FRACTION = 0.5
@@ -60,8 +62,9 @@ class AnnulusFits:
     """Refined annuli, in the order of the predicted ones.
 
     Attributes:
-        centers_px: (M, 2, 2) centres of the outer and the inner edge; the predicted ones where a fit was rejected.
-        cov_px2: (M, 4, 4) joint covariance of outer x, y and inner x, y.
+        centers_px: (M, 2) centres of the outer edges, the predicted ones where a fit was rejected; the inner ones lie
+            the predicted step beside them.
+        cov_px2: (M, 2, 2) their covariances.
         contrast_dn: (M,) mean light of the annulus above that beside it. [DN]
         lit_fraction: (M,) share of the azimuth that is lit.
         inflation: (M,) factor in `cov_px2` for residuals that hang together, as shadows leave them.
@@ -80,23 +83,6 @@ class AnnulusFits:
         """(M,) which annuli were not rejected."""
         return np.array([reason is None for reason in self.reasons], dtype=np.bool_)
 
-    def outer_given_offset(self, inner_from_outer_px: Array) -> tuple[Array, Array]:
-        """Outer centres when the step between the centres, a perspective effect of known size, is taken as known.
-
-        Args:
-            inner_from_outer_px: (M, 2) predicted inner minus outer centre.
-
-        Returns:
-            (M, 2) centres and (M, 2, 2) covariances of the best joint estimate; those of rejected ones mean nothing.
-        """
-        design = np.concatenate([np.eye(2), np.eye(2)])
-        measured = self.centers_px.copy()
-        measured[:, 1] -= inner_from_outer_px
-        weight = np.linalg.inv(self.cov_px2)
-        cov = np.linalg.inv(design.T @ weight @ design)
-        centers = np.einsum("mij,jk,mkl,ml->mi", cov, design.T, weight, measured.reshape(-1, 4))
-        return centers, cov
-
 
 def fit_annuli(
     signals: Sequence[MarkerSignal],
@@ -107,63 +93,87 @@ def fit_annuli(
 ) -> AnnulusFits:
     """Fit every annulus of both eyes.
 
-    Annuli too thin to show each edge by itself keep the predicted shapes up to a common scale and the predicted step
-    between the centres.
+    Shapes, and the step between the centres, are those that the pose of the markers predicts, up to the size of each
+    edge; of annuli too thin to show each edge by itself, up to a common size. Free shapes would follow shadows.
 
     Args:
         signals: left and right, around the annuli.
         outer: predicted outer edges, within a third of their radius.
         inner: predicted inner edges, of the same annuli.
-        noise: of the frame's pixels, from `fit_discs`.
+        noise: of the frame's pixels, from `fit_discs`; what stands out against it is contrast.
         collar_factor: radius of the dark collar around the annulus over that of its outer edge, 0 where unknown. What
             lies beyond is left out, and its blur fitted.
     """
     if len(outer) == 0:
         nothing = np.zeros(0)
-        return AnnulusFits(np.zeros((0, 2, 2)), np.zeros((0, 4, 4)), nothing, nothing, nothing, ())
+        return AnnulusFits(np.zeros((0, 2)), np.zeros((0, 2, 2)), nothing, nothing, nothing, ())
     width_px = float((outer.radii_px - inner.radii_px).min())
     thin = width_px < _THIN_PX
     pixels, beyond = _within_collar(annulus_pixels(signals, outer, inner), outer, collar_factor)
     turns = azimuth_basis(pixels, _ORDER_THIN if thin else _ORDER)
     start = annulus_start(pixels, outer, inner, turns.shape[1])
     first = _first_fit(pixels, (turns, beyond), start, thin)
-    if width_px > _WIDE_PX and _unevenness(start + first.parameters) > _UNEVEN_SHARE:
+    rough = all_parameters(start, tied_to_pose(start, thin), first)
+    if not thin and _unevenness(rough) > _UNEVEN_SHARE:
         turns = np.concatenate([turns, radial_slopes(pixels, turns, outer, inner)], axis=1)
-        start = np.pad(start + first.parameters, ((0, 0), (0, SLOPE_TURNS)))
+        start = np.pad(rough, ((0, 0), (0, SLOPE_TURNS)))
         first = _first_fit(pixels, (turns, beyond), start, thin)
-    ties = free_to_all(start, thin)
+    ties = tied_to_pose(start, thin)
     model = in_free_parameters(annulus_model(pixels, turns, beyond), start, ties)
-    between, light = _lit(all_parameters(start, ties, first), pixels, turns)
-    weights = pixels.present / noise.variances(between, light)
-    final = minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
+    final, weights = _weighted_fit(pixels, turns, (start, ties), model, first)
     parameters = all_parameters(start, ties, final)
-    between, light = _lit(parameters, pixels, turns)
+    between, light = share_and_light(parameters, pixels, turns)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
     sectors = sector_index(pixels.x_px, pixels.y_px, _SECTORS)
-    spread = residual_spread(final.residuals, weights, sectors, contrast, ties.shape[2])
-    inflation = np.maximum(spread.inflation, spread.chi2_per_dof)
-    # Both eyes see the same shadow: what it adds does not average out between them, and so counts twice.
-    cov = _center_covariance(final, ties, thin) * (2 * inflation - 1)[:, None, None]
+    inflation = residual_spread(final.residuals, weights, sectors, contrast, final.parameters.shape[1]).inflation
+    # The first two free parameters are the common shift.
+    cov = final.covariance()[:, :2, :2] * (1 + _SHADOW_FACTOR * (inflation - 1))[:, None, None]
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
-    predicted = np.stack([outer.centers_px, inner.centers_px], axis=1)
-    fitted = pixels.origins_px[:, None] + parameters[:, CENTERS].reshape(-1, 2, 2)
-    return AnnulusFits(np.where(good[:, None, None], fitted, predicted), cov, contrast, lit, inflation, reasons)
+    centers = np.where(good[:, None], pixels.origins_px + parameters[:, OUTER][:, :2], outer.centers_px)
+    return AnnulusFits(centers, cov, contrast, lit, inflation, reasons)
 
 
 def _first_fit(pixels: PixelSet, light: tuple[Array32, Array32], start: Array, thin: bool) -> Minimum:
     """The fit of equal weights, for the noise by what each pixel sees; `light` is that on the annulus and beyond."""
-    ties = free_to_all(start, thin)
+    ties = tied_to_pose(start, thin)
     model = in_free_parameters(annulus_model(pixels, *light), start, ties)
     begin = evaluate(model, pixels.values, pixels.present, np.zeros((len(start), ties.shape[2])))
     return minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
 
 
+def _weighted_fit(
+    pixels: PixelSet, turns: Array32, shape: tuple[Array, Array], model: Model, first: Minimum
+) -> tuple[Minimum, Array32]:
+    """The fit of inverse variances, with the pixels' response, and the weights.
+
+    The noise is the annuli's own: what lies around them is lighter than a marker's face, and so noisier.
+
+    Args:
+        pixels, turns: of the annuli.
+        shape: start and ties, see `all_parameters`.
+        model: in the free parameters.
+        first: fit of equal weights.
+    """
+    parameters = all_parameters(*shape, first)
+    model = with_pictures(model, response_pictures(pixels, parameters, share_and_light(parameters, pixels, turns)[1]))
+    free = np.pad(first.parameters, ((0, 0), (0, RESPONSE_PICTURES)))
+    begin = evaluate(model, pixels.values, pixels.present, free)
+    first = minimise(model, pixels.values, pixels.present, begin, _RESPONSE_STEPS, FIRST_SMALL_STEP_PX)
+    parameters = all_parameters(*shape, first)
+    between, light = share_and_light(parameters, pixels, turns)
+    leverages = np.minimum(first.leverages(first.covariance(), pixels.present), _MOST_LEVERAGE)
+    contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
+    noise = measure_noise(first.residuals**2 / (1 - leverages), pixels.present, between, contrast)
+    weights = pixels.present / noise.variances(between, light)
+    return minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX), weights
+
+
 def _unevenness(parameters: Array) -> float:
     """Root mean square of the light's change with the azimuth over its mean, of the less even annulus."""
     turns = parameters[:, AMPLITUDE:]
-    mean = np.maximum(turns[:, 0] - parameters[:, BACKGROUND], np.finfo(float).tiny)
+    mean = np.maximum(turns[:, 0] - parameters[:, BACKGROUND], 1.0)  # one number
     return float((np.sqrt((turns[:, 1:] ** 2).sum(axis=1) / 2) / mean).max())
 
 
@@ -173,22 +183,6 @@ def _within_collar(pixels: PixelSet, outer: Ellipses, collar_factor: float) -> t
         return pixels, np.zeros_like(pixels.x_px)
     beyond = share_outside(collar_factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX)
     return pixels.only(beyond < _MOST_BEYOND), beyond
-
-
-def _center_covariance(fit: Minimum, ties: Array, thin: bool) -> Array:
-    """(N, 4, 4) of outer x, y and inner x, y."""
-    chosen = ties[:, CENTERS]
-    cov: Array = np.einsum("nap,npq,nbq->nab", chosen, fit.covariance(), chosen)
-    apart = np.array([[1.0, -1.0], [-1.0, 1.0]]) / 4
-    return cov + thin * _OFFSET_SIGMA_PX**2 * np.kron(apart, np.eye(2))
-
-
-def _lit(parameters: Array, pixels: PixelSet, turns: Array32) -> tuple[Array32, Array32]:
-    """Share of each pixel that lies on the annulus, and the annulus's light above the background there."""
-    outer, inner = both_edges(parameters, pixels.x_px, pixels.y_px)
-    rest = parameters[:, BACKGROUND:].astype(np.float32)
-    light = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
-    return outer.inside - inner.inside, light - rest[:, 0, None]
 
 
 def _reasons(

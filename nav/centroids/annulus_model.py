@@ -65,6 +65,14 @@ def both_edges(parameters: Array, x_px: Array32, y_px: Array32) -> tuple[Edge, E
     return edges.take(slice(None, count)), edges.take(slice(count, None))
 
 
+def share_and_light(parameters: Array, pixels: PixelSet, turns: Array32) -> tuple[Array32, Array32]:
+    """Share of each pixel that lies on the annulus, and the annulus's light above the background there."""
+    outer, inner = both_edges(parameters, pixels.x_px, pixels.y_px)
+    rest = parameters[:, BACKGROUND:].astype(np.float32)
+    light = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
+    return outer.inside - inner.inside, light - rest[:, 0, None]
+
+
 def azimuth_basis(pixels: PixelSet, order: int) -> Array32:
     """(N, 2 order + 1, K): one, then cosines and sines of multiples of the azimuth."""
     angle = np.arctan2(pixels.y_px, pixels.x_px)
@@ -102,26 +110,22 @@ def annulus_start(pixels: PixelSet, outer: Ellipses, inner: Ellipses, turn_count
     return parameters
 
 
-def free_to_all(start: Array, thin: bool) -> Array:
+def tied_to_pose(start: Array, thin: bool) -> Array:
     """(N, P, Q) how the model's parameters follow the free ones.
 
-    Of thin annuli a common shift and a common scale of both edges are free, of others all that the model has.
+    A common shift of both edges is free, and the size of each, or of thin annuli of both; their shapes are not.
     """
     count = start.shape[1]
-    ties = np.broadcast_to(np.eye(count), (len(start), count, count))
-    if not thin:
-        return ties
-    moved = np.zeros((len(start), count, 3))
+    moved = np.zeros((len(start), count, 3 if thin else 4))
     moved[:, CENTERS, [0, 1, 0, 1]] = 1
-    for edge in (OUTER, INNER):
-        moved[:, edge.start + 2 : edge.stop, 2] = start[:, edge.start + 2 : edge.stop]
-    return np.concatenate([moved, ties[:, :, WIDTH:]], axis=2)
+    for place, edge in enumerate((OUTER, INNER)):
+        moved[:, edge.start + 2 : edge.stop, 2 if thin else 2 + place] = start[:, edge.start + 2 : edge.stop]
+    rest = np.broadcast_to(np.eye(count)[:, WIDTH:], (len(start), count, count - WIDTH))
+    return np.concatenate([moved, rest], axis=2)
 
 
 def in_free_parameters(model: Model, start: Array, ties: Array) -> Model:
     """The model in its free parameters, counted from the start."""
-    if ties.shape[1] == ties.shape[2]:
-        return lambda free: model(start + free)
     across = ties.transpose(0, 2, 1).astype(np.float32)
 
     def in_free(free: Array) -> tuple[Array32, Array32]:
@@ -132,6 +136,6 @@ def in_free_parameters(model: Model, start: Array, ties: Array) -> Model:
 
 
 def all_parameters(start: Array, ties: Array, fit: Minimum) -> Array:
-    """(N, P) the model's parameters where a fit in the free ones ended."""
-    parameters: Array = start + np.einsum("npq,nq->np", ties, fit.parameters)
+    """(N, P) the model's parameters where a fit in the free ones, and what else follows them, ended."""
+    parameters: Array = start + np.einsum("npq,nq->np", ties, fit.parameters[:, : ties.shape[2]])
     return parameters

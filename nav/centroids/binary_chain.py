@@ -40,6 +40,9 @@ class Centroids:
     cov_px2: Array
 
 
+NOTHING = Centroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
+
+
 def binary_centroids(
     channel: Pixels, box_xywh_px: tuple[float, float, float, float], layout: MarkerLayout
 ) -> Centroids:
@@ -59,7 +62,7 @@ def binary_centroids(
     """
     left, top, right, bottom = _crop(channel.shape, box_xywh_px)
     if right - left < 3 or bottom - top < 3:
-        return Centroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
+        return NOTHING
     roi = np.ascontiguousarray(channel[top:bottom, left:right])
     blobs, opened = _best_regions(roi, layout)
     moved = Blobs(blobs.centers_px + np.array([left, top]), blobs.areas_px2)

@@ -6,7 +6,7 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_profile, ellipse_parameters
-from nav.centroids.least_squares import Model
+from nav.centroids.least_squares import Minimum, Model, patch_blocks
 from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet, edge_distances
 
@@ -30,31 +30,49 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, furthe
     own_count = _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside
     count = own_count + (0 if further is None else further.shape[1])
 
+    blocks = patch_blocks(len(x), count * x.shape[1])
+
     def model(parameters: Array) -> tuple[Array32, Array32]:
-        edge = edge_profile(parameters[:, :ELLIPSE_PARAMETERS], parameters[:, WIDTH], x, y)
-        rest = parameters[:, BACKGROUND:].astype(np.float32)[:, :, None]
-        inside, outside = edge.inside, 1 - edge.inside
-        dark, bright = rest[:, 0], rest[:, 1]
-        jacobian = np.empty((len(x), count, x.shape[1]), np.float32)
-        place = _PLAIN_COUNT
-        if slope_outside:
-            dark = dark + rest[:, 2] * x + rest[:, 3] * y
-            jacobian[:, place], jacobian[:, place + 1] = x * outside, y * outside
-            place += 2
-        if slope_inside:
-            bright = bright + rest[:, place - BACKGROUND] * x + rest[:, place + 1 - BACKGROUND] * y
-            jacobian[:, place], jacobian[:, place + 1] = x * inside, y * inside
-        steep = (bright - dark) * edge.density
-        np.multiply(edge.slopes, steep[:, None], out=jacobian[:, :ELLIPSE_PARAMETERS])
-        jacobian[:, WIDTH] = -steep * edge.distance_px / parameters[:, WIDTH, None].astype(np.float32)
-        jacobian[:, BACKGROUND], jacobian[:, LEVEL] = outside, inside
-        picture = dark + (bright - dark) * inside
-        if further is not None:
-            jacobian[:, own_count:] = further
-            picture += np.matmul(parameters[:, None, own_count:].astype(np.float32), further)[:, 0]
+        picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
+        for part in blocks:
+            _draw(parameters[part], x[part], y[part], (slope_outside, slope_inside), jacobian[part], picture[part])
+            if further is not None:
+                jacobian[part, own_count:] = further[part]
+                lights = parameters[part, None, own_count:].astype(np.float32)
+                picture[part] += np.matmul(lights, further[part])[:, 0]
         return picture, jacobian
 
     return model
+
+
+def _draw(
+    parameters: Array, x: Array32, y: Array32, slopes: tuple[bool, bool], jacobian: Array32, picture: Array32
+) -> None:
+    """Fill picture and derivatives of a few patches, without other backgrounds; `slopes` outside and inside."""
+    by_ellipse = jacobian[:, :ELLIPSE_PARAMETERS]
+    edge = edge_profile(parameters[:, :ELLIPSE_PARAMETERS], parameters[:, WIDTH], x, y, by_ellipse)
+    rest = parameters[:, BACKGROUND:].astype(np.float32)[:, :, None]
+    inside, outside = jacobian[:, LEVEL], jacobian[:, BACKGROUND]
+    inside[:] = edge.inside
+    np.subtract(1, inside, out=outside)
+    dark, bright = rest[:, 0], rest[:, 1]
+    place = _PLAIN_COUNT
+    if slopes[0]:
+        dark = dark + rest[:, 2] * x + rest[:, 3] * y
+        np.multiply(x, outside, out=jacobian[:, place])
+        np.multiply(y, outside, out=jacobian[:, place + 1])
+        place += 2
+    if slopes[1]:
+        bright = bright + rest[:, place - BACKGROUND] * x + rest[:, place + 1 - BACKGROUND] * y
+        np.multiply(x, inside, out=jacobian[:, place])
+        np.multiply(y, inside, out=jacobian[:, place + 1])
+    contrast = bright - dark
+    steep = contrast * edge.density
+    by_ellipse *= steep[:, None]
+    steep *= edge.distance_px
+    np.divide(steep, -parameters[:, WIDTH, None].astype(np.float32), out=jacobian[:, WIDTH])
+    np.multiply(contrast, inside, out=picture)
+    picture += dark
 
 
 def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
@@ -67,3 +85,9 @@ def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
         weight = pixels.present * side
         parameters[:, column] = (weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
     return parameters
+
+
+def contrasts(fit: Minimum) -> Array:
+    """(N,) light of fitted discs above that beside them. [DN]"""
+    contrast: Array = fit.parameters[:, LEVEL] - fit.parameters[:, BACKGROUND]
+    return contrast

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.images import Pixels
 from geometry.se3 import Array
-from nav.centroids.ellipses import Ellipses
+from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
 from nav.centroids.marker_signal import Array32, MarkerSignal
 
 # Pixels this far outside the edge are seen; a plain picture needs more of them to know its background. [px]
@@ -61,12 +61,17 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
         shapes_px: (N, 2, 2).
         x_px, y_px: (N, ...), of shapes that fit each other.
     """
-    inverse = np.linalg.inv(shapes_px).astype(np.float32)
+    inverse = shape_inverses(shapes_px).astype(np.float32)
     a, b, c = (inverse[:, i, j].reshape((-1,) + (1,) * (x_px.ndim - 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
-    radii = np.sqrt(np.linalg.det(shapes_px)).astype(np.float32).reshape(a.shape)
+    radii = shape_radii(shapes_px).astype(np.float32).reshape(a.shape)
     # Of x (N, 1, W) and y (N, H, 1) only what needs both is computed on the whole grid.
     w0, w1 = a * x_px + b * y_px, b * x_px + c * y_px
-    distances: Array32 = radii * (1 - np.sqrt(w0 * w0 + w1 * w1))
+    w0 *= w0
+    w1 *= w1
+    w0 += w1
+    distances: Array32 = np.sqrt(w0, out=w0)
+    np.subtract(1, distances, out=distances)
+    distances *= radii
     return distances
 
 
@@ -79,7 +84,11 @@ def disc_pixels(signals: Sequence[MarkerSignal], discs: Ellipses, everything: bo
         distance = edge_distances(discs.shapes_px, x, y)
         chosen: NDArray[np.bool_] = distance >= -outer
         if not whole:
-            chosen &= (np.abs(distance) <= _BAND_PX) | thin
+            taken = distance <= _BAND_PX
+            if outer > _BAND_PX:
+                taken &= distance >= -_BAND_PX
+            taken |= thin
+            chosen &= taken
         return chosen
 
     return _gather(signals, discs, float(outer), choose)
@@ -124,29 +133,37 @@ def _gather(
     along = (pitch * steps).astype(np.float32)
     x, y = starts[:, 0, None, None] + along[:, None].T, starts[:, 1, None, None] + along[:, None]
     chosen = choose(x, y, (steps[:, None] % _THIN == 0) & (steps % _THIN == 0))
-    patch, cell = np.divmod(np.flatnonzero(chosen), len(steps) ** 2)
-    row, column = np.divmod(cell, len(steps))
-    columns, rows = middles[patch, 0] + steps[column], middles[patch, 1] + steps[row]
-    heights, widths = np.array([signal.values.shape for signal in signals]).T
-    eye = outlines.eyes[patch]
-    seen = (columns >= 0) & (rows >= 0) & (columns < widths[eye]) & (rows < heights[eye])
-    truncated = np.bincount(patch[~seen], minlength=len(outlines)) > 0
-    if truncated.any():
-        patch, eye, row, column, rows, columns = (i[seen] for i in (patch, eye, row, column, rows, columns))
+    columns, rows = (middles[:, axis, None] + steps for axis in (0, 1))
+    heights, widths = np.array([signal.values.shape for signal in signals]).T[:, outlines.eyes, None]
+    on_image = (rows >= 0) & (rows < heights), (columns >= 0) & (columns < widths)
+    truncated = np.zeros(len(outlines), np.bool_)
+    if not (on_image[0].all() and on_image[1].all()):
+        seen = on_image[0][:, :, None] & on_image[1][:, None]
+        truncated = (chosen & ~seen).any(axis=(1, 2))
+        chosen &= seen
+    # Flat indices are found and split faster than those of three axes.
+    cell = np.flatnonzero(chosen)
+    patch = cell // len(steps) ** 2
+    cell -= len(steps) ** 2 * patch
+    row = cell // len(steps)
+    column = cell - len(steps) * row
     counts = np.bincount(patch, minlength=len(outlines))
-    length = max(1, int(counts.max()))
-    place = np.arange(len(patch)) + (length * np.arange(len(outlines)) - np.cumsum(counts) + counts)[patch]
+    present = np.arange(max(1, int(counts.max()))) < counts[:, None]
+    eye = outlines.eyes[patch]
+    sites = [
+        (mine, middles[patch[mine], 1] + steps[row[mine]], middles[patch[mine], 0] + steps[column[mine]])
+        for mine in (np.flatnonzero(eye == index) for index in range(len(signals)))
+    ]
 
-    def padded(values: Array32) -> Array32:
-        array = np.zeros(len(outlines) * length, np.float32)
-        array[place] = values
-        return array.reshape(-1, length)
+    def padded(values: Array32 | NDArray[np.bool_]) -> Array32:
+        array = np.zeros(present.shape, np.float32)
+        array[present] = values
+        return array
 
     def at_sites(pictures: Sequence[_Picture]) -> Array32:
         values = np.empty(len(patch), np.float32)
-        for index, picture in enumerate(pictures):
-            mine = eye == index
-            values[mine] = picture[rows[mine], columns[mine]]
+        for picture, (mine, at_rows, at_columns) in zip(pictures, sites, strict=True):
+            values[mine] = picture[at_rows, at_columns]
         return values
 
     values = at_sites([signal.values for signal in signals])
@@ -155,7 +172,7 @@ def _gather(
         padded(starts[patch, 0] + along[column]),
         padded(starts[patch, 1] + along[row]),
         padded(values),
-        padded(np.ones(len(patch), np.float32)),
+        present.astype(np.float32),
         padded(at_sites([signal.clipped for signal in signals])) > 0,
         outlines.centers_px,
         truncated,

@@ -43,22 +43,23 @@ def without_pixel_response(fit: Minimum, pixels: PixelSet, inside: Array32, cont
         The fit after one linear step with the shares free, and (N, K) what the data have beyond Gaussian edges.
     """
     weights = pixels.present
-    patch, pixel = np.nonzero((inside > _SEEN[0]) & (inside < _SEEN[1]) & (weights > 0))
-    shapes = np.zeros((len(weights), weights.shape[1], _SHAPES), np.float32)
-    steps = _box_edges(
-        fit.parameters[:, :ELLIPSE_PARAMETERS].astype(np.float32)[patch],
-        pixels.x_px[patch, pixel],
-        pixels.y_px[patch, pixel],
-    )
-    shapes[patch, pixel] = contrast.astype(np.float32)[patch, None] * (steps - inside[patch, pixel, None])
-    weighted = shapes * weights[:, :, None]
+    edge = (inside > _SEEN[0]) & (inside < _SEEN[1]) & (weights > 0)
+    counts = edge.sum(axis=1)
+    ellipses = np.repeat(fit.parameters[:, :ELLIPSE_PARAMETERS].astype(np.float32), counts, axis=0)
+    steps = box_edges(ellipses, pixels.x_px[edge], pixels.y_px[edge])
+    steps -= inside[edge]
+    steps *= np.repeat(contrast.astype(np.float32), counts)
+    shapes = np.zeros((len(weights), _SHAPES, weights.shape[1]), np.float32)
+    for shape, step in enumerate(steps):
+        shapes[:, shape][edge] = step
+    weighted = (shapes * weights[:, None]).transpose(0, 2, 1)
     coupled = np.matmul(fit.jacobian, weighted).astype(np.float64)
     taken = np.matmul(fit.covariance(), coupled)
-    slopes = np.einsum("npk,nk->np", fit.jacobian, weights * fit.residuals).astype(np.float64)
+    slopes = np.matmul(fit.jacobian, (weights * fit.residuals)[:, :, None])[..., 0].astype(np.float64)
     along = np.einsum("nks,nk->s", weighted, fit.residuals) - np.einsum("nps,np->s", taken, slopes)
-    own = np.matmul(shapes.transpose(0, 2, 1), weighted) - np.matmul(coupled.transpose(0, 2, 1), taken)
+    own = np.matmul(shapes, weighted) - np.matmul(coupled.transpose(0, 2, 1), taken)
     shares = _solved(own.sum(axis=0), along)
-    beyond: Array32 = np.matmul(shapes, shares.astype(np.float32))
+    beyond: Array32 = np.matmul(shares.astype(np.float32), shapes)
     return fit.given(fit.residuals - beyond, weights), beyond
 
 
@@ -69,8 +70,8 @@ def _solved(normal: Array, gradient: Array) -> Array:
     return shares
 
 
-def _box_edges(ellipse: Array32, x_px: Array32, y_px: Array32) -> Array32:
-    """(E, 3) light from within that a pixel's own box takes, those beside it, and those across its corners.
+def box_edges(ellipse: Array32, x_px: Array32, y_px: Array32) -> Array32:
+    """(3, E) light from within that a pixel's own box takes, those beside it, and those across its corners.
 
     The outline is a straight line across the nine boxes. What a box takes is the second difference, by both its sides,
     of the half square of the distance inwards.
@@ -82,8 +83,9 @@ def _box_edges(ellipse: Array32, x_px: Array32, y_px: Array32) -> Array32:
     cx, cy, a, c, b = ellipse.T
     dx, dy = x_px - cx, y_px - cy
     w0, w1 = a * dx + b * dy, b * dx + c * dy
-    q, m0, m1 = np.hypot(w0, w1), a * w0 + b * w1, b * w0 + c * w1
-    slope = np.hypot(m0, m1)
+    # No overflow to guard against here: hypot would, at five times the price.
+    q, m0, m1 = np.sqrt(w0 * w0 + w1 * w1), a * w0 + b * w1, b * w0 + c * w1
+    slope = np.sqrt(m0 * m0 + m1 * m1)
     across, down = (np.maximum(np.abs(m) / slope, _LEAST_SINE) for m in (m0, m1))
     inwards = (1 - q) * q / slope + _SIDES_PX[:, None, None] * across + _SIDES_PX[:, None] * down
     np.maximum(inwards, 0, out=inwards)
@@ -92,5 +94,5 @@ def _box_edges(ellipse: Array32, x_px: Array32, y_px: Array32) -> Array32:
     taken = (between[:, 1:] - between[:, :-1]) / (2 * across * down)
     beside = (taken[0, 1] + taken[2, 1] + taken[1, 0] + taken[1, 2]) / 4
     corners = (taken[0, 0] + taken[2, 0] + taken[0, 2] + taken[2, 2]) / 4
-    edges: Array32 = np.stack([taken[1, 1], beside, corners], axis=-1)
+    edges: Array32 = np.stack([taken[1, 1], beside, corners])
     return edges

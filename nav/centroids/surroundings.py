@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf
 
 from geometry.se3 import Array
+from nav.centroids.edge_profile import blurred_step
 from nav.centroids.ellipses import Ellipses, plane_shapes
 from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet, edge_distances
@@ -74,5 +74,4 @@ def shares_beyond(around: Surroundings, discs: Ellipses, pixels: PixelSet, width
 def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float) -> Array32:
     """(N, K) how much of the light at places (N, K) comes from outside ellipses (N, 2, 2) about the origin."""
     distance = edge_distances(shapes_px, x_px, y_px)
-    share: Array32 = np.float32(0.5) - np.float32(0.5) * erf(distance / np.float32(np.sqrt(2) * width_px))
-    return share
+    return blurred_step(distance * np.float32(-np.sqrt(0.5) / width_px))[0]

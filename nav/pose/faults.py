@@ -14,6 +14,8 @@ _LEAST_PAIRS = 3
 _COLLINEAR_FRACTION = 0.02
 # A centre may lie outside the image when something else than our detector measured it, but not by more than its size.
 _OUTSIDE_IMAGES = 1.0
+# A ring tilted by 60 degrees looks a quarter smaller in the middle; the rest is room for noise far away.
+_RIG_MISS_FRACTION, _RIG_MISS_PX = 0.35, 1.0
 
 
 def fault(observation: Observation) -> NoFixReason | None:
@@ -22,7 +24,7 @@ def fault(observation: Observation) -> NoFixReason | None:
         reason = _bad_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
         if reason is not None:
             return reason
-    return _too_few_pairs(observation) or _degenerate_pairs(observation)
+    return _too_few_pairs(observation) or _degenerate_pairs(observation) or _another_rig(observation)
 
 
 def hub_fault(observation: Observation) -> NoFixReason | None:
@@ -43,14 +45,19 @@ def left_fault(observation: Observation, least: int) -> NoFixReason | None:
         observation: what was measured; the right eye is not looked at.
         least: how many markers the method needs.
     """
-    reason = _bad_numbers(observation, observation.pixels_px[0], observation.cov_px2[0], 0, "marker")
+    return eye_fault(observation, 0, least)
+
+
+def eye_fault(observation: Observation, eye: int, least: int) -> NoFixReason | None:
+    """Why no pose can rest on the markers of one eye alone, 0 left or 1 right, or None when one can."""
+    reason = _bad_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
     if reason is not None:
         return reason
-    seen = observation.seen[0]
+    seen = observation.seen[eye]
     if seen.sum() < least:
-        return NoFixReason(f"{int(seen.sum())} markers in the left eye, {least} are needed")
-    if _on_a_line(observation.layout.centers_m[seen, :2]) or _on_a_line(observation.pixels_px[0, seen]):
-        return NoFixReason("the markers that the left eye sees lie on one line")
+        return NoFixReason(f"{int(seen.sum())} markers in the {EYES[eye]} eye, {least} are needed")
+    if _on_a_line(observation.layout.centers_m[seen, :2]) or _on_a_line(observation.pixels_px[eye, seen]):
+        return NoFixReason(f"the markers that the {EYES[eye]} eye sees lie on one line")
     return None
 
 
@@ -90,6 +97,26 @@ def _degenerate_pairs(observation: Observation) -> NoFixReason | None:
     if disparity_px.min() <= 0:
         return NoFixReason("a marker's disparity is not positive")
     return None
+
+
+def _another_rig(observation: Observation) -> NoFixReason | None:
+    """Whether disparities and the ring's size speak of different distances, as they do with another rig's baseline."""
+    paired = observation.paired
+    first, second = np.triu_indices(int(paired.sum()), 1)
+    places = observation.layout.centers_m[paired]
+    gaps_m = np.linalg.norm(places[first] - places[second], axis=1)
+    gaps_px = np.linalg.norm(
+        observation.pixels_px[:, paired][:, first] - observation.pixels_px[:, paired][:, second], axis=2
+    )
+    # Medians, so that a bad marker or two tell nothing of the rig.
+    expected_px = observation.rig.baseline_m * float(np.median(gaps_px / gaps_m))
+    disparity_px = float(np.median(observation.pixels_px[0, paired, 0] - observation.pixels_px[1, paired, 0]))
+    if abs(disparity_px - expected_px) <= _RIG_MISS_FRACTION * min(disparity_px, expected_px) + _RIG_MISS_PX:
+        return None
+    return NoFixReason(
+        f"rig and drogue do not fit: markers this large have a disparity of {expected_px:.1f} px, "
+        f"these have {disparity_px:.1f} px"
+    )
 
 
 def _on_a_line(points: Array) -> bool:

@@ -1,4 +1,4 @@
-"""Method `mono-circle`: the ring as one ellipse in the left image.
+"""Method `mono-circle`: the ring as one ellipse in one image.
 
 A reconstruction of what monocular work on the drogue's circular edges does (Ma et al. 2019); its full text was not
 available. The ellipse through the markers' centres gives two poses in closed form, both are refined, and the hub, as a
@@ -12,10 +12,11 @@ import numpy as np
 from geometry.se3 import Array, RigidTransform
 from nav.pose.adjustment import Adjusted, adjust, inverse_information
 from nav.pose.circle_pose import circle_poses, conic_through
-from nav.pose.faults import hub_fault, left_fault
+from nav.pose.faults import hub_fault
 from nav.pose.features import Features, left_features, stack_features
 from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.joint import misfit
+from nav.pose.mono_eye import solve_with_one_eye
 from nav.pose.prediction import predict_px, rotations_with_axis, used_left, with_best_roll
 from nav.pose.reprojection import State, linearise
 
@@ -29,8 +30,12 @@ _PASSES = 3
 
 
 def mono_circle(observation: Observation) -> Solution | NoFixReason:
-    """Pose from the ellipse through the left eye's markers and the ring's radius."""
-    reason = left_fault(observation, _LEAST_MARKERS) or hub_fault(observation)
+    """Pose from the ellipse through one eye's markers and the ring's radius."""
+    return solve_with_one_eye(observation, _LEAST_MARKERS, _solve)
+
+
+def _solve(observation: Observation) -> Solution | NoFixReason:
+    reason = hub_fault(observation)
     if reason is not None:
         return reason
     radius_m = observation.layout.ring_radius_m
@@ -38,7 +43,7 @@ def mono_circle(observation: Observation) -> Solution | NoFixReason:
         return NoFixReason("an ellipse needs all markers on one circle about the drogue's origin")
     starts = _closed_form(observation, radius_m)
     if starts is None:
-        return NoFixReason("the markers of the left eye lie on no ellipse")
+        return NoFixReason("the markers lie on no ellipse")
     rotations, translations = starts
     adjusted = adjust(_across_only(observation, rotations, translations), rotations, translations)
     best = int(np.argmin(_branch_costs(observation, adjusted)))

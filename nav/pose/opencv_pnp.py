@@ -1,4 +1,4 @@
-"""Methods `mono-ippe` and `mono-sqpnp`: OpenCV's solvers on the markers of the left eye.
+"""Methods `mono-ippe` and `mono-sqpnp`: OpenCV's solvers on the markers of one eye.
 
 They take image points for the images of points. The markers are discs, so the pose of a first pass tells how far each
 ellipse centre lies from the image of its disc's centre, and a second pass works on the corrected points.
@@ -8,34 +8,33 @@ ECCV 2020, doi:10.1007/978-3-030-58452-8_28 (SQPnP).
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 
 from geometry.se3 import Array, RigidTransform
 from nav.pose.adjustment import information_at, inverse_information
-from nav.pose.faults import left_fault
 from nav.pose.features import left_features
 from nav.pose.interface import NoFixReason, Observation, PoseMode, Solution
 from nav.pose.joint import misfit
 from nav.pose.mono import LEAST_MARKERS
+from nav.pose.mono_eye import solve_with_one_eye
 from nav.pose.prediction import predict_px, used_left
 from nav.pose.reprojection import State, linearise
 
 
 def mono_ippe(observation: Observation) -> Solution | NoFixReason:
     """Both poses of IPPE, each refined by Levenberg-Marquardt; without that it misses the bound by 2 below 5 m."""
-    return _solve(observation, cv2.SOLVEPNP_IPPE, refine=True)
+    return solve_with_one_eye(observation, LEAST_MARKERS, partial(_solve, flag=cv2.SOLVEPNP_IPPE, refine=True))
 
 
 def mono_sqpnp(observation: Observation) -> Solution | NoFixReason:
     """The minima that SQPnP knows of, as they are."""
-    return _solve(observation, cv2.SOLVEPNP_SQPNP, refine=False)
+    return solve_with_one_eye(observation, LEAST_MARKERS, partial(_solve, flag=cv2.SOLVEPNP_SQPNP, refine=False))
 
 
 def _solve(observation: Observation, flag: int, refine: bool) -> Solution | NoFixReason:
-    reason = left_fault(observation, LEAST_MARKERS)
-    if reason is not None:
-        return reason
     measured = observation.pixels_px[0, observation.seen[0]]
     poses = _poses(observation, measured, flag, refine)
     if not poses:

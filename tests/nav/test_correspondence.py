@@ -129,15 +129,27 @@ def test_rings_of_two_drogues_are_not_matched(make_pose):
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_too_few_regions_in_one_eye(make_pose, eye):
+def test_too_few_regions_in_one_eye_leave_the_other(make_pose, eye):
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(6)
     place = make_pose(0.06, 0, 5)
     parts = {other: centroids(layout, place, other, rng) for other in EYES}
     parts[eye] = centroids(layout, place, eye, rng, hidden=range(4))
-    answer = correspond(parts["left"], parts["right"], RIG, layout)
+    observation = correspond(parts["left"], parts["right"], RIG, layout)
+    assert not isinstance(observation, NoFixReason), observation.reason
+    assert observation.seen.sum(axis=1).tolist() == [0 if other == eye else 8 for other in EYES]
+    # Six deviations of centroids of black and white pixels with a radius of 21 px.
+    assert worst_match_px(observation, layout, place) < 6 * 0.033
+
+
+def test_too_few_regions_in_both_eyes(make_pose):
+    layout = marker_layout(PRESETS["red-8"])
+    place, rng = make_pose(0.06, 0, 5), np.random.default_rng(8)
+    left, right = (centroids(layout, place, eye, rng, hidden=range(4)) for eye in EYES)
+    answer = correspond(left, right, RIG, layout)
     assert isinstance(answer, NoFixReason)
-    assert f"of the {eye} image" in answer.reason
+    assert "regions of the left image" in answer.reason
+    assert "regions of the right image" in answer.reason
 
 
 def test_an_uneven_layout_keeps_its_own_names(make_pose):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import NoFix
+from datasets_manifest.estimates import NoFix, PoseEstimate
 from datasets_manifest.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
@@ -87,7 +89,7 @@ def broken(make_pose, corrupt) -> Observation:
     return Observation(RIG, LAYOUT, pixels, cov)
 
 
-# Methods of the left eye answer without the right one; tests/nav/test_pose_bad_input.py has what turns them down.
+# Methods of one eye answer without the other; tests/nav/test_pose_bad_input.py has what turns them down.
 STEREO_METHODS = [name for name in METHODS if not name.startswith("mono-")]
 
 
@@ -141,7 +143,41 @@ def test_flat_images(level):
     image = np.full((960, 1280, 3), level, np.uint8)
     sighting = Navigator(RIG, DROGUE).observe(StereoImages(image, image, 0.0, 1e-3))
     assert isinstance(sighting.observation, NoFixReason)
-    assert "no drogue detected in the left image" in sighting.observation.reason
+    assert "no drogue detected in the left image, nor in the right one" in sighting.observation.reason
+
+
+@pytest.mark.parametrize("blind", EYES)
+@pytest.mark.parametrize("z_m", [3.0, 12.0])
+def test_one_blind_eye(draw, make_pose, blind, z_m):
+    place = make_pose(0.1, 0.05, z_m, 8, -7, 10)
+    images = draw(RIG, DROGUE, place, np.random.default_rng(8))
+    images = replace(images, **{blind: np.zeros_like(images.left)})
+    for estimate in Navigator(RIG, DROGUE).estimate(2, images, list(METHODS)):
+        if estimate.method in STEREO_METHODS:
+            assert isinstance(estimate, NoFix)
+            assert estimate.reason == f"markers in one eye only: no drogue detected in the {blind} image"
+            continue
+        assert isinstance(estimate, PoseEstimate), estimate.reason
+        assert {feature.eye for feature in estimate.features} == {eye for eye in EYES if eye != blind}
+        # mono-circle works on binary centroids of 0.05 px; single-eye depth errs by 44 mm at 10 m and 0.1 px, by its
+        # square with distance. The right eye's frame is 120 mm off.
+        limit_m = np.array([0.01, 0.01, 4 * 0.044]) * max(1.0, (z_m / 10) ** 2)
+        error_m = np.abs(estimate.left_from_drogue.translation_m - place.translation_m)
+        assert (error_m < limit_m).all(), estimate.method
+
+
+def test_a_single_eye_is_measured_by_the_edge_model_too(draw, make_pose):
+    place = make_pose(0.1, 0.05, 5.0, 8, -7, 10)
+    images = draw(RIG, DROGUE, place, np.random.default_rng(9))
+    navigator = Navigator(RIG, DROGUE)
+    seen = navigator.refine(images, navigator.observe(images)).observation
+    alone = replace(images, left=np.zeros_like(images.left))
+    single = navigator.refine(alone, navigator.observe(alone)).observation
+    assert isinstance(seen, Observation)
+    assert isinstance(single, Observation)
+    assert not single.seen[0].any()
+    # Noise and widths are the frame's, of two eyes or of one: that moves a weight, not a centre.
+    np.testing.assert_allclose(single.pixels_px[1], seen.pixels_px[1], atol=0.002)
 
 
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
