@@ -93,10 +93,11 @@ def blur_circle_px(frame: FrameSpec, depth_m: float) -> float:
 def _defocused(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np.float32]:
     """(H, W, 3) radiance with two layers out of focus: all parts by the depth of the rim's centre, and the far sky.
 
-    A blurred part lets through what it no longer covers: `sky (1 - coverage) + parts`, each blurred by its own circle.
+    A calibration board goes by its own centre. A blurred part lets through what it no longer covers:
+    `sky (1 - coverage) + parts`, each blurred by its own circle.
     """
     sky_px = blur_circle_px(frame, np.inf)
-    pose = frame.left_from_drogue
+    pose = frame.board.left_from_board if frame.board is not None else frame.left_from_drogue
     part_px = sky_px if pose is None else blur_circle_px(frame, float(pose.translation_m[2]))
     if max(sky_px, part_px) < _SHARP_BELOW_PX:
         return seen.radiance_cd_m2

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from datasets_manifest.frame import FrameSpec
 from datasets_manifest.recipe import RenderSettings
 from geometry.stereo import EYES, Eye
+from render.analytic_engine.board import board_eye
 from render.analytic_engine.flat_parts import flat_drogue, ring_radiance
 from render.analytic_engine.outlines import EyeView, seen_areas
 from render.analytic_engine.painting import paint
@@ -54,6 +55,10 @@ class AnalyticEngine:
         stage_s = {"sky": 0.0, "light": 0.0, "passes": 0.0, "outlines": 0.0, "composite": 0.0}
         with _timed(stage_s, "sky"):
             behind = backgrounds(frame)
+        if frame.board is not None:
+            with _timed(stage_s, "outlines"):
+                boards = {eye: board_eye(frame, frame.board, eye, behind[eye]) for eye in EYES}
+            return self._stereo(boards, stage_s)
         if frame.drogue is None or frame.left_from_drogue is None:
             return self._stereo({eye: _empty_eye(frame, behind[eye]) for eye in EYES}, stage_s)
         flat = flat_drogue(frame.drogue, missing_parts(frame))

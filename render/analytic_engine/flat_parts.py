@@ -11,7 +11,7 @@ from datasets_manifest.frame import FrameSpec
 from drogue_models.meshes import FACE_THICKNESS_M
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part, marker_id
-from geometry.se3 import Array
+from geometry.se3 import Array, RigidTransform
 from render.surfaces import lamp_radiance_rgb, mean_reflectance_rgb
 from scenes.surroundings import Surroundings
 
@@ -86,14 +86,29 @@ def ring_radiance(frame: FrameSpec, around: Surroundings, rings: tuple[FlatRing,
     """
     pose = frame.left_from_drogue
     assert pose is not None
-    towards_camera = -np.sign(pose.translation_m @ pose.rotation[:, 2]) * pose.rotation[:, 2]
-    illuminance_lux = around.plate_illuminance_lux(frame.world_from_left.rotate(towards_camera))
-    towards_drogue = pose.translation_m / np.linalg.norm(pose.translation_m)
-    air = around.airlight(frame.world_from_left.rotate(towards_drogue)).astype(np.float64)
-    slant = 1.0 / towards_drogue[2]
-    radiance: dict[int, Array] = {}
-    for ring in rings:
-        sent = mean_reflectance_rgb(frame, ring.part) * illuminance_lux / np.pi + lamp_radiance_rgb(frame, ring.part)
-        clear = np.exp(-around.extinction_per_m * slant * pose.apply(ring.center_m)[2])
-        radiance[ring.part] = sent * clear + air * (1.0 - clear)
-    return radiance
+    plate = PlateLight(frame, around, pose)
+    return {
+        ring.part: plate.seen(
+            mean_reflectance_rgb(frame, ring.part), lamp_radiance_rgb(frame, ring.part), pose.apply(ring.center_m)[2]
+        )
+        for ring in rings
+    }
+
+
+class PlateLight:
+    """Light on a flat thing that faces the camera, and what the air leaves of what it sends back."""
+
+    def __init__(self, frame: FrameSpec, around: Surroundings, pose: RigidTransform) -> None:
+        """Light on a plate whose pose in the left camera has its axis along z; either side may face the camera."""
+        towards_camera = -np.sign(pose.translation_m @ pose.rotation[:, 2]) * pose.rotation[:, 2]
+        self._illuminance_lux = around.plate_illuminance_lux(frame.world_from_left.rotate(towards_camera))
+        towards_plate = pose.translation_m / np.linalg.norm(pose.translation_m)
+        self._air = around.airlight(frame.world_from_left.rotate(towards_plate)).astype(np.float64)
+        self._extinction_per_depth = around.extinction_per_m / towards_plate[2]
+
+    def seen(self, reflectance_rgb: Array, lamp_cd_m2: Array | float, depth_m: float) -> Array:
+        """(3,) radiance at the camera of a surface with a (3,) reflectance and light of its own. [cd/m2]"""
+        sent = reflectance_rgb * self._illuminance_lux / np.pi + lamp_cd_m2
+        clear = np.exp(-self._extinction_per_depth * depth_m)
+        radiance: Array = sent * clear + self._air * (1.0 - clear)
+        return radiance
