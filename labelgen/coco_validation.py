@@ -17,7 +17,8 @@ from datasets_manifest.manifest import Manifest
 from datasets_manifest.records import PairRecord
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES, Eye
-from labelgen.export.coco import coco_image_id
+from labelgen.export.coco_entries import DROGUE, coco_image_id
+from labelgen.export.keypoints import view_of
 
 # COCO's boxes and keypoints are the records' numbers plus a half, rounded at most once.
 _TOLERANCE_PX = 1e-9
@@ -50,13 +51,13 @@ class CocoFiles:
         image_id = coco_image_id(record.frame_index, eye)
         if self._all is None or image_id not in self._all.imgs:
             return []
-        view = record.views.left if eye == "left" else record.views.right
+        view = view_of(record, eye)
         where = f"{self._path}: image {image_id}"
         annotations = self._all.imgToAnns[image_id]
         if view.box_visible_xywh_px is None:
             return [f"{where}: has annotations, no drogue is visible"] if annotations else []
-        if len(annotations) != 1:
-            return [f"{where}: must have one annotation, has {len(annotations)}"]
+        if [annotation.get("category_id") for annotation in annotations] != [DROGUE]:
+            return [f"{where}: must have one annotation, of the drogue, has {len(annotations)}"]
         annotation = annotations[0]
         try:
             faults = _annotation_faults(annotation, record, eye)
@@ -98,7 +99,7 @@ class CocoFiles:
 
 
 def _annotation_faults(annotation: dict[str, Any], record: PairRecord, eye: Eye) -> list[str]:
-    view = record.views.left if eye == "left" else record.views.right
+    view = view_of(record, eye)
     faults = []
     box = np.array(view.box_visible_xywh_px) + np.array([0.5, 0.5, 0.0, 0.0])
     if np.abs(np.array(annotation["bbox"]) - box).max() > _TOLERANCE_PX:

@@ -19,16 +19,14 @@ from datasets_manifest.records import PairRecord
 from datasets_manifest.writer import leftovers
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import drogue_part_ids
-from geometry.distortion import Lens
 from geometry.stereo import EYES, Eye
+from labelgen.bag_validation import bag_faults, bag_files
+from labelgen.calibration_validation import calibration_faults
 from labelgen.coco_validation import CocoFiles
 from labelgen.part_pixels import FeaturePixels, is_one_of
+from labelgen.passes_validation import passes_faults
+from labelgen.projection_validation import box_faults, projection_faults
 from labelgen.validation import check_boxes, check_empty, check_unoccluded_marker, named_features
-
-# Two ways to project in float64 agree far better; a pixel convention that is wrong does not.
-_PROJECTION_TOLERANCE_PX = 1e-6
-# The eyes' rows come out of the same numbers.
-_EPIPOLAR_TOLERANCE_PX = 1e-9
 
 
 class Check(FrozenModel):
@@ -114,10 +112,15 @@ def validate_dataset(path: Path) -> ValidationReport:
         return tally.report(pairs=0)
     manifest = dataset.manifest
     tally.add("manifest", _count_faults(manifest))
+    tally.add("drops", _drop_faults(manifest))
     tally.add("split", _split_faults(manifest))
+    tally.add("calibration", calibration_faults(path, manifest.recipe.rig))
     tally.add("leftovers", [f"{entry}: was left by a run that was killed" for entry in leftovers(path)])
     for frame_index in sorted(set(frame_indices(path)) - set(dataset.frame_indices)):
         tally.add("frames on disk", [f"{frame_folder(path, frame_index)}: is not in the manifest"])
+    bags = bag_files(path)
+    if bags:
+        tally.add("bags", bag_faults(dataset, bags))
     coco = CocoFiles(path, manifest)
     for fault in coco.faults():
         tally.add("annotation files", [fault])
@@ -134,13 +137,15 @@ def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _T
         tally.add("records", [str(error)])
         return
     tally.add("records", [f"{folder / RECORD_FILE}: {fault}" for fault in _entry_faults(record, entry)])
-    tally.add("hashes", [*dataset.verify(entry.frame_index), *_stray_files(folder, record)])
+    changed = dataset.verify(entry.frame_index)
+    tally.add("hashes", [*changed, *_stray_files(folder, record)])
     try:
         dataset.images(entry.frame_index)
         tally.add("images", [])
     except ValueError as error:
         tally.add("images", [str(error)])
-    tally.add("projection", [f"{folder}: {fault}" for fault in _projection_faults(record)])
+    tally.add("projection and epipolar rows", [f"{folder}: {fault}" for fault in projection_faults(record)])
+    tally.add("keypoints in boxes", [f"{folder}: {fault}" for fault in box_faults(record)])
     for eye in EYES:
         path = folder / parts_file(eye)
         part_id = _read_part_ids(path, record)
@@ -150,11 +155,31 @@ def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _T
         tally.add("part ids", [])
         tally.add("labels against part ids", [f"{path}: {fault}" for fault in _label_faults(record, eye, part_id)])
         tally.add("annotations", coco.annotation_faults(record, eye, part_id))
+        # What was changed does not reach the decoder; it is a fault already.
+        found = passes_faults(dataset, record, eye, part_id) if not changed else None
+        if found is not None:
+            tally.add("depth and normals", [f"{folder}: {fault}" for fault in found])
 
 
 def _count_faults(manifest: Manifest) -> list[str]:
     want = count_pairs(manifest.frames)
     return [] if manifest.counts == want else [f"manifest.json: counts are {manifest.counts}, the frames give {want}"]
+
+
+def _drop_faults(manifest: Manifest) -> list[str]:
+    """Every frame of the recipe is there, or dropped with its reason, or was not asked for; none twice."""
+    indices = [entry.frame_index for entry in manifest.frames]
+    dropped = [drop.frame_index for drop in manifest.drops]
+    count = manifest.recipe.frames.count
+    faults = [f"manifest.json: frame {index} is both there and dropped" for index in sorted({*indices} & {*dropped})]
+    if len({*indices}) < len(indices) or len({*dropped}) < len(dropped):
+        faults.append("manifest.json: frames, drops: must name each frame once")
+    beyond = sorted(index for index in {*indices, *dropped} if index >= count)
+    if beyond:
+        faults.append(f"manifest.json: frame {beyond[0]} is none of the recipe's {count}")
+    if sum(manifest.engines.values()) != len(indices):
+        faults.append(f"manifest.json: engines: give {sum(manifest.engines.values())} pairs, there are {len(indices)}")
+    return faults
 
 
 def _split_faults(manifest: Manifest) -> list[str]:
@@ -176,44 +201,16 @@ def _entry_faults(record: PairRecord, entry: FrameEntry) -> list[str]:
         faults.append("frame: belongs to another frame or scene")
     if (record.left_from_drogue is None) != (record.frame.drogue is None):
         faults.append("left_from_drogue: must be given exactly when the frame has a drogue")
+    elif record.left_from_drogue is not None and record.frame.left_from_drogue is not None:
+        difference = record.left_from_drogue.as_matrix() - record.frame.left_from_drogue.as_matrix()
+        if np.abs(difference).max() > 0:
+            faults.append("left_from_drogue: differs from the frame's")
     return faults
 
 
 def _stray_files(folder: Path, record: PairRecord) -> list[str]:
     known = {*record.file_sha256, RECORD_FILE}
     return [f"{entry}: is not on record" for entry in sorted(folder.iterdir()) if entry.name not in known]
-
-
-def _projection_faults(record: PairRecord) -> list[str]:
-    """Centres against OpenCV's projection of the pose, and row against row of the pair once rectified."""
-    pose, drogue = record.left_from_drogue, record.frame.drogue
-    if pose is None or drogue is None:
-        return []
-    layout, rig = marker_layout(drogue), record.frame.rig
-    centers_m = layout.centers_m
-    if layout.hub_center_m is not None:
-        centers_m = np.vstack([centers_m, layout.hub_center_m])
-    faults, labels = [], {}
-    for eye in EYES:
-        named = named_features(record, layout, pose, eye)
-        if len(named) != len(centers_m):
-            return [f"{eye}: has {len(named)} features, the drogue {len(centers_m)}"]
-        offset = pose.translation_m - rig.eye_offset_m(eye)
-        lens = rig.lens(eye) or Lens(rig.camera)
-        real_from_ideal = lens.ideal_from_real.T
-        turn, _ = cv2.Rodrigues(real_from_ideal @ pose.rotation)
-        want, _ = cv2.projectPoints(
-            centers_m, turn, real_from_ideal @ offset, lens.camera.matrix(), lens.distortion.coefficients()
-        )
-        labelled = np.array([view.center_proj_px for _, view, _ in named])
-        error = np.abs(labelled - want[:, 0]).max(axis=1)
-        labels[eye] = rig.ideal_px(labelled, eye)
-        for index in np.flatnonzero(error > _PROJECTION_TOLERANCE_PX):
-            faults.append(f"{eye}: {named[index][0]}: center_proj_px: is {error[index]:.3g} px off the pose's image")
-    gap = float(np.abs(labels["left"][:, 1] - labels["right"][:, 1]).max())
-    if gap > _EPIPOLAR_TOLERANCE_PX:
-        faults.append(f"center_proj_px: rows of left and right differ by {gap:.3g} px")
-    return faults
 
 
 def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> list[str]:

@@ -128,7 +128,7 @@ def _check_drogue(
     for name, feature, disc in named_features(record, layout, pose, eye):
         hole_m = layout.hub_inner_radius_m if name == "hub" else 0.0
         found = _check_visibility(feature, pixels.count(disc.part), seen.amodal_px.get(disc.part, 0))
-        found += _check_pixels(disc, hole_m, seen, pixels)
+        found += check_pixels(disc, hole_m, seen.depth_m, pixels)
         if name != "hub" and feature.in_image and feature.visible_fraction == 1:
             found += check_unoccluded_marker(feature, disc, seen.part_id, pixels)
         faults += [f"{name}: {fault}" for fault in found]
@@ -159,8 +159,15 @@ def _check_visibility(feature: FeatureView, visible: int, amodal: int) -> list[s
     return [] if feature.visible_fraction == want else [f"visible_fraction: is {feature.visible_fraction}, not {want}"]
 
 
-def _check_pixels(disc: DiscInEye, hole_m: float, seen: EyeRadiance, pixels: FeaturePixels) -> list[str]:
-    """Every pixel of a feature around a hole: whether it lies on it, and its depth against the feature's plane."""
+def check_pixels(disc: DiscInEye, hole_m: float, depth_m: NDArray[np.float32], pixels: FeaturePixels) -> list[str]:
+    """Every pixel of a feature around a hole: whether it lies on it, and its depth against the feature's plane.
+
+    Args:
+        disc: the feature's.
+        hole_m: radius of its hole. [m]
+        depth_m: (H, W) planar depth. [m]
+        pixels: where the eye sees which feature.
+    """
     rows, columns = pixels.places(disc.part)
     places_px = np.stack([columns, rows], axis=-1).astype(np.float64)
     distance_m = disc.distance_m(places_px)
@@ -173,13 +180,14 @@ def _check_pixels(disc: DiscInEye, hole_m: float, seen: EyeRadiance, pixels: Fea
     if not on_face.any():
         return faults
     rows, columns, places_px = rows[on_face], columns[on_face], places_px[on_face]
-    error_m = np.abs(seen.depth_m[rows, columns].astype(np.float64) - disc.plane_depth_m(places_px))
+    error_m = np.abs(depth_m[rows, columns].astype(np.float64) - disc.plane_depth_m(places_px))
     rays = disc.rays(places_px)
     slant = np.abs(rays @ disc.normal) / np.linalg.norm(rays, axis=-1)
     reach_m = float(np.linalg.norm(disc.center_m)) + disc.radius_m
     limit_m = _DEPTH_ROUNDINGS * float(np.finfo(np.float32).eps) * reach_m / slant
     worst = int(np.argmax(error_m / limit_m))
-    if error_m[worst] > limit_m[worst]:
+    # A depth that is no number is a fault too.
+    if not error_m[worst] <= limit_m[worst]:
         faults.append(
             f"depth at pixel {columns[worst]}, {rows[worst]} is {error_m[worst]:.2e} m off the plane of part "
             f"{disc.part}, more than {limit_m[worst]:.2e} m"

@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument
+from labelgen.export.formats import FORMATS, write_export
+from labelgen.export.log import ExportLog
 
-EXAMPLES = ("droguekit export data/demo --format coco --out data/demo-coco",)
-FORMATS = ("coco",)
+EXAMPLES = (
+    "droguekit export data/demo --format coco --out data/demo-coco",
+    "droguekit export data/demo --format blind --out data/demo-blind",
+)
 
 
 def export(
     dataset: DatasetArgument,
-    format_: Annotated[str, typer.Option("--format", metavar="NAME", help=f"One of: {', '.join(FORMATS)}.")],
+    format_: Annotated[str, typer.Option("--format", metavar="NAME", help="One of the formats below.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR2", help="Folder for the files; made if missing.")],
 ) -> None:
-    """Write a dataset's labels in another format. Images stay where they are."""
-    from labelgen.export.coco import write_coco
+    """Write a dataset's labels in another format, with the images where the format has them.
 
-    if format_ not in FORMATS:
-        raise ValueError(f"--format: no format named {format_!r}; there are {', '.join(FORMATS)}")
-    for path in write_coco(dataset, out):
+    What the format cannot hold as it is in the dataset is counted and printed.
+    """
+    log = ExportLog(progress_report())
+    for path in write_export(format_, dataset, out, log):
         typer.echo(f"wrote {path}")
+    for what, count in log.losses.items():
+        typer.echo(f"{format_}: {count} x {what}")
+
+
+_FORMAT_LINES = "\n".join(f"  {name:<17} {format_.description}" for name, format_ in FORMATS.items())
+# The backspace keeps the help's line breaks.
+export.__doc__ = f"{inspect.cleandoc(export.__doc__ or '')}\n\n\b\nFormats:\n{_FORMAT_LINES}"

@@ -19,7 +19,7 @@ from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import Eye
-from labelgen.export.coco import write_coco
+from labelgen.export.coco import write_annotations
 from labelgen.frame_labels import label_frame
 from render.engine import EyeRadiance, StereoRadiance
 from render.sensor import expose
@@ -157,7 +157,7 @@ def write_small_dataset(folder: Path, recipe: Recipe, pairs: list[Pair]) -> Path
     splits = ("train", "val", "test")
     write_manifest(folder, build_manifest(folder, recipe, "1", lambda scene_id: splits[scene_id % 3]))
     write_calibration(folder, recipe.rig)
-    write_coco(folder, folder / "annotations")
+    write_annotations(folder, folder / "annotations")
     return folder
 
 

@@ -9,7 +9,9 @@ from datasets_manifest.manifest import read_manifest
 from datasets_manifest.writer import leftovers
 from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
 from geometry.stereo import EYES
-from labelgen.export.coco import clockwise_order, coco_annotation, coco_image_id, write_coco
+from labelgen.export.coco import write_annotations
+from labelgen.export.coco_entries import coco_annotation, coco_image_id
+from labelgen.export.keypoints import clockwise_order
 
 
 def test_image_ids_are_those_that_are_promised():
@@ -71,7 +73,7 @@ def test_splits_hold_what_the_manifest_says(small_dataset):
 
 
 def test_the_same_dataset_gives_the_same_bytes(small_dataset, tmp_path):
-    again = write_coco(small_dataset, tmp_path / "again")
+    again = write_annotations(small_dataset, tmp_path / "again")
     for first, second in zip(sorted((small_dataset / "annotations").iterdir()), sorted(again), strict=True):
         assert first.name == second.name and first.read_bytes() == second.read_bytes()
 
@@ -81,7 +83,7 @@ def test_an_unreadable_frame_leaves_the_old_files(small_dataset, full_pairs):
     path = small_dataset / "frames" / f"{full_pairs[-1].frame.frame_index:06d}" / "right_parts.png"
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ValueError, match=r"right_parts\.png: the PNG is truncated"):
-        write_coco(small_dataset, small_dataset / "annotations")
+        write_annotations(small_dataset, small_dataset / "annotations")
     assert {path: path.read_bytes() for path in (small_dataset / "annotations").iterdir()} == before
     assert leftovers(small_dataset) == []
 
@@ -95,7 +97,7 @@ def test_hidden_and_absent_keypoints(full_pairs):
     views = pair.record.views
     left = views.left.model_copy(update={"markers": tuple(markers)})
     record = pair.record.model_copy(update={"views": views.model_copy(update={"left": left})})
-    annotation = coco_annotation(record, "left", pair.radiance.left.part_id)
+    annotation = coco_annotation(record, "left", pair.radiance.left.part_id, 8)
     points = np.array(annotation["keypoints"]).reshape(8, 3)
     assert points[0, 2] == 1 and points[1].tolist() == [0, 0, 0]
     np.testing.assert_allclose(points[2], [0.1, 10.5, 2], atol=1e-12)

@@ -1,0 +1,47 @@
+"""A dataset's calibration files against the rig of its manifest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from datasets_manifest.calibration import OPENCV_STEREO_FILE, calibration_files, opencv_stereo_matrices
+from datasets_manifest.layout import CALIBRATION_FOLDER
+from geometry.stereo import StereoRig
+
+# The files hold 16 digits.
+_TOLERANCE = 1e-14
+
+
+def calibration_faults(dataset: Path, rig: StereoRig) -> list[str]:
+    """What is wrong with the files that are there; OpenCV's must be."""
+    folder, faults = dataset / CALIBRATION_FOLDER, []
+    for name, text in calibration_files(rig).items():
+        path = folder / name
+        try:
+            found = path.read_bytes()
+        except FileNotFoundError:
+            if name == OPENCV_STEREO_FILE:
+                faults.append(f"{path}: is missing")
+            continue
+        except OSError as error:
+            faults.append(f"{path}: cannot be read: {error.strerror}")
+            continue
+        if found != text.encode():
+            faults.append(f"{path}: is not that of the manifest's rig")
+        elif name == OPENCV_STEREO_FILE:
+            # Only what is known not to be damaged is given to OpenCV's parser.
+            faults += _opencv_faults(path, rig)
+    return faults
+
+
+def _opencv_faults(path: Path, rig: StereoRig) -> list[str]:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    faults = []
+    for name, want in opencv_stereo_matrices(rig).items():
+        found = storage.getNode(name).mat()
+        if found is None or found.shape != want.shape or not np.allclose(found, want, rtol=_TOLERANCE, atol=1e-300):
+            faults.append(f"{path}: {name}: OpenCV reads {None if found is None else found.tolist()}")
+    return faults

@@ -1,0 +1,247 @@
+"""BOP: a stereo pair as two sensors of one image, models with their symmetries, everything in millimetres.
+
+Source: the BOP challenge's description of its dataset format; sensors by suffix as in its industrial datasets. BOP's
+boxes are differences of pixel numbers, one less than COCO's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.atomic import new_folder
+from datasets_manifest.layout import image_file, passes_file
+from datasets_manifest.manifest import SplitName
+from datasets_manifest.passes import read_passes
+from datasets_manifest.png import encode_png
+from datasets_manifest.reader import Dataset, read_frame_bytes
+from datasets_manifest.records import PairRecord
+from datasets_manifest.writer import canonical_json
+from drogue_models.parts import drogue_part_ids
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import RigidTransform, exp_twist
+from geometry.stereo import EYES, Eye
+from labelgen.export.bop_models import MM_PER_M, object_id, write_models
+from labelgen.export.frame_files import frame_file, link_or_copy
+from labelgen.export.log import ExportLog
+from labelgen.masks import Mask, amodal_masks, joined, visible_mask_of
+
+SPLIT_FOLDERS: dict[SplitName, str] = {"train": "train_pbr", "val": "val", "test": "test"}
+TARGETS_FILE = "test_targets_bop19.json"
+# The challenge asks for objects of which this share is seen.
+_TARGET_FROM_FRACTION = 0.1
+# Millimetres per depth number: the finest that holds the farthest thing in the image.
+_DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
+_MOST_DEPTH = 65535
+
+_INFO = """# {name}
+
+A droguekit dataset in the BOP format. Lengths are millimetres.
+
+* Sensors `left` and `right` are the eyes of one stereo rig; the image number is that of the pair.
+* Camera axes are OpenCV's, pixel (0, 0) is the centre of the top-left one. World axes are x east, y north, z up, with
+  the origin in the left eye.
+* `train`, `val` and `test` of the dataset are `train_pbr`, `val` and `test`; `{targets}` lists the pairs of `test`
+  in which at least a tenth of the drogue is seen by either eye.
+* `mask` is all of the drogue as far as it is on the image, `mask_visib` what is seen of it: rim, face, canopy, ribs,
+  coupling, hub and markers, without hose and tanker.
+* `depth` is planar, 0 for the sky, in steps of the image's own `depth_scale`. {depth}
+* Data licence: {licence}.
+"""
+
+
+def write_bop(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+    """Write a dataset for BOP's tools; arguments and errors as in `labelgen.export.formats`.
+
+    Raises:
+        ValueError: also for a rig with real lenses, whose images are no pinholes'.
+    """
+    source = Dataset(dataset)
+    recipe = source.manifest.recipe
+    if recipe.rig.lenses is not None:
+        raise ValueError("rig: BOP holds pinhole images only, and this rig has real lenses; take one of ideal eyes")
+    splits = source.manifest.split_of_frame()
+    targets: list[dict[str, int]] = []
+    with new_folder(out) as folder:
+        _write_json(folder / "camera.json", _camera(recipe.rig.camera))
+        for eye in EYES:
+            _write_json(folder / f"camera_{eye}.json", _camera(recipe.rig.camera))
+        write_models(recipe, folder)
+        writer = _Scenes(source, folder, log)
+        for record in log.records(source):
+            split = splits[record.frame_index]
+            seen = writer.add(record, split)
+            if split == "test" and seen >= _TARGET_FROM_FRACTION:
+                targets.append(
+                    {
+                        "im_id": record.frame_index,
+                        "inst_count": 1,
+                        "obj_id": object_id(recipe, record),
+                        "scene_id": record.scene_id,
+                    }
+                )
+        writer.finish()
+        (folder / TARGETS_FILE).write_text(
+            "[" + ",\n".join(map(canonical_json, sorted(targets, key=lambda target: target["scene_id"]))) + "]\n"
+        )
+        (folder / "dataset_info.md").write_text(
+            _INFO.format(
+                name=recipe.name,
+                targets=TARGETS_FILE,
+                depth="" if recipe.outputs.exr else "There is none: the dataset has no EXR files.",
+                licence=source.manifest.data_licence,
+            )
+        )
+    return [out]
+
+
+class _Scenes:
+    """The images and tables of all scenes; every pair is appended to its scene's tables as it comes."""
+
+    def __init__(self, source: Dataset, folder: Path, log: ExportLog) -> None:
+        self._source, self._folder, self._log = source, folder, log
+        self._tables: set[Path] = set()
+
+    def add(self, record: PairRecord, split: SplitName) -> float:
+        """Write one pair.
+
+        Returns:
+            The share of the drogue that the eye which sees more of it sees.
+        """
+        scene = self._folder / SPLIT_FOLDERS[split] / f"{record.scene_id:06d}"
+        seen = [self._add_eye(record, eye, scene) for eye in EYES]
+        return max(seen)
+
+    def finish(self) -> None:
+        """Close every table."""
+        for path in sorted(self._tables):
+            with path.open("a", encoding="utf-8") as stream:
+                stream.write("\n}\n")
+
+    def _add_eye(self, record: PairRecord, eye: Eye, scene: Path) -> float:
+        dataset, index = self._source.path, record.frame_index
+        picture = "gray" if record.frame.sensor.color == "mono" else "rgb"
+        link_or_copy(frame_file(dataset, index, image_file(eye)), scene / f"{picture}_{eye}" / f"{index:06d}.png")
+        depth_scale = self._add_depth(record, eye, scene)
+        self._append(scene / f"scene_camera_{eye}.json", index, _scene_camera(record, eye, depth_scale))
+        truth, info, visible_share = [], [], 0.0
+        if record.left_from_drogue is not None and record.frame.drogue is not None:
+            masks = self._masks(record, eye)
+            truth.append(_ground_truth(record, eye, object_id(self._source.manifest.recipe, record)))
+            info.append(_info(record, eye, *masks))
+            visible_share = info[0]["visib_fract"]
+            for name, mask in zip(("mask", "mask_visib"), masks, strict=True):
+                path = scene / f"{name}_{eye}" / f"{index:06d}_000000.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(encode_png(mask.astype(np.uint8) * np.uint8(255), of_areas=True))
+        self._append(scene / f"scene_gt_{eye}.json", index, truth)
+        self._append(scene / f"scene_gt_info_{eye}.json", index, info)
+        return visible_share
+
+    def _masks(self, record: PairRecord, eye: Eye) -> tuple[Mask, Mask]:
+        """All of the drogue, and what is seen of it."""
+        assert record.frame.drogue is not None
+        part_id = self._source.part_ids(record.frame_index, eye)
+        parts = tuple(drogue_part_ids(record.frame.drogue.marker_count))
+        return joined(amodal_masks(record, eye, part_id), parts, part_id.shape), visible_mask_of(part_id, parts)
+
+    def _add_depth(self, record: PairRecord, eye: Eye, scene: Path) -> float:
+        """Write the depth where the dataset has it; returns millimetres per number."""
+        if not self._source.manifest.recipe.outputs.exr:
+            self._log.lost("depth images left out, for the dataset has no EXR files")
+            return 1.0
+        name = passes_file(eye)
+        data = read_frame_bytes(self._source.path, record.frame_index, name)
+        passes = read_passes(data, f"frame {record.frame_index}: {name}", record.frame.rig.camera)
+        numbers, scale = depth_numbers(passes["depth.Z"])
+        path = scene / f"depth_{eye}" / f"{record.frame_index:06d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(encode_png(numbers, of_areas=True))
+        return scale
+
+    def _append(self, path: Path, index: int, value: Any) -> None:
+        begun = path in self._tables
+        self._tables.add(path)
+        with path.open("a", encoding="utf-8", newline="\n") as stream:
+            stream.write(f'{"," if begun else "{"}\n"{index}": {canonical_json(value)}')
+
+
+def depth_numbers(depth_m: NDArray[np.float32]) -> tuple[NDArray[np.uint16], float]:
+    """(H, W) depth as BOP stores it, and millimetres per number; 0 for the sky and what no number reaches."""
+    known = np.isfinite(depth_m)
+    depth_mm = np.where(known, depth_m, 0.0).astype(np.float64) * MM_PER_M
+    farthest = float(depth_mm.max(initial=0.0))
+    scale = next((scale for scale in _DEPTH_SCALES if farthest / scale <= _MOST_DEPTH), _DEPTH_SCALES[-1])
+    numbers = np.rint(depth_mm / scale)
+    return np.where(numbers <= _MOST_DEPTH, numbers, 0).astype(np.uint16), scale
+
+
+def _write_json(path: Path, value: Any) -> None:
+    path.write_text(canonical_json(value) + "\n", encoding="utf-8")
+
+
+def _camera(camera: PinholeCamera) -> dict[str, float]:
+    return {
+        "fx": camera.fx_px,
+        "fy": camera.fy_px,
+        "cx": camera.cx_px,
+        "cy": camera.cy_px,
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "depth_scale": 1.0,
+    }
+
+
+def _eye_from_left(record: PairRecord, eye: Eye) -> RigidTransform:
+    return exp_twist(np.concatenate([-record.frame.rig.eye_offset_m(eye), np.zeros(3)]))
+
+
+def _scene_camera(record: PairRecord, eye: Eye, depth_scale: float) -> dict[str, Any]:
+    eye_from_world = _eye_from_left(record, eye) @ record.frame.world_from_left.inverse()
+    return {
+        "cam_K": record.frame.rig.camera.matrix().ravel().tolist(),
+        "depth_scale": depth_scale,
+        "cam_R_w2c": eye_from_world.rotation.ravel().tolist(),
+        "cam_t_w2c": (eye_from_world.translation_m * MM_PER_M).tolist(),
+    }
+
+
+def _ground_truth(record: PairRecord, eye: Eye, obj_id: int) -> dict[str, Any]:
+    assert record.left_from_drogue is not None
+    eye_from_drogue = _eye_from_left(record, eye) @ record.left_from_drogue
+    return {
+        "cam_R_m2c": eye_from_drogue.rotation.ravel().tolist(),
+        "cam_t_m2c": (eye_from_drogue.translation_m * MM_PER_M).tolist(),
+        "obj_id": obj_id,
+    }
+
+
+def _info(record: PairRecord, eye: Eye, whole: Mask, visible: Mask) -> dict[str, Any]:
+    view = record.views.left if eye == "left" else record.views.right
+    count_all, count_visible = int(np.count_nonzero(whole)), int(np.count_nonzero(visible))
+    full = view.box_full_xywh_px
+    if view.truncated and full is not None:
+        low, high = np.ceil(full[:2]), np.floor(np.add(full[:2], full[2:]))
+        box = [int(value) for value in (*low, *(high - low))]
+    else:
+        box = _box(whole)
+    return {
+        "bbox_obj": box,
+        "bbox_visib": _box(visible),
+        "px_count_all": count_all,
+        "px_count_valid": count_all,
+        "px_count_visib": count_visible,
+        "visib_fract": count_visible / count_all if count_all else 0.0,
+    }
+
+
+def _box(mask: Mask) -> list[int]:
+    """x, y, width and height as BOP counts them; -1 all for an empty mask."""
+    if not mask.any():
+        return [-1, -1, -1, -1]
+    column, row, width, height = cv2.boundingRect(mask.view(np.uint8))
+    return [column, row, width - 1, height - 1]

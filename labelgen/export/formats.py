@@ -1,0 +1,104 @@
+"""The formats that a dataset can be written in; a format's module is imported when it is asked for.
+
+A writer takes the dataset's folder, the folder to write into and a log. It goes through `log.records(...)`, holds one
+pair at a time, tells the log what its format cannot hold, and makes files appear whole or not at all: single files by
+`open_text_atomic`, folders by `new_folder`, both of `datasets_manifest.atomic`. The same dataset gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from labelgen.export.log import ExportLog
+
+Writer = Callable[[Path, Path, ExportLog], list[Path]]
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """One format.
+
+    Attributes:
+        description: one line for the command's help.
+        writer: `module:function` of its `Writer`, which returns the files or folders to tell the user of.
+        extra: the extra of pyproject.toml that has what it needs, or None.
+    """
+
+    description: str
+    writer: str
+    extra: str | None = None
+
+
+FORMATS: dict[str, ExportFormat] = {
+    "coco": ExportFormat(
+        "drogue, markers and hub: boxes, run-length masks, keypoints; a file a split", "labelgen.export.coco:write_coco"
+    ),
+    "yolo": ExportFormat(
+        "ultralytics pose: box and keypoints in the drogue's order", "labelgen.export.yolo:write_yolo"
+    ),
+    "yolo-image-order": ExportFormat(
+        "ultralytics pose with keypoints as they stand in the image, for training on even rings",
+        "labelgen.export.yolo:write_yolo_image_order",
+    ),
+    "yolo-detect": ExportFormat(
+        "ultralytics boxes of drogue, markers and hub", "labelgen.export.yolo:write_yolo_detect"
+    ),
+    "speed": ExportFormat("SPEED+ pose lists and camera, a folder an eye", "labelgen.export.speed:write_speed"),
+    "kitti": ExportFormat("KITTI calibration, boxes and images", "labelgen.export.kitti:write_kitti"),
+    "webdataset": ExportFormat(
+        "tar shards of images, part ids and records", "labelgen.export.tar_shards:write_webdataset"
+    ),
+    "parquet": ExportFormat("one table, a row a view", "labelgen.export.parquet:write_parquet", "exports"),
+    "rosbag": ExportFormat(
+        "ROS 2 bags (MCAP): images, CameraInfo, TF, true pose", "labelgen.export.rosbag:write_rosbag", "exports"
+    ),
+    "tum": ExportFormat("true trajectories as TUM text", "labelgen.export.tum:write_tum"),
+    "bop": ExportFormat(
+        "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.bop:write_bop"
+    ),
+    "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.masks:write_masks"),
+    "opencv": ExportFormat("the rig as OpenCV's stereo YAML", "labelgen.export.calibration:write_opencv"),
+    "kalibr": ExportFormat("the rig as Kalibr's camera chain", "labelgen.export.calibration:write_kalibr"),
+    "ros-camera-info": ExportFormat(
+        "the rig as ROS camera_info, a file an eye", "labelgen.export.calibration:write_camera_info"
+    ),
+    "blind": ExportFormat("images, rig and drogue without any truth", "labelgen.export.blind:write_blind"),
+}
+
+
+def write_export(name: str, dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+    """Write a dataset in a format.
+
+    Args:
+        name: of the format.
+        dataset: the dataset's folder.
+        out: folder to write into.
+        log: is told how far the work is and what the format cannot hold.
+
+    Returns:
+        The files or folders to tell the user of.
+
+    Raises:
+        ValueError: no such format, a package that it needs is missing, a dataset that cannot be read, or a place that
+            cannot be written into.
+        OSError: the disk is full or cannot be written; nothing half-written is left.
+    """
+    if name not in FORMATS:
+        raise ValueError(f"--format: no format named {name!r}; there are {', '.join(FORMATS)}")
+    chosen = FORMATS[name]
+    module, function = chosen.writer.split(":")
+    try:
+        writer: Writer = getattr(importlib.import_module(module), function)
+    except ModuleNotFoundError as error:
+        if chosen.extra is None:
+            raise
+        raise ValueError(f"{name}: {error.name} is missing: pip install 'droguekit[{chosen.extra}]'") from error
+    if out.resolve().is_relative_to(dataset.resolve()):
+        raise ValueError(f"--out: must lie outside the dataset's folder, got {out}")
+    try:
+        return writer(dataset, out, log)
+    finally:
+        log.end()

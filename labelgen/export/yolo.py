@@ -1,0 +1,170 @@
+"""Datasets as ultralytics reads them: `data.yaml`, `images/SPLIT` and `labels/SPLIT`, both eyes as images of their own.
+
+A label file has a row a object, `class cx cy w h`, for poses followed by `x y flag` of each keypoint; all lengths are
+shares of the image's width and height, counted from its corner. A file without rows is an image without a drogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from datasets_manifest.atomic import new_folder
+from datasets_manifest.manifest import Manifest
+from datasets_manifest.reader import Dataset
+from datasets_manifest.records import PairRecord
+from drogue_models.marker_layout import marker_layout
+from drogue_models.parameters import DrogueParameters
+from geometry.stereo import EYES, Eye
+from labelgen.export.coco import read_part_ids
+from labelgen.export.coco_entries import HUB, MARKER, coco_annotation, coco_features
+from labelgen.export.frame_files import place_image
+from labelgen.export.keypoints import (
+    ABSENT,
+    clockwise_order,
+    count_absent_keypoints,
+    count_cuts,
+    keypoint_count,
+    view_keypoints,
+    view_of,
+)
+from labelgen.export.log import ExportLog
+
+_CLASSES = ("drogue", "marker", "hub")
+_CLASS_OF_CATEGORY = {MARKER: 1, HUB: 2}
+
+Rows = Callable[[PairRecord, Eye], list[list[float]]]
+
+
+def write_yolo(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+    """Write boxes and keypoints, the keypoints in the drogue's own order.
+
+    Args:
+        dataset: the dataset's folder.
+        out: new folder.
+        log: is told what is left out.
+
+    Returns:
+        `data.yaml`, which names the rest.
+
+    Raises:
+        ValueError: the dataset cannot be read, or `out` is not empty.
+        OSError: the folder cannot be written; it is then not there.
+    """
+    return _write_pose(dataset, out, log, in_image_order=False)
+
+
+def write_yolo_image_order(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+    """Write boxes and keypoints, beginning with the keypoint nearest the top and then clockwise.
+
+    On an even ring a network cannot know which marker is the first; this order it can learn. Arguments, result and
+    errors as those of `write_yolo`.
+    """
+    return _write_pose(dataset, out, log, in_image_order=True)
+
+
+def write_yolo_detect(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+    """Write visible boxes of drogues, markers and hubs. Arguments, result and errors as those of `write_yolo`."""
+    source = Dataset(dataset)
+
+    def rows(record: PairRecord, eye: Eye) -> list[list[float]]:
+        part_id = read_part_ids(source, record, eye)
+        drogue = coco_annotation(record, eye, None, 0)
+        if drogue is None:
+            return []
+        if part_id is None:
+            log.lost("views without boxes of markers and hub: the dataset has no part ids of them")
+            return [[0, *_shares(drogue["bbox"], record)]]
+        features = coco_features(record, eye, part_id, 0)
+        return [
+            [0, *_shares(drogue["bbox"], record)],
+            *([_CLASS_OF_CATEGORY[entry["category_id"]], *_shares(entry["bbox"], record)] for entry in features),
+        ]
+
+    return _write(source, out, log, rows, ())
+
+
+def _write_pose(dataset: Path, out: Path, log: ExportLog, in_image_order: bool) -> list[Path]:
+    source = Dataset(dataset)
+    count = keypoint_count(source.manifest)
+
+    def rows(record: PairRecord, eye: Eye) -> list[list[float]]:
+        view, camera = view_of(record, eye), record.frame.rig.camera
+        drogue = coco_annotation(record, eye, None, 0)
+        if drogue is None:
+            return []
+        points = view_keypoints(view, camera, count)
+        count_absent_keypoints(log, points, len(view.markers))
+        if in_image_order:
+            points = [points[index] for index in clockwise_order(view)] + [ABSENT] * (count - len(view.markers))
+        shares = [(point.x / camera.width_px, point.y / camera.height_px, point.flag) for point in points]
+        return [[0, *_shares(drogue["bbox"], record), *(number for share in shares for number in share)]]
+
+    if not _one_flip_fits(source.manifest, in_image_order):
+        log.lost("values of flip_idx that do not fit all drogues: train with fliplr=0")
+    ring = max(len(drogue.marker_positions_m) for drogue in _drogues(source.manifest))
+    flip = [-index % ring if index < ring else index for index in range(count)]
+    return _write(source, out, log, rows, (f"kpt_shape: [{count}, 3]", f"flip_idx: {flip}"))
+
+
+def _write(source: Dataset, out: Path, log: ExportLog, rows: Rows, lines: tuple[str, ...]) -> list[Path]:
+    splits = source.manifest.split_of_frame()
+    with new_folder(out) as folder:
+        for record in log.records(source):
+            for eye in EYES:
+                place = f"{splits[record.frame_index]}/{record.frame_index:06d}_{eye}"
+                place_image(source, record.frame_index, eye, folder / "images" / f"{place}.png", log)
+                label = folder / "labels" / f"{place}.txt"
+                label.parent.mkdir(parents=True, exist_ok=True)
+                text = "".join(" ".join(map(repr, row)) + "\n" for row in rows(record, eye))
+                label.write_text(text, encoding="utf-8", newline="\n")
+                count_cuts(log, record, eye)
+        names = _CLASSES[:1] if lines else _CLASSES
+        yaml = [
+            f"# droguekit dataset {source.manifest.name}, sha256 {source.manifest.dataset_sha256}",
+            "# An empty path is the folder of this file.",
+            'path: ""',
+            *_split_lines(set(splits.values()), log),
+            *lines,
+            "names:",
+            *(f"  {number}: {name}" for number, name in enumerate(names)),
+        ]
+        (folder / "data.yaml").write_text("\n".join(yaml) + "\n", encoding="utf-8", newline="\n")
+    return [out / "data.yaml"]
+
+
+def _split_lines(splits: set[str], log: ExportLog) -> list[str]:
+    """The folders of the splits; ultralytics wants the first two, with or without pairs of their own."""
+    lines = []
+    for split in ("train", "val", "test"):
+        if split in splits:
+            lines.append(f"{split}: images/{split}")
+        elif split != "test" and splits:
+            other = next(name for name in ("train", "val", "test") if name in splits)
+            lines.append(f"{split}: images/{other}  # the dataset has no pairs for {split}")
+            log.lost(f"splits without pairs: data.yaml names images/{other} for {split}")
+    return lines
+
+
+def _drogues(manifest: Manifest) -> list[DrogueParameters]:
+    recipe = manifest.recipe
+    return [variant.drogue for variant in recipe.variants] or [recipe.drogue]
+
+
+def _one_flip_fits(manifest: Manifest, in_image_order: bool) -> bool:
+    """Whether mirroring an image exchanges the same keypoints on all drogues of a dataset."""
+    layouts = [marker_layout(drogue) for drogue in _drogues(manifest)]
+    even = all(layout.symmetry_order == layout.count for layout in layouts)
+    return len({layout.count for layout in layouts}) == 1 and (even or in_image_order)
+
+
+def _shares(box: list[float], record: PairRecord) -> list[float]:
+    """Middle and size of a box that counts from the image's corner, as shares of the image."""
+    camera = record.frame.rig.camera
+    x, y, width, height = box
+    return [
+        (x + width / 2) / camera.width_px,
+        (y + height / 2) / camera.height_px,
+        width / camera.width_px,
+        height / camera.height_px,
+    ]

@@ -1,0 +1,31 @@
+import shutil
+
+import pytest
+
+from labelgen.dataset_validation import validate_dataset
+from labelgen.export.formats import write_export
+from labelgen.export.log import ExportLog
+
+
+@pytest.fixture
+def with_bags(small_dataset, tmp_path):
+    """A dataset into whose folder its user has moved the bags."""
+    write_export("rosbag", small_dataset, tmp_path / "bags", ExportLog())
+    shutil.move(tmp_path / "bags", small_dataset / "bags")
+    return small_dataset
+
+
+def test_bags_in_a_dataset_are_read(with_bags):
+    report = validate_dataset(with_bags)
+    assert report.faults == [] and {check.name: check.count for check in report.checks}["bags"] == 1
+    (bag,) = (with_bags / "bags").rglob("*.mcap")
+    whole = bag.read_bytes()
+    bag.write_bytes(whole[: len(whole) // 2])
+    (fault,) = validate_dataset(with_bags).faults
+    assert fault.startswith(f"{bag}: ") and "\n" not in fault
+
+
+def test_more_pairs_in_bags_than_in_the_dataset_are_a_fault(with_bags, pairs):
+    shutil.copytree(with_bags / "bags", with_bags / "again")
+    (fault,) = validate_dataset(with_bags).faults
+    assert fault.endswith(f"bags hold {2 * len(pairs)} pairs, the dataset {len(pairs)}")
