@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord, PixelBox, PixelPoint, ViewRecord
+from datasets_manifest.records import PairRecord, PixelBox, PixelPoint
 from droguekit.benchmark.label_drawing import (
     BOX_RGB,
     Picture,
@@ -53,27 +53,36 @@ class Tile:
 def contact_tiles(dataset: Dataset, count: int = 12) -> list[Tile]:
     """Up to `count` pairs spread over the distances, nearest first; empty if no pair shows a drogue."""
     indices = dataset.frame_indices
-    looked_at = [indices[k] for k in _spread(len(indices), _MOST_LOOKED_AT)]
+    looked_at = [indices[k] for k in spread(len(indices), _MOST_LOOKED_AT)]
     records = [record for record in map(dataset.record, looked_at) if record.left_from_drogue is not None]
     records.sort(key=lambda record: (_distance_m(record), record.frame_index))
     tiles = []
-    for record in (records[k] for k in _spread(len(records), count)):
-        picture = label_picture(display_picture(dataset.images(record.frame_index)), record.views.left)
-        tiles.append(
-            Tile(record.frame_index, _distance_m(record), jpeg_uri(picture), picture.shape[1], picture.shape[0])
-        )
+    for record in (records[k] for k in spread(len(records), count)):
+        view = record.views.left
+        centers = [marker.center_ellipse_px for marker in view.markers if marker.visible_fraction > 0]
+        picture = label_picture(display_picture(dataset.images(record.frame_index)), view.box_visible_xywh_px, centers)
+        tiles.append(tile_of(record.frame_index, _distance_m(record), picture))
     return tiles
 
 
-def label_picture(picture: Picture, view: ViewRecord) -> Picture:
-    """A small copy of an image with the visible box and the marker centres; a far drogue also enlarged in a corner."""
+def tile_of(frame_index: int, distance_m: float, picture: Picture) -> Tile:
+    """A picture as a page holds it."""
+    return Tile(frame_index, distance_m, jpeg_uri(picture), picture.shape[1], picture.shape[0])
+
+
+def label_picture(picture: Picture, box: PixelBox | None, centers: Sequence[PixelPoint]) -> Picture:
+    """A small copy of an image with a box and the marker centres; a far drogue also enlarged in a corner.
+
+    Args:
+        picture: (H, W, 3) the image.
+        box: around the drogue, or None where it is not seen; nothing is drawn then.
+        centers: of the markers in sight. [px]
+    """
     width = picture.shape[1]
     tile, scale = resized(picture, _TILE_WIDTH_PX)
-    box = view.box_visible_xywh_px
     if box is None:
         return tile
     draw_box(tile, box, scale)
-    centers = [marker.center_ellipse_px for marker in view.markers if marker.visible_fraction > 0]
     if box[2] >= _ENLARGE_BELOW * width:
         draw_crosses(tile, centers, scale)
     else:
@@ -107,7 +116,7 @@ def _put_inset(tile: Picture, picture: Picture, box: PixelBox, centers: Sequence
     tile[y : y + side, x : x + side] = inset
 
 
-def _spread(length: int, count: int) -> list[int]:
+def spread(length: int, count: int) -> list[int]:
     """Up to `count` places spread over a list, both ends among them."""
     return sorted({round(place) for place in np.linspace(0, length - 1, min(count, length))}) if length else []
 

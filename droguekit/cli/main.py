@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import keyword
 import os
 import sys
 from typing import Annotated, Any
@@ -18,6 +19,7 @@ COMMANDS = {
     "plan": "Show what a recipe will make, how long it takes and how large it gets.",
     "render": "Make a dataset from a recipe; goes on where it stopped.",
     "merge": "Join shards of a dataset that were made apart.",
+    "import": "Make a dataset from real stereo images, without truth.",
     "validate": "Check a dataset: files, hashes, labels against part ids.",
     "reproduce": "Make one frame of a dataset again and compare.",
     "export": "Write a dataset's labels in another format.",
@@ -43,12 +45,16 @@ def load_command(name: str) -> Any:
     """The command `name`, its module imported now; None where there is none."""
     if name not in COMMANDS:
         return None
-    module = importlib.import_module(f"droguekit.cli.{name}")
+    # Python keeps some words for itself, such as `import`.
+    name_in_code = f"{name}_" if keyword.iskeyword(name) else name
+    module = importlib.import_module(f"droguekit.cli.{name_in_code}")
     examples: tuple[str, ...] = getattr(module, "EXAMPLES", ())
     # The backspace keeps the help's line breaks.
     epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)]) if examples else None
     app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command(name=name, epilog=epilog, short_help=COMMANDS[name], no_args_is_help=False)(getattr(module, name))
+    app.command(name=name, epilog=epilog, short_help=COMMANDS[name], no_args_is_help=False)(
+        getattr(module, name_in_code)
+    )
     return typer.main.get_command(app)
 
 

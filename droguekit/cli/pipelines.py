@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from droguekit.batch.local import RunSummary
     from droguekit.batch.progress import ProgressReport
     from droguekit.benchmark.benchmark import BenchmarkResult
+    from droguekit.benchmark.blind_check import BlindCheck
 
 
 def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tuple[Recipe, str]:
@@ -30,13 +31,20 @@ def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tupl
     Raises:
         ValueError: no such recipe, wrong keys, or no such engine.
     """
-    from datasets_manifest.recipe import load_recipe
+    from pydantic import ValidationError
+
+    from datasets_manifest.recipe import Recipe, load_recipe
+    from drogue_models.presets import explain
     from render.engine import EngineUnavailableError, engine_names
 
     recipe, text = load_recipe(name_or_path, seed)
     if engine is not None:
         settings = recipe.render.model_copy(update={"engine": engine})
-        recipe = recipe.model_copy(update={"render": settings})
+        try:
+            # Checked anew, for not every engine can draw everything.
+            recipe = Recipe.model_validate(dict(recipe) | {"render": settings})
+        except ValidationError as error:
+            raise ValueError(f"--engine {engine}: {explain(error)}") from error
     if recipe.render.engine not in engine_names():
         raise EngineUnavailableError(
             f"engine: no engine named {recipe.render.engine!r}; there are {', '.join(engine_names())}"
@@ -153,6 +161,26 @@ def benchmark_dataset(dataset: Path, estimates: Path, json_out: Path | None, htm
     return result
 
 
+def check_blind_dataset(dataset: Path, estimates: Path, json_out: Path | None, html_out: Path | None) -> BlindCheck:
+    """The same without truth: compare estimates with their own measurements, and with boxes if there are any.
+
+    Raises:
+        ValueError: a dataset or estimates that cannot be read.
+        OSError: a result cannot be written.
+    """
+    from datasets_manifest.writer import write_text_atomic
+    from droguekit.benchmark.blind_check import check_blind
+    from droguekit.benchmark.blind_report import write_blind_report
+
+    check = check_blind(dataset, estimates)
+    if json_out is not None:
+        write_text_atomic(json_out, check.to_json())
+    if html_out is not None:
+        html_out.parent.mkdir(parents=True, exist_ok=True)
+        write_blind_report(dataset, estimates, check, html_out)
+    return check
+
+
 @dataclass(frozen=True)
 class DemoFiles:
     """What a demo leaves in its folder."""
@@ -186,7 +214,7 @@ _BENCH_STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
 
 
 _BENCH_SAMPLES = {
-    "corpus": {"samples_per_px": 16, "open_samples_per_px": 4, "edge_samples_per_px": 64},
+    "corpus": {"samples_per_px": 16, "open_samples_per_px": 4, "edge_samples_per_px": 256},
     "benchmark": {"samples_per_px": 64, "open_samples_per_px": 8, "edge_samples_per_px": 400},
 }
 BENCH_QUALITIES = tuple(_BENCH_SAMPLES)

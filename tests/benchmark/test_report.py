@@ -208,9 +208,9 @@ def test_the_box_stands_where_the_record_has_it(build: SimpleNamespace) -> None:
     for distance_m in (1.7, 20.0):
         record = build.record(0, build.pose(0.1, 0.0, distance_m))
         black = np.zeros((build.rig.camera.height_px, build.rig.camera.width_px, 3), np.uint8)
-        tile = label_picture(black, record.views.left)
-        assert tile.shape == (300, 400, 3)
         box = record.views.left.box_visible_xywh_px
+        tile = label_picture(black, box, [marker.center_ellipse_px for marker in record.views.left.markers])
+        assert tile.shape == (300, 400, 3)
         scale = 400 / 1280
         edge = tile[:, round((box[0] + 0.5) * scale - 0.5)]
         # The yellow left edge of the box runs down this column, blurred over two by smoothing.

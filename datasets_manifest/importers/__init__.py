@@ -1,0 +1,1 @@
+"""Real stereo images of anybody's camera as a dataset without truth."""

@@ -1,0 +1,219 @@
+"""Stereo pairs in a ROS 1 or ROS 2 bag."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_typestore
+
+from datasets_manifest.images import Pixels
+from datasets_manifest.importers.source import SourcePair
+from datasets_manifest.importers.stereo_calibration import StereoCalibration
+from geometry.stereo import EYES
+
+_IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+# Bayer patterns by their first two pixels; OpenCV names them by the second row's second and third.
+_BAYER = {
+    "bayer_rggb": cv2.COLOR_BayerBG2RGB,
+    "bayer_bggr": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg": cv2.COLOR_BayerGR2RGB,
+    "bayer_grbg": cv2.COLOR_BayerGB2RGB,
+}
+_CHANNELS = {"rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4, "mono": 1}
+# Distortion models of sensor_msgs/CameraInfo that are Brown-Conrady's.
+_MODELS = ("plumb_bob", "")
+
+
+class RosBag:
+    """The pairs of a bag: images of equal time stamps.
+
+    Attributes:
+        count: how many pairs there are.
+        left_out: images without a partner.
+    """
+
+    def __init__(self, path: Path, topics: tuple[str, str] | None = None) -> None:
+        """Look through a bag; images are decoded later.
+
+        Args:
+            path: a rosbag2 folder, or a `.bag` file of ROS 1.
+            topics: of the left and the right images; without them the two whose names differ in left and right.
+
+        Raises:
+            ValueError: no bag, one that is damaged, or topics that do not fit.
+        """
+        self._path = path
+        with self._open() as reader:
+            self._topics = topics or _stereo_topics(reader)
+            for topic in self._topics:
+                if not any(c.topic == topic and c.msgtype in _IMAGE_TYPES for c in reader.connections):
+                    raise ValueError(f"{path}: has no images on {topic}; there are {_image_topics(reader)}")
+            stamps: dict[str, set[int]] = {topic: set() for topic in self._topics}
+            for connection, _, message in _messages(reader, self._topics, path):
+                stamps[connection.topic].add(_stamp_ns(message))
+        left, right = (stamps[topic] for topic in self._topics)
+        self._both = left & right
+        alone = {self._topics[0]: left - right, self._topics[1]: right - left}
+        self.left_out = tuple(
+            f"{topic}: {len(times)} images without one of the same time stamp on the other topic"
+            for topic, times in alone.items()
+            if times
+        )
+        self.count = len(self._both)
+        if not self.count:
+            raise ValueError(f"{path}: no images on {' and '.join(self._topics)} have equal time stamps")
+
+    def __iter__(self) -> Iterator[SourcePair]:
+        waiting: dict[int, dict[str, Pixels]] = {}
+        with self._open() as reader:
+            for connection, _, message in _messages(reader, self._topics, self._path):
+                stamp_ns = _stamp_ns(message)
+                if stamp_ns not in self._both:
+                    continue
+                views = waiting.setdefault(stamp_ns, {})
+                views[connection.topic] = decode_image(message, f"{self._path}: {connection.topic} at {stamp_ns} ns")
+                if len(views) == len(EYES):
+                    left, right = (waiting[stamp_ns][topic] for topic in self._topics)
+                    del waiting[stamp_ns]
+                    yield SourcePair(self._topics, 1e-9 * stamp_ns, left, right)
+
+    def calibration(self) -> StereoCalibration:
+        """The calibration in the bag: both CameraInfo beside the images.
+
+        Raises:
+            ValueError: there is none, or it is none of a stereo pair.
+        """
+        topics = tuple(topic.rsplit("/", 1)[0] + "/camera_info" for topic in self._topics)
+        found: dict[str, Any] = {}
+        with self._open() as reader:
+            for connection, _, message in _messages(reader, topics, self._path):
+                found.setdefault(connection.topic, message)
+                if len(found) == len(EYES):
+                    break
+        if len(found) < len(EYES):
+            raise ValueError(f"{self._path}: has no CameraInfo on {' and '.join(topics)}; give --calibration")
+        left, right = (found[topic] for topic in topics)
+        return _calibration(left, right, self._path)
+
+    @contextmanager
+    def _open(self) -> Iterator[AnyReader]:
+        try:
+            reader = AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader.open()
+        except Exception as error:  # whatever a damaged bag makes its reader raise
+            message = " ".join(str(error).split()) or type(error).__name__
+            raise ValueError(f"{self._path}: is no bag: {message}") from error
+        try:
+            yield reader
+        finally:
+            reader.close()
+
+
+def decode_image(message: Any, name: str) -> Pixels:
+    """The pixels of an Image or CompressedImage: (H, W, 3) red, green, blue, or (H, W) grey.
+
+    Raises:
+        ValueError: an encoding that is not known, or data of another length; names the image.
+    """
+    if hasattr(message, "format"):
+        return _decompressed(message, name)
+    found = re.fullmatch(r"(bayer_[a-z]{4}|[a-z]+)(8|16)", message.encoding)
+    channels = None if found is None else 1 if found[1] in _BAYER else _CHANNELS.get(found[1])
+    if found is None or channels is None:
+        raise ValueError(
+            f"{name}: encoding {message.encoding!r} is not read; use rgb8, bgr8, mono8, bayer_rggb8 or the like"
+        )
+    kind, dtype = found[1], np.dtype(f"{'>' if message.is_bigendian else '<'}u{int(found[2]) // 8}")
+    row_bytes = message.width * channels * dtype.itemsize
+    if not row_bytes or message.step < row_bytes or len(message.data) != message.step * message.height:
+        raise ValueError(f"{name}: {len(message.data)} bytes are no image of {message.width}x{message.height}")
+    rows = np.asarray(message.data).reshape(message.height, message.step)[:, :row_bytes]
+    values = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
+    image = values.reshape(message.height, message.width, channels)
+    if kind in _BAYER:
+        return np.asarray(cv2.cvtColor(image, _BAYER[kind]))
+    if channels == 1:
+        return np.ascontiguousarray(image[:, :, 0])
+    return np.ascontiguousarray(image[:, :, 2::-1] if kind.startswith("bgr") else image[:, :, :3])
+
+
+def _decompressed(message: Any, name: str) -> Pixels:
+    image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED) if len(message.data) else None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{name}: is truncated, or no compressed image of 8 or 16 bits")
+    return np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, 2::-1])
+
+
+def _messages(reader: AnyReader, topics: tuple[str, ...], path: Path) -> Iterator[tuple[Connection, int, Any]]:
+    """Decoded messages of some topics; whatever a damaged bag makes its reader raise becomes one clear line."""
+    connections = [connection for connection in reader.connections if connection.topic in topics]
+    if not connections:
+        return
+    try:
+        for connection, time_ns, data in reader.messages(connections=connections):
+            yield connection, time_ns, reader.deserialize(data, connection.msgtype)
+    except GeneratorExit:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: is damaged: {type(error).__name__}: {error}") from error
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def _image_topics(reader: AnyReader) -> str:
+    return ", ".join(sorted(c.topic for c in reader.connections if c.msgtype in _IMAGE_TYPES)) or "none"
+
+
+def _stereo_topics(reader: AnyReader) -> tuple[str, str]:
+    """The image topics whose names differ in left and right."""
+    topics = {connection.topic for connection in reader.connections if connection.msgtype in _IMAGE_TYPES}
+    pairs = sorted((topic, topic.replace("left", "right")) for topic in topics if "left" in topic)
+    pairs = [pair for pair in pairs if pair[1] in topics]
+    if len(pairs) != 1:
+        raise ValueError(
+            f"topics: {len(pairs)} pairs of image topics are named left and right; choose by --topics LEFT,RIGHT from "
+            f"{_image_topics(reader)}"
+        )
+    return pairs[0]
+
+
+def _calibration(left: Any, right: Any, path: Path) -> StereoCalibration:
+    """From both messages: R and P of each eye rectify it, and the right one's P[0, 3] is -f B."""
+    for info in (left, right):
+        if info.distortion_model not in _MODELS:
+            raise ValueError(
+                f"{path}: distortion model {info.distortion_model!r} is not read; calibrate with plumb_bob"
+            )
+    if (left.width, left.height) != (right.width, right.height):
+        raise ValueError(f"{path}: the eyes' CameraInfo give images of different size")
+    rotations = [np.asarray(info.r, dtype=np.float64).reshape(3, 3) for info in (left, right)]
+    projection = np.asarray(right.p, dtype=np.float64).reshape(3, 4)
+    if not projection[0, 0] > 0 or not projection[0, 3] < 0:
+        raise ValueError(
+            f"{path}: the right CameraInfo's P[0, 3] must be -f times the baseline, got {projection[0, 3]:g}"
+        )
+    right_from_left = rotations[1].T @ rotations[0]
+    shift = rotations[1].T @ np.array([projection[0, 3] / projection[0, 0], 0.0, 0.0])
+    intrinsics = [np.asarray(info.k, dtype=np.float64).reshape(3, 3) for info in (left, right)]
+    distortion = [np.asarray(info.d, dtype=np.float64).reshape(-1) for info in (left, right)]
+    return StereoCalibration(
+        (int(left.width), int(left.height)),
+        M1=intrinsics[0],
+        D1=distortion[0],
+        M2=intrinsics[1],
+        D2=distortion[1],
+        R=right_from_left,
+        T=shift,
+    )

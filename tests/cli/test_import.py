@@ -1,0 +1,170 @@
+"""Images that came from a dataset, imported as if a real camera had taken them: navigation must find the same poses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools.coco import COCO
+
+from datasets_manifest.blind import BlindDataset
+from datasets_manifest.estimates import PoseEstimate, read_estimates
+from datasets_manifest.reader import Dataset
+from datasets_manifest.writer import leftovers
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+from labelgen.export.formats import write_export
+from labelgen.export.log import ExportLog
+
+
+def poses(dataset: Path, out: Path) -> dict[int, np.ndarray]:
+    """What `navigate` finds, by pair."""
+    assert run(["navigate", str(dataset), "--method", "joint", "--out", str(out)]) == DONE
+    found = read_estimates(out)
+    return {e.frame_index: e.left_from_drogue.as_matrix() for e in found if isinstance(e, PoseEstimate)}
+
+
+@pytest.fixture
+def pictures(smoke_dataset: Path, tmp_path: Path) -> Path:
+    """A folder as a camera's software leaves it: left_0001.png, right_0001.png ..."""
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    for index in Dataset(smoke_dataset).frame_indices:
+        for eye in ("left", "right"):
+            shutil.copy(smoke_dataset / "frames" / f"{index:06d}" / f"{eye}.png", folder / f"{eye}_{index:04d}.png")
+    return folder
+
+
+def arguments(source: Path, dataset: Path, out: Path) -> list[str]:
+    black_level = Dataset(dataset).record(0).image_black_level_dn
+    calibration = dataset / "calibration" / "opencv_stereo.yaml"
+    return [
+        *("import", str(source), "--out", str(out), "--calibration", str(calibration)),
+        *("--encoding", "linear", "--black-level", str(black_level)),
+    ]
+
+
+def drogue_boxes(dataset: Path) -> dict[str, Any]:
+    """A COCO file of the drogue's boxes, as somebody would draw them on `pictures`."""
+    table: dict[str, Any] = json.loads((dataset / "annotations" / "all.json").read_text())
+    drogue = next(c["id"] for c in table["categories"] if c["name"] == "drogue")
+    table["annotations"] = [a for a in table["annotations"] if a["category_id"] == drogue]
+    for image in table["images"]:
+        frame, eye = Path(image["file_name"]).parent.name, Path(image["file_name"]).stem
+        image["file_name"] = f"{eye}_{int(frame):04d}.png"
+    return table
+
+
+def test_imported_images_give_the_same_poses(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
+    assert run(arguments(pictures, smoke_dataset, tmp_path / "imported")) == DONE
+    imported, source = BlindDataset(tmp_path / "imported"), Dataset(smoke_dataset)
+    assert len(imported.frame_indices) == len(source.frame_indices)
+    for place, index in enumerate(source.frame_indices):
+        np.testing.assert_array_equal(imported.pair(place).images.right, source.images(index).right)
+    want, got = poses(smoke_dataset, tmp_path / "a.jsonl"), poses(tmp_path / "imported", tmp_path / "b.jsonl")
+    assert len(want) > 0 and sorted(got) == [source.frame_indices.index(index) for index in sorted(want)]
+    for index, pose in want.items():
+        # The same pixels and the same rig: only sums in another order.
+        np.testing.assert_allclose(got[source.frame_indices.index(index)], pose, atol=1e-9)
+
+
+def test_views_side_by_side_are_the_same_pairs(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    for left in sorted(pictures.glob("left_*")):
+        right = left.with_name(left.name.replace("left", "right"))
+        both = np.concatenate([cv2.imread(str(left)), cv2.imread(str(right))], axis=1)
+        assert cv2.imwrite(str(wide / left.name.replace("left_", "")), both)
+    for source, out in ((pictures, "two"), (wide, "one")):
+        assert run(arguments(source, smoke_dataset, tmp_path / out)) == DONE
+    for file in sorted((tmp_path / "two" / "frames").rglob("*.*")):
+        assert file.read_bytes() == (tmp_path / "one" / file.relative_to(tmp_path / "two")).read_bytes()
+
+
+def test_a_bag_brings_its_calibration(smoke_dataset: Path, tmp_path: Path) -> None:
+    (bag,) = write_export("rosbag", smoke_dataset, tmp_path / "bags", ExportLog())
+    assert run(["import", str(bag), "--out", str(tmp_path / "imported"), "--encoding", "linear"]) == DONE
+    imported, source = BlindDataset(tmp_path / "imported"), Dataset(smoke_dataset)
+    for place, index in enumerate(source.frame_indices):
+        got, want = imported.pair(place), source.images(index)
+        np.testing.assert_array_equal(got.images.left, want.left)
+        assert got.images.time_s == pytest.approx(want.time_s, abs=1e-9)
+        rig = source.manifest.recipe.rig
+        assert got.rig.camera == rig.camera and got.rig.lenses is None
+        assert got.rig.baseline_m == pytest.approx(rig.baseline_m, rel=1e-12)
+
+
+def test_boxes_come_along(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
+    table = drogue_boxes(smoke_dataset)
+    (tmp_path / "boxes.json").write_text(json.dumps(table))
+    order = [*arguments(pictures, smoke_dataset, tmp_path / "imported"), "--boxes", str(tmp_path / "boxes.json")]
+    assert run(order) == DONE
+    got = COCO(str(tmp_path / "imported" / "annotations" / "all.json"))
+    assert len(got.anns) == len(table["annotations"]) > 0
+    for annotation in table["annotations"]:
+        assert got.imgToAnns[annotation["image_id"]][0]["bbox"] == annotation["bbox"]
+
+
+def test_the_benchmark_checks_poses_without_truth(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
+    boxes = tmp_path / "boxes.json"
+    boxes.write_text(json.dumps(drogue_boxes(smoke_dataset)))
+    imported, html = tmp_path / "imported", tmp_path / "report.html"
+    assert run([*arguments(pictures, smoke_dataset, imported), "--boxes", str(boxes)]) == DONE
+    found = len(poses(imported, tmp_path / "a.jsonl"))
+    files = ("--estimates", str(tmp_path / "a.jsonl"), "--json", str(tmp_path / "b.json"), "--html", str(html))
+    assert run(["benchmark", str(imported), *files]) == DONE
+    row = json.loads((tmp_path / "b.json").read_text())["methods"]["joint"]
+    assert row["n"] == len(BlindDataset(imported).frame_indices) and row["fixes"] == found
+    # Centroids of these images err by less than a tenth of a pixel, and the rim is nearly the whole drogue.
+    assert row["residual_rms_px"] < 0.1
+    assert row["boxes"] == 2 * found and row["middle_in_box_fraction"] == 1.0 and row["rim_box_iou_median"] > 0.9
+    assert html.read_text().count("<figure>") == min(12, row["n"])
+
+
+def test_the_preview_shows_imported_pairs(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
+    assert run(arguments(pictures, smoke_dataset, tmp_path / "imported")) == DONE
+    order = ["preview", str(tmp_path / "imported"), "--out", str(tmp_path / "sheet.png"), "--columns", "3"]
+    assert run(order) == DONE
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    # Three tiles of 400 px side by side, with gaps of 4 px; the sky is brighter than the paper between them.
+    assert sheet.shape[1] == 3 * 404 + 4 and np.median(sheet) > 24
+    assert run([*order, "--by-family"]) == WRONG_INPUT
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (("--calibration", "none.yaml"), "no such calibration"),
+        (("--drogue", "blue-9"), "no preset"),
+        (("--encoding", "log"), "--encoding"),
+        (("--rate", "0"), "--rate"),
+        (("--calibration-unit", "ft"), "--calibration-unit"),
+        (("--topics", "a,b"), "is no bag"),
+        (("--boxes", "none.json"), "none.json"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    change: tuple[str, str],
+    fault: str,
+    smoke_dataset: Path,
+    pictures: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run([*arguments(pictures, smoke_dataset, tmp_path / "imported"), *change]) == WRONG_INPUT
+    said = capsys.readouterr().err
+    assert fault in said and said.count("\n") == 1
+    assert not (tmp_path / "imported").exists()
+
+
+def test_an_image_of_another_size_leaves_nothing(
+    smoke_dataset: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cv2.imwrite(str(sorted(pictures.glob("right_*"))[-1]), np.zeros((10, 12, 3), np.uint8))
+    assert run(arguments(pictures, smoke_dataset, tmp_path / "imported")) == WRONG_INPUT
+    assert "as calibrated, got 12x10" in capsys.readouterr().err
+    assert not (tmp_path / "imported").exists() and leftovers(tmp_path) == []
