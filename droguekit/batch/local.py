@@ -13,6 +13,8 @@ from typing import Any, TextIO
 
 from datasets_manifest import layout
 from datasets_manifest.calibration import write_calibration
+from datasets_manifest.card import write_card
+from datasets_manifest.croissant import write_croissant
 from datasets_manifest.manifest import Drop, Manifest, build_manifest, made_with, read_manifest, write_manifest
 from datasets_manifest.recipe import Recipe
 from droguekit.batch.cluster import run_on_cluster
@@ -23,7 +25,7 @@ from droguekit.batch.progress import ProgressReport
 from droguekit.batch.resume import open_dataset, sort_frames
 from droguekit.batch.stop import StopRequest
 from droguekit.batch.workers import MAX_ATTEMPTS, Attempt, Limits, is_accident, run_tasks
-from labelgen.export.coco import write_coco
+from labelgen.export.coco import write_annotations
 from render.engine import EngineUnavailableError
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scene
@@ -135,7 +137,7 @@ def render_dataset(
 
 
 def describe_dataset(recipe: Recipe, out: Path, drops: Sequence[Drop], made_by: Manifest | None = None) -> Manifest:
-    """Write all that a dataset holds besides its frames: manifest, annotations, calibration.
+    """Write all that a dataset holds besides its frames: manifest, annotations, calibration, card, Croissant.
 
     Args:
         recipe: that it was made from.
@@ -153,7 +155,9 @@ def describe_dataset(recipe: Recipe, out: Path, drops: Sequence[Drop], made_by: 
         manifest = made_with(manifest, made_by.software, made_by.cpu_features)
     write_manifest(out, manifest)
     write_calibration(out, recipe.rig)
-    write_coco(out, out / layout.ANNOTATIONS_FOLDER)
+    write_annotations(out, out / layout.ANNOTATIONS_FOLDER)
+    write_card(out, manifest)
+    write_croissant(out, manifest)
     return manifest
 
 

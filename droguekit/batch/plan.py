@@ -1,4 +1,4 @@
-"""What a recipe will make: counts, distances, and from a few measured frames time and size."""
+"""What a recipe will make: counts, distances, boxes and places, without rendering."""
 
 from __future__ import annotations
 
@@ -6,22 +6,46 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.optimize import nnls
 
 from datasets_manifest.recipe import Recipe
-from droguekit.batch.frame_task import FrameReport
-from droguekit.batch.measure import measure_frames
-from geometry.se3 import Array
-from scenes.families import family_of_scene
+from drogue_models.parameters import DrogueParameters
+from geometry.se3 import Array, RigidTransform
+from geometry.stereo import EYES, StereoRig
+from labelgen.boxes import full_box
+from scenes.families import family_of_scene, recipe_of_scene
 from scenes.sampler import sample_left_from_drogue, scene_of_frame, split_of_scene
+from scenes.target import drogue_of_scene
 
 # A worker may have to load its engine and compile kernels within its first frame.
 _START_S = 300.0
 # Our choice, far above what an engine takes for one sample of one pixel.
 _S_PER_SAMPLE = 20e-6
-# Enough for shares to within 2 % and a histogram without holes; more only takes time.
-_MOST_SAMPLED = 1000
+# Shares to within 1 %, and every frame of the corpora that ship; ten seconds.
+_MOST_SAMPLED = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFrames:
+    """Frames of a recipe as they were drawn; NaN where a frame has no drogue.
+
+    Attributes:
+        indices: (N,) of the frames, ascending.
+        scenes: (N,) which scene each belongs to.
+        families: (N,) place of its family in the recipe, 0 without families.
+        distances_m: (N,) of the rim centre along the optical axis. [m]
+        centers_px: (N, 2) middle of the drogue's full box in the left image. [px]
+        sides_px: (N,) side of the square with that box's area. [px]
+        rooms_px: (N, 4) lowest and highest u, lowest and highest v, between which the middle of the box may lie so that
+            both views hold all of the drogue; NaN also where the place is not drawn. [px]
+    """
+
+    indices: tuple[int, ...]
+    scenes: Array
+    families: Array
+    distances_m: Array
+    centers_px: Array
+    sides_px: Array
+    rooms_px: Array
 
 
 @dataclass(frozen=True)
@@ -32,44 +56,27 @@ class Plan:
         by_split: pairs in each split.
         by_scene: pairs in each scene.
         by_family: scenes and pairs of each family, in the recipe's order; empty without families.
-        sampled: indices of the frames that were drawn for the distances.
-        distances_m: of those with a drogue, NaN for those without. [m]
+        drawn: the frames that were drawn.
     """
 
     by_split: dict[str, int]
     by_scene: dict[int, int]
     by_family: dict[str, tuple[int, int]]
-    sampled: tuple[int, ...]
-    distances_m: Array
+    drawn: DrawnFrames
 
     @property
     def empty_fraction(self) -> float:
         """Share of the drawn frames without a drogue."""
-        return float(np.isnan(self.distances_m).mean())
+        return float(np.isnan(self.drawn.distances_m).mean())
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What a whole run is expected to take.
+def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> Plan:
+    """Count the pairs of a recipe, and draw its frames or, of a larger one, so many of them evenly spread.
 
-    Attributes:
-        probed: the measured frames by index.
-        worker_s: working time of one worker for all pairs. [s]
-        size_bytes: of all pairs on disk.
+    Raises:
+        ValueError: a pose that cannot be framed.
     """
-
-    probed: dict[int, FrameReport]
-    worker_s: float
-    size_bytes: float
-
-
-def plan_recipe(recipe: Recipe) -> Plan:
-    """Draw the frames of a recipe without rendering them."""
-    count = recipe.frames.count
-    rounds, rest = divmod(count, recipe.frames.scenes)
-    # Every run of as many frames as there are scenes visits each scene once.
-    by_scene = Counter(dict.fromkeys(range(recipe.frames.scenes), rounds))
-    by_scene.update(scene_of_frame(recipe, frame_index) for frame_index in range(count - rest, count))
+    by_scene = _pairs_by_scene(recipe)
     by_split: Counter[str] = Counter()
     for scene_id, pairs in by_scene.items():
         by_split[split_of_scene(recipe, scene_id)] += pairs
@@ -79,12 +86,12 @@ def plan_recipe(recipe: Recipe) -> Plan:
         if family is not None:
             scenes, total = by_family[family.name]
             by_family[family.name] = scenes + 1, total + pairs
-    sampled = tuple(sorted({int(index) for index in np.linspace(0, count - 1, min(count, _MOST_SAMPLED))}))
-    distances = []
-    for frame_index in sampled:
-        pose = sample_left_from_drogue(recipe, frame_index)
-        distances.append(np.nan if pose is None else float(pose.translation_m[2]))
-    return Plan(dict(by_split), dict(by_scene), by_family, sampled, np.array(distances))
+    sampled = tuple(
+        sorted(
+            {int(index) for index in np.linspace(0, recipe.frames.count - 1, min(recipe.frames.count, most_sampled))}
+        )
+    )
+    return Plan(dict(by_split), dict(by_scene), by_family, draw_frames(recipe, sampled))
 
 
 def frame_timeout_s(recipe: Recipe) -> float:
@@ -94,42 +101,55 @@ def frame_timeout_s(recipe: Recipe) -> float:
     return _START_S + float(round(_S_PER_SAMPLE * samples))
 
 
-def probe_cost(recipe: Recipe, plan: Plan) -> Cost:
-    """Render the nearest, the middle and the farthest of the drawn frames, and reckon from them.
+def _pairs_by_scene(recipe: Recipe) -> Counter[int]:
+    count, scenes = recipe.frames.count, recipe.frames.scenes
+    length = 1 if recipe.sequence is None else recipe.sequence.frames_per_sequence
+    # Every run of as many frames, or sequences, as there are scenes visits each scene once.
+    rounds = count // (scenes * length)
+    by_scene = Counter(dict.fromkeys(range(scenes), rounds * length))
+    by_scene.update(scene_of_frame(recipe, frame_index) for frame_index in range(rounds * scenes * length, count))
+    return by_scene
 
-    The area of the drogue in the image, and with it the work, goes with the inverse square of its distance.
+
+def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
+    """Distances, boxes and places of frames.
 
     Raises:
-        ValueError: the engine cannot be used, or a frame cannot be made.
-        OSError: the temporary folder cannot be written.
+        ValueError: a pose that cannot be framed.
     """
-    order = np.argsort(plan.distances_m)[: max(1, int(np.isfinite(plan.distances_m).sum()))]
-    # The farthest first: it is made twice, and is the cheapest.
-    chosen = dict.fromkeys(plan.sampled[order[place]] for place in (-1, len(order) // 2, 0))
-    reports = dict(zip(chosen, measure_frames(recipe, tuple(chosen)), strict=True))
-    measured_m = [_distance_m(report) for report in reports.values()]
-    share = recipe.frames.count / len(plan.sampled)
-    seconds = fit_inverse_square(measured_m, [report.wall_s for report in reports.values()], plan.distances_m)
-    size = fit_inverse_square(measured_m, [report.size_bytes for report in reports.values()], plan.distances_m)
-    return Cost(reports, share * float(seconds.sum()), share * float(size.sum()))
+    scenes = np.array([scene_of_frame(recipe, frame_index) for frame_index in indices])
+    places = {family.name: place for place, family in enumerate(recipe.families)}
+    known: dict[int, tuple[int, DrogueParameters, bool]] = {}
+    for scene_id in map(int, np.unique(scenes)):
+        own = recipe_of_scene(recipe, scene_id)
+        is_placed = not own.pose.on_axis and recipe.sequence is None
+        known[scene_id] = places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
+    rows = np.full((len(indices), 8), np.nan)
+    for row, frame_index, scene_id in zip(rows, indices, map(int, scenes), strict=True):
+        pose = sample_left_from_drogue(recipe, frame_index)
+        if pose is None:
+            continue
+        _, drogue, is_placed = known[scene_id]
+        center_px, side_px, room_px = _box(drogue, recipe.rig, pose)
+        row[:] = pose.translation_m[2], *center_px, side_px, *(room_px if is_placed else np.full(4, np.nan))
+    return DrawnFrames(
+        indices=indices,
+        scenes=scenes,
+        families=np.array([known[int(scene_id)][0] for scene_id in scenes]),
+        distances_m=rows[:, 0],
+        centers_px=rows[:, 1:3],
+        sides_px=rows[:, 3],
+        rooms_px=rows[:, 4:],
+    )
 
 
-def _distance_m(report: FrameReport) -> float:
-    return np.inf if report.distance_m is None else report.distance_m
-
-
-def fit_inverse_square(distance_m: ArrayLike, values: ArrayLike, at_m: ArrayLike) -> Array:
-    """The law `a + b / distance^2` with a, b >= 0 that fits given values best, at other distances.
-
-    Args:
-        distance_m: (N,) of the given values, inf without a drogue. [m]
-        values: (N,) given.
-        at_m: (M,) where the law is wanted, NaN without a drogue. [m]
-
-    Returns:
-        (M,) values of the law.
-    """
-    inverse = 1.0 / np.square(np.asarray(distance_m, dtype=np.float64))
-    (base, slope), _ = nnls(np.stack([np.ones_like(inverse), inverse], axis=1), np.asarray(values, dtype=np.float64))
-    result: Array = base + slope * np.nan_to_num(1.0 / np.square(np.asarray(at_m, dtype=np.float64)))
-    return result
+def _box(drogue: DrogueParameters, rig: StereoRig, pose: RigidTransform) -> tuple[Array, float, Array]:
+    """Middle of the left image's full box [px], side of its square [px], and (4,) room of its middle [px]."""
+    boxes = np.array([full_box(drogue, rig, pose, eye) for eye in EYES])
+    low, size = boxes[:, :2], boxes[:, 2:]
+    center = low[0] + size[0] / 2
+    # A box moves in both images alike, as far as neither leaves its image; lenses may move it further out.
+    edge = rig.largest_shift_px() - 0.5
+    limit = np.array([rig.camera.width_px, rig.camera.height_px]) - 1 - edge
+    lowest, highest = center - (low.min(axis=0) - edge), center + (limit - (low + size).max(axis=0))
+    return center, float(np.sqrt(size[0].prod())), np.stack([lowest, highest], axis=1).ravel()

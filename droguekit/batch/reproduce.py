@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from datasets_manifest.layout import RECORD_FILE, frame_folder
-from datasets_manifest.provenance import cpu_features, software_versions
+from datasets_manifest.provenance import cpu_features, differing_builds, software_versions
 from datasets_manifest.reader import Dataset
 from datasets_manifest.recipe import Recipe
 from droguekit.batch.frame_task import FrameTask
@@ -83,15 +83,8 @@ def _make_again(recipe: Recipe, frame_index: int) -> tuple[dict[str, Any], str]:
 
 def _elsewhere(source: Dataset, old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
     """How this machine differs from the one that the manifest describes, as far as pixels depend on it."""
-    here = software_versions()
-    there = source.manifest.software
-    found = [
-        f"{name} {there.get(name, 'missing')} there, {here.get(name, 'missing')} here"
-        for name in sorted({*here, *there})
-        if here.get(name) != there.get(name)
-    ]
-    if set(cpu_features()) != set(source.manifest.cpu_features):
-        found.append("another set of processor features")
+    manifest = source.manifest
+    found = differing_builds(manifest.software, manifest.cpu_features, software_versions(), cpu_features())
     if old["engine_version"] != new["engine_version"]:
         found.append(f"{old['engine_version']} there, {new['engine_version']} here")
     return tuple(found)

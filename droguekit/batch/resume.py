@@ -27,6 +27,8 @@ _OURS = {
     layout.RECIPE_FILE,
     layout.MANIFEST_FILE,
     layout.EVENTS_FILE,
+    layout.CARD_FILE,
+    layout.CROISSANT_FILE,
     layout.FRAMES_FOLDER,
     layout.ANNOTATIONS_FOLDER,
     layout.CALIBRATION_FOLDER,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -12,61 +13,81 @@ from droguekit.cli.arguments import EngineOption, RecipeArgument, SeedOption, Wo
 from droguekit.cli.pipelines import open_recipe
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from datasets_manifest.recipe import Recipe
-    from droguekit.batch.plan import Cost, Plan
+    from droguekit.batch.plan import Plan
+    from droguekit.batch.plan_cost import Cost
+    from droguekit.batch.plan_laws import LawCheck
 
 EXAMPLES = (
     "droguekit plan demo",
+    "droguekit plan paper-corpus --html plan.html   (with plots of distances, sizes and places)",
     "droguekit plan my-recipe.toml --no-probe   (without rendering: no time and size)",
 )
 _BAR_LENGTH = 40
 _HISTOGRAM_BINS = 10
 _MOST_LINES = 20
+# Above this a machine is worth a word; less is the probe's own writing to disk.
+_BUSY = 1.25
 
 
 def plan(
     recipe: RecipeArgument,
     seed: SeedOption = None,
     probe: Annotated[
-        bool, typer.Option(help="Render up to three frames into a temporary folder to reckon time and size.")
+        bool, typer.Option(help="Render a few frames into a temporary folder to reckon time and size.")
     ] = True,
     workers: WorkersOption = None,
     engine: EngineOption = None,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="Write the plan with its plots as one page.")
+    ] = None,
 ) -> None:
     """Show what a recipe will make, how long it will take and how large it will get, without making it."""
     from droguekit.batch.machine import default_workers
-    from droguekit.batch.plan import frame_timeout_s, plan_recipe, probe_cost
+    from droguekit.batch.plan import frame_timeout_s, plan_recipe
+    from droguekit.batch.plan_cost import probe_cost
 
     chosen, _ = open_recipe(recipe, seed, engine)
     planned = plan_recipe(chosen)
-    _show_counts(chosen, planned)
-    _show_distances(chosen, planned)
-    typer.echo(f"a frame that is at work for {duration(frame_timeout_s(chosen))} counts as hung and is tried again")
+    said = [*_counts(chosen, planned), *_distances(chosen, planned), *_laws(chosen, planned)]
+    said.append(f"a frame that is at work for {duration(frame_timeout_s(chosen))} counts as hung and is tried again")
+    for line in said:
+        typer.echo(line)
     if probe:
-        _show_cost(probe_cost(chosen, planned), default_workers() if workers is None else max(1, workers))
+        cost = probe_cost(chosen, planned)
+        costs = list(_cost(cost, default_workers() if workers is None else max(1, workers)))
+        for line in costs:
+            typer.echo(line)
+        said += costs
+    if html is not None:
+        from droguekit.cli.plan_page import write_plan_page
+
+        write_plan_page(chosen, planned, said, html)
+        typer.echo(f"wrote {html}")
 
 
-def _show_counts(recipe: Recipe, planned: Plan) -> None:
+def _counts(recipe: Recipe, planned: Plan) -> Iterator[str]:
     camera = recipe.rig.camera
-    typer.echo(
+    yield (
         f"{recipe.name}: {recipe.frames.count} pairs of 2 x {camera.width_px} x {camera.height_px}, "
         f"seed {recipe.seed}, drogue {recipe.drogue.name}, sensor {recipe.sensor.name}, engine {recipe.render.engine}"
     )
-    splits = ", ".join(f"{name} {planned.by_split.get(name, 0)}" for name in ("train", "val", "test"))
-    typer.echo(f"by split: {splits}")
+    yield "by split: " + ", ".join(f"{name} {planned.by_split.get(name, 0)}" for name in ("train", "val", "test"))
     for name, (family_scenes, pairs) in planned.by_family.items():
-        typer.echo(f"  {name:<16} {family_scenes:4d} scenes {pairs:7d} pairs")
+        yield f"  {name:<16} {family_scenes:4d} scenes {pairs:7d} pairs"
     scenes = list(planned.by_scene.items())
     shown = ", ".join(f"{scene_id}: {pairs}" for scene_id, pairs in scenes[:_MOST_LINES])
     more = f" and {len(scenes) - _MOST_LINES} more" if len(scenes) > _MOST_LINES else ""
-    typer.echo(f"by scene: {shown}{more}")
-    typer.echo(f"without a drogue: {100 * planned.empty_fraction:.1f} %")
+    yield f"by scene: {shown}{more}"
+    yield f"without a drogue: {100 * planned.empty_fraction:.1f} %"
 
 
-def _show_distances(recipe: Recipe, planned: Plan) -> None:
+def _distances(recipe: Recipe, planned: Plan) -> Iterator[str]:
     import numpy as np
 
-    distances = planned.distances_m[np.isfinite(planned.distances_m)]
+    distances = planned.drawn.distances_m[np.isfinite(planned.drawn.distances_m)]
     if len(distances) == 0:
         return
     if recipe.distance.stations_m is not None:
@@ -78,15 +99,54 @@ def _show_distances(recipe: Recipe, planned: Plan) -> None:
         edges = np.geomspace(distances.min(), max(distances.max(), distances.min() * 1.001), _HISTOGRAM_BINS + 1)
         counts = np.histogram(distances, edges)[0]
         names = [f"{low:6.2f} - {high:6.2f} m" for low, high in pairwise(edges)]
-    drawn = "" if len(planned.sampled) == recipe.frames.count else f", of {len(planned.sampled)} drawn frames"
-    typer.echo(f"distance of the rim centre{drawn}:")
+    count = len(planned.drawn.indices)
+    yield f"distance of the rim centre{'' if count == recipe.frames.count else f', of {count} drawn frames'}:"
     for name, pairs in zip(names, counts, strict=True):
-        typer.echo(f"  {name} {pairs:6d} {'#' * round(_BAR_LENGTH * pairs / max(counts.max(), 1))}".rstrip())
+        yield f"  {name} {pairs:6d} {'#' * round(_BAR_LENGTH * pairs / max(counts.max(), 1))}".rstrip()
 
 
-def _show_cost(cost: Cost, workers: int) -> None:
-    typer.echo("measured, with one worker:")
+def _laws(recipe: Recipe, planned: Plan) -> Iterator[str]:
+    from droguekit.batch.plan_laws import check_places, check_sizes
+
+    sizes = check_sizes(planned.drawn, recipe)
+    if sizes is not None:
+        check, edges = sizes
+        yield f"box sizes, side of the square with the box's area, law {recipe.distance.law}:"
+        for low, high, count, expected in zip(edges, edges[1:], check.counts, check.expected, strict=False):
+            yield f"  {low:6.1f} - {high:6.1f} px {count:6.0f}, intended {expected:8.1f}"
+        yield f"  {_verdict(check)}"
+    places = check_places(planned.drawn, recipe.rig.camera)
+    if places is not None:
+        yield (
+            "places of the box's middle in the left image, cell by cell; law: anywhere that both views hold all of it, "
+            "all places equally likely (intended in brackets):"
+        )
+        for counts, intended in zip(places.counts, places.expected, strict=True):
+            yield "  " + " ".join(f"{n:5.0f} {f'({e:.0f})':<6}" for n, e in zip(counts, intended, strict=True)).rstrip()
+        yield f"  {_verdict(places)}"
+
+
+def _verdict(check: LawCheck) -> str:
+    if check.degrees == 0:
+        return "too few pairs for a chi-square"
+    return (
+        f"chi-square {check.statistic:.1f} with {check.degrees} degrees of freedom: chance of as much or more if the "
+        f"law holds {check.p_value:.2g}"
+    )
+
+
+def _cost(cost: Cost, workers: int) -> Iterator[str]:
+    yield "measured, with one worker:"
     for frame_index, report in cost.probed.items():
         where = "no drogue" if report.distance_m is None else f"{report.distance_m:.2f} m"
-        typer.echo(f"  frame {frame_index} ({where}): {report.wall_s:.2f} s, {human_size(report.size_bytes)}")
-    typer.echo(f"all: about {duration(cost.worker_s / workers)} with {workers} workers, {human_size(cost.size_bytes)}")
+        cpu_s = sum(report.stage_s.values())
+        yield f"  frame {frame_index} ({where}): {cpu_s:.2f} s of processor time, {human_size(report.size_bytes)}"
+    yield f"a worker needs {cost.start_s:.1f} s to start, and {cost.scene_s:.2f} s more for each scene it meets"
+    run_s = cost.run_s(workers)
+    size = human_size(cost.size_bytes)
+    yield f"all: about {duration(run_s)} with {workers} workers that have a core each, {size} without the records"
+    if cost.wall_over_cpu > _BUSY:
+        yield (
+            f"the machine is busy: a second of work took {cost.wall_over_cpu:.1f} s; if it stays so, the run takes "
+            f"about {duration(run_s * cost.wall_over_cpu)}"
+        )

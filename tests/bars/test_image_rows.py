@@ -123,7 +123,7 @@ def test_the_recipes_hold_the_protocol(tier: str, light_name: str) -> None:
     assert recipe.render.engine == {"a": "analytic", "b": "mitsuba"}[tier]
     assert recipe.seed == 1
     part = recipe.model_copy(update={"frames": recipe.frames.model_copy(update={"count": 36})})
-    distances = plan_recipe(part).distances_m
+    distances = plan_recipe(part).drawn.distances_m
     assert np.unique(distances.round(6), return_counts=True)[1].tolist() == [4] * len(STATIONS_M)
 
 

@@ -7,9 +7,12 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.plan import fit_inverse_square, plan_recipe, probe_cost
-from scenes.sampler import sample_frame, scene_of_frame, split_of_scene
+from datasets_manifest.recipe import Recipe, parse_recipe
+from droguekit.batch.plan import draw_frames, plan_recipe
+from geometry.se3 import RigidTransform
+from geometry.stereo import EYES
+from labelgen.boxes import full_box
+from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scene
 
 RECIPE = """
 name = "planned"
@@ -28,53 +31,76 @@ test = 0.2
 """
 
 
+def planned(**changes: str) -> Recipe:
+    text = RECIPE
+    for old, new in changes.items():
+        text = text.replace(f"{old} = ", f"{old} = {new} # ")
+    return parse_recipe(text)
+
+
 def test_counts_are_those_of_the_frames() -> None:
-    recipe = parse_recipe(RECIPE)
+    recipe = planned()
     plan = plan_recipe(recipe)
     scenes = [scene_of_frame(recipe, index) for index in range(23)]
     assert plan.by_scene == Counter(scenes)
     assert plan.by_split == Counter(split_of_scene(recipe, scene) for scene in scenes)
-    assert plan.sampled == tuple(range(23))
+    assert plan.drawn.indices == tuple(range(23))
+    assert plan.drawn.scenes.tolist() == scenes
 
 
 def test_distances_are_those_of_the_frames_and_empty_ones_have_none() -> None:
-    recipe = parse_recipe(RECIPE)
+    recipe = planned()
     plan = plan_recipe(recipe)
     poses = [sample_frame(recipe, index).left_from_drogue for index in range(23)]
     expected = [np.nan if pose is None else pose.translation_m[2] for pose in poses]
-    np.testing.assert_array_equal(plan.distances_m, expected)
+    np.testing.assert_array_equal(plan.drawn.distances_m, expected)
     assert plan.empty_fraction == sum(pose is None for pose in poses) / 23
 
 
+def test_boxes_are_those_of_the_labels() -> None:
+    recipe = planned()
+    drawn = plan_recipe(recipe).drawn
+    for index, center_px, side_px in zip(drawn.indices, drawn.centers_px, drawn.sides_px, strict=True):
+        pose = sample_left_from_drogue(recipe, index)
+        if pose is None:
+            assert np.isnan([*center_px, side_px]).all()
+            continue
+        u, v, width, height = full_box(recipe.drogue, recipe.rig, pose, "left")
+        np.testing.assert_allclose(center_px, [u + width / 2, v + height / 2], rtol=1e-12)  # float64 sums
+        np.testing.assert_allclose(side_px**2, width * height, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rig", ['"rgb-ideal"', '"paper-real"'])
+def test_a_box_at_the_end_of_its_room_touches_the_edge_of_an_image(rig: str) -> None:
+    recipe = parse_recipe(f"rig = {rig}\n" + RECIPE.replace("empty_fraction = 0.3", ""))
+    camera, drawn = recipe.rig.camera, draw_frames(recipe, tuple(range(12)))
+    kept_px = recipe.rig.largest_shift_px()
+    last_px = np.array([camera.width_px, camera.height_px]) - 0.5
+    for index, center_px, room_px in zip(drawn.indices, drawn.centers_px, drawn.rooms_px, strict=True):
+        pose = sample_left_from_drogue(recipe, index)
+        assert pose is not None
+        for axis, end in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            step_m = np.zeros(3)
+            shift_px = room_px[2 * axis + end] - center_px[axis]
+            step_m[axis] = shift_px * pose.translation_m[2] / camera.fx_px
+            moved = RigidTransform(pose.rotation, pose.translation_m + step_m)
+            boxes = np.array([full_box(recipe.drogue, recipe.rig, moved, eye) for eye in EYES])
+            low, high = boxes[:, axis].min() + 0.5, last_px[axis] - (boxes[:, axis] + boxes[:, 2 + axis]).max()
+            # The box's ends are nearer or farther than the centre by up to 0.4 m, and move so much more or less; a lens
+            # bends the way by up to what is kept free for it.
+            within_px = 2 + 0.4 / pose.translation_m[2] * abs(shift_px) + 2 * kept_px
+            assert abs((high if end else low) - kept_px) < within_px
+
+
+def test_places_that_are_not_drawn_have_no_room() -> None:
+    drawn = plan_recipe(parse_recipe(RECIPE + "[pose]\non_axis = true\n")).drawn
+    assert np.isnan(drawn.rooms_px).all()
+    assert np.isfinite(drawn.centers_px).any()
+
+
 def test_a_large_recipe_is_drawn_in_part_but_counted_in_full() -> None:
-    recipe = parse_recipe(RECIPE.replace("count = 23", "count = 1000003"))
-    plan = plan_recipe(recipe)
+    plan = plan_recipe(planned(count="1000003"), most_sampled=50)
     assert sum(plan.by_scene.values()) == 1_000_003
-    assert len(plan.sampled) == 1000
-    assert plan.sampled[0] == 0
-    assert plan.sampled[-1] == 1_000_002
-
-
-def test_the_fit_goes_through_what_follows_the_law() -> None:
-    distance_m = np.array([2.0, 8.0, 40.0])
-    at_m = np.array([3.0, 20.0, np.nan])
-    fitted = fit_inverse_square(distance_m, 0.7 + 28 / distance_m**2, at_m)
-    np.testing.assert_allclose(fitted, [0.7 + 28 / 9, 0.7 + 28 / 400, 0.7], rtol=1e-12)  # float64 least squares
-
-
-def test_the_fit_never_says_less_than_nothing() -> None:
-    fitted = fit_inverse_square(np.array([2.0, 8.0, 40.0]), np.array([1.0, 2.0, 3.0]), np.array([1.0, 100.0]))
-    assert (fitted >= 0).all()
-
-
-@pytest.mark.mitsuba
-def test_the_probe_measures_the_nearest_the_middle_and_the_farthest(tiny_recipe: str) -> None:
-    recipe = parse_recipe(tiny_recipe)
-    plan = plan_recipe(recipe)
-    cost = probe_cost(recipe, plan)
-    order = np.argsort(plan.distances_m)
-    assert set(cost.probed) == {order[0], order[2], order[3]}
-    sizes = [report.size_bytes for report in cost.probed.values()]
-    # All pairs lie between the probed ones in distance, and the fit is a line through three points of one slope.
-    assert 4 * min(sizes) * 0.8 <= cost.size_bytes <= 4 * max(sizes) * 1.2
-    assert cost.worker_s > 0
+    assert len(plan.drawn.indices) == 50
+    assert plan.drawn.indices[0] == 0
+    assert plan.drawn.indices[-1] == 1_000_002

@@ -44,11 +44,14 @@ def test_preview_shows_every_pair_it_is_asked_for(smoke_dataset: Path, tmp_path:
     assert [bool(np.ptp(tile) > 100) for tile in tiles] == [True] * 5 + [False]
 
 
-def test_export_writes_the_annotations_that_the_dataset_has(smoke_dataset: Path, tmp_path: Path) -> None:
+def test_export_adds_markers_and_hubs_to_the_annotations_that_the_dataset_has(
+    smoke_dataset: Path, tmp_path: Path
+) -> None:
     assert run(["export", str(smoke_dataset), "--format", "coco", "--out", str(tmp_path / "coco")]) == DONE
     exported = json.loads((tmp_path / "coco" / "all.json").read_text())
     stored = json.loads((smoke_dataset / layout.ANNOTATIONS_FOLDER / "all.json").read_text())
-    assert exported["annotations"] == stored["annotations"]
+    assert [entry for entry in exported["annotations"] if entry["category_id"] == 1] == stored["annotations"]
+    assert {entry["category_id"] for entry in exported["annotations"]} == {1, 2, 3}
 
 
 def test_navigate_writes_one_estimate_for_each_pair_and_method(smoke_dataset: Path, tmp_path: Path) -> None:

@@ -1,0 +1,83 @@
+"""The plan as a page with plots."""
+
+from __future__ import annotations
+
+import base64
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+
+RECIPE = """
+name = "{name}"
+description = "a < b & c"
+[frames]
+count = 40
+scenes = 4
+empty_fraction = {empty}
+[distance]
+law = "{law}"
+{distance}
+{families}
+"""
+LOG = {"law": "log-uniform", "distance": "low_m = 2.0\nhigh_m = 40.0"}
+STATIONS = {"law": "stations", "distance": "stations_m = [2.0, 5.0]"}
+FAMILIES = '[[families]]\nname = "day"\n[[families]]\nname = "dusk"\n'
+
+
+def page_of(tmp_path: Path, empty: float = 0.0, families: str = "", **law: str) -> str:
+    recipe = tmp_path / "own.toml"
+    recipe.write_text(RECIPE.format(name="own", empty=empty, families=families, **law), encoding="utf-8")
+    out = tmp_path / "new" / "plan.html"
+    assert run(["plan", str(recipe), "--no-probe", "--html", str(out)]) == DONE
+    return out.read_text(encoding="utf-8")
+
+
+def pictures(page: str) -> list[np.ndarray]:
+    found = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
+    images = [cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR) for data in found]
+    assert all(image is not None and np.ptp(image) > 200 for image in images)
+    return images
+
+
+def test_the_page_needs_nothing_from_outside(tmp_path: Path) -> None:
+    page = page_of(tmp_path, families=FAMILIES, **LOG)
+    assert "http" not in page and "<script" not in page
+    assert "a &lt; b &amp; c" in page
+    assert len(pictures(page)) == 4
+
+
+def test_the_page_repeats_what_the_command_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = page_of(tmp_path, **LOG)
+    said = capsys.readouterr().out.splitlines()
+    assert said[-1].startswith("wrote ")
+    shown = page[page.index("<pre>") + 5 : page.index("</pre>")].splitlines()
+    assert [line.replace("&#39;", "'") for line in shown] == said[:-1]
+
+
+def test_stations_have_bars_and_no_law_of_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(pictures(page_of(tmp_path, **STATIONS))) == 3
+    shown = capsys.readouterr().out
+    assert "box sizes" not in shown
+    assert "places of the box's middle" in shown
+
+
+def test_the_law_is_printed_with_its_chi_square(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["plan", "detector-small", "--no-probe"]) == DONE
+    shown = capsys.readouterr().out
+    assert "box sizes, side of the square with the box's area, law log-uniform:" in shown
+    assert len(re.findall(r"chi-square [\d.]+ with (?:9|47) degrees of freedom", shown)) == 2
+
+
+def test_without_drogues_there_are_no_boxes(tmp_path: Path) -> None:
+    assert pictures(page_of(tmp_path, empty=1.0, **LOG)) == []
+
+
+def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert run(["plan", "smoke", "--no-probe", "--html", str(tmp_path / "file" / "plan.html")]) == WRONG_INPUT
+    assert str(tmp_path / "file") in capsys.readouterr().err
