@@ -7,6 +7,11 @@ import io
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The same draws on every machine, however busy it is; `make fuzz` draws anew.
+settings.register_profile("suite", deadline=None, derandomize=True, database=None)
+settings.load_profile("suite")
 
 RENDERED_FIXTURES = {"smoke_dataset", "tiny_dataset"}
 
