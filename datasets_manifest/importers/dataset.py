@@ -46,7 +46,7 @@ class ImportSettings:
         rig: that took them.
         drogue: what to look for.
         encoding: of the numbers; by default `gamma` for 8 bit and `linear` for deeper images.
-        black_level_dn: number that no light gives. [DN]
+        black_level_dn: number that no light gives, in the source's numbers. [DN]
         bits: how many bits of deep images are used; by default what the first pair needs.
         exposure_s: how long the shutter was open; 0 where nobody knows. [s]
         boxes: around the drogue, by image name.
@@ -89,7 +89,7 @@ def write_imported(source: PairSource, settings: ImportSettings, out: Path, adva
             for eye, name, image in zip(EYES, pair.names, (pair.left, pair.right), strict=True):
                 pixels = depth.checked(image, name, settings.rig)
                 (target / image_file(eye)).write_bytes(encode_png(pixels))
-            _write(target / RECORD_FILE, _record(pair, settings))
+            _write(target / RECORD_FILE, _record(pair, settings, depth.kept_level_dn(settings.black_level_dn)))
             boxes = boxes_of_pair(settings.boxes or {}, pair.names, settings.rig.camera.width_px)
             for view, box in enumerate(boxes):
                 image_id = 2 * frame_index + view + 1
@@ -118,8 +118,21 @@ class _Depth:
         self.color: Literal["rgb", "mono"] = "rgb" if image.ndim == 3 else "mono"
         self._dtype = image.dtype
         self.output_bits: Literal[8, 12] = 8 if image.dtype == np.uint8 else _KEPT_BITS
+        if bits is not None and self.output_bits == 8:
+            raise ValueError(f"{pair.names[0]}: has 8 bits; leave the number of bits out")
         is_deep = max(int(pair.left.max()), int(pair.right.max())) >= 2**_KEPT_BITS
         self._bits = bits or (_DEEPEST_BITS if is_deep else _KEPT_BITS)
+
+    def kept_level_dn(self, level_dn: float) -> float:
+        """A level of the source's numbers, in the numbers that are kept.
+
+        Raises:
+            ValueError: the images have no such numbers.
+        """
+        kept = level_dn if self.output_bits == 8 else level_dn * 2.0 ** (_KEPT_BITS - self._bits)
+        if not 0 <= kept < 2**self.output_bits - 1:
+            raise ValueError(f"black level: must be below the images' largest number, got {level_dn:g}")
+        return kept
 
     def checked(self, image: Pixels, name: str, rig: StereoRig) -> Pixels:
         """The image in the depth in which it is kept.
@@ -142,11 +155,11 @@ class _Depth:
         return np.asarray(image >> shift if shift >= 0 else image << -shift, dtype=np.uint16)
 
 
-def _record(pair: SourcePair, settings: ImportSettings) -> dict[str, Any]:
+def _record(pair: SourcePair, settings: ImportSettings, black_level_dn: float) -> dict[str, Any]:
     """What a pair's record says besides the truth."""
     return {
         "time_s": pair.time_s,
-        "image_black_level_dn": settings.black_level_dn,
+        "image_black_level_dn": black_level_dn,
         "frame": {"exposure": {"time_s": settings.exposure_s}},
     }
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+from datasets_manifest.importers.image_folder import image_key
 from datasets_manifest.records import PixelBox
 
 
 def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:
-    """The boxes of each image, by the image file's own name, in pixel-centre coordinates.
+    """The boxes of each image, by `image_key`, in pixel-centre coordinates.
 
     Raises:
         ValueError: it cannot be read or is not COCO; names the file.
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-        names = {_number(image["id"]): Path(str(image["file_name"])).name for image in table["images"]}
+        names = {_number(image["id"]): image_key(PurePosixPath(str(image["file_name"]))) for image in table["images"]}
         boxes: dict[str, list[PixelBox]] = {}
         for annotation in table["annotations"]:
             boxes.setdefault(names[_number(annotation["image_id"])], []).append(_box(annotation["bbox"]))

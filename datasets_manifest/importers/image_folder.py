@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import cv2
 import numpy as np
@@ -17,8 +17,11 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 _FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("L", "R"))
 # What tells the views apart in a file's name, at its beginning or its end.
 _SIDE = re.compile(
-    r"^(?:(?P<first>left|right|l|r)[-_. ])?(?P<rest>.*?)(?:[-_. ]?(?P<last>left|right|[-_. ][lr]))?$", re.I
+    r"^(?:(?P<first>left|right|l[-_. ]|r[-_. ])[-_. ]?)?(?P<rest>.*?)(?:[-_. ]?(?P<last>left|right|[-_. ][lr]))?$", re.I
 )
+
+
+_VIEW_FOLDERS = {name for names in _FOLDERS for name in names}
 
 
 class ImageFolder:
@@ -66,7 +69,12 @@ class ImageFolder:
                     )
                 yield SourcePair((left.name, left.name), time_s, both[:, : self._width_px], both[:, self._width_px :])
             else:
-                yield SourcePair((left.name, right.name), time_s, read_image(left), read_image(right))
+                yield SourcePair((image_key(left), image_key(right)), time_s, read_image(left), read_image(right))
+
+
+def image_key(path: PurePath) -> str:
+    """An image's own name, with its folder where that tells the views apart."""
+    return f"{path.parent.name}/{path.name}" if path.parent.name in _VIEW_FOLDERS else path.name
 
 
 def read_image(path: Path) -> Pixels:
@@ -98,17 +106,25 @@ def _pairs(folder: Path) -> tuple[list[tuple[Path, Path]], tuple[str, ...]]:
     views: tuple[dict[str, Path], dict[str, Path]] = ({}, {})
     for names in _FOLDERS:
         if all((folder / name).is_dir() for name in names):
-            views = tuple({path.stem: path for path in _images(folder / name)} for name in names)  # type: ignore[assignment]
+            for view, name in zip(views, names, strict=True):
+                for path in _images(folder / name):
+                    _add(view, path.stem, path)
             break
     else:
         for path in _images(folder):
             side, rest = _side(path.stem)
             if side is not None:
-                views[side][rest] = path
+                _add(views[side], rest, path)
     left, right = views
     both = sorted(left.keys() & right.keys(), key=_in_number_order)
     alone = [view[key] for view in views for key in sorted(view.keys() - set(both))]
     return [(left[key], right[key]) for key in both], tuple(f"{path}: has no partner" for path in alone)
+
+
+def _add(view: dict[str, Path], key: str, path: Path) -> None:
+    if key in view:
+        raise ValueError(f"{path}: and {view[key].name} are the same view's; keep one of them")
+    view[key] = path
 
 
 def _side(stem: str) -> tuple[int | None, str]:

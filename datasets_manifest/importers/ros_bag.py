@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from datasets_manifest.images import Pixels
 from datasets_manifest.importers.source import SourcePair
 from datasets_manifest.importers.stereo_calibration import StereoCalibration
+from geometry.se3 import Array
 from geometry.stereo import EYES
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -59,7 +60,12 @@ class RosBag:
                     raise ValueError(f"{path}: has no images on {topic}; there are {_image_topics(reader)}")
             stamps: dict[str, set[int]] = {topic: set() for topic in self._topics}
             for connection, _, message in _messages(reader, self._topics, path):
-                stamps[connection.topic].add(_stamp_ns(message))
+                stamp_ns = _stamp_ns(message)
+                if stamp_ns in stamps[connection.topic]:
+                    raise ValueError(
+                        f"{path}: {connection.topic} has two images stamped {stamp_ns} ns, which cannot be paired"
+                    )
+                stamps[connection.topic].add(stamp_ns)
         left, right = (stamps[topic] for topic in self._topics)
         self._both = left & right
         alone = {self._topics[0]: left - right, self._topics[1]: right - left}
@@ -73,16 +79,17 @@ class RosBag:
             raise ValueError(f"{path}: no images on {' and '.join(self._topics)} have equal time stamps")
 
     def __iter__(self) -> Iterator[SourcePair]:
-        waiting: dict[int, dict[str, Pixels]] = {}
+        waiting: dict[int, dict[str, Any]] = {}
         with self._open() as reader:
             for connection, _, message in _messages(reader, self._topics, self._path):
                 stamp_ns = _stamp_ns(message)
                 if stamp_ns not in self._both:
                     continue
                 views = waiting.setdefault(stamp_ns, {})
-                views[connection.topic] = decode_image(message, f"{self._path}: {connection.topic} at {stamp_ns} ns")
+                views[connection.topic] = message
                 if len(views) == len(EYES):
-                    left, right = (waiting[stamp_ns][topic] for topic in self._topics)
+                    name = f"{self._path}: at {stamp_ns} ns"
+                    left, right = (decode_image(views[topic], name) for topic in self._topics)
                     del waiting[stamp_ns]
                     yield SourcePair(self._topics, 1e-9 * stamp_ns, left, right)
 
@@ -92,7 +99,13 @@ class RosBag:
         Raises:
             ValueError: there is none, or it is none of a stereo pair.
         """
-        topics = tuple(topic.rsplit("/", 1)[0] + "/camera_info" for topic in self._topics)
+        for topic in self._topics:
+            if "image_rect" in topic:
+                raise ValueError(
+                    f"{topic}: is rectified, and its CameraInfo is the raw images'; choose those by --topics, or give "
+                    "--calibration"
+                )
+        topics = tuple(topic.removesuffix("/compressed").rsplit("/", 1)[0] + "/camera_info" for topic in self._topics)
         found: dict[str, Any] = {}
         with self._open() as reader:
             for connection, _, message in _messages(reader, topics, self._path):
@@ -147,7 +160,10 @@ def decode_image(message: Any, name: str) -> Pixels:
 
 
 def _decompressed(message: Any, name: str) -> Pixels:
-    image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED) if len(message.data) else None
+    try:
+        image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED) if len(message.data) else None
+    except cv2.error as error:
+        raise ValueError(f"{name}: {' '.join(str(error).split())[:200]}") from error
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{name}: is truncated, or no compressed image of 8 or 16 bits")
     return np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, 2::-1])
@@ -198,16 +214,16 @@ def _calibration(left: Any, right: Any, path: Path) -> StereoCalibration:
             )
     if (left.width, left.height) != (right.width, right.height):
         raise ValueError(f"{path}: the eyes' CameraInfo give images of different size")
-    rotations = [np.asarray(info.r, dtype=np.float64).reshape(3, 3) for info in (left, right)]
-    projection = np.asarray(right.p, dtype=np.float64).reshape(3, 4)
+    rotations = [_numbers(info, "r").reshape(3, 3) for info in (left, right)]
+    projection = _numbers(right, "p").reshape(3, 4)
     if not projection[0, 0] > 0 or not projection[0, 3] < 0:
         raise ValueError(
             f"{path}: the right CameraInfo's P[0, 3] must be -f times the baseline, got {projection[0, 3]:g}"
         )
     right_from_left = rotations[1].T @ rotations[0]
     shift = rotations[1].T @ np.array([projection[0, 3] / projection[0, 0], 0.0, 0.0])
-    intrinsics = [np.asarray(info.k, dtype=np.float64).reshape(3, 3) for info in (left, right)]
-    distortion = [np.asarray(info.d, dtype=np.float64).reshape(-1) for info in (left, right)]
+    intrinsics = [_numbers(info, "k").reshape(3, 3) for info in (left, right)]
+    distortion = [_numbers(info, "d") for info in (left, right)]
     return StereoCalibration(
         (int(left.width), int(left.height)),
         M1=intrinsics[0],
@@ -217,3 +233,8 @@ def _calibration(left: Any, right: Any, path: Path) -> StereoCalibration:
         R=right_from_left,
         T=shift,
     )
+
+
+def _numbers(info: Any, name: str) -> Array:
+    """A field of CameraInfo, whose matrices have capital names in ROS 1."""
+    return np.asarray(getattr(info, name if hasattr(info, name) else name.upper()), dtype=np.float64).reshape(-1)

@@ -93,9 +93,9 @@ def rig_of_calibration(calibration: StereoCalibration) -> StereoRig:
         return StereoRig(left.camera, baseline_m)
     R1, R2, P1, P2, *_ = cv2.stereoRectify(
         calibration.M1,
-        calibration.D1,
+        left.distortion.coefficients(),
         calibration.M2,
-        calibration.D2,
+        right.distortion.coefficients(),
         calibration.size_px,
         calibration.R,
         calibration.T,

@@ -18,6 +18,7 @@ EXAMPLES = (
     "droguekit import flight7-bag/ --drogue my-drogue.toml --out data/flight7   (calibration from its CameraInfo)",
     "droguekit navigate data/flight7 --method joint-hub --out estimates.jsonl",
 )
+_RATE_HZ = 25.0
 _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -36,7 +37,10 @@ def import_(
     topics: Annotated[
         str | None, typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics of a bag, where several are.")
     ] = None,
-    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Pairs a second in a folder.")] = 25.0,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", metavar="HZ", help="Pairs a second in a folder; 25 if left out.", show_default=False),
+    ] = None,
     encoding: Annotated[
         str | None,
         typer.Option(metavar="linear|gamma", help="Of the numbers; by default gamma for 8 bit, linear for deeper."),
@@ -58,13 +62,15 @@ def import_(
     if calibration_unit not in _UNITS_M:
         raise ValueError(f"--calibration-unit: must be one of {', '.join(_UNITS_M)}, got {calibration_unit!r}")
     for name, value, low, high in (
-        ("rate", rate, 1e-3, 1e4),
-        ("black-level", black_level, 0, 4095),
-        ("bits", bits or 12, 9, 16),
+        ("rate", _RATE_HZ if rate is None else rate, 1e-3, 1e4),
+        ("black-level", black_level, 0, 65535),
+        ("bits", 12 if bits is None else bits, 9, 16),
     ):
         if not low <= value <= high:
             raise ValueError(f"--{name}: must be from {low:g} to {high:g}, got {value:g}")
-    pairs, rig = _open_source(source, calibration, _UNITS_M[calibration_unit], topics, rate)
+    if _is_bag(source) and (rate is not None or boxes is not None):
+        raise ValueError("--rate, --boxes: are for folders of images; a bag has stamps, and no names for its images")
+    pairs, rig = _open_source(source, calibration, _UNITS_M[calibration_unit], topics, rate or _RATE_HZ)
     given = None if boxes is None else read_boxes(boxes)
     settings = ImportSettings(
         name=out.resolve().name,

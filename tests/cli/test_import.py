@@ -72,6 +72,20 @@ def test_imported_images_give_the_same_poses(smoke_dataset: Path, pictures: Path
         np.testing.assert_allclose(got[source.frame_indices.index(index)], pose, atol=1e-9)
 
 
+def test_deep_images_keep_their_black_level(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
+    for file in pictures.iterdir():
+        image = cv2.imread(str(file)).astype(np.uint16) << 8
+        assert cv2.imwrite(str(file), image)
+    order = ["import", str(pictures), "--calibration", str(smoke_dataset / "calibration" / "opencv_stereo.yaml")]
+    assert run([*order, "--out", str(tmp_path / "imported"), "--black-level", "1024"]) == DONE
+    pair = BlindDataset(tmp_path / "imported").pair(0).images
+    # 16 bits are kept as 12: numbers and black level are a sixteenth.
+    assert (pair.bits, pair.black_level_dn, pair.encoding) == (12, 64.0, "linear")
+    want = cv2.imread(str(pictures / "left_0000.png"), cv2.IMREAD_UNCHANGED)[:, :, ::-1] >> 4
+    np.testing.assert_array_equal(pair.left, want)
+    assert run([*order, "--out", str(tmp_path / "other"), "--black-level", "65535"]) == WRONG_INPUT
+
+
 def test_views_side_by_side_are_the_same_pairs(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
     wide = tmp_path / "wide"
     wide.mkdir()

@@ -29,6 +29,7 @@ def save(path: Path, rgb: np.ndarray) -> None:
         "L_{}.bmp R_{}.bmp",
         "l_{}.tif r_{}.tif",
         "cam0/{}.png cam1/{}.png",
+        "left{}.png right{}.png",
     ],
 )
 def test_two_files_a_pair(names: str, tmp_path: Path) -> None:
@@ -79,3 +80,10 @@ def test_folders_and_files_that_do_not_do_are_named(tmp_path: Path) -> None:
         (tmp_path / "a.png").write_bytes(damaged)
         with pytest.raises(ValueError, match=r"a\.png: is truncated"):
             read_image(tmp_path / "a.png")
+
+
+def test_two_files_of_one_view_are_refused(tmp_path: Path) -> None:
+    for name in ("left/1.png", "left/1.bmp", "right/1.png"):
+        save(tmp_path / name, picture(1))
+    with pytest.raises(ValueError, match="are the same view's"):
+        ImageFolder(tmp_path, WIDTH, 25.0)

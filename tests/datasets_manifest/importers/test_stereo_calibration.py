@@ -73,6 +73,14 @@ def test_a_calibration_in_millimetres_wants_its_unit(tmp_path: Path) -> None:
     assert rig_of_calibration(read_opencv_stereo(path, unit_m=1e-3)).baseline_m == pytest.approx(0.12)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
+def test_few_coefficients_are_the_first(count: int, real: StereoCalibration) -> None:
+    padded = np.concatenate([real.D1[:count], np.zeros(5 - count)])
+    short, long = (rig_of_calibration(changed(real, D1=given)) for given in (real.D1[:count], padded))
+    np.testing.assert_array_equal(short.lenses[0].distortion.coefficients(), padded)
+    assert short.camera == long.camera
+
+
 def changed(calibration: StereoCalibration, **fields: object) -> StereoCalibration:
     return StereoCalibration(**{**vars(calibration), **fields})
 
