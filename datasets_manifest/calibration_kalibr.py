@@ -46,6 +46,6 @@ def kalibr_camchain(rig: StereoRig) -> str:
             "  distortion_model: radtan",
             f"  intrinsics: {yaml_list([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])}",
             f"  resolution: [{rig.camera.width_px}, {rig.camera.height_px}]",
-            f"  rostopic: /{('left', 'right')[index]}/image_raw",
+            f"  rostopic: /stereo/{('left', 'right')[index]}/image_raw",
         ]
     return "\n".join(lines) + "\n"

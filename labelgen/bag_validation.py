@@ -79,7 +79,7 @@ def _calibration_faults(dataset: Dataset, infos: dict[str, Any]) -> list[str]:
         if info is None:
             faults.append(f"has no CameraInfo of the {eye} eye")
             continue
-        for name, given in (("M", info.k), ("R", info.r), ("P", info.p)):
+        for name, given in (("M", info.k), ("D", info.d), ("R", info.r), ("P", info.p)):
             exact = want[f"{name}{number}"].ravel()
             found = np.asarray(given, dtype=np.float64)
             if found.shape != exact.shape or not np.allclose(found, exact, rtol=_TOLERANCE, atol=_TOLERANCE):

@@ -6,6 +6,7 @@ boxes are differences of pixel numbers, one less than COCO's.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.layout import image_file, passes_file
+from datasets_manifest.layout import passes_file
 from datasets_manifest.manifest import SplitName
 from datasets_manifest.passes import read_passes
 from datasets_manifest.png import encode_png
@@ -26,7 +27,7 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import EYES, Eye
 from labelgen.export.bop_models import MM_PER_M, object_id, write_models
-from labelgen.export.frame_files import frame_file, link_or_copy
+from labelgen.export.frame_files import place_image
 from labelgen.export.log import ExportLog
 from labelgen.masks import Mask, amodal_masks, joined, visible_mask_of
 
@@ -123,9 +124,9 @@ class _Scenes:
                 stream.write("\n}\n")
 
     def _add_eye(self, record: PairRecord, eye: Eye, scene: Path) -> float:
-        dataset, index = self._source.path, record.frame_index
+        index = record.frame_index
         picture = "gray" if record.frame.sensor.color == "mono" else "rgb"
-        link_or_copy(frame_file(dataset, index, image_file(eye)), scene / f"{picture}_{eye}" / f"{index:06d}.png")
+        place_image(self._source, index, eye, scene / f"{picture}_{eye}" / f"{index:06d}.png", self._log)
         depth_scale = self._add_depth(record, eye, scene)
         self._append(scene / f"scene_camera_{eye}.json", index, _scene_camera(record, eye, depth_scale))
         truth, info, visible_share = [], [], 0.0
@@ -220,9 +221,24 @@ def _ground_truth(record: PairRecord, eye: Eye, obj_id: int) -> dict[str, Any]:
     }
 
 
+def _count_all(record: PairRecord, eye: Eye, whole: Mask) -> int:
+    """Pixels of the whole silhouette beyond the image too, on a canvas of three times its size, as BOP counts them."""
+    view = record.views.left if eye == "left" else record.views.right
+    if not view.truncated or record.frame.drogue is None:
+        return int(np.count_nonzero(whole))
+    rig = record.frame.rig
+    c = rig.camera
+    wide = PinholeCamera(3 * c.width_px, 3 * c.height_px, c.fx_px, c.fy_px, c.cx_px + c.width_px, c.cy_px + c.height_px)
+    frame = record.frame.model_copy(update={"rig": replace(rig, camera=wide)})
+    nothing = np.zeros((wide.height_px, wide.width_px), np.uint8)
+    masks = amodal_masks(record.model_copy(update={"frame": frame}), eye, nothing)
+    parts = tuple(drogue_part_ids(record.frame.drogue.marker_count))
+    return int(np.count_nonzero(joined(masks, parts, nothing.shape)))
+
+
 def _info(record: PairRecord, eye: Eye, whole: Mask, visible: Mask) -> dict[str, Any]:
     view = record.views.left if eye == "left" else record.views.right
-    count_all, count_visible = int(np.count_nonzero(whole)), int(np.count_nonzero(visible))
+    count_all, count_visible = _count_all(record, eye, whole), int(np.count_nonzero(visible))
     full = view.box_full_xywh_px
     if view.truncated and full is not None:
         low, high = np.ceil(full[:2]), np.floor(np.add(full[:2], full[2:]))
@@ -233,7 +249,7 @@ def _info(record: PairRecord, eye: Eye, whole: Mask, visible: Mask) -> dict[str,
         "bbox_obj": box,
         "bbox_visib": _box(visible),
         "px_count_all": count_all,
-        "px_count_valid": count_all,
+        "px_count_valid": int(np.count_nonzero(whole)),
         "px_count_visib": count_visible,
         "visib_fract": count_visible / count_all if count_all else 0.0,
     }

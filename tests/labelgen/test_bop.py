@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ from datasets_manifest.manifest import build_manifest, write_manifest
 from datasets_manifest.recipe import parse_recipe
 from datasets_manifest.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
+from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES
 from labelgen.export.bop import depth_numbers, write_bop
 from labelgen.export.log import ExportLog
@@ -133,6 +135,31 @@ def test_masks_boxes_and_counts_agree(bop, full_pairs):
             for key, mask in (("bbox_obj", whole), ("bbox_visib", visible)):
                 rows, columns = np.nonzero(mask)
                 assert info[key] == [columns.min(), rows.min(), np.ptp(columns), np.ptp(rows)]
+
+
+def test_what_leaves_the_image_counts_for_the_whole(full_pairs, small_recipe, tmp_path):
+    frame, make = full_pairs[0].frame, type(full_pairs[0])
+    camera, pose = frame.rig.camera, frame.left_from_drogue
+    # The drogue's middle on the left border.
+    middle_m = np.array([-camera.cx_px / camera.fx_px * pose.translation_m[2], 0.0, pose.translation_m[2]])
+    cut = frame.model_copy(update={"left_from_drogue": replace(pose, translation_m=middle_m)})
+    pair = make(cut)
+    assert pair.record.views.left.truncated
+    files = encode_files(pair.images, {eye: getattr(pair.radiance, eye).part_id for eye in EYES})
+    write_frame(tmp_path / "dataset", pair.record, files)
+    write_manifest(
+        tmp_path / "dataset", build_manifest(tmp_path / "dataset", small_recipe, "1", lambda scene_id: "val")
+    )
+    write_bop(tmp_path / "dataset", tmp_path / "bop", ExportLog())
+    (info,) = json.loads(next((tmp_path / "bop").rglob("scene_gt_info_left.json")).read_text())[str(cut.frame_index)]
+    wide = PinholeCamera(
+        3 * camera.width_px, camera.height_px, camera.fx_px, camera.fy_px, camera.cx_px + camera.width_px, camera.cy_px
+    )
+    whole = make(cut.model_copy(update={"rig": replace(frame.rig, camera=wide)}))
+    count = np.isin(whole.radiance.left.part_id, drogue_part_ids(8)).sum()
+    # A ray that passes on an edge may be decided otherwise.
+    assert info["px_count_all"] == pytest.approx(count, rel=0.01)
+    assert info["px_count_valid"] < 0.7 * count and 0.4 < info["visib_fract"] < 0.7
 
 
 def test_depth_images_are_the_dataset_s_depth(bop, pairs):
