@@ -50,7 +50,8 @@ class RenderSettings(FrozenModel):
         max_depth: longest path, counted in segments.
         denoise: whether light that reaches a matt drogue by way of other surfaces is smoothed over each surface (engine
             mitsuba). Paths then start from pixel centres, `samples_per_px` where the smoothing is wide and up to
-            `edge_samples_per_px` where the drogue is far away; edges take the fewer rays the more pixels are inside.
+            `edge_samples_per_px` where the drogue is far away; insides take `open_samples_per_px` rays, and edges the
+            fewer the more pixels are inside.
     """
 
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)

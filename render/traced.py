@@ -38,7 +38,7 @@ class TracedEye:
         """The same passes with these pixels, and their (P, 4) radiance and coverage."""
         return replace(self, pixel=pixel, radiance_cd_m2=light[:, :3], coverage=light[:, 3])
 
-    def put_behind_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> None:
+    def put_behind_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Let the air between parts and camera take its share of their light and add its own, in place.
 
         A pixel on an edge has the depth of its nearest neighbour; the drogue's own depth matters little to the haze.
@@ -46,11 +46,16 @@ class TracedEye:
         Args:
             air: (P, 3) radiance of endless air in the direction of each traced pixel. [cd/m2]
             optical_depth_per_m: (P,) optical depth per planar depth. [1/m]
+
+        Returns:
+            (P, 1) the share of their light that is left.
         """
         nearest = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[self.pixel]
         clear = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))[:, None]
         through = self.radiance_cd_m2 * clear + self.coverage[:, None] * (1.0 - clear) * air
         self.radiance_cd_m2 = through.astype(np.float32)
+        share: NDArray[np.float32] = clear.astype(np.float32)
+        return share
 
     def pixels_over(self, behind: NDArray[np.float32]) -> NDArray[np.float32]:
         """(P, 3) radiance of the traced pixels over the surroundings `behind` (H, W, 3)."""

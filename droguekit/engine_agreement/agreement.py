@@ -104,7 +104,8 @@ def centroid_offset(frames: Sequence[FrameAgreement]) -> CentroidOffset | None:
 
 def plate_bars(plates: Sequence[PlateLight]) -> list[Bar]:
     """What the engines are held to by light on white plates."""
-    worst = max(abs(plate.ratio - 1) for plate in plates)
+    # numpy's maximum keeps what is not a number, so that a plate without light misses the bar.
+    worst = float(np.max([abs(plate.ratio - 1) for plate in plates]))
     return [Bar("white plates, largest difference", worst, MOST_PLATE_ERROR)]
 
 
@@ -126,10 +127,13 @@ def part_ratios(frames: Sequence[FrameAgreement]) -> dict[str, float]:
     names = sorted({name for frame in frames for name in frame.part_sums})
     ratios = {}
     for name in names:
-        rows = [frame.part_sums[name] for frame in frames if name in frame.part_sums]
+        rows = [frame.part_sums[name] for frame in frames if frame.part_sums.get(name, (0, 0.0, 0.0))[1] > 0]
+        if not rows:
+            continue
         ratios[name] = float(np.average([other / one for _, one, other in rows], weights=[count for count, *_ in rows]))
     return ratios
 
 
 def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0
+    """Root mean square; of nothing it is infinite, as nothing was shown."""
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("inf")

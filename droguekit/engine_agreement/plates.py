@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets_manifest.frame import FrameSpec
-from datasets_manifest.recipe import Recipe, load_recipe
+from datasets_manifest.recipe import Recipe, RenderSettings, load_recipe
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part
 from droguekit.engine_agreement.measures import luminance
@@ -45,17 +45,22 @@ def compare_plate(tilt_deg: tuple[float, float], samples: int, one: RenderEngine
         samples: through each of its pixels.
         one, other: engines.
     """
-    recipe = _plate_recipe(samples)
-    frame = _plate_frame(recipe, *tilt_deg)
+    frame, settings = plate_frame(samples, tilt_deg)
     got = []
     for engine in (one, other):
-        seen = engine.render(frame, recipe.render).left
+        seen = engine.render(frame, settings).left
         inside = (seen.part_id == Part.FACE) & (seen.coverage > 0.999)
         got.append(np.pi * float(luminance(seen.radiance_cd_m2[inside]).mean()))
     assert frame.left_from_drogue is not None
     normal = -(frame.world_from_left @ frame.left_from_drogue).rotation[:, 2]
     integral = luminance(surroundings(frame.environment).plate_illuminance_lux(normal))
     return PlateLight(*tilt_deg, got[0], got[1], float(integral))
+
+
+def plate_frame(samples: int, tilt_deg: tuple[float, float]) -> tuple[FrameSpec, RenderSettings]:
+    """A frame of the white plate, and how to render it; arguments as `compare_plate`."""
+    recipe = _plate_recipe(samples)
+    return _tilted(recipe, *tilt_deg), recipe.render
 
 
 def _plate_recipe(samples: int) -> Recipe:
@@ -67,7 +72,7 @@ def _plate_recipe(samples: int) -> Recipe:
     return Recipe.model_validate({**recipe.model_dump(), **changes})
 
 
-def _plate_frame(recipe: Recipe, pitch_deg: float, yaw_deg: float) -> FrameSpec:
+def _tilted(recipe: Recipe, pitch_deg: float, yaw_deg: float) -> FrameSpec:
     frame = sample_frame(recipe, 0)
     assert frame.drogue is not None
     drogue = DrogueParameters.model_validate(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -119,7 +120,10 @@ def write_json(out: Path, tables: dict[str, Any], bars: Sequence[Bar]) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    content = {"schema": 2, "bars": [{**vars(bar), "reached": bar.reached} for bar in bars], **tables}
+    # JSON has no number for what was not measured.
+    rows = [{**vars(bar), "value": bar.value if math.isfinite(bar.value) else None} for bar in bars]
+    reached = [{**row, "reached": bar.reached} for row, bar in zip(rows, bars, strict=True)]
+    content = {"schema": 2, "bars": reached, **tables}
     write_text_atomic(out / "agreement.json", json.dumps(content, indent=1) + "\n")
 
 

@@ -9,17 +9,18 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from datasets_manifest.recipe import RenderSettings
 from droguekit.engine_agreement.agreement import compare_frame
-from droguekit.engine_agreement.costs import COST_STATIONS_M, CostAt, cost_of, measure_costs
+from droguekit.engine_agreement.costs import COST_FAMILY, COST_STATIONS_M, CostAt, cost_of, measure_costs
 from droguekit.engine_agreement.findings import Findings, Found
-from droguekit.engine_agreement.paired_frames import PairedFrame
-from droguekit.engine_agreement.plates import TILTS_DEG, PlateLight, compare_plate
+from droguekit.engine_agreement.paired_frames import PairedFrame, frame_at, recipe_of_family
+from droguekit.engine_agreement.plates import TILTS_DEG, PlateLight, compare_plate, plate_frame
 from droguekit.engine_agreement.report import frame_row, write_picture
 from render.engine import RenderEngine, load_engine
 
 
 class Engines:
-    """Two engines, loaded when the first picture is needed."""
+    """Two engines, loaded when they or their versions are first asked for."""
 
     def __init__(self, names: tuple[str, str]) -> None:
         self.names = names
@@ -70,8 +71,7 @@ class Work:
         """
         rows = []
         for index, paired in enumerate(frames):
-            text = paired.frame.model_dump_json() + paired.settings.model_dump_json()
-            made_from = {"frame_sha256": hashlib.sha256(text.encode()).hexdigest()}
+            made_from = {"frame_sha256": _sha256(paired.frame.model_dump_json(), paired.settings.model_dump_json())}
             rows.append(self._found(f"frame-{index:03d}", made_from, partial(self._frame, index, paired)))
             self.say(line(rows[-1]))
         return rows
@@ -89,7 +89,8 @@ class Work:
         """
         plates = []
         for number, tilt in enumerate(TILTS_DEG):
-            made_from = {"tilt_deg": tilt, "samples": samples}
+            frame, settings = plate_frame(samples, tilt)
+            made_from = {"frame_sha256": _sha256(frame.model_dump_json(), settings.model_dump_json())}
             row = self._found(f"plate-{number}", made_from, partial(self._plate, tilt, samples))
             plates.append(PlateLight(**row))
             self.say(line(plates[-1]))
@@ -106,7 +107,8 @@ class Work:
         """
         costs = []
         for distance_m in COST_STATIONS_M:
-            made_from = {"distance_m": distance_m, "seed": self.seed}
+            frame = frame_at(recipe_of_family(COST_FAMILY, self.seed), distance_m, 1, 0)
+            made_from = {"distance_m": distance_m, "sha256": _sha256(frame.model_dump_json(), str(RenderSettings()))}
             row = self._found(f"cost-{distance_m:g}m", made_from, partial(self._cost, distance_m))
             costs.append(cost_of(row))
             self.say(line(costs[-1]))
@@ -124,3 +126,7 @@ class Work:
         found = find()
         findings.keep(name, whole, found)
         return found
+
+
+def _sha256(*texts: str) -> str:
+    return hashlib.sha256("".join(texts).encode()).hexdigest()

@@ -104,6 +104,10 @@ class BlenderEngine:
                 raise ValueError(f"engine blender: {error}") from error
         started = time.process_time()
         for eye in EYES:
+            # Half the difference of two halves is light and coverage too, and the air dims it alike.
+            apart = traced[eye].lit_by(scatter[eye].pixel, scatter[eye].light)
+            apart.put_behind_air(*air_before(frame, apart.pixel))
+            scatter[eye] = _Scatter(apart.pixel, np.column_stack([apart.radiance_cd_m2, apart.coverage]))
             traced[eye].put_behind_air(*air_before(frame, traced[eye].pixel))
         eyes = {eye: traced[eye].over(behind[eye]) for eye in EYES}
         self._stage_s["composite"] += time.process_time() - started

@@ -73,8 +73,10 @@ class MitsubaEngine:
         traced = self._tracer.trace(frame, settings, around)
         stage_s |= traced.stage_s
         started = time.process_time()
-        for seen in (*traced.eyes.values(), *traced.again.values()):
+        for eye in EYES:
+            seen, again = traced.eyes[eye], traced.again[eye]
             seen.put_behind_air(*air_before(frame, seen.pixel))
+            traced.error_again[eye] *= again.put_behind_air(*air_before(frame, again.pixel))
         noise = _noise(frame, traced, behind)
         eyes = {eye: traced.eyes[eye].over(behind[eye]) for eye in EYES}
         stage_s["composite"] = time.process_time() - started

@@ -103,7 +103,7 @@ class SmoothedPaths:
 
 
 def _grid_count(count: float) -> int:
-    """The nearest of a few square counts, as each count compiles kernels of its own."""
+    """One of few counts, as each compiles kernels of its own: the nearest square from 4 on, a whole number below."""
     if count < 4:
         return max(int(count), 1)
     side = math.sqrt(count)

@@ -79,6 +79,10 @@ def test_one_engine_against_itself_errs_alike_and_stays_when_run_again(tmp_path)
     report = PlainProgress(io.StringIO())
     paired = render_paired(tmp_path, ("analytic", "analytic"), 10.0, 2, 3, report)
     assert paired.one == paired.other
+    written = {file: file.stat().st_mtime_ns for file in paired.one.rglob("*.png")}
+    assert written
+    render_paired(tmp_path, ("analytic", "analytic"), 10.0, 2, 3, report)
+    assert {file: file.stat().st_mtime_ns for file in paired.one.rglob("*.png")} == written
     errors = paired_errors(paired)
     assert errors.pairs == 2 and errors.one.shape == (2, 5)
     assert np.array_equal(errors.one, errors.other)
