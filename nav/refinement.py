@@ -67,6 +67,8 @@ def refine(
     around = _surroundings(layout, index, radius_px / layout.radius_m)
     if around is not None and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
         middles_px = np.stack([rig.image(rough.left_from_drogue.translation_m, eye) for eye in EYES])
+        # An eye that shows no markers has no say: far outside of the image there is nothing to weigh.
+        middles_px[~observation.seen.any(axis=1)] = -1e6
         rim_px = radius_px * layout.face_outer_radius_m / layout.radius_m
         others_weight = balancing_weight(images, color, middles_px, rim_px, others_weight)
     signals = marker_signals(images, color, _together([discs, *hubs]), others_weight)

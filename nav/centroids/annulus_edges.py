@@ -173,7 +173,7 @@ def _weighted_fit(
 def _unevenness(parameters: Array) -> float:
     """Root mean square of the light's change with the azimuth over its mean, of the less even annulus."""
     turns = parameters[:, AMPLITUDE:]
-    mean = np.maximum(turns[:, 0] - parameters[:, BACKGROUND], 1.0)  # one number
+    mean = np.maximum(turns[:, 0] - parameters[:, BACKGROUND], 1.0)  # at least 1 DN
     return float((np.sqrt((turns[:, 1:] ** 2).sum(axis=1) / 2) / mean).max())
 
 

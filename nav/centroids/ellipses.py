@@ -37,12 +37,6 @@ class Ellipses:
     def __len__(self) -> int:
         return len(self.eyes)
 
-    @property
-    def semi_axes_px(self) -> Array:
-        """(M, 2) semi-axes, the smaller first. [px]"""
-        axes: Array = np.linalg.eigvalsh(self.shapes_px)
-        return axes
-
     @cached_property
     def radii_px(self) -> Array:
         """(M,) radii of the circles of the same area. [px]"""

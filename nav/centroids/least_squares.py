@@ -87,14 +87,12 @@ class Minimum:
         residuals: (N, K) data minus model.
         jacobian: (N, P, K).
         normal: the normal equations there.
-        converged: (N,) whether the last step was small.
     """
 
     parameters: Array
     residuals: Array32
     jacobian: Array32
     normal: NormalEquations
-    converged: np.ndarray[tuple[int], np.dtype[np.bool_]]
 
     def covariance(self) -> Array:
         """(N, P, P) inverse of the normal matrices."""
@@ -123,7 +121,7 @@ def evaluate(model: Model, data: Array32, weights: Array32, parameters: Array) -
     values, jacobian = model(parameters)
     residuals = data - values
     normal = NormalEquations(jacobian, residuals, np.sqrt(weights))
-    return Minimum(parameters, residuals, jacobian, normal, np.zeros(len(parameters), np.bool_))
+    return Minimum(parameters, residuals, jacobian, normal)
 
 
 def minimise(
@@ -143,7 +141,6 @@ def minimise(
     roots = np.sqrt(weights)
     cost = _cost(residuals, roots)
     damping = np.full(len(parameters), _FIRST_DAMPING)
-    converged = np.zeros(len(parameters), np.bool_)
     normal = NormalEquations(jacobian, residuals, roots)
     for _ in range(most_steps):
         step = normal.step(damping)
@@ -166,7 +163,7 @@ def minimise(
         normal = NormalEquations(jacobian, residuals, roots)
         if converged.all():
             break
-    return Minimum(parameters, residuals, jacobian, normal, converged)
+    return Minimum(parameters, residuals, jacobian, normal)
 
 
 def _cost(residuals: Array32, roots: Array32) -> Array:

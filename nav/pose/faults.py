@@ -38,16 +38,6 @@ def hub_fault(observation: Observation) -> NoFixReason | None:
     return None
 
 
-def left_fault(observation: Observation, least: int) -> NoFixReason | None:
-    """Why no pose can rest on the markers of the left eye alone, or None when one can.
-
-    Args:
-        observation: what was measured; the right eye is not looked at.
-        least: how many markers the method needs.
-    """
-    return eye_fault(observation, 0, least)
-
-
 def eye_fault(observation: Observation, eye: int, least: int) -> NoFixReason | None:
     """Why no pose can rest on the markers of one eye alone, 0 left or 1 right, or None when one can."""
     reason = _bad_numbers(observation, observation.pixels_px[eye], observation.cov_px2[eye], eye, "marker")
@@ -108,15 +98,27 @@ def _another_rig(observation: Observation) -> NoFixReason | None:
     gaps_px = np.linalg.norm(
         observation.pixels_px[:, paired][:, first] - observation.pixels_px[:, paired][:, second], axis=2
     )
-    # Medians, so that a bad marker or two tell nothing of the rig.
+    # Medians, so that a bad marker or two tell nothing of the rig; but where only neighbours of a tilted ring are seen,
+    # all gaps are shortened alike, and the longest axis of the map from drogue to image is not.
     expected_px = observation.rig.baseline_m * float(np.median(gaps_px / gaps_m))
+    untilted_px = observation.rig.baseline_m * _largest_scale_px_per_m(observation)
     disparity_px = float(np.median(observation.pixels_px[0, paired, 0] - observation.pixels_px[1, paired, 0]))
-    if abs(disparity_px - expected_px) <= _RIG_MISS_FRACTION * min(disparity_px, expected_px) + _RIG_MISS_PX:
-        return None
+    for size_px in (expected_px, untilted_px):
+        if abs(disparity_px - size_px) <= _RIG_MISS_FRACTION * min(disparity_px, size_px) + _RIG_MISS_PX:
+            return None
     return NoFixReason(
         f"rig and drogue do not fit: markers this large have a disparity of {expected_px:.1f} px, "
         f"these have {disparity_px:.1f} px"
     )
+
+
+def _largest_scale_px_per_m(observation: Observation) -> float:
+    """Largest scale of the affine map from the markers' plane to an image, mean of both eyes."""
+    paired = observation.paired
+    arms_m = observation.layout.centers_m[paired, :2]
+    arms_m = arms_m - arms_m.mean(axis=0)
+    maps = [np.linalg.lstsq(arms_m, px - px.mean(axis=0), rcond=None)[0] for px in observation.pixels_px[:, paired]]
+    return float(np.mean([np.linalg.svd(map_, compute_uv=False)[0] for map_ in maps]))
 
 
 def _on_a_line(points: Array) -> bool:

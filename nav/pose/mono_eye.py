@@ -64,15 +64,22 @@ def _alone(observation: Observation, eye: int) -> Observation:
 def _from_right(solution: Solution, observation: Observation) -> Solution:
     """A solution in the right eye's frame as one in the left eye's.
 
-    Both eyes look along the same axes, so that the covariance of small turns and shifts stays as it is.
+    Both eyes look along the same axes, so that the covariance of small turns and shifts stays as it is, but for what is
+    not known of the right eye against the left one.
     """
     offset_m = observation.rig.eye_offset_m(EYES[_RIGHT])
 
     def moved(pose: RigidTransform) -> RigidTransform:
         return RigidTransform(pose.rotation, pose.translation_m + offset_m)
 
+    covariance = solution.covariance
+    if covariance is not None:
+        covariance = covariance.copy()
+        x_per_px_m = solution.left_from_drogue.translation_m[2] / observation.rig.camera.fx_px
+        covariance[0, 0] += (observation.tolerances.disparity_px * x_per_px_m) ** 2
     return replace(
         solution,
+        covariance=covariance,
         left_from_drogue=moved(solution.left_from_drogue),
         used=solution.used[::-1].copy(),
         modes=tuple(replace(mode, left_from_drogue=moved(mode.left_from_drogue)) for mode in solution.modes),
