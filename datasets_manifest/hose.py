@@ -76,7 +76,7 @@ def _resolve(value: Any) -> Any:
     if not isinstance(table, dict) or "preset" not in table:
         return value
     changes = {key: change for key, change in table.items() if key != "preset"}
-    if table["preset"] not in HOSES:
+    if not isinstance(table["preset"], str) or table["preset"] not in HOSES:
         raise ValueError(f"preset: no hose named {table['preset']!r}; there are {', '.join(HOSES)}")
     return {**HOSES[table["preset"]].model_dump(), **changes}
 

@@ -12,7 +12,7 @@ from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.pose_ranges import Pose
 from datasets_manifest.ranges import Range
 from datasets_manifest.target_ranges import TargetRanges
-from datasets_manifest.turbulence import Turbulence
+from datasets_manifest.turbulence import SLOWEST_M_S, Turbulence
 from geometry.stereo import StereoRig
 
 Manoeuvre = Literal["docking", "station", "missed-approach"]
@@ -133,6 +133,11 @@ class SequenceRanges(FrozenModel):
                     f"hose.length_m: a hose of {self.hose.length_m:g} m is shorter than the {away_m:.3g} m from the "
                     "pod to release_m; lengthen it or release the drogue nearer to the pod"
                 )
+        if self.hose.airspeed_m_s < SLOWEST_M_S and set(self.turbulence) != {"none"}:
+            raise ValueError(
+                f"turbulence: needs an airspeed of at least {SLOWEST_M_S:g} m/s, got {self.hose.airspeed_m_s:g}; "
+                "use 'none'"
+            )
         span_s = (self.frames_per_sequence - 1) / self.frame_rate_hz
         for manoeuvre in self.receiver.manoeuvres:
             needed_s = self.receiver.duration_s(manoeuvre)

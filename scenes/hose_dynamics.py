@@ -11,10 +11,12 @@ neither drifts nor feeds in energy.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg.lapack import dgtsv
+from scipy.optimize import brentq
 
 from datasets_manifest.hose import HoseParameters
 from geometry.se3 import Array
@@ -22,8 +24,6 @@ from geometry.se3 import Array
 LINKS = 16
 TIME_STEP_S = 0.002
 GRAVITY_M_S2 = 9.80665  # standard gravity
-# Each pass brings the direction of a link in equilibrium closer by a factor of ten or more.
-_EQUILIBRIUM_PASSES = 60
 
 
 @dataclass
@@ -101,16 +101,23 @@ class HoseModel:
         weight = np.array([0.0, 0.0, -GRAVITY_M_S2])
         beyond = self._drogue * self.airspeed_m_s * wind
         links, tensions = np.zeros((3, self.links)), np.zeros(self.links)
-        direction = beyond + self.masses_kg[-1] * weight
         for index in reversed(range(self.links)):
             beyond = beyond + self.masses_kg[index] * weight
-            for _ in range(_EQUILIBRIUM_PASSES):
-                direction = direction / np.linalg.norm(direction)
-                drag = self._link_drag(direction[:, None], wind[:, None])[:, 0]
-                direction = beyond + drag / 2
-            tensions[index] = np.linalg.norm(direction)
-            links[:, index] = direction / tensions[index] * self.link_m
-            beyond = beyond + drag
+
+            def force(angle: float, beyond: Array = beyond) -> Array:
+                drag = self._link_drag(_below_the_wind(angle)[:, None], wind[:, None])[:, 0]
+                pull: Array = beyond + drag / 2
+                return pull
+
+            def across(angle: float, force: Callable[[float], Array] = force) -> float:
+                pull = force(angle)
+                return float(pull[0] * np.sin(angle) + pull[2] * np.cos(angle))
+
+            angle = float(brentq(across, 0.0, np.pi / 2 + 1e-6, xtol=1e-15, rtol=8.9e-16))
+            direction = _below_the_wind(angle)
+            tensions[index] = np.linalg.norm(force(angle))
+            links[:, index] = direction * self.link_m
+            beyond = beyond + self._link_drag(direction[:, None], wind[:, None])[:, 0]
         return links, tensions
 
     def _link_drag(self, direction: Array, wind_m_s: Array) -> Array:
@@ -194,3 +201,8 @@ class HoseModel:
         potential = GRAVITY_M_S2 * self.masses_kg * state.nodes_m[2, :, 1:]
         total: Array = (kinetic + potential).sum(axis=-1)
         return total
+
+
+def _below_the_wind(angle: float) -> Array:
+    """Unit vector from a link's upper to its lower end, turned down from the wind's direction by an angle [rad]."""
+    return np.array([np.cos(angle), 0.0, -np.sin(angle)])

@@ -128,9 +128,9 @@ class Guidance:
 
     def _known(self) -> tuple[Array, Array]:
         """(3, S) place and velocity of the drogue a delay ago."""
-        at = max(len(self._seen) - 1 - self._delay, 0.0)
-        first = min(int(at), len(self._seen) - 2)
-        if first < 0:
+        at = len(self._seen) - 1 - self._delay
+        if at < 1:
             return self._seen[0], np.zeros_like(self._seen[0])
-        older, newer = self._seen[first : first + 2]
-        return older + (at - first) * (newer - older), (newer - older) / self._period_s
+        # The rate is that of the step before, as the one after is younger than the delay.
+        older, newer = self._seen[int(at) - 1 : int(at) + 1]
+        return newer + (at - int(at)) * (newer - older), (newer - older) / self._period_s

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from datasets_manifest.turbulence import Turbulence
+from datasets_manifest.turbulence import SLOWEST_M_S, Turbulence
 from geometry.se3 import Array
 
 GUST_PERIOD_S = 0.02
@@ -27,8 +27,6 @@ _LOWEST_FT = 10.0
 # Wind at 20 ft above ground, and standard deviation in free air, of light, moderate and severe turbulence.
 _WIND_AT_20_FT_M_S = {"light": 15 * _KNOT_M_S, "moderate": 30 * _KNOT_M_S, "severe": 45 * _KNOT_M_S}
 _FREE_AIR_M_S = {"light": 5 * _FOOT_M, "moderate": 10 * _FOOT_M, "severe": 20 * _FOOT_M}
-# A frozen field needs to be flown through: slower than this it is not one.
-SLOWEST_M_S = 5.0
 
 
 @dataclass(frozen=True)
