@@ -49,11 +49,13 @@ def check_sizes(drawn: DrawnFrames, recipe: Recipe) -> tuple[LawCheck, Array] | 
     """Sizes of the boxes in bins of equal ratio, the first and the last open.
 
     Returns:
-        The check, and the (SIZE_BINS + 1,) edges of the bins [px]; None without a drogue, or where distances are not
-        drawn: at stations and in sequences.
+        The check, and the (SIZE_BINS + 1,) edges of the bins [px]; None without a drogue, with drogues of several
+        sizes, or where distances are not drawn: at stations and in sequences.
     """
     shows, law = np.isfinite(drawn.distances_m), recipe.distance
     if law.law == "stations" or recipe.sequence is not None or not shows.any() or law.low_m == law.high_m:
+        return None
+    if len({variant.drogue.rim_radius_m for variant in recipe.variants}) > 1:
         return None
     assert law.low_m is not None and law.high_m is not None
     sides_px = drawn.sides_px[shows]
@@ -120,6 +122,9 @@ def chi_square(hits: Array, laws: Array) -> LawCheck:
     """
     counts, expected = hits.sum(axis=0), laws.sum(axis=0)
     rare = expected < _FEWEST_EXPECTED
+    if rare.any() and not rare.all() and expected[rare].sum() < _FEWEST_EXPECTED:
+        # Too few even together: with the smallest of the others.
+        rare[np.argmin(np.where(rare, np.inf, expected))] = True
     if rare.any():
         hits = np.column_stack([hits[:, ~rare], hits[:, rare].sum(axis=1)])
         laws = np.column_stack([laws[:, ~rare], laws[:, rare].sum(axis=1)])

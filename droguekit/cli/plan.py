@@ -49,6 +49,8 @@ def plan(
     from droguekit.batch.plan import frame_timeout_s, plan_recipe
     from droguekit.batch.plan_cost import probe_cost
 
+    if workers is not None and (not probe or workers < 1):
+        raise ValueError("--workers: must be at least 1, and goes with the probe; leave it or --no-probe out")
     chosen, _ = open_recipe(recipe, seed, engine)
     planned = plan_recipe(chosen)
     said = [*_counts(chosen, planned), *_distances(chosen, planned), *_laws(chosen, planned)]
@@ -57,7 +59,7 @@ def plan(
         typer.echo(line)
     if probe:
         cost = probe_cost(chosen, planned)
-        costs = list(_cost(cost, default_workers() if workers is None else max(1, workers)))
+        costs = list(_cost(cost, default_workers() if workers is None else workers))
         for line in costs:
             typer.echo(line)
         said += costs

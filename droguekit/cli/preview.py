@@ -19,6 +19,7 @@ EXAMPLES = (
     "droguekit preview data/world --out sheet.jpg --by-family --count 30   (no labels, a row for each family)",
     "droguekit preview data/docking-10m --animate docking.gif --sequence 1   (the flight from the side)",
 )
+_COLUMNS, _TILE_WIDTH_PX = 4, 400
 
 
 def preview(
@@ -28,8 +29,8 @@ def preview(
         int | None,
         typer.Option("--count", help="How many pairs, spread evenly; 20, or 150 of an animation.", show_default=False),
     ] = None,
-    columns: Annotated[int, typer.Option("--columns", help="Tiles in a row, or families side by side.")] = 4,
-    tile_width: Annotated[int, typer.Option("--tile-width", metavar="PX", help="Width of a tile.")] = 400,
+    columns: Annotated[int, typer.Option("--columns", help="Tiles in a row, or families side by side.")] = _COLUMNS,
+    tile_width: Annotated[int, typer.Option("--tile-width", metavar="PX", help="Width of a tile.")] = _TILE_WIDTH_PX,
     by_family: Annotated[
         bool, typer.Option("--by-family", help="A row for each family of conditions, without labels.")
     ] = False,
@@ -47,6 +48,8 @@ def preview(
 
     if (out is None) == (animate is None):
         raise ValueError("--out, --animate: give one of them, a file for a sheet or for an animation")
+    if animate is not None and (by_family or columns != _COLUMNS or tile_width != _TILE_WIDTH_PX):
+        raise ValueError("--by-family, --columns, --tile-width: go with --out; leave them out of an animation")
     if sequence is not None and animate is None:
         raise ValueError("--sequence: goes with --animate; leave it out for a sheet")
     if animate is not None:
