@@ -82,8 +82,8 @@ def write_export(name: str, dataset: Path, out: Path, log: ExportLog) -> list[Pa
         The files or folders to tell the user of.
 
     Raises:
-        ValueError: no such format, a package that it needs is missing, a dataset that cannot be read, or a place that
-            cannot be written into.
+        ValueError: no such format, a package that it needs is missing, a dataset that cannot be read or has no
+            pairs, or a place that cannot be written into.
         OSError: the disk is full or cannot be written; nothing half-written is left.
     """
     if name not in FORMATS:
@@ -98,6 +98,11 @@ def write_export(name: str, dataset: Path, out: Path, log: ExportLog) -> list[Pa
         raise ValueError(f"{name}: {error.name} is missing: pip install 'droguekit[{chosen.extra}]'") from error
     if out.resolve().is_relative_to(dataset.resolve()):
         raise ValueError(f"--out: must lie outside the dataset's folder, got {out}")
+    # Imported here, as the list of formats is also the command's help, which loads nothing that reads a dataset.
+    from datasets_manifest.manifest import read_manifest
+
+    if not read_manifest(dataset).frames:
+        raise ValueError(f"{dataset}: its manifest lists no pairs yet; let `render` finish first")
     try:
         return writer(dataset, out, log)
     finally:

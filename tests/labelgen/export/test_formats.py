@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datasets_manifest.manifest import build_manifest, write_manifest
 from datasets_manifest.png import encode_png
 from labelgen.export.formats import FORMATS, write_export
 from labelgen.export.log import ExportLog
@@ -134,6 +135,15 @@ def test_a_missing_package_is_named_with_its_extra(mixed_dataset, tmp_path, monk
     monkeypatch.delitem(sys.modules, "labelgen.export.parquet", raising=False)
     with pytest.raises(ValueError, match=r"parquet: pyarrow is missing: pip install 'droguekit\[exports\]'"):
         write_export("parquet", mixed_dataset, tmp_path, ExportLog())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_dataset_that_is_still_being_rendered_is_refused(name, small_recipe, tmp_path):
+    dataset = tmp_path / "dataset"
+    dataset.mkdir()
+    write_manifest(dataset, build_manifest(dataset, small_recipe, "1", lambda scene_id: "train"))
+    with pytest.raises(ValueError, match="lists no pairs yet"):
+        write_export(name, dataset, tmp_path / "out", ExportLog())
 
 
 @pytest.mark.parametrize("name", NAMES)
