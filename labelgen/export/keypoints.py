@@ -79,7 +79,7 @@ def equal_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
     """The orders of the markers that a turn of the drogue onto itself makes, beginning with the drogue's own.
 
     Returns:
-        One for each of the `symmetry_order` turns: entry i is the marker that comes to stand where i stood.
+        One for each of the `symmetry_order` turns: entry i is the place, by marker, to which marker i comes.
     """
     layout = marker_layout(drogue)
     places = layout.centers_m[:, :2]
