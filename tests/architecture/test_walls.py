@@ -28,6 +28,7 @@ TRESPASSES = [
     ("blind", "nav/trespass.py", "import datasets_manifest.records"),
     ("blind", "nav/pose/trespass.py", "from datasets_manifest import reader"),
     ("blind", "nav/trespass.py", "import datasets_manifest"),
+    ("training", "nav/pose/trespass.py", "import nav.training"),
     ("no-generator", "nav/trespass.py", "def f():\n    import scenes.seeding"),
     ("no-generator", "droguekit/benchmark/trespass.py", "import labelgen.frame_labels"),
     ("light", "nav/trespass.py", "import drogue_models.meshes"),
