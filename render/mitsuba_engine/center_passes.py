@@ -13,7 +13,7 @@ from datasets_manifest.frame import FrameSpec
 from geometry.stereo import Eye
 from render.mitsuba_engine.camera_rays import CameraRays
 from render.mitsuba_engine.scene import DrogueScene, by_shape
-from render.mitsuba_engine.traced import ASIDE, OF_DROGUE
+from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, slipped_through
 from render.traced import TracedEye, amodal_counts
 
 CENTER = (0.5, 0.5)
@@ -64,16 +64,18 @@ class CenterPasses:
         normal = np.zeros((*self._shape, 3), dtype=np.float32)
         covered = np.flatnonzero(part_id)
         if len(covered):
-            points, normals, leaked = self._surface(covered, CENTER)
+            pose = self._rays.pose_at_middle
+            points, normals = self._surface(covered, CENTER)
+            leaked = slipped_through(part_id.reshape(-1)[covered], normals, points - pose[:, 3])
             for place in ASIDE:
                 if not leaked.any():
                     break
                 again = np.flatnonzero(leaked)
                 aside = covered[again]
-                points[again], normals[again], leaked[again] = self._surface(aside, place)
+                points[again], normals[again] = self._surface(aside, place)
                 ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=place))
                 part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
-            pose = self._rays.pose_at_middle
+                leaked[again] = slipped_through(ids, normals[again], points[again] - pose[:, 3])
             met = part_id.reshape(-1)[covered] > 0
             depth.reshape(-1)[covered[met]] = np.einsum("pi,i->p", points[met] - pose[:, 3], pose[:, 2])
             normal.reshape(-1, 3)[covered[met]] = np.einsum("pi,ij->pj", normals[met], pose[:, :3])
@@ -89,17 +91,12 @@ class CenterPasses:
 
     def _surface(
         self, pixel: NDArray[np.int64], place: tuple[float, float]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """(P, 3) points and normals in the drogue frame, and (P,) which rays slipped into a part through a seam.
-
-        All parts are closed: a surface that looks away from the camera is seen from inside, by a ray that passed
-        exactly between two triangles.
-        """
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(P, 3) points and normals in the drogue frame."""
         ray = self._center_rays(mi.UInt32(pixel), place=place)
         hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-        inside = hit.is_valid() & (dr.dot(hit.n, ray.d) > 0)
-        dr.eval(hit.p, hit.n, inside)
-        return np.array(hit.p).T, np.array(hit.n).T, np.array(inside)
+        dr.eval(hit.p, hit.n)
+        return np.array(hit.p).T, np.array(hit.n).T
 
     def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
         """Pixel centres that each marker and the hub would cover alone, on the image's grid."""

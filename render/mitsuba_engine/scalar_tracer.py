@@ -22,6 +22,7 @@ from render.mitsuba_engine.traced import (
     Plan,
     Traced,
     plan_pixels,
+    slipped_through,
 )
 from render.motion import blur_px, pose_polynomial
 from render.traced import TracedEye, amodal_counts
@@ -188,14 +189,17 @@ class _View:
         """Look again, a little aside, where a ray slipped between two triangles into a closed part."""
         part_id, values = passes
         towards = values[..., 1:4] - pose[:3, 3]
-        for v, u in np.argwhere((part_id > 0) & ((values[..., 4:] * towards).sum(axis=-1) > 0)):
+        for v, u in np.argwhere(slipped_through(part_id, values[..., 4:], towards)):
             for place in ASIDE:
                 ray_px = np.array([u + place[0] - 0.5, v + place[1] - 0.5])
                 direction = pose[:3, :3] @ self._camera.rays(ray_px)
                 direction /= np.linalg.norm(direction)
                 hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(pose[:3, 3].tolist()), mi.Vector3f(direction.tolist())))
-                if hit.is_valid() and np.array(hit.n) @ direction < 0:
-                    part_id[v, u] = int(hit.shape.id().split("_")[1])
+                if not hit.is_valid():
+                    continue
+                part, normal = np.array(int(hit.shape.id().split("_")[1]), dtype=np.uint8), np.array(hit.n)
+                if not slipped_through(part, normal, direction):
+                    part_id[v, u] = part
                     values[v, u, 1:] = [*hit.p, *hit.n]
                     break
 

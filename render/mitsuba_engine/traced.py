@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drogue_models.parts import MAX_MARKERS, SURROUNDING_PARTS, Part, drogue_part_ids
+from drogue_models.parts import MAX_MARKERS, SURROUNDING_PARTS, Part, drogue_part_ids, marker_id
 from geometry.stereo import Eye
 from render.traced import TracedEye, inside_one_part
 
@@ -24,10 +24,29 @@ def _marked(parts: Iterable[int]) -> NDArray[np.uint8]:
 
 
 OF_DROGUE = _marked(drogue_part_ids(MAX_MARKERS))
+_MARKERS = _marked(marker_id(index) for index in range(MAX_MARKERS))
 _DEEP_PARTS = (Part.COUPLING, Part.HUB)
 _DEEP = _marked(_DEEP_PARTS)
 # Whether most of the sky is seen from a part, by its id.
 IN_OPEN = _marked({*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS})
+
+
+def slipped_through(
+    part_id: NDArray[np.uint8], normals: NDArray[np.float32], towards: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Which rays met what no ray can see, having passed exactly between two triangles.
+
+    All parts are closed, so a surface that looks away from the camera is seen from inside. A marker fills its pocket
+    up to the front, so its wall is seen from within the face.
+
+    Args:
+        part_id: (...,) part that each ray met.
+        normals: (..., 3) outward normal there, in the drogue frame.
+        towards: (..., 3) direction of the ray, of any length, in the drogue frame.
+    """
+    inside: NDArray[np.bool_] = (normals * towards).sum(axis=-1) > 0
+    on_wall = (_MARKERS[part_id] > 0) & (normals[..., 2] > -0.5)
+    return (part_id > 0) & (inside | on_wall)
 
 
 @dataclass(frozen=True, eq=False)
