@@ -14,10 +14,11 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from nav.centroids.annulus_edges import fit_annuli
 from nav.centroids.centroid_quality import NoiseModel
+from nav.centroids.disc_rejection import LARGEST_SCALE
 from nav.centroids.edge_model import fit_discs
-from nav.centroids.ellipses import Ellipses, circles, outline_shapes
+from nav.centroids.ellipses import Ellipses, outline_shapes, shape_radii
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
-from nav.centroids.patches import OUTER_DIFFERENCE_PX
+from nav.centroids.patches import OUTER_DIFFERENCE_PX, WHOLE_RADIUS_PX
 from nav.centroids.surroundings import Surroundings
 from nav.channels import PLAIN, balancing_weight
 from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation
@@ -62,7 +63,7 @@ def refine(
     sizes = np.broadcast_to(radius_px * np.eye(2), (layout.count, 2, 2))
     seen = zip(EYES, observation.pixels_px, strict=True)
     rough_px = np.stack([real_places(rig, eye, places, sizes) for eye, places in seen])
-    discs = circles(eyes, rough_px[eyes, index], np.full(len(eyes), radius_px))
+    discs = Ellipses(eyes, rough_px[eyes, index], marker_shapes(rig, layout, rough.left_from_drogue)[eyes, index])
     hubs = [hub for mode in rough.modes for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
     around = _surroundings(layout, index, radius_px / layout.radius_m)
     if around is not None and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
@@ -98,6 +99,28 @@ def _surroundings(layout: MarkerLayout, index: NDArray[np.int64], scale_px_per_m
     if edges_m[1] == 0 or margin_m * scale_px_per_m > _SEEN_PX:
         return None
     return Surroundings(places_m[index], edges_m)
+
+
+def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> Array:
+    """(2, N, 2, 2) shapes of the markers' images: circles of one size, or of large ones the ellipses that a pose shows.
+
+    The near side of a tilted drogue is larger by pixels at 1.7 m. A window from a circle would there end within the
+    blur of the edge, and leave no face to fit its light to.
+    """
+    depth_m = pose.translation_m[2]
+    radius_px = rig.camera.fx_px * layout.radius_m / depth_m
+    even = np.broadcast_to(radius_px * np.eye(2), (len(EYES), layout.count, 2, 2))
+    outlines_m = np.concatenate(
+        [disc_outline(pose, at_m, layout.radius_m, _OUTLINE_POINTS) for at_m in layout.centers_m]
+    )
+    # A rough pose may stand so askew that part of the drogue would be beside or behind the eyes.
+    if radius_px <= WHOLE_RADIUS_PX or outlines_m[:, 2].min() < depth_m / 2:
+        return even
+    points = np.stack([rig.image(outlines_m, eye) for eye in EYES]).reshape(-1, _OUTLINE_POINTS, 2)
+    shapes = outline_shapes(points - points.mean(axis=1, keepdims=True))
+    scale = shape_radii(shapes) / radius_px
+    likely = ((scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE)).reshape(even.shape[:2])
+    return np.where(likely[..., None, None], shapes.reshape(even.shape), even)
 
 
 def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> list[Ellipses]:

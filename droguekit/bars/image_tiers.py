@@ -24,8 +24,8 @@ from droguekit.bars.table import BarRow
 from droguekit.benchmark.result import BenchmarkResult
 
 LIGHTS: tuple[Literal["day", "dusk"], ...] = ("day", "dusk")
-# What must be navigated for the bars: ours with and without hub, and the seed paper's.
-METHODS = (BEST, "joint", "joint-robust", CHAIN, "constant")
+# What must be navigated for the bars: our best method, and the seed paper's.
+METHODS = (BEST, CHAIN)
 
 
 @dataclass(frozen=True)

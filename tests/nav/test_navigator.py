@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -19,6 +20,7 @@ from geometry.stereo import EYES, paper_rig
 from nav.navigator import CENTROID_CHOICES, Navigator
 from nav.pose.interface import NoFixReason
 from nav.pose.tolerances import EXACT, StatedTolerances
+from nav.refinement import marker_shapes
 from nav.runner import method_names, navigate
 from render.engine import load_engine
 from render.sensor import expose
@@ -88,6 +90,31 @@ def test_other_drogues(draw, make_pose, name):
         assert isinstance(estimate, PoseEstimate)
         # The weakest of them, the paper's, misses by 40 mm on average at 10 m with five markers.
         assert np.linalg.norm(estimate.left_from_drogue.translation_m - place.translation_m) < 0.2
+
+
+def test_outlines_of_near_markers_are_those_of_opencv(make_pose):
+    place = make_pose(0.06, -0.03, 1.7, 9, -8, 12)
+    shapes = marker_shapes(RIG, LAYOUT, place)
+    camera, turn = RIG.camera, np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
+    rim = LAYOUT.radius_m * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
+    for side, eye in enumerate(EYES):
+        at = place.translation_m - RIG.eye_offset_m(eye)
+        for index, center in enumerate(LAYOUT.centers_m):
+            points = cv2.projectPoints(center + rim, cv2.Rodrigues(place.rotation)[0], at, matrix, None)[0]
+            _, axes, angle = cv2.fitEllipse(points.astype(np.float32))
+            c, s = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+            basis = np.array([[c, -s], [s, c]])
+            # Points even in space are not quite even on the ellipse: the square of the perspective across a disc, 3 %.
+            np.testing.assert_allclose(shapes[side, index], basis @ np.diag(axes) @ basis.T / 2, atol=0.06)
+    # A circle of one size for all would be off by pixels.
+    assert np.ptp(np.linalg.norm(shapes, axis=(2, 3))) > 3
+
+
+@pytest.mark.parametrize(("z_m", "pitch_deg"), [(0.2, 80), (1.7, 89), (1.7, 90), (40.0, 10)])
+def test_outlines_of_far_markers_and_of_impossible_poses_are_circles(make_pose, z_m, pitch_deg):
+    shapes = marker_shapes(RIG, LAYOUT, make_pose(0, 0, z_m, pitch_deg))
+    np.testing.assert_allclose(shapes, np.broadcast_to(RIG.camera.fx_px * 0.05 / z_m * np.eye(2), shapes.shape))
 
 
 def test_hidden_markers_and_false_discs(draw, make_pose):
