@@ -28,6 +28,8 @@ class Environment(FrozenModel):
         turbidity: Linke-like turbidity of Preetham's model, 2 very clear to 6 hazy.
         visibility_m: meteorological range (2 % contrast), which sets the extinction of the air. [m]
         altitude_m: of the camera above ground. [m]
+        camera_offset_m: east and north of the place about which ground and clouds are laid out; only a sequence flies
+            away from it. [m]
         ground: what lies below; `town` runs out into fields.
         ground_reflectance_rgb: mean diffuse reflectance of the ground, of a coast's land, or of the water under the
             surface of the sea.
@@ -44,6 +46,8 @@ class Environment(FrozenModel):
     turbidity: float = Field(ge=1.9, le=10)
     visibility_m: float = Field(ge=500, le=400_000)
     altitude_m: float = Field(ge=10, le=20_000)
+    # Left out where it says nothing, so that the hashes of single pairs do not know of it.
+    camera_offset_m: tuple[float, float] = Field(default=(0.0, 0.0), exclude_if=lambda offset_m: offset_m == (0.0, 0.0))
     ground: GroundKind = "fields"
     ground_reflectance_rgb: ReflectanceRgb
     ground_texture_seed: int = Field(ge=0)

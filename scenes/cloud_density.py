@@ -24,14 +24,19 @@ _TURN_COSINE, _TURN_SINE = np.float32(np.cos(0.37)), np.float32(np.sin(0.37))
 class CloudDensity:
     """Density of one layer: positive where there is cloud, negative outside.
 
+    Args:
+        layer: its description.
+        offset_m: of the camera, east and north of the place about which the layer is laid out. [m]
+
     Attributes:
         layer: its description.
         extinction_per_m: inside the cloud. [1/m]
         steepness: how fast full density is reached with growing excess.
     """
 
-    def __init__(self, layer: CloudLayer) -> None:
+    def __init__(self, layer: CloudLayer, offset_m: tuple[float, float] = (0.0, 0.0)) -> None:
         self.layer = layer
+        self._east_m, self._north_m = np.float32(offset_m[0]), np.float32(offset_m[1])
         self._threshold = np.float32(ndtri(np.clip(1.0 - layer.cover_fraction, 1e-4, 1.0 - 1e-4)))
         self._sign = np.float32(np.sign(layer.height_above_camera_m))
         base_m = layer.height_above_camera_m - (0.0 if layer.is_above else layer.thickness_m)
@@ -47,7 +52,9 @@ class CloudDensity:
     def excess(self, directions: NDArray[np.float32], distance_m: _Field) -> _Field:
         """(H, W) excess at a distance along each direction."""
         return self._excess(
-            directions[..., 0] * distance_m, directions[..., 1] * distance_m, self._height_m(directions, distance_m)
+            directions[..., 0] * distance_m + self._east_m,
+            directions[..., 1] * distance_m + self._north_m,
+            self._height_m(directions, distance_m),
         )
 
     def crossing(self, rise: _Field) -> tuple[_Field, _Field]:
@@ -73,11 +80,13 @@ class CloudDensity:
     def place(self, directions: NDArray[np.float32], distance_m: _Field) -> NDArray[np.float32]:
         """(H, W, 3) place at a distance along each direction, the third coordinate over the level surface."""
         place = directions * distance_m[..., None]
+        place[..., 0] += self._east_m
+        place[..., 1] += self._north_m
         place[..., 2] = self._height_m(directions, distance_m)
         return place
 
     def excess_at(self, place_m: NDArray[np.float32]) -> _Field:
-        """(H, W) excess at (H, W, 3) places relative to the camera."""
+        """(H, W) excess at (H, W, 3) places."""
         return self._excess(place_m[..., 0], place_m[..., 1], place_m[..., 2])
 
     def _excess(self, x_m: _Field, y_m: _Field, z_m: _Field) -> _Field:
@@ -145,10 +154,13 @@ class CloudDensity:
     def cirrus_depth(self, directions: NDArray[np.float32], distance_m: _Field) -> _Field:
         """(H, W) vertical optical depth of streaks."""
         layer = self.layer
+        size_m = np.float32(layer.feature_size_m)
         per_m = distance_m * np.float32(1.0 / layer.feature_size_m)
-        cosine, sine = np.cos(np.radians(layer.heading_deg)), np.sin(np.radians(layer.heading_deg))
-        along = (directions[..., 0] * np.float32(cosine) + directions[..., 1] * np.float32(sine)) * per_m
-        across = (directions[..., 1] * np.float32(cosine) - directions[..., 0] * np.float32(sine)) * per_m
+        cosine, sine = (np.float32(turn(np.radians(layer.heading_deg))) for turn in (np.cos, np.sin))
+        along = (directions[..., 0] * cosine + directions[..., 1] * sine) * per_m
+        along += (self._east_m * cosine + self._north_m * sine) / size_m
+        across = (directions[..., 1] * cosine - directions[..., 0] * sine) * per_m
+        across += (self._north_m * cosine - self._east_m * sine) / size_m
         seed = layer.texture_seed
         bend = sample_tile(seed + 2, 2.4, along * np.float32(0.35), across * np.float32(0.35))
         streaks = sample_tile(

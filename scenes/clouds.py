@@ -69,7 +69,13 @@ def diffuse_transmission(layer: CloudLayer) -> float:
     return 1.0 - layer.cover_fraction * (1.0 - 1.0 / (1.0 + BACK_SCATTER * layer.optical_depth))
 
 
-def see_cloud(layer: CloudLayer, directions: NDArray[np.float32], light: CloudLight, every: int = 1) -> SeenCloud:
+def see_cloud(
+    layer: CloudLayer,
+    directions: NDArray[np.float32],
+    light: CloudLight,
+    every: int = 1,
+    offset_m: tuple[float, float] = (0.0, 0.0),
+) -> SeenCloud:
     """The layer along (H, W, 3) unit directions in world axes.
 
     Args:
@@ -77,11 +83,12 @@ def see_cloud(layer: CloudLayer, directions: NDArray[np.float32], light: CloudLi
         directions: neighbours in the array must be neighbours in direction if `every` is not 1.
         light: what shines on it.
         every: march every so many rays down and across, and those at edges; the light comes from every ray.
+        offset_m: of the camera, east and north of the place about which the layer is laid out. [m]
     """
+    density = CloudDensity(layer, offset_m)
     if layer.kind == "cirrus":
-        return _see_cirrus(layer, directions, light)
+        return _see_cirrus(density, directions, light)
     rise = directions[..., 2] * np.float32(np.sign(layer.height_above_camera_m))
-    density = CloudDensity(layer)
     met = march(density, directions, light.direction, every)
     place = density.place(directions, met.distance_m)
     # Knobs too fine to march through fray the edges and show in the light.
@@ -173,10 +180,9 @@ def _shade(
     return result
 
 
-def _see_cirrus(layer: CloudLayer, directions: NDArray[np.float32], light: CloudLight) -> SeenCloud:
+def _see_cirrus(density: CloudDensity, directions: NDArray[np.float32], light: CloudLight) -> SeenCloud:
     """Ice cloud without depth: thin enough for light that was scattered once, plus an even share."""
-    rise = directions[..., 2] * np.float32(np.sign(layer.height_above_camera_m))
-    density = CloudDensity(layer)
+    rise = directions[..., 2] * np.float32(np.sign(density.layer.height_above_camera_m))
     near_m, _ = density.crossing(rise)
     depth = density.cirrus_depth(directions, near_m)
     opacity = 1.0 - np.exp(-depth / np.maximum(rise, np.float32(_LOWEST_CIRRUS_RISE)))

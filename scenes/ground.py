@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property, lru_cache
 
 import cv2
@@ -135,11 +136,25 @@ class Ground:
                     continue
                 # One ray more than the block has, so that what lies between them can be interpolated.
                 chosen = tuple(slice(part.start, part.stop + step - 1, step) for part in block)
-                view = ground_view(directions[chosen], self._environment.altitude_m, step * angle_rad)
+                view = self._view(directions[chosen], step * angle_rad)
                 seen = self._block(view, regions[chosen], shapes[chosen])
                 height, width = total[block].shape[:2]
                 total[block] = seen if step == 1 else enlarge(seen, step, (height, width))
         return total
+
+    def seen_from(self, environment: Environment) -> Ground:
+        """The same ground from another place at the same altitude.
+
+        Args:
+            environment: this ground's, with another `camera_offset_m`.
+        """
+        moved = copy(self)
+        moved._environment = environment
+        return moved
+
+    def _view(self, directions: NDArray[np.float32], angle_rad: float) -> GroundView:
+        environment = self._environment
+        return ground_view(directions, environment.altitude_m, angle_rad, environment.camera_offset_m)
 
     @property
     def _mean_radiance(self) -> NDArray[np.float32]:
@@ -148,7 +163,7 @@ class Ground:
 
     def _smooth_fields(self, directions: NDArray[np.float32], every: int, angle_rad: float) -> tuple[Field, Field]:
         """(H, W, 4) regions; (H, W, 3) by how much places are moved, and the share of the beam that the slope takes."""
-        view = ground_view(directions[::every, ::every], self._environment.altitude_m, every * angle_rad)
+        view = self._view(directions[::every, ::every], every * angle_rad)
         x_m, y_m = view.x_m + self._shift_m[0], view.y_m + self._shift_m[1]
         fields = [tile.sample(x_m, y_m, np.sqrt(view.across_m * view.along_m)) for tile in (_regions(), _shapes())]
         fields[1] = np.concatenate([fields[1][..., :2], self._facing(fields[1][..., 2:])[..., None]], axis=-1)

@@ -20,7 +20,7 @@ class GroundView:
     """Pieces of ground seen along rays, all of shape (H, W).
 
     Attributes:
-        x_m, y_m: their middles, east and north of the camera. [m]
+        x_m, y_m: their middles, east and north of the place about which the ground is laid out. [m]
         away_x, away_y: unit vector along the ground, away from the camera.
         sine: of the angle between ray and ground.
         across_m, along_m: their width, and their length away from the camera. [m]
@@ -76,13 +76,16 @@ def pixel_angle_rad(directions: NDArray[np.float32]) -> float:
     return max([float(np.linalg.norm(middle - other)) for other in beside] + [_NARROWEST_RAD])
 
 
-def ground_view(directions: NDArray[np.float32], altitude_m: float, angle_rad: float) -> GroundView:
+def ground_view(
+    directions: NDArray[np.float32], altitude_m: float, angle_rad: float, offset_m: tuple[float, float] = (0.0, 0.0)
+) -> GroundView:
     """The ground along rays; those that miss it see its farthest rim.
 
     Args:
         directions: (H, W, 3) unit vectors in world axes.
         altitude_m: of the camera. [m]
         angle_rad: between neighbouring rays. [rad]
+        offset_m: of the camera, east and north of the place about which the ground is laid out. [m]
     """
     sine = np.maximum(-directions[..., 2], np.float32(altitude_m / FARTHEST_M))
     distance_m = np.float32(altitude_m) / sine
@@ -90,8 +93,8 @@ def ground_view(directions: NDArray[np.float32], altitude_m: float, angle_rad: f
     across_m = distance_m * np.float32(angle_rad)
     stretch = 1.0 / float(sine.mean())
     return GroundView(
-        x_m=directions[..., 0] * distance_m,
-        y_m=directions[..., 1] * distance_m,
+        x_m=directions[..., 0] * distance_m + np.float32(offset_m[0]),
+        y_m=directions[..., 1] * distance_m + np.float32(offset_m[1]),
         away_x=directions[..., 0] / level,
         away_y=directions[..., 1] / level,
         sine=sine,

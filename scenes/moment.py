@@ -16,6 +16,7 @@ class Moment:
         time_s: mid-exposure. [s]
         left_from_drogue, left_from_tanker: poses, or None without a drogue.
         world_from_left: pose.
+        camera_offset_m: east and north, as in `Environment`. [m]
         left_twist_per_s, drogue_twist_per_s: (6,) body twists. [m/s, rad/s]
         hose_nodes_left_m: (K, 3) from the coupling to the pod, or None without a drogue. [m]
     """
@@ -28,3 +29,4 @@ class Moment:
     left_twist_per_s: Array
     drogue_twist_per_s: Array
     hose_nodes_left_m: Array | None
+    camera_offset_m: tuple[float, float] = (0.0, 0.0)

@@ -69,6 +69,8 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     drogue = drogue_of_scene(recipe, scene_id)
     moment = _moment_of_frame(recipe, drogue, frame_index)
     pose = moment.left_from_drogue
+    if moment.sequence_id is not None:
+        environment = environment.model_copy(update={"camera_offset_m": moment.camera_offset_m})
     # What stands beside a sequence stays there all along.
     stands = frame_index if moment.sequence_id is None else moment.sequence_id
     return FrameSpec(

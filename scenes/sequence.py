@@ -139,6 +139,8 @@ class Flight:
         left_from_drogue = left_from_axes @ tanker_from_drogue
         self._check_seen(left_from_drogue, time_s)
         nodes = self._trajectory.nodes_m(time_s)
+        forward_m = np.array([-self._sequence.hose.airspeed_m_s * time_s, 0.0, 0.0])
+        east_m, north_m, _ = (WORLD_FROM_TANKER @ (forward_m + tanker_from_left.translation_m)).tolist()
         pod = RigidTransform(np.eye(3), nodes[0])
         length_s = self._sequence.frames_per_sequence / self._sequence.frame_rate_hz
         return Moment(
@@ -150,6 +152,7 @@ class Flight:
             left_twist_per_s=_twist(self.tanker_from_left, time_s),
             drogue_twist_per_s=_twist(self.tanker_from_drogue, time_s),
             hose_nodes_left_m=left_from_axes.apply(nodes[::-1]),
+            camera_offset_m=(east_m, north_m),
         )
 
     def tanker_from_left(self, time_s: float) -> RigidTransform:

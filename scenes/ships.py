@@ -24,7 +24,7 @@ class Ship:
     """A ship from above: a hull with its bridge aft, and a wake.
 
     Attributes:
-        x_m, y_m: of its middle, east and north of the camera. [m]
+        x_m, y_m: of its middle, east and north of the place about which the sea is laid out. [m]
         heading_rad: from east towards north.
         length_m, width_m: [m]
         hull_rgb: diffuse reflectance of hull and deck.

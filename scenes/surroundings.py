@@ -5,6 +5,7 @@ The same function is the background of the images and, as a map, the light on th
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,18 @@ class Surroundings:
         self.environment = environment
         self.sky = ClearSky(environment)
         self.air = LayeredAir(environment, self.sky)
+
+    def seen_from(self, environment: Environment) -> Surroundings:
+        """The same surroundings from another place: ground and clouds move, the light on things stays that of here.
+
+        Args:
+            environment: the same, with another `camera_offset_m`.
+        """
+        moved = copy(self)
+        moved.environment = environment
+        # Made here, so that it does not matter who asked first.
+        vars(moved).update(ground=self.ground.seen_from(environment), light_map=self.light_map)
+        return moved
 
     def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
         """The parts that vary slowly: clear sky, and endless air at the same azimuth.
@@ -155,7 +168,7 @@ class Surroundings:
         many = directions.shape[0] * directions.shape[1] >= _MANY_RAYS
         every = _CLOUD_STEP_PX if many else 1
         chosen, behind_air = directions[::every, ::every], air[::every, ::every]
-        seen = see_cloud(layer, chosen, self.air.light_on(layer), every)
+        seen = see_cloud(layer, chosen, self.air.light_on(layer), every, self.environment.camera_offset_m)
         clear = np.exp(seen.distance_m * np.float32(-self.environment.extinction_per_m))[..., None]
         light = behind_air + clear * (seen.radiance - behind_air)
         # Light times opacity is interpolated: light where there is no cloud means nothing.
@@ -216,6 +229,10 @@ class MappedSurroundings(Surroundings):
         self._light = load_map(environment.map)
         self._coarse = self._light.shrunk(_LIGHT_MAP_HEIGHT_PX)
 
+    def seen_from(self, environment: Environment) -> Surroundings:
+        """The same: a map has no depth."""
+        return self
+
     def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
         """Coarse radiance, and endless air at the same azimuth; see `Surroundings.clear_radiance`."""
         return self._coarse.radiance(directions), self.airlight(directions)
@@ -272,4 +289,6 @@ def surroundings(environment: Environment) -> Surroundings:
     Raises:
         ValueError: the environment's map cannot be read, or has changed.
     """
-    return _cached(environment.model_dump_json(), environment.map.folder if environment.map is not None else None)
+    still = environment.model_copy(update={"camera_offset_m": (0.0, 0.0)})
+    here = _cached(still.model_dump_json(), environment.map.folder if environment.map is not None else None)
+    return here if environment.camera_offset_m == (0.0, 0.0) else here.seen_from(environment)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from datasets_manifest.manifest import Drop
 from datasets_manifest.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
@@ -22,6 +23,10 @@ _START_S = 300.0
 _S_PER_SAMPLE = 20e-6
 # Shares to within 1 %, and every frame of the corpora that ship; ten seconds.
 _MOST_SAMPLED = 10_000
+# When so many frames fail before any other could be drawn, it is the recipe that fails; so does `render`.
+_FIRST_FRAMES = 3
+# Distance, middle and side of the box, room of its middle.
+_COLUMNS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +34,7 @@ class DrawnFrames:
     """Frames of a recipe as they were drawn; NaN where a frame has no drogue.
 
     Attributes:
-        indices: (N,) of the frames, ascending.
+        indices: (N,) of the frames, ascending, without those that cannot be made.
         scenes: (N,) which scene each belongs to.
         families: (N,) place of its family in the recipe, 0 without families.
         distances_m: (N,) of the rim centre along the optical axis. [m]
@@ -37,6 +42,7 @@ class DrawnFrames:
         sides_px: (N,) side of the square with that box's area. [px]
         rooms_px: (N, 4) lowest and highest u, lowest and highest v, between which the middle of the box may lie so that
             both views hold all of the drogue; NaN also where the place is not drawn. [px]
+        drops: frames that were asked for and cannot be made, and why.
     """
 
     indices: tuple[int, ...]
@@ -46,6 +52,7 @@ class DrawnFrames:
     centers_px: Array
     sides_px: Array
     rooms_px: Array
+    drops: tuple[Drop, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,8 +60,8 @@ class Plan:
     """What a recipe will make.
 
     Attributes:
-        by_split: pairs in each split.
-        by_scene: pairs in each scene.
+        by_split: pairs in each split, with those that turn out to be impossible to make.
+        by_scene: pairs in each scene, likewise.
         by_family: scenes and pairs of each family, in the recipe's order; empty without families.
         drawn: the frames that were drawn.
     """
@@ -69,12 +76,18 @@ class Plan:
         """Share of the drawn frames without a drogue."""
         return float(np.isnan(self.drawn.distances_m).mean())
 
+    @property
+    def dropped_fraction(self) -> float:
+        """Share of the frames that were to be drawn that cannot be made."""
+        drops = len(self.drawn.drops)
+        return drops / (drops + len(self.drawn.indices))
+
 
 def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> Plan:
     """Count the pairs of a recipe, and draw its frames or, of a larger one, so many of them evenly spread.
 
     Raises:
-        ValueError: a pose that cannot be framed.
+        ValueError: none of the first ones can be made.
     """
     by_scene = _pairs_by_scene(recipe)
     by_split: Counter[str] = Counter()
@@ -115,32 +128,51 @@ def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
     """Distances, boxes and places of frames.
 
     Raises:
-        ValueError: a pose that cannot be framed.
+        ValueError: none of the first ones can be made.
     """
-    scenes = np.array([scene_of_frame(recipe, frame_index) for frame_index in indices])
     places = {family.name: place for place, family in enumerate(recipe.families)}
     known: dict[int, tuple[int, DrogueParameters, bool]] = {}
-    for scene_id in map(int, np.unique(scenes)):
-        own = recipe_of_scene(recipe, scene_id)
-        is_placed = not own.pose.on_axis and recipe.sequence is None
-        known[scene_id] = places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
-    rows = np.full((len(indices), 8), np.nan)
-    for row, frame_index, scene_id in zip(rows, indices, map(int, scenes), strict=True):
-        pose = sample_left_from_drogue(recipe, frame_index)
-        if pose is None:
+    drawn, scenes, rows, drops = list[int](), list[int](), list[Array](), list[Drop]()
+    for frame_index in indices:
+        scene_id = scene_of_frame(recipe, frame_index)
+        try:
+            if scene_id not in known:
+                own = recipe_of_scene(recipe, scene_id)
+                is_placed = not own.pose.on_axis and recipe.sequence is None
+                known[scene_id] = places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
+            row = _row(recipe, frame_index, *known[scene_id][1:])
+        except ValueError as error:
+            drops.append(Drop(frame_index=frame_index, reason=" ".join(str(error).split())))
+            if not drawn and len(drops) >= min(_FIRST_FRAMES, len(indices)):
+                raise
             continue
-        _, drogue, is_placed = known[scene_id]
-        center_px, side_px, room_px = _box(drogue, recipe.rig, pose)
-        row[:] = pose.translation_m[2], *center_px, side_px, *(room_px if is_placed else np.full(4, np.nan))
+        drawn.append(frame_index)
+        scenes.append(scene_id)
+        rows.append(row)
+    values = np.array(rows).reshape(-1, _COLUMNS)
     return DrawnFrames(
-        indices=indices,
-        scenes=scenes,
-        families=np.array([known[int(scene_id)][0] for scene_id in scenes]),
-        distances_m=rows[:, 0],
-        centers_px=rows[:, 1:3],
-        sides_px=rows[:, 3],
-        rooms_px=rows[:, 4:],
+        indices=tuple(drawn),
+        scenes=np.array(scenes, dtype=np.int64),
+        families=np.array([known[scene_id][0] for scene_id in scenes], dtype=np.int64),
+        distances_m=values[:, 0],
+        centers_px=values[:, 1:3],
+        sides_px=values[:, 3],
+        rooms_px=values[:, 4:],
+        drops=tuple(drops),
     )
+
+
+def _row(recipe: Recipe, frame_index: int, drogue: DrogueParameters, is_placed: bool) -> Array:
+    """(_COLUMNS,) distance [m], middle and side of the box, and room of its middle [px].
+
+    Raises:
+        ValueError: a pose that cannot be framed.
+    """
+    pose = sample_left_from_drogue(recipe, frame_index)
+    if pose is None:
+        return np.full(_COLUMNS, np.nan)
+    center_px, side_px, room_px = _box(drogue, recipe.rig, pose)
+    return np.array([pose.translation_m[2], *center_px, side_px, *(room_px if is_placed else np.full(4, np.nan))])
 
 
 def _box(drogue: DrogueParameters, rig: StereoRig, pose: RigidTransform) -> tuple[Array, float, Array]:

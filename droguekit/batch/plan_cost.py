@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import math
-import time
-from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import nnls
 
+from datasets_manifest.manifest import Drop
 from datasets_manifest.recipe import Recipe
 from droguekit.batch.frame_task import FrameReport
-from droguekit.batch.measure import measure_frames
 from droguekit.batch.plan import DrawnFrames, Plan
+from droguekit.batch.plan_probe import Probe, choose_frames, cpu_s, probe
 from droguekit.batch.workers import Limits
 from geometry.se3 import Array
+from scenes.sampler import scene_of_frame
 
-# Three cannot tell the law from the differences between scenes; more than a dozen hardly better the mean.
-_FEWEST_PROBES, _MOST_PROBES = 3, 12
+# Of the law: constant, inverse and inverse square of the distance.
+_TERMS = 3
 # In which the environment of a scene is made; every process does it once for each of its scenes.
 _SCENE_STAGE = "sample"
 
@@ -31,112 +30,108 @@ class Cost:
 
     Attributes:
         probed: the measured frames by index.
+        drops: frames that were to be measured and cannot be made, and why.
         start_s: until a worker process is ready for its first frame. [s]
-        scene_s: for a process to make the environment of a scene. [s]
+        scene_s: for a process to make the environment of a scene, or to fly a sequence. [s]
         frames_s: for all pairs, their environments at hand. [s]
+        error_s: standard error of `frames_s`. [s]
         wall_over_cpu: how long a second of a processor took: 1 on an idle machine, more where others work too, or where
             the engine waits for another device.
         size_bytes: of all pairs on disk, without the records.
-        count, scenes: of the recipe.
+        count, scenes, sequences: of the recipe; 0 sequences where pairs are single.
     """
 
     probed: dict[int, FrameReport]
+    drops: tuple[Drop, ...]
     start_s: float
     scene_s: float
     frames_s: float
+    error_s: float
     wall_over_cpu: float
     size_bytes: float
     count: int
     scenes: int
+    sequences: int
+
+    def work_s(self, workers: int) -> float:
+        """Processor time of all frames of a run, without the starts of its processes. [s]"""
+        processes, workers = self._processes(workers), max(1, min(workers, self.count))
+        # Pairs go through the scenes in turn, and so does every process; sequences come one after the other.
+        visits = processes * self.scenes if self.sequences == 0 else self.sequences * workers + processes - workers
+        return min(self.count, visits) * self.scene_s + self.frames_s
 
     def run_s(self, workers: int) -> float:
         """Time of a run in which every worker has a core to itself. [s]"""
-        workers = max(1, min(workers, self.count))
-        processes = max(workers, math.ceil(self.count / Limits().tasks_per_process))
-        visits = min(self.count, processes * self.scenes)
-        return (processes * self.start_s + visits * self.scene_s + self.frames_s) / workers
+        return (self._processes(workers) * self.start_s + self.work_s(workers)) / max(1, min(workers, self.count))
+
+    def _processes(self, workers: int) -> int:
+        return max(1, min(workers, self.count), math.ceil(self.count / Limits().tasks_per_process))
 
 
 def probe_cost(recipe: Recipe, plan: Plan) -> Cost:
     """Render a few frames, spread over distances and families, and reckon from them.
 
     Raises:
-        ValueError: the engine cannot be used, or a frame cannot be made.
+        ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the temporary folder cannot be written.
     """
-    chosen = probe_frames(plan.drawn, recipe.frames.count)
-    began_s = time.monotonic()
-    reports = dict(zip(chosen, measure_frames(recipe, chosen), strict=True))
-    whole_s = time.monotonic() - began_s
-    walls_s = [report.wall_s for report in reports.values()]
-    wall_over_cpu = max(1.0, sum(walls_s) / sum(sum(report.stage_s.values()) for report in reports.values()))
-    share = recipe.frames.count / len(plan.drawn.indices)
-
-    def total(value: Callable[[FrameReport], float]) -> float:
-        values = [value(report) for report in reports.values()]
-        at_m = [math.nan if report.distance_m is None else report.distance_m for report in reports.values()]
-        return share * float(fit_over_distance(at_m, values, plan.drawn.distances_m).sum())
-
+    probed = probe(recipe, choose_frames(plan.drawn, recipe.frames.count))
+    reports = list(probed.counted.values())
+    every = [*probed.warm_up.values(), *reports, probed.repeated]
+    count = recipe.frames.count * (1 - plan.dropped_fraction)
+    law = _Law(plan.drawn, probed.counted)
+    frames_s, error_s = law.total([cpu_s(report) - report.stage_s.get(_SCENE_STAGE, 0.0) for report in reports], count)
     return Cost(
-        probed=reports,
-        # The first frame is made once more before all others.
-        start_s=max(0.0, whole_s - sum(walls_s) - walls_s[0]) / wall_over_cpu,
-        scene_s=_scene_s(plan.drawn, reports),
-        frames_s=total(lambda report: sum(report.stage_s.values()) - report.stage_s.get(_SCENE_STAGE, 0.0)),
-        wall_over_cpu=wall_over_cpu,
-        size_bytes=total(lambda report: report.size_bytes),
+        probed=probed.counted,
+        drops=probed.drops,
+        start_s=probed.start_cpu_s,
+        scene_s=_scene_s(recipe, probed),
+        frames_s=frames_s,
+        error_s=error_s,
+        wall_over_cpu=max(1.0, sum(report.wall_s for report in every) / sum(cpu_s(report) for report in every)),
+        size_bytes=law.total([report.size_bytes for report in reports], count)[0],
         count=recipe.frames.count,
         scenes=recipe.frames.scenes,
+        sequences=0 if recipe.sequence is None else -(-recipe.frames.count // recipe.sequence.frames_per_sequence),
     )
 
 
-def probe_frames(drawn: DrawnFrames, count: int) -> tuple[int, ...]:
-    """Which frames to measure: one from each of several strata of distance, one without a drogue if there are any.
+class _Law:
+    """How measured values go with the distance, each family of frames counting by its share of the recipe."""
 
-    Nearest and farthest are among them. Within a stratum the family, and then the scene, that has had the fewest comes
-    first.
+    def __init__(self, drawn: DrawnFrames, reports: dict[int, FrameReport]) -> None:
+        rows = [drawn.indices.index(frame_index) for frame_index in reports]
+        self._measured_m, self._drawn_m = drawn.distances_m[rows], drawn.distances_m
+        shares, probes = np.bincount(drawn.families), np.bincount(drawn.families[rows])
+        # Those without a drogue are few and of one family by chance; their law is a constant of their own.
+        self._weights = np.where(
+            np.isnan(self._measured_m), 1.0, (shares / np.maximum(probes, 1))[drawn.families[rows]]
+        )
 
-    Args:
-        drawn: of the recipe.
-        count: of all its pairs.
-    """
-    shows = np.flatnonzero(np.isfinite(drawn.distances_m))
-    order = shows[np.argsort(drawn.distances_m[shows], kind="stable")]
-    strata = np.array_split(order, min(_MOST_PROBES, max(_FEWEST_PROBES, math.isqrt(count)), max(1, len(order))))
-    families, scenes, chosen = Counter[int](), Counter[int](), list[int]()
-
-    def take(place: int) -> None:
-        families[int(drawn.families[place])] += 1
-        scenes[int(drawn.scenes[place])] += 1
-        chosen.append(drawn.indices[place])
-
-    # The farthest first: it is made twice, and is the cheapest.
-    ends = [order[[-1]], *strata[1:-1], order[[0]]] if len(strata) > 1 else strata
-    for stratum in ends:
-        if len(stratum):
-            rarity = [(families[int(drawn.families[p])], scenes[int(drawn.scenes[p])]) for p in stratum]
-            middle = [abs(k - len(stratum) // 2) for k in range(len(stratum))]
-            take(int(stratum[min(range(len(stratum)), key=lambda k: (*rarity[k], middle[k]))]))
-    empty = np.flatnonzero(np.isnan(drawn.distances_m))
-    if len(empty):
-        take(int(empty[0]))
-    return tuple(chosen)
+    def total(self, values: ArrayLike, count: float) -> tuple[float, float]:
+        """Sum over all pairs, and its standard error by how the measured values scatter about the law."""
+        measured = np.asarray(values, dtype=np.float64)
+        fitted = fit_over_distance(self._measured_m, measured, self._drawn_m, self._weights)
+        left = measured - fit_over_distance(self._measured_m, measured, self._measured_m, self._weights)
+        shows = np.isfinite(self._measured_m)
+        n, share = int(shows.sum()), float(np.isfinite(self._drawn_m).mean())
+        error = math.sqrt(float(np.square(left[shows]).sum()) / max(n - _TERMS, 1) / max(n, 1)) * share
+        return count * float(fitted.mean()), count * error
 
 
-def _scene_s(drawn: DrawnFrames, reports: dict[int, FrameReport]) -> float:
-    """What a scene's first frame takes more than its later ones. [s]"""
-    scene_of = dict(zip(drawn.indices, map(int, drawn.scenes), strict=True))
-    times_s = {index: report.stage_s.get(_SCENE_STAGE, 0.0) for index, report in reports.items()}
-    again = next(iter(times_s))
-    known, first_s = {scene_of[again]}, list[float]()
-    for index, seconds in times_s.items():
-        if scene_of[index] not in known:
-            first_s.append(seconds - times_s[again])
-        known.add(scene_of[index])
-    return max(0.0, float(np.mean(first_s))) if first_s else 0.0
+def _scene_s(recipe: Recipe, probed: Probe) -> float:
+    """What the first frame of a scene, or of a sequence, takes more than its later ones. [s]"""
+    first_s: dict[int, float] = {}
+    for frame_index, report in (probed.warm_up | probed.counted).items():
+        length = None if recipe.sequence is None else recipe.sequence.frames_per_sequence
+        unit = scene_of_frame(recipe, frame_index) if length is None else frame_index // length
+        first_s.setdefault(unit, report.stage_s.get(_SCENE_STAGE, 0.0))
+    # Tables that serve all scenes are made in the first frame of all.
+    later_s = list(first_s.values())[1:] or list(first_s.values())
+    return max(0.0, float(np.mean(later_s)) - probed.repeated.stage_s.get(_SCENE_STAGE, 0.0))
 
 
-def fit_over_distance(distance_m: ArrayLike, values: ArrayLike, at_m: ArrayLike) -> Array:
+def fit_over_distance(distance_m: ArrayLike, values: ArrayLike, at_m: ArrayLike, weights: ArrayLike = 1.0) -> Array:
     """The law `a + b / distance + c / distance^2` that fits given values best, at other distances.
 
     The drogue's area in the image goes with the inverse square of its distance, and its outline with the inverse.
@@ -146,11 +141,13 @@ def fit_over_distance(distance_m: ArrayLike, values: ArrayLike, at_m: ArrayLike)
         distance_m: (N,) of the given values, NaN without a drogue. [m]
         values: (N,) given.
         at_m: (M,) where the law is wanted, NaN without a drogue. [m]
+        weights: (N,) how much each value counts.
 
     Returns:
         (M,) values of the law.
     """
-    terms, _ = nnls(_terms(distance_m), np.asarray(values, dtype=np.float64))
+    root = np.sqrt(np.broadcast_to(weights, np.shape(values)))
+    terms, _ = nnls(_terms(distance_m) * root[:, None], np.asarray(values, dtype=np.float64) * root)
     result: Array = _terms(at_m) @ terms
     return result
 

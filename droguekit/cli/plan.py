@@ -13,8 +13,9 @@ from droguekit.cli.arguments import EngineOption, RecipeArgument, SeedOption, Wo
 from droguekit.cli.pipelines import open_recipe
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
+    from datasets_manifest.manifest import Drop
     from datasets_manifest.recipe import Recipe
     from droguekit.batch.plan import Plan
     from droguekit.batch.plan_cost import Cost
@@ -84,6 +85,19 @@ def _counts(recipe: Recipe, planned: Plan) -> Iterator[str]:
     more = f" and {len(scenes) - _MOST_LINES} more" if len(scenes) > _MOST_LINES else ""
     yield f"by scene: {shown}{more}"
     yield f"without a drogue: {100 * planned.empty_fraction:.1f} %"
+    yield from _drops(recipe, planned.drawn.drops, planned.dropped_fraction)
+
+
+def _drops(recipe: Recipe, drops: Sequence[Drop], fraction: float) -> Iterator[str]:
+    if not drops:
+        return
+    drawn = round(len(drops) / fraction)
+    of = "" if drawn == recipe.frames.count else f" of {drawn} that were drawn"
+    yield f"cannot be made, and will be missing: {len(drops)} pairs{of}, {100 * fraction:.1f} %"
+    for drop in drops[:_MOST_LINES]:
+        yield f"  frame {drop.frame_index}: {drop.reason}"
+    if len(drops) > _MOST_LINES:
+        yield f"  and {len(drops) - _MOST_LINES} more"
 
 
 def _distances(recipe: Recipe, planned: Plan) -> Iterator[str]:
@@ -101,7 +115,7 @@ def _distances(recipe: Recipe, planned: Plan) -> Iterator[str]:
         edges = np.geomspace(distances.min(), max(distances.max(), distances.min() * 1.001), _HISTOGRAM_BINS + 1)
         counts = np.histogram(distances, edges)[0]
         names = [f"{low:6.2f} - {high:6.2f} m" for low, high in pairwise(edges)]
-    count = len(planned.drawn.indices)
+    count = len(planned.drawn.indices) + len(planned.drawn.drops)
     yield f"distance of the rim centre{'' if count == recipe.frames.count else f', of {count} drawn frames'}:"
     for name, pairs in zip(names, counts, strict=True):
         yield f"  {name} {pairs:6d} {'#' * round(_BAR_LENGTH * pairs / max(counts.max(), 1))}".rstrip()
@@ -138,17 +152,24 @@ def _verdict(check: LawCheck) -> str:
 
 
 def _cost(cost: Cost, workers: int) -> Iterator[str]:
-    yield "measured, with one worker:"
+    from droguekit.batch.plan_probe import cpu_s
+
+    yield "measured, with one worker, once it was warm:"
     for frame_index, report in cost.probed.items():
         where = "no drogue" if report.distance_m is None else f"{report.distance_m:.2f} m"
-        cpu_s = sum(report.stage_s.values())
-        yield f"  frame {frame_index} ({where}): {cpu_s:.2f} s of processor time, {human_size(report.size_bytes)}"
-    yield f"a worker needs {cost.start_s:.1f} s to start, and {cost.scene_s:.2f} s more for each scene it meets"
-    run_s = cost.run_s(workers)
+        size = human_size(report.size_bytes)
+        yield f"  frame {frame_index} ({where}): {cpu_s(report):.2f} s of processor time, {size}"
+    for drop in cost.drops:
+        yield f"  frame {drop.frame_index} cannot be made, and will be missing: {drop.reason}"
+    kind = "sequence" if cost.sequences else "scene"
+    yield f"a worker needs {cost.start_s:.1f} s to start, and {cost.scene_s:.2f} s more for each {kind} it meets"
+    work_s, run_s = cost.work_s(workers), cost.run_s(workers)
+    scatter = f"give or take {100 * cost.error_s / work_s:.0f} % by how the measured ones scatter"
+    yield f"all pairs: {duration(work_s)} of processor time, {scatter}"
     size = human_size(cost.size_bytes)
     yield f"all: about {duration(run_s)} with {workers} workers that have a core each, {size} without the records"
     if cost.wall_over_cpu > _BUSY:
         yield (
-            f"the machine is busy: a second of work took {cost.wall_over_cpu:.1f} s; if it stays so, the run takes "
-            f"about {duration(run_s * cost.wall_over_cpu)}"
+            f"the machine is busy: a second of work took {cost.wall_over_cpu:.1f} s, and work may cost a quarter "
+            f"more than on an idle one; if it stays so, the run takes about {duration(run_s * cost.wall_over_cpu)}"
         )

@@ -98,6 +98,51 @@ def test_places_that_are_not_drawn_have_no_room() -> None:
     assert np.isfinite(drawn.centers_px).any()
 
 
+SWINGING = """
+name = "swinging"
+[frames]
+count = 20
+[exposure]
+time_s = 0.002
+[sequence]
+frames_per_sequence = 20
+frame_rate_hz = 5
+hose = {{ preset = "small-uav", airspeed_m_s = {airspeed_m_s} }}
+turbulence = "none"
+release_m = [3.0, 0.0, 1.0]
+[sequence.receiver]
+manoeuvres = ["station"]
+start_m = 4.0
+[sequence.receiver.follower]
+bandwidth_hz = 0
+"""
+
+
+def test_a_pair_that_cannot_be_made_is_a_drop_with_its_reason_and_the_others_are_drawn() -> None:
+    # Let go above the wind, the drogue swings, and shows its side to the receiver once or twice.
+    recipe = parse_recipe(SWINGING.format(airspeed_m_s=4))
+    reasons = {}
+    for index in range(20):
+        try:
+            sample_frame(recipe, index)
+        except ValueError as error:
+            reasons[index] = str(error)
+    assert 0 < len(reasons) < 18
+    plan = plan_recipe(recipe)
+    drawn = plan.drawn
+    assert {drop.frame_index: drop.reason for drop in drawn.drops} == reasons
+    assert drawn.indices == tuple(index for index in range(20) if index not in reasons)
+    assert len(drawn.distances_m) == len(drawn.scenes) == len(drawn.families) == len(drawn.indices)
+    assert plan.empty_fraction == 0
+
+
+def test_a_recipe_of_which_no_pair_can_be_made_is_refused() -> None:
+    # In still air the hose hangs straight down, and so the receiver looks at the drogue from the side.
+    hanging = SWINGING.format(airspeed_m_s=0).replace("release_m", "# release_m")
+    with pytest.raises(ValueError, match=r"sequence 0: leaves the visible volume at 0\.40 s"):
+        plan_recipe(parse_recipe(hanging))
+
+
 def test_a_large_recipe_is_drawn_in_part_but_counted_in_full() -> None:
     plan = plan_recipe(planned(count="1000003"), most_sampled=50)
     assert sum(plan.by_scene.values()) == 1_000_003

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from datasets_manifest.recipe import parse_recipe
 from droguekit.batch.plan import plan_recipe
-from droguekit.batch.plan_cost import Cost, fit_over_distance, probe_cost, probe_frames
+from droguekit.batch.plan_cost import Cost, fit_over_distance, probe_cost
+from droguekit.batch.plan_probe import choose_frames
+from droguekit.batch.workers import Limits
 
 RECIPE = """
 name = "spread"
@@ -42,10 +47,18 @@ def test_the_fit_never_says_less_than_nothing() -> None:
     assert (fitted >= 0).all()
 
 
+def test_weighted_values_pull_the_fit() -> None:
+    # Two values at one distance: the fit there is their weighted mean.
+    at_m = np.full(2, 5.0)
+    fitted = fit_over_distance(at_m, np.array([1.0, 4.0]), at_m, np.array([2.0, 1.0]))
+    np.testing.assert_allclose(fitted, 2.0, rtol=1e-9)  # float64 least squares
+
+
 def test_probed_frames_are_spread_over_distances_families_and_scenes() -> None:
     recipe = parse_recipe(RECIPE)
     drawn = plan_recipe(recipe).drawn
-    chosen = probe_frames(drawn, 200)
+    order = choose_frames(drawn, 200)
+    chosen = order.counted
     assert len(chosen) == len(set(chosen)) == 13
     distances = drawn.distances_m[list(chosen)]
     shown = distances[np.isfinite(distances)]
@@ -58,48 +71,93 @@ def test_probed_frames_are_spread_over_distances_families_and_scenes() -> None:
     assert len(set(drawn.scenes[list(chosen)])) == 10
 
 
+def test_as_many_other_frames_of_all_distances_and_families_come_first() -> None:
+    drawn = plan_recipe(parse_recipe(RECIPE)).drawn
+    order = choose_frames(drawn, 200)
+    assert len(set(order.warm_up)) == 12
+    assert not set(order.warm_up) & set(order.counted)
+    assert np.bincount(drawn.families[list(order.warm_up)]).min() >= 5
+    distances = drawn.distances_m[list(order.warm_up)]
+    # The first and the last of twelve strata of 2 to 40 m.
+    assert distances.min() < 3 and distances.max() > 25
+
+
 def test_few_frames_are_probed_where_there_are_few() -> None:
     drawn = plan_recipe(parse_recipe(RECIPE.replace("count = 200", "count = 2").replace("= 0.2", "= 0.0"))).drawn
-    assert sorted(probe_frames(drawn, 2)) == [0, 1]
+    order = choose_frames(drawn, 2)
+    assert sorted(order.counted) == [0, 1]
+    assert len(order.warm_up) == 1
 
 
 def test_only_empty_frames_are_probed_where_there_are_no_others() -> None:
     drawn = plan_recipe(parse_recipe(RECIPE.replace("empty_fraction = 0.2", "empty_fraction = 1.0"))).drawn
-    assert len(probe_frames(drawn, 200)) == 1
+    assert len(choose_frames(drawn, 200).counted) == 1
 
 
-def test_time_counts_starts_and_scenes_of_every_process() -> None:
-    cost = Cost(
+def cost(count: int, scenes: int, sequences: int = 0) -> Cost:
+    return Cost(
         probed={},
+        drops=(),
         start_s=10.0,
         scene_s=0.5,
         frames_s=1000.0,
+        error_s=50.0,
         wall_over_cpu=1.5,
         size_bytes=0.0,
-        count=1000,
-        scenes=60,
+        count=count,
+        scenes=scenes,
+        sequences=sequences,
     )
-    # A process makes 200 pairs: five processes, each of which meets 60 scenes.
-    assert cost.run_s(2) == (5 * 10 + 5 * 60 * 0.5 + 1000) / 2
-    # Each of twenty processes makes 50 pairs, so that no more than 1000 scenes are met.
-    assert cost.run_s(20) == (20 * 10 + 1000 * 0.5 + 1000) / 20
+
+
+def test_time_counts_starts_and_scenes_of_every_process() -> None:
+    # Five processes, each of which meets 60 scenes.
+    count = 5 * Limits().tasks_per_process
+    assert cost(count, 60).work_s(2) == 5 * 60 * 0.5 + 1000
+    assert cost(count, 60).run_s(2) == (5 * 10 + 5 * 60 * 0.5 + 1000) / 2
+    # With twenty workers a hundred pairs are five for each, so that no more than a hundred scenes are met.
+    assert cost(100, 60).run_s(20) == (20 * 10 + 100 * 0.5 + 1000) / 20
+
+
+def test_every_worker_flies_every_sequence_once_and_a_new_process_the_one_it_comes_to() -> None:
+    count = 5 * Limits().tasks_per_process
+    assert cost(count, 1, sequences=4).work_s(2) == (4 * 2 + 5 - 2) * 0.5 + 1000
+    assert cost(24, 1, sequences=1).work_s(1) == 0.5 + 1000
 
 
 def test_the_probe_reckons_from_what_it_measures(analytic_recipe: str) -> None:
     recipe = parse_recipe(analytic_recipe)
     plan = plan_recipe(recipe)
-    cost = probe_cost(recipe, plan)
+    found = probe_cost(recipe, plan)
     order = np.argsort(plan.drawn.distances_m)
-    assert {order[0], order[-1]} < set(cost.probed)
-    assert len(cost.probed) == 3
-    sizes = [report.size_bytes for report in cost.probed.values()]
+    assert {order[0], order[-1]} < set(found.probed)
+    assert len(found.probed) == 3
+    sizes = [report.size_bytes for report in found.probed.values()]
     # All pairs lie between the nearest and the farthest, and the fit goes through or between the measured sizes.
-    assert 8 * min(sizes) * 0.8 <= cost.size_bytes <= 8 * max(sizes) * 1.2
-    slowest_s = max(sum(report.stage_s.values()) for report in cost.probed.values())
-    assert 0 < cost.frames_s <= 8 * slowest_s * 1.2
+    assert 8 * min(sizes) * 0.8 <= found.size_bytes <= 8 * max(sizes) * 1.2
+    slowest_s = max(sum(report.stage_s.values()) for report in found.probed.values())
+    assert 0 < found.frames_s <= 8 * slowest_s * 1.2
+    assert found.start_s > 0
+    assert found.drops == ()
+
+
+def test_a_frame_that_the_engine_refuses_is_a_drop_of_the_probe(
+    quick_recipe: str, troubled: Callable[..., Path]
+) -> None:
+    recipe = parse_recipe(quick_recipe)
+    plan = plan_recipe(recipe)
+    order = choose_frames(plan.drawn, 8)
+    troubled(refuse=[order.warm_up[0], order.counted[1]])
+    found = probe_cost(recipe, plan)
+    assert [drop.frame_index for drop in found.drops] == [order.warm_up[0], order.counted[1]]
+    assert found.drops[0].reason == f"frame {order.warm_up[0]} is beyond me"
+    assert tuple(found.probed) == (order.counted[0], order.counted[2])
+    troubled(refuse=list(range(8)))
+    with pytest.raises(ValueError, match=r"none of 3 can be made, the last because: frame \d is beyond me"):
+        probe_cost(recipe, plan)
 
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_no_more_workers_than_pairs_share_the_time(workers: int) -> None:
-    cost = Cost({}, 1.0, 0.0, 10.0, 1.0, 0.0, count=workers, scenes=1)
-    assert cost.run_s(100) == cost.run_s(workers)
+    few = cost(workers, 1)
+    assert few.run_s(100) == few.run_s(workers)

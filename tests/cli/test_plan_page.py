@@ -77,6 +77,39 @@ def test_without_drogues_there_are_no_boxes(tmp_path: Path) -> None:
     assert pictures(page_of(tmp_path, empty=1.0, **LOG)) == []
 
 
+def test_pairs_that_cannot_be_made_are_listed_with_their_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "swinging.toml"
+    # Let go above the wind, the drogue swings, and shows its side to the receiver once or twice.
+    recipe.write_text(
+        """
+name = "swinging"
+[frames]
+count = 20
+[exposure]
+time_s = 0.002
+[sequence]
+frames_per_sequence = 20
+frame_rate_hz = 5
+hose = { preset = "small-uav", airspeed_m_s = 4 }
+turbulence = "none"
+release_m = [3.0, 0.0, 1.0]
+[sequence.receiver]
+manoeuvres = ["station"]
+start_m = 4.0
+[sequence.receiver.follower]
+bandwidth_hz = 0
+""",
+        encoding="utf-8",
+    )
+    assert run(["plan", str(recipe), "--no-probe", "--html", str(tmp_path / "plan.html")]) == DONE
+    shown = capsys.readouterr().out
+    dropped = re.findall(r"^  frame (\d+): sequence 0: leaves the visible volume at", shown, re.MULTILINE)
+    assert f"cannot be made, and will be missing: {len(dropped)} pairs, {5 * len(dropped):.1f} %" in shown
+    assert len(pictures((tmp_path / "plan.html").read_text(encoding="utf-8"))) == 3
+
+
 def test_a_page_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert run(["plan", "smoke", "--no-probe", "--html", str(tmp_path / "file" / "plan.html")]) == WRONG_INPUT

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe import load_recipe, parse_recipe
-from datasets_manifest.sequence_ranges import CLOSURE_ACCELERATION_M_S2, Follower, Receiver
+from datasets_manifest.sequence_ranges import CLOSURE_ACCELERATION_M_S2, Follower, Receiver, SequenceRanges
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.se3 import exp_twist, log_twist
@@ -17,6 +17,8 @@ from scenes.receiver import Guidance, run_m, wanted_places
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scene
 from scenes.sequence import _flight
 from scenes.suspension import WORLD_FROM_TANKER
+from scenes.trajectory import Surroundings, simulate
+from scenes.turbulence import GUST_PERIOD_S
 
 BASE = """
 name = "sequence-test"
@@ -175,6 +177,34 @@ def test_bow_wave_of_a_half_body():
     # A stream of V against it comes to rest at the tip, half a radius ahead.
     tip = np.array([[[-0.25]], [[0.0]], [[0.0]]])
     assert bow_wave(tip, source, 120.0, 0.5)[0, 0, 0] == pytest.approx(-120.0)
+
+
+@pytest.mark.parametrize(("radius_m", "beside_and_behind_m", "abeam_m"), [(0.5, 0.19, 0.34), (0.15, 0.02, 0.05)])
+def test_a_nose_pushes_the_drogue_away(radius_m, beside_and_behind_m, abeam_m):
+    """A nose 0.9 m to the left of the hanging drogue: as far behind it, as that of a receiver, or level with it."""
+    hose = SequenceRanges(frames_per_sequence=1, receiver=Receiver(manoeuvres=("station",))).hose
+    samples = round(18 / GUST_PERIOD_S)
+    # Comes in from the side within eight seconds, so that the hose hardly swings.
+    inwards_m = 8 * np.clip(1 - np.arange(samples) * GUST_PERIOD_S / 8, 0, 1)
+    for behind_m, pushed_m in ((0.9, beside_and_behind_m), (0.0, abeam_m)):
+        way = simulate_beside(hose, radius_m, inwards_m, np.array([behind_m, -0.9, 0.0]))
+        # Mean over a period of the free swing, from where the drogue hangs. Pushes are known to the centimetre.
+        assert (way[-round(3.9 / GUST_PERIOD_S) :, 1] - way[0, 1]).mean() == pytest.approx(pushed_m, abs=0.008)
+
+
+def simulate_beside(hose, radius_m, inwards_m, source_m):
+    """(T, 3) way of a drogue beside a source that comes in from the left to its place about the hanging drogue."""
+    from_drogue = np.zeros((len(inwards_m), 3, 1))
+    from_drogue[:, 1, 0] = -inwards_m
+    around = Surroundings(
+        gusts_m_s=np.zeros_like(from_drogue),
+        pod_m=lambda times: np.zeros((len(times), 3)),
+        from_drogue_m=from_drogue,
+        nose_source_m=source_m,
+        body_radius_m=radius_m,
+        follower=Follower(bandwidth_hz=0),
+    )
+    return simulate(hose, around).nodes_m[:, :, 0, -1]
 
 
 def test_the_drogue_points_with_a_lag_of_its_own():

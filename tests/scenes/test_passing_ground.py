@@ -1,0 +1,153 @@
+"""Ground and clouds that a flying camera passes."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets_manifest.frame import Environment
+from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.weather import CloudLayer
+from scenes.clouds import CloudLight, see_cloud
+from scenes.ground import MEAN_REFLECTANCE, Ground, GroundLight
+from scenes.light import luminance
+from scenes.sampler import sample_frame
+from scenes.surroundings import surroundings
+from scenes.suspension import WORLD_FROM_TANKER
+
+FOCAL_PX, SIZE_PX = 400.0, 192
+RECIPE = """
+name = "passing"
+[frames]
+count = 40
+scenes = 2
+[exposure]
+time_s = 0.002
+[sequence]
+frames_per_sequence = 20
+frame_rate_hz = 10
+tanker_motion_m = 0
+hose = { preset = "full-size", airspeed_m_s = 100 }
+turbulence = "none"
+release_m = [13.8, 0.0, -5]
+[sequence.receiver]
+manoeuvres = ["station"]
+start_m = 4.0
+"""
+
+
+def environment(kind="fields", **changes):
+    values = {
+        "sun_elevation_deg": 40.0,
+        "sun_azimuth_deg": 60.0,
+        "turbidity": 2.5,
+        "visibility_m": 150_000.0,
+        "altitude_m": 1500.0,
+        "ground": kind,
+        "ground_reflectance_rgb": MEAN_REFLECTANCE[kind],
+        "ground_texture_seed": 3,
+    }
+    return Environment.model_validate(values | changes)
+
+
+def looking(sign):
+    """(H, W, 3) directions of a pinhole that looks straight up (1) or down (-1); columns go east, rows north."""
+    offset = (np.arange(SIZE_PX) - (SIZE_PX - 1) / 2) / FOCAL_PX
+    x, y = np.meshgrid(offset, offset)
+    rays = np.stack([x, y, np.full_like(x, sign)], axis=-1)
+    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def flow_px(before, after):
+    """How far a picture has moved to the right and down, by OpenCV's phase correlation."""
+    window = cv2.createHanningWindow((SIZE_PX, SIZE_PX), cv2.CV_64F)
+    pictures = [np.asarray(picture, dtype=np.float64) - float(np.mean(picture)) for picture in (before, after)]
+    return np.array(cv2.phaseCorrelate(*pictures, window)[0])
+
+
+def light():
+    direction = np.array([0.6, 0.0, 0.8])
+    return GroundLight(np.full(3, 6000.0), direction, np.full(3, 60_000.0), lambda rays: np.full_like(rays, 2000.0))
+
+
+@pytest.mark.parametrize("kind", ["fields", "forest"])
+@pytest.mark.parametrize("flown_m", [(37.5, 0.0), (-22.5, 15.0)])
+def test_ground_below_flows_by_focal_length_times_way_over_altitude(kind, flown_m):
+    here = environment(kind)
+    ground = Ground(here, light())
+    there = ground.seen_from(here.model_copy(update={"camera_offset_m": flown_m}))
+    before, after = (luminance(seen.radiance(looking(-1))) for seen in (ground, there))
+    # East of us is on the right, and what we fly towards comes to the left. A tenth of a pixel is what phase
+    # correlation finds of whole shifts under a window.
+    np.testing.assert_allclose(flow_px(before, after), -FOCAL_PX * np.array(flown_m) / 1500.0, atol=0.1)
+    # The same places: so many whole pixels apart the pictures are the same but for the rounding of places in float32.
+    columns, rows = np.rint(FOCAL_PX * np.array(flown_m) / 1500.0).astype(int)
+    shifted = np.roll(after, (rows, columns), axis=(0, 1))[40:-40, 40:-40]
+    assert np.abs(shifted - before[40:-40, 40:-40]).mean() < 0.02 * before.std()
+
+
+def test_ships_are_passed_as_the_sea_is():
+    flown_m = np.array([60.0, 0.0])
+    for seed in range(40):
+        here = environment("sea", ground_texture_seed=seed)
+        ground = Ground(here, light())
+        if ground._ships:
+            break
+    ship = ground._ships[0]
+    above = environment("sea", ground_texture_seed=seed, camera_offset_m=(ship.x_m, ship.y_m))
+    pictures = [
+        luminance(ground.seen_from(above.model_copy(update={"camera_offset_m": place})).radiance(looking(-1)))
+        for place in ((ship.x_m, ship.y_m), (ship.x_m + flown_m[0], ship.y_m))
+    ]
+    # A quarter of a pixel: the sky's reflection stays where it is.
+    np.testing.assert_allclose(flow_px(*pictures), -FOCAL_PX * flown_m / 1500.0, atol=0.25)
+
+
+def test_clouds_flow_by_their_own_distance():
+    flown_m, height_m = (45.0, -30.0), 1200.0
+    shared = {"optical_depth": 3.0, "texture_seed": 4, "feature_size_m": 300.0, "heading_deg": 30.0}
+    sun = CloudLight(np.array([0.6, 0.0, 0.8]), np.full(3, 6e4), np.full(3, 6e3), np.full(3, 2e3))
+    expected_px = -FOCAL_PX * np.array(flown_m) / height_m
+    cirrus = CloudLayer(kind="cirrus", height_above_camera_m=height_m, cover_fraction=0.7, **shared)
+    before, after = (see_cloud(cirrus, looking(1), sun, 1, place).opacity for place in ((0.0, 0.0), flown_m))
+    # Without depth: as for the ground, but the layer bends with the Earth, by nothing here.
+    np.testing.assert_allclose(flow_px(before, after), expected_px, atol=0.15)
+    cumulus = CloudLayer(
+        kind="cumulus", height_above_camera_m=-height_m, cover_fraction=0.4, thickness_m=100.0, **shared
+    )
+    before, after = (see_cloud(cumulus, looking(-1), sun, 1, place).opacity for place in ((0.0, 0.0), flown_m))
+    # Between that of its tops and that of its base, 100 m farther, and a third of a pixel for edges that change.
+    assert np.linalg.norm(flow_px(before, after) - expected_px) < 0.09 * np.linalg.norm(expected_px) + 0.33
+
+
+def test_sky_and_light_stay_as_they_are():
+    cloud = CloudLayer(height_above_camera_m=-900.0, cover_fraction=0.4, feature_size_m=900.0, optical_depth=10.0,
+                       texture_seed=1, thickness_m=300.0)  # fmt: skip
+    here = environment(clouds=(cloud,))
+    moved = here.model_copy(update={"camera_offset_m": (400.0, 20.0)})
+    there, around = surroundings(moved), surroundings(here)
+    assert around is surroundings(here)
+    np.testing.assert_array_equal(there.light_map, around.light_map)
+    np.testing.assert_array_equal(there.radiance(looking(1)), around.radiance(looking(1)))
+    assert not np.array_equal(there.radiance(looking(-1)), around.radiance(looking(-1)))
+    # Nothing of the way stays behind.
+    assert surroundings(here).environment.camera_offset_m == (0.0, 0.0)
+
+
+def test_a_sequence_flies_with_its_airspeed_and_starts_again():
+    recipe = parse_recipe(RECIPE)
+    frames = [sample_frame(recipe, index) for index in range(40)]
+    places = np.array([frame.environment.camera_offset_m for frame in frames])
+    # With a pod that keeps its place, the receiver's own motion is what the poses tell of it.
+    eyes = np.array([(WORLD_FROM_TANKER @ frame.left_from_tanker.inverse().translation_m)[:2] for frame in frames])
+    flown = np.outer(np.tile(np.arange(20) * 0.1, 2), [100.0, 0.0])
+    np.testing.assert_allclose(places, flown + eyes, atol=1e-9)  # rounding of hundreds of metres
+    assert np.linalg.norm(places[20] - places[0]) < 1.0
+    still = [frame.environment.model_copy(update={"camera_offset_m": (0.0, 0.0)}) for frame in frames]
+    assert all(one == still[0] for one in still[:20])
+
+
+def test_single_pairs_do_not_know_of_flight():
+    recipe = parse_recipe('name = "single"\n[frames]\ncount = 1\n[distance]\nlaw = "uniform"\nlow_m = 3\nhigh_m = 9\n')
+    assert "camera_offset_m" not in sample_frame(recipe, 0).environment.model_dump()
