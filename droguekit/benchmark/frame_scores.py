@@ -14,6 +14,7 @@ from droguekit.benchmark.consistency import squared_errors
 from droguekit.benchmark.flips import flip_trials, ring_tilt_scale
 from droguekit.benchmark.frame_truth import DrogueTruth
 from droguekit.benchmark.pose_errors import pose_error
+from droguekit.benchmark.rangefinder_errors import Depth
 from droguekit.benchmark.reference import Reference, bound_covariance, feature_noise
 from droguekit.benchmark.statistics import root_mean_square
 from droguekit.benchmark.summary import FrameScore, PoseScore
@@ -65,6 +66,7 @@ def _pose_score(
     error = pose_error(pose, truth.left_from_drogue)
     own = bound_covariance(truth, _used(truth, centroids), noise)
     covariance = common if own is None else own
+    reading_m = truth.rangefinder_reading_m
     scale_rad = None if noise is None else ring_tilt_scale(truth, centroids, noise.marker_px)
     return PoseScore(
         error=error,
@@ -73,6 +75,7 @@ def _pose_score(
         has_covariance=estimate.covariance is not None,
         squared_errors=squared_errors(estimate, error),
         flips=None if covariance is None else flip_trials(pose, truth, covariance, scale_rad),
+        depth=None if reading_m is None else Depth(float(pose.translation_m[2]), truth.distance_m, reading_m),
     )
 
 

@@ -33,6 +33,7 @@ class DrogueTruth:
         centers_px: (2, M, 2) centres of the image ellipses. [px]
         visible: (2, M) whether the feature lies in the image and is visible.
         sequence_id: of the sequence that the pair belongs to, or None for a single one.
+        rangefinder_reading_m: what a rangefinder says of the distance, or None without one. [m]
     """
 
     left_from_drogue: RigidTransform
@@ -41,6 +42,7 @@ class DrogueTruth:
     centers_px: Array
     visible: NDArray[np.bool_]
     sequence_id: int | None = None
+    rangefinder_reading_m: float | None = None
 
     @cached_property
     def jacobian(self) -> Array:
@@ -82,6 +84,7 @@ def drogue_truth(record: PairRecord) -> DrogueTruth | None:
             [[f.in_image and f.visible_fraction >= VISIBLE_FRACTION for f in features] for features in eyes]
         ),
         sequence_id=record.sequence_id,
+        rangefinder_reading_m=record.frame.rangefinder_reading_m,
     )
 
 

@@ -16,6 +16,7 @@ from droguekit.benchmark.result_parts import (
     Flips,
     Nees,
     NormalizedErrors,
+    RangefinderErrors,
     ResultModel,
 )
 
@@ -48,6 +49,7 @@ class Row(ResultModel):
         failures: pairs without a pose.
         rmse_with_failures: root mean square errors over all n pairs, where a pair without a pose counts with the
             standard deviation of the true poses of the dataset.
+        rangefinder: depths against the readings of a rangefinder; null without any.
     """
 
     n: int
@@ -97,6 +99,7 @@ class Row(ResultModel):
     sight_flips: Flips
     failures: int
     rmse_with_failures: ComponentErrors
+    rangefinder: RangefinderErrors | None = None
 
     def value(self, key: str) -> float | None:
         """The number of that name.

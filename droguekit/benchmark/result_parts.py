@@ -128,6 +128,36 @@ class Flips(ResultModel):
     predicted: float | None
 
 
+class DepthErrors(ResultModel):
+    """Errors in depth over some pairs.
+
+    Attributes:
+        bias_m, rmse_m: mean and root mean square. [m]
+        mean_absolute_m, mean_absolute_fraction: mean size, and that over the depth it is compared with. [m]
+    """
+
+    bias_m: float
+    rmse_m: float
+    mean_absolute_m: float
+    mean_absolute_fraction: float
+
+
+class RangefinderErrors(ResultModel):
+    """Depths as an experiment sees them that has a rangefinder's reading for the truth.
+
+    Attributes:
+        n: pairs with a pose and a reading.
+        against_reading: estimate minus reading, what such an experiment would report.
+        against_truth: estimate minus truth, over the same pairs.
+        reading: reading minus truth, over the same pairs.
+    """
+
+    n: int
+    against_reading: DepthErrors
+    against_truth: DepthErrors
+    reading: DepthErrors
+
+
 class MeanRatios(ResultModel):
     """Mean error of one method over that of another, over the pairs in which both found a pose.
 

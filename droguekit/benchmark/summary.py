@@ -11,6 +11,7 @@ from droguekit.benchmark.centroid_errors import CentroidErrors, centroid_statist
 from droguekit.benchmark.consistency import nees, normalized_errors
 from droguekit.benchmark.flips import FlipTrials, flip_row
 from droguekit.benchmark.pose_errors import COMPONENTS, PoseError
+from droguekit.benchmark.rangefinder_errors import Depth, rangefinder_errors
 from droguekit.benchmark.result import Row
 from droguekit.benchmark.result_parts import Bound, ComponentErrors, ComponentRatios
 from droguekit.benchmark.statistics import (
@@ -37,6 +38,7 @@ class PoseScore:
         has_covariance: whether the estimate carries one.
         squared_errors: (3,) see `consistency.squared_errors`.
         flips: None where no bound is known.
+        depth: beside the rangefinder's reading, or None without one.
     """
 
     error: PoseError
@@ -45,6 +47,7 @@ class PoseScore:
     has_covariance: bool
     squared_errors: Array | None
     flips: FlipTrials | None
+    depth: Depth | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,7 @@ def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Ro
             **_checks(poses),
             "failures": len(scores) - len(poses),
             "rmse_with_failures": _with_failures(poses, len(scores), truth_spread),
+            "rangefinder": rangefinder_errors([pose.depth for pose in poses if pose.depth is not None]),
         }
     )
 
