@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
 # where the folder lies.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow torture fuzz lint bench bench-engines bench-peers bars-nav-a bars-nav-b bars-nav-c bars-nav-d publish clean
+.PHONY: help setup demo test test-slow torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-c bars-nav-d publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -46,6 +46,15 @@ bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (an 
 bench-peers: ## CPU seconds per pair of our path, plain Cycles and plain Mitsuba at equal noise (hours; installs Blender; goes on where it stopped)
 	@scripts/setup all
 	@$(BIN)/python -m droguekit.peer_comparison --out out/peer-comparison
+
+bench-scaling: ## two workers against one on 200 pairs, and what a frame costs besides its work (minutes; on a machine that does nothing else; goes on where it stopped)
+	@scripts/setup all
+	@$(BIN)/python -m droguekit.batch.scaling --out out/scaling
+
+CORPUS ?= out/detector/datasets/detector-small
+bench-detectors: ## detectors OURS=FILE.onnx beside YOLOv8n and YOLOv8s, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; goes on where it stopped)
+	@scripts/setup all
+	@$(BIN)/python -m droguekit.detector_peers --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
 
 bench: ## CPU seconds per stereo pair by distance and stage
 	@scripts/setup mitsuba

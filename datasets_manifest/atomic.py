@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
+from typing import IO, Any, BinaryIO, TextIO, cast
 
 PART_SUFFIX = ".part"
 """Ends the name of everything that is still being written; such names also begin with a dot."""
@@ -35,13 +35,30 @@ def open_text_atomic(path: Path) -> Iterator[TextIO]:
     Raises:
         OSError: it cannot be written; one line that names the file. Nothing is left behind.
     """
+    with _taking_name(path) as part, part.open("x", encoding="utf-8", newline="\n") as stream:
+        yield stream
+        _sync(stream)
+
+
+@contextmanager
+def open_bytes_atomic(path: Path) -> Iterator[BinaryIO]:
+    """The same for bytes; the stream can be read too.
+
+    Raises:
+        OSError: it cannot be written; one line that names the file. Nothing is left behind.
+    """
+    with _taking_name(path) as part, part.open("x+b") as stream:
+        yield cast(BinaryIO, stream)
+        _sync(stream)
+
+
+@contextmanager
+def _taking_name(path: Path) -> Iterator[Path]:
+    """A name to write under, which is changed to `path` when the block ends without an error."""
     part = part_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("x", encoding="utf-8", newline="\n") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
+        yield part
         part.replace(path)
         sync_folder(path.parent)
     except OSError as error:
@@ -49,6 +66,11 @@ def open_text_atomic(path: Path) -> Iterator[TextIO]:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def _sync(stream: IO[Any]) -> None:
+    stream.flush()
+    os.fsync(stream.fileno())
 
 
 def write_text_atomic(path: Path, text: str) -> None:
@@ -59,6 +81,16 @@ def write_text_atomic(path: Path, text: str) -> None:
     """
     with open_text_atomic(path) as stream:
         stream.write(text)
+
+
+def write_bytes_atomic(path: Path, data: bytes) -> None:
+    """Write or replace a file by one rename.
+
+    Raises:
+        OSError: it cannot be written; one line that names the file. Nothing is left behind.
+    """
+    with open_bytes_atomic(path) as stream:
+        stream.write(data)
 
 
 @contextmanager

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError
 
 from datasets_manifest.frame import Sensor
+from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.images import StereoImages
 from datasets_manifest.json_types import FrozenModel, Rig
-from datasets_manifest.layout import BLIND_FILE, frame_folder
+from datasets_manifest.layout import BLIND_FILE
 from datasets_manifest.manifest import read_manifest
 from datasets_manifest.reader import read_images, read_shutter, read_sought
+from datasets_manifest.storage import Location, open_storage
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain
 from geometry.stereo import StereoRig
@@ -57,14 +58,15 @@ class BlindIndex(FrozenModel):
     frames: tuple[Annotated[int, Field(ge=0)], ...]
 
 
-def read_blind_index(dataset: Path) -> BlindIndex:
-    """What may be known of the dataset in a folder, blind or not.
+def read_blind_index(dataset: Location) -> BlindIndex:
+    """What may be known of a dataset, blind or not.
 
     Raises:
         ValueError: no such folder, or neither a manifest nor an index that can be trusted; names the file.
     """
-    path = dataset / BLIND_FILE
-    if not path.exists():
+    storage = open_storage(dataset)
+    path = storage.where(BLIND_FILE)
+    if not storage.exists(BLIND_FILE):
         manifest = read_manifest(dataset)
         return BlindIndex(
             name=manifest.name,
@@ -75,7 +77,7 @@ def read_blind_index(dataset: Path) -> BlindIndex:
             frames=tuple(sorted(entry.frame_index for entry in manifest.frames)),
         )
     try:
-        return BlindIndex.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        return BlindIndex.model_validate(json.loads(storage.read(BLIND_FILE)))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
@@ -87,14 +89,14 @@ def read_blind_index(dataset: Path) -> BlindIndex:
 class BlindDataset:
     """Stereo pairs without their truth; images are read when they are asked for."""
 
-    def __init__(self, path: Path) -> None:
-        """Open the dataset in a folder.
+    def __init__(self, path: Location) -> None:
+        """Open the dataset in a folder, or at a URL such as `s3://bucket/name`.
 
         Raises:
-            ValueError: no such folder, or nothing in it that can be trusted.
+            ValueError: no such place, or nothing in it that can be trusted.
         """
         index = read_blind_index(path)
-        self._path = path
+        self._frames = FrameStore(path)
         self._rig: StereoRig = index.rig
         self._drogue = index.drogue
         self._has_variants = index.drogues_differ
@@ -107,8 +109,7 @@ class BlindDataset:
         Raises:
             ValueError: it is missing, truncated or of another size or depth than the rig's; names the file.
         """
-        shutter = read_shutter(self._path, frame_index)
-        folder = frame_folder(self._path, frame_index)
-        images = read_images(folder, self._rig.camera, self._sensor, shutter)
-        drogue = read_sought(self._path, frame_index, self._drogue) if self._has_variants else self._drogue
+        shutter = read_shutter(self._frames, frame_index)
+        images = read_images(self._frames, frame_index, self._rig.camera, self._sensor, shutter)
+        drogue = read_sought(self._frames, frame_index, self._drogue) if self._has_variants else self._drogue
         return BlindPair(frame_index, images, self._rig, drogue)

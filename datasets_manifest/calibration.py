@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 
-from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.calibration_kalibr import KALIBR_FILE, kalibr_camchain, kalibr_fault
 from datasets_manifest.calibration_matrices import opencv_stereo_matrices
 from datasets_manifest.calibration_ros import camera_info, camera_info_file
 from datasets_manifest.layout import CALIBRATION_FOLDER
+from datasets_manifest.storage import Location, join, open_storage
 from geometry.stereo import EYES, StereoRig
 
 __all__ = ["OPENCV_STEREO_FILE", "calibration_files", "opencv_stereo", "opencv_stereo_matrices", "write_calibration"]
@@ -37,17 +35,16 @@ def calibration_files(rig: StereoRig) -> dict[str, str]:
     return files | {camera_info_file(eye): camera_info(rig, eye) for eye in EYES}
 
 
-def write_calibration(dataset: Path, rig: StereoRig) -> list[Path]:
+def write_calibration(dataset: Location, rig: StereoRig) -> list[Location]:
     """Write the rig into the dataset's calibration folder.
 
     Returns:
-        The files, OpenCV's first.
+        Where the files lie, OpenCV's first.
 
     Raises:
         OSError: they cannot be written.
     """
-    paths = []
-    for name, text in calibration_files(rig).items():
-        paths.append(dataset / CALIBRATION_FOLDER / name)
-        write_text_atomic(paths[-1], text)
-    return paths
+    storage, files = open_storage(dataset), calibration_files(rig)
+    for name, text in files.items():
+        storage.write(f"{CALIBRATION_FOLDER}/{name}", text.encode())
+    return [join(dataset, f"{CALIBRATION_FOLDER}/{name}") for name in files]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
-from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.layout import CARD_FILE
 from datasets_manifest.manifest import Manifest
 from datasets_manifest.pose_ranges import DistanceLaw
+from datasets_manifest.storage import Location, join, open_storage
 
 # https://github.com/huggingface/hub-docs/blob/main/datasetcard.md: steps of the tag `size_categories`, by images.
 _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
@@ -29,15 +28,14 @@ def card_text(manifest: Manifest) -> str:
     return f"{_metadata(manifest)}\n{_body(manifest)}"
 
 
-def write_card(dataset: Path, manifest: Manifest) -> Path:
-    """Write the card into the dataset's folder.
+def write_card(dataset: Location, manifest: Manifest) -> Location:
+    """Write the card into the dataset.
 
     Raises:
         OSError: it cannot be written.
     """
-    path = dataset / CARD_FILE
-    write_text_atomic(path, card_text(manifest))
-    return path
+    open_storage(dataset).write(CARD_FILE, card_text(manifest).encode())
+    return join(dataset, CARD_FILE)
 
 
 def citation(manifest: Manifest) -> str:

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
-from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.card import citation
 from datasets_manifest.layout import (
     ANNOTATIONS_FOLDER,
@@ -18,10 +16,13 @@ from datasets_manifest.layout import (
     FRAMES_FOLDER,
     MANIFEST_FILE,
     RECORD_FILE,
+    SHARDS_FOLDER,
     image_file,
     parts_file,
 )
 from datasets_manifest.manifest import Manifest
+from datasets_manifest.shard_index import read_pairs_per_tar
+from datasets_manifest.storage import Location, Storage, join, open_storage
 from geometry.stereo import EYES
 
 _LICENCE_URLS = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
@@ -81,27 +82,36 @@ _TRUTH_FIELDS = (
     ("roll_deg", "roll_deg", _FLOAT, "Roll of the drogue in the left camera. [deg]"),
     ("family", "conditions.family", _TEXT, "Kind of conditions."),
 )
+_SETS = (
+    ("records", RECORD_FILE, "application/json", "The truth of each pair."),
+    *((f"{eye}-images", image_file(eye), "image/png", f"What the {eye} camera saw.") for eye in EYES),
+    *((f"{eye}-parts", parts_file(eye), "image/png", f"Part id of each pixel of the {eye} eye.") for eye in EYES),
+)
+_SHARDS = "shards"
 
 
-def write_croissant(dataset: Path, manifest: Manifest) -> Path:
+def write_croissant(dataset: Location, manifest: Manifest) -> Location:
     """Write `croissant.json` into a dataset whose manifest and annotations are written.
 
     Raises:
         OSError: it cannot be written, or a file that it names cannot be read.
     """
-    path = dataset / CROISSANT_FILE
     text = json.dumps(describe_croissant(dataset, manifest), indent=1, allow_nan=False, ensure_ascii=False)
-    write_text_atomic(path, text + "\n")
-    return path
+    open_storage(dataset).write(CROISSANT_FILE, f"{text}\n".encode())
+    return join(dataset, CROISSANT_FILE)
 
 
-def describe_croissant(dataset: Path, manifest: Manifest) -> dict[str, Any]:
+def describe_croissant(dataset: Location, manifest: Manifest) -> dict[str, Any]:
     """The description as JSON-LD; nothing in it depends on where or when the files lie.
 
     Raises:
         OSError: a file that it names cannot be read.
     """
-    annotations = sorted((dataset / ANNOTATIONS_FOLDER).glob("*.json"))
+    storage = open_storage(dataset)
+    is_packed = read_pairs_per_tar(storage) is not None
+    names = storage.names(ANNOTATIONS_FOLDER)
+    annotations = [f"{ANNOTATIONS_FOLDER}/{name}" for name in names if name.endswith(".json") and name[0] != "."]
+    shards = [_shards()] if is_packed else []
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
@@ -115,26 +125,21 @@ def describe_croissant(dataset: Path, manifest: Manifest) -> dict[str, Any]:
         "citeAs": citation(manifest),
         "isLiveDataset": False,
         "distribution": [
-            _file(dataset, dataset / MANIFEST_FILE, "What the dataset is made of and how it was made."),
-            *(_file(dataset, path, "COCO boxes, masks and keypoints.") for path in annotations),
-            _file_set("records", RECORD_FILE, "application/json", "The truth of each pair."),
-            *(_file_set(f"{eye}-images", image_file(eye), "image/png", f"What the {eye} camera saw.") for eye in EYES),
-            *(
-                _file_set(f"{eye}-parts", parts_file(eye), "image/png", f"Part id of each pixel of the {eye} eye.")
-                for eye in EYES
-            ),
+            _file(storage, MANIFEST_FILE, "What the dataset is made of and how it was made."),
+            *(_file(storage, name, "COCO boxes, masks and keypoints.") for name in annotations),
+            *shards,
+            *(_file_set(name, file, encoding, text, is_packed) for name, file, encoding, text in _SETS),
         ],
-        "recordSet": [_pairs(), _truth(), *(_images(eye) for eye in EYES)],
+        "recordSet": [_pairs(), _truth(), *(_images(eye, is_packed) for eye in EYES)],
     }
 
 
-def _file(dataset: Path, path: Path, description: str) -> dict[str, Any]:
-    data = path.read_bytes()
-    name = path.relative_to(dataset).as_posix()
+def _file(storage: Storage, name: str, description: str) -> dict[str, Any]:
+    data = storage.read(name)
     return {
         "@type": "cr:FileObject",
         "@id": name,
-        "name": path.name,
+        "name": name.rpartition("/")[2],
         "description": description,
         "contentUrl": name,
         "contentSize": f"{len(data)} B",
@@ -143,14 +148,30 @@ def _file(dataset: Path, path: Path, description: str) -> dict[str, Any]:
     }
 
 
-def _file_set(name: str, file: str, encoding: str, description: str) -> dict[str, Any]:
+def _shards() -> dict[str, Any]:
+    return {
+        "@type": "cr:FileSet",
+        "@id": _SHARDS,
+        "name": _SHARDS,
+        "description": "Archives of the files of many pairs.",
+        "encodingFormat": "application/x-tar",
+        "includes": f"{SHARDS_FOLDER}/*.tar",
+    }
+
+
+def _file_set(name: str, file: str, encoding: str, description: str, is_packed: bool) -> dict[str, Any]:
+    place = (
+        {"containedIn": {"@id": _SHARDS}, "includes": f"*.{file}"}
+        if is_packed
+        else {"includes": f"{FRAMES_FOLDER}/*/{file}"}
+    )
     return {
         "@type": "cr:FileSet",
         "@id": name,
         "name": name,
         "description": description,
         "encodingFormat": encoding,
-        "includes": f"{FRAMES_FOLDER}/*/{file}",
+        **place,
     }
 
 
@@ -170,13 +191,13 @@ def _truth() -> dict[str, Any]:
     return _record_set("truth", "Pose of the drogue in each pair; missing values where there is none.", fields)
 
 
-def _images(eye: str) -> dict[str, Any]:
+def _images(eye: str, is_packed: bool) -> dict[str, Any]:
     set_name = f"{eye}-images"
     source = {"fileSet": {"@id": set_name}}
     folder = {
         **source,
         "extract": {"fileProperty": "fullpath"},
-        "transform": {"regex": r"(?:.*[/\\])?(\d+)[/\\][^/\\]+$"},
+        "transform": {"regex": r"(?:.*[/\\])?(\d+)" + (r"\." if is_packed else r"[/\\]") + r"[^/\\]+$"},
     }
     fields = [
         {

@@ -6,16 +6,16 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.json_types import FrozenModel
-from datasets_manifest.layout import BLIND_FILE, MANIFEST_FILE, RECORD_FILE, frame_folder, frame_indices
+from datasets_manifest.layout import BLIND_FILE, MANIFEST_FILE, RECORD_FILE
 from datasets_manifest.provenance import CONVENTIONS, cpu_features, software_versions
 from datasets_manifest.recipe import Recipe
+from datasets_manifest.storage import Location, in_order, open_storage
 from datasets_manifest.writer import canonical_json
 from drogue_models.presets import explain
 
@@ -109,16 +109,16 @@ def dataset_sha256(recipe: Recipe, record_hashes: Iterable[str]) -> str:
 
 
 def build_manifest(
-    dataset: Path,
+    dataset: Location,
     recipe: Recipe,
     render_version: str,
     split_of_scene: Callable[[int], SplitName],
     drops: Sequence[Drop] = (),
 ) -> Manifest:
-    """Describe the frames that lie in a dataset's folder.
+    """Describe the frames that lie in a dataset.
 
     Args:
-        dataset: the folder.
+        dataset: where it lies.
         recipe: that it was made from.
         render_version: `render.version.RENDER_VERSION`.
         split_of_scene: the split of a scene's id.
@@ -128,8 +128,9 @@ def build_manifest(
         ValueError: a record that cannot be read; names the file.
     """
     entries, engines = [], Counter[str]()
-    for frame_index in frame_indices(dataset):
-        entry, engine = _read_entry(dataset, frame_index, split_of_scene)
+    store = FrameStore(dataset)
+    found = in_order(lambda index: _read_entry(store, index, split_of_scene), store.indices(), store.storage)
+    for entry, engine in found:
         entries.append(entry)
         engines[engine] += 1
     content: dict[str, Any] = {
@@ -157,30 +158,30 @@ def made_with(manifest: Manifest, software: Mapping[str, str], cpu_features: Seq
     return Manifest.model_validate({**content, "manifest_sha256": _content_sha256(content)})
 
 
-def write_manifest(dataset: Path, manifest: Manifest) -> Path:
+def write_manifest(dataset: Location, manifest: Manifest) -> None:
     """Write `manifest.json`, whole or not at all.
 
     Raises:
         OSError: it cannot be written.
     """
-    path = dataset / MANIFEST_FILE
-    write_text_atomic(path, json.dumps(manifest.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
-    return path
+    with open_storage(dataset).write_text(MANIFEST_FILE) as stream:
+        stream.write(json.dumps(manifest.model_dump(mode="json"), indent=1, allow_nan=False) + "\n")
 
 
-def read_manifest(dataset: Path) -> Manifest:
-    """The manifest of a dataset's folder.
+def read_manifest(dataset: Location) -> Manifest:
+    """The manifest of a dataset.
 
     Raises:
         ValueError: missing, truncated or edited; one line that names the file.
     """
-    path = dataset / MANIFEST_FILE
-    if not dataset.is_dir():
+    storage = open_storage(dataset)
+    path = storage.where(MANIFEST_FILE)
+    if not storage.is_there():
         raise ValueError(f"{dataset}: there is no such dataset folder")
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(storage.read(MANIFEST_FILE))
     except FileNotFoundError as error:
-        if (dataset / BLIND_FILE).is_file():
+        if storage.exists(BLIND_FILE):
             raise ValueError(
                 f"{dataset}: is a blind dataset, which has no truth; take the one that it came from"
             ) from error
@@ -211,11 +212,13 @@ def _content_sha256(table: dict[str, Any]) -> str:
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()
 
 
-def _read_entry(dataset: Path, frame_index: int, split_of_scene: Callable[[int], SplitName]) -> tuple[FrameEntry, str]:
+def _read_entry(
+    store: FrameStore, frame_index: int, split_of_scene: Callable[[int], SplitName]
+) -> tuple[FrameEntry, str]:
     """What the manifest holds of one record, and its engine; the record's other contents are not checked here."""
-    path = frame_folder(dataset, frame_index) / RECORD_FILE
+    path = store.where(frame_index, RECORD_FILE)
     try:
-        data = path.read_bytes()
+        data = store.read(frame_index, RECORD_FILE)
         table = json.loads(data)
         entry = FrameEntry(
             frame_index=table["frame_index"],

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
@@ -17,6 +16,7 @@ from datasets_manifest.manifest import Manifest
 from datasets_manifest.provenance import differing_builds
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import FeatureView, HubView, PairRecord, ViewRecord
+from datasets_manifest.storage import Location
 from datasets_manifest.writer import canonical_json
 from drogue_models.presets import explain
 
@@ -110,7 +110,7 @@ def read_publication(name: str) -> Publication:
         raise ValueError(f"published/{name}.json: {explain(error)}; `make publish` makes it anew") from error
 
 
-def build_publication(dataset: Path) -> Publication:
+def build_publication(dataset: Location) -> Publication:
     """What is published of a dataset.
 
     Raises:
@@ -155,7 +155,7 @@ def _centers(feature: FeatureView) -> tuple[float, ...]:
     return (*feature.center_proj_px, *feature.center_ellipse_px, *inner)
 
 
-def compare_with_published(dataset: Path, published: Publication) -> Comparison:
+def compare_with_published(dataset: Location, published: Publication) -> Comparison:
     """Compare a dataset with what was published of its recipe, pair by pair.
 
     The dataset's files are taken to be those of its manifest, which `validate` checks.

@@ -1,23 +1,21 @@
-"""Stereo pairs onto the disk: a frame's folder appears whole, by one rename, or not at all."""
+"""Stereo pairs into a dataset: a frame appears whole or not at all."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.atomic import PART_SUFFIX, part_path, sync_folder, write_text_atomic
+from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.images import Pixels, StereoImages
-from datasets_manifest.layout import RECORD_FILE, frame_folder, image_file, mosaic_file, parts_file
+from datasets_manifest.layout import RECORD_FILE, frame_name, image_file, is_plain_name, mosaic_file, parts_file
 from datasets_manifest.png import encode_png
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location, open_storage
 from geometry.stereo import Eye
 
 __all__ = ["encode_files", "remove_leftovers", "write_frame", "write_text_atomic"]
@@ -68,11 +66,11 @@ def encode_record(record: PairRecord) -> bytes:
     return (canonical_json(record.model_dump(mode="json")) + "\n").encode()
 
 
-def write_frame(dataset: Path, record: PairRecord, files: Mapping[str, bytes]) -> PairRecord:
+def write_frame(dataset: Location, record: PairRecord, files: Mapping[str, bytes]) -> PairRecord:
     """Put one stereo pair into a dataset; a frame of that index that is there already is replaced.
 
     Args:
-        dataset: the dataset's folder; made if missing.
+        dataset: where the dataset lies; a folder is made if missing.
         record: the truth; its `file_sha256` is filled in here.
         files: contents by plain file name.
 
@@ -88,50 +86,27 @@ def write_frame(dataset: Path, record: PairRecord, files: Mapping[str, bytes]) -
             raise ValueError(f"files: must have plain names other than {RECORD_FILE}, got {name!r}")
     hashes = {name: hashlib.sha256(files[name]).hexdigest() for name in sorted(files)}
     complete = record.model_copy(update={"file_sha256": hashes})
-    target = frame_folder(dataset, record.frame_index)
-    part = part_path(target)
-    try:
-        part.mkdir(parents=True)
-        for name in sorted(files):
-            _write_synced(part / name, files[name])
-        _write_synced(part / RECORD_FILE, encode_record(complete))
-        sync_folder(part)
-        remove_frame(dataset, record.frame_index)
-        part.rename(target)
-        sync_folder(target.parent)
-    except OSError as error:
-        raise OSError(error.errno, f"{target}: cannot be written: {error.strerror}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    together = {**files, RECORD_FILE: encode_record(complete)}
+    open_storage(dataset).write_together(frame_name(record.frame_index), together, RECORD_FILE)
     return complete
 
 
-def remove_frame(dataset: Path, frame_index: int) -> None:
-    """Take a frame out of a dataset, if it is there, by one rename before anything in it is deleted.
+def remove_frame(dataset: Location, frame_index: int) -> None:
+    """Take a frame that has a folder out of a dataset, at once before anything in it is deleted.
 
     Raises:
         OSError: it cannot be removed.
     """
-    target = frame_folder(dataset, frame_index)
-    if not target.exists():
-        return
-    grave = part_path(target)
-    target.rename(grave)
-    shutil.rmtree(grave)
+    open_storage(dataset).delete_folder(frame_name(frame_index), RECORD_FILE)
 
 
-def leftovers(dataset: Path) -> list[Path]:
+def leftovers(dataset: Location) -> list[str]:
     """What runs that were killed have left half-written, sorted."""
-    folders = [dataset, *(entry for entry in _entries(dataset) if entry.is_dir() and entry.name[0] != ".")]
-    return sorted(
-        entry
-        for folder in folders
-        for entry in _entries(folder)
-        if entry.name.startswith(".") and entry.name.endswith(PART_SUFFIX)
-    )
+    storage = open_storage(dataset)
+    return [storage.where(name) for name in storage.leftovers(RECORD_FILE)]
 
 
-def remove_leftovers(dataset: Path) -> list[Path]:
+def remove_leftovers(dataset: Location) -> list[str]:
     """Delete what killed runs have left half-written; only while nobody else writes into the dataset.
 
     Returns:
@@ -140,29 +115,8 @@ def remove_leftovers(dataset: Path) -> list[Path]:
     Raises:
         OSError: something cannot be deleted; one line that names it.
     """
-    found = leftovers(dataset)
-    for entry in found:
-        try:
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry)
-            else:
-                entry.unlink()
-        except OSError as error:
-            raise OSError(error.errno, f"{entry}: cannot be removed: {error.strerror}") from error
-    return found
-
-
-def is_plain_name(name: str) -> bool:
-    """Whether a file name stays in its folder on every system."""
-    return name not in ("", ".", "..") and not any(character in name for character in "/\\:\0")
-
-
-def _entries(folder: Path) -> list[Path]:
-    return list(folder.iterdir()) if folder.is_dir() else []
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    with path.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
+    storage = open_storage(dataset)
+    found = storage.leftovers(RECORD_FILE)
+    for name in found:
+        storage.delete(name)
+    return [storage.where(name) for name in found]

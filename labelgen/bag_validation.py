@@ -10,35 +10,40 @@ import numpy as np
 
 from datasets_manifest.calibration import opencv_stereo_matrices
 from datasets_manifest.reader import Dataset
+from datasets_manifest.storage import Location, open_storage
 from geometry.stereo import EYES
 
 # Numbers that went through float64 and one product.
 _TOLERANCE = 1e-12
 
 
-def bag_files(dataset: Path) -> list[Path]:
-    """The bags' files below a dataset's folder, sorted; links are not followed."""
-    return sorted(path for path in dataset.rglob("*.mcap") if path.is_file() and not path.is_symlink())
+def bag_files(dataset: Location) -> list[str]:
+    """Names of the bags' files below a dataset, sorted; links are not followed."""
+    return open_storage(dataset).files_ending(".mcap")
 
 
-def bag_faults(dataset: Dataset, paths: list[Path]) -> list[str]:
+def bag_faults(dataset: Dataset, names: list[str]) -> list[str]:
     """What is wrong with the bags: images in pairs, as many as the dataset has, and its calibration.
 
     Args:
         dataset: that they were made of.
-        paths: all of them.
+        names: all of them.
     """
+    storage = open_storage(dataset.path)
+    paths = {name: storage.where(name) for name in names}
     try:
         import mcap.reader  # noqa: F401
         import mcap_ros2.decoder  # noqa: F401
     except ModuleNotFoundError as error:
         return [
-            f"{path}: cannot be checked, for {error.name} is missing: pip install mcap-ros2-support" for path in paths
+            f"{path}: cannot be checked, for {error.name} is missing: pip install mcap-ros2-support"
+            for path in paths.values()
         ]
     faults, pairs = [], 0
-    for path in paths:
+    for name, path in paths.items():
         try:
-            stamps, infos = _contents(path)
+            with storage.local_copy(name) as file:
+                stamps, infos = _contents(file)
         # Whatever a damaged bag makes the library raise.
         except Exception as error:
             faults.append(f"{path}: is damaged: {' '.join(str(error).split()) or type(error).__name__}")
@@ -51,7 +56,8 @@ def bag_faults(dataset: Dataset, paths: list[Path]) -> list[str]:
             )
         faults += [f"{path}: {fault}" for fault in _calibration_faults(dataset, infos)]
     if not faults and pairs != len(dataset.frame_indices):
-        faults.append(f"{paths[0].parent}: bags hold {pairs} pairs, the dataset {len(dataset.frame_indices)}")
+        where = paths[names[0]].rpartition("/")[0]
+        faults.append(f"{where}: bags hold {pairs} pairs, the dataset {len(dataset.frame_indices)}")
     return faults
 
 

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 
 from datasets_manifest.calibration import OPENCV_STEREO_FILE, calibration_files, opencv_stereo_matrices
 from datasets_manifest.layout import CALIBRATION_FOLDER
+from datasets_manifest.storage import Location, open_storage
 from geometry.stereo import StereoRig
 
 # The files hold 16 digits.
 _TOLERANCE = 1e-14
 
 
-def calibration_faults(dataset: Path, rig: StereoRig) -> list[str]:
+def calibration_faults(dataset: Location, rig: StereoRig) -> list[str]:
     """What is wrong with the files that are there; OpenCV's must be."""
-    folder, faults = dataset / CALIBRATION_FOLDER, []
+    storage, faults = open_storage(dataset), []
     for name, text in calibration_files(rig).items():
-        path = folder / name
+        path = storage.where(f"{CALIBRATION_FOLDER}/{name}")
         try:
-            found = path.read_bytes()
+            found = storage.read(f"{CALIBRATION_FOLDER}/{name}")
         except FileNotFoundError:
             if name == OPENCV_STEREO_FILE:
                 faults.append(f"{path}: is missing")
@@ -33,12 +32,12 @@ def calibration_faults(dataset: Path, rig: StereoRig) -> list[str]:
             faults.append(f"{path}: is not that of the manifest's rig")
         elif name == OPENCV_STEREO_FILE:
             # Only what is known not to be damaged is given to OpenCV's parser.
-            faults += _opencv_faults(path, rig)
+            faults += _opencv_faults(path, text, rig)
     return faults
 
 
-def _opencv_faults(path: Path, rig: StereoRig) -> list[str]:
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+def _opencv_faults(path: str, text: str, rig: StereoRig) -> list[str]:
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     faults = []
     for name, want in opencv_stereo_matrices(rig).items():
         found = storage.getNode(name).mat()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from pycocotools.coco import COCO
 from datasets_manifest.layout import ANNOTATIONS_FOLDER
 from datasets_manifest.manifest import Manifest
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location, open_storage
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES, Eye
 from labelgen.export.coco_entries import DROGUE, coco_image_id
@@ -27,10 +27,11 @@ _TOLERANCE_PX = 1e-9
 class CocoFiles:
     """`all.json` and the file of every split that has pairs, in memory."""
 
-    def __init__(self, dataset: Path, manifest: Manifest) -> None:
+    def __init__(self, dataset: Location, manifest: Manifest) -> None:
         """Read what can be read; what cannot is a fault."""
         self._faults: list[str] = []
-        self._path = dataset / ANNOTATIONS_FOLDER / "all.json"
+        self._storage = open_storage(dataset)
+        self._path = self._storage.where(f"{ANNOTATIONS_FOLDER}/all.json")
         wanted: dict[str, set[int]] = {"all": set()}
         for entry in manifest.frames:
             ids = {coco_image_id(entry.frame_index, eye) for eye in EYES}
@@ -69,12 +70,14 @@ class CocoFiles:
         return [f"{where}: {fault}" for fault in faults]
 
     def _load(self, name: str, ids: set[int]) -> COCO | None:
-        path = self._path.with_name(f"{name}.json")
+        inside = f"{ANNOTATIONS_FOLDER}/{name}.json"
+        path = self._storage.where(inside)
         try:
-            json.loads(path.read_bytes())
-            # pycocotools reports its progress on standard output.
-            with contextlib.redirect_stdout(io.StringIO()):
-                coco = COCO(str(path))
+            with self._storage.local_copy(inside) as file:
+                json.loads(file.read_bytes())
+                # pycocotools reports its progress on standard output.
+                with contextlib.redirect_stdout(io.StringIO()):
+                    coco = COCO(str(file))
         except FileNotFoundError:
             self._faults.append(f"{path}: is missing")
             return None
@@ -95,7 +98,8 @@ class CocoFiles:
         same = same and all(self._all.anns.get(key) == annotation for key, annotation in part.anns.items())
         same = same and len(part.anns) == sum(len(self._all.imgToAnns[key]) for key in part.imgs if key in whole)
         if not same:
-            self._faults.append(f"{self._path.with_name(f'{split}.json')}: differs from all.json")
+            path = self._storage.where(f"{ANNOTATIONS_FOLDER}/{split}.json")
+            self._faults.append(f"{path}: differs from all.json")
 
 
 def _annotation_faults(annotation: dict[str, Any], record: PairRecord, eye: Eye) -> list[str]:

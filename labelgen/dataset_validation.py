@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.json_types import FrozenModel
-from datasets_manifest.layout import RECORD_FILE, frame_folder, frame_indices, parts_file
+from datasets_manifest.layout import RECORD_FILE, parts_file
 from datasets_manifest.manifest import FrameEntry, Manifest, count_pairs
 from datasets_manifest.png import png_fault
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location, open_storage
 from datasets_manifest.writer import leftovers
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import drogue_part_ids
@@ -26,6 +27,7 @@ from labelgen.coco_validation import CocoFiles
 from labelgen.part_pixels import FeaturePixels, is_one_of
 from labelgen.passes_validation import passes_faults
 from labelgen.projection_validation import box_faults, projection_faults
+from labelgen.shard_validation import shard_faults
 from labelgen.validation import check_boxes, check_empty, check_unoccluded_marker, named_features
 
 
@@ -90,19 +92,21 @@ class _Tally:
         return ValidationReport(pairs=pairs, checks=tuple(checks))
 
 
-def validate_dataset(path: Path) -> ValidationReport:
+def validate_dataset(path: Location) -> ValidationReport:
     """Check everything that can be checked about a dataset without making it again.
 
     Args:
-        path: the dataset's folder.
+        path: where the dataset lies.
 
     Returns:
         What was checked and what is wrong; damaged files are faults, not exceptions.
 
     Raises:
-        ValueError: there is no such folder.
+        ValueError: there is no such folder, or a URL that cannot be used.
+        OSError: a place that cannot be reached.
     """
-    if not path.is_dir():
+    storage = open_storage(path)
+    if not storage.is_there():
         raise ValueError(f"{path}: there is no such dataset folder")
     tally = _Tally()
     try:
@@ -116,8 +120,13 @@ def validate_dataset(path: Path) -> ValidationReport:
     tally.add("split", _split_faults(manifest))
     tally.add("calibration", calibration_faults(path, manifest.recipe.rig))
     tally.add("leftovers", [f"{entry}: was left by a run that was killed" for entry in leftovers(path)])
-    for frame_index in sorted(set(frame_indices(path)) - set(dataset.frame_indices)):
-        tally.add("frames on disk", [f"{frame_folder(path, frame_index)}: is not in the manifest"])
+    for name, found in shard_faults(storage):
+        tally.add(name, found)
+    try:
+        for frame_index in sorted({*dataset.frames.indices()} - {*dataset.frame_indices}):
+            tally.add("frames on disk", [f"{dataset.frames.where(frame_index)}: is not in the manifest"])
+    except ValueError as error:
+        tally.add("frames on disk", [str(error)])
     bags = bag_files(path)
     if bags:
         tally.add("bags", bag_faults(dataset, bags))
@@ -130,15 +139,16 @@ def validate_dataset(path: Path) -> ValidationReport:
 
 
 def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _Tally) -> None:
-    folder = frame_folder(dataset.path, entry.frame_index)
+    folder = dataset.frames.where(entry.frame_index)
+    file = dataset.frames.where(entry.frame_index, RECORD_FILE)
     try:
         record = dataset.record(entry.frame_index)
     except ValueError as error:
         tally.add("records", [str(error)])
         return
-    tally.add("records", [f"{folder / RECORD_FILE}: {fault}" for fault in _entry_faults(record, entry)])
+    tally.add("records", [f"{file}: {fault}" for fault in _entry_faults(record, entry)])
     changed = dataset.verify(entry.frame_index)
-    tally.add("hashes", [*changed, *_stray_files(folder, record)])
+    tally.add("hashes", [*changed, *_stray_files(dataset.frames, record)])
     try:
         dataset.images(entry.frame_index)
         tally.add("images", [])
@@ -147,8 +157,8 @@ def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _T
     tally.add("projection and epipolar rows", [f"{folder}: {fault}" for fault in projection_faults(record)])
     tally.add("keypoints in boxes", [f"{folder}: {fault}" for fault in box_faults(record)])
     for eye in EYES:
-        path = folder / parts_file(eye)
-        part_id = _read_part_ids(path, record)
+        path = dataset.frames.where(entry.frame_index, parts_file(eye))
+        part_id = _read_part_ids(dataset.frames, record, eye)
         if part_id is None:
             tally.add("part ids", [f"{path}: cannot be read as 8 bit grey of the rig's size"])
             continue
@@ -208,9 +218,9 @@ def _entry_faults(record: PairRecord, entry: FrameEntry) -> list[str]:
     return faults
 
 
-def _stray_files(folder: Path, record: PairRecord) -> list[str]:
-    known = {*record.file_sha256, RECORD_FILE}
-    return [f"{entry}: is not on record" for entry in sorted(folder.iterdir()) if entry.name not in known]
+def _stray_files(frames: FrameStore, record: PairRecord) -> list[str]:
+    known, index = {*record.file_sha256, RECORD_FILE}, record.frame_index
+    return [f"{frames.where(index, name)}: is not on record" for name in frames.names(index) if name not in known]
 
 
 def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> list[str]:
@@ -231,14 +241,16 @@ def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> l
     return faults
 
 
-def _read_part_ids(path: Path, record: PairRecord) -> NDArray[np.uint8] | None:
+def _read_part_ids(frames: FrameStore, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
     """The part ids by OpenCV's own reader; None where they cannot be had."""
     camera = record.frame.rig.camera
     try:
-        whole = png_fault(path.read_bytes()) is None
-    except OSError:
+        data = frames.read(record.frame_index, parts_file(eye))
+    except ValueError:
         return None
-    part_id: NDArray[np.uint8] | None = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if whole else None
+    part_id: NDArray[np.uint8] | None = None
+    if png_fault(data) is None:
+        part_id = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if part_id is None or part_id.dtype != np.uint8 or part_id.shape != (camera.height_px, camera.width_px):
         return None
     return part_id

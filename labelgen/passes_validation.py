@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.layout import passes_file
 from datasets_manifest.passes import read_passes
-from datasets_manifest.reader import Dataset, read_frame_bytes
+from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part
@@ -34,7 +34,7 @@ def passes_faults(dataset: Dataset, record: PairRecord, eye: Eye, part_id: NDArr
     if name not in record.file_sha256:
         return None
     try:
-        data = read_frame_bytes(dataset.path, record.frame_index, name)
+        data = dataset.frames.read(record.frame_index, name)
         planes = read_passes(data, name, record.frame.rig.camera)
     except ValueError as error:
         return [str(error)]

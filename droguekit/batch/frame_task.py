@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import cv2
 
 from datasets_manifest.layout import passes_file
+from datasets_manifest.packing import Packing, pack_if_complete
 from datasets_manifest.recipe import Recipe
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from datasets_manifest.writer import encode_files, write_frame
 from geometry.stereo import EYES, Eye
 from labelgen.frame_labels import label_frame
@@ -40,13 +41,15 @@ class FrameTask:
 
     Attributes:
         recipe: what to make.
-        dataset: the folder.
+        dataset: where it lies.
         engine_version: what the frames that are already there were made with, or None when there are none.
+        packing: which frames come into a tar file together, or None where each keeps its folder.
     """
 
     recipe: Recipe
-    dataset: Path
+    dataset: Location
     engine_version: str | None = None
+    packing: Packing | None = None
 
     def __call__(self, frame_index: int) -> FrameReport:
         """Make and write frame `frame_index`.
@@ -72,6 +75,8 @@ class FrameTask:
             raise OSError(error.errno, f"frame {frame_index}: cannot be made: {where}: {error.strerror}") from error
         with _timed(stage_s, "write"):
             write_frame(self.dataset, record, files)
+            if self.packing is not None:
+                pack_if_complete(self.dataset, frame_index, self.packing)
         distance_m = record.conditions.distance_m
         size_bytes = sum(len(content) for content in files.values())
         return FrameReport(socket.gethostname(), time.monotonic() - began_s, stage_s, distance_m, size_bytes)

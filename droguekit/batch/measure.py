@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.reader import read_record_table
 from datasets_manifest.recipe import Recipe
 from droguekit.batch.frame_task import FrameReport, FrameTask
@@ -59,7 +60,7 @@ def _measure(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ..
 
 def _measured(task: FrameTask, frame_index: int) -> MeasuredFrame:
     report = task(frame_index)
-    conditions = read_record_table(task.dataset, frame_index)["conditions"]
+    conditions = read_record_table(FrameStore(task.dataset), frame_index)["conditions"]
     return MeasuredFrame(report, conditions["monte_carlo_over_sensor_noise"], _memory_bytes())
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from datasets_manifest.layout import RECIPE_FILE
 from datasets_manifest.manifest import Manifest, read_manifest
-from datasets_manifest.reader import Dataset, read_frame_bytes
+from datasets_manifest.packing import pack_if_complete, packing_of
+from datasets_manifest.reader import Dataset
+from datasets_manifest.storage import Location, open_storage
 from datasets_manifest.writer import write_frame
-from droguekit.batch.local import Events, RunSummary, Totals, describe_dataset, still_missing
+from droguekit.batch.local import RunSummary, describe_dataset, still_missing
+from droguekit.batch.making import Events, Totals
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.resume import differing_keys, open_dataset, sort_frames
 from render.version import RENDER_VERSION
@@ -17,15 +19,18 @@ from render.version import RENDER_VERSION
 _SHOWN = 20
 
 
-def merge_shards(out: Path, shards: Sequence[Path], report: ProgressReport) -> RunSummary:
+def merge_shards(
+    out: Location, shards: Sequence[Location], report: ProgressReport, pairs_per_tar: int | None = None
+) -> RunSummary:
     """Join shards of one recipe to a dataset, the same that one run would have made.
 
     Frames that are in `out` already and whole stay, so a merge that was stopped goes on by the same call.
 
     Args:
-        out: the dataset's folder; made if missing.
-        shards: folders of datasets that hold a part of the frames each; a frame may be in several.
+        out: where the dataset is to lie; a folder is made if missing.
+        shards: places of datasets that hold a part of the frames each; a frame may be in several.
         report: hears how it goes.
+        pairs_per_tar: how many frames come into a tar file; None leaves that as it is, folders at first.
 
     Raises:
         ValueError: the shards do not belong together, lack frames, or hold a damaged one; nothing is joined then.
@@ -41,17 +46,19 @@ def merge_shards(out: Path, shards: Sequence[Path], report: ProgressReport) -> R
     drops = [drop for other in manifests.values() for drop in other.drops if drop.frame_index not in sources]
     _complete(manifest.recipe.frames.count, {*sources, *(drop.frame_index for drop in drops)})
     datasets = {shard: Dataset(shard) for shard in shards}
-    recipe_text = (first / RECIPE_FILE).read_text(encoding="utf-8")
-    with open_dataset(out, manifest.recipe, recipe_text) as stream:
+    recipe_text = open_storage(first).read(RECIPE_FILE).decode()
+    with open_dataset(out, manifest.recipe, recipe_text, pairs_per_tar) as stream:
         events = Events(stream)
         whole = sort_frames(out, read_manifest(out)).whole
         events.write("merge", shards=[str(shard) for shard in shards], kept=len(whole))
-        totals = Totals()
+        totals, packing = Totals(), packing_of(out, range(manifest.recipe.frames.count))
         report.begin("pairs", len(sources) - len(whole))
         try:
             for frame_index in sorted(set(sources) - whole):
                 totals.size_bytes += _copy(datasets[sources[frame_index]], frame_index, out)
                 totals.made.append(frame_index)
+                if packing is not None:
+                    pack_if_complete(out, frame_index, packing)
                 report.advance()
         finally:
             report.end()
@@ -62,7 +69,7 @@ def merge_shards(out: Path, shards: Sequence[Path], report: ProgressReport) -> R
     return RunSummary(totals, len(whole), missing, result.counts.pairs, planned, result.dataset_sha256)
 
 
-def _belongs(first: Path, manifest: Manifest, shard: Path, other: Manifest) -> None:
+def _belongs(first: Location, manifest: Manifest, shard: Location, other: Manifest) -> None:
     """See that two shards are parts of one dataset.
 
     Raises:
@@ -96,13 +103,13 @@ def _builds(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str, str
     )
 
 
-def _sources(manifests: dict[Path, Manifest]) -> dict[int, Path]:
+def _sources(manifests: dict[Location, Manifest]) -> dict[int, Location]:
     """Where each frame lies.
 
     Raises:
         ValueError: two shards hold different frames of one index.
     """
-    found: dict[int, tuple[Path, str]] = {}
+    found: dict[int, tuple[Location, str]] = {}
     for shard, manifest in manifests.items():
         for entry in manifest.frames:
             known, sha256 = found.setdefault(entry.frame_index, (shard, entry.record_sha256))
@@ -123,7 +130,7 @@ def _complete(count: int, there: set[int]) -> None:
         )
 
 
-def _copy(source: Dataset, frame_index: int, out: Path) -> int:
+def _copy(source: Dataset, frame_index: int, out: Location) -> int:
     """Copy a frame, hashing it on the way.
 
     Returns:
@@ -136,6 +143,6 @@ def _copy(source: Dataset, frame_index: int, out: Path) -> int:
     if faults:
         raise ValueError(f"{faults[0]}; start the command of that shard again, which mends it, then merge")
     record = source.record(frame_index)
-    files = {name: read_frame_bytes(source.path, frame_index, name) for name in record.file_sha256}
+    files = {name: source.frames.read(frame_index, name) for name in record.file_sha256}
     write_frame(out, record, files)
     return sum(len(content) for content in files.values())

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable
 from typing import Protocol, TextIO
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
+from rich.text import Text
 
 # A log gets a line at most this often, and always one at the end.
 _LINE_EVERY_S = 10.0
@@ -24,6 +26,10 @@ class ProgressReport(Protocol):
         """One piece is finished."""
         ...
 
+    def note(self, text: str) -> None:
+        """What stands beside the count from the next piece on, such as failures so far; empty for nothing."""
+        ...
+
     def say(self, text: str) -> None:
         """A line for the user."""
         ...
@@ -38,24 +44,28 @@ class PlainProgress:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        self._what, self._total, self._done = "", 0, 0
-        self._began_s = self._told_s = 0.0
+        self._what, self._note = "", ""
+        self._pace = Pace(0)
+        self._told_s = 0.0
 
     def begin(self, what: str, total: int) -> None:
         """Start counting."""
-        self._what, self._total, self._done = what, total, 0
-        self._began_s = self._told_s = time.monotonic()
+        self._what, self._note, self._pace = what, "", Pace(total)
+        self._told_s = time.monotonic()
 
     def advance(self) -> None:
         """Count one, and tell it when the last line is old or this was the last piece."""
-        self._done += 1
+        self._pace.advance()
         now_s = time.monotonic()
-        if self._done < self._total and now_s - self._told_s < _LINE_EVERY_S:
+        if self._pace.done < self._pace.total and now_s - self._told_s < _LINE_EVERY_S:
             return
         self._told_s = now_s
-        rate_per_s = self._done / max(now_s - self._began_s, 1e-9)
-        left = "" if self._done == self._total else f", {duration((self._total - self._done) / rate_per_s)} left"
-        self.say(f"{self._what}: {self._done} of {self._total}, {60 * rate_per_s:.1f} a minute{left}")
+        count = f"{self._what}: {self._pace.done} of {self._pace.total}"
+        self.say(", ".join(filter(None, (count, self._pace.rate(), self._pace.time_left(), self._note))))
+
+    def note(self, text: str) -> None:
+        """Keep it for the next line."""
+        self._note = text
 
     def say(self, text: str) -> None:
         """Print the line."""
@@ -65,36 +75,53 @@ class PlainProgress:
         """Nothing to clear."""
 
 
+class _NotedBar(Progress):
+    """A bar with a line below it."""
+
+    note = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """The bar and the note."""
+        yield from super().get_renderables()
+        if self.note:
+            yield Text(self.note, no_wrap=True, overflow="ellipsis")
+
+
 class TerminalProgress:
-    """A bar on a terminal."""
+    """A bar on a terminal, with the note on a line of its own: narrow terminals have no room for both."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._progress: Progress | None = None
+        self._progress: _NotedBar | None = None
         self._task = TaskID(0)
-        self._began_s, self._done = 0.0, 0
+        self._pace = Pace(0)
 
     def begin(self, what: str, total: int) -> None:
         """Draw the empty bar."""
-        self._progress = Progress(
+        self._progress = _NotedBar(
             TextColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(bar_width=None),  # what the others leave of the line
             MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[pace]}", markup=False),
             console=self._console,
             transient=True,
+            expand=True,
         )
-        self._task = self._progress.add_task(what, total=total, rate="")
-        self._began_s, self._done = time.monotonic(), 0
+        self._task = self._progress.add_task(what, total=total, pace="")
+        self._pace = Pace(total)
         self._progress.start()
 
     def advance(self) -> None:
         """Move the bar by one."""
         if self._progress is not None:
-            self._done += 1
-            rate_per_min = 60 * self._done / max(time.monotonic() - self._began_s, 1e-9)
-            self._progress.update(self._task, advance=1, rate=f"{rate_per_min:.1f} a minute")
+            self._pace.advance()
+            pace = ", ".join(filter(None, (self._pace.rate(), self._pace.time_left())))
+            self._progress.update(self._task, advance=1, pace=pace)
+
+    def note(self, text: str) -> None:
+        """Show it below the bar."""
+        if self._progress is not None:
+            self._progress.note = text
 
     def say(self, text: str) -> None:
         """Print the line above the bar."""
@@ -105,6 +132,30 @@ class TerminalProgress:
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
+
+
+class Pace:
+    """How fast equal pieces of work go, by the clock that nobody sets."""
+
+    def __init__(self, total: int) -> None:
+        self.total, self.done = total, 0
+        self._began_s = time.monotonic()
+
+    def advance(self) -> None:
+        """One piece is finished."""
+        self.done += 1
+
+    def rate(self) -> str:
+        """Pieces a minute."""
+        return f"{60 * self._per_second():.1f} a minute"
+
+    def time_left(self) -> str:
+        """Of the pieces that are not finished, at the rate so far; empty when there are none."""
+        left = self.total - self.done
+        return f"{duration(left / self._per_second())} left" if left else ""
+
+    def _per_second(self) -> float:
+        return self.done / max(time.monotonic() - self._began_s, 1e-9)
 
 
 def progress_report() -> ProgressReport:

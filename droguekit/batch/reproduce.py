@@ -16,6 +16,7 @@ from datasets_manifest.layout import RECORD_FILE, frame_folder
 from datasets_manifest.provenance import cpu_features, differing_builds, software_versions
 from datasets_manifest.reader import Dataset
 from datasets_manifest.recipe import Recipe
+from datasets_manifest.storage import Location
 from droguekit.batch.frame_task import FrameTask
 from droguekit.batch.workers import run_alone
 
@@ -49,7 +50,7 @@ class Reproduction:
     elsewhere: tuple[str, ...]
 
 
-def reproduce_frame(dataset: Path, frame_index: int) -> Reproduction:
+def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
     """Make a frame of a dataset again, from the manifest alone, and compare record and files.
 
     Raises:
@@ -62,7 +63,7 @@ def reproduce_frame(dataset: Path, frame_index: int) -> Reproduction:
     faults = source.verify(frame_index)
     if faults:
         return Reproduction("different", tuple(faults), ())
-    old = json.loads((frame_folder(dataset, frame_index) / RECORD_FILE).read_bytes())
+    old = json.loads(source.frames.read(frame_index, RECORD_FILE))
     new, record_sha256 = run_alone(partial(_make_again, source.manifest.recipe, frame_index))
     expected = next(entry.record_sha256 for entry in source.manifest.frames if entry.frame_index == frame_index)
     # The record holds the hashes of all other files.

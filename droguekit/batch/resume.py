@@ -15,11 +15,14 @@ from typing import Any, TextIO
 from pydantic import ValidationError
 
 from datasets_manifest import layout
-from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.manifest import Manifest, build_manifest, read_manifest, write_manifest
+from datasets_manifest.packing import choose_packing, mend_shards, pack_all
 from datasets_manifest.recipe import Recipe
 from datasets_manifest.records import PairRecord
-from datasets_manifest.writer import remove_frame, remove_leftovers
+from datasets_manifest.shard_index import shard_numbers
+from datasets_manifest.storage import Location, in_order, open_storage
+from datasets_manifest.writer import remove_leftovers
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scene
 
@@ -30,46 +33,92 @@ _OURS = {
     layout.CARD_FILE,
     layout.CROISSANT_FILE,
     layout.FRAMES_FOLDER,
+    layout.SHARDS_FOLDER,
     layout.ANNOTATIONS_FOLDER,
     layout.CALIBRATION_FOLDER,
 }
 
 
 @contextmanager
-def open_dataset(out: Path, recipe: Recipe, recipe_text: str) -> Iterator[TextIO]:
-    """A dataset's folder, new or to be completed, that nobody else writes into meanwhile.
+def open_dataset(out: Location, recipe: Recipe, recipe_text: str, pairs_per_tar: int | None = None) -> Iterator[TextIO]:
+    """A dataset, new or to be completed, that nobody else writes into meanwhile.
 
     Frames that a manifest does not vouch for are removed, and so is what killed runs left half-written. A folder that
-    was new is removed again when the block ends with an error before it has a frame.
+    was new is removed again when the block ends with an error before it has a frame. On an object store nothing keeps
+    a second run away.
+
+    Args:
+        out: where it lies.
+        recipe: what it is made from.
+        recipe_text: the recipe as given.
+        pairs_per_tar: how many frames come into a tar file; None leaves that as it is.
 
     Yields:
         The stream to which events are appended.
 
     Raises:
-        ValueError: the folder holds something else, another recipe, or another run at work.
+        ValueError: the place holds something else, another recipe, or another run at work.
         OSError: it cannot be made or written.
     """
+    folder = open_storage(out).path("")
+    with _open_place(out) if folder is None else _open_folder(folder) as events:
+        remove_leftovers(out)
+        _start(out, recipe, recipe_text)
+        choose_packing(out, pairs_per_tar)
+        mend_shards(out)
+        yield events
+
+
+def finish_frames(out: Location) -> None:
+    """What is left to do for the frames once nobody makes any more: pack them, and remove what lost workers began.
+
+    Raises:
+        ValueError: a list of a tar file is missing or damaged.
+        OSError: a place that cannot be read or written.
+    """
+    remove_leftovers(out)
+    pack_all(out)
+
+
+@contextmanager
+def _open_folder(out: Path) -> Iterator[TextIO]:
     is_new = not out.exists()
     if not is_new and not out.is_dir():
         raise ValueError(f"{out}: is a file; give a folder for the dataset")
-    foreign = [] if is_new else sorted(entry.name for entry in out.iterdir() if not _is_ours(entry.name))
-    if foreign and not (out / layout.MANIFEST_FILE).exists():
-        raise ValueError(f"{out}: holds other things ({foreign[0]}); give a new or empty folder for the dataset")
+    _refuse_foreign(out)
     out.mkdir(parents=True, exist_ok=True)
     try:
         with (out / layout.EVENTS_FILE).open("a", encoding="utf-8") as events:
             _lock(events, out)
-            remove_leftovers(out)
-            _start(out, recipe, recipe_text)
             yield events
     except BaseException:
-        if is_new and not layout.frame_indices(out):
+        if is_new and not layout.frame_indices(out) and not shard_numbers(open_storage(out)):
             shutil.rmtree(out, ignore_errors=True)
         raise
 
 
-def _is_ours(name: str) -> bool:
-    return name in _OURS or name.startswith(".")
+@contextmanager
+def _open_place(out: Location) -> Iterator[TextIO]:
+    """The same where files cannot be appended to: new events wait in a temporary file until the block ends."""
+    _refuse_foreign(out)
+    storage = open_storage(out)
+    before = storage.read(layout.EVENTS_FILE) if storage.exists(layout.EVENTS_FILE) else b""
+    storage.write(layout.EVENTS_FILE, before)  # by which workers elsewhere see that it is the same place
+    with storage.spool("") as events:
+        try:
+            yield events
+        finally:
+            events.seek(0)
+            with storage.write_text(layout.EVENTS_FILE) as stream:
+                stream.write(before.decode())
+                shutil.copyfileobj(events, stream)
+
+
+def _refuse_foreign(out: Location) -> None:
+    names = open_storage(out).names("")
+    foreign = [name for name in names if name not in _OURS and not name.startswith(".")]
+    if foreign and layout.MANIFEST_FILE not in names:
+        raise ValueError(f"{out}: holds other things ({foreign[0]}); give a new or empty folder for the dataset")
 
 
 def _lock(events: TextIO, out: Path) -> None:
@@ -80,9 +129,10 @@ def _lock(events: TextIO, out: Path) -> None:
         raise ValueError(f"{out}: another run is writing into it; wait for its end, or give another folder") from error
 
 
-def _start(out: Path, recipe: Recipe, recipe_text: str) -> None:
-    """See that the folder belongs to the recipe; a new one gets its manifest before its first frame."""
-    if (out / layout.MANIFEST_FILE).exists():
+def _start(out: Location, recipe: Recipe, recipe_text: str) -> None:
+    """See that the place belongs to the recipe; a new one gets its manifest before its first frame."""
+    storage = open_storage(out)
+    if storage.exists(layout.MANIFEST_FILE):
         manifest = read_manifest(out)
         differing = differing_keys(manifest.recipe.model_dump(mode="json"), recipe.model_dump(mode="json"))
         if differing:
@@ -94,9 +144,12 @@ def _start(out: Path, recipe: Recipe, recipe_text: str) -> None:
                 "pixels differ; render into a new folder"
             )
         return
-    for frame_index in layout.frame_indices(out):
-        remove_frame(out, frame_index)
-    write_text_atomic(out / layout.RECIPE_FILE, recipe_text)
+    for name in storage.folders_with(layout.FRAMES_FOLDER, layout.RECORD_FILE):
+        storage.delete_folder(f"{layout.FRAMES_FOLDER}/{name}", layout.RECORD_FILE)
+    for number in shard_numbers(storage):
+        storage.delete(layout.shard_index_file(number))
+        storage.delete(layout.shard_file(number))
+    storage.write(layout.RECIPE_FILE, recipe_text.encode())
     write_manifest(out, build_manifest(out, recipe, RENDER_VERSION, lambda scene_id: split_of_scene(recipe, scene_id)))
 
 
@@ -130,18 +183,20 @@ class Found:
     engine_version: str | None
 
 
-def sort_frames(dataset: Path, manifest: Manifest) -> Found:
+def sort_frames(dataset: Location, manifest: Manifest) -> Found:
     """Tell the frames that are there as they were written from the damaged ones.
 
     Raises:
-        ValueError: whole frames were made by different engine versions.
+        ValueError: whole frames were made by different engine versions, or a list of a tar file is damaged.
     """
     vouched = {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
     whole: list[int] = []
     damaged: list[int] = []
     versions: dict[str, int] = {}
-    for frame_index in layout.frame_indices(dataset):
-        record = _read_whole(layout.frame_folder(dataset, frame_index), vouched.get(frame_index))
+    store = FrameStore(dataset)
+    indices = store.indices()
+    records = in_order(lambda index: _read_whole(store, index, vouched.get(index)), indices, store.storage)
+    for frame_index, record in zip(indices, records, strict=True):
         if record is None or record.frame_index != frame_index:
             damaged.append(frame_index)
         else:
@@ -153,16 +208,16 @@ def sort_frames(dataset: Path, manifest: Manifest) -> Found:
     return Found(frozenset(whole), tuple(damaged), next(iter(versions), None))
 
 
-def _read_whole(folder: Path, record_sha256: str | None) -> PairRecord | None:
+def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) -> PairRecord | None:
     """The record of a frame, or None where it or a file of the frame is not what was written."""
     try:
-        data = (folder / layout.RECORD_FILE).read_bytes()
+        data = store.read(frame_index, layout.RECORD_FILE)
         if record_sha256 not in (None, hashlib.sha256(data).hexdigest()):
             return None
         record = PairRecord.model_validate(json.loads(data))
         for name, sha256 in record.file_sha256.items():
-            if hashlib.sha256((folder / name).read_bytes()).hexdigest() != sha256:
+            if hashlib.sha256(store.read(frame_index, name)).hexdigest() != sha256:
                 return None
-    except (OSError, ValueError, ValidationError, RecursionError):
+    except (ValueError, ValidationError, RecursionError):
         return None
     return record

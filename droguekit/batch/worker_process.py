@@ -56,6 +56,7 @@ class Worker:
         self.index: int | None = None
         self.is_ready = False
         self.tasks_done = 0
+        self.resident_gib = 0.0
         self._began_s = 0.0
 
     def give(self, index: int) -> None:

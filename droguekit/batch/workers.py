@@ -29,7 +29,7 @@ class Limits:
     """
 
     timeout_s: float | None = None
-    tasks_per_process: int = 200
+    tasks_per_process: int = 500
     process_gib: float | None = None
 
     def __post_init__(self) -> None:
@@ -54,6 +54,7 @@ class Attempt(Generic[T]):
         value: what the task returned, or None.
         error: what it raised, `WorkerDiedError` when its process died, `TaskTimeoutError` when it took too long.
         final: whether the task is not tried again.
+        workers_gib: memory that the workers held together when they last told, 0.0 where they do not. [GiB]
     """
 
     index: int
@@ -61,6 +62,7 @@ class Attempt(Generic[T]):
     value: T | None
     error: BaseException | None
     final: bool
+    workers_gib: float = 0.0
 
 
 def is_accident(error: BaseException | None) -> bool:
@@ -166,19 +168,20 @@ class _Crew(Generic[T]):
             worker.is_ready = True
             self._deaths_at_start = 0
             return
-        value, raised, resident_gib = message
+        value, raised, worker.resident_gib = message
         index = cast(int, worker.index)
         if is_accident(raised):
             yield self._fail(worker, raised)
             return
         worker.index = None
         worker.tasks_done += 1
+        workers_gib = self._resident_gib()
         if worker.tasks_done >= self._limits.tasks_per_process or (
-            self._limits.process_gib is not None and resident_gib > self._limits.process_gib
+            self._limits.process_gib is not None and worker.resident_gib > self._limits.process_gib
         ):
             self._workers.remove(worker)
             worker.dismiss()
-        yield Attempt(index, self._failures[index] + 1, value, raised, final=True)
+        yield Attempt(index, self._failures[index] + 1, value, raised, True, workers_gib)
 
     def _fail(self, worker: Worker, error: BaseException) -> Attempt[T]:
         """End a worker by whose accident a task has failed; the task waits for its next attempt if it has one."""
@@ -189,7 +192,10 @@ class _Crew(Generic[T]):
         final = self._failures[index] >= MAX_ATTEMPTS
         if not final:
             self._waiting.append(index)
-        return Attempt(index, self._failures[index], None, error, final)
+        return Attempt(index, self._failures[index], None, error, final, self._resident_gib())
+
+    def _resident_gib(self) -> float:
+        return sum(worker.resident_gib for worker in self._workers)
 
     def _lose_idle(self, worker: Worker, error: WorkerDiedError) -> None:
         """A death without a task costs none; but workers that die before their first one are no accident.

@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from datasets_manifest.storage import as_location
+
 RecipeArgument = Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a shipped recipe, or a .toml file.")]
-DatasetArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The dataset's folder.")]
+# A `Location`: typer knows no unions.
+DatasetArgument = Annotated[
+    Any,
+    typer.Argument(metavar="DIR", parser=as_location, help="The dataset's folder, or a URL such as s3://BUCKET/NAME."),
+]
+TarOption = Annotated[
+    int | None,
+    typer.Option(
+        "--tar",
+        metavar="N",
+        help="Keep pairs in tar files of N instead of a folder each, for corpora of millions; once chosen, it stays.",
+    ),
+]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Replaces the recipe's seed.")]
 WorkersOption = Annotated[
     int | None,
@@ -16,6 +29,10 @@ WorkersOption = Annotated[
         "--workers",
         help="Worker processes; by default as many as cores and memory allow. 0 works in this process, for debugging.",
     ),
+]
+DetectorOption = Annotated[
+    str | None,
+    typer.Option("--detector", metavar="NAME|FILE.onnx", help="A detector's name, or a network; docs/detection.md."),
 ]
 EngineOption = Annotated[str | None, typer.Option("--engine", metavar="NAME", help="Replaces the recipe's engine.")]
 

@@ -24,6 +24,8 @@ COMMANDS = {
     "reproduce": "Make one frame of a dataset again and compare.",
     "export": "Write a dataset's labels in another format.",
     "preview": "Draw a contact sheet of a dataset with its labels.",
+    "detect": "Find the drogue in every image, without the truth.",
+    "train": "Train a detector on datasets, evaluate and export it.",
     "navigate": "Estimate the drogue's pose in every pair, without the truth.",
     "benchmark": "Compare estimates with the truth: numbers and a report.",
     "model": "Write the drogue as a mesh.",

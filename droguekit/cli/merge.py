@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from datasets_manifest.storage import as_location
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import human_size
+from droguekit.cli.arguments import TarOption, human_size
 from droguekit.cli.main import FAULT
 
 EXAMPLES = ("droguekit merge data/demo data/demo-0 data/demo-1",)
 
 
 def merge(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The dataset's folder; made if missing.")],
-    shards: Annotated[list[Path], typer.Argument(metavar="SHARD...", help="Folders that `render --shard` has made.")],
+    out: Annotated[
+        Any,
+        typer.Argument(metavar="OUT", parser=as_location, help="The dataset's folder, made if missing, or a URL."),
+    ],
+    shards: Annotated[
+        list[Any],
+        typer.Argument(metavar="SHARD...", parser=as_location, help="Folders or URLs that `render --shard` made."),
+    ],
+    tar: TarOption = None,
 ) -> None:
     """Join shards of one recipe to the dataset that one run would have made.
 
@@ -24,7 +31,7 @@ def merge(
     """
     from droguekit.batch.merge import merge_shards
 
-    summary = merge_shards(out, shards, progress_report())
+    summary = merge_shards(out, shards, progress_report(), tar)
     size = human_size(summary.totals.size_bytes)
     typer.echo(f"{out}: joined {len(summary.totals.made)} pairs ({size}), kept {summary.kept}")
     typer.echo(f"{summary.pairs} of {summary.planned} pairs are there; dataset sha256 {summary.dataset_sha256}")

@@ -17,6 +17,7 @@ from droguekit.cli.interrupts import interrupts_wait
 if TYPE_CHECKING:
     from datasets_manifest.estimates import Estimate
     from datasets_manifest.recipe import Recipe
+    from datasets_manifest.storage import Location
     from droguekit.bars.image_tiers import TierData
     from droguekit.bars.table import BarTable
     from droguekit.batch.local import RunSummary
@@ -60,15 +61,17 @@ class RenderOrder:
         workers: processes of this machine, as many as it holds when None.
         timeout_s: for one frame, by the recipe when None. [s]
         scheduler: address of a Dask scheduler whose workers do it instead, or None.
+        pairs_per_tar: how many frames come into a tar file; None leaves that as it is, folders at first.
     """
 
     workers: int | None = None
     timeout_s: float | None = None
     scheduler: str | None = None
+    pairs_per_tar: int | None = None
 
 
 def render_frames(
-    recipe: Recipe, text: str, out: Path, frames: Sequence[int], order: RenderOrder, report: ProgressReport
+    recipe: Recipe, text: str, out: Location, frames: Sequence[int], order: RenderOrder, report: ProgressReport
 ) -> RunSummary:
     """Make frames of a recipe into a dataset.
 
@@ -77,8 +80,9 @@ def render_frames(
         OSError: the folder cannot be written or the disk is full; finished frames stay.
     """
     with interrupts_wait():
-        from droguekit.batch.local import Spread, render_dataset
+        from droguekit.batch.local import render_dataset
         from droguekit.batch.machine import default_workers
+        from droguekit.batch.making import Spread
         from render.engine import engine_notice
 
     workers = default_workers() if order.workers is None else order.workers
@@ -88,10 +92,12 @@ def render_frames(
         raise ValueError(f"--timeout: must be above 0 s, got {order.timeout_s:g}")
     if order.scheduler is not None and order.workers is not None:
         raise ValueError("--workers: means processes of this machine; with --scheduler leave it out")
+    if str(out).startswith("memory:") and workers != 0:
+        raise ValueError(f"--out: {out} is the memory of one process; give --workers 0, or another place")
     notice = engine_notice(recipe.render.engine)
     if notice is not None:
         report.say(notice)
-    spread = Spread(workers, order.timeout_s, order.scheduler)
+    spread = Spread(workers, order.timeout_s, order.scheduler, order.pairs_per_tar)
     return render_dataset(recipe, text, out, frames, spread, report)
 
 
@@ -105,16 +111,22 @@ class Fixes:
 
 
 def navigate_dataset(
-    dataset: Path, methods: Sequence[str], out: Path, report: ProgressReport, centroids: str = "own"
+    dataset: Location,
+    methods: Sequence[str],
+    out: Path,
+    report: ProgressReport,
+    centroids: str = "own",
+    detector: str | None = None,
 ) -> list[Fixes]:
     """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
 
     Raises:
-        ValueError: no such dataset, method or way to measure centroids, or an image that cannot be read.
+        ValueError: no such dataset, method, detector or way to measure centroids, or an image that cannot be read.
         OSError: the estimates cannot be written.
     """
     from datasets_manifest.blind import BlindDataset
     from datasets_manifest.estimates import write_estimates
+    from nav.detector.registry import DEFAULT_DETECTOR
     from nav.runner import CENTROID_CHOICES, method_names, navigate
 
     choice = next((name for name in CENTROID_CHOICES if name == centroids), None)
@@ -122,7 +134,7 @@ def navigate_dataset(
         raise ValueError(f"--centroids: must be one of {', '.join(CENTROID_CHOICES)}, got {centroids!r}")
     chosen = list(dict.fromkeys(methods)) or list(method_names())
     blind = BlindDataset(dataset)
-    estimates = navigate(blind, chosen, choice)
+    estimates = navigate(blind, chosen, choice, DEFAULT_DETECTOR if detector is None else detector)
     fixes: Counter[str] = Counter()
 
     def counted() -> Iterator[Estimate]:
@@ -141,7 +153,9 @@ def navigate_dataset(
     return [Fixes(method, fixes[method], len(blind.frame_indices)) for method in chosen]
 
 
-def benchmark_dataset(dataset: Path, estimates: Path, json_out: Path | None, html_out: Path | None) -> BenchmarkResult:
+def benchmark_dataset(
+    dataset: Location, estimates: Path, json_out: Path | None, html_out: Path | None
+) -> BenchmarkResult:
     """Compare estimates with the truth, and write the numbers and the report where a place is given for them.
 
     Raises:
@@ -161,7 +175,7 @@ def benchmark_dataset(dataset: Path, estimates: Path, json_out: Path | None, htm
     return result
 
 
-def check_blind_dataset(dataset: Path, estimates: Path, json_out: Path | None, html_out: Path | None) -> BlindCheck:
+def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | None, html_out: Path | None) -> BlindCheck:
     """The same without truth: compare estimates with their own measurements, and with boxes if there are any.
 
     Raises:

@@ -11,6 +11,7 @@ from droguekit.cli.arguments import DatasetArgument
 
 if TYPE_CHECKING:
     from datasets_manifest.reader import Dataset
+    from datasets_manifest.storage import Location
     from droguekit.benchmark.label_drawing import Picture
 
 EXAMPLES = (
@@ -84,16 +85,19 @@ def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:
         raise ValueError(f"--out: must end in .png or .jpg, got {out}")
 
 
-def _draw_sheet(dataset: Path, count: int, columns: int, tile_width: int, by_family: bool) -> tuple[Picture, int, int]:
+def _draw_sheet(
+    dataset: Location, count: int, columns: int, tile_width: int, by_family: bool
+) -> tuple[Picture, int, int]:
     """The sheet, how many pairs it shows, and how many there are."""
     import numpy as np
 
     from datasets_manifest.blind import BlindDataset
     from datasets_manifest.layout import BLIND_FILE
     from datasets_manifest.reader import Dataset
+    from datasets_manifest.storage import open_storage
     from droguekit.cli.contact_sheet import draw_blind_sheet, draw_contact_sheet, draw_family_sheet
 
-    is_blind = (dataset / BLIND_FILE).exists()
+    is_blind = open_storage(dataset).exists(BLIND_FILE)
     if is_blind and by_family:
         raise ValueError(f"--by-family: {dataset} has no truth, and so no families")
     source = BlindDataset(dataset) if is_blind else Dataset(dataset)

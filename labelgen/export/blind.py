@@ -22,13 +22,14 @@ from datasets_manifest.layout import (
 )
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from datasets_manifest.writer import canonical_json
 from geometry.stereo import EYES
-from labelgen.export.frame_files import frame_file, link_or_copy
+from labelgen.export.frame_files import place_file
 from labelgen.export.log import ExportLog
 
 
-def write_blind(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_blind(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write images, time stamps, rig, drogue and calibration.
 
     Args:
@@ -53,7 +54,7 @@ def write_blind(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
         for record in log.records(source):
             target = frame_folder(folder, record.frame_index)
             for name in names:
-                link_or_copy(frame_file(dataset, record.frame_index, name), target / name)
+                place_file(source, record.frame_index, name, target / name)
             _write_text(target / RECORD_FILE, canonical_json(_blind_record(record, index.drogues_differ)) + "\n")
         _write_text(folder / BLIND_FILE, canonical_json(index.model_dump(mode="json")) + "\n")
     return [out]

@@ -19,8 +19,9 @@ from datasets_manifest.layout import passes_file
 from datasets_manifest.manifest import SplitName
 from datasets_manifest.passes import read_passes
 from datasets_manifest.png import encode_png
-from datasets_manifest.reader import Dataset, read_frame_bytes
+from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from datasets_manifest.writer import canonical_json
 from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
@@ -55,7 +56,7 @@ A droguekit dataset in the BOP format. Lengths are millimetres.
 """
 
 
-def write_bop(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_bop(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write a dataset for BOP's tools; arguments and errors as in `labelgen.export.formats`.
 
     Raises:
@@ -156,7 +157,7 @@ class _Scenes:
             self._log.lost("depth images left out, for the dataset has no EXR files")
             return 1.0
         name = passes_file(eye)
-        data = read_frame_bytes(self._source.path, record.frame_index, name)
+        data = self._source.frames.read(record.frame_index, name)
         passes = read_passes(data, f"frame {record.frame_index}: {name}", record.frame.rig.camera)
         numbers, scale = depth_numbers(passes["depth.Z"])
         path = scene / f"depth_{eye}" / f"{record.frame_index:06d}.png"

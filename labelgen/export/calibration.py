@@ -9,16 +9,17 @@ from datasets_manifest.calibration import OPENCV_STEREO_FILE, opencv_stereo
 from datasets_manifest.calibration_kalibr import KALIBR_FILE, kalibr_camchain
 from datasets_manifest.calibration_ros import camera_info, camera_info_file
 from datasets_manifest.manifest import read_manifest
+from datasets_manifest.storage import Location
 from geometry.stereo import EYES
 from labelgen.export.log import ExportLog
 
 
-def write_opencv(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_opencv(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """OpenCV's stereo YAML; arguments and errors as in `labelgen.export.formats`."""
     return _write(out, {OPENCV_STEREO_FILE: opencv_stereo(read_manifest(dataset).recipe.rig)})
 
 
-def write_kalibr(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_kalibr(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Kalibr's camera chain; arguments and errors as in `labelgen.export.formats`.
 
     Raises:
@@ -27,7 +28,7 @@ def write_kalibr(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
     return _write(out, {KALIBR_FILE: kalibr_camchain(read_manifest(dataset).recipe.rig)})
 
 
-def write_camera_info(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_camera_info(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """ROS's `camera_info`, a file an eye; arguments and errors as in `labelgen.export.formats`."""
     rig = read_manifest(dataset).recipe.rig
     return _write(out, {camera_info_file(eye): camera_info(rig, eye) for eye in EYES})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
@@ -11,10 +10,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.atomic import open_text_atomic
 from datasets_manifest.layout import parts_file
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location, Storage, join, open_storage
 from datasets_manifest.writer import canonical_json
 from geometry.stereo import EYES, Eye
 from labelgen.export.coco_entries import coco_annotation, coco_features, coco_header, coco_image
@@ -22,15 +21,15 @@ from labelgen.export.keypoints import count_absent_keypoints, count_cuts, keypoi
 from labelgen.export.log import ExportLog
 
 
-def write_annotations(dataset: Path, out: Path) -> list[Path]:
+def write_annotations(dataset: Location, out: Location) -> list[Location]:
     """Write the files that every dataset has under `annotations`: drogues alone.
 
-    Arguments, result and errors as those of `write_coco`.
+    Arguments, result and errors as those of `write_coco`; `out` may be a URL too.
     """
-    return _write(dataset, out, ExportLog(), with_features=False)
+    return [join(out, name) for name in _write(dataset, out, ExportLog(), with_features=False)]
 
 
-def write_coco(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_coco(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write `all.json` and one file for each split that has pairs: drogues, markers and hubs.
 
     Args:
@@ -45,7 +44,7 @@ def write_coco(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
         ValueError: the dataset cannot be read; names the file.
         OSError: a file cannot be written. It is then left as it was before.
     """
-    return _write(dataset, out, log, with_features=True)
+    return [out / name for name in _write(dataset, out, log, with_features=True)]
 
 
 def read_part_ids(source: Dataset, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
@@ -57,14 +56,15 @@ def read_part_ids(source: Dataset, record: PairRecord, eye: Eye) -> NDArray[np.u
     return source.part_ids(record.frame_index, eye) if parts_file(eye) in record.file_sha256 else None
 
 
-def _write(dataset: Path, out: Path, log: ExportLog, with_features: bool) -> list[Path]:
-    source = Dataset(dataset)
+def _write(dataset: Location, out: Location, log: ExportLog, with_features: bool) -> list[str]:
+    """Write the files, and return their names in `out`."""
+    source, target = Dataset(dataset), open_storage(out)
     splits = source.manifest.split_of_frame()
     names = ["all", *(split for split in ("train", "val", "test") if split in splits.values())]
     header = canonical_json(coco_header(source.manifest, with_features))
     count = keypoint_count(source.manifest)
     with ExitStack() as stack:
-        writers = {name: _CocoFile(stack, out / f"{name}.json", header) for name in names}
+        writers = {name: _CocoFile(stack, target, f"{name}.json", header) for name in names}
         for record in log.records(source):
             split = splits[record.frame_index]
             for eye in EYES:
@@ -79,7 +79,7 @@ def _write(dataset: Path, out: Path, log: ExportLog, with_features: bool) -> lis
                 _tell(log, record, eye, annotations)
         for writer in writers.values():
             writer.finish()
-    return [out / f"{name}.json" for name in names]
+    return [f"{name}.json" for name in names]
 
 
 def _tell(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[str, Any]]) -> None:
@@ -96,17 +96,12 @@ def _tell(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[s
     log.lost("markers and hubs of which no pixel is seen: without a label", features - len(annotations) + 1)
 
 
-def _spool(folder: Path) -> IO[str]:
-    """A file without a name on the disk of `folder`, not in memory as /tmp is on many machines."""
-    return tempfile.TemporaryFile("w+", encoding="utf-8", newline="\n", dir=folder)
-
-
 class _CocoFile:
     """One file that grows entry by entry: images go straight to it, annotations wait in a spool on disk."""
 
-    def __init__(self, stack: ExitStack, path: Path, header: str) -> None:
-        self._stream: IO[str] = stack.enter_context(open_text_atomic(path))
-        self._annotations: IO[str] = stack.enter_context(_spool(path.parent))
+    def __init__(self, stack: ExitStack, target: Storage, name: str, header: str) -> None:
+        self._stream: IO[str] = stack.enter_context(target.write_text(name))
+        self._annotations: IO[str] = stack.enter_context(target.spool(""))
         self._stream.write(header.removesuffix("}") + ',"images":[')
         self._images = 0
         self._annotated = 0

@@ -1,6 +1,6 @@
 """The formats that a dataset can be written in; a format's module is imported when it is asked for.
 
-A writer takes the dataset's folder, the folder to write into and a log. It goes through `log.records(...)`, holds one
+A writer takes the dataset's place, the folder to write into and a log. It goes through `log.records(...)`, holds one
 pair at a time, tells the log what its format cannot hold, and makes files appear whole or not at all: single files by
 `open_text_atomic`, folders by `new_folder`, both of `datasets_manifest.atomic`. The same dataset gives the same bytes.
 """
@@ -12,9 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from datasets_manifest.storage import Location, open_storage
 from labelgen.export.log import ExportLog
 
-Writer = Callable[[Path, Path, ExportLog], list[Path]]
+Writer = Callable[[Location, Path, ExportLog], list[Path]]
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ FORMATS: dict[str, ExportFormat] = {
 }
 
 
-def write_export(name: str, dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_export(name: str, dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write a dataset in a format.
 
     Args:
@@ -96,7 +97,8 @@ def write_export(name: str, dataset: Path, out: Path, log: ExportLog) -> list[Pa
         if chosen.extra is None:
             raise
         raise ValueError(f"{name}: {error.name} is missing: pip install 'droguekit[{chosen.extra}]'") from error
-    if out.resolve().is_relative_to(dataset.resolve()):
+    folder = open_storage(dataset).path("")
+    if folder is not None and out.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"--out: must lie outside the dataset's folder, got {out}")
     # Imported here, as the list of formats is also the command's help, which loads nothing that reads a dataset.
     from datasets_manifest.manifest import read_manifest

@@ -8,26 +8,27 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets_manifest.layout import frame_folder, image_file
+from datasets_manifest.layout import image_file
 from datasets_manifest.png import decode_png, encode_png
-from datasets_manifest.reader import Dataset, read_frame_bytes
+from datasets_manifest.reader import Dataset
 from geometry.stereo import Eye
 from labelgen.export.log import ExportLog
 
 
-def frame_file(dataset: Path, frame_index: int, name: str) -> Path:
-    """A file of a pair, which must lie in its folder itself and not behind a link.
+def place_file(source: Dataset, frame_index: int, name: str, target: Path) -> None:
+    """A file of a pair once more: without taking room where the disk can do so.
 
     Raises:
         ValueError: it is missing or leads elsewhere; names the file.
+        OSError: it cannot be written.
     """
-    folder = frame_folder(dataset, frame_index)
-    path = folder / name
-    if path.is_symlink() or path.resolve().parent != folder.resolve():
-        raise ValueError(f"{path}: leads outside the frame's folder")
-    if not path.is_file():
-        raise ValueError(f"{path}: is missing")
-    return path
+    path = source.frames.path(frame_index, name)
+    if path is not None:
+        link_or_copy(path, target)
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with target.open("xb") as stream:
+        stream.write(source.frames.read(frame_index, name))
 
 
 def link_or_copy(source: Path, target: Path) -> None:
@@ -61,11 +62,11 @@ def place_image(source: Dataset, frame_index: int, eye: Eye, target: Path, log: 
         OSError: it cannot be written.
     """
     name, bits = image_file(eye), source.manifest.recipe.sensor.output_bits
-    path = frame_file(source.path, frame_index, name)
     if bits == 8:
-        link_or_copy(path, target)
+        place_file(source, frame_index, name, target)
         return
-    pixels = decode_png(read_frame_bytes(source.path, frame_index, name), str(path)) >> (bits - 8)
+    where = source.frames.where(frame_index, name)
+    pixels = decode_png(source.frames.read(frame_index, name), where) >> (bits - 8)
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_bytes(encode_png(pixels.astype(np.uint8)))
     log.lost(f"images of {bits} bits: written with their upper 8")

@@ -18,6 +18,7 @@ from datasets_manifest.atomic import new_folder
 from datasets_manifest.calibration import opencv_stereo_matrices
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord, PixelBox, ViewRecord
+from datasets_manifest.storage import Location
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
@@ -31,7 +32,7 @@ _NUMBER_OF_EYE: dict[Eye, int] = {"left": 2, "right": 3}
 _UNOCCLUDED_FRACTION, _PARTLY_FRACTION = 0.99, 0.5
 
 
-def write_kitti(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write `training/{image_2,image_3,label_2,label_3,calib}` and the lists of the splits under `ImageSets`.
 
     Args:

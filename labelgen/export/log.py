@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Protocol
 
-from datasets_manifest.layout import RECORD_FILE, frame_folder
+from datasets_manifest.layout import RECORD_FILE
 from labelgen.export.consistency import record_fault
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class ExportLog:
             record = source.record(frame_index)
             fault = record_fault(record)
             if fault is not None:
-                raise ValueError(f"{frame_folder(source.path, frame_index) / RECORD_FILE}: {fault}")
+                raise ValueError(f"{source.frames.where(frame_index, RECORD_FILE)}: {fault}")
             yield record
             if self._progress is not None:
                 self._progress.advance()

@@ -9,12 +9,13 @@ import numpy as np
 from datasets_manifest.atomic import new_folder
 from datasets_manifest.png import encode_png
 from datasets_manifest.reader import Dataset
+from datasets_manifest.storage import Location
 from geometry.stereo import EYES
 from labelgen.export.log import ExportLog
 from labelgen.masks import Mask, amodal_masks, joined, mask_parts, visible_mask_of
 
 
-def write_masks(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write `000123/left_rim_visible.png` and `left_rim_amodal.png`, 255 on the part and 0 elsewhere.
 
     A part that the image has nothing of has no file. Arguments and errors as in `labelgen.export.formats`.

@@ -18,6 +18,7 @@ from datasets_manifest.layout import FRAMES_FOLDER, image_file
 from datasets_manifest.manifest import Manifest
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import FeatureView, PairRecord, PixelBox
+from datasets_manifest.storage import Location
 from datasets_manifest.writer import canonical_json
 from geometry.stereo import EYES, Eye
 from labelgen.export.coco_entries import coco_image_id
@@ -47,7 +48,7 @@ _FEATURE_NUMBERS = (
 )
 
 
-def write_parquet(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_parquet(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write `views.parquet`.
 
     Args:

@@ -13,6 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from datasets_manifest.atomic import new_folder
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from geometry.stereo import EYES, StereoRig
 from labelgen.export import ros_messages as ros
 from labelgen.export.log import ExportLog
@@ -39,7 +40,7 @@ def camera_info_topic(eye: str) -> str:
     return f"/stereo/{eye}/camera_info"
 
 
-def write_rosbag(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write a bag a sequence: images, CameraInfo, transforms, and the true pose of the drogue.
 
     Args:

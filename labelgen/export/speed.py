@@ -20,6 +20,7 @@ from datasets_manifest.atomic import new_folder
 from datasets_manifest.frame import Sensor
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from datasets_manifest.writer import canonical_json
 from geometry.distortion import Lens
 from geometry.stereo import EYES, Eye, StereoRig
@@ -29,7 +30,7 @@ from labelgen.export.log import ExportLog
 _LISTS = {"train": "train.json", "val": "validation.json", "test": "test.json"}
 
 
-def write_speed(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write camera, pose lists and images of both eyes.
 
     Args:

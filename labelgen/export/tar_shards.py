@@ -11,8 +11,9 @@ import tarfile
 from pathlib import Path
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.reader import Dataset, read_frame_bytes
+from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from datasets_manifest.writer import canonical_json
 from labelgen.export.log import ExportLog
 
@@ -20,7 +21,7 @@ SHARD_BYTES = 500_000_000
 """A shard ends before it would grow beyond this, unless one sample is larger."""
 
 
-def write_webdataset(dataset: Path, out: Path, log: ExportLog, shard_bytes: int = SHARD_BYTES) -> list[Path]:
+def write_webdataset(dataset: Location, out: Path, log: ExportLog, shard_bytes: int = SHARD_BYTES) -> list[Path]:
     """Write `SPLIT-NNNNNN.tar`.
 
     Args:
@@ -58,7 +59,7 @@ def _sample(source: Dataset, record: PairRecord, split: str) -> dict[str, bytes]
     label = {"split": split, "dataset_sha256": source.manifest.dataset_sha256, **record.model_dump(mode="json")}
     files = {f"{key}.json": canonical_json(label).encode()}
     for name in record.file_sha256:
-        files[f"{key}.{name}"] = read_frame_bytes(source.path, record.frame_index, name)
+        files[f"{key}.{name}"] = source.frames.read(record.frame_index, name)
     return files
 
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from datasets_manifest.atomic import new_folder
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from labelgen.export.log import ExportLog
 from labelgen.export.sequences import SequenceOrder, sequence_name
 
@@ -19,7 +20,7 @@ _HEADER = (
 )
 
 
-def write_tum(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_tum(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write a file a sequence, a line a pair.
 
     Args:

@@ -13,6 +13,7 @@ from datasets_manifest.atomic import new_folder
 from datasets_manifest.manifest import Manifest
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
+from datasets_manifest.storage import Location
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
@@ -36,7 +37,7 @@ _CLASS_OF_CATEGORY = {MARKER: 1, HUB: 2}
 Rows = Callable[[PairRecord, Eye], list[list[float]]]
 
 
-def write_yolo(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_yolo(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write boxes and keypoints, the keypoints in the drogue's own order.
 
     Args:
@@ -54,7 +55,7 @@ def write_yolo(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
     return _write_pose(dataset, out, log, in_image_order=False)
 
 
-def write_yolo_image_order(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_yolo_image_order(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write boxes and keypoints, beginning with the keypoint nearest the top and then clockwise.
 
     On an even ring a network cannot know which marker is the first; this order it can learn. Arguments, result and
@@ -63,7 +64,7 @@ def write_yolo_image_order(dataset: Path, out: Path, log: ExportLog) -> list[Pat
     return _write_pose(dataset, out, log, in_image_order=True)
 
 
-def write_yolo_detect(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
+def write_yolo_detect(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write visible boxes of drogues, markers and hubs. Arguments, result and errors as those of `write_yolo`."""
     source = Dataset(dataset)
 
@@ -84,7 +85,7 @@ def write_yolo_detect(dataset: Path, out: Path, log: ExportLog) -> list[Path]:
     return _write(source, out, log, rows, ())
 
 
-def _write_pose(dataset: Path, out: Path, log: ExportLog, in_image_order: bool) -> list[Path]:
+def _write_pose(dataset: Location, out: Path, log: ExportLog, in_image_order: bool) -> list[Path]:
     source = Dataset(dataset)
     count = keypoint_count(source.manifest)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -110,6 +111,8 @@ train = 0.5
 test = 0.5
 """
 
+ANALYTIC_RECIPE = QUICK_RECIPE.replace('"troubled"', '"analytic"')
+
 Make = Callable[..., RunSummary]
 Hashes = Callable[[Path], dict[str, str]]
 
@@ -156,28 +159,58 @@ def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.fixture
-def troubled(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """Installs the engine `troubled`, for this process and those that it starts, with accidents by name and frame."""
+@pytest.fixture(scope="session")
+def troubled_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of Python packages with the engine `troubled` installed in it."""
     site = tmp_path_factory.mktemp("site")
     (site / "troubled_engine.py").write_text(TROUBLED_ENGINE)
     information = site / "troubled_engine-1.0.dist-info"
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: troubled-engine\nVersion: 1.0\n")
     (information / "entry_points.txt").write_text("[droguekit.engines]\ntroubled = troubled_engine:TroubledEngine\n")
-    monkeypatch.syspath_prepend(site)
-    monkeypatch.setenv("PYTHONPATH", str(site))
-    monkeypatch.setenv("TROUBLE_MARKS", str(site))
+    return site
+
+
+@pytest.fixture
+def troubled(troubled_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Installs the engine `troubled`, for this process and those that it starts, with accidents by name and frame.
+
+    The function returns the folder where accidents that happen once leave their marks.
+    """
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    monkeypatch.syspath_prepend(troubled_site)
+    monkeypatch.setenv("PYTHONPATH", str(troubled_site), prepend=os.pathsep)
+    monkeypatch.setenv("TROUBLE_MARKS", str(marks))
 
     def set_troubles(**frames: Sequence[int]) -> Path:
         monkeypatch.setenv("TROUBLES", json.dumps(frames))
-        return site
+        return marks
 
     set_troubles()
     return set_troubles
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
+def quick_dataset(troubled_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of `quick_recipe`, made by one worker without an accident; to be read only."""
+    out = tmp_path_factory.mktemp("quick") / "dataset"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(troubled_site)
+        summary = _make(out, text=QUICK_RECIPE)
+    assert (summary.drops, summary.totals.retries) == ((), 0)
+    return out
+
+
+@pytest.fixture(scope="session")
+def analytic_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of `analytic_recipe`, made by one worker; to be read only."""
+    out = tmp_path_factory.mktemp("analytic") / "dataset"
+    assert _make(out, text=ANALYTIC_RECIPE).drops == ()
+    return out
+
+
+@pytest.fixture(scope="session")
 def quick_recipe() -> str:
     """Eight pairs by the engine `troubled`, as TOML."""
     return QUICK_RECIPE
@@ -186,4 +219,4 @@ def quick_recipe() -> str:
 @pytest.fixture(scope="session")
 def analytic_recipe() -> str:
     """The same pairs by the engine that ships, as TOML."""
-    return QUICK_RECIPE.replace('"troubled"', '"analytic"')
+    return ANALYTIC_RECIPE

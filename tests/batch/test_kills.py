@@ -29,25 +29,36 @@ _LOOK_EVERY_S = 0.02
 class KilledRun:
     """A run in processes of its own that is killed now and then, and started again whenever it has ended."""
 
-    def __init__(self, recipe: Path, out: Path, rng: np.random.Generator) -> None:
+    def __init__(self, recipe: Path, out: Path, scratch: Path, rng: np.random.Generator) -> None:
         self._command = [sys.executable, "-m", "droguekit.cli.main", "render", str(recipe), "--out", str(out)]
         self._out, self._rng = out, rng
+        self._environment = {**os.environ, "TMPDIR": str(scratch)}
         self._process: subprocess.Popen[bytes] | None = None
         self.kills = 0
 
-    def go_on_for(self, frames: int) -> bool:
-        """Let it run until so many more frames are there, and a random moment longer.
+    def go_on_until(self, is_reached: Callable[[], bool], longest_s: float) -> bool:
+        """Let it run until something is so, and a random moment of up to so long after that.
 
         Returns:
             Whether it is still at work.
         """
         if self._process is None or self._process.poll() is not None:
             command = [*self._command, "--workers", "2"]
-            self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        goal = len(layout.frame_indices(self._out)) + frames
-        while len(layout.frame_indices(self._out)) < goal and not self._ends_within(_LOOK_EVERY_S):
+            self._process = subprocess.Popen(
+                command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=self._environment
+            )
+        while not is_reached() and not self._ends_within(_LOOK_EVERY_S):
             pass
-        return not self._ends_within(float(self._rng.uniform(0, 0.3)))
+        return not self._ends_within(float(self._rng.uniform(0, longest_s)))
+
+    def frames(self) -> int:
+        """How many are there."""
+        return len(layout.frame_indices(self._out))
+
+    def begins(self) -> int:
+        """How often it has looked at what is there, and begun with the rest."""
+        events = self._out / layout.EVENTS_FILE
+        return events.read_text().count('"event": "start"') if events.exists() else 0
 
     def kill(self) -> None:
         """Kill a random worker, the run, or the run and its workers."""
@@ -81,27 +92,36 @@ class KilledRun:
 
 def torture(recipe_text: str, kills: int, make: Make, hashes: Hashes, folder: Path) -> None:
     """Kill a run so often on its way through a recipe, and compare with an undisturbed one."""
-    calm, out, recipe = folder / "calm", folder / "out", folder / "recipe.toml"
+    calm, out, recipe, scratch = folder / "calm", folder / "out", folder / "recipe.toml", folder / "scratch"
     recipe.write_text(recipe_text)
+    scratch.mkdir()
     planned = make(calm, text=recipe_text).planned
     rng = np.random.Generator(np.random.Philox(8))
-    run = KilledRun(recipe, out, rng)
+    run = KilledRun(recipe, out, scratch, rng)
     try:
         while run.kills < kills:
-            # Together some two thirds of the frames: the last kill still meets a run at work.
-            if run.go_on_for(int(rng.integers(0, max(1, round(4 / 3 * planned / kills)) + 1))):
+            if kills - run.kills <= max(1, kills // 10):
+                # The last ones meet it when all frames are there, and manifest and annotations are written.
+                begun = run.begins()
+                is_at_work = run.go_on_until(
+                    lambda begun=begun: run.frames() == planned and run.begins() > begun, longest_s=0.01 * planned
+                )
+            else:
+                # With the frames that end meanwhile some two thirds of all: kills meet frames to the last.
+                more = int(rng.integers(0, round(planned / kills / 2) + 1))
+                goal = min(planned, run.frames() + more)
+                is_at_work = run.go_on_until(lambda goal=goal: run.frames() >= goal, 0.3 if more == 0 else 0.05)
+            if is_at_work:
                 run.kill()
-            elif len(layout.frame_indices(out)) == planned:
-                break
     finally:
         run.end()
     print(
-        f"{run.kills} kills, {len(layout.frame_indices(out))} of {planned} pairs there, {len(leftovers(out))} leftovers"
+        f"{run.kills} kills, {run.begins()} starts, {run.frames()} of {planned} pairs, {len(leftovers(out))} leftovers"
     )
-    assert run.kills >= kills // 2  # frames that were in hand of other workers finish meanwhile
     summary = make(out, text=recipe_text)
     assert summary.drops == ()
     assert leftovers(out) == []
+    assert [*scratch.iterdir()] == []
     assert summary.dataset_sha256 == read_manifest(calm).dataset_sha256
     assert hashes(out) == hashes(calm)
     assert validate_dataset(out).passed

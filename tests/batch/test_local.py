@@ -44,41 +44,41 @@ def test_a_whole_dataset_is_left_as_it_is(tiny_dataset: Path, make: Make, hashes
 
 
 def test_missing_truncated_and_changed_frames_are_made_again(
-    tiny_dataset: Path, make: Make, hashes: Hashes, tmp_path: Path
+    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
 ) -> None:
     out = tmp_path / "copy"
-    shutil.copytree(tiny_dataset, out)
+    shutil.copytree(analytic_dataset, out)
     shutil.rmtree(layout.frame_folder(out, 0))
     image = layout.frame_folder(out, 1) / "left.png"
     image.write_bytes(image.read_bytes()[:1000])
     record = layout.frame_folder(out, 2) / layout.RECORD_FILE
     record.write_text(record.read_text().replace('"family":"clear"', '"family":"foggy"'))
-    summary = make(out)
+    summary = make(out, text=analytic_recipe)
     assert set(summary.totals.made) == {0, 1, 2}
-    assert summary.kept == 1
-    assert hashes(out) == hashes(tiny_dataset)
+    assert summary.kept == 5
+    assert hashes(out) == hashes(analytic_dataset)
 
 
 def test_frames_that_no_manifest_vouches_for_are_made_again(
-    tiny_dataset: Path, make: Make, hashes: Hashes, tmp_path: Path
+    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
 ) -> None:
     out = tmp_path / "copy"
-    shutil.copytree(tiny_dataset, out)
+    shutil.copytree(analytic_dataset, out)
     (out / layout.MANIFEST_FILE).unlink()
-    assert make(out).kept == 0
-    assert hashes(out) == hashes(tiny_dataset)
+    assert make(out, text=analytic_recipe).kept == 0
+    assert hashes(out) == hashes(analytic_dataset)
 
 
 def test_a_part_is_a_dataset_that_the_rest_completes(
-    tiny_dataset: Path, make: Make, hashes: Hashes, tmp_path: Path
+    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
 ) -> None:
     out = tmp_path / "parts"
-    first = make(out, range(1, 3))
-    assert (first.pairs, first.planned) == (2, 4)
+    first = make(out, range(1, 3), text=analytic_recipe)
+    assert (first.pairs, first.planned) == (2, 8)
     assert [entry.frame_index for entry in read_manifest(out).frames] == [1, 2]
-    second = make(out)
-    assert (second.kept, second.pairs) == (2, 4)
-    assert hashes(out) == hashes(tiny_dataset)
+    second = make(out, text=analytic_recipe)
+    assert (second.kept, second.pairs) == (2, 8)
+    assert hashes(out) == hashes(analytic_dataset)
 
 
 def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
@@ -94,6 +94,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
         "class Tell:\n"
         "    def begin(self, what, total): pass\n"
         "    def advance(self): print('frame', flush=True)\n"
+        "    def note(self, text): pass\n"
         "    def say(self, text): pass\n"
         "    def end(self): pass\n"
         "if __name__ == '__main__':\n"

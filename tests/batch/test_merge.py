@@ -26,10 +26,9 @@ def recipe_file(tmp_path_factory: pytest.TempPathFactory, analytic_recipe: str) 
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, analytic_recipe: str, make: Make) -> Path:
-    out = tmp_path_factory.mktemp("whole") / "dataset"
-    make(out, text=analytic_recipe)
-    return out
+def whole(analytic_dataset: Path) -> Path:
+    """The same pairs by one run; to be read only."""
+    return analytic_dataset
 
 
 @pytest.fixture(scope="module")

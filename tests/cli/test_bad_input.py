@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import resource
@@ -9,12 +10,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
 
 from datasets_manifest import layout
-from droguekit.cli.main import FAULT, WRONG_INPUT
+from droguekit.cli.main import FAULT, WRONG_INPUT, run
 
 RECIPE = """
 name = "mine"
@@ -30,8 +32,15 @@ samples_per_px = 1
 
 
 def _run(*arguments: str | Path, before: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "droguekit.cli.main", *(str(argument) for argument in arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=before)
+    """The command as a user sees it, in this process unless something has to be done to its process before."""
+    words = [str(argument) for argument in arguments]
+    if before is not None:
+        command = [sys.executable, "-m", "droguekit.cli.main", *words]
+        return subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=before)
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = run(words)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 def _assert_refused(result: subprocess.CompletedProcess[str], message: str) -> None:
@@ -112,12 +121,14 @@ def test_an_unwritable_folder(tmp_path: Path) -> None:
         _assert_refused(_run("render", "smoke", "--out", tmp_path / "closed" / "out"), r"closed.*Permission denied")
 
 
-@pytest.mark.mitsuba
 @pytest.mark.parametrize(
-    ("most_bytes", "message"),
-    [(500_000, r"out/frames/000000: cannot be written: File too large"), (20_000, r"cannot be .*File too large")],
+    ("engine", "most_bytes", "message"),
+    [
+        ("analytic", 500_000, r"out/frames/000000: cannot be written: File too large"),
+        pytest.param("mitsuba", 20_000, r"cannot be .*File too large", marks=pytest.mark.mitsuba),
+    ],
 )
-def test_a_full_disk_leaves_nothing_half_written(most_bytes: int, message: str, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_nothing_half_written(engine: str, most_bytes: int, message: str, tmp_path: Path) -> None:
     recipe, out = tmp_path / "mine.toml", tmp_path / "out"
     recipe.write_text(RECIPE.replace("3.0", "30.0").replace("9.0", "40.0"))
 
@@ -126,7 +137,7 @@ def test_a_full_disk_leaves_nothing_half_written(most_bytes: int, message: str, 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
-    _assert_refused(_run("render", recipe, "--out", out, "--workers", "1", before=limit), message)
+    _assert_refused(_run("render", recipe, "--out", out, "--workers", "1", "--engine", engine, before=limit), message)
     assert not out.exists()
 
 

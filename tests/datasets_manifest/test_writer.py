@@ -215,7 +215,7 @@ def test_a_killed_run_leaves_only_leftovers(maker, tmp_path):
     assert done.returncode == -signal.SIGKILL
     dataset = tmp_path / "dataset"
     assert frame_indices(dataset) == []
-    (left,) = leftovers(dataset)
+    left = Path(*leftovers(dataset))
     assert left.parent == dataset / "frames" and left.name.startswith(".000007-")
     (dataset / "annotations").mkdir()
     (dataset / "annotations" / ".all.json-1.part").write_text("{")

@@ -1,0 +1,255 @@
+"""A real S3 protocol server on loopback as the place of datasets: complete and identical, whatever happens."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from moto.server import ThreadedMotoServer
+
+from datasets_manifest import layout
+from datasets_manifest.frame_store import FrameStore, frames_there
+from datasets_manifest.manifest import read_manifest
+from datasets_manifest.reader import Dataset
+from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.storage import open_storage
+from datasets_manifest.writer import encode_record, leftovers
+from droguekit.batch.local import RunSummary, render_dataset
+from droguekit.batch.making import Spread
+from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
+from labelgen.dataset_validation import validate_dataset
+
+Make = Callable[..., RunSummary]
+Hashes = Callable[[Path], dict[str, str]]
+
+BUCKET = "pairs"
+# What moto takes for credentials; any others would do.
+ENVIRONMENT = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ThreadedMotoServer]:
+    """A server with one bucket, for this process and those that it starts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(logging.getLogger("werkzeug"), "level", logging.ERROR)
+        server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+        server.start()
+        host, port = server.get_host_and_port()
+        for name, value in {**ENVIRONMENT, "AWS_ENDPOINT_URL": f"http://{host}:{port}"}.items():
+            patch.setenv(name, value)
+        open_storage(f"s3://{BUCKET}")._fs.mkdir(BUCKET)  # type: ignore[attr-defined]
+        yield server
+        server.stop()
+
+
+@pytest.fixture
+def place(server: ThreadedMotoServer, request: pytest.FixtureRequest) -> str:
+    """A place of the test's own."""
+    return f"s3://{BUCKET}/{request.node.name}"
+
+
+@pytest.fixture(scope="module")
+def text(analytic_recipe: str) -> str:
+    """A recipe of five small pairs."""
+    return analytic_recipe.replace("count = 8", "count = 5")
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory, text: str, make: Make) -> Path:
+    """What one undisturbed run makes on this machine's disk, a folder a frame."""
+    out = tmp_path_factory.mktemp("local") / "dataset"
+    make(out, workers=0, text=text)
+    return out
+
+
+def contents(dataset: Path | str) -> dict[str, bytes]:
+    """All files that a dataset is made of; frames by their index, however they lie."""
+    storage, store = open_storage(dataset), FrameStore(dataset)
+    others = {*storage.files_ending(".json"), *storage.files_ending(".yaml"), layout.RECIPE_FILE, layout.CARD_FILE}
+    # How the frames lie is told by these.
+    telling = (layout.FRAMES_FOLDER, layout.SHARDS_FOLDER, layout.CROISSANT_FILE)
+    files = {name: storage.read(name) for name in others if not name.startswith(telling)}
+    if store.pairs_per_tar is not None:
+        # The hashes of these stand in it.
+        assert json.loads(storage.read(layout.CROISSANT_FILE))["distribution"]
+    frames = {f"{i}/{name}": store.read(i, name) for i in store.indices() for name in store.names(i)}
+    return {**files, **frames}
+
+
+@pytest.mark.parametrize("pairs_per_tar", [None, 2])
+def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
+    place: str, pairs_per_tar: int | None, text: str, local: Path, make: Make
+) -> None:
+    spread = Spread(0, pairs_per_tar=pairs_per_tar)
+    first = make(place, range(1, 4), spread, text)
+    assert (first.kept, first.pairs) == (0, 3)
+    # A frame half written, one that lacks a file, and one with another picture.
+    storage = open_storage(place)
+    storage.write("frames/000004/left.png", b"half")
+    if pairs_per_tar is None:
+        storage.delete("frames/000001/right.png")
+        storage.write("frames/000002/left.png", storage.read("frames/000003/left.png"))
+    summary = make(place, workers=0, text=text)
+    assert (summary.kept, len(summary.totals.made)) == ((1, 4) if pairs_per_tar is None else (3, 2))
+    assert summary.dataset_sha256 == read_manifest(local).dataset_sha256
+    assert contents(place) == contents(local)
+    assert leftovers(place) == []
+    tars = storage.files_ending(".tar")
+    assert tars == ([] if pairs_per_tar is None else [f"shards/00000{number}.tar" for number in range(3)])
+    assert (storage.names("frames") == []) == (pairs_per_tar is not None)
+    events = [json.loads(line)["event"] for line in storage.read(layout.EVENTS_FILE).splitlines()]
+    assert events.count("start") == events.count("end") == 2 and events.count("frame") == 3 + len(summary.totals.made)
+
+
+@pytest.fixture(scope="module")
+def packed(server: ThreadedMotoServer, make: Make, text: str) -> str:
+    """A dataset in tar files on the object store; to be read only."""
+    place = f"s3://{BUCKET}/packed"
+    make(place, workers=Spread(0, pairs_per_tar=2), text=text)
+    return place
+
+
+def test_commands_read_it_there(
+    packed: str, local: Path, hashes: Hashes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, dataset in enumerate((str(local), packed)):
+        out = tmp_path / str(number)
+        assert run(["validate", dataset]) == DONE
+        assert run(["navigate", dataset, "--method", "paper", "--out", str(out / "estimates.jsonl")]) == DONE
+        scores = ["--estimates", str(tmp_path / "0" / "estimates.jsonl"), "--json", str(out / "benchmark.json")]
+        assert run(["benchmark", dataset, *scores, "--html", str(out / "report.html")]) == DONE
+        for name in ("kitti", "webdataset"):
+            assert run(["export", dataset, "--format", name, "--out", str(out / name)]) == DONE
+    told = capsys.readouterr().out
+    assert f"{packed}: 5 pairs, no faults" in told and "tar files                                 3        0" in told
+    one, other = hashes(tmp_path / "0"), hashes(tmp_path / "1")
+    one.pop("estimates.jsonl"), other.pop("estimates.jsonl")  # hold times
+    assert one == other
+    assert len(one) > 20
+
+
+def test_images_and_records_are_those_on_disk(packed: str, local: Path) -> None:
+    here, there = Dataset(local), Dataset(packed)
+    assert there.frame_indices == here.frame_indices
+    for index in here.frame_indices:
+        assert encode_record(there.record(index)) == encode_record(here.record(index))
+        assert (there.images(index).right == here.images(index).right).all()
+        assert (there.part_ids(index, "left") == here.part_ids(index, "left")).all()
+
+
+def test_a_changed_tar_file_is_found(make: Make, text: str, place: str) -> None:
+    make(place, range(2), Spread(0, pairs_per_tar=2), text)
+    storage = open_storage(place)
+    file = FrameStore(place)._shard(0).frames[1]["left_parts.png"]
+    data = bytearray(storage.read("shards/000000.tar"))
+    data[file.offset + 60] ^= 1
+    storage.write("shards/000000.tar", bytes(data))
+    faults = validate_dataset(place).faults
+    assert f"{place}/shards/000000.json: is not the list of {place}/shards/000000.tar, which was changed" in faults
+    assert f"{place}/shards/000000.tar/000001.left_parts.png: was changed, its hash is not the one on record" in faults
+    assert run(["validate", place]) == FAULT
+    assert make(place, range(2), 0, text).totals.made == [1]
+    assert validate_dataset(place).passed
+
+
+def test_shards_are_merged_from_there_and_to_there(
+    local: Path, place: str, make: Make, text: str, tmp_path: Path
+) -> None:
+    make(f"{place}/even", range(0, 5, 2), Spread(0, pairs_per_tar=4), text)
+    make(tmp_path / "odd", range(1, 5, 2), 0, text)
+    assert frames_there(f"{place}/even") == [0, 2, 4]
+    # Complete within the run: neighbours of a part come together in one file.
+    assert open_storage(f"{place}/even").names("frames") == []
+    assert run(["merge", f"{place}/whole", f"{place}/even", str(tmp_path / "odd"), "--tar", "3"]) == DONE
+    assert contents(f"{place}/whole") == contents(local)
+
+
+def test_a_run_that_is_killed_with_all_its_processes_goes_on(
+    place: str, text: str, local: Path, make: Make, tmp_path: Path
+) -> None:
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(text)
+    options = ["--out", place, "--workers", "1", "--tar", "2"]
+    command = [sys.executable, "-m", "droguekit.cli.main", "render", str(recipe), *options]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+        storage = open_storage(place)
+        while not (storage.names(layout.SHARDS_FOLDER)[1:] or storage.folders_with("frames", layout.RECORD_FILE)):
+            assert process.poll() is None
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        for victim in (process.pid, *map(int, children)):
+            os.kill(victim, signal.SIGKILL)
+    summary = make(place, workers=0, text=text)
+    assert summary.kept + len(summary.totals.made) == 5 and summary.kept >= 1
+    assert contents(place) == contents(local)
+    assert leftovers(place) == []
+
+
+@pytest.mark.slow
+def test_dask_workers_write_there_themselves(place: str, text: str, local: Path, make: Make) -> None:
+    distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}
+    with distributed.LocalCluster(processes=True, **options) as cluster:
+        spread = Spread(0, scheduler=cluster.scheduler_address, pairs_per_tar=2)
+        assert make(place, workers=spread, text=text).drops == ()
+    assert contents(place) == contents(local)
+    assert leftovers(place) == [] and open_storage(place).names(layout.FRAMES_FOLDER) == []
+
+
+class Ends:
+    """Hears how a run goes, and ends the server once two frames are finished."""
+
+    def __init__(self, server: ThreadedMotoServer) -> None:
+        self._server, self._left = server, 2
+
+    def begin(self, what: str, total: int) -> None:
+        """Nothing to do."""
+
+    def advance(self) -> None:
+        self._left -= 1
+        if self._left == 0:
+            self._server.stop()
+
+    def note(self, text: str) -> None:
+        """Nothing to do."""
+
+    def say(self, text: str) -> None:
+        """Nothing to do."""
+
+    def end(self) -> None:
+        """Nothing to do."""
+
+
+def test_a_lost_connection_ends_the_run_in_one_line_and_finished_frames_stay(
+    server: ThreadedMotoServer, place: str, text: str, local: Path, make: Make
+) -> None:
+    host, port = server.get_host_and_port()
+    with pytest.raises(OSError, match=f"{place}/.*cannot be ") as caught:
+        render_dataset(parse_recipe(text), text, place, range(5), Spread(0), Ends(server))
+    assert "\n" not in str(caught.value)
+    ThreadedMotoServer.__init__(server, ip_address=host, port=port, verbose=False)
+    server.start()  # its contents belong to the process
+    summary = make(place, workers=0, text=text)
+    assert summary.kept == 2
+    assert contents(place) == contents(local)
+
+
+def test_places_that_cannot_be_used_are_one_clear_line(
+    server: ThreadedMotoServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words, message in (
+        (["validate", "s3://nowhere/x"], "s3://nowhere/x: there is no such dataset"),
+        (["validate", f"s3://{BUCKET}/nothing"], f"s3://{BUCKET}/nothing: there is no such dataset"),
+        (["render", "smoke", "--out", "s3://nowhere/x"], "cannot be written: The specified bucket does not exist"),
+        (["render", "smoke", "--out", "memory://x"], "is the memory of one process; give --workers 0"),
+        (["render", "smoke", "--out", "s4://b/x"], "s4://b/x: is no place that can be used: Protocol not known: s4"),
+    ):
+        assert run([*words, *(["--engine", "analytic"] if words[0] == "render" else [])]) == WRONG_INPUT
+        told = capsys.readouterr().err
+        assert message in told and told.count("\n") == 1

@@ -1,0 +1,149 @@
+"""A folder and an object store, through the same interface, keep and lose the same things."""
+
+from __future__ import annotations
+
+import pickle
+import uuid
+
+import pytest
+
+from datasets_manifest.frame_store import FrameStore
+from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
+from datasets_manifest.reader import Dataset
+from datasets_manifest.storage import absolute, as_location, in_order, join, open_storage
+from datasets_manifest.writer import encode_files, leftovers, remove_frame, remove_leftovers, write_frame
+
+
+@pytest.fixture(params=["folder", "memory"])
+def place(request, tmp_path):
+    """An empty place of each kind; the memory is that of this process."""
+    return tmp_path / "place" if request.param == "folder" else f"memory://{uuid.uuid4().hex}"
+
+
+def test_files_are_kept_replaced_and_removed(place):
+    storage = open_storage(place)
+    assert not storage.is_there() and not storage.exists("a") and storage.names("") == []
+    storage.write("a", b"first")
+    storage.write("a", b"0123456789")
+    storage.write("folder/b.json", b"")
+    assert storage.is_there() and storage.exists("a") and storage.size("a") == 10
+    assert storage.read("a") == b"0123456789" and storage.read("a", 3, 4) == b"3456" and storage.read("a", 8) == b"89"
+    assert storage.names("") == ["a", "folder"] and storage.names("folder") == ["b.json"] and storage.names("no") == []
+    assert storage.files_ending(".json") == ["folder/b.json"]
+    with storage.open("a") as stream:
+        stream.seek(5)
+        assert stream.read(2) == b"56"
+    with storage.local_copy("a") as path:
+        assert path.read_bytes() == b"0123456789"
+    storage.delete("a")
+    storage.delete("a")
+    assert storage.names("") == ["folder"]
+    with pytest.raises(FileNotFoundError):
+        storage.read("a")
+
+
+def test_streams_count_when_their_block_ends_without_an_error(place):
+    storage = open_storage(place)
+    storage.write("text", b"old")
+    with pytest.raises(RuntimeError, match="stop"), storage.write_text("text") as stream:
+        stream.write("new")
+        raise RuntimeError("stop")
+    assert storage.read("text") == b"old"
+    with storage.write_text("text") as stream:
+        stream.write("größer\n")
+    with storage.write_large("deep/bytes") as stream:
+        stream.write(bytes(100_000))
+        stream.seek(0)
+        assert len(stream.read()) == 100_000
+    assert storage.read("text").decode() == "größer\n" and storage.size("deep/bytes") == 100_000
+    with storage.spool("") as spool:
+        spool.write("passes")
+    assert storage.names("") == ["deep", "text"]
+
+
+def test_a_folder_counts_with_its_last_file(place):
+    storage = open_storage(place)
+    storage.write_together("frames/000001", {"x": b"1", "record.json": b"{}"}, "record.json")
+    storage.write_together("frames/000002", {"x": b"2", "record.json": b"{}"}, "record.json")
+    storage.write_together("frames/000002", {"x": b"3", "record.json": b"{}"}, "record.json")
+    storage.write("frames/000003/x", b"half")
+    assert storage.folders_with("frames", "record.json") == ["000001", "000002"]
+    assert storage.read("frames/000002/x") == b"3"
+    storage.delete_folder("frames/000001", "record.json")
+    storage.delete_folder("frames/000001", "record.json")
+    assert storage.folders_with("frames", "record.json") == ["000002"] and storage.names("frames/000001") == []
+
+
+def test_objects_of_a_frame_without_its_record_are_leftovers(maker):
+    make_recipe, _, _, _, add_frame = maker
+    place = f"memory://{uuid.uuid4().hex}"
+    add_frame(place, make_recipe(), 0)
+    add_frame(place, make_recipe(), 1)
+    # The record is the first to go and the last to come.
+    open_storage(place).delete("frames/000001/record.json")
+    names = ["left.png", "left_parts.png", "right.png", "right_parts.png"]
+    assert leftovers(place) == [f"{place}/frames/000001/{name}" for name in names]
+    assert FrameStore(place).indices() == [0]
+    assert len(remove_leftovers(place)) == 4 and leftovers(place) == []
+    remove_frame(place, 0)
+    assert FrameStore(place).indices() == []
+
+
+def test_a_dataset_reads_the_same_from_both(place, maker):
+    make_recipe, make_images, make_parts, make_record, _ = maker
+    recipe = make_recipe()
+    for index in (0, 2):
+        write_frame(
+            place, make_record(recipe, index), encode_files(make_images(recipe, index), make_parts(recipe, index))
+        )
+    write_manifest(place, build_manifest(place, recipe, "1", lambda _: "train"))
+    dataset = pickle.loads(pickle.dumps(Dataset(place)))  # data loaders send it to other processes
+    assert dataset.frame_indices == (0, 2)
+    assert (dataset.images(2).right == make_images(recipe, 2).right).all()
+    assert (dataset.part_ids(2, "left") == make_parts(recipe, 2)["left"]).all()
+    assert dataset.record(0).frame_index == 0 and dataset.verify(0) == dataset.verify(2) == []
+    open_storage(place).write("frames/000002/left.png", b"changed")
+    assert dataset.verify(2) == [f"{place}/frames/000002/left.png: was changed, its hash is not the one on record"]
+    open_storage(place).delete("frames/000002/left.png")
+    with pytest.raises(ValueError, match=r"frames/000002/left\.png: is missing"):
+        dataset.images(2)
+
+
+def test_places_by_their_names(tmp_path, monkeypatch):
+    assert as_location("s3://bucket/name/") == "s3://bucket/name"
+    assert as_location("data/demo") == as_location("data/demo/") and join("s3://b/n", "x") == "s3://b/n/x"
+    assert as_location(f"file://{tmp_path}") == tmp_path
+    monkeypatch.chdir(tmp_path)
+    assert absolute("data") == tmp_path / "data" and absolute("s3://b/n") == "s3://b/n"
+
+
+def test_a_place_may_be_called_as_what_lies_in_it():
+    storage = open_storage(f"memory://{uuid.uuid4().hex}/frames")
+    storage.write_together("frames/000001[2]*", {"x": b"", "record.json": b"{}"}, "record.json")
+    assert storage.names("") == ["frames"] and storage.names("frames") == ["000001[2]*"]
+    storage.delete_folder("frames/000001[2]*", "record.json")
+    assert storage.folders_with("frames", "record.json") == []
+
+
+@pytest.mark.parametrize("url", ["nonsense://x/y", "s3:///"])
+def test_urls_that_nobody_knows_are_refused(url):
+    with pytest.raises((ValueError, OSError), match=url.split(":")[0]) as caught:
+        read_manifest(url)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_package_is_named_with_its_cure(monkeypatch):
+    # What Python does for a package that is not installed.
+    monkeypatch.setitem(__import__("sys").modules, "fsspec.core", None)
+    with pytest.raises(ValueError, match=r'missing: pip install "droguekit\[remote\]"'):
+        open_storage(f"memory://{uuid.uuid4().hex}")
+
+
+@pytest.mark.parametrize("place", ["folder", "memory"], indirect=True)
+def test_work_comes_back_in_order_and_errors_in_their_turn(place):
+    storage = open_storage(place)
+    assert list(in_order(lambda number: number**2, range(100), storage)) == [number**2 for number in range(100)]
+    results = in_order(lambda number: 1 / (50 - number), range(100), storage)
+    assert [next(results) for _ in range(50)] == [1 / (50 - number) for number in range(50)]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
