@@ -10,7 +10,7 @@ from datasets_manifest.images import Pixels, StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
-from geometry.stereo import Eye
+from geometry.stereo import EYES, Eye
 from nav.blobs import disc_like_blobs
 from nav.channels import OTHERS_WEIGHTS, marker_channel, marker_color
 from nav.detector.interface import Detection, StereoDetection
@@ -44,6 +44,11 @@ class ColorBlobDetector:
     def detect(self, images: StereoImages) -> StereoDetection:
         """Boxes around the rim in both images."""
         return StereoDetection(self._detect_eye(images, "left"), self._detect_eye(images, "right"))
+
+    def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
+        """At most one an eye: the ring that shows most of the markers."""
+        found = {eye: self._detect_eye(images, eye) for eye in EYES}
+        return {eye: (one,) if one is not None and one.score >= least_score else () for eye, one in found.items()}
 
     def _detect_eye(self, images: StereoImages, eye: Eye) -> Detection | None:
         best: RingMatch | None = None

@@ -42,3 +42,15 @@ class Detector(Protocol):
     def detect(self, images: StereoImages) -> StereoDetection:
         """Boxes around the drogue in both images."""
         ...
+
+    def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
+        """Everything in either image that may be the drogue, from which average precision is computed.
+
+        Args:
+            images: the pair.
+            least_score: what scores lower is left out.
+
+        Returns:
+            Of each eye its candidates, the best first.
+        """
+        ...

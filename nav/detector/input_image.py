@@ -1,0 +1,124 @@
+"""What a detector network sees of an image, and its boxes' way back.
+
+Training and use both go through here, so that they see the same pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.images import Pixels, StereoImages
+from geometry.se3 import Array
+from geometry.stereo import Eye
+from nav.detector.maps import SIZE_STEP_PX
+
+PADDING_DN = 114
+"""Grey of what the image leaves of the input: between sky and ground, so that its edge is no strong one."""
+
+
+@dataclass(frozen=True)
+class Letterbox:
+    """Where an image lies in a network's input.
+
+    Attributes:
+        scale: (2,) input pixels an image pixel, in x and y; they differ by rounding to whole pixels.
+        offset_px: (2,) low corner of the image in the input. [px]
+    """
+
+    scale: tuple[float, float]
+    offset_px: tuple[int, int]
+
+    def to_input(self, boxes_xywh_px: Array) -> Array:
+        """(n, 4) boxes in pixel-centre coordinates of the image, as in records, to corner coordinates of the input."""
+        boxes = np.asarray(boxes_xywh_px, dtype=np.float64).reshape(-1, 4)
+        return np.hstack(((boxes[:, :2] + 0.5) * self.scale + self.offset_px, boxes[:, 2:] * self.scale))
+
+    def to_image(self, boxes_xywh_px: Array) -> Array:
+        """(n, 4) boxes in corner coordinates of the input to pixel-centre coordinates of the image."""
+        boxes = np.asarray(boxes_xywh_px, dtype=np.float64).reshape(-1, 4)
+        return np.hstack(((boxes[:, :2] - self.offset_px) / self.scale - 0.5, boxes[:, 2:] / self.scale))
+
+
+def letterbox(image_size_px: tuple[int, int], input_size_px: tuple[int, int]) -> Letterbox:
+    """The image as large as it fits, in the middle.
+
+    Args:
+        image_size_px: width, height.
+        input_size_px: width, height; multiples of 32.
+
+    Raises:
+        ValueError: an input size that no network takes.
+    """
+    if min(input_size_px) < SIZE_STEP_PX or any(side % SIZE_STEP_PX for side in input_size_px):
+        width, height = input_size_px
+        raise ValueError(f"input_size_px: must be multiples of {SIZE_STEP_PX}, got {width}x{height}")
+    fit = min(inside / side for inside, side in zip(input_size_px, image_size_px, strict=True))
+    width, height = (max(1, round(side * fit)) for side in image_size_px)
+    offset = (input_size_px[0] - width) // 2, (input_size_px[1] - height) // 2
+    return Letterbox((width / image_size_px[0], height / image_size_px[1]), offset)
+
+
+def input_image(images: StereoImages, eye: Eye, input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
+    """One eye's picture as a network sees it: 8 bit, display-encoded, of the network's size.
+
+    Light above the black level is encoded by the sRGB curve whatever the sensor's encoding and depth, then reduced by
+    averaging over areas, and padded with grey. A mono picture has three equal channels.
+
+    Args:
+        images: the pair.
+        eye: which of the two.
+        input_size_px: width, height; multiples of 32.
+
+    Returns:
+        (height, width, 3) red, green, blue, and where the image lies in it.
+
+    Raises:
+        ValueError: an input size that no network takes.
+    """
+    place = letterbox(images.size_px, input_size_px)
+    picture = _display_encoded(images.left if eye == "left" else images.right, images)
+    size = round(images.size_px[0] * place.scale[0]), round(images.size_px[1] * place.scale[1])
+    enlarges = place.scale[0] > 1
+    resized = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if enlarges else cv2.INTER_AREA)
+    if resized.ndim == 2:
+        resized = cv2.cvtColor(resized, cv2.COLOR_GRAY2RGB)
+    if size == input_size_px:
+        return np.asarray(resized), place
+    padded = np.full((input_size_px[1], input_size_px[0], 3), PADDING_DN, np.uint8)
+    left, top = place.offset_px
+    padded[top : top + size[1], left : left + size[0]] = resized
+    return padded, place
+
+
+def network_input(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    """(B, 3, H, W) from 0 to 1 of B pictures (H, W, 3)."""
+    batch = np.stack([picture.transpose(2, 0, 1) for picture in pictures])
+    return np.ascontiguousarray(batch, dtype=np.float32) * np.float32(1 / 255)
+
+
+def _display_encoded(image: Pixels, images: StereoImages) -> NDArray[np.uint8]:
+    """The picture in 8 bits of the sRGB curve (IEC 61966-2-1), 0 at the black level."""
+    if images.encoding == "gamma" and images.bits == 8 and images.black_level_dn == 0:
+        return image.astype(np.uint8, copy=False)
+    codes = np.arange(2**images.bits) / (2**images.bits - 1)
+    black = np.array(images.black_level_dn / (2**images.bits - 1))
+    if images.encoding == "gamma":
+        codes, black = _srgb_to_light(codes), _srgb_to_light(black)
+    light = np.clip((codes - black) / (1 - black), 0, 1)
+    table = np.round(255 * _light_to_srgb(light)).astype(np.uint8)
+    if image.dtype == np.uint8:
+        return np.asarray(cv2.LUT(image, table), dtype=np.uint8)
+    return np.take(table, image, mode="clip")
+
+
+def _srgb_to_light(code: Array) -> Array:
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
+def _light_to_srgb(light: Array) -> Array:
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

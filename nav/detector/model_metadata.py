@@ -1,0 +1,77 @@
+"""What a network file says of itself, in its own metadata."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+from nav.detector.maps import SIZE_STEP_PX
+
+METADATA_KEY = "droguekit_detector"
+"""Under this key an ONNX file has the JSON text of `ModelMetadata`."""
+
+_JSON_NAME: dict[type, str] = {str: "a text", Mapping: "an object"}
+
+
+@dataclass(frozen=True)
+class ModelMetadata:
+    """Everything that is needed to use a network, and where it comes from.
+
+    Attributes:
+        input_size_px: width and height that it was made for; multiples of 32.
+        score_threshold: what scores lower is no drogue.
+        classes: names, one.
+        licence: of the weights.
+        manifest_sha256: of the dataset that it was trained on; empty where it was on none of ours.
+        network: its `NetworkConfig` as a dict; empty where it is none of ours.
+        training: what else is told of the training: plain JSON.
+    """
+
+    input_size_px: tuple[int, int] = (640, 480)
+    score_threshold: float = 0.5
+    classes: tuple[str, ...] = ("drogue",)
+    licence: str = ""
+    manifest_sha256: str = ""
+    network: Mapping[str, str] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        sides = self.input_size_px
+        if len(sides) != 2 or any(type(side) is not int or side < 1 or side % SIZE_STEP_PX for side in sides):
+            raise ValueError(f"input_size_px: must be two multiples of {SIZE_STEP_PX}, got {sides!r}")
+        if not isinstance(self.score_threshold, (int, float)) or not 0 <= self.score_threshold <= 1:
+            raise ValueError(f"score_threshold: must be 0 to 1, got {self.score_threshold!r}")
+        if len(self.classes) != 1 or not all(isinstance(name, str) for name in self.classes):
+            raise ValueError(f"classes: must be one name, got {self.classes!r}")
+        for name, kind in (("licence", str), ("manifest_sha256", str), ("network", Mapping), ("training", Mapping)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name}: must be {_JSON_NAME[kind]}, got {getattr(self, name)!r}")
+
+    def to_json(self) -> str:
+        """What `from_json` reads."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> ModelMetadata:
+        """The metadata in a text.
+
+        Raises:
+            ValueError: it is not the JSON of an object with these keys, or a value is not allowed.
+        """
+        try:
+            values = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"metadata: is not JSON: {error}") from error
+        if not isinstance(values, dict):
+            raise ValueError(f"metadata: must be an object, got {type(values).__name__}")
+        unknown = sorted(set(values) - {each.name for each in fields(cls)})
+        if unknown:
+            raise ValueError(f"metadata: has unknown keys {', '.join(unknown)}")
+        for name in ("input_size_px", "classes"):
+            if name in values:
+                if not isinstance(values[name], list):
+                    raise ValueError(f"{name}: must be a list, got {values[name]!r}")
+                values[name] = tuple(values[name])
+        return cls(**values)

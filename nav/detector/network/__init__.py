@@ -1,0 +1,1 @@
+"""The detector network in torch: what is trained and exported. Nothing that navigates imports it."""

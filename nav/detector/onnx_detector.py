@@ -1,0 +1,150 @@
+"""A detector network in an ONNX file, run by onnxruntime. The contract of such a file is in docs/detector.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+from onnxruntime.capi import onnxruntime_pybind11_state as faults
+
+from datasets_manifest.images import StereoImages
+from geometry.stereo import EYES, Eye
+from nav.detector.decoding import decode
+from nav.detector.input_image import input_image, letterbox, network_input
+from nav.detector.interface import Detection, StereoDetection
+from nav.detector.maps import MAP_CHANNELS, SIZE_STEP_PX, STRIDES
+from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
+
+_FAULTS = (
+    faults.EPFail, faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf,
+    faults.NotImplemented, faults.RuntimeException, RuntimeError,
+)  # fmt: skip
+# Only errors: a file that cannot be used is reported by the exception, once.
+_LOG_ERRORS = 4
+
+
+class OnnxDetector:
+    """Both eyes in one pass through a network.
+
+    Attributes:
+        name: how it is called in results.
+        metadata: what the file says of itself.
+        input_size_px: width, height of what the network is given. [px]
+    """
+
+    def __init__(
+        self, file: Path, name: str = "", threads: int = 1, input_size_px: tuple[int, int] | None = None
+    ) -> None:
+        """Open a network.
+
+        Args:
+            file: the network, with all its weights inside.
+            name: the file's own by default.
+            threads: of onnxruntime within one pass.
+            input_size_px: width, height, multiples of 32; by default what the file was made for.
+
+        Raises:
+            ValueError: the file is missing, truncated, or no network of this kind; names the file.
+        """
+        if threads < 1:
+            raise ValueError(f"threads: must be at least 1, got {threads}")
+        self.name = name or file.stem
+        self._file = file
+        self._session = _open_session(file, threads)
+        self._input_name, fixed_size = _checked_input(file, self._session)
+        self.metadata = _read_metadata(file, self._session, fixed_size)
+        self.input_size_px = input_size_px or fixed_size or self.metadata.input_size_px
+        if fixed_size and self.input_size_px != fixed_size:
+            raise ValueError(f"{file}: takes {fixed_size[0]}x{fixed_size[1]} px only, asked for {self.input_size_px}")
+        letterbox(self.input_size_px, self.input_size_px)
+        probe = fixed_size or (SIZE_STEP_PX, 2 * SIZE_STEP_PX)
+        self._check_maps(self._run(np.zeros((len(EYES), 3, probe[1], probe[0]), np.float32)), probe)
+
+    def detect(self, images: StereoImages) -> StereoDetection:
+        """The best box in each image, where it scores as much as the file asks for."""
+        found = self._candidates(images, self.metadata.score_threshold, most=1)
+        return StereoDetection(*(next(iter(found[eye]), None) for eye in EYES))
+
+    def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
+        """Boxes of each image, the best first, without those that overlap a better one."""
+        return self._candidates(images, least_score, most=20)
+
+    def _candidates(self, images: StereoImages, least_score: float, most: int) -> dict[Eye, tuple[Detection, ...]]:
+        pictures, places = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
+        maps = self._run(network_input(pictures))
+        answers: dict[Eye, tuple[Detection, ...]] = {}
+        for eye, place, (boxes, scores) in zip(EYES, places, decode(maps, least_score, most), strict=True):
+            answers[eye] = tuple(
+                Detection((x, y, width, height), score)
+                for (x, y, width, height), score in zip(place.to_image(boxes).tolist(), scores.tolist(), strict=True)
+            )
+        return answers
+
+    def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
+        try:
+            maps: list[NDArray[Any]] = self._session.run(None, {self._input_name: batch})
+        except _FAULTS as error:
+            raise ValueError(f"{self._file}: does not run on {batch.shape}: {_first_line(error)}") from error
+        return maps
+
+    def _check_maps(self, maps: list[NDArray[Any]], size_px: tuple[int, int]) -> None:
+        want = [(len(EYES), MAP_CHANNELS, size_px[1] // stride, size_px[0] // stride) for stride in STRIDES]
+        got = [np.shape(each) for each in maps]
+        if got != want or any(not np.issubdtype(each.dtype, np.floating) for each in maps):
+            raise ValueError(f"{self._file}: outputs must be maps of numbers {want}, got {got}; see docs/detector.md")
+
+
+def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{file}: cannot be read: {error.strerror}") from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _LOG_ERRORS
+    # Threads that wait must not burn the cores that rendering or another measurement runs on.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        # From memory, so that a file cannot name others to be read.
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except _FAULTS as error:
+        raise ValueError(f"{file}: is truncated or not an ONNX network: {_first_line(error)}") from error
+
+
+def _checked_input(file: Path, session: onnxruntime.InferenceSession) -> tuple[str, tuple[int, int] | None]:
+    """Name of the only input, and (width, height) where they are fixed."""
+    inputs = session.get_inputs()
+    shape = list(inputs[0].shape) if len(inputs) == 1 else []
+    if len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
+        got = ", ".join(f"{each.name}: {each.type} {each.shape}" for each in inputs)
+        raise ValueError(f"{file}: must have one float32 input (B, 3, H, W), got {got}; see docs/detector.md")
+    if shape[0] == 1:
+        raise ValueError(f"{file}: takes one image a pass, must take both eyes; export it with a dynamic batch")
+    width, height = shape[3], shape[2]
+    if not (isinstance(width, int) and isinstance(height, int)):
+        return inputs[0].name, None
+    if width % SIZE_STEP_PX or height % SIZE_STEP_PX:
+        raise ValueError(f"{file}: width and height must be multiples of {SIZE_STEP_PX}, got {width}x{height}")
+    return inputs[0].name, (width, height)
+
+
+def _read_metadata(
+    file: Path, session: onnxruntime.InferenceSession, fixed_size: tuple[int, int] | None
+) -> ModelMetadata:
+    text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+    if text is None and fixed_size is None:
+        raise ValueError(f"{file}: takes any size and has no metadata {METADATA_KEY!r} that names one; add it")
+    try:
+        if text is None and fixed_size is not None:
+            return ModelMetadata(input_size_px=fixed_size)
+        return ModelMetadata.from_json(text or "")
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,57 @@
+"""Detectors by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from drogue_models.parameters import DrogueParameters
+from nav.detector.interface import Detector
+
+COLOR_BLOB = "color-blob"
+DEFAULT_DETECTOR = COLOR_BLOB
+# Networks whose weights belong to the package, by the name of their file.
+_SHIPPED = ("mobile-l", "mobile-s")
+_WEIGHTS = Path(__file__).parent / "weights"
+_SUFFIX = ".onnx"
+
+
+def detector_names() -> tuple[str, ...]:
+    """Names that `open_detector` knows, whether or not their weights are there."""
+    return (COLOR_BLOB, *_SHIPPED)
+
+
+def open_detector(name_or_file: str, drogue: DrogueParameters, threads: int = 1) -> Detector:
+    """A detector of one drogue, see `detector_factory`."""
+    return detector_factory(name_or_file, threads)(drogue)
+
+
+def detector_factory(name_or_file: str, threads: int = 1) -> Callable[[DrogueParameters], Detector]:
+    """What makes detectors of the drogue that it is told; a network is opened once, and is the same for all.
+
+    Args:
+        name_or_file: one of `detector_names`, or a file `*.onnx` that keeps the contract of docs/detector.md.
+        threads: of a network.
+
+    Raises:
+        ValueError: no such name, or a file that is missing or no such network; names it.
+    """
+    if name_or_file == COLOR_BLOB:
+        from nav.detector.color_blob import ColorBlobDetector
+
+        return ColorBlobDetector
+    if name_or_file in _SHIPPED:
+        file = _WEIGHTS / f"{name_or_file}{_SUFFIX}"
+        if not file.exists():
+            raise ValueError(
+                f"detector: the weights of {name_or_file} are not installed ({file}); name another detector, or a file"
+            )
+    elif name_or_file.endswith(_SUFFIX):
+        file = Path(name_or_file)
+    else:
+        names = ", ".join(detector_names())
+        raise ValueError(f"detector: must be one of {names} or a file *{_SUFFIX}, got {name_or_file!r}")
+    from nav.detector.onnx_detector import OnnxDetector
+
+    network = OnnxDetector(file, file.stem, threads)
+    return lambda drogue: network

@@ -1,0 +1,227 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from onnx import TensorProto, helper
+
+from datasets_manifest.images import StereoImages
+from geometry.stereo import EYES
+from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
+from nav.detector.network.config import NetworkConfig
+from nav.detector.onnx_detector import OnnxDetector
+from nav.training.onnx_export import INPUT_NAME, OUTPUT_NAMES, export_onnx
+
+METADATA = ModelMetadata(input_size_px=(320, 256), score_threshold=0.6, licence="Apache-2.0")
+# In cells of 8 px of the 320x256 input: column and row of a red square of one cell.
+PLACES = {"left": (7, 5), "right": (3, 20)}
+IMAGE_PX = (640, 512)
+
+
+def red_squares_pair(times: int = 1) -> StereoImages:
+    """Grey images with a red square of 16 `times` px each, that fills cells of 8 px after halving."""
+    pictures = []
+    for eye in EYES:
+        column, row = PLACES[eye]
+        picture = np.full((IMAGE_PX[1], IMAGE_PX[0], 3), 120, np.uint8)
+        picture[16 * row : 16 * (row + times), 16 * column : 16 * (column + times)] = (255, 0, 0)
+        pictures.append(picture)
+    return StereoImages(pictures[0], pictures[1], 0.0, 0.0, encoding="gamma")
+
+
+def one_line(error: pytest.ExceptionInfo[ValueError], file: Path) -> None:
+    assert str(error.value).startswith(f"{file}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_finds_what_a_hand_made_network_answers(red_squares):
+    detector = OnnxDetector(red_squares(metadata=METADATA))
+    found = detector.detect(red_squares_pair())
+    for eye in EYES:
+        detection = found.of(eye)
+        assert detection is not None
+        column, row = PLACES[eye]
+        # One stride from the cell's centre on each side is two cells of 16 px of the image; pixel centres are at 0.5.
+        expected = (16 * column - 8 - 0.5, 16 * row - 8 - 0.5, 32, 32)
+        # float32 of numbers of some hundreds.
+        np.testing.assert_allclose(detection.box_xywh_px, expected, atol=1e-3)
+        assert detection.score == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
+
+
+def test_candidates_are_ordered_and_as_good_as_asked(red_squares):
+    detector = OnnxDetector(red_squares(metadata=METADATA))
+    found = detector.candidates(red_squares_pair(times=3), least_score=0.2)
+    for eye in EYES:
+        scores = [each.score for each in found[eye]]
+        assert len(scores) >= 2
+        assert scores == sorted(scores, reverse=True) and min(scores) >= 0.2
+
+
+def test_no_drogue_is_none_and_not_an_error(red_squares):
+    grey = np.full((IMAGE_PX[1], IMAGE_PX[0], 3), 120, np.uint8)
+    detector = OnnxDetector(red_squares(metadata=METADATA))
+    pair = StereoImages(grey, grey, 0.0, 0.0)
+    found = detector.detect(pair)
+    assert found.left is None and found.right is None
+    assert detector.candidates(pair, 0.5) == {"left": (), "right": ()}
+
+
+def test_one_eye_may_be_blind(red_squares):
+    pair = red_squares_pair()
+    pair = replace(pair, right=np.full_like(pair.right, 120))
+    found = OnnxDetector(red_squares(metadata=METADATA)).detect(pair)
+    assert found.left is not None and found.right is None
+
+
+def test_the_threshold_is_that_of_the_file(red_squares):
+    for threshold, sees in ((0.99995, True), (0.99996, False)):
+        # The square's score is 0.9999546.
+        detector = OnnxDetector(red_squares(metadata=replace(METADATA, score_threshold=threshold)))
+        assert (detector.detect(red_squares_pair()).left is not None) == sees
+
+
+def test_input_size_is_the_files_or_as_asked(red_squares):
+    file = red_squares(metadata=METADATA)
+    assert OnnxDetector(file).input_size_px == (320, 256)
+    larger = OnnxDetector(file, input_size_px=(640, 512))
+    assert larger.input_size_px == (640, 512)
+    # Unreduced, the square is a whole cell of stride 16, and its box two of them.
+    found = larger.detect(red_squares_pair()).left
+    assert found is not None
+    assert found.box_xywh_px[2] in (pytest.approx(16, abs=1e-3), pytest.approx(32, abs=1e-3))
+    with pytest.raises(ValueError, match="input_size_px: must be multiples of 32, got 300x200"):
+        OnnxDetector(file, input_size_px=(300, 200))
+
+
+def test_a_network_of_fixed_size_needs_no_metadata(red_squares):
+    file = red_squares(shape=("b", 3, 256, 320))
+    assert OnnxDetector(file).detect(red_squares_pair()).left is not None
+    with pytest.raises(ValueError, match="takes 320x256 px only") as error:
+        OnnxDetector(file, input_size_px=(640, 480))
+    one_line(error, file)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({}, "takes any size and has no metadata 'droguekit_detector'"),
+        ({"metadata": METADATA, "channels": 6}, "outputs must be maps of numbers"),
+        ({"metadata": METADATA, "strides": (8, 16)}, "outputs must be maps of numbers"),
+        ({"metadata": METADATA, "strides": (8, 16, 16)}, "does not run|not an ONNX network"),
+        ({"metadata": METADATA, "strides": (4, 8, 16)}, "outputs must be maps of numbers"),
+        ({"metadata": METADATA, "shape": (1, 3, 256, 320)}, "takes one image a pass"),
+        ({"metadata": METADATA, "shape": ("b", 3, 250, 320)}, "must be multiples of 32, got 320x250"),
+        ({"metadata": METADATA, "shape": ("b", 1, "h", "w")}, r"one float32 input \(B, 3, H, W\)|not an ONNX network"),
+    ],
+)
+def test_networks_of_another_kind_are_refused(red_squares, kwargs, message):
+    file = red_squares(**kwargs)
+    with pytest.raises(ValueError, match=message) as error:
+        OnnxDetector(file)
+    one_line(error, file)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "metadata: is not JSON"),
+        ("[1]", "metadata: must be an object, got list"),
+        ('{"input_size_px": [320, 250]}', "input_size_px: must be two multiples of 32"),
+        ('{"input_size_px": 320}', "input_size_px: must be a list"),
+        ('{"score_threshold": "high"}', "score_threshold: must be 0 to 1"),
+        ('{"licence": 5}', "licence: must be a text, got 5"),
+        ('{"training": []}', "training: must be an object"),
+        ('{"colour": 1}', "metadata: has unknown keys colour"),
+    ],
+)
+def test_metadata_that_makes_no_sense_is_refused(red_squares, text, message):
+    file = red_squares()
+    model = onnx.load(file)
+    helper.set_model_props(model, {METADATA_KEY: text})
+    onnx.save(model, file)
+    with pytest.raises(ValueError, match=message) as error:
+        OnnxDetector(file)
+    one_line(error, file)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a network", b"\x89PNG\r\n\x1a\n" + bytes(100), bytes(1000)])
+def test_files_that_are_no_networks_are_refused(tmp_path, content):
+    file = tmp_path / "network.onnx"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match="is truncated or not an ONNX network") as error:
+        OnnxDetector(file)
+    one_line(error, file)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_refused(red_squares, share):
+    file = red_squares(metadata=METADATA)
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError) as error:
+        OnnxDetector(file)
+    one_line(error, file)
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path):
+    for file in (tmp_path / "missing.onnx", tmp_path):
+        with pytest.raises(ValueError, match="cannot be read") as error:
+            OnnxDetector(file)
+        one_line(error, file)
+
+
+def test_a_file_cannot_name_other_files_to_be_read(red_squares, tmp_path):
+    file = red_squares(metadata=METADATA)
+    model = onnx.load(file)
+    (tmp_path / "secret").write_bytes(bytes(60))
+    (weights,) = (each for each in model.graph.initializer if each.name == "weights")
+    weights.ClearField("raw_data")
+    weights.data_location = TensorProto.EXTERNAL
+    weights.external_data.add(key="location", value="secret")
+    file.write_bytes(model.SerializeToString())
+    with pytest.raises(ValueError) as error:
+        OnnxDetector(file)
+    one_line(error, file)
+
+
+def test_threads_must_be_positive(red_squares):
+    with pytest.raises(ValueError, match="threads: must be at least 1, got 0"):
+        OnnxDetector(red_squares(metadata=METADATA), threads=0)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [NetworkConfig("l"), NetworkConfig("s", "se", "concat")],
+    ids=lambda config: "-".join(config.to_dict().values()),
+)
+def test_exported_network_answers_as_torch_does(network, tmp_path, config):
+    trained, file = network(config), tmp_path / "net" / "network.onnx"
+    metadata = replace(METADATA, network=config.to_dict(), manifest_sha256="ab" * 32, training={"passes": 7})
+    before = {name: value.clone() for name, value in trained.state_dict().items()}
+    export_onnx(trained.train(), file, metadata)
+    assert trained.training
+    assert all(torch.equal(value, before[name]) for name, value in trained.state_dict().items())
+    trained.eval()
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+    detector = OnnxDetector(file)
+    assert detector.metadata == metadata
+    session = onnxruntime.InferenceSession(file.read_bytes(), providers=["CPUExecutionProvider"])
+    for shape in ((1, 3, 64, 96), (3, 3, 128, 64)):
+        images = np.random.default_rng(5).random(shape, dtype=np.float32)
+        with torch.no_grad():
+            expected = [each.numpy() for each in trained(torch.from_numpy(images))]
+        for answer, reference in zip(session.run(list(OUTPUT_NAMES), {INPUT_NAME: images}), expected, strict=True):
+            # Some 60 float32 layers summed in another order, with normalisation folded into the weights.
+            np.testing.assert_allclose(answer, reference, atol=2e-4 * max(1.0, float(np.abs(reference).max())))
+
+
+def test_an_export_that_fails_leaves_nothing_behind(network, tmp_path):
+    (tmp_path / "network.onnx").mkdir()
+    with pytest.raises(OSError, match=r"network\.onnx: cannot be written"):
+        export_onnx(network(NetworkConfig("s")), tmp_path / "network.onnx", METADATA)
+    assert [path.name for path in tmp_path.iterdir()] == ["network.onnx"]

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from datasets_manifest.blind import BlindDataset
+from datasets_manifest.estimates import NoFix
+from drogue_models.presets import PRESETS
+from geometry.stereo import EYES
+from nav.detector.color_blob import ColorBlobDetector
+from nav.detector.model_metadata import ModelMetadata
+from nav.detector.registry import DEFAULT_DETECTOR, detector_factory, detector_names, open_detector
+from nav.runner import navigate
+
+DROGUE = PRESETS["red-8"]
+
+
+def test_the_default_is_among_the_names():
+    assert DEFAULT_DETECTOR in detector_names()
+    assert open_detector(DEFAULT_DETECTOR, DROGUE).name == DEFAULT_DETECTOR
+
+
+@pytest.mark.parametrize("name", ["", "yolo", "mobile-xl", "weights.pt"])
+def test_a_name_that_does_not_exist_lists_those_that_do(name):
+    with pytest.raises(ValueError, match=r"detector: must be one of color-blob, mobile-l, mobile-s or a file \*\.onnx"):
+        open_detector(name, DROGUE)
+
+
+def test_a_file_is_opened_once_and_called_by_its_name(red_squares):
+    file = red_squares(metadata=ModelMetadata(input_size_px=(320, 256)))
+    make = detector_factory(str(file))
+    assert make(DROGUE).name == "squares"
+    assert make(DROGUE) is make(PRESETS["white-8"])
+
+
+def test_color_blob_has_the_detection_as_its_only_candidate(draw, make_pose):
+    from geometry.pinhole import PinholeCamera
+    from geometry.stereo import StereoRig
+
+    rig = StereoRig(PinholeCamera(320, 240, 533.3, 533.3, 159.5, 119.5), 0.12)
+    images = draw(rig, DROGUE, make_pose(0.06, 0, 3.0, 5, 5, 10), np.random.default_rng(1))
+    detector = ColorBlobDetector(DROGUE)
+    found = detector.detect(images)
+    candidates = detector.candidates(images, 0.1)
+    for eye in EYES:
+        detection = found.of(eye)
+        assert detection is not None
+        assert candidates[eye] == (detection,)
+        assert detector.candidates(images, min(1.0, detection.score + 1e-6))[eye] == () or detection.score == 1
+
+
+def test_navigation_asks_the_detector_that_is_named(smoke_dataset, red_squares):
+    dataset = BlindDataset(smoke_dataset)
+    # A network that wants more red than there is.
+    blind = str(red_squares(metadata=ModelMetadata(input_size_px=(640, 480), score_threshold=1.0)))
+    estimates = list(navigate(dataset, ["joint"], detector=blind))
+    assert estimates and all(isinstance(each, NoFix) and "no drogue detected" in each.reason for each in estimates)
+    with pytest.raises(ValueError, match="detector: must be one of"):
+        navigate(dataset, ["joint"], detector="nobody")
+
+
+def test_naming_detectors_imports_nothing_heavy():
+    code = (
+        "import sys, nav.detector.registry as registry; registry.detector_names();"
+        "print([name for name in ('torch', 'onnxruntime', 'cv2', 'onnx') if name in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
