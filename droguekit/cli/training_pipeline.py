@@ -1,0 +1,75 @@
+"""From recipes and datasets to a trained detector: the part of `droguekit.cli.pipelines` that needs torch."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from datasets_manifest.storage import Location, as_location
+from droguekit.cli.pipelines import RenderOrder, open_recipe, render_frames
+
+if TYPE_CHECKING:
+    from droguekit.batch.progress import ProgressReport
+    from nav.training.training import TrainingResult
+
+_NEEDED = ("torch", "onnx", "onnxscript", "tensorboard")
+
+
+@dataclass(frozen=True)
+class TrainingOrder:
+    """What a detector is trained on, and how.
+
+    Attributes:
+        sources: folders or URLs of datasets, and recipes.
+        settings_file: TOML of training settings, or None.
+        changes: to both the file and the defaults.
+        size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
+        cache: folder for images at the network's size, or None for the training's own.
+        workers: that render, as many as the machine holds when None.
+    """
+
+    sources: tuple[str, ...]
+    settings_file: Path | None
+    changes: dict[str, Any]
+    size: str | None
+    final_size: str | None
+    cache: Path | None
+    workers: int | None
+
+
+def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> TrainingResult:
+    """Render what is missing, train, evaluate and export.
+
+    Raises:
+        ValueError: a wrong setting, a dataset that cannot be used, or a folder of another training.
+        OSError: a file cannot be written.
+        KeyboardInterrupt: it was told to stop, and what was done is saved.
+    """
+    from droguekit.batch.stop import StopRequest
+    from nav.training.settings import build_settings, parse_size
+
+    sizes = {"size_px": order.size, "final_size_px": order.final_size}
+    parsed = {name: parse_size(text) for name, text in sizes.items() if text is not None}
+    settings = build_settings(order.settings_file, {**order.changes, **parsed})
+    missing = [name for name in _NEEDED if find_spec(name) is None]
+    if missing:
+        raise ValueError(f"train: {', '.join(missing)} is missing: pip install 'droguekit[train]'")
+    datasets: list[Location] = []
+    for source in order.sources:
+        location = as_location(source)
+        if isinstance(location, str) or location.is_dir():
+            datasets.append(location)
+            continue
+        recipe, text = open_recipe(source, None, None)
+        datasets.append(out / "datasets" / recipe.name)
+        report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {datasets[-1]}")
+        render_frames(recipe, text, datasets[-1], range(recipe.frames.count), RenderOrder(order.workers), report)
+    # Threads of torch that wait for each other by spinning lose most of their time where others use the cores too.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from nav.training.training import train
+
+    with StopRequest(report.say) as stop:
+        return train(datasets, out, settings, report, order.cache, lambda: stop.is_requested)

@@ -1,0 +1,133 @@
+"""Batches of augmented images, each a function of the settings, the corpus and its number.
+
+An epoch shows every training image once, in an order of its own; where four are put together, each of them once as the
+one that the others are drawn to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nav.detector.input_image import PADDING_DN
+from nav.training.corpus import Corpus, EyeIndex
+from nav.training.image_views import (
+    Boxes,
+    Image,
+    ImageView,
+    ViewRanges,
+    Window,
+    fit_scale,
+    sample_view,
+    show,
+    whole_view,
+)
+from nav.training.mosaic import TILES, sample_mosaic
+from nav.training.ordered_work import in_order
+from nav.training.painted_shapes import distract, occlude
+from nav.training.photometry import vary_light
+from nav.training.seeding import generator
+from nav.training.settings import SizePx, TrainingSettings
+
+_MOSAIC_FRACTION = 0.8  # of the images while mosaic is on
+_WHOLE_FRACTION = 0.25  # of the others: as they are when the detector is used
+# Scales against the image that just fits the network's input.
+_MOSAIC_RANGES = ViewRanges(scale=(0.3, 1.3), turn_deg=4, flip_fraction=0.5)
+_SINGLE_RANGES = ViewRanges(scale=(0.65, 1.5), turn_deg=4, flip_fraction=0.5)
+_AHEAD_BATCHES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What one step learns from.
+
+    Attributes:
+        images: (B, H, W, 3) gamma-encoded red, green, blue; with both views the eyes of a pair follow each other.
+        boxes: B arrays (n, 4), x, y of the low corner, width, height, from the corner of the image. [px]
+    """
+
+    images: NDArray[np.uint8]
+    boxes: tuple[Boxes, ...]
+
+
+class BatchMaker:
+    """Makes any batch of a training."""
+
+    def __init__(self, corpus: Corpus, settings: TrainingSettings) -> None:
+        self._corpus, self._settings = corpus, settings
+        self._pairs = corpus.split("train")
+        # A sample is what is drawn at once: an eye, or both of a pair.
+        self._eyes = 2 if settings.views == "both" else 1
+        self._samples_per_epoch = 2 * len(self._pairs) // self._eyes
+        self._samples_per_batch = settings.batch_images // self._eyes
+
+    def epoch_after(self, step: int) -> int:
+        """How many epochs are complete after the steps before `step`."""
+        return step * self._samples_per_batch // self._samples_per_epoch
+
+    def batch(self, step: int) -> Batch:
+        """The batch of a step, counted from 0."""
+        images, boxes = [], []
+        for number in range(step * self._samples_per_batch, (step + 1) * self._samples_per_batch):
+            for image, own in self._sample(step, *divmod(number, self._samples_per_epoch)):
+                images.append(image)
+                boxes.append(own)
+        return Batch(np.stack(images), tuple(boxes))
+
+    def batches(self, steps: range, threads: int) -> Generator[Batch]:
+        """The batches of steps, in their order, made ahead by threads."""
+        return in_order(self.batch, steps, threads, threads + _AHEAD_BATCHES)
+
+    def _sample(self, step: int, epoch: int, position: int) -> Iterator[tuple[Image, Boxes]]:
+        """Images and boxes of one eye, or of both."""
+        settings = self._settings
+        order = generator(settings.seed, epoch, 0, "order").permutation(self._samples_per_epoch)
+        rng = generator(settings.seed, epoch, position, "geometry")
+        first = int(order[position])
+        is_mosaic = settings.mosaic_at(step) and rng.random() < _MOSAIC_FRACTION
+        samples = [first, *rng.integers(self._samples_per_epoch, size=TILES - 1)] if is_mosaic else [first]
+        # The first of the four stands in any corner.
+        samples = [samples[tile] for tile in rng.permutation(len(samples))]
+        members = [self._members(int(sample)) for sample in samples]
+        size = settings.size_at(step)
+        views = self._sample_views(rng, members, size, is_mosaic)
+        for eye_number, of_eye in enumerate(zip(*members, strict=True)):
+            # The eyes see one scene in one light, but each with its own noise.
+            light = generator(settings.seed, epoch, position, f"light {eye_number}")
+            yield self._paint(light, list(of_eye), views, size)
+
+    def _members(self, sample: int) -> list[tuple[int, EyeIndex]]:
+        """Pair and eye of a sample's images."""
+        if self._eyes == 2:
+            pair = int(self._pairs[sample])
+            return [(pair, 0), (pair, 1)]
+        return [(int(self._pairs[sample // 2]), sample % 2)]
+
+    def _sample_views(
+        self, rng: np.random.Generator, members: list[list[tuple[int, EyeIndex]]], size: SizePx, is_mosaic: bool
+    ) -> list[ImageView]:
+        source_wh, canvas_wh = self._corpus.size_px[::-1], size[::-1]
+        fit = fit_scale(source_wh, canvas_wh)
+        # What only one eye sees is a reason to look there too.
+        boxes = [np.vstack([self._corpus.boxes(*member) for member in sample]) for sample in members]
+        if is_mosaic:
+            return sample_mosaic(rng, [source_wh] * len(boxes), boxes, canvas_wh, _MOSAIC_RANGES.times(fit))
+        if rng.random() < _WHOLE_FRACTION:
+            return [whole_view(source_wh, canvas_wh)]
+        return [sample_view(rng, source_wh, boxes[0], Window(0, 0, *canvas_wh), _SINGLE_RANGES.times(fit))]
+
+    def _paint(
+        self, rng: np.random.Generator, members: list[tuple[int, EyeIndex]], views: list[ImageView], size: SizePx
+    ) -> tuple[Image, Boxes]:
+        canvas = np.full((*size, 3), PADDING_DN, dtype=np.uint8)
+        shown = [
+            show(canvas, self._corpus.image(*member), self._corpus.boxes(*member), view)
+            for member, view in zip(members, views, strict=True)
+        ]
+        boxes = np.vstack(shown)
+        distract(rng, canvas, boxes)
+        boxes = occlude(rng, canvas, boxes)
+        return vary_light(rng, canvas), boxes

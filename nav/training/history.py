@@ -1,0 +1,110 @@
+"""How a training went: a row an epoch, as a table on disk and for people, and the curves of TensorBoard."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from datasets_manifest.atomic import write_text_atomic
+
+VALIDATED = ("ap", "ap50", "ap75", "recall50")
+HISTORY_FILE, LOSSES_FILE, TENSORBOARD_FOLDER = "history.csv", "losses.csv", "tensorboard"
+
+
+@dataclass(frozen=True)
+class EpochRow:
+    """One epoch.
+
+    Attributes:
+        epoch: how many are complete with it; the last row may be of a part.
+        image_passes: images that went through the network so far.
+        height_px, width_px: of the network's input.
+        loss, score_loss, box_loss: means over the epoch's steps.
+        learning_rate: of its last step.
+        images_per_s: of training, without validation.
+        ap, ap50, ap75, recall50: on the validation split with the averaged weights; None without one.
+    """
+
+    epoch: int
+    image_passes: int
+    height_px: int
+    width_px: int
+    loss: float
+    score_loss: float
+    box_loss: float
+    learning_rate: float
+    images_per_s: float
+    ap: float | None
+    ap50: float | None
+    ap75: float | None
+    recall50: float | None
+
+    def to_line(self, image_passes: int, time_left_s: float) -> str:
+        """For people.
+
+        Args:
+            image_passes: of the whole training.
+            time_left_s: until it ends. [s]
+        """
+        validation = (
+            "no validation"
+            if self.ap is None or self.ap50 is None
+            else f"val AP50 {100 * self.ap50:5.1f}, AP {100 * self.ap:5.1f}"
+        )
+        return (
+            f"epoch {self.epoch:3d}: {self.image_passes:,} of {image_passes:,} images at "
+            f"{self.height_px}x{self.width_px}, loss {self.loss:.3f} (score {self.score_loss:.3f}, box "
+            f"{self.box_loss:.3f}), {validation}, {self.images_per_s:.1f} images/s, {_duration(time_left_s)} left"
+        )
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{round(seconds)} s" if minutes < 2 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def write_tables(out: Path, rows: Sequence[EpochRow], losses: Sequence[float], batch_images: int) -> None:
+    """Write `history.csv`, a row an epoch, and `losses.csv`, a row a step.
+
+    Raises:
+        OSError: one cannot be written.
+    """
+    text = io.StringIO()
+    table = csv.DictWriter(text, [field.name for field in fields(EpochRow)], lineterminator="\n")
+    table.writeheader()
+    table.writerows(asdict(row) for row in rows)
+    write_text_atomic(out / HISTORY_FILE, text.getvalue())
+    lines = [f"{(step + 1) * batch_images},{loss!r}\n" for step, loss in enumerate(losses)]
+    write_text_atomic(out / LOSSES_FILE, "".join(["image_passes,loss\n", *lines]))
+
+
+class Curves:
+    """TensorBoard's log of a training."""
+
+    def __init__(self, out: Path, image_passes: int) -> None:
+        """Go on after `image_passes` images; what stands there of later ones, of a run that was killed, is hidden."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer: Any = SummaryWriter(str(out / TENSORBOARD_FOLDER), purge_step=image_passes)
+
+    def add_step(self, image_passes: int, loss: float, score: float, box: float, learning_rate: float) -> None:
+        """One step's point on each curve."""
+        values = {"loss": loss, "score": score, "box": box, "learning_rate": learning_rate}
+        for name, value in values.items():
+            self._writer.add_scalar(f"train/{name}", value, image_passes)
+
+    def add_epoch(self, row: EpochRow) -> None:
+        """One epoch's points."""
+        for name in VALIDATED:
+            value = getattr(row, name)
+            if value is not None:
+                self._writer.add_scalar(f"val/{name}", value, row.image_passes)
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()

@@ -1,0 +1,171 @@
+"""Geometric augmentation: a flipped, scaled, turned and cropped view of an image, and what of its boxes it shows.
+
+Boxes are (n, 4) x, y of the low corner, width, height, counted from the corner of the image: all of it is
+(0, 0, W, H). A drogue is round, so what is turned is the ellipse in its box.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from nav.detector.input_image import PADDING_DN
+
+Boxes = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+LEAST_VISIBLE_FRACTION = 0.3
+"""A drogue of which a view shows less is painted over, for nobody would call what is left a drogue."""
+_SMALLEST_BOX_PX = 7.0  # longer side; at 40 m the paper's camera sees 11 px at an input of 320x416
+_LARGEST_BOX_SHARE = 1.2  # longer side against the window's shorter one; more is mostly cut off
+_SHIFT_SHARE = 0.9  # how much of the freedom to move the crop is used while the drogue stays in it
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of the canvas that a view fills: low corner and size, in whole pixels. [px]"""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class ViewRanges:
+    """What views are drawn from.
+
+    Attributes:
+        scale: smallest and largest magnification; 1 shows a pixel of the image as one of the canvas.
+        turn_deg: largest rotation either way.
+        flip_fraction: share of views that are mirrored left to right.
+    """
+
+    scale: tuple[float, float]
+    turn_deg: float
+    flip_fraction: float
+
+    def times(self, factor: float) -> ViewRanges:
+        """The same with magnifications multiplied by a factor."""
+        return replace(self, scale=(self.scale[0] * factor, self.scale[1] * factor))
+
+
+@dataclass(frozen=True, eq=False)
+class ImageView:
+    """Where an image's points go: `canvas = linear @ source + shift`, both counted from corners, shown in `window`."""
+
+    linear: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    window: Window
+
+
+def fit_scale(source_wh: tuple[int, int], canvas_wh: tuple[int, int]) -> float:
+    """Magnification at which a whole image just fits a canvas."""
+    return min(canvas_wh[0] / source_wh[0], canvas_wh[1] / source_wh[1])
+
+
+def whole_view(source_wh: tuple[int, int], canvas_wh: tuple[int, int]) -> ImageView:
+    """The whole image in the middle of the canvas: what is not augmented."""
+    scale = fit_scale(source_wh, canvas_wh)
+    shift = (np.array(canvas_wh) - scale * np.array(source_wh)) / 2
+    return ImageView(np.eye(2) * scale, shift, Window(0, 0, *canvas_wh))
+
+
+def sample_view(
+    rng: np.random.Generator, source_wh: tuple[int, int], boxes: Boxes, window: Window, ranges: ViewRanges
+) -> ImageView:
+    """A view whose crop shows the first box's centre, and is anywhere in an image without boxes.
+
+    Args:
+        rng: the stream.
+        source_wh: of the image. [px]
+        boxes: of the image.
+        window: to fill.
+        ranges: of the draws.
+    """
+    low_scale, high_scale = ranges.scale
+    if len(boxes):
+        longest_px = float(boxes[0, 2:].max())
+        largest_px = _LARGEST_BOX_SHARE * min(window.width, window.height)
+        high_scale = max(min(high_scale, largest_px / longest_px), low_scale)
+        low_scale = min(max(low_scale, _SMALLEST_BOX_PX / longest_px), high_scale)
+    scale = float(np.exp(rng.uniform(np.log(low_scale), np.log(high_scale))))
+    turn = np.radians(rng.uniform(-ranges.turn_deg, ranges.turn_deg))
+    mirror = -1.0 if rng.random() < ranges.flip_fraction else 1.0
+    linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ np.diag([mirror, 1.0])
+    source, crop = np.array(source_wh, dtype=np.float64), np.array([window.width, window.height]) / scale
+    low, high = np.minimum(crop / 2, source - crop / 2), np.maximum(crop / 2, source - crop / 2)
+    if len(boxes):
+        anchor = boxes[0, :2] + boxes[0, 2:] / 2
+        reach = _SHIFT_SHARE * crop / 2
+        low, high = np.clip(anchor - reach, low, high), np.clip(anchor + reach, low, high)
+    middle = np.array([window.x + window.width / 2, window.y + window.height / 2])
+    return ImageView(linear, middle - linear @ rng.uniform(low, high), window)
+
+
+def draw_view(canvas: Image, image: Image, view: ImageView) -> None:
+    """Paint the view into its window of the canvas, grey where the image ends."""
+    window = view.window
+    source = image
+    # Averaging before a strong reduction, which interpolation would alias.
+    reduction = int(1 / np.sqrt(abs(np.linalg.det(view.linear))))
+    if reduction >= 2:
+        small_wh = (max(image.shape[1] // reduction, 1), max(image.shape[0] // reduction, 1))
+        source = np.asarray(cv2.resize(image, small_wh, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    ratio = np.array([image.shape[1] / source.shape[1], image.shape[0] / source.shape[0]])
+    linear = view.linear * ratio
+    # OpenCV counts from pixel centres.
+    shift = view.shift - (window.x, window.y) + linear @ (0.5, 0.5) - 0.5
+    canvas[window.y : window.y + window.height, window.x : window.x + window.width] = cv2.warpAffine(
+        source,
+        np.column_stack([linear, shift]),
+        (window.width, window.height),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(PADDING_DN, PADDING_DN, PADDING_DN),
+    )
+
+
+def moved_boxes(boxes: Boxes, view: ImageView) -> Boxes:
+    """Where the boxes lie on the canvas, also outside the window."""
+    if not len(boxes):
+        return boxes.reshape(0, 4)
+    centers = (boxes[:, :2] + boxes[:, 2:] / 2) @ view.linear.T + view.shift
+    # An ellipse with the half axes (a, b) along x and y reaches sqrt((m00 a)^2 + (m01 b)^2) in x after the map m.
+    halves = np.sqrt((boxes[:, 2:] / 2) ** 2 @ (view.linear**2).T)
+    return np.hstack([centers - halves, 2 * halves])
+
+
+def clipped_boxes(boxes: Boxes, window: Window) -> tuple[Boxes, NDArray[np.float64]]:
+    """The parts of boxes in a window, and the share of each box's area that they are.
+
+    Returns:
+        (n, 4) boxes, of no width or height where nothing is left, and (n,) shares.
+    """
+    low_limit, high_limit = (
+        np.array([window.x, window.y]),
+        np.array([window.x + window.width, window.y + window.height]),
+    )
+    low = np.clip(boxes[:, :2], low_limit, high_limit)
+    high = np.clip(boxes[:, :2] + boxes[:, 2:], low_limit, high_limit)
+    areas = boxes[:, 2] * boxes[:, 3]
+    shares = np.prod(high - low, axis=1) / np.where(areas > 0, areas, 1)
+    return np.hstack([low, high - low]), shares
+
+
+def show(canvas: Image, image: Image, boxes: Boxes, view: ImageView) -> Boxes:
+    """Paint a view and tell which boxes it shows.
+
+    Returns:
+        (m, 4) visible parts of the drogues that are visible enough. Of the others, what is visible is painted grey, so
+        that no drogue stands on the canvas without a box.
+    """
+    draw_view(canvas, image, view)
+    visible, shares = clipped_boxes(moved_boxes(boxes, view), view.window)
+    kept = shares >= LEAST_VISIBLE_FRACTION
+    for x, y, width, height in visible[~kept & (shares > 0)]:
+        canvas[int(y) : int(np.ceil(y + height)), int(x) : int(np.ceil(x + width))] = PADDING_DN
+    return visible[kept]

@@ -1,0 +1,25 @@
+"""Whom a training tells how far it is."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Observer(Protocol):
+    """What long work tells while it runs."""
+
+    def begin(self, what: str, total: int) -> None:
+        """`total` pieces of work of the kind `what` are about to start."""
+        ...
+
+    def advance(self) -> None:
+        """One piece is finished."""
+        ...
+
+    def say(self, text: str) -> None:
+        """A line for the user."""
+        ...
+
+    def end(self) -> None:
+        """The work that `begin` announced is over."""
+        ...

@@ -1,0 +1,145 @@
+"""What a training is told: network, pictures, length and pace."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from datasets_manifest.json_types import FrozenModel
+from drogue_models.presets import explain
+
+STRIDE_PX = 32
+"""Heights and widths of the network's input are multiples of it."""
+
+SizePx = tuple[int, int]
+"""(height, width) of the network's input. [px]"""
+
+# They change where or how fast the work is done, and floats in their last bits, but not what is trained.
+_FREE_TO_CHANGE = ("device", "threads", "loader_threads", "checkpoint_minutes")
+
+
+class TrainingSettings(FrozenModel):
+    """A training, but for its datasets.
+
+    Attributes:
+        variant, attention, fusion: of the network.
+        views: `both` puts the two eyes of a pair into one batch, with the same geometric draw; `one` draws single eyes.
+        mosaic: put four images together, but not in the last `plain_fraction` of the training.
+        size_px: (height, width) of the network's input.
+        final_size_px: the same in the last `final_fraction` of the training; None to keep `size_px`.
+        image_passes: how many images go forwards and backwards through the network in all.
+        batch_images: in one step; even, for `both`.
+        optimizer, learning_rate, weight_decay: the learning rate is the highest of the schedule.
+        warmup_passes: images over which the learning rate rises from zero; a cosine falls to `floor_fraction` of it.
+        ema_decay: of the moving average of the weights, by step; it is what is evaluated and exported.
+        gradient_norm: longer gradients are shortened to it.
+        seed: of every draw.
+        precision: `bf16` computes most of it in bfloat16; `auto` does so where the processor has it in hardware.
+        device: `cpu` or `cuda`.
+        threads: that compute; as many as cores by 0.
+        loader_threads: that prepare images meanwhile.
+        checkpoint_minutes: at least so often the state is saved, besides the end of every epoch.
+    """
+
+    variant: Literal["l", "s"] = "l"
+    attention: Literal["eca", "se"] = "eca"
+    fusion: Literal["asff", "concat"] = "asff"
+    views: Literal["one", "both"] = "both"
+    mosaic: bool = True
+    plain_fraction: float = Field(default=0.2, ge=0, le=1)
+    size_px: SizePx = (480, 640)
+    final_size_px: SizePx | None = None
+    final_fraction: float = Field(default=1 / 3, gt=0, lt=1)
+    image_passes: int = Field(default=40_000, ge=1)
+    batch_images: int = Field(default=8, ge=2)
+    optimizer: Literal["adamw", "sgd"] = "adamw"
+    learning_rate: float = Field(default=2e-3, gt=0)
+    weight_decay: float = Field(default=0.02, ge=0)
+    warmup_passes: int = Field(default=1500, ge=0)
+    floor_fraction: float = Field(default=0.01, ge=0, le=1)
+    ema_decay: float = Field(default=0.998, ge=0, lt=1)
+    gradient_norm: float = Field(default=10.0, gt=0)
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    precision: Literal["auto", "float32", "bf16"] = "auto"
+    device: Literal["cpu", "cuda"] = "cpu"
+    threads: int = Field(default=0, ge=0)
+    loader_threads: int = Field(default=1, ge=1)
+    checkpoint_minutes: float = Field(default=5.0, gt=0)
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        for name, size in (("size_px", self.size_px), ("final_size_px", self.final_size_px)):
+            if size is not None and not all(side >= STRIDE_PX and side % STRIDE_PX == 0 for side in size):
+                raise ValueError(f"{name}: must be multiples of {STRIDE_PX} px, such as 480x640, got {size_text(size)}")
+        if self.views == "both" and self.batch_images % 2:
+            raise ValueError(f"batch_images: must be even for both views at once, got {self.batch_images}")
+        return self
+
+    @property
+    def largest_size_px(self) -> SizePx:
+        """(height, width) at which images are kept."""
+        sizes = (self.size_px, self.final_size_px or self.size_px)
+        return max(sizes, key=lambda size: size[0] * size[1])
+
+    @property
+    def steps(self) -> int:
+        """How often the weights change."""
+        return -(-self.image_passes // self.batch_images)
+
+    def size_at(self, step: int) -> SizePx:
+        """(height, width) of the network's input in a step, counted from 0."""
+        if self.final_size_px is not None and step >= round(self.steps * (1 - self.final_fraction)):
+            return self.final_size_px
+        return self.size_px
+
+    def mosaic_at(self, step: int) -> bool:
+        """Whether images are put together in a step."""
+        return self.mosaic and step < round(self.steps * (1 - self.plain_fraction))
+
+
+def size_text(size_px: SizePx) -> str:
+    """`480x640` for a height of 480 and a width of 640."""
+    return f"{size_px[0]}x{size_px[1]}"
+
+
+def parse_size(text: str) -> SizePx:
+    """(height, width) of `480x640`.
+
+    Raises:
+        ValueError: not of that form.
+    """
+    height, cross, width = text.partition("x")
+    if not cross or not (height.isdecimal() and width.isdecimal()) or len(text) > 12:
+        raise ValueError(f"size: must be HEIGHTxWIDTH in pixels, such as 480x640, got {text!r}")
+    return int(height), int(width)
+
+
+def build_settings(file: Path | None, changes: dict[str, Any]) -> TrainingSettings:
+    """Settings from a TOML file, the defaults where it says nothing, and changes to both.
+
+    Raises:
+        ValueError: no such file, not TOML, an unknown key or a wrong value; names the file.
+    """
+    table: dict[str, Any] = {}
+    if file is not None:
+        try:
+            table = tomllib.loads(file.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ValueError(f"{file}: cannot be read: {error.strerror}") from error
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{file}: is not TOML: {error}") from error
+    try:
+        return TrainingSettings.model_validate({**table, **changes})
+    except ValidationError as error:
+        where = f"{file}: " if file is not None else ""
+        raise ValueError(f"{where}{explain(error)}") from error
+
+
+def differing_settings(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
+    """Keys that make another training of it, in order; those that change only where the work is done do not count."""
+    keys = [*first, *(key for key in second if key not in first)]
+    missing = object()
+    return [key for key in keys if key not in _FREE_TO_CHANGE and first.get(key, missing) != second.get(key, missing)]

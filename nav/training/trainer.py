@@ -1,0 +1,154 @@
+"""The loop: batches through the network, and what follows from time to time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+
+from nav.detector.network.loss import DetectionLoss, detection_loss
+from nav.training.answers import answer, to_tensor
+from nav.training.average_precision import AveragePrecision, average_precision
+from nav.training.batch_statistics import measure_batch_statistics
+from nav.training.batches import Batch, BatchMaker
+from nav.training.checkpoint import BEST_FILE, save
+from nav.training.corpus import Corpus
+from nav.training.history import VALIDATED, Curves, EpochRow, write_tables
+from nav.training.observer import Observer
+from nav.training.precision import Computing
+from nav.training.schedule import learning_rate
+from nav.training.settings import TrainingSettings
+from nav.training.state import TrainingState, save_state
+
+_CURVE_EVERY_STEPS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Trainer:
+    """A training in its folder.
+
+    Attributes:
+        corpus, settings: what is learned, and how.
+        computing: where and how precisely.
+        out: folder of checkpoint, tables and curves.
+        observer: is told of every epoch.
+        should_stop: asked after every step.
+    """
+
+    corpus: Corpus
+    settings: TrainingSettings
+    computing: Computing
+    out: Path
+    observer: Observer
+    should_stop: Callable[[], bool]
+
+    def run(self, state: TrainingState) -> None:
+        """Go on from a state to the end.
+
+        Raises:
+            ValueError: the loss is no number any more.
+            OSError: a file cannot be written; the checkpoint before stays.
+            KeyboardInterrupt: it was told to stop, and what was done is saved.
+        """
+        self.observer.begin(f"steps of {self.settings.batch_images} images", self.settings.steps - state.step)
+        try:
+            self._run(state)
+        finally:
+            self.observer.end()
+
+    def _run(self, state: TrainingState) -> None:
+        settings, maker = self.settings, BatchMaker(self.corpus, self.settings)
+        curves = Curves(self.out, state.step * settings.batch_images)
+        batches = maker.batches(range(state.step, settings.steps), settings.loader_threads)
+        saved_s = began_s = time.monotonic()
+        with closing(curves), closing(batches):
+            for batch in batches:
+                self._step(state, batch, curves)
+                state.row_seconds += time.monotonic() - began_s
+                self.observer.advance()
+                if maker.epoch_after(state.step) > maker.epoch_after(state.step - 1) or state.step == settings.steps:
+                    self._end_epoch(state, maker.epoch_after(state.step), curves)
+                    saved_s = time.monotonic()
+                elif self.should_stop() or time.monotonic() - saved_s > 60 * settings.checkpoint_minutes:
+                    self._save(state)
+                    saved_s = time.monotonic()
+                if self.should_stop() and state.step < settings.steps:
+                    self.observer.say(f"stopped after {state.step * settings.batch_images:,} images, which are saved")
+                    raise KeyboardInterrupt
+                began_s = time.monotonic()
+
+    def _step(self, state: TrainingState, batch: Batch, curves: Curves) -> None:
+        rate = learning_rate(self.settings, state.step)
+        loss = self._learn(state, batch, rate)
+        total, score, box = (float(part.detach()) for part in loss)
+        if not math.isfinite(total):
+            raise ValueError(
+                f"learning_rate: the loss became {total} at step {state.step}; train with a lower one than "
+                f"{self.settings.learning_rate:g}, into another folder"
+            )
+        state.average.update(state.network, state.step)
+        state.step += 1
+        state.losses.append(total)
+        state.parts.append((score, box))
+        if state.step % _CURVE_EVERY_STEPS == 0:
+            curves.add_step(state.step * self.settings.batch_images, total, score, box, rate)
+
+    def _learn(self, state: TrainingState, batch: Batch, rate: float) -> DetectionLoss:
+        for group in state.optimizer.param_groups:
+            group["lr"] = rate
+        state.network.train()
+        boxes = [torch.from_numpy(own).float().to(self.computing.device) for own in batch.boxes]
+        with self.computing.autocast():
+            maps = state.network(to_tensor(batch.images, self.computing))
+        loss = detection_loss(maps, boxes)
+        state.optimizer.zero_grad(set_to_none=True)
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(state.network.parameters(), self.settings.gradient_norm)
+        state.optimizer.step()
+        return loss
+
+    def _end_epoch(self, state: TrainingState, epoch: int, curves: Curves) -> None:
+        """Validate, tell, keep the best, save."""
+        settings, size = self.settings, self.settings.size_at(state.step - 1)
+        began_s = time.monotonic()
+        measure_batch_statistics(state.average.network, self.corpus, size, self.computing)
+        answers = answer(state.average.network, self.corpus, "val", size, settings.batch_images, self.computing)
+        validation = average_precision(answers.truth, answers.found)
+        row = self._row(state, epoch, validation)
+        state.rows.append(row)
+        stage = int(settings.final_size_px is not None and size == settings.final_size_px)
+        if validation is not None and (stage, validation.ap) > state.best:
+            state.best = (stage, validation.ap)
+            save(self.out / BEST_FILE, {"network": state.average.network.state_dict(), "step": state.step})
+        per_step_s = (state.row_seconds + time.monotonic() - began_s) / len(state.parts)
+        state.parts, state.row_seconds = [], 0.0
+        curves.add_epoch(row)
+        self._save(state)
+        left_s = (settings.steps - state.step) * per_step_s
+        self.observer.say(row.to_line(settings.steps * settings.batch_images, left_s))
+
+    def _row(self, state: TrainingState, epoch: int, validation: AveragePrecision | None) -> EpochRow:
+        settings = self.settings
+        height_px, width_px = settings.size_at(state.step - 1)
+        count = len(state.parts)
+        return EpochRow(
+            epoch=epoch,
+            image_passes=state.step * settings.batch_images,
+            height_px=height_px,
+            width_px=width_px,
+            loss=sum(state.losses[-count:]) / count,
+            score_loss=sum(score for score, _ in state.parts) / count,
+            box_loss=sum(box for _, box in state.parts) / count,
+            learning_rate=learning_rate(settings, state.step - 1),
+            images_per_s=count * settings.batch_images / max(state.row_seconds, 1e-9),
+            **(dict.fromkeys(VALIDATED) if validation is None else asdict(validation)),
+        )
+
+    def _save(self, state: TrainingState) -> None:
+        write_tables(self.out, state.rows, state.losses, self.settings.batch_images)
+        save_state(self.out, state, self.settings, self.corpus.datasets)

@@ -1,0 +1,173 @@
+"""A training from datasets to an exported network, in a folder in which it can be stopped and taken up again."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.storage import Location
+from nav.detector.model_metadata import ModelMetadata
+from nav.detector.network.model import DetectorNetwork
+from nav.training.answers import Answers, answer
+from nav.training.average_precision import AveragePrecision, average_precision
+from nav.training.checkpoint import BEST_FILE, load, remove_leftovers
+from nav.training.corpus import Corpus, open_corpus
+from nav.training.observer import Observer
+from nav.training.onnx_export import export_onnx
+from nav.training.precision import Computing, open_computing, own_threads
+from nav.training.score_threshold import best_threshold
+from nav.training.settings import TrainingSettings
+from nav.training.state import TrainingState, new_network, new_state, restore_state
+from nav.training.trainer import Trainer
+
+SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"
+WEIGHTS_LICENCE = "Apache-2.0"
+_LOCK_FILE = ".lock"
+_USUAL_THRESHOLD = 0.5
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What came of a training.
+
+    Attributes:
+        file: the exported network.
+        best_step: the step whose averaged weights it has.
+        validation, test: on the splits; None for those without a drogue.
+        score_threshold: below which an answer is no drogue.
+    """
+
+    file: Path
+    best_step: int
+    validation: AveragePrecision | None
+    test: AveragePrecision | None
+    score_threshold: float
+
+
+def train(
+    datasets: Sequence[Location],
+    out: Path,
+    settings: TrainingSettings,
+    observer: Observer,
+    cache: Path | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> TrainingResult:
+    """Train, evaluate on the split `test` and export; what an earlier run in this folder did is kept.
+
+    Args:
+        datasets: folders or URLs.
+        out: folder; made if missing.
+        settings: of the training.
+        observer: is told how far it is.
+        cache: folder for images at the network's size; `out / "cache"` by default.
+        should_stop: asked after every step.
+
+    Raises:
+        ValueError: a dataset that cannot be used, a device that is not there, a folder of another training, or one in
+            which another run is at work; names the path.
+        OSError: a file cannot be written.
+        KeyboardInterrupt: it was told to stop, and what was done is saved; the same call goes on.
+    """
+    computing = open_computing(settings)
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is a file; give a folder for the training")
+    out.mkdir(parents=True, exist_ok=True)
+    with _locked(out), own_threads(settings.threads):
+        remove_leftovers(out)
+        size, threads = settings.largest_size_px, settings.loader_threads
+        corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
+        state = new_state(settings, computing)
+        restore_state(out, state, settings, corpus.datasets)
+        write_text_atomic(out / SETTINGS_FILE, json.dumps(settings.model_dump(mode="json"), indent=1) + "\n")
+        observer.say(_summary(corpus, settings, computing, state))
+        Trainer(corpus, settings, computing, out, observer, should_stop).run(state)
+        return _finish(out, corpus, settings, computing, state)
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """The kernel frees this lock when the process ends, however it ends."""
+    with (out / _LOCK_FILE).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(
+                f"{out}: another training is at work in it; wait for its end, or give another folder"
+            ) from error
+        yield
+
+
+def _summary(corpus: Corpus, settings: TrainingSettings, computing: Computing, state: TrainingState) -> str:
+    pairs = {split: len(corpus.split(split)) for split in ("train", "val", "test")}
+    weights = sum(each.numel() for each in state.network.parameters())
+    done = f", going on after {state.step * settings.batch_images:,}" if state.step else ""
+    return (
+        f"{settings.variant}, {settings.attention}, {settings.fusion}: {weights / 1e6:.2f} million weights; "
+        f"{pairs['train']} pairs to train on, {pairs['val']} to validate, {pairs['test']} to test; "
+        f"{settings.image_passes:,} images{done}; {computing.device.type}, {'bf16' if computing.bf16 else 'float32'}"
+    )
+
+
+def _finish(
+    out: Path, corpus: Corpus, settings: TrainingSettings, computing: Computing, state: TrainingState
+) -> TrainingResult:
+    """Evaluate and export the best weights, and the last."""
+    best_step, network = _best(out, settings, state)
+    size = settings.size_at(settings.steps - 1)
+
+    def answers(split: Any) -> Answers:
+        network_here = network.to(computing.device)
+        return answer(network_here, corpus, split, size, settings.batch_images, computing)
+
+    validation, test = answers("val"), answers("test")
+    threshold = best_threshold(validation.truth, validation.found, _USUAL_THRESHOLD)
+    result = TrainingResult(
+        out / ONNX_FILE,
+        best_step,
+        average_precision(validation.truth, validation.found),
+        average_precision(test.truth, test.found),
+        threshold,
+    )
+    table = _result_table(result, corpus, settings)
+    write_text_atomic(out / RESULT_FILE, json.dumps(table, indent=1) + "\n")
+    metadata = ModelMetadata(
+        input_size_px=(size[1], size[0]),
+        score_threshold=threshold,
+        licence=WEIGHTS_LICENCE,
+        manifest_sha256=corpus.datasets[0].manifest_sha256,
+        network=network.config.to_dict(),
+        training=table,
+    )
+    export_onnx(network, out / ONNX_FILE, metadata)
+    export_onnx(state.average.network, out / LAST_ONNX_FILE, metadata)
+    return result
+
+
+def _best(out: Path, settings: TrainingSettings, state: TrainingState) -> tuple[int, DetectorNetwork]:
+    """The step and the averaged weights that were best on the validation split, or the last where there is none."""
+    network = new_network(settings).eval()
+    saved = load(out / BEST_FILE) if state.best[0] >= 0 else None
+    if saved is None:
+        network.load_state_dict(state.average.network.state_dict())
+        return state.step, network
+    network.load_state_dict(saved["network"])
+    return int(saved["step"]), network
+
+
+def _result_table(result: TrainingResult, corpus: Corpus, settings: TrainingSettings) -> dict[str, Any]:
+    """What the exported file and `result.json` say of the training; plain JSON."""
+    return {
+        "datasets": [asdict(stamp) for stamp in corpus.datasets],
+        "settings": settings.model_dump(mode="json"),
+        "image_passes": settings.steps * settings.batch_images,
+        "best_after_image_passes": result.best_step * settings.batch_images,
+        "score_threshold": result.score_threshold,
+        "validation": None if result.validation is None else asdict(result.validation),
+        "test": None if result.test is None else asdict(result.test),
+    }

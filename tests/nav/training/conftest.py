@@ -1,0 +1,76 @@
+"""Small datasets of the analytic engine, and a corpus of plain ellipses made in memory."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe import parse_recipe
+from droguekit.batch.local import render_dataset
+from droguekit.batch.progress import PlainProgress
+from nav.training.corpus import Corpus
+from nav.training.image_cache import CachedPair, ImageCache
+
+RECIPE = {
+    "seed": "5",
+    "rig": '{preset = "rgb-ideal", width_px = 320, height_px = 240, focal_px = 300.0, encoding = "gamma"}',
+    "frames": "{count = 40, scenes = 10, empty_fraction = 0.1}",
+    "distance": '{law = "log-uniform", low_m = 2.0, high_m = 4.0}',
+    "render": '{engine = "analytic"}',
+    "split": "{train = 1.0, val = 0.0, test = 0.0}",
+}
+
+
+def make_dataset(folder: Path, **changes: str) -> Path:
+    values = {"name": '"toy"', "description": '"Near drogues."', **RECIPE, **changes}
+    text = "".join(f"{key} = {value}\n" for key, value in values.items())
+    recipe, told = parse_recipe(text), io.StringIO()
+    summary = render_dataset(recipe, text, folder, range(recipe.frames.count), 0, PlainProgress(told))
+    assert summary.drops == (), told.getvalue()
+    return folder
+
+
+@pytest.fixture
+def render_toy() -> Callable[..., Path]:
+    return make_dataset
+
+
+@pytest.fixture(scope="session")
+def toy_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """40 pairs, all to train on; to be read only."""
+    return make_dataset(tmp_path_factory.mktemp("toy") / "dataset")
+
+
+@pytest.fixture(scope="session")
+def split_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight pairs of four scenes in all three splits; to be read only (copy it to change it)."""
+    frames, split = "{count = 8, scenes = 4}", "{train = 0.5, val = 0.25, test = 0.25}"
+    return make_dataset(tmp_path_factory.mktemp("split") / "dataset", frames=frames, split=split)
+
+
+def paint_ellipse(image: np.ndarray, box: tuple[float, float, float, float], color: int = 255) -> None:
+    """The ellipse in a box, by OpenCV; coordinates from the corner of the image."""
+    x, y, width, height = box
+    center, size = (x + width / 2 - 0.5, y + height / 2 - 0.5), (width, height)
+    cv2.ellipse(image, (center, size, 0.0), (color,) * 3, -1)
+
+
+@pytest.fixture(scope="session")
+def ellipse_corpus() -> Corpus:
+    """12 pairs of white ellipses on black, 96 x 128; both eyes see the same; each has a grey level of its own."""
+    rng = np.random.default_rng(3)
+    images, pairs = np.zeros((12, 2, 96, 128, 3), np.uint8), []
+    for number in range(12):
+        x, y, width, height = *rng.uniform(5, 50, 2), *rng.uniform(16, 40, 2)
+        for eye in (0, 1):
+            images[number, eye] = number
+            paint_ellipse(images[number, eye], (x, y, width, height))
+        box = (float(x), float(y), float(width), float(height))
+        pairs.append(CachedPair(frame_index=number, split="train", boxes=(box, box)))
+    places = np.array([(0, index) for index in range(12)])
+    return Corpus((), (96, 128), (ImageCache(images, tuple(pairs)),), places)

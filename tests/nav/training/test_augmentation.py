@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nav.training.batches import BatchMaker
+from nav.training.corpus import Corpus
+from nav.training.painted_shapes import distract, occlude
+from nav.training.photometry import vary_light
+from nav.training.seeding import generator
+from nav.training.settings import build_settings
+
+BOX = np.array([[60.0, 40.0, 50.0, 36.0]])
+
+
+def white_ellipse() -> np.ndarray:
+    """White where a pixel's centre lies in the ellipse."""
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    inside = ((columns - 85) / 25) ** 2 + ((rows - 58) / 18) ** 2 <= 1
+    return np.repeat(np.where(inside, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def test_occluded_boxes_go_around_what_is_left() -> None:
+    changed = 0
+    for seed in range(400):
+        image = white_ellipse()
+        before = image.copy()
+        (box,) = occlude(np.random.default_rng(seed), image, BOX)
+        if (image == before).all():
+            np.testing.assert_array_equal(box, BOX[0])
+            continue
+        changed += 1
+        left = (image == 255).all(axis=2)
+        # No more than 45 % may be hidden; the rest of the tolerance is the edge's pixels.
+        assert left.sum() > 0.53 * (before == 255).all(axis=2).sum()
+        rows, columns = np.flatnonzero(left.any(axis=1)), np.flatnonzero(left.any(axis=0))
+        seen = [columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]]
+        # An edge that was not touched lies where the ellipse ends, within the pixel beyond the last that it covers.
+        np.testing.assert_allclose([*box[:2], *(box[:2] + box[2:])], [*seen[:2], *np.add(seen[:2], seen[2:])], atol=1)
+    assert changed > 10
+
+
+def test_distractors_never_touch_a_drogue() -> None:
+    painted = 0
+    for seed in range(300):
+        image = white_ellipse()
+        distract(np.random.default_rng(seed), image, BOX)
+        assert (image[40:76, 60:110] == white_ellipse()[40:76, 60:110]).all()
+        painted += (image != white_ellipse()).any()
+    assert painted > 30
+
+
+def test_light_varies_and_the_image_given_stays() -> None:
+    image = np.full((32, 48, 3), 128, np.uint8)
+    varied = [vary_light(np.random.default_rng(seed), image) for seed in range(200)]
+    assert (image == 128).all()
+    assert all(each.shape == image.shape and each.dtype == np.uint8 for each in varied)
+    means = np.array([each.mean() for each in varied])
+    assert means.min() < 40 and means.max() > 180  # low light, and nearly twice the exposure
+    again = vary_light(np.random.default_rng(7), image)
+    np.testing.assert_array_equal(again, varied[7])
+
+
+def test_streams_differ_by_every_part_of_their_key() -> None:
+    keys = [(0, 0, 0, "a"), (1, 0, 0, "a"), (2**40, 0, 0, "a"), (0, 1, 0, "a"), (0, 0, 1, "a"), (0, 0, 0, "b")]
+    assert len({generator(*key).integers(2**62) for key in keys}) == len(keys)
+    with pytest.raises(ValueError, match="must not be negative"):
+        generator(0, -1, 0, "a")
+
+
+@pytest.mark.parametrize("views", ["one", "both"])
+def test_batches_depend_on_their_number_alone(ellipse_corpus: Corpus, views: str) -> None:
+    settings = build_settings(None, {"size_px": (96, 128), "views": views, "batch_images": 4, "image_passes": 40})
+    maker = BatchMaker(ellipse_corpus, settings)
+    alone = [maker.batch(step) for step in (5, 3, 4)]
+    for threads in (1, 3):
+        ahead = list(BatchMaker(ellipse_corpus, settings).batches(range(3, 6), threads))
+        for mine, theirs in zip((alone[1], alone[2], alone[0]), ahead, strict=True):
+            np.testing.assert_array_equal(mine.images, theirs.images)
+            assert [boxes.tolist() for boxes in mine.boxes] == [boxes.tolist() for boxes in theirs.boxes]
+
+
+def test_both_eyes_get_the_same_geometry_and_their_own_noise(ellipse_corpus: Corpus) -> None:
+    # Both eyes of this corpus see the same, so boxes differ only where one eye's drogue was occluded.
+    settings = build_settings(None, {"size_px": (96, 128), "views": "both", "batch_images": 8, "image_passes": 400})
+    maker = BatchMaker(ellipse_corpus, settings)
+    equal = images_equal = pairs = 0
+    for step in range(12):
+        batch = maker.batch(step)
+        for left in range(0, 8, 2):
+            pairs += 1
+            equal += np.array_equal(batch.boxes[left], batch.boxes[left + 1])
+            images_equal += np.array_equal(batch.images[left], batch.images[left + 1])
+    # An eighth of about 2.5 drogues an image, in either eye, of which some stay as they are.
+    assert pairs / 4 < equal and images_equal < pairs / 10
+
+
+def test_an_epoch_shows_every_image_once(ellipse_corpus: Corpus) -> None:
+    shown: list[tuple[int, int]] = []
+
+    class Watched(BatchMaker):
+        def _members(self, sample: int) -> list[tuple[int, int]]:
+            members = super()._members(sample)
+            shown.extend(members)
+            return members
+
+    settings = build_settings(
+        None, {"size_px": (96, 128), "mosaic": False, "views": "one", "batch_images": 6, "image_passes": 480}
+    )
+    maker = Watched(ellipse_corpus, settings)
+    for step in range(8):
+        maker.batch(step)
+    everything = sorted((pair, eye) for pair in range(12) for eye in (0, 1))
+    assert sorted(shown[:24]) == everything and sorted(shown[24:]) == everything
+    assert shown[:24] != shown[24:]
+    assert [maker.epoch_after(step) for step in (0, 3, 4, 8)] == [0, 0, 1, 2]
+
+
+def test_the_last_part_is_larger_and_without_mosaic(ellipse_corpus: Corpus) -> None:
+    changes = {"size_px": (64, 96), "final_size_px": (96, 128), "batch_images": 4, "image_passes": 120}
+    settings = build_settings(None, changes)
+    maker = BatchMaker(ellipse_corpus, settings)
+    assert [maker.batch(step).images.shape[1:3] for step in (0, 19, 20, 29)] == [(64, 96)] * 2 + [(96, 128)] * 2
+    assert [settings.mosaic_at(step) for step in (0, 23, 24, 29)] == [True, True, False, False]
+    # One image has at most one drogue.
+    assert max(len(boxes) for step in range(24, 30) for boxes in maker.batch(step).boxes) == 1
+    assert max(len(boxes) for step in range(6) for boxes in maker.batch(step).boxes) > 1

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+
+RECIPE = """
+name = "two-scenes"
+description = "Four small pairs."
+rig = {preset = "rgb-ideal", width_px = 320, height_px = 240, focal_px = 300.0}
+frames = {count = 4, scenes = 2}
+distance = {law = "log-uniform", low_m = 2.0, high_m = 10.0}
+render = {engine = "analytic"}
+split = {train = 0.5, val = 0.5, test = 0.0}
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_wait_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The command sets it for its process where nobody did; other tests shall not find it.
+    monkeypatch.setenv("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def test_a_recipe_becomes_a_detector(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe, out = tmp_path / "recipe.toml", tmp_path / "out"
+    recipe.write_text(RECIPE)
+    size = ["--size", "64x96", "--final-size", "96x128", "--image-passes", "16", "--variant", "s", "--threads", "1"]
+    command = ["train", str(recipe), "--out", str(out), *size, "--views", "one", "--workers", "0"]
+    assert run(command) == DONE
+    told = capsys.readouterr()
+    assert "val: AP50" in told.out and "detector.onnx" in told.out and "test:" not in told.out
+    assert (out / "detector.onnx").stat().st_size > 0 and (out / "datasets" / "two-scenes" / "manifest.json").is_file()
+    assert "at 64x96" in told.err and "at 96x128" in told.err
+    assert run([*command, "--no-mosaic"]) == WRONG_INPUT
+    refused = capsys.readouterr().err.splitlines()[-1]
+    assert "belongs to a training that differs in mosaic;" in refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["no-such-recipe"], "no-such-recipe"),
+        ([".", "--size", "480"], "size: must be HEIGHTxWIDTH"),
+        ([".", "--size", "100x100"], "size_px: must be multiples of 32 px"),
+        ([".", "--image-passes", "0"], "image_passes:"),
+        ([".", "--settings", "none.toml"], "none.toml: cannot be read"),
+        (["nav"], "manifest.json: is missing"),
+    ],
+)
+def test_wrong_input_is_one_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nav").mkdir()
+    assert run(["train", *arguments, "--out", str(tmp_path / "out")]) == WRONG_INPUT
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

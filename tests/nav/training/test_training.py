@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import csv
+import io
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+
+from droguekit.batch.progress import PlainProgress
+from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
+from nav.training.answers import answer
+from nav.training.average_precision import average_precision
+from nav.training.corpus import open_corpus
+from nav.training.precision import open_computing, own_threads
+from nav.training.settings import build_settings
+from nav.training.state import new_state, restore_state
+from nav.training.training import TrainingResult, train
+
+# One thread and float32: the same sums in the same order, whoever else uses the machine.
+SMALL = {
+    "variant": "s",
+    "size_px": (96, 128),
+    "batch_images": 4,
+    "warmup_passes": 8,
+    "precision": "float32",
+    "threads": 1,
+}
+
+
+def run(dataset: Path, out: Path, **changes: Any) -> tuple[TrainingResult, str]:
+    told = io.StringIO()
+    return train([dataset], out, build_settings(None, {**SMALL, **changes}), PlainProgress(told)), told.getvalue()
+
+
+def step_losses(out: Path) -> list[float]:
+    return [float(row["loss"]) for row in csv.DictReader((out / "losses.csv").open())]
+
+
+# Killed in the middle of an epoch, after steps that no checkpoint has.
+KILLED = """
+import io, os, signal, sys
+from pathlib import Path
+from droguekit.batch.progress import PlainProgress
+from nav.training.settings import TrainingSettings
+from nav.training.training import train
+
+calls = 0
+def kill():
+    global calls
+    calls += 1
+    if calls == KILLED_AT:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return False
+
+if __name__ == "__main__":
+    settings = TrainingSettings.model_validate_json(sys.argv[3])
+    train([Path(sys.argv[1])], Path(sys.argv[2]), settings, PlainProgress(io.StringIO()), should_stop=kill)
+"""
+
+
+def test_a_killed_training_goes_on_with_the_same_curve(split_dataset: Path, tmp_path: Path) -> None:
+    settings = build_settings(None, {**SMALL, "image_passes": 24})
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    run(split_dataset, whole, image_passes=24)
+    # Asked after each of 8 pairs that are decoded, then in every step; two steps are an epoch of 4 pairs.
+    script = KILLED.replace("KILLED_AT", "12")
+    command = [sys.executable, "-c", script, str(split_dataset), str(killed), settings.model_dump_json()]
+    died = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert died.returncode == -signal.SIGKILL, died.stderr
+    assert not (killed / "detector.onnx").exists()
+    done = len(step_losses(killed))
+    assert 0 < done < settings.steps
+    _, told = run(split_dataset, killed, image_passes=24)
+    assert f"going on after {4 * done}" in told
+    # Equal sums in equal order; what is left is how another process's memory happens to be aligned.
+    np.testing.assert_allclose(step_losses(killed), step_losses(whole), rtol=1e-4)
+    result, expected = (json.loads((out / "result.json").read_text()) for out in (killed, whole))
+    assert result["settings"] == expected["settings"] and result["datasets"] == expected["datasets"]
+    rows, rows_expected = (list(csv.DictReader((out / "history.csv").open())) for out in (killed, whole))
+    assert [row["image_passes"] for row in rows] == [row["image_passes"] for row in rows_expected]
+
+
+def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset: Path, tmp_path: Path) -> None:
+    settings = build_settings(None, {**SMALL, "image_passes": 24})
+    told = io.StringIO()
+    with pytest.raises(KeyboardInterrupt):
+        train([split_dataset], tmp_path, settings, PlainProgress(told), tmp_path / "cache", Calls(12))
+    assert "which are saved" in told.getvalue()
+    for changes, keys in (({"learning_rate": 0.5, "mosaic": False}, "mosaic, learning_rate"), ({"seed": 3}, "seed")):
+        other = settings.model_copy(update=changes)
+        with pytest.raises(ValueError, match=rf"checkpoint\.pt: belongs to a training that differs in {keys};"):
+            train([split_dataset], tmp_path, other, PlainProgress(told))
+    # Where and with how many threads it computes may change.
+    elsewhere = settings.model_copy(update={"loader_threads": 2, "checkpoint_minutes": 1.0})
+    train([split_dataset], tmp_path, elsewhere, PlainProgress(told))
+    assert len(step_losses(tmp_path)) == settings.steps
+
+
+class Calls:
+    """True from the n-th time that it is asked."""
+
+    def __init__(self, count: int) -> None:
+        self.left = count
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        return self.left <= 0
+
+
+def test_what_a_training_leaves(split_dataset: Path, tmp_path: Path) -> None:
+    result, told = run(split_dataset, tmp_path, image_passes=16, views="one", attention="se", fusion="concat")
+    assert result.validation is not None and result.test is not None
+    assert told.count("val AP50") == 2 and "left" in told
+    metadata = {entry.key: entry.value for entry in onnx.load(result.file).metadata_props}
+    stated = ModelMetadata.from_json(metadata[METADATA_KEY])
+    manifest = json.loads((split_dataset / "manifest.json").read_text())
+    assert stated.licence == "Apache-2.0" and stated.manifest_sha256 == manifest["manifest_sha256"]
+    assert stated.input_size_px == (128, 96)
+    assert stated.network == {"variant": "s", "attention": "se", "fusion": "concat"}
+    assert stated.training == json.loads((tmp_path / "result.json").read_text())
+    assert stated.training["image_passes"] == 16
+    assert {each.name for each in tmp_path.iterdir()} >= {
+        "checkpoint.pt", "best.pt", "detector.onnx", "last.onnx", "history.csv", "losses.csv", "settings.json",
+        "tensorboard",
+    }  # fmt: skip
+    # A finished training that is asked for again only evaluates and exports.
+    again, told = run(split_dataset, tmp_path, image_passes=16, views="one", attention="se", fusion="concat")
+    assert again == result and "epoch" not in told
+
+
+def test_a_device_that_is_not_there_is_refused(split_dataset: Path, tmp_path: Path) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    with pytest.raises(ValueError, match="device: torch sees no CUDA device"):
+        run(split_dataset, tmp_path, device="cuda")
+
+
+def test_a_folder_in_use_is_refused(split_dataset: Path, tmp_path: Path) -> None:
+    import fcntl
+
+    with (tmp_path / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(ValueError, match="another training is at work"):
+            run(split_dataset, tmp_path)
+
+
+# 350 steps, without images put together: a network that is to know 80 images needs no others.
+TOY = {"image_passes": 1400, "warmup_passes": 160, "learning_rate": 0.005, "mosaic": False, "ema_decay": 0.97}
+
+
+@pytest.mark.slow
+def test_forty_pairs_are_learned_by_heart(toy_dataset: Path, tmp_path: Path) -> None:
+    settings = build_settings(None, {**SMALL, **TOY})
+    train([toy_dataset], tmp_path, settings, PlainProgress(io.StringIO()))
+    corpus = open_corpus([toy_dataset], tmp_path / "cache", settings.size_px, 1, PlainProgress(io.StringIO()))
+    computing = open_computing(settings)
+    state = new_state(settings, computing)
+    restore_state(tmp_path, state, settings, corpus.datasets)
+    with own_threads(1):
+        answers = answer(state.average.network, corpus, "train", settings.size_px, 8, computing)
+    reached = average_precision(answers.truth, answers.found)
+    assert reached is not None and reached.ap50 >= 0.95
