@@ -8,6 +8,7 @@ from pathlib import Path
 
 from datasets_manifest.estimates import Estimate, PoseEstimate, read_estimates
 from datasets_manifest.reader import Dataset
+from datasets_manifest.storage import Location
 from droguekit.benchmark.centroid_errors import CentroidErrors, centroid_errors
 from droguekit.benchmark.comparisons import PairGroups, compare
 from droguekit.benchmark.distance_bins import DistanceBin
@@ -26,7 +27,7 @@ __all__ = ["BenchmarkResult", "run_benchmark", "score"]
 Truths = Mapping[int, DrogueTruth | None]
 
 
-def run_benchmark(dataset: Path, estimates: Path) -> BenchmarkResult:
+def run_benchmark(dataset: Location, estimates: Path) -> BenchmarkResult:
     """Score every method of a file of estimates on a dataset.
 
     Args:

@@ -13,9 +13,11 @@ from pydantic import Field
 
 from datasets_manifest.blind import BlindIndex, read_blind_index
 from datasets_manifest.estimates import Estimate, PoseEstimate, read_estimates
+from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.layout import ANNOTATIONS_FOLDER
 from datasets_manifest.reader import read_sought
 from datasets_manifest.records import PixelBox
+from datasets_manifest.storage import Location, open_storage
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from droguekit.benchmark.pose_errors import by_method
@@ -77,7 +79,7 @@ class BlindScene(NamedTuple):
     boxes: Mapping[Eye, PixelBox]
 
 
-def check_blind(dataset: Path, estimates: Path) -> BlindCheck:
+def check_blind(dataset: Location, estimates: Path) -> BlindCheck:
     """Check every method of a file of estimates on a dataset without truth.
 
     Raises:
@@ -93,16 +95,16 @@ def check_blind(dataset: Path, estimates: Path) -> BlindCheck:
     )
 
 
-def blind_scenes(dataset: Path, index: BlindIndex) -> dict[int, BlindScene]:
+def blind_scenes(dataset: Location, index: BlindIndex) -> dict[int, BlindScene]:
     """What is known of each pair.
 
     Raises:
         ValueError: a pair or the boxes cannot be read; names the file.
     """
-    boxes = _read_boxes(dataset)
+    boxes, frames = _read_boxes(dataset), FrameStore(dataset)
     scenes = {}
     for frame in index.frames:
-        drogue = read_sought(dataset, frame, index.drogue) if index.drogues_differ else index.drogue
+        drogue = read_sought(frames, frame, index.drogue) if index.drogues_differ else index.drogue
         given = {eye: boxes[2 * frame + view + 1] for view, eye in enumerate(EYES) if 2 * frame + view + 1 in boxes}
         scenes[frame] = BlindScene(index.rig, drogue, given)
     return scenes
@@ -173,18 +175,18 @@ def _overlap(one: PixelBox, other: PixelBox) -> float:
     return common / (one[2] * one[3] + other[2] * other[3] - common)
 
 
-def _read_boxes(dataset: Path) -> dict[int, PixelBox]:
+def _read_boxes(dataset: Location) -> dict[int, PixelBox]:
     """Boxes by image id, in pixel-centre coordinates; none where the dataset has no annotations."""
-    path = dataset / ANNOTATIONS_FOLDER / "all.json"
-    if not path.exists():
+    storage, name = open_storage(dataset), f"{ANNOTATIONS_FOLDER}/all.json"
+    if not storage.exists(name):
         return {}
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
+        table = json.loads(storage.read(name))
         boxes = {}
         for annotation in table["annotations"]:
             x, y, width, height = (float(number) for number in annotation["bbox"])
             # COCO counts from the image's corner.
             boxes[int(annotation["image_id"])] = (x - 0.5, y - 0.5, width, height)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path}: holds no COCO boxes that can be read: {error}") from error
+        raise ValueError(f"{storage.where(name)}: holds no COCO boxes that can be read: {error}") from error
     return boxes

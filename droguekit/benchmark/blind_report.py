@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.blind import BlindDataset, read_blind_index
 from datasets_manifest.estimates import PoseEstimate, read_estimates
+from datasets_manifest.storage import Location
 from droguekit.benchmark.blind_check import BlindCheck, blind_scenes, marker_images_px, rim_box_px
 from droguekit.benchmark.contact_sheet import Tile, label_picture, spread, tile_of
 from droguekit.benchmark.label_drawing import display_picture
 from droguekit.benchmark.number_text import percent, plain_number, three_digits
+from droguekit.benchmark.report import page_template
 
 COLUMNS = ("pose found", "residual [px]", "views with a box", "middle in box", "overlap")
 _MOST_TILES = 12
@@ -30,23 +30,16 @@ def row_cells(check: BlindCheck, method: str) -> list[str]:
     ]
 
 
-def write_blind_report(dataset: Path, estimates: Path, check: BlindCheck, out_html: Path) -> None:
+def write_blind_report(dataset: Location, estimates: Path, check: BlindCheck, out_html: Path) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
     Raises:
         ValueError: dataset or estimates cannot be read.
         OSError: the page cannot be written.
     """
-    environment = Environment(
-        loader=PackageLoader("droguekit.benchmark"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     # The method with the most poses shows what was found; the first of the file among equals.
     shown_method = max(check.methods, key=lambda name: check.methods[name].fixes)
-    page = environment.get_template("blind_report.html.j2").render(
+    page = page_template("blind_report.html.j2").render(
         check=check,
         columns=COLUMNS,
         rows=[[name, *row_cells(check, name)] for name in check.methods],
@@ -56,7 +49,7 @@ def write_blind_report(dataset: Path, estimates: Path, check: BlindCheck, out_ht
     write_text_atomic(out_html, page)
 
 
-def _tiles(dataset: Path, estimates: Path, method: str) -> list[tuple[Tile, str]]:
+def _tiles(dataset: Location, estimates: Path, method: str) -> list[tuple[Tile, str]]:
     """Left images of some pairs with the pose of a method drawn in, and their captions."""
     index, source = read_blind_index(dataset), BlindDataset(dataset)
     scenes = blind_scenes(dataset, index)

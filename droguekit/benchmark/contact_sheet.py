@@ -20,11 +20,11 @@ from droguekit.benchmark.label_drawing import (
     resized,
 )
 
-_TILE_WIDTH_PX = 400
+TILE_WIDTH_PX = 400
 _JPEG_QUALITY = 82
 
 # A drogue smaller than this share of the picture's width is shown once more, enlarged, in a corner.
-_ENLARGE_BELOW = 0.3
+ENLARGE_BELOW = 0.3
 _INSET_SHARE = 0.38
 _INSET_MARGIN = 1.25
 
@@ -79,11 +79,11 @@ def label_picture(picture: Picture, box: PixelBox | None, centers: Sequence[Pixe
         centers: of the markers in sight. [px]
     """
     width = picture.shape[1]
-    tile, scale = resized(picture, _TILE_WIDTH_PX)
+    tile, scale = resized(picture, TILE_WIDTH_PX)
     if box is None:
         return tile
     draw_box(tile, box, scale)
-    if box[2] >= _ENLARGE_BELOW * width:
+    if box[2] >= ENLARGE_BELOW * width:
         draw_crosses(tile, centers, scale)
     else:
         _put_inset(tile, picture, box, centers)
@@ -98,7 +98,18 @@ def jpeg_uri(picture: Picture) -> str:
 
 def _put_inset(tile: Picture, picture: Picture, box: PixelBox, centers: Sequence[PixelPoint]) -> None:
     """Enlarge the surroundings of the box into the corner that is farthest from it."""
-    side = round(_INSET_SHARE * tile.shape[0])
+    inset, scale, corner = enlarged_surroundings(picture, box, tile.shape[0])
+    draw_crosses(inset, centers, scale, corner)
+    put_in_far_corner(tile, inset, (box[0] + box[2] / 2) / picture.shape[1], (box[1] + box[3] / 2) / picture.shape[0])
+
+
+def enlarged_surroundings(picture: Picture, box: PixelBox, tile_height: int) -> tuple[Picture, float, PixelPoint]:
+    """A square around a box, as large as an inset of a tile of that height.
+
+    Returns:
+        The inset, its size over that of what it shows, and the low corner of what it shows. [px]
+    """
+    side = round(_INSET_SHARE * tile_height)
     middle = (box[0] + box[2] / 2, box[1] + box[3] / 2)
     reach = _INSET_MARGIN * max(box[2], box[3])
     scale = side / reach
@@ -109,10 +120,15 @@ def _put_inset(tile: Picture, picture: Picture, box: PixelBox, centers: Sequence
     inset = cv2.warpAffine(
         picture, warp, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
     )
-    draw_crosses(inset, centers, scale, corner)
+    return np.asarray(inset, dtype=np.uint8), scale, corner
+
+
+def put_in_far_corner(tile: Picture, inset: Picture, x_share: float, y_share: float) -> None:
+    """Frame an inset and put it into the corner that is farthest from a place, given as shares of the tile's size."""
+    side = inset.shape[0]
     cv2.rectangle(inset, (0, 0), (side - 1, side - 1), BOX_RGB, 1)
-    x = 0 if middle[0] > picture.shape[1] / 2 else tile.shape[1] - side
-    y = 0 if middle[1] > picture.shape[0] / 2 else tile.shape[0] - side
+    x = 0 if x_share > 0.5 else tile.shape[1] - side
+    y = 0 if y_share > 0.5 else tile.shape[0] - side
     tile[y : y + side, x : x + side] = inset
 
 

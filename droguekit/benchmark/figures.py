@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import re
 from collections.abc import Iterator, Sequence
@@ -27,21 +28,21 @@ _COLORS = (
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*", "d")
 
 # Stands for the page's own text colour while matplotlib draws.
-_INK = "#010203"
+INK = "#010203"
 
 _STYLE = {
     "svg.hashsalt": "droguekit",  # element ids that do not change from run to run
     "svg.fonttype": "none",
     "font.family": "sans-serif",
     "font.size": 10.0,
-    "text.color": _INK,
-    "axes.edgecolor": _INK,
-    "axes.labelcolor": _INK,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
+    "text.color": INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
 }
 
-_PANEL_IN = (4.4, 3.3)
+PANEL_IN = (4.4, 3.3)
 
 # With more methods than this, panels are larger and intervals fainter, or nothing could be told apart.
 FEW_METHODS = 6
@@ -99,7 +100,7 @@ def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
     """
     names = list(result.methods)
     few = len(names) <= FEW_METHODS
-    with _drawing(_PANEL_IN if few else _LARGE_PANEL_IN) as (figure, axes):
+    with drawing(PANEL_IN if few else _LARGE_PANEL_IN) as (figure, axes):
         styles = method_styles(names)
         # A little apart, so that methods do not cover each other, and all within an eighth of the true distance.
         step = min(1.03, 1.25 ** (1 / len(names)))
@@ -108,20 +109,20 @@ def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
             _draw_method(axes, result.methods[name], quantity, styles[name], (shift, 1.0 if few else 0.3))
         _draw_bound(axes, result.reference, quantity)
         _finish_axes(axes, quantity)
-        return _svg(figure, quantity.key, f"{quantity.title} against distance, by method")
+        return svg_element(figure, quantity.key, f"{quantity.title} against distance, by method")
 
 
 def legend_key(style: MethodStyle | None) -> str:
     """A short line as the panels draw it, for the page's legend; None is the bound."""
-    with _drawing((0.5, 0.2)) as (figure, axes):
+    with drawing((0.5, 0.2)) as (figure, axes):
         axes.set_position((0, 0, 1, 1))
         axes.set_axis_off()
         axes.set(xlim=(0, 2), ylim=(-1, 1))
         if style is None:
-            axes.plot([0, 2], [0, 0], color=_INK, linestyle=(0, (4, 2)), linewidth=1.4)
+            axes.plot([0, 2], [0, 0], color=INK, linestyle=(0, (4, 2)), linewidth=1.4)
         else:
             axes.plot([0, 1, 2], [0, 0, 0], color=style.color, marker=style.marker, markevery=[1], markersize=6)
-        return _svg(figure, "key", "")
+        return svg_element(figure, "key", "")
 
 
 def _draw_method(
@@ -158,7 +159,7 @@ def _draw_bound(axes: Axes, reference: Sequence[ReferenceBin], quantity: Quantit
     if drawn:
         # A single distance has no line: a cross stands for it.
         x, y = zip(*drawn, strict=True)
-        axes.plot(x, y, color=_INK, linestyle=(0, (4, 2)), linewidth=1.6, marker="+", markersize=5, zorder=5)
+        axes.plot(x, y, color=INK, linestyle=(0, (4, 2)), linewidth=1.6, marker="+", markersize=5, zorder=5)
 
 
 def _finish_axes(axes: Axes, quantity: Quantity) -> None:
@@ -166,7 +167,7 @@ def _finish_axes(axes: Axes, quantity: Quantity) -> None:
     axes.set_yscale("log")
     axes.set_title(quantity.title, fontsize=10.5, loc="left")
     axes.set_xlabel("Distance [m]")
-    axes.grid(True, color=_INK, alpha=0.15, linewidth=0.6)
+    axes.grid(True, color=INK, alpha=0.15, linewidth=0.6)
     low, high = axes.get_ylim()
     # Only decades where there are enough of them, else 1, 2 and 5 of each.
     subdivisions = (1.0,) if np.log10(high / low) > 3 else (1.0, 2.0, 5.0)
@@ -183,7 +184,7 @@ def _middle(low_m: float, high_m: float) -> float:
 
 
 @contextmanager
-def _drawing(size_in: tuple[float, float]) -> Iterator[tuple[Figure, Axes]]:
+def drawing(size_in: tuple[float, float]) -> Iterator[tuple[Figure, Axes]]:
     """A figure of its own, without pyplot and without a trace in matplotlib's settings."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size_in, layout="constrained" if size_in[1] > 1 else None)
@@ -194,7 +195,7 @@ def _drawing(size_in: tuple[float, float]) -> Iterator[tuple[Figure, Axes]]:
         yield figure, axes
 
 
-def _svg(figure: Figure, name: str, label: str) -> str:
+def svg_element(figure: Figure, name: str, label: str) -> str:
     """The figure as an element for an HTML page; `name` keeps its ids apart from those of the page's other figures."""
     stream = io.StringIO()
     figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -202,6 +203,6 @@ def _svg(figure: Figure, name: str, label: str) -> str:
     text = text[text.index("<svg") :]
     text = re.sub(r"\s+xmlns(:\w+)?=\"[^\"]*\"", "", text).replace("xlink:href", "href")
     text = re.sub(r"\s+(width|height)=\"[\d.]+pt\"", "", text, count=2)
-    text = re.sub(r"(\bid=\"|url\(#|href=\"#)", rf"\g<1>{name}-", text).replace(_INK, "currentColor")
-    role = f'role="img" aria-label="{label}"' if label else 'aria-hidden="true"'
+    text = re.sub(r"(\bid=\"|url\(#|href=\"#)", rf"\g<1>{name}-", text).replace(INK, "currentColor")
+    role = f'role="img" aria-label="{html.escape(label)}"' if label else 'aria-hidden="true"'
     return text.replace("<svg", f"<svg {role}", 1).strip()

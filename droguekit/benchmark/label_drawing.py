@@ -43,17 +43,21 @@ def resized(picture: Picture, width_px: int) -> tuple[Picture, float]:
     return np.asarray(copy, dtype=np.uint8), scale
 
 
-def draw_box(tile: Picture, box_px: PixelBox, scale: float) -> None:
-    """Draw a box of an image into a resized copy of it.
+def draw_box(
+    tile: Picture, box_px: PixelBox, scale: float, corner_px: PixelPoint = _IMAGE_CORNER, color: Rgb = BOX_RGB
+) -> None:
+    """Draw a box of an image into a resized copy of it, or an enlarged cut-out.
 
     Args:
         tile: (H, W, 3) the copy.
         box_px: x, y, width, height in the image.
-        scale: size of the copy over that of the image.
+        scale: size of the copy over that of what it shows.
+        corner_px: low corner of what it shows.
+        color: red, green, blue.
     """
     x, y, width, height = box_px
-    low, high = (_fixed_point(end, scale, _IMAGE_CORNER) for end in ((x, y), (x + width, y + height)))
-    cv2.rectangle(tile, low, high, BOX_RGB, 1, cv2.LINE_AA, _SHIFT)
+    low, high = (_fixed_point(end, scale, corner_px) for end in ((x, y), (x + width, y + height)))
+    cv2.rectangle(tile, low, high, color, 1, cv2.LINE_AA, _SHIFT)
 
 
 def draw_crosses(

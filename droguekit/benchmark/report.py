@@ -5,24 +5,31 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.estimates import read_estimates
 from datasets_manifest.manifest import Manifest
 from datasets_manifest.reader import Dataset
+from datasets_manifest.storage import Location
 from drogue_models.marker_layout import marker_layout
 from droguekit.benchmark.check_tables import check_tables
 from droguekit.benchmark.contact_sheet import contact_tiles
 from droguekit.benchmark.figures import FEW_METHODS, QUANTITIES, error_panel, legend_key, method_styles
 from droguekit.benchmark.narrative import result_sentences
 from droguekit.benchmark.number_text import plain_number, three_digits
-from droguekit.benchmark.report_tables import centroid_table, component_tables, overall_table, position_table
+from droguekit.benchmark.report_tables import (
+    centroid_table,
+    component_tables,
+    overall_table,
+    position_table,
+    rangefinder_tables,
+)
 from droguekit.benchmark.result import BenchmarkResult
 
 
-def write_report(dataset: Path, estimates: Path, result: BenchmarkResult, out_html: Path) -> None:
+def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, out_html: Path) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
     Args:
@@ -40,15 +47,8 @@ def write_report(dataset: Path, estimates: Path, result: BenchmarkResult, out_ht
         raise ValueError(
             f"{dataset}: is not the dataset of this result, whose hash begins {result.dataset.sha256[:12]}"
         )
-    environment = Environment(
-        loader=PackageLoader("droguekit.benchmark"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     styles = method_styles(list(result.methods))
-    page = environment.get_template("report.html.j2").render(
+    page = page_template("report.html.j2").render(
         result=result,
         sentences=result_sentences(result),
         facts=dataset_facts(data.manifest, estimates.name),
@@ -61,12 +61,26 @@ def write_report(dataset: Path, estimates: Path, result: BenchmarkResult, out_ht
             overall_table(result),
             position_table(result),
             *component_tables(result),
+            *rangefinder_tables(result),
             *check_tables(result),
             centroid_table(result),
         ],
+        has_readings=any(method.overall.rangefinder is not None for method in result.methods.values()),
         times=stage_times_ms(estimates),
     )
     write_text_atomic(out_html, page)
+
+
+def page_template(name: str) -> Template:
+    """A template of this package; what it is not given is an error."""
+    environment = Environment(
+        loader=PackageLoader("droguekit.benchmark"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name)
 
 
 def dataset_facts(manifest: Manifest, estimates_name: str) -> list[tuple[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from droguekit.benchmark.number_text import distance_text, interval_text, millimetres, percent, three_digits
+from droguekit.benchmark.number_text import ABSENT, distance_text, interval_text, millimetres, percent, three_digits
 from droguekit.benchmark.pose_errors import COMPONENTS
 from droguekit.benchmark.result import BenchmarkResult, Row
 
@@ -104,6 +104,34 @@ def centroid_table(result: BenchmarkResult) -> Table:
     return Table(
         "centroids", "Marker centroids against the true ellipse centres [px]", columns, _by_distance(result, cells)
     )
+
+
+def rangefinder_tables(result: BenchmarkResult) -> list[Table]:
+    """Depth errors as an experiment with a rangefinder sees them, beside the true ones; none without readings."""
+    names = [name for name, method in result.methods.items() if method.overall.rangefinder is not None]
+    if not names:
+        return []
+    columns = ["pairs", "RMS against reading", "mean against reading", "of the distance"]
+    columns += ["RMS against truth", "mean against truth", "of the distance", "reading against truth, RMS", "bias"]
+
+    def cells(row: Row) -> list[str]:
+        found = row.rangefinder
+        if found is None:
+            return ["0", *[ABSENT] * (len(columns) - 1)]
+        sides = (found.against_reading, found.against_truth)
+        both = [
+            text
+            for side in sides
+            for text in (
+                millimetres(side.rmse_m),
+                millimetres(side.mean_absolute_m),
+                f"{three_digits(100 * side.mean_absolute_fraction)} %",
+            )
+        ]
+        return [str(found.n), *both, millimetres(found.reading.rmse_m), millimetres(found.reading.bias_m)]
+
+    title = "Depth against the rangefinder's reading and against the truth [mm]"
+    return [Table("rangefinder", title, columns, with_overall(result, names, cells))]
 
 
 def _component_table(result: BenchmarkResult, name: str) -> Table:

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from datasets_manifest.layout import BLIND_FILE
+from datasets_manifest.storage import open_storage
+from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument
+from droguekit.cli.detection_pipelines import DetectionOrder, benchmark_detections
 from droguekit.cli.pipelines import benchmark_dataset, check_blind_dataset
 
 if TYPE_CHECKING:
@@ -19,30 +22,63 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "droguekit benchmark data/demo --estimates estimates.jsonl --json benchmark.json --html report.html",
     "droguekit benchmark data/demo --estimates somebody-elses.jsonl",
+    "droguekit benchmark data/corpus --detections ours.json --detections theirs.json --html detectors.html",
+    "droguekit benchmark data/corpus --detector color-blob --json detectors.json",
 )
 
 
 def benchmark(
     dataset: DatasetArgument,
     estimates: Annotated[
-        Path, typer.Option("--estimates", metavar="FILE.jsonl", help="Of `navigate`, or anybody's in that format.")
-    ],
+        Path | None,
+        typer.Option("--estimates", metavar="FILE.jsonl", help="Of `navigate`, or anybody's in that format."),
+    ] = None,
+    detections: Annotated[
+        list[Path] | None,
+        typer.Option("--detections", metavar="FILE.json", help="Of `detect`, or anybody's COCO results. Repeatable."),
+    ] = None,
+    detector: Annotated[
+        list[str] | None,
+        typer.Option("--detector", metavar="NAME|FILE.onnx", help="Runs a detector and scores it. Repeatable."),
+    ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option("--split", metavar="NAME", help="Detectors: train, val, test or all; by default test if there."),
+    ] = None,
+    threshold: Annotated[
+        float | None,
+        typer.Option("--threshold", help="Detectors: score from which a box counts in recall and false alarms."),
+    ] = None,
     json_: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Gets the numbers.")] = None,
     html: Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Gets the report, one page.")] = None,
 ) -> None:
-    """Compare pose estimates with the truth of a dataset, by method and distance.
+    """Compare pose estimates, or a detector's boxes, with the truth of a dataset.
 
-    An imported dataset has none: there, estimates are compared with their own measurements, and with boxes if any.
+    An imported dataset has none: there, estimates are compared with their own measurements, and both with boxes if any.
     """
-    if (dataset / BLIND_FILE).exists():
-        lines = _blind_lines(check_blind_dataset(dataset, estimates, json_, html))
-    else:
-        lines = _error_lines(benchmark_dataset(dataset, estimates, json_, html))
-    for line in lines:
+    order = DetectionOrder(detections or (), detector or (), split, threshold)
+    for line in _lines(dataset, estimates, order, json_, html):
         typer.echo(line)
     for path in (json_, html):
         if path is not None:
             typer.echo(f"wrote {path}")
+
+
+def _lines(
+    dataset: Path, estimates: Path | None, order: DetectionOrder, json_out: Path | None, html_out: Path | None
+) -> Iterator[str]:
+    wants_detections = bool(order.files or order.detectors)
+    if (estimates is not None) == wants_detections:
+        raise ValueError("--estimates: give either estimates, or detections (--detections, --detector)")
+    if estimates is None:
+        from droguekit.benchmark.detection_tables import detector_lines
+
+        return detector_lines(benchmark_detections(dataset, order, json_out, html_out, progress_report()))
+    if order.split is not None or order.threshold is not None:
+        raise ValueError("--split, --threshold: are for detections, not for estimates")
+    if open_storage(dataset).exists(BLIND_FILE):
+        return _blind_lines(check_blind_dataset(dataset, estimates, json_out, html_out))
+    return _error_lines(benchmark_dataset(dataset, estimates, json_out, html_out))
 
 
 def _error_lines(result: BenchmarkResult) -> Iterator[str]:

@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument
+from droguekit.cli.arguments import DatasetArgument, DetectorOption
 from droguekit.cli.pipelines import navigate_dataset
 
 EXAMPLES = (
     "droguekit navigate data/demo --out estimates.jsonl",
     "droguekit navigate data/demo --method paper --method joint --out estimates.jsonl",
     "droguekit navigate data/demo --centroids binary --out estimates.jsonl",
+    "droguekit navigate data/demo --detector my-network.onnx --out estimates.jsonl",
 )
 
 
@@ -32,8 +33,9 @@ def navigate(
             help="Measured points: each method's own (the paper's chain, or edge fits), or one kind for all.",
         ),
     ] = "own",
+    detector: DetectorOption = None,
 ) -> None:
     """Estimate the drogue's pose in every pair of a dataset, from images, rig and drogue alone."""
-    for fixes in navigate_dataset(dataset, method or (), out, progress_report(), centroids):
+    for fixes in navigate_dataset(dataset, method or (), out, progress_report(), centroids, detector):
         typer.echo(f"{fixes.method:<16} {fixes.fixes} fixes in {fixes.pairs} pairs")
     typer.echo(f"wrote {out}")

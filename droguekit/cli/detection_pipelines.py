@@ -1,0 +1,141 @@
+"""What the commands do that runs or scores detectors; rooms are imported where they are used, as in `pipelines`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from droguekit.batch.progress import ProgressReport
+    from droguekit.benchmark.detection_benchmark import DetectorRun
+    from droguekit.benchmark.detection_boxes import FoundBox
+    from droguekit.benchmark.detection_result import DetectionResult, PairTimes
+
+
+@dataclass(frozen=True)
+class DetectionCounts:
+    """What `detect_dataset` did."""
+
+    detector: str
+    boxes: int
+    images_with_boxes: int
+    pairs: int
+    times: PairTimes
+
+
+def detect_dataset(
+    dataset: Path, name_or_file: str | None, out: Path, least_score: float, report: ProgressReport
+) -> DetectionCounts:
+    """Find the drogue in every image without the truth, and write COCO results; the default detector when None.
+
+    Raises:
+        ValueError: no such dataset or detector, a score that is none, or an image that cannot be read.
+        OSError: the file cannot be written; it is then left as it was.
+    """
+    from droguekit.benchmark.detection_boxes import write_detections
+    from droguekit.benchmark.detection_run import DetectorPass
+    from nav.detector.registry import DEFAULT_DETECTOR, detector_factory
+
+    if not 0 <= least_score <= 1:
+        raise ValueError(f"--least-score: must be from 0 to 1, got {least_score:g}")
+    detecting = DetectorPass(dataset, detector_factory(DEFAULT_DETECTOR if name_or_file is None else name_or_file))
+    images = set()
+
+    def counted() -> Iterator[FoundBox]:
+        for box in detecting.boxes(least_score, report.advance):
+            images.add(box.image_id)
+            yield box
+
+    report.begin("pairs", detecting.pairs)
+    try:
+        boxes = write_detections(out, counted())
+    finally:
+        report.end()
+    return DetectionCounts(detecting.name, boxes, len(images), detecting.pairs, detecting.times())
+
+
+@dataclass(frozen=True)
+class DetectionOrder:
+    """Which boxes to score, and how.
+
+    Attributes:
+        files: of COCO results, each known by its name without ending.
+        detectors: names or files of networks, to be run first.
+        split: to score on, see `score_detections`.
+        threshold: operating threshold, see `score_detections`.
+    """
+
+    files: Sequence[Path]
+    detectors: Sequence[str]
+    split: str | None = None
+    threshold: float | None = None
+
+
+def benchmark_detections(
+    dataset: Path, order: DetectionOrder, json_out: Path | None, html_out: Path | None, report: ProgressReport
+) -> DetectionResult:
+    """Compare boxes with the truth, and write the numbers and the report where a place is given for them.
+
+    Raises:
+        ValueError: a dataset, file or detector that cannot be read, or two of one name.
+        OSError: a result cannot be written.
+    """
+    from datasets_manifest.atomic import write_text_atomic
+    from droguekit.benchmark.detection_benchmark import score_detections
+    from droguekit.benchmark.detection_report import write_detection_report
+    from droguekit.benchmark.detection_truth import read_detection_truth
+
+    if order.threshold is not None and not 0 <= order.threshold <= 1:
+        raise ValueError(f"--threshold: must be from 0 to 1, got {order.threshold:g}")
+    truth = read_detection_truth(dataset)
+    runs = _runs(dataset, order, frozenset(image.image_id for image in truth.images), report)
+    scored = score_detections(truth, runs, order.split, order.threshold)
+    if json_out is not None:
+        write_text_atomic(json_out, scored.result.to_json())
+    if html_out is not None:
+        write_detection_report(dataset, scored, html_out)
+    return scored.result
+
+
+def _runs(
+    dataset: Path, order: DetectionOrder, image_ids: frozenset[int], report: ProgressReport
+) -> dict[str, DetectorRun]:
+    """Boxes by the name that they are reported under."""
+    from droguekit.benchmark.detection_benchmark import DetectorRun
+    from droguekit.benchmark.detection_boxes import read_detections
+    from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
+    from nav.detector.registry import detector_factory
+
+    runs: dict[str, DetectorRun] = {}
+
+    def add(name: str, run: DetectorRun) -> None:
+        if name in runs:
+            raise ValueError(f"--detections, --detector: two are named {name!r}; rename a file")
+        runs[name] = run
+
+    for file in order.files:
+        add(file.stem, DetectorRun(read_detections(file, image_ids)))
+    for name_or_file in order.detectors:
+        detecting = DetectorPass(dataset, detector_factory(name_or_file))
+        report.say(f"{detecting.name}: looking for the drogue, without the truth")
+        report.begin("pairs", detecting.pairs)
+        try:
+            boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
+        finally:
+            report.end()
+        cost = _gflops_per_image(name_or_file, detecting.input_size_px)
+        add(detecting.name, DetectorRun(boxes, detecting.times(), detecting.score_threshold, cost))
+    return runs
+
+
+def _gflops_per_image(name_or_file: str, size_px: tuple[int, int] | None) -> float | None:
+    """Operations of a network in a file, where the package that can count them is installed."""
+    from importlib.util import find_spec
+
+    if size_px is None or not Path(name_or_file).is_file() or find_spec("onnx") is None:
+        return None
+    from droguekit.detector_peers.onnx_cost import network_cost
+
+    return network_cost(Path(name_or_file), size_px).gflops_per_image

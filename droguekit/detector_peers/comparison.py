@@ -1,0 +1,235 @@
+"""Training, exporting, timing and scoring of peers and ours: a stage whose file is there is over."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.blind import BlindDataset
+from datasets_manifest.reader import Dataset
+from droguekit.benchmark.detection_boxes import write_detections
+from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
+from droguekit.detector_peers.environment import peer_python, peer_variables
+from droguekit.detector_peers.latency import measure_latency
+from droguekit.detector_peers.onnx_cost import network_cost
+from droguekit.detector_peers.yolo_corpus import export_corpus, images_to_train_on
+from droguekit.detector_peers.yolo_detector import YoloDetector
+from nav.detector.interface import Detector
+from nav.detector.onnx_detector import OnnxDetector
+
+PEERS = ("yolov8s", "yolov8n")
+_SCRIPT = Path(__file__).with_name("yolo_script.py")
+_TIMED_PAIRS = 4
+# Where it is computed and how long it is timed change nothing that is trained.
+_FREE_TO_CHANGE = ("ours", "threads", "rounds", "device", "environment")
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class PeerOrder:
+    """What is compared.
+
+    Attributes:
+        corpus: dataset to train and to score on.
+        ours: ONNX files of our detectors, trained elsewhere on the same corpus.
+        image_passes: through each peer; 0 leaves them untrained, and times them only.
+        size_px: width and height of every network's input.
+        batch: images in a step of the peers' training.
+        threads: of training and timing.
+        rounds: of timing.
+        device: on which peers are trained, as ultralytics names it.
+        seed: of the peers' training.
+        environment: folder of the peers' virtual environment.
+    """
+
+    corpus: Path
+    ours: tuple[Path, ...]
+    image_passes: int
+    size_px: tuple[int, int]
+    batch: int
+    threads: int
+    rounds: int
+    device: str
+    seed: int
+    environment: Path
+
+    def __post_init__(self) -> None:
+        if self.image_passes < 0 or self.batch < 1 or self.threads < 1 or self.rounds < 1:
+            raise ValueError(
+                "image_passes, batch, threads, rounds: must be positive, got "
+                f"{self.image_passes}, {self.batch}, {self.threads}, {self.rounds}"
+            )
+        if any(side < 32 or side % 32 for side in self.size_px):
+            raise ValueError(f"size: must be multiples of 32 px, got {self.size_px[1]}x{self.size_px[0]}")
+
+
+def compare_peers(order: PeerOrder, out: Path, say: Say) -> dict[str, Any]:
+    """Run every stage that is not over yet.
+
+    Args:
+        order: what to compare.
+        out: folder of the comparison.
+        say: takes a line about what goes on.
+
+    Returns:
+        By detector's name, its cost, times and scores.
+
+    Raises:
+        ValueError: a wrong number, corpus or file, or a folder of another comparison.
+        OSError: the peers' environment cannot be made, a training failed, or a file cannot be written.
+    """
+    _check_folder(order, out)
+    networks = {name: _peer_network(order, out, name, say) for name in PEERS}
+    detectors: dict[str, Detector] = {name: YoloDetector(file, order.threads) for name, file in networks.items()}
+    for file in order.ours:
+        if file.stem in networks:
+            raise ValueError(f"--ours: {file}: another detector is named {file.stem!r}; rename the file")
+        networks[file.stem] = file
+        detectors[file.stem] = OnnxDetector(file, file.stem, order.threads, order.size_px)
+    say(f"timing {', '.join(detectors)} in turns, {order.threads} threads")
+    rows = {
+        name: network_cost(file, order.size_px)._asdict() | times
+        for (name, file), times in zip(networks.items(), _latencies(order, detectors), strict=True)
+    }
+    if order.image_passes:
+        scores = _scores(order, out, detectors, say)
+        rows = {name: row | scores[name] for name, row in rows.items()}
+    told = {name: str(value) for name, value in asdict(order).items()}
+    write_text_atomic(
+        out / "comparison.json", json.dumps({"schema": 1, "order": told, "detectors": rows}, indent=1) + "\n"
+    )
+    return rows
+
+
+def run_script(python: Path, order: Mapping[str, Any], log: Path, variables: Mapping[str, str]) -> None:
+    """Have the peers' environment do something; what it says goes to a log.
+
+    Raises:
+        OSError: it failed; says its last line and names the log.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a", encoding="utf-8") as stream:
+        ended = subprocess.run(
+            # -P: a file that lies where the user works must not stand in for a module of ultralytics.
+            [str(python), "-P", str(_SCRIPT)],
+            input=json.dumps(order),
+            text=True,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            env=dict(variables),
+            cwd=log.parent,
+            check=False,
+        )
+    if ended.returncode != 0:
+        lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        raise OSError(f"{log}: ultralytics ended with status {ended.returncode}: {lines[-1] if lines else 'silently'}")
+
+
+def training_length(image_passes: int, images: int) -> tuple[int, float]:
+    """Epochs, and the share of the images that each of them takes, that make so many passes.
+
+    ultralytics trains whole epochs: the passes are met by leaving a share of the images out.
+
+    Raises:
+        ValueError: no images.
+    """
+    if images < 1:
+        raise ValueError("corpus: has no images to train on")
+    epochs = max(1, -(-image_passes // images))
+    return epochs, min(1.0, image_passes / (epochs * images))
+
+
+def _check_folder(order: PeerOrder, out: Path) -> None:
+    """Refuse a folder of another comparison, and claim a new one."""
+    settings = {name: str(value) for name, value in asdict(order).items() if name not in _FREE_TO_CHANGE}
+    settings["corpus"] = Dataset(order.corpus).manifest.dataset_sha256
+    file = out / "settings.json"
+    if file.exists():
+        try:
+            before = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{file}: is not JSON: {error}") from error
+        differing = sorted(name for name in settings if before.get(name) != settings[name])
+        if differing:
+            raise ValueError(f"{out}: holds a comparison with another {', '.join(differing)}; name a new folder")
+    write_text_atomic(file, json.dumps(settings, indent=1) + "\n")
+
+
+def _peer_network(order: PeerOrder, out: Path, name: str, say: Say) -> Path:
+    """A peer's ONNX file, trained and exported where that has not been done."""
+    file = (out / f"{name}.onnx").resolve()
+    if file.exists():
+        return file
+    python = peer_python(order.environment, say)
+    folder = (out / name).resolve()
+    variables = peer_variables(out / "ultralytics", order.threads)
+    weights = f"{name}.yaml"
+    if order.image_passes:
+        weights = str(folder / "train" / "weights" / "best.pt")
+        over = folder / "trained"
+        if not over.exists():
+            data = export_corpus(order.corpus, out / "corpus").resolve()
+            epochs, fraction = training_length(order.image_passes, images_to_train_on(order.corpus))
+            training = {
+                "do": "train",
+                "config": f"{name}.yaml",
+                "data": str(data),
+                "folder": str(folder),
+                "epochs": epochs,
+                "fraction": fraction,
+                "side_px": max(order.size_px),
+                "batch": order.batch,
+                "threads": order.threads,
+                "device": order.device,
+                "seed": order.seed,
+            }
+            say(f"{name}: training, {epochs} epochs of {fraction:.1%} of the images; {folder / 'train.log'}")
+            run_script(python, training, folder / "train.log", variables)
+            write_text_atomic(over, "")
+    say(f"{name}: exporting")
+    part = file.with_suffix(".part.onnx")
+    export = {"do": "export", "weights": weights, "file": str(part), "size_px": order.size_px}
+    run_script(python, export, folder / "export.log", variables)
+    part.replace(file)
+    return file
+
+
+def _latencies(order: PeerOrder, detectors: Mapping[str, Detector]) -> list[dict[str, Any]]:
+    source = BlindDataset(order.corpus)
+    pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
+    return [latency._asdict() for latency in measure_latency(detectors, pairs, order.rounds).values()]
+
+
+def _scores(order: PeerOrder, out: Path, detectors: Mapping[str, Detector], say: Say) -> dict[str, dict[str, Any]]:
+    """Overall scores by our own benchmark, of the boxes of every detector; those found before stand."""
+    files = []
+    for name, detector in detectors.items():
+        file = out / "detections" / f"{name}.json"
+        files.append(file)
+        # Our own may have been trained anew under the same name.
+        if not file.exists() or name not in PEERS:
+            say(f"{name}: looking for the drogue")
+            _detect(order.corpus, detector, file)
+    result, page = out / "scores.json", out / "scores.html"
+    options = [word for file in files for word in ("--detections", str(file))]
+    command = [sys.executable, "-P", "-m", "droguekit.cli.main", "benchmark", str(order.corpus), *options]
+    ended = subprocess.run(
+        [*command, "--json", str(result), "--html", str(page)], capture_output=True, text=True, check=False
+    )
+    if ended.returncode != 0:
+        raise OSError(ended.stderr.strip() or f"benchmark ended with status {ended.returncode}")
+    say(f"wrote {page}")
+    table = json.loads(result.read_text(encoding="utf-8"))["detectors"]
+    return {name: {key: table[name]["overall"][key] for key in ("ap", "ap50", "ap75", "recall")} for name in detectors}
+
+
+def _detect(corpus: Path, detector: Detector, file: Path) -> None:
+    looking = DetectorPass(corpus, lambda drogue: detector)
+    write_detections(file, looking.boxes(LEAST_SCORE, lambda: None))

@@ -1,0 +1,120 @@
+"""`detect`, and `benchmark` on what it writes, through their own entry point."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from pathlib import Path
+
+import pytest
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+from datasets_manifest.estimates import PoseEstimate, read_estimates
+from datasets_manifest.layout import ANNOTATIONS_FOLDER
+from droguekit.benchmark.detection_truth import read_detection_truth
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+
+
+@pytest.fixture(scope="module")
+def detections(smoke_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("detect") / "boxes.json"
+    assert run(["detect", str(smoke_dataset), "--detector", "color-blob", "--out", str(out)]) == DONE
+    return out
+
+
+def test_boxes_have_the_image_ids_of_the_annotations_and_agree_with_them_by_pycocotools(
+    smoke_dataset: Path, detections: Path
+) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth = COCO(str(smoke_dataset / ANNOTATIONS_FOLDER / "all.json"))
+        judge = COCOeval(truth, truth.loadRes(str(detections)), "bbox")
+        judge.evaluate()
+        judge.accumulate()
+        judge.summarize()
+    entries = json.loads(detections.read_text())
+    assert {entry["image_id"] for entry in entries} <= set(truth.getImgIds())
+    assert all(set(entry) == {"image_id", "category_id", "bbox", "score"} for entry in entries)
+    # Six near drogues in clear daylight; the rim's circle is found to a pixel of at least 190.
+    assert judge.stats[1] > 0.8
+
+
+def test_the_truth_is_that_of_the_annotations(smoke_dataset: Path) -> None:
+    annotations = json.loads((smoke_dataset / ANNOTATIONS_FOLDER / "all.json").read_text())["annotations"]
+    boxes = {image.image_id: image.box_xywh for image in read_detection_truth(smoke_dataset).images if image.box_xywh}
+    assert boxes == {entry["image_id"]: tuple(entry["bbox"]) for entry in annotations if entry["image_id"] in boxes}
+    assert len(boxes) == 12
+
+
+def test_benchmark_scores_a_file_like_the_detector_itself(
+    smoke_dataset: Path, detections: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outputs = ["--json", str(tmp_path / "scores.json"), "--html", str(tmp_path / "scores.html")]
+    options = ["--detections", str(detections), "--detector", "color-blob", "--split", "all"]
+    assert run(["benchmark", str(smoke_dataset), *options, *outputs]) == DONE
+    told = capsys.readouterr().out
+    assert "boxes" in told and "color-blob" in told
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    from_file, live = scores["detectors"]["boxes"], scores["detectors"]["color-blob"]
+    # Files hold boxes rounded to a thousandth of a pixel.
+    assert from_file["overall"]["ap"] == pytest.approx(live["overall"]["ap"], abs=1e-3)
+    assert live["times"]["pairs"] == 6 and from_file["times"] is None
+    assert "<html" in (tmp_path / "scores.html").read_text()
+
+
+def test_a_dataset_without_its_truth_gives_the_same_boxes(
+    smoke_dataset: Path, detections: Path, tmp_path: Path
+) -> None:
+    blind = tmp_path / "blind"
+    assert run(["export", str(smoke_dataset), "--format", "blind", "--out", str(blind)]) == DONE
+    assert run(["detect", str(blind), "--detector", "color-blob", "--out", str(tmp_path / "boxes.json")]) == DONE
+    assert json.loads((tmp_path / "boxes.json").read_text()) == json.loads(detections.read_text())
+    scores = ["benchmark", str(blind), "--detections", str(tmp_path / "boxes.json")]
+    assert run(scores) == WRONG_INPUT
+
+
+def test_the_least_score_leaves_boxes_out(smoke_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "boxes.json"
+    options = ["--detector", "color-blob", "--least-score", "1", "--out", str(out)]
+    assert run(["detect", str(smoke_dataset), *options]) == DONE
+    assert json.loads(out.read_text()) == []
+
+
+def test_navigate_looks_where_the_detector_says(smoke_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "estimates.jsonl"
+    options = ["--method", "joint", "--detector", "color-blob", "--out", str(out)]
+    assert run(["navigate", str(smoke_dataset), *options]) == DONE
+    assert any(isinstance(estimate, PoseEstimate) for estimate in read_estimates(out))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["detect", "{data}", "--detector", "nobody", "--out", "{out}"], "detector: must be one of"),
+        (["detect", "{data}", "--detector", "none.onnx", "--out", "{out}"], "none.onnx"),
+        (["detect", "{data}/none", "--out", "{out}"], "none"),
+        (["detect", "{data}", "--least-score", "2", "--out", "{out}"], "--least-score: must be from 0 to 1, got 2"),
+        (["navigate", "{data}", "--detector", "nobody", "--out", "{out}"], "detector: must be one of"),
+        (["benchmark", "{data}"], "give either estimates, or detections"),
+        (["benchmark", "{data}", "--estimates", "{out}", "--detector", "color-blob"], "give either estimates"),
+        (["benchmark", "{data}", "--estimates", "{out}", "--split", "all"], "--split, --threshold: are for detections"),
+        (["benchmark", "{data}", "--detections", "{out}"], "boxes.json: cannot be read"),
+        (["benchmark", "{data}", "--detector", "color-blob", "--threshold", "nan"], "--threshold: must be from 0 to 1"),
+        (["benchmark", "{data}", "--detections", "{there}", "--detections", "{there}"], "two are named"),
+        (["benchmark", "{data}", "--detections", "{there}", "--split", "best"], "--split: the dataset has no pairs"),
+    ],
+)
+def test_wrong_input_is_one_line_and_leaves_nothing(
+    smoke_dataset: Path,
+    detections: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    places = {"data": str(smoke_dataset), "out": str(tmp_path / "boxes.json"), "there": str(detections)}
+    assert run([argument.format(**places) for argument in arguments]) == WRONG_INPUT
+    told = capsys.readouterr().err.strip().splitlines()
+    assert message in told[-1]
+    assert list(tmp_path.iterdir()) == []
