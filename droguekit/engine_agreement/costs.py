@@ -18,7 +18,7 @@ from render.engine import RenderEngine, StereoRadiance
 COST_STATIONS_M = (40.0, 20.0, 10.0, 5.0, 2.0)
 COST_FAMILY = "demo"
 # Even squares, tried in turn: on edges noise falls faster than any law by which it could be carried on.
-_SAMPLES = (16, 36, 64, 100, 144, 256)
+_SAMPLES = (16, 64, 144, 256, 400, 576)
 
 
 @dataclass(frozen=True)

@@ -41,16 +41,24 @@ class PairedDatasets:
 
 
 def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> tuple[Recipe, str]:
-    """What is rendered at one distance, and the text that it comes from."""
+    """What is rendered at one distance, and the text that it comes from.
+
+    Every pixel gets as many samples by either engine: where one of them spent more on the markers' edges, its poses
+    would err less for that alone.
+    """
     recipe, text = load_recipe(RECIPE, seed)
     side = 2 * round(np.sqrt(_SAMPLES_AT_5_M) * distance_m / 5.0 / 2)
+    samples = int(np.clip(side**2, 4, _MOST_SAMPLES))
     changes = {
         "frames": {"count": pairs, "scenes": pairs},
         "distance": {"law": "stations", "stations_m": (distance_m,)},
         "render": {
             **recipe.render.model_dump(),
             "engine": engine,
-            "samples_per_px": int(np.clip(side**2, 4, _MOST_SAMPLES)),
+            "samples_per_px": samples,
+            "open_samples_per_px": samples,
+            "edge_samples_per_px": samples,
+            "surround_samples_per_px": samples,
         },
     }
     return Recipe.model_validate({**recipe.model_dump(), **changes}), text

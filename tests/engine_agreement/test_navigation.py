@@ -75,6 +75,14 @@ def test_samples_grow_with_distance_and_stay_within_their_bounds():
     assert samples == [4, 16, 64, 144]
 
 
+@pytest.mark.parametrize("distance_m", [5.0, 40.0])
+def test_no_engine_may_spend_more_on_some_pixels(distance_m):
+    settings = station_recipe("mitsuba", distance_m, 1, 0)[0].render
+    kinds = settings.open_samples_per_px, settings.edge_samples_per_px, settings.surround_samples_per_px
+    assert set(kinds) == {settings.samples_per_px}
+    assert not settings.denoise
+
+
 def test_one_engine_against_itself_errs_alike_and_stays_when_run_again(tmp_path):
     report = PlainProgress(io.StringIO())
     paired = render_paired(tmp_path, ("analytic", "analytic"), 10.0, 2, 3, report)
