@@ -175,6 +175,12 @@ def compare_with_published(dataset: Location, published: Publication) -> Compari
     common = [entry for entry in mine.frames if entry.frame_index in known]
     other = [entry.frame_index for entry in common if entry.record_sha256 != known[entry.frame_index]]
     faults = [fault for i in other for fault in differing_labels(labels[i], labels_of(source.record(i)))]
+    if mine.render_version != theirs.render_version:
+        faults.insert(
+            0,
+            f"published by render version {theirs.render_version}, this is {mine.render_version}; "
+            "`make publish` is due where that is the newer one",
+        )
     if not common:
         faults.append(f"{dataset}: has none of the {len(known)} published pairs")
     return Comparison(len(common), len(common) - len(other), tuple(faults), _elsewhere(theirs, mine))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -29,6 +30,18 @@ class LayeredAir:
     def __init__(self, environment: Environment, sky: ClearSky) -> None:
         self._environment = environment
         self._sky = sky
+
+    def seen_from(self, environment: Environment) -> LayeredAir:
+        """The same air from another place: other clouds stand before sun and moon; what is a mean over them stays.
+
+        Args:
+            environment: the same, with another `camera_offset_m`.
+        """
+        moved = copy(self)
+        moved._environment = environment
+        for own in ("beam_share", "beam_illuminance_lux"):
+            vars(moved).pop(own, None)
+        return moved
 
     @cached_property
     def sky_level_lux(self) -> NDArray[np.float64]:
@@ -73,10 +86,10 @@ class LayeredAir:
     @cached_property
     def beam_share(self) -> float:
         """Share of the beam that cloud and mist let through to the camera."""
-        direction = self._sky.beam.direction
+        direction, offset_m = self._sky.beam.direction, self._environment.camera_offset_m
         share = 1.0
         for layer in self._environment.clouds:
-            share *= 1.0 - opacity_towards(layer, direction)
+            share *= 1.0 - opacity_towards(layer, direction, offset_m)
         return share * self._mist_beam_share
 
     @property

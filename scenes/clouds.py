@@ -129,13 +129,15 @@ def band_limited(layered: Radiance, layer: CloudLayer, directions: NDArray[np.fl
     return result
 
 
-def opacity_towards(layer: CloudLayer, direction: NDArray[np.float64]) -> float:
-    """How much of the sun's or moon's beam the layer takes on its way to the camera."""
+def opacity_towards(
+    layer: CloudLayer, direction: NDArray[np.float64], offset_m: tuple[float, float] = (0.0, 0.0)
+) -> float:
+    """How much of the sun's or moon's beam the layer takes on its way to the camera; see `see_cloud`."""
     if direction[2] * layer.height_above_camera_m <= 0:
         return 0.0
     nothing = np.zeros(3)
     light = CloudLight(direction, nothing, nothing, nothing)
-    return float(see_cloud(layer, direction[None, None].astype(np.float32), light).opacity[0, 0])
+    return float(see_cloud(layer, direction[None, None].astype(np.float32), light, 1, offset_m).opacity[0, 0])
 
 
 def _shade(

@@ -45,15 +45,19 @@ class Surroundings:
         self.air = LayeredAir(environment, self.sky)
 
     def seen_from(self, environment: Environment) -> Surroundings:
-        """The same surroundings from another place: ground and clouds move, the light on things stays that of here.
+        """The same surroundings from another place.
+
+        Ground and clouds move, and with them the share of the sun's beam that gets through; the light map stays that
+        of here.
 
         Args:
             environment: the same, with another `camera_offset_m`.
         """
-        moved = copy(self)
-        moved.environment = environment
         # Made here, so that it does not matter who asked first.
-        vars(moved).update(ground=self.ground.seen_from(environment), light_map=self.light_map)
+        own = {"ground": self.ground.seen_from(environment), "light_map": self.light_map}
+        moved = copy(self)
+        moved.environment, moved.air = environment, self.air.seen_from(environment)
+        vars(moved).update(own)
         return moved
 
     def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
@@ -283,12 +287,19 @@ def _cached(key: str, folder: Path | None) -> Surroundings:
     return MappedSurroundings(environment.model_copy(update={"map": placed}))
 
 
+# Engine, background and glare of one pair ask in turn.
+@lru_cache(maxsize=2)
+def _passing(key: str, folder: Path | None) -> Surroundings:
+    environment = Environment.model_validate_json(key)
+    still = environment.model_copy(update={"camera_offset_m": (0.0, 0.0)})
+    return _cached(still.model_dump_json(), folder).seen_from(environment)
+
+
 def surroundings(environment: Environment) -> Surroundings:
     """The surroundings of an environment; the same object for equal environments, as frames share scenes.
 
     Raises:
         ValueError: the environment's map cannot be read, or has changed.
     """
-    still = environment.model_copy(update={"camera_offset_m": (0.0, 0.0)})
-    here = _cached(still.model_dump_json(), environment.map.folder if environment.map is not None else None)
-    return here if environment.camera_offset_m == (0.0, 0.0) else here.seen_from(environment)
+    made = _cached if environment.camera_offset_m == (0.0, 0.0) else _passing
+    return made(environment.model_dump_json(), environment.map.folder if environment.map is not None else None)

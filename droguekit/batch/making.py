@@ -12,17 +12,13 @@ from typing import Any, TextIO
 
 from datasets_manifest.manifest import Drop
 from droguekit.batch.cluster import LostWorkersError, run_on_cluster
-from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
+from droguekit.batch.drop_rule import ERRORS_OF_THE_PLACE, FIRST_FRAMES, reason_of
+from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.machine import GIB_PER_WORKER, available_memory_gib
 from droguekit.batch.plan import frame_timeout_s
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.stop import StopRequest
 from droguekit.batch.workers import MAX_ATTEMPTS, Attempt, Limits, is_accident, run_tasks
-from render.engine import EngineUnavailableError
-
-# Errors that other frames would meet too; so does whatever the first frames of a run all fail by.
-_ERRORS_OF_THE_PLACE = (OSError, EngineUnavailableError, OtherBuildError)
-_FIRST_FRAMES = 3
 
 
 @dataclass(frozen=True)
@@ -163,7 +159,8 @@ def _attempts(
         return run_on_cluster(task, todo, spread.scheduler, timeout_s, stop)
     workers = min(spread.workers, len(todo))
     share_gib = available_memory_gib() / max(workers, 1)
-    return run_tasks(task, todo, workers, Limits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib)), stop)
+    limits = Limits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib))
+    return run_tasks(task, todo, workers, limits, stop, task.pack)
 
 
 def _reason(attempt: Attempt[FrameReport], made: int, dropped: int, planned: int) -> str:
@@ -178,7 +175,7 @@ def _reason(attempt: Attempt[FrameReport], made: int, dropped: int, planned: int
     if is_accident(error):
         return f"{error}, attempt {attempt.number} of {MAX_ATTEMPTS}"
     if not isinstance(error, LostWorkersError):
-        is_common = made == 0 and dropped + 1 >= min(_FIRST_FRAMES, planned)
-        if is_common or isinstance(error, _ERRORS_OF_THE_PLACE):
+        is_common = made == 0 and dropped + 1 >= min(FIRST_FRAMES, planned)
+        if is_common or isinstance(error, ERRORS_OF_THE_PLACE):
             raise error
-    return " ".join(str(error).split()) or type(error).__name__
+    return reason_of(error)

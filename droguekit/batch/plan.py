@@ -10,6 +10,7 @@ import numpy as np
 from datasets_manifest.manifest import Drop
 from datasets_manifest.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
+from droguekit.batch.drop_rule import FIRST_FRAMES, drop_of
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from labelgen.boxes import full_box
@@ -23,8 +24,6 @@ _START_S = 300.0
 _S_PER_SAMPLE = 20e-6
 # Shares to within 1 %, and every frame of the corpora that ship; ten seconds.
 _MOST_SAMPLED = 10_000
-# When so many frames fail before any other could be drawn, it is the recipe that fails; so does `render`.
-_FIRST_FRAMES = 3
 # Distance, middle and side of the box, room of its middle.
 _COLUMNS = 8
 
@@ -142,8 +141,8 @@ def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
                 known[scene_id] = places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
             row = _row(recipe, frame_index, *known[scene_id][1:])
         except ValueError as error:
-            drops.append(Drop(frame_index=frame_index, reason=" ".join(str(error).split())))
-            if not drawn and len(drops) >= min(_FIRST_FRAMES, len(indices)):
+            drops.append(drop_of(frame_index, error))
+            if not drawn and len(drops) >= min(FIRST_FRAMES, len(indices)):
                 raise
             continue
         drawn.append(frame_index)

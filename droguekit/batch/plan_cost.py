@@ -34,7 +34,7 @@ class Cost:
         start_s: until a worker process is ready for its first frame. [s]
         scene_s: for a process to make the environment of a scene, or to fly a sequence. [s]
         frames_s: for all pairs, their environments at hand. [s]
-        error_s: standard error of `frames_s`. [s]
+        error_s: standard error of `frames_s`, or None where too few were measured to tell. [s]
         wall_over_cpu: how long a second of a processor took: 1 on an idle machine, more where others work too, or where
             the engine waits for another device.
         size_bytes: of all pairs on disk, without the records.
@@ -46,7 +46,7 @@ class Cost:
     start_s: float
     scene_s: float
     frames_s: float
-    error_s: float
+    error_s: float | None
     wall_over_cpu: float
     size_bytes: float
     count: int
@@ -75,12 +75,18 @@ def probe_cost(recipe: Recipe, plan: Plan) -> Cost:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the temporary folder cannot be written.
     """
-    probed = probe(recipe, choose_frames(plan.drawn, recipe.frames.count))
+    return reckon(recipe, plan, probe(recipe, choose_frames(plan.drawn, recipe.frames.count)))
+
+
+def reckon(recipe: Recipe, plan: Plan, probed: Probe) -> Cost:
+    """What measured frames say of all pairs of a recipe."""
     reports = list(probed.counted.values())
     every = [*probed.warm_up.values(), *reports, probed.repeated]
     count = recipe.frames.count * (1 - plan.dropped_fraction)
     law = _Law(plan.drawn, probed.counted)
-    frames_s, error_s = law.total([cpu_s(report) - report.stage_s.get(_SCENE_STAGE, 0.0) for report in reports], count)
+    # What that stage takes of every pair is what it takes of one whose environment is at hand.
+    at_hand_s = _scene_stage_s(probed.repeated)
+    frames_s, error_s = law.total([cpu_s(report) - _scene_stage_s(report) + at_hand_s for report in reports], count)
     return Cost(
         probed=probed.counted,
         drops=probed.drops,
@@ -102,21 +108,27 @@ class _Law:
     def __init__(self, drawn: DrawnFrames, reports: dict[int, FrameReport]) -> None:
         rows = [drawn.indices.index(frame_index) for frame_index in reports]
         self._measured_m, self._drawn_m = drawn.distances_m[rows], drawn.distances_m
-        shares, probes = np.bincount(drawn.families), np.bincount(drawn.families[rows])
-        # Those without a drogue are few and of one family by chance; their law is a constant of their own.
-        self._weights = np.where(
-            np.isnan(self._measured_m), 1.0, (shares / np.maximum(probes, 1))[drawn.families[rows]]
-        )
+        shows, families = np.isfinite(self._measured_m), drawn.families[rows]
+        # A family of which none was measured counts as the others do on average.
+        shares = np.bincount(drawn.families[np.isfinite(self._drawn_m)], minlength=int(drawn.families.max()) + 1)
+        probes = np.bincount(families[shows], minlength=len(shares))
+        # Those without a drogue have a law of their own, a constant.
+        self._weights = np.where(shows, (shares / np.maximum(probes, 1))[families], 1.0)
 
-    def total(self, values: ArrayLike, count: float) -> tuple[float, float]:
-        """Sum over all pairs, and its standard error by how the measured values scatter about the law."""
+    def total(self, values: ArrayLike, count: float) -> tuple[float, float | None]:
+        """Sum over all pairs, and its standard error by how the measured values scatter about the law.
+
+        The error is None where the law has as many terms as there are values with a drogue: none scatters then.
+        """
         measured = np.asarray(values, dtype=np.float64)
         fitted = fit_over_distance(self._measured_m, measured, self._drawn_m, self._weights)
         left = measured - fit_over_distance(self._measured_m, measured, self._measured_m, self._weights)
         shows = np.isfinite(self._measured_m)
         n, share = int(shows.sum()), float(np.isfinite(self._drawn_m).mean())
-        error = math.sqrt(float(np.square(left[shows]).sum()) / max(n - _TERMS, 1) / max(n, 1)) * share
-        return count * float(fitted.mean()), count * error
+        total = count * float(fitted.mean())
+        if n <= _TERMS:
+            return total, None
+        return total, count * share * math.sqrt(float(np.square(left[shows]).sum()) / (n - _TERMS) / n)
 
 
 def _scene_s(recipe: Recipe, probed: Probe) -> float:
@@ -125,10 +137,14 @@ def _scene_s(recipe: Recipe, probed: Probe) -> float:
     for frame_index, report in (probed.warm_up | probed.counted).items():
         length = None if recipe.sequence is None else recipe.sequence.frames_per_sequence
         unit = scene_of_frame(recipe, frame_index) if length is None else frame_index // length
-        first_s.setdefault(unit, report.stage_s.get(_SCENE_STAGE, 0.0))
+        first_s.setdefault(unit, _scene_stage_s(report))
     # Tables that serve all scenes are made in the first frame of all.
     later_s = list(first_s.values())[1:] or list(first_s.values())
-    return max(0.0, float(np.mean(later_s)) - probed.repeated.stage_s.get(_SCENE_STAGE, 0.0))
+    return max(0.0, float(np.mean(later_s)) - _scene_stage_s(probed.repeated))
+
+
+def _scene_stage_s(report: FrameReport) -> float:
+    return report.stage_s.get(_SCENE_STAGE, 0.0)
 
 
 def fit_over_distance(distance_m: ArrayLike, values: ArrayLike, at_m: ArrayLike, weights: ArrayLike = 1.0) -> Array:

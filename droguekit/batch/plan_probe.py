@@ -6,7 +6,7 @@ import math
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from datasets_manifest.manifest import Drop
 from datasets_manifest.recipe import Recipe
-from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
+from droguekit.batch.drop_rule import ERRORS_OF_THE_PLACE, drop_of
+from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.plan import DrawnFrames
 from droguekit.batch.workers import run_alone
-from render.engine import EngineUnavailableError
 
 # Three cannot tell the law from the differences between scenes; more than a dozen hardly better the mean.
 _FEWEST_PROBES, _MOST_PROBES = 3, 12
@@ -111,28 +111,46 @@ def _probe(recipe: Recipe, order: ProbeOrder) -> Probe:
     drops = list[Drop]()
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         task = FrameTask(recipe, Path(folder))
-        warm_up = _make(task, order.warm_up, drops)
-        counted = _make(task, order.counted, drops)
+        warm_up, failed_s = make_in_turn(task, order.warm_up, drops, False)
+        counted, more_failed_s = make_in_turn(task, order.counted, drops, bool(warm_up))
         if not counted:
             raise ValueError(f"frames: none of {len(order.counted)} can be made, the last because: {drops[-1].reason}")
         repeated = task(next(reversed(counted)))
     reports = [*warm_up.values(), *counted.values(), repeated]
-    start_cpu_s = time.process_time() - sum(cpu_s(report) for report in reports)
-    return Probe(warm_up, counted, repeated, max(0.0, start_cpu_s), tuple(drops))
+    in_frames_s = sum(cpu_s(report) for report in reports) + failed_s + more_failed_s
+    return Probe(warm_up, counted, repeated, max(0.0, time.process_time() - in_frames_s), tuple(drops))
 
 
-def _make(task: FrameTask, frames: tuple[int, ...], drops: list[Drop]) -> dict[int, FrameReport]:
-    """Those of the frames that can be made; the others are added to the drops."""
-    made = dict[int, FrameReport]()
+def make_in_turn(
+    task: Callable[[int], FrameReport], frames: tuple[int, ...], drops: list[Drop], is_loaded: bool
+) -> tuple[dict[int, FrameReport], float]:
+    """Make frames one after the other.
+
+    Args:
+        task: makes one.
+        frames: which.
+        drops: those that cannot be made are added to it.
+        is_loaded: the engine is; before, its loading is part of the first frame's time.
+
+    Returns:
+        Those that can be made, and processor time that went into the others, the engine being loaded. [s]
+
+    Raises:
+        ValueError: the engine cannot be used.
+        OSError: the temporary folder cannot be written.
+    """
+    made, failed_s = dict[int, FrameReport](), 0.0
     for frame_index in frames:
+        began_s = time.process_time()
         try:
             made[frame_index] = task(frame_index)
-        except (OSError, EngineUnavailableError, OtherBuildError):
+        except ERRORS_OF_THE_PLACE:
             raise
         except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            drops.append(Drop(frame_index=frame_index, reason=reason))
-    return made
+            drops.append(drop_of(frame_index, error))
+            if is_loaded or made:
+                failed_s += time.process_time() - began_s
+    return made, failed_s
 
 
 def cpu_s(report: FrameReport) -> float:

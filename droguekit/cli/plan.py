@@ -164,8 +164,10 @@ def _cost(cost: Cost, workers: int) -> Iterator[str]:
     kind = "sequence" if cost.sequences else "scene"
     yield f"a worker needs {cost.start_s:.1f} s to start, and {cost.scene_s:.2f} s more for each {kind} it meets"
     work_s, run_s = cost.work_s(workers), cost.run_s(workers)
-    scatter = f"give or take {100 * cost.error_s / work_s:.0f} % by how the measured ones scatter"
-    yield f"all pairs: {duration(work_s)} of processor time, {scatter}"
+    scatter = ""
+    if cost.error_s is not None:
+        scatter = f", give or take {100 * cost.error_s / work_s:.0f} % by how the measured ones scatter"
+    yield f"all pairs: {duration(work_s)} of processor time{scatter}"
     size = human_size(cost.size_bytes)
     yield f"all: about {duration(run_s)} with {workers} workers that have a core each, {size} without the records"
     if cost.wall_over_cpu > _BUSY:

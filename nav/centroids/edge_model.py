@@ -31,8 +31,8 @@ from nav.centroids.working_memory import keep_freed_memory
 
 # Shading of a smaller disc can hardly be told from a shift of it: fitting it adds 30 % of noise here, 100 % at 4 px.
 _LEAST_RADIUS_FOR_SHADING_PX = 7.5
-# Beside dim markers a slope of the face's light moves all centres alike by thousandths of a pixel. To fit it costs 7 %
-# of noise or less for larger discs, more for smaller ones, whose windows the light from beyond the face reaches too.
+# Beside dim markers a slope of the face's light moves all centres alike by thousandths of a pixel. To fit it costs 7 to
+# 10 % of noise for larger discs, more for smaller ones, whose windows the light from beyond the face reaches too.
 _LEAST_RADIUS_FOR_SLOPE_BESIDE_PX = 27.0
 _FIRST_STEPS, _SECOND_STEPS = 6, 3
 # Gauss-Newton's error is the square of its step or so: the first fit, for noise and weights, may end early. [px]

@@ -174,9 +174,9 @@ class _View:
         # The integrator counts shapes from 1; 0 is no shape.
         table = np.array([0, *(int(shape.id().split("_")[1]) for shape in scene.shapes())], dtype=np.uint8)
         part_id: NDArray[np.uint8] = table[values[..., 0].astype(np.int64)]
-        hit = part_id > 0
         pose = self._drogue_from_eye(s)
         self._mend_leaks(scene, pose, (part_id, values))
+        hit = part_id > 0
         depth = np.where(hit, np.einsum("...i,i->...", values[..., 1:4] - pose[:3, 3], pose[:3, 2]), np.inf).astype(
             np.float32
         )
@@ -195,12 +195,10 @@ class _View:
                 direction = pose[:3, :3] @ self._camera.rays(ray_px)
                 direction /= np.linalg.norm(direction)
                 hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(pose[:3, 3].tolist()), mi.Vector3f(direction.tolist())))
-                if not hit.is_valid():
-                    continue
-                part, normal = np.array(int(hit.shape.id().split("_")[1]), dtype=np.uint8), np.array(hit.n)
-                if not slipped_through(part, normal, direction):
-                    part_id[v, u] = part
-                    values[v, u, 1:] = [*hit.p, *hit.n]
+                # A ray aside that meets nothing saw the sky.
+                part_id[v, u] = int(hit.shape.id().split("_")[1]) if hit.is_valid() else 0
+                values[v, u, 1:] = [*hit.p, *hit.n]
+                if not slipped_through(part_id[v, u], values[v, u, 4:], direction):
                     break
 
     def sunlit(self, scene: DrogueScene, passes: _Passes, s: float) -> NDArray[np.bool_]:

@@ -31,6 +31,7 @@ from droguekit.batch.publish import PUBLISHED, publish
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.stereo import EYES
 from labelgen.boxes import full_box
+from render.version import RENDER_VERSION
 from scenes.sampler import sample_left_from_drogue, split_of_scene
 
 OTHER_FEATURES = ("SSE", "SSE2")
@@ -106,6 +107,16 @@ def test_another_label_is_found_on_any_machine(dataset: Path, tmp_path: Path) ->
     assert comparison.label_faults == ("frame 3: left.box_full_xywh_px[0]: differs from what was published",)
 
 
+def test_another_render_version_is_told_as_such(dataset: Path) -> None:
+    published = build_publication(dataset)
+    older = published.model_copy(update={"manifest": published.manifest.model_copy(update={"render_version": "0"})})
+    comparison = compare_with_published(dataset, older)
+    assert verdicts(comparison) == ("different", 8, 8)
+    assert comparison.label_faults == (
+        f"published by render version 0, this is {RENDER_VERSION}; `make publish` is due where that is the newer one",
+    )
+
+
 def test_last_bits_of_a_preset_make_no_other_recipe(dataset: Path) -> None:
     published = build_publication(dataset)
     recipe = published.manifest.recipe
@@ -160,6 +171,11 @@ def test_publishing_never_keeps_old_frames(tmp_path: Path) -> None:
 
 def test_published_manifests_are_of_recipes_that_are_published() -> None:
     assert set(publication_names()) == set(PUBLISHED)
+
+
+@pytest.mark.parametrize("name", publication_names())
+def test_what_is_published_is_of_this_render_version(name: str) -> None:
+    assert read_publication(name).manifest.render_version == RENDER_VERSION, "`make publish` is due"
 
 
 @pytest.mark.parametrize("name", publication_names())

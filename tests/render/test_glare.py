@@ -3,8 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datasets_manifest.weather import CloudLayer
 from render.engine import EyeRadiance
 from render.glare import glare_spread_per_sr, sun_glare
+from scenes.clouds import opacity_towards
 from scenes.light import luminance
 from scenes.sampler import sample_frame
 from scenes.surroundings import surroundings
@@ -57,3 +59,19 @@ def test_no_veil_from_behind_at_night_or_from_a_hidden_sun(make_recipe):
     inside = with_sun(make_recipe, 3.0, 0.0)
     assert sun_glare(inside, eye(inside)) is not None
     assert sun_glare(inside, eye(inside, coverage=1.0)) is None
+
+
+def test_clouds_that_a_flying_camera_passes_take_the_glare(make_recipe):
+    frame = with_sun(make_recipe, 20.0, 0.0)
+    heap = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_size_m=900.0, optical_depth=3.0,
+                      texture_seed=1, thickness_m=100.0)  # fmt: skip
+    clear, beam = sun_glare(frame, eye(frame)), surroundings(frame.environment).beam_direction
+    shares = []
+    for east_m in (0.0, 400.0, 800.0, 1200.0, 1600.0):
+        update = {"clouds": (heap,), "camera_offset_m": (east_m, 0.0)}
+        passing = frame.model_copy(update={"environment": frame.environment.model_copy(update=update)})
+        shares.append(1.0 - opacity_towards(heap, beam, (east_m, 0.0)))
+        veil = sun_glare(passing, eye(passing))
+        # Float32; a veil by less than 1 lux is left out.
+        np.testing.assert_allclose(0.0 if veil is None else veil, shares[-1] * clear, rtol=1e-5, atol=1e-2)
+    assert max(shares) - min(shares) > 0.5

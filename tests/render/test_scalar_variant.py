@@ -45,6 +45,49 @@ samples_per_px = 64
 surround_samples_per_px = 16
 """
 
+# A disc smaller than a ray's step aside, right before the camera and seen from behind: as if a ray had slipped into a
+# part's inside. The second one stands before a wall that faces the camera.
+LEAKS = """
+import sys
+import mitsuba as mi
+import numpy as np
+mi.set_variant("scalar_rgb")
+from datasets_manifest.recipe import parse_recipe
+from render.mitsuba_engine.scalar_tracer import _MITSUBA_FROM_OPENCV, _View
+from scenes.sampler import sample_frame
+recipe = parse_recipe(open(sys.argv[1]).read())
+view = _View(sample_frame(recipe, 0), "left")
+camera, pose = recipe.rig.camera, view._drogue_from_eye(0.0)
+def plate(pixel, depth_m, radius_m, turn):
+    place = np.eye(4)
+    place[:3, :3] = turn * radius_m
+    place[:3, 3] = camera.rays(np.array(pixel, dtype=float)) * depth_m
+    return {"type": "disk", "to_world": mi.ScalarTransform4f((pose @ place).tolist())}
+towards, away = np.diag([1.0, -1.0, -1.0]), np.eye(3)
+tiny_m = 1e-3 / camera.fx_px
+shapes = {
+    "part_1": plate((40, 60), 1.0, tiny_m, away),
+    "part_2": plate((120, 60), 1.0, tiny_m, away),
+    "part_3": plate((120, 60), 2.0, 0.05, towards),
+}
+scene = mi.load_dict({"type": "scene", **shapes})
+part_id, depth, normal = view.passes(scene, 0.0)
+np.savez(sys.argv[2], part_id=part_id, depth=depth, normal=normal)
+"""
+
+
+def test_where_a_ray_slipped_through_what_stands_beside_is_seen(tmp_path):
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed")
+    (tmp_path / "recipe.toml").write_text(RECIPE)
+    command = [sys.executable, "-c", LEAKS, str(tmp_path / "recipe.toml"), str(tmp_path / "passes.npz")]
+    subprocess.run(command, check=True)
+    with np.load(tmp_path / "passes.npz") as seen:
+        assert (seen["part_id"][60, 40], seen["depth"][60, 40]) == (0, np.inf)
+        assert not seen["normal"][60, 40].any()
+        assert seen["part_id"][60, 120] == 3
+        assert seen["depth"][60, 120] == pytest.approx(2.0, rel=1e-5)  # float32
+        np.testing.assert_allclose(seen["normal"][60, 120], [0, 0, -1], atol=1e-5)
+
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):

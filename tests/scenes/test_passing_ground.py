@@ -51,9 +51,9 @@ def environment(kind="fields", **changes):
     return Environment.model_validate(values | changes)
 
 
-def looking(sign):
+def looking(sign, side_px=SIZE_PX):
     """(H, W, 3) directions of a pinhole that looks straight up (1) or down (-1); columns go east, rows north."""
-    offset = (np.arange(SIZE_PX) - (SIZE_PX - 1) / 2) / FOCAL_PX
+    offset = (np.arange(side_px) - (side_px - 1) / 2) / FOCAL_PX
     x, y = np.meshgrid(offset, offset)
     rays = np.stack([x, y, np.full_like(x, sign)], axis=-1)
     return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
@@ -61,7 +61,7 @@ def looking(sign):
 
 def flow_px(before, after):
     """How far a picture has moved to the right and down, by OpenCV's phase correlation."""
-    window = cv2.createHanningWindow((SIZE_PX, SIZE_PX), cv2.CV_64F)
+    window = cv2.createHanningWindow(before.shape[::-1], cv2.CV_64F)
     pictures = [np.asarray(picture, dtype=np.float64) - float(np.mean(picture)) for picture in (before, after)]
     return np.array(cv2.phaseCorrelate(*pictures, window)[0])
 
@@ -119,6 +119,48 @@ def test_clouds_flow_by_their_own_distance():
     before, after = (see_cloud(cumulus, looking(-1), sun, 1, place).opacity for place in ((0.0, 0.0), flown_m))
     # Between that of its tops and that of its base, 100 m farther, and a third of a pixel for edges that change.
     assert np.linalg.norm(flow_px(before, after) - expected_px) < 0.09 * np.linalg.norm(expected_px) + 0.33
+
+
+def test_clouds_of_a_large_picture_flow_too():
+    # So many rays that clouds are marched on every second one, and enlarged.
+    side_px, flown_m, height_m = 256, (48.0, -32.0), 1200.0
+    cirrus = CloudLayer(kind="cirrus", height_above_camera_m=height_m, cover_fraction=0.7, feature_size_m=300.0,
+                        optical_depth=3.0, texture_seed=4)  # fmt: skip
+    here = environment(clouds=(cirrus,), sun_elevation_deg=20.0)
+    there = here.model_copy(update={"camera_offset_m": flown_m})
+    before, after = (luminance(surroundings(seen).radiance(looking(1, side_px))) for seen in (here, there))
+    # A third of a pixel: the sky behind stays where it is.
+    np.testing.assert_allclose(flow_px(before, after), -FOCAL_PX * np.array(flown_m) / height_m, atol=0.33)
+
+
+CUMULUS = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_size_m=900.0, optical_depth=10.0,
+                     texture_seed=1, thickness_m=300.0)  # fmt: skip
+
+
+def test_clouds_that_pass_before_the_sun_take_its_light():
+    here = environment(clouds=(CUMULUS,), sun_elevation_deg=30.0)
+    to_sun = surroundings(here).beam_direction
+    ray = to_sun[None, None].astype(np.float32)
+    sun = CloudLight(to_sun, np.full(3, 6e4), np.full(3, 6e3), np.full(3, 2e3))
+    clear = surroundings(here.model_copy(update={"clouds": ()}))
+    clear_disc, open_shares = disc_towards(clear, ray), []
+    for east_m in np.arange(0.0, 2500.0, 250.0):
+        around = surroundings(here.model_copy(update={"camera_offset_m": (float(east_m), 0.0)}))
+        open_shares.append(1.0 - float(see_cloud(CUMULUS, ray, sun, 1, (float(east_m), 0.0)).opacity[0, 0]))
+        # Float32 radiance.
+        expected = clear_disc * open_shares[-1]
+        np.testing.assert_allclose(disc_towards(around, ray), expected, rtol=1e-5, atol=1e-5 * clear_disc.max())
+        expected_lux = clear.beam_illuminance_lux * open_shares[-1]
+        np.testing.assert_allclose(around.beam_illuminance_lux, expected_lux, rtol=1e-9)  # the same float64 product
+    assert min(open_shares) < 0.01 and max(open_shares) > 0.99
+    # Nothing of the way stays behind.
+    np.testing.assert_allclose(disc_towards(surroundings(here), ray), clear_disc * open_shares[0], rtol=1e-5)
+
+
+def disc_towards(around, ray):
+    disc = np.zeros((1, 1, 3), dtype=np.float32)
+    around.add_discs(disc, ray)
+    return disc
 
 
 def test_sky_and_light_stay_as_they_are():
