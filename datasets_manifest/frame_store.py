@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from threading import Lock
 
 from datasets_manifest.layout import (
     FRAMES_FOLDER,
@@ -19,10 +20,12 @@ from datasets_manifest.shard_index import (
     read_shard_index,
     shard_numbers,
 )
-from datasets_manifest.storage import Location, open_storage
+from datasets_manifest.storage import Location, in_order, open_storage
 
 # A list of 1000 frames takes some 2 MB of memory.
 _LISTS_KEPT = 64
+# Requests run in threads. It is not the store's own: a store is pickled for the processes of data loaders.
+_LISTS_LOCK = Lock()
 
 
 class FrameStore:
@@ -46,8 +49,9 @@ class FrameStore:
         """
         found = set(self.staged)
         if self.pairs_per_tar is not None:
-            for number in shard_numbers(self.storage):
-                found.update(read_shard_index(self.storage, number).frames)
+            read = partial(read_shard_index, self.storage)
+            for shard in in_order(read, shard_numbers(self.storage), self.storage):
+                found.update(shard.frames)
         return sorted(found)
 
     @cached_property
@@ -93,7 +97,7 @@ class FrameStore:
             return self.storage.read(tar, file.offset, file.size)
         except FileNotFoundError as error:
             raise ValueError(f"{self.where(frame_index, name)}: is missing") from error
-        except (OSError, RuntimeError) as error:
+        except OSError as error:
             raise ValueError(f"{self.where(frame_index, name)}: cannot be read: {error}") from error
 
     def path(self, frame_index: int, name: str) -> Path | None:
@@ -124,10 +128,11 @@ class FrameStore:
 
     def _shard(self, number: int) -> ShardIndex:
         """The list of a tar file; those that were read last are kept."""
-        shard = self._shards.pop(number, None) or read_shard_index(self.storage, number)
-        self._shards[number] = shard
-        if len(self._shards) > _LISTS_KEPT:
-            self._shards.pop(next(iter(self._shards)), None)
+        with _LISTS_LOCK:
+            shard = self._shards.pop(number, None) or read_shard_index(self.storage, number)
+            self._shards[number] = shard
+            if len(self._shards) > _LISTS_KEPT:
+                del self._shards[next(iter(self._shards))]
         return shard
 
 

@@ -48,7 +48,7 @@ class LocalStorage:
         """Whether the file is a link that leads out of its folder."""
         path = self._root / name
         # Links are few, and to follow every part of a path takes as long as to read a small file.
-        return path.is_symlink() and path.resolve().parent != path.parent.resolve()
+        return path.is_symlink() and Path(os.path.realpath(path)).parent != Path(os.path.realpath(path.parent))
 
     def size(self, name: str) -> int:
         """Of a file. [bytes]"""
@@ -89,13 +89,13 @@ class LocalStorage:
         """Folders that hold the file `mark`."""
         return [name for name in self.names(folder) if (self._root / folder / name / mark).is_file()]
 
-    def leftovers(self, mark: str) -> list[str]:
-        """What is still called as only unfinished things are; finished folders appear with all their files."""
+    def leftovers(self, folder: str, mark: str) -> list[str]:
+        """What is still called as only unfinished things are; folders with a mark appear with all their files."""
         folders = [name for name in self.names("") if not name.startswith(".") and (self._root / name).is_dir()]
         return sorted(
-            f"{folder}/{name}".lstrip("/")
-            for folder in ["", *folders]
-            for name in self.names(folder)
+            f"{place}/{name}".lstrip("/")
+            for place in ["", *folders]
+            for name in self.names(place)
             if name.startswith(".") and name.endswith(PART_SUFFIX)
         )
 

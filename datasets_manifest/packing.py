@@ -10,8 +10,10 @@ import hashlib
 import io
 import json
 import tarfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import BinaryIO
 
 from datasets_manifest.frame_store import FrameStore
@@ -75,8 +77,7 @@ def choose_packing(dataset: Location, pairs_per_tar: int | None) -> None:
     """
     if pairs_per_tar is None:
         return
-    if not 1 <= pairs_per_tar <= MAX_PAIRS_PER_TAR:
-        raise ValueError(f"--tar: must be from 1 to {MAX_PAIRS_PER_TAR} pairs, got {pairs_per_tar}")
+    check_pairs_per_tar(pairs_per_tar)
     storage = open_storage(dataset)
     there = read_pairs_per_tar(storage)
     if there is None:
@@ -87,6 +88,16 @@ def choose_packing(dataset: Location, pairs_per_tar: int | None) -> None:
             f"--tar: {storage.where()} has tar files of {there} pairs, got {pairs_per_tar}; leave it out, or render "
             "into a new folder"
         )
+
+
+def check_pairs_per_tar(pairs_per_tar: int | None) -> None:
+    """See that a number of pairs can be chosen; None leaves a dataset as it is.
+
+    Raises:
+        ValueError: it is out of range.
+    """
+    if pairs_per_tar is not None and not 1 <= pairs_per_tar <= MAX_PAIRS_PER_TAR:
+        raise ValueError(f"--tar: must be from 1 to {MAX_PAIRS_PER_TAR} pairs, got {pairs_per_tar}")
 
 
 def packing_of(dataset: Location, frames: range) -> Packing | None:
@@ -100,7 +111,7 @@ def packing_of(dataset: Location, frames: range) -> Packing | None:
 
 
 class _NotWholeError(Exception):
-    """A frame's folder is damaged, or another process has packed it and removes it."""
+    """Frames' folders are damaged, or another process has packed them and removes them."""
 
 
 def pack_if_complete(dataset: Location, frame_index: int, packing: Packing) -> None:
@@ -177,27 +188,48 @@ def _indices(names: list[str]) -> set[int]:
 
 def _pack_again(storage: Storage, number: int, staged: list[int], packed: Mapping[int, Packed]) -> None:
     """Pack the whole ones of the frames that have folders, with those that their tar file holds already."""
-    whole = [index for index in staged if _staged_files(storage, index) is not None]
-    known = [
-        index
-        for index in whole
-        if index in packed and _packed_files(storage, number, packed[index]) == _staged_files(storage, index)
-    ]
-    if known != whole:
+    if all(index in packed for index in staged) and all(
+        in_order(partial(_is_known, storage, number, packed), staged, storage)
+    ):
+        _remove_folders(storage, staged)
+        return
+    waiting, whole = set(staged), list[int]()
+
+    def files_of(index: int) -> tuple[Contents | None, Contents | None]:
+        files = _staged_files(storage, index) if index in waiting else None
         # What is damaged in the tar file and was not made again is none of the dataset's frames any more.
-        contents = (
-            (index, _staged_files(storage, index))
-            if index in whole
-            else (index, _packed_files(storage, number, packed[index]))
-            for index in sorted({*packed, *whole})
-        )
-        _pack(storage, number, ((index, files) for index, files in contents if files is not None))
-    _remove_folders(storage, whole)
+        return files, _packed_files(storage, number, packed[index]) if files is None and index in packed else None
+
+    def contents() -> Iterator[tuple[int, Contents]]:
+        indices = sorted({*packed, *waiting})
+        for index, (mine, before) in zip(indices, in_order(files_of, indices, storage), strict=True):
+            if mine is not None:
+                whole.append(index)
+            files = mine or before
+            if files is not None:
+                yield index, files
+        if not whole:
+            raise _NotWholeError
+
+    with suppress(_NotWholeError):
+        _pack(storage, number, contents())
+        _remove_folders(storage, whole)
 
 
-def _all_staged(storage: Storage, indices: Iterable[int]) -> Iterator[tuple[int, Contents]]:
-    for index in indices:
-        files = _staged_files(storage, index)
+def _is_known(storage: Storage, number: int, packed: Mapping[int, Packed], frame_index: int) -> bool:
+    """Whether a frame's folder is whole, and its tar file holds the same."""
+    files = _staged_files(storage, frame_index)
+    return files is not None and files == _packed_files(storage, number, packed[frame_index])
+
+
+def _all_staged(storage: Storage, indices: Sequence[int]) -> Iterator[tuple[int, Contents]]:
+    """Frames that have folders, with their files, of which only a few are in memory at a time.
+
+    Raises:
+        _NotWholeError: one is damaged.
+    """
+    contents = in_order(partial(_staged_files, storage), indices, storage)
+    for index, files in zip(indices, contents, strict=True):
         if files is None:
             raise _NotWholeError
         yield index, files

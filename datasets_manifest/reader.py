@@ -66,8 +66,11 @@ class Dataset:
         Raises:
             ValueError: the pair is missing, or its record is truncated or wrong; names the file.
         """
+        return self._parse_record(frame_index, self.frames.read(frame_index, RECORD_FILE))
+
+    def _parse_record(self, frame_index: int, data: bytes) -> PairRecord:
         path = self.frames.where(frame_index, RECORD_FILE)
-        table = read_record_table(self.frames, frame_index)
+        table = _parse_table(data, path)
         try:
             record = PairRecord.model_validate(table)
         except ValidationError as error:
@@ -80,6 +83,25 @@ class Dataset:
             if not is_plain_name(name):
                 raise ValueError(f"{path}: file_sha256: must name files of the frame's own folder, got {name!r}")
         return record
+
+    def whole_frame(self, frame_index: int) -> tuple[PairRecord, dict[str, bytes]]:
+        """The record and the other files by name of a pair of the manifest, each read once and hashed.
+
+        Raises:
+            ValueError: a file is missing, or is not the one on record; names it.
+        """
+        data = self.frames.read(frame_index, RECORD_FILE)
+        self._check_hash(frame_index, RECORD_FILE, data, self._record_hashes[frame_index])
+        record = self._parse_record(frame_index, data)
+        files: dict[str, bytes] = {}
+        for name, expected in record.file_sha256.items():
+            files[name] = self.frames.read(frame_index, name)
+            self._check_hash(frame_index, name, files[name], expected)
+        return record, files
+
+    def _check_hash(self, frame_index: int, name: str, data: bytes, expected: str) -> None:
+        if hashlib.sha256(data).hexdigest() != expected:
+            raise ValueError(f"{self.frames.where(frame_index, name)}: was changed, its hash is not the one on record")
 
     def images(self, frame_index: int) -> StereoImages:
         """What the cameras saw.
@@ -109,14 +131,21 @@ class Dataset:
         expected = self._record_hashes.get(frame_index)
         if expected is None:
             return [f"{self.frames.where(frame_index)}: is not in the manifest"]
-        faults = _hash_faults(self.frames, frame_index, RECORD_FILE, expected)
+        faults = self._hash_faults(frame_index, RECORD_FILE, expected)
         try:
             hashes = self.record(frame_index).file_sha256
         except ValueError as error:
             return [*faults, str(error)]
         for name, want in hashes.items():
-            faults += _hash_faults(self.frames, frame_index, name, want)
+            faults += self._hash_faults(frame_index, name, want)
         return faults
+
+    def _hash_faults(self, frame_index: int, name: str, expected: str) -> list[str]:
+        try:
+            self._check_hash(frame_index, name, self.frames.read(frame_index, name), expected)
+        except ValueError as error:
+            return [str(error)]
+        return []
 
 
 def read_record_table(frames: FrameStore, frame_index: int) -> dict[str, Any]:
@@ -125,9 +154,12 @@ def read_record_table(frames: FrameStore, frame_index: int) -> dict[str, Any]:
     Raises:
         ValueError: it is missing, truncated or no JSON object; names the file.
     """
-    path = frames.where(frame_index, RECORD_FILE)
+    return _parse_table(frames.read(frame_index, RECORD_FILE), frames.where(frame_index, RECORD_FILE))
+
+
+def _parse_table(data: bytes, path: str) -> dict[str, Any]:
     try:
-        table = json.loads(frames.read(frame_index, RECORD_FILE))
+        table = json.loads(data)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
     if not isinstance(table, dict):
@@ -215,13 +247,3 @@ def _read(
     if image.shape != shape or image.dtype != dtype:
         raise ValueError(f"{where}: must be {shape} of {np.dtype(dtype).name}, got {image.shape} of {image.dtype}")
     return image
-
-
-def _hash_faults(frames: FrameStore, frame_index: int, name: str, expected: str) -> list[str]:
-    try:
-        digest = hashlib.sha256(frames.read(frame_index, name)).hexdigest()
-    except ValueError as error:
-        return [str(error)]
-    if digest == expected:
-        return []
-    return [f"{frames.where(frame_index, name)}: was changed, its hash is not the one on record"]

@@ -7,13 +7,13 @@ import io
 import os
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TextIO, cast
 
-# Headers of a tar archive are read one by one: little more than a header is fetched with each.
-_BLOCK_BYTES = 2**16
+# Streams are for tar archives, which are read from end to end: few requests, whose answers take longer than their way.
+_BLOCK_BYTES = 2**23
 
 
 class RemoteStorage:
@@ -40,13 +40,12 @@ class RemoteStorage:
 
     def is_there(self) -> bool:
         """Whether any object lies below the URL."""
-        with self._told("", "read"):
-            return bool(self._fs.exists(self._path("")))
+        return self._info("") is not None
 
     def exists(self, name: str) -> bool:
         """Whether there is an object of that name."""
-        with self._told(name, "read"):
-            return bool(self._fs.isfile(self._path(name)))
+        info = self._info(name)
+        return info is not None and info["type"] == "file"
 
     def leads_outside(self, name: str) -> bool:
         """There are no links."""
@@ -63,14 +62,9 @@ class RemoteStorage:
         with self._told(name, "read"):
             return bytes(self._fs.cat_file(self._path(name), **part))
 
-    @contextmanager
-    def open(self, name: str) -> Iterator[BinaryIO]:
-        """A stream that fetches what is read, in small blocks."""
-        with (
-            self._told(name, "read"),
-            self._fs.open(self._path(name), "rb", block_size=_BLOCK_BYTES, cache_type="bytes") as stream,
-        ):
-            yield stream
+    def open(self, name: str) -> AbstractContextManager[BinaryIO]:
+        """A stream that fetches what is read, in large blocks."""
+        return io.BufferedReader(_ObjectStream(self, name), _BLOCK_BYTES)
 
     @contextmanager
     def local_copy(self, name: str) -> Iterator[Path]:
@@ -102,9 +96,10 @@ class RemoteStorage:
         parts = (PurePosixPath(name).parts for name in self._find(folder))
         return sorted({names[depth] for names in parts if len(names) == depth + 2 and names[-1] == mark})
 
-    def leftovers(self, mark: str) -> list[str]:
-        """Objects of folders two deep, where one with the mark may have been begun, that lack it."""
-        deep = [name for name in self._find("") if len(PurePosixPath(name).parts) == 3]
+    def leftovers(self, folder: str, mark: str) -> list[str]:
+        """Objects directly in the folders of a folder, where the one with the mark is the last to come."""
+        depth = len(PurePosixPath(folder).parts)
+        deep = [name for name in self._find(folder) if len(PurePosixPath(name).parts) == depth + 2]
         whole = {str(PurePosixPath(name).parent) for name in deep if PurePosixPath(name).name == mark}
         return [name for name in deep if str(PurePosixPath(name).parent) not in whole]
 
@@ -123,12 +118,12 @@ class RemoteStorage:
 
     @contextmanager
     def write_large(self, name: str) -> Iterator[BinaryIO]:
-        """Bytes that wait in a temporary file until they are whole."""
-        with tempfile.NamedTemporaryFile(prefix="droguekit-") as stream:
+        """Bytes that wait in a temporary file until they are whole; it has no name, so that a kill leaves nothing."""
+        with tempfile.TemporaryFile() as stream:
             yield cast(BinaryIO, stream)
             stream.flush()
             with self._told(name, "written"):
-                self._fs.put_file(stream.name, self._path(name))
+                self._fs.put_file(f"/proc/self/fd/{stream.fileno()}", self._path(name))
 
     def spool(self, folder: str) -> TextIO:
         """A file without a name among the temporary ones."""
@@ -178,6 +173,19 @@ class RemoteStorage:
     def _path(self, name: str) -> str:
         return f"{self._root}/{name}".rstrip("/")
 
+    def _info(self, name: str) -> dict[str, Any] | None:
+        """What the store tells of an object or a folder, or None where there is neither.
+
+        Raises:
+            OSError: it cannot tell. That is no answer: what asks may be about to delete what it does not find.
+        """
+        with self._told(name, "read"):
+            try:
+                info: dict[str, Any] = self._fs.info(self._path(name))
+            except FileNotFoundError:
+                return None
+        return info
+
     def _find(self, folder: str) -> list[str]:
         """Names of all objects below a folder, sorted."""
         with self._told(folder, "read"):
@@ -204,6 +212,43 @@ class RemoteStorage:
             if isinstance(error, FileNotFoundError):
                 number = errno.EIO
             raise OSError(number, f"{self.where(name)}: cannot be {what}: {reason}") from error
+
+
+class _ObjectStream(io.RawIOBase):
+    """An object as a file; every read is a request."""
+
+    def __init__(self, storage: RemoteStorage, name: str) -> None:
+        """Look how large it is.
+
+        Raises:
+            FileNotFoundError: it is missing.
+        """
+        self._storage, self._name = storage, name
+        self._size, self._position = storage.size(name), 0
+
+    def readable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seekable(self) -> bool:
+        """Yes."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place, which is the next to be read."""
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
+        self._position = max(0, start + offset)
+        return self._position
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill a buffer, as far as the object goes."""
+        size = min(len(buffer), self._size - self._position)
+        if size <= 0:
+            return 0
+        data = self._storage.read(self._name, self._position, size)
+        buffer[: len(data)] = data
+        self._position += len(data)
+        return len(data)
 
 
 @cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tarfile
-from typing import IO, Annotated, Any, BinaryIO, Literal, NamedTuple, Self
+from typing import IO, Annotated, Any, BinaryIO, Literal, NamedTuple, Self, cast
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -22,6 +22,7 @@ from datasets_manifest.storage import Storage
 from drogue_models.presets import explain
 
 MAX_PAIRS_PER_TAR = 100_000
+_BLOCK_BYTES = 2**20
 
 
 class ShardLayout(FrozenModel):
@@ -116,14 +117,16 @@ def read_shard_index(storage: Storage, number: int) -> ShardIndex:
 
 
 def index_of_archive(stream: BinaryIO) -> ShardIndex:
-    """The list of a tar file, from the archive itself, which is hashed on the way.
+    """The list of a tar file, from the archive itself, which is read once from its beginning to its end.
 
     Raises:
         ValueError: it is no archive of frames, or damaged.
+        OSError: it cannot be read.
     """
     frames: dict[int, dict[str, PackedFile]] = {}
+    hashed = _HashedStream(stream)
     try:
-        with tarfile.open(fileobj=stream, mode="r:") as archive:
+        with tarfile.open(fileobj=cast(IO[bytes], hashed), mode="r|", bufsize=_BLOCK_BYTES) as archive:
             for member in archive:
                 key, _, name = member.name.partition(".")
                 data = archive.extractfile(member)
@@ -134,15 +137,32 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
                 files[name] = PackedFile(member.offset_data, member.size, digest)
     except tarfile.TarError as error:
         raise ValueError(f"is no whole tar file: {error}") from error
-    stream.seek(0)
-    sha256 = sha256_of(stream)
-    return ShardIndex(size=stream.tell(), sha256=sha256, frames=frames)
+    while hashed.read(_BLOCK_BYTES):
+        pass
+    try:
+        return ShardIndex(size=hashed.size, sha256=hashed.digest.hexdigest(), frames=frames)
+    except ValidationError as error:
+        raise ValueError(explain(error)) from error
+
+
+class _HashedStream:
+    """A stream that is read once, with the number of bytes that were read and their hash."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream, self.size, self.digest = stream, 0, hashlib.sha256()
+
+    def read(self, size: int) -> bytes:
+        """The next bytes, none at its end."""
+        block = self._stream.read(size)
+        self.size += len(block)
+        self.digest.update(block)
+        return block
 
 
 def sha256_of(stream: IO[bytes]) -> str:
     """Hash of what is left of a stream."""
     digest = hashlib.sha256()
-    while block := stream.read(2**20):
+    while block := stream.read(_BLOCK_BYTES):
         digest.update(block)
     return digest.hexdigest()
 

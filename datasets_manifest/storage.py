@@ -81,8 +81,8 @@ class Storage(Protocol):
         """Names of the folders in a folder that hold the file `mark`, sorted."""
         ...
 
-    def leftovers(self, mark: str) -> list[str]:
-        """Names of what killed runs have left half-written, sorted; folders of frames without `mark` among them."""
+    def leftovers(self, folder: str, mark: str) -> list[str]:
+        """Names of what killed runs left half-written, sorted; in folders of a folder `mark` tells what is whole."""
         ...
 
     def write(self, name: str, data: bytes) -> None:
@@ -115,10 +115,19 @@ class Storage(Protocol):
 
 
 def as_location(text: str) -> Location:
-    """What a user names: a URL stays one, and anything else is a folder."""
-    if text.startswith("file://"):
-        return Path(text.removeprefix("file://"))
-    return text.rstrip("/") if "://" in text else Path(text)
+    """What a user names: a URL stays one, and anything else is a folder.
+
+    Raises:
+        ValueError: a URL that names nothing.
+    """
+    scheme, slashes, name = text.partition("://")
+    if not slashes:
+        return Path(text)
+    if scheme == "file" and name:
+        return Path(name)
+    if not name.strip("/"):
+        raise ValueError(f"{text}: names no place; give {scheme}://NAME")
+    return text.rstrip("/")
 
 
 def open_storage(location: Location) -> Storage:

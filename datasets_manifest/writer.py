@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.images import Pixels, StereoImages
-from datasets_manifest.layout import RECORD_FILE, frame_name, image_file, is_plain_name, mosaic_file, parts_file
+from datasets_manifest.layout import (
+    FRAMES_FOLDER,
+    RECORD_FILE,
+    frame_name,
+    image_file,
+    is_plain_name,
+    mosaic_file,
+    parts_file,
+)
 from datasets_manifest.png import encode_png
 from datasets_manifest.records import PairRecord
 from datasets_manifest.storage import Location, open_storage
@@ -103,7 +111,7 @@ def remove_frame(dataset: Location, frame_index: int) -> None:
 def leftovers(dataset: Location) -> list[str]:
     """What runs that were killed have left half-written, sorted."""
     storage = open_storage(dataset)
-    return [storage.where(name) for name in storage.leftovers(RECORD_FILE)]
+    return [storage.where(name) for name in storage.leftovers(FRAMES_FOLDER, RECORD_FILE)]
 
 
 def remove_leftovers(dataset: Location) -> list[str]:
@@ -116,7 +124,7 @@ def remove_leftovers(dataset: Location) -> list[str]:
         OSError: something cannot be deleted; one line that names it.
     """
     storage = open_storage(dataset)
-    found = storage.leftovers(RECORD_FILE)
+    found = storage.leftovers(FRAMES_FOLDER, RECORD_FILE)
     for name in found:
         storage.delete(name)
     return [storage.where(name) for name in found]

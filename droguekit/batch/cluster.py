@@ -109,9 +109,10 @@ class ClusterTask:
         # The kernel's default for this signal ends the process, whatever hangs in it, by a clock that nobody sets.
         signal.setitimer(signal.ITIMER_REAL, self.timeout_s)
         try:
-            return Made(self.task(frame_index), worker.address, resident_gib())
+            report = self.task(frame_index)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
+        return Made(self.task.pack(frame_index, report), worker.address, resident_gib())
 
 
 def make_on_worker(pickled_task: bytes, frame_index: int) -> Made:

@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
@@ -75,11 +75,29 @@ class FrameTask:
             raise OSError(error.errno, f"frame {frame_index}: cannot be made: {where}: {error.strerror}") from error
         with _timed(stage_s, "write"):
             write_frame(self.dataset, record, files)
-            if self.packing is not None:
-                pack_if_complete(self.dataset, frame_index, self.packing)
         distance_m = record.conditions.distance_m
         size_bytes = sum(len(content) for content in files.values())
         return FrameReport(socket.gethostname(), time.monotonic() - began_s, stage_s, distance_m, size_bytes)
+
+    def pack(self, frame_index: int, report: FrameReport) -> FrameReport:
+        """Pack the tar file that a frame has made complete, if it has; apart, for it may take longer than a frame may.
+
+        Args:
+            frame_index: of the frame, which is made.
+            report: of it.
+
+        Returns:
+            The report with what this cost.
+
+        Raises:
+            OSError: the tar file could not be written; the frames stay as they are.
+        """
+        if self.packing is None:
+            return report
+        began_s, stage_s = time.monotonic(), dict(report.stage_s)
+        with _timed(stage_s, "write"):
+            pack_if_complete(self.dataset, frame_index, self.packing)
+        return replace(report, wall_s=report.wall_s + time.monotonic() - began_s, stage_s=stage_s)
 
 
 @dataclass(frozen=True)

@@ -139,10 +139,9 @@ def _copy(source: Dataset, frame_index: int, out: Location) -> int:
     Raises:
         ValueError: it is damaged.
     """
-    faults = source.verify(frame_index)
-    if faults:
-        raise ValueError(f"{faults[0]}; start the command of that shard again, which mends it, then merge")
-    record = source.record(frame_index)
-    files = {name: source.frames.read(frame_index, name) for name in record.file_sha256}
+    try:
+        record, files = source.whole_frame(frame_index)
+    except ValueError as error:
+        raise ValueError(f"{error}; start the command of that shard again, which mends it, then merge") from error
     write_frame(out, record, files)
     return sum(len(content) for content in files.values())

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from pydantic import ValidationError
-
 from datasets_manifest import layout
 from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.manifest import Manifest, build_manifest, read_manifest, write_manifest
-from datasets_manifest.packing import choose_packing, mend_shards, pack_all
+from datasets_manifest.packing import check_pairs_per_tar, choose_packing, mend_shards, pack_all
 from datasets_manifest.recipe import Recipe
 from datasets_manifest.records import PairRecord
 from datasets_manifest.shard_index import shard_numbers
@@ -44,8 +42,10 @@ def open_dataset(out: Location, recipe: Recipe, recipe_text: str, pairs_per_tar:
     """A dataset, new or to be completed, that nobody else writes into meanwhile.
 
     Frames that a manifest does not vouch for are removed, and so is what killed runs left half-written. A folder that
-    was new is removed again when the block ends with an error before it has a frame. On an object store nothing keeps
-    a second run away.
+    was new is removed again when the block ends with an error before it has a frame.
+
+    Nothing keeps two runs out of one place on an object store, and they damage each other's frames: give each its own
+    place and merge.
 
     Args:
         out: where it lies.
@@ -60,6 +60,7 @@ def open_dataset(out: Location, recipe: Recipe, recipe_text: str, pairs_per_tar:
         ValueError: the place holds something else, another recipe, or another run at work.
         OSError: it cannot be made or written.
     """
+    check_pairs_per_tar(pairs_per_tar)
     folder = open_storage(out).path("")
     with _open_place(out) if folder is None else _open_folder(folder) as events:
         remove_leftovers(out)
@@ -188,6 +189,7 @@ def sort_frames(dataset: Location, manifest: Manifest) -> Found:
 
     Raises:
         ValueError: whole frames were made by different engine versions, or a list of a tar file is damaged.
+        OSError: the connection to an object store fails, which says nothing of the frames.
     """
     vouched = {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
     whole: list[int] = []
@@ -209,7 +211,11 @@ def sort_frames(dataset: Location, manifest: Manifest) -> Found:
 
 
 def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) -> PairRecord | None:
-    """The record of a frame, or None where it or a file of the frame is not what was written."""
+    """The record of a frame, or None where it or a file of the frame is not what was written.
+
+    Raises:
+        OSError: the connection to an object store fails.
+    """
     try:
         data = store.read(frame_index, layout.RECORD_FILE)
         if record_sha256 not in (None, hashlib.sha256(data).hexdigest()):
@@ -218,6 +224,9 @@ def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) 
         for name, sha256 in record.file_sha256.items():
             if hashlib.sha256(store.read(frame_index, name)).hexdigest() != sha256:
                 return None
-    except (ValueError, ValidationError, RecursionError):
+    except (ValueError, RecursionError) as error:
+        cause = error.__cause__
+        if store.storage.is_remote and isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError):
+            raise cause from None
         return None
     return record

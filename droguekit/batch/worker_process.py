@@ -16,7 +16,7 @@ from typing import Any
 
 from droguekit.batch.machine import resident_gib
 
-READY = "ready"
+READY, UNTIMED = "ready", "untimed"
 _CONTEXT = multiprocessing.get_context("spawn")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -42,14 +42,20 @@ class TaskTimeoutError(OSError):
 class Worker:
     """A process that works on at most one task; nothing of it is shared with another one."""
 
-    def __init__(self, function: Callable[[int], Any]) -> None:
+    def __init__(self, function: Callable[[int], Any], then: Callable[[int, Any], Any] | None = None) -> None:
         """Start it; it says `READY` once it can take tasks.
+
+        Args:
+            function: of each index.
+            then: makes of an index and its value what is sent back; it says `UNTIMED` before.
 
         Raises:
             OSError: it cannot be started.
         """
         self.connection, there = _CONTEXT.Pipe()
-        self._process = _CONTEXT.Process(target=_serve, args=(there, function, os.getpid()), name="droguekit-worker")
+        self._process = _CONTEXT.Process(
+            target=_serve, args=(there, function, then, os.getpid()), name="droguekit-worker"
+        )
         with _one_thread():
             self._process.start()
         there.close()
@@ -57,11 +63,12 @@ class Worker:
         self.is_ready = False
         self.tasks_done = 0
         self.resident_gib = 0.0
+        self.is_timed = False
         self._began_s = 0.0
 
     def give(self, index: int) -> None:
         """Let it begin a task; that it is dead already shows when its answer is received."""
-        self.index = index
+        self.index, self.is_timed = index, True
         self._began_s = time.monotonic()
         with suppress(OSError):
             self.connection.send(index)
@@ -112,7 +119,12 @@ def _one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _serve(connection: Connection[Any, Any], function: Callable[[int], Any], parent: int) -> None:
+def _serve(
+    connection: Connection[Any, Any],
+    function: Callable[[int], Any],
+    then: Callable[[int, Any], Any] | None,
+    parent: int,
+) -> None:
     """The life of a worker: answers each index with (value, error, resident memory in GiB)."""
     # A group of its own: Ctrl-C at the terminal reaches the parent alone, and a kill reaches what an engine started.
     os.setpgid(0, 0)
@@ -127,8 +139,11 @@ def _serve(connection: Connection[Any, Any], function: Callable[[int], Any], par
         value, error = None, None
         try:
             value = function(index)
+            if then is not None:
+                connection.send(UNTIMED)
+                value = then(index, value)
         except Exception as raised:
-            error = _portable(raised)
+            value, error = None, _portable(raised)
         connection.send((value, error, resident_gib()))
 
 

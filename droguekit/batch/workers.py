@@ -11,7 +11,7 @@ from multiprocessing.connection import wait
 from typing import Any, Generic, TypeVar, cast
 
 from droguekit.batch.stop import StopRequest
-from droguekit.batch.worker_process import READY, TaskTimeoutError, Worker, WorkerDiedError
+from droguekit.batch.worker_process import READY, UNTIMED, TaskTimeoutError, Worker, WorkerDiedError
 
 T = TypeVar("T")
 
@@ -76,6 +76,7 @@ def run_tasks(
     workers: int,
     limits: Limits | None = None,
     stop: StopRequest | None = None,
+    then: Callable[[int, T], T] | None = None,
 ) -> Generator[Attempt[T], None, None]:
     """Run `function(index)` for every index in worker processes, and report each attempt as it ends.
 
@@ -88,6 +89,7 @@ def run_tasks(
         workers: number of processes; 0 runs in this process, for debugging, without limits.
         limits: what a worker may take.
         stop: once it is requested, no more tasks begin, and the iterator ends with those that are running.
+        then: follows on a task in the same process and has any time; makes of its index and value what is reported.
 
     Raises:
         OSError: worker processes cannot be started.
@@ -95,9 +97,9 @@ def run_tasks(
     if workers == 0:
         for index in indices:
             if stop is None or not stop.is_requested:
-                yield _attempt_here(function, index)
+                yield _attempt_here(function, then, index)
         return
-    crew = _Crew(function, deque(indices), workers, limits or Limits())
+    crew = _Crew[T](partial(Worker, function, then), deque(indices), workers, limits or Limits())
     try:
         while crew.fill(stop is not None and stop.is_requested):
             yield from crew.attempts(stop)
@@ -105,9 +107,10 @@ def run_tasks(
         crew.kill()
 
 
-def _attempt_here(function: Callable[[int], T], index: int) -> Attempt[T]:
+def _attempt_here(function: Callable[[int], T], then: Callable[[int, T], T] | None, index: int) -> Attempt[T]:
     try:
-        return Attempt(index, 1, function(index), None, final=True)
+        value = function(index)
+        return Attempt(index, 1, value if then is None else then(index, value), None, final=True)
     except Exception as error:
         return Attempt(index, 1, None, error, final=True)
 
@@ -115,8 +118,8 @@ def _attempt_here(function: Callable[[int], T], index: int) -> Attempt[T]:
 class _Crew(Generic[T]):
     """The workers of one run, the tasks that wait, and how often each task has failed."""
 
-    def __init__(self, function: Callable[[int], T], waiting: deque[int], size: int, limits: Limits) -> None:
-        self._function, self._waiting, self._size, self._limits = function, waiting, size, limits
+    def __init__(self, start: Callable[[], Worker], waiting: deque[int], size: int, limits: Limits) -> None:
+        self._start, self._waiting, self._size, self._limits = start, waiting, size, limits
         self._workers: list[Worker] = []
         self._failures: Counter[int] = Counter()
         self._deaths_at_start = 0
@@ -134,7 +137,7 @@ class _Crew(Generic[T]):
                 worker.give(self._waiting.popleft())
         starting = sum(not worker.is_ready for worker in self._workers)
         for _ in range(min(self._size - len(self._workers), len(self._waiting) - starting)):
-            self._workers.append(Worker(self._function))
+            self._workers.append(self._start())
         return bool(self._waiting) or any(worker.index is not None for worker in self._workers)
 
     def attempts(self, stop: StopRequest | None) -> Iterator[Attempt[T]]:
@@ -144,14 +147,15 @@ class _Crew(Generic[T]):
         if stop is not None and not stop.is_requested:
             awaited.append(stop.fileno())
         patience_s = None
-        if self._limits.timeout_s is not None and busy:
-            patience_s = max(0.0, min(worker.seconds_left(self._limits.timeout_s) for worker in busy))
+        timed = [worker for worker in busy if worker.is_timed]
+        if self._limits.timeout_s is not None and timed:
+            patience_s = max(0.0, min(worker.seconds_left(self._limits.timeout_s) for worker in timed))
         ready = wait(awaited, patience_s)
         if stop is not None and stop.fileno() in ready:
             stop.acknowledge(len(busy))
         for worker in [worker for worker in self._workers if worker.connection in ready]:
             yield from self._hear(worker)
-        for worker in [worker for worker in busy if worker in self._workers and worker.index is not None]:
+        for worker in [worker for worker in timed if worker in self._workers and worker.is_timed]:
             if self._limits.timeout_s is not None and worker.seconds_left(self._limits.timeout_s) <= 0:
                 yield self._fail(worker, TaskTimeoutError(self._limits.timeout_s))
 
@@ -168,12 +172,15 @@ class _Crew(Generic[T]):
             worker.is_ready = True
             self._deaths_at_start = 0
             return
+        if message == UNTIMED:
+            worker.is_timed = False
+            return
         value, raised, worker.resident_gib = message
         index = cast(int, worker.index)
         if is_accident(raised):
             yield self._fail(worker, raised)
             return
-        worker.index = None
+        worker.index, worker.is_timed = None, False
         worker.tasks_done += 1
         workers_gib = self._resident_gib()
         if worker.tasks_done >= self._limits.tasks_per_process or (

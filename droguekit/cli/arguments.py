@@ -2,17 +2,49 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from datasets_manifest.storage import as_location
+from datasets_manifest.storage import Location, as_location
+
+if TYPE_CHECKING:
+    Place = Location
+else:
+    # typer knows no unions, and prints the names of types.
+    Place = type("folder or URL", (), {})
+
+
+def local_path(text: str | None) -> Path | None:
+    """The callback of an option `--out` of type `Path`, which has `parser=str`: what it writes is no URL.
+
+    Raises:
+        ValueError: it is one, which would become the name of a folder.
+    """
+    if text is not None and "://" in text:
+        raise ValueError(f"--out: must be a folder or file of this machine, got {text}")
+    return None if text is None else Path(text)
+
+
+def places(texts: list[str]) -> list[Location]:
+    """The callback of an argument of type `list[Place]`, which has `parser=str`.
+
+    Raises:
+        ValueError: a URL that names nothing.
+    """
+    return [as_location(text) for text in texts]
+
 
 RecipeArgument = Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a shipped recipe, or a .toml file.")]
-# A `Location`: typer knows no unions.
 DatasetArgument = Annotated[
-    Any,
-    typer.Argument(metavar="DIR", parser=as_location, help="The dataset's folder, or a URL such as s3://BUCKET/NAME."),
+    Place,
+    typer.Argument(
+        metavar="DIR",
+        parser=str,
+        callback=as_location,
+        help="The dataset's folder, or a URL such as s3://BUCKET/NAME.",
+    ),
 ]
 TarOption = Annotated[
     int | None,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from datasets_manifest.storage import as_location
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import TarOption, human_size
+from droguekit.cli.arguments import Place, TarOption, human_size, places
 from droguekit.cli.main import FAULT
 
 EXAMPLES = ("droguekit merge data/demo data/demo-0 data/demo-1",)
@@ -16,12 +16,16 @@ EXAMPLES = ("droguekit merge data/demo data/demo-0 data/demo-1",)
 
 def merge(
     out: Annotated[
-        Any,
-        typer.Argument(metavar="OUT", parser=as_location, help="The dataset's folder, made if missing, or a URL."),
+        Place,
+        typer.Argument(
+            metavar="OUT", parser=str, callback=as_location, help="The dataset's folder, made if missing, or a URL."
+        ),
     ],
     shards: Annotated[
-        list[Any],
-        typer.Argument(metavar="SHARD...", parser=as_location, help="Folders or URLs that `render --shard` made."),
+        list[Place],
+        typer.Argument(
+            metavar="SHARD...", parser=str, callback=places, help="Folders or URLs that `render --shard` made."
+        ),
     ],
     tar: TarOption = None,
 ) -> None:

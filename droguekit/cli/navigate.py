@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, DetectorOption
+from droguekit.cli.arguments import DatasetArgument, DetectorOption, local_path
 from droguekit.cli.pipelines import navigate_dataset
 
 EXAMPLES = (
@@ -21,7 +21,10 @@ EXAMPLES = (
 
 def navigate(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.jsonl", help="Gets one estimate a line.")],
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE.jsonl", parser=str, callback=local_path, help="Gets one estimate a line."),
+    ],
     method: Annotated[
         list[str] | None, typer.Option("--method", metavar="NAME", help="May be repeated; all methods unless given.")
     ] = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from droguekit.cli.arguments import DatasetArgument
+from droguekit.cli.arguments import DatasetArgument, local_path
 
 if TYPE_CHECKING:
     from datasets_manifest.reader import Dataset
@@ -25,7 +25,10 @@ _COLUMNS, _TILE_WIDTH_PX = 4, 400
 
 def preview(
     dataset: DatasetArgument,
-    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="A .png or .jpg file.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", parser=str, callback=local_path, help="A .png or .jpg file."),
+    ] = None,
     count: Annotated[
         int | None,
         typer.Option("--count", help="How many pairs, spread evenly; 20, or 150 of an animation.", show_default=False),

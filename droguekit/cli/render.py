@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -10,6 +10,7 @@ from datasets_manifest.storage import as_location
 from droguekit.batch.progress import duration, progress_report
 from droguekit.cli.arguments import (
     EngineOption,
+    Place,
     RecipeArgument,
     SeedOption,
     TarOption,
@@ -33,11 +34,12 @@ EXAMPLES = (
 def render(
     recipe: RecipeArgument,
     out: Annotated[
-        Any,
+        Place,
         typer.Option(
             "--out",
             metavar="DIR",
-            parser=as_location,
+            parser=str,
+            callback=as_location,
             help="The dataset's folder, made if missing, or a URL such as s3://BUCKET/NAME.",
         ),
     ],

@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import WorkersOption
+from droguekit.cli.arguments import WorkersOption, local_path
 from droguekit.cli.training_pipeline import TrainingOrder, train_detector
 
 EXAMPLES = (
     "droguekit train detector-small --out out/detector   (renders the recipe first)",
     "droguekit train data/mine data/more --out out/mine --variant s --image-passes 20000 --size 320x416",
-    "droguekit train data/mine --out out/mine --size 320x416 --final-size 480x640   (large images in the last third)",
+    "droguekit train data/mine --out out/mine --size 320x416 --final-size 480x640   (large images in the last half)",
     "droguekit train data/mine --out out/mine --settings mine.toml   (learning rate, batch, seed and so on)",
 )
 
@@ -27,7 +27,12 @@ def train(
             help="Datasets' folders or URLs, and recipes, shipped or .toml, which are rendered into OUT/datasets.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The training's folder; made if missing.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", metavar="DIR", parser=str, callback=local_path, help="The training's folder; made if missing."
+        ),
+    ],
     variant: Annotated[Literal["l", "s"] | None, typer.Option("--variant", help="Large or small network.")] = None,
     attention: Annotated[
         Literal["eca", "se"] | None, typer.Option("--attention", help="Attention to channels.")
@@ -49,7 +54,7 @@ def train(
         str | None, typer.Option("--size", metavar="HxW", help="The network's input, multiples of 32; 480x640.")
     ] = None,
     final_size: Annotated[
-        str | None, typer.Option("--final-size", metavar="HxW", help="The same in the last third of the training.")
+        str | None, typer.Option("--final-size", metavar="HxW", help="The same in the last half of the training.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of weights and augmentation; 0.")] = None,
     device: Annotated[Literal["cpu", "cuda"] | None, typer.Option("--device", help="Where to compute; cpu.")] = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -10,9 +11,11 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from moto.server import ThreadedMotoServer
+from s3fs import S3FileSystem
 
 from datasets_manifest import layout
 from datasets_manifest.frame_store import FrameStore, frames_there
@@ -69,6 +72,14 @@ def local(tmp_path_factory: pytest.TempPathFactory, text: str, make: Make) -> Pa
     return out
 
 
+@pytest.fixture(scope="module")
+def local_tars(tmp_path_factory: pytest.TempPathFactory, text: str, make: Make) -> Path:
+    """The same in tar files of two pairs."""
+    out = tmp_path_factory.mktemp("local-tars") / "dataset"
+    make(out, workers=Spread(0, pairs_per_tar=2), text=text)
+    return out
+
+
 def contents(dataset: Path | str) -> dict[str, bytes]:
     """All files that a dataset is made of; frames by their index, however they lie."""
     storage, store = open_storage(dataset), FrameStore(dataset)
@@ -76,16 +87,13 @@ def contents(dataset: Path | str) -> dict[str, bytes]:
     # How the frames lie is told by these.
     telling = (layout.FRAMES_FOLDER, layout.SHARDS_FOLDER, layout.CROISSANT_FILE)
     files = {name: storage.read(name) for name in others if not name.startswith(telling)}
-    if store.pairs_per_tar is not None:
-        # The hashes of these stand in it.
-        assert json.loads(storage.read(layout.CROISSANT_FILE))["distribution"]
     frames = {f"{i}/{name}": store.read(i, name) for i in store.indices() for name in store.names(i)}
     return {**files, **frames}
 
 
 @pytest.mark.parametrize("pairs_per_tar", [None, 2])
 def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
-    place: str, pairs_per_tar: int | None, text: str, local: Path, make: Make
+    place: str, pairs_per_tar: int | None, text: str, local: Path, local_tars: Path, make: Make
 ) -> None:
     spread = Spread(0, pairs_per_tar=pairs_per_tar)
     first = make(place, range(1, 4), spread, text)
@@ -103,6 +111,9 @@ def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
     assert leftovers(place) == []
     tars = storage.files_ending(".tar")
     assert tars == ([] if pairs_per_tar is None else [f"shards/00000{number}.tar" for number in range(3)])
+    there = open_storage(local if pairs_per_tar is None else local_tars)
+    for name in (layout.CROISSANT_FILE, *tars, *(f"shards/{name}" for name in there.names(layout.SHARDS_FOLDER))):
+        assert storage.read(name) == there.read(name), name
     assert (storage.names("frames") == []) == (pairs_per_tar is not None)
     events = [json.loads(line)["event"] for line in storage.read(layout.EVENTS_FILE).splitlines()]
     assert events.count("start") == events.count("end") == 2 and events.count("frame") == 3 + len(summary.totals.made)
@@ -178,17 +189,78 @@ def test_a_run_that_is_killed_with_all_its_processes_goes_on(
     recipe.write_text(text)
     options = ["--out", place, "--workers", "1", "--tar", "2"]
     command = [sys.executable, "-m", "droguekit.cli.main", "render", str(recipe), *options]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment) as process:
         storage = open_storage(place)
         while not (storage.names(layout.SHARDS_FOLDER)[1:] or storage.folders_with("frames", layout.RECORD_FILE)):
-            assert process.poll() is None
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(0.02)
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         for victim in (process.pid, *map(int, children)):
             os.kill(victim, signal.SIGKILL)
+    assert [*temporary.iterdir()] == []
     summary = make(place, workers=0, text=text)
     assert summary.kept + len(summary.totals.made) == 5 and summary.kept >= 1
     assert contents(place) == contents(local)
     assert leftovers(place) == []
+
+
+class Trouble:
+    """What s3fs makes of a store that answers some requests with an error, after all its attempts."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._call = S3FileSystem._call_s3
+        self._refused = lambda method, key: False
+        patch.setattr(
+            S3FileSystem, "_call_s3", lambda system, *words, **options: self._answer(system, *words, **options)
+        )
+
+    def refuse(self, refused: Callable[[str, str], bool]) -> None:
+        """Let requests fail by their method and object."""
+        self._refused = refused
+
+    async def _answer(self, system: S3FileSystem, method: str, *words: Any, **options: Any) -> Any:
+        if self._refused(method, options.get("Key", "")):
+            raise OSError(errno.EBUSY, "Please reduce your request rate.")
+        return await self._call(system, method, *words, **options)
+
+
+def test_a_store_that_does_not_answer_has_not_said_that_anything_is_missing(
+    place: str, text: str, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(place, range(2), 0, text)
+    storage = open_storage(place)
+    before = {name: storage.read(name) for name in storage.files_ending("") if name != layout.EVENTS_FILE}
+    trouble = Trouble(monkeypatch)
+    for refused in (
+        lambda method, key: method == "head_object" and key.endswith(layout.MANIFEST_FILE),
+        lambda method, key: method == "get_object" and key.endswith("000001/left.png"),
+        lambda method, key: method == "get_object" and key.endswith("000001/record.json"),
+    ):
+        trouble.refuse(refused)
+        with pytest.raises(OSError, match=f"{place}/.*: cannot be read: .*reduce your request rate"):
+            make(place, range(2), 0, text)
+    trouble.refuse(lambda method, key: method == "head_object")
+    with pytest.raises(OSError, match="reduce your request rate"):
+        storage.is_there()
+    trouble.refuse(lambda method, key: False)
+    assert {name: storage.read(name) for name in before} == before
+    assert (summary := make(place, range(2), 0, text)).kept == 2 and not summary.totals.made
+
+
+@pytest.mark.slow
+def test_a_large_object_is_sent_in_parts(place: str) -> None:
+    storage = open_storage(place)
+    # s3fs sends less than 100 MiB, twice the size of a part, in one request.
+    block = bytes(range(256)) * 2**12
+    with storage.write_large("large") as stream:
+        for _ in range(101):
+            stream.write(block)
+    assert storage.size("large") == 101 * len(block)
+    with storage.open("large") as stream:
+        assert all(stream.read(len(block)) == block for _ in range(101)) and stream.read() == b""
 
 
 @pytest.mark.slow
@@ -241,15 +313,27 @@ def test_a_lost_connection_ends_the_run_in_one_line_and_finished_frames_stay(
 
 
 def test_places_that_cannot_be_used_are_one_clear_line(
-    server: ThreadedMotoServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    server: ThreadedMotoServer, local: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for words, message in (
         (["validate", "s3://nowhere/x"], "s3://nowhere/x: there is no such dataset"),
         (["validate", f"s3://{BUCKET}/nothing"], f"s3://{BUCKET}/nothing: there is no such dataset"),
         (["render", "smoke", "--out", "s3://nowhere/x"], "cannot be written: The specified bucket does not exist"),
         (["render", "smoke", "--out", "memory://x"], "is the memory of one process; give --workers 0"),
+        (["render", "smoke", "--out", f"s3://{BUCKET}/none", "--tar", "0"], "--tar: must be from 1 to 100000 pairs"),
+        (["merge", f"s3://{BUCKET}/none", str(local), "--tar", "100001"], "--tar: must be from 1 to 100000 pairs"),
+        (["validate", "s3:///"], "s3:///: names no place; give s3://NAME"),
+        (["merge", f"s3://{BUCKET}/none", "memory://"], "memory://: names no place; give memory://NAME"),
+        (
+            ["navigate", str(local), "--out", "s3://b/x"],
+            "--out: must be a folder or file of this machine, got s3://b/x",
+        ),
+        (["export", str(local), "--format", "coco", "--out", "s3://b/x"], "--out: must be a folder or file of this"),
+        (["import", "x", "--out", "s3://b/x"], "--out: must be a folder or file of this machine, got s3://b/x"),
+        (["train", "smoke", "--out", "s3://b/x"], "--out: must be a folder or file of this machine, got s3://b/x"),
         (["render", "smoke", "--out", "s4://b/x"], "s4://b/x: is no place that can be used: Protocol not known: s4"),
     ):
         assert run([*words, *(["--engine", "analytic"] if words[0] == "render" else [])]) == WRONG_INPUT
         told = capsys.readouterr().err
         assert message in told and told.count("\n") == 1
+    assert not open_storage(f"s3://{BUCKET}/none").is_there()

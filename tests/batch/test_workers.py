@@ -13,7 +13,7 @@ from types import ModuleType
 import pytest
 
 from droguekit.batch.machine import available_cores, available_memory_gib, default_workers
-from droguekit.batch.worker_process import TaskTimeoutError, WorkerDiedError
+from droguekit.batch.worker_process import READY, UNTIMED, TaskTimeoutError, Worker, WorkerDiedError
 from droguekit.batch.workers import MAX_ATTEMPTS, Limits, run_alone, run_tasks
 
 # Workers are fresh processes: what they run must be importable there, which a test module is not.
@@ -53,6 +53,12 @@ def grow(index):
     return os.getpid()
 
 held = []
+
+def add(amount, index, value):
+    return value + amount
+
+def refuse_after(index, value):
+    raise ValueError(f"{value} is refused")
 
 def hang(index):
     # A C function that holds Python's lock: no signal handler and no thread of this process ever runs again.
@@ -113,6 +119,29 @@ def test_an_error_is_reported_and_not_tried_again(tasks: ModuleType, workers: in
     error = next(attempt.error for attempt in attempts if attempt.index == 1)
     assert isinstance(error, ValueError)
     assert str(error) == "index: 1 is refused"
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_what_follows_on_a_task_makes_its_value_and_its_error(tasks: ModuleType, workers: int) -> None:
+    attempts = [*run_tasks(tasks.square, range(3), workers, then=partial(tasks.add, 10))]
+    assert {attempt.index: attempt.value for attempt in attempts} == {0: 10, 1: 11, 2: 14}
+    (attempt,) = run_tasks(tasks.square, [2], workers, then=tasks.refuse_after)
+    assert attempt.value is None and str(attempt.error) == "4 is refused" and attempt.final
+
+
+def test_the_time_of_a_task_ends_before_what_follows_on_it(tasks: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    worker = Worker(tasks.square, partial(tasks.add, 10))
+    try:
+        assert worker.receive() == READY
+        worker.give(3)
+        assert worker.receive() == UNTIMED
+        assert worker.receive()[0] == 19
+    finally:
+        worker.kill()
+    # As if the time were over as soon as the task is.
+    monkeypatch.setattr(Worker, "seconds_left", lambda worker, timeout_s: timeout_s if worker.is_timed else -1.0)
+    attempts = [*run_tasks(tasks.square, range(4), 2, Limits(timeout_s=600.0), then=partial(tasks.add, 10))]
+    assert sorted(attempt.value or 0 for attempt in attempts) == [10, 11, 14, 19]
 
 
 def test_workers_get_one_thread_each_and_this_process_keeps_its_own(

@@ -7,6 +7,8 @@ import os
 import shutil
 import signal
 import tarfile
+import uuid
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -18,7 +20,8 @@ from datasets_manifest.layout import frame_folder
 from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
 from datasets_manifest.packing import Packing, choose_packing, mend_shards, pack_all, pack_if_complete
 from datasets_manifest.reader import Dataset
-from datasets_manifest.writer import leftovers, remove_leftovers
+from datasets_manifest.storage import open_storage
+from datasets_manifest.writer import leftovers, remove_frame, remove_leftovers
 
 FRAMES = (0, 1, 2, 3, 4, 6)
 
@@ -216,12 +219,57 @@ def test_a_spoilt_list_is_one_clear_line(staged, spoil, message):
     assert (Dataset(staged).images(3).left == Dataset(staged).images(3).left).all()
 
 
-def test_an_archive_that_is_none_is_named(staged):
-    pack_all(staged)
-    (staged / "shards/000001.json").unlink()
-    (staged / "shards/000001.tar").write_bytes(b"no archive" * 100)
-    with pytest.raises(ValueError, match=r"000001\.tar: is no whole tar file: .*; delete it"):
-        mend_shards(staged)
+@pytest.fixture(params=["folder", "memory"])
+def place(request, tmp_path):
+    """A place of each kind where frames come into tar files of two."""
+    place = tmp_path / "place" if request.param == "folder" else f"memory://{uuid.uuid4().hex}"
+    choose_packing(place, 2)
+    return place
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda data: b"no archive" * 100, "is no whole tar file: "),
+        (lambda data: data[: len(data) // 2], "is no whole tar file: "),
+        (lambda data: data.replace(b"000000.record.json", b"000000.rec0rd.json"), ""),
+        (lambda data: data.replace(b"000000.", b"xxxxxx."), ""),
+    ],
+)
+def test_an_archive_that_is_none_is_named(place, maker, spoil, message):
+    make_recipe, _, _, _, add_frame = maker
+    add_frame(place, make_recipe(), 0)
+    pack_all(place)
+    storage = open_storage(place)
+    storage.delete("shards/000000.json")
+    storage.write("shards/000000.tar", spoil(storage.read("shards/000000.tar")))
+    with pytest.raises(ValueError, match=rf"000000\.tar: {message}.*; delete it") as caught:
+        mend_shards(place)
+    assert "\n" not in str(caught.value)
+
+
+def test_archives_of_a_store_are_packed_listed_and_mended_as_on_disk(place, maker):
+    make_recipe, _, _, _, add_frame = maker
+    for index in range(3):
+        add_frame(place, make_recipe(), index)
+    before = contents(place)
+    pack_if_complete(place, 1, Packing(2, range(4)))
+    pack_all(place)
+    storage = open_storage(place)
+    assert FrameStore(place).staged == frozenset() and contents(place) == before
+    lists = [storage.read(f"shards/{name}") for name in storage.names("shards")]
+    storage.delete("shards/000000.json")
+    mend_shards(place)
+    assert [storage.read(f"shards/{name}") for name in storage.names("shards")] == lists
+    # A folder that a killed run has left beside the archive, one made since, and a damaged one.
+    for index in (0, 2, 3):
+        add_frame(place, make_recipe(), index)
+    storage.write("frames/000000/left.png", b"")
+    before |= {(3, name): FrameStore(place).read(3, name) for name in FrameStore(place).names(3)}
+    pack_all(place)
+    assert FrameStore(place).staged == {0}
+    remove_frame(place, 0)
+    assert contents(place) == before
 
 
 def test_a_list_is_made_again_from_its_archive(staged):
@@ -232,6 +280,17 @@ def test_a_list_is_made_again_from_its_archive(staged):
         frames_there(staged)
     mend_shards(staged)
     assert shards(staged) == before
+
+
+def test_threads_read_one_store_while_lists_come_and_go(staged, monkeypatch):
+    wanted = contents(staged)
+    pack_all(staged)
+    monkeypatch.setattr("datasets_manifest.frame_store._LISTS_KEPT", 1)
+    store = FrameStore(staged)
+    places = [*wanted] * 20
+    with ThreadPoolExecutor(16) as threads:
+        assert [*threads.map(lambda place: store.read(*place), places)] == [wanted[place] for place in places]
+    assert len(store._shards) == 1
 
 
 def test_reads_stay_within_the_list(staged):

@@ -11,7 +11,7 @@ from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
 from datasets_manifest.reader import Dataset
 from datasets_manifest.storage import absolute, as_location, in_order, join, open_storage
-from datasets_manifest.writer import encode_files, leftovers, remove_frame, remove_leftovers, write_frame
+from datasets_manifest.writer import encode_files, encode_record, leftovers, remove_frame, remove_leftovers, write_frame
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -89,6 +89,28 @@ def test_objects_of_a_frame_without_its_record_are_leftovers(maker):
     assert FrameStore(place).indices() == []
 
 
+def test_what_other_people_keep_in_a_dataset_is_no_leftover(place, maker):
+    make_recipe, _, _, _, add_frame = maker
+    add_frame(place, make_recipe(), 0)
+    others = ["even/shards/000000.tar", "even/annotations/all.json", "bags/flight-0/x.mcap", "frames/notes.txt"]
+    for name in others:
+        open_storage(place).write(name, b"mine")
+    assert leftovers(place) == remove_leftovers(place) == []
+    assert all(open_storage(place).read(name) == b"mine" for name in others)
+
+
+def test_what_a_caller_does_wrong_with_a_stream_stays_the_callers_error(place):
+    storage = open_storage(place)
+    storage.write("a", bytes(range(256)) * 4)
+    with pytest.raises(ValueError, match="mine"), storage.open("a"):
+        raise ValueError("mine")
+    with storage.open("a") as stream:
+        assert stream.seek(-6, 2) == 1018 and stream.read() == bytes(range(250, 256)) and stream.read(1) == b""
+        assert stream.seek(2) == 2 and stream.read(3) == b"\2\3\4" and stream.tell() == 5
+    with pytest.raises(FileNotFoundError), storage.open("b") as stream:
+        stream.read()
+
+
 def test_a_dataset_reads_the_same_from_both(place, maker):
     make_recipe, make_images, make_parts, make_record, _ = maker
     recipe = make_recipe()
@@ -109,10 +131,40 @@ def test_a_dataset_reads_the_same_from_both(place, maker):
         dataset.images(2)
 
 
+def test_a_frame_is_handed_on_as_it_is_on_record_or_not_at_all(place, maker):
+    make_recipe, make_images, make_parts, make_record, _ = maker
+    recipe = make_recipe()
+    files = encode_files(make_images(recipe, 0), make_parts(recipe, 0))
+    record = write_frame(place, make_record(recipe, 0), files)
+    write_manifest(place, build_manifest(place, recipe, "1", lambda _: "train"))
+    found, data = Dataset(place).whole_frame(0)
+    assert (encode_record(found), data) == (encode_record(record), files)
+    storage = open_storage(place)
+    for name in ("right.png", "record.json"):
+        whole = storage.read(f"frames/000000/{name}")
+        storage.write(f"frames/000000/{name}", whole + b" ")
+        with pytest.raises(ValueError, match=rf"frames/000000/{name}: was changed, its hash is not the one on record"):
+            Dataset(place).whole_frame(0)
+        storage.write(f"frames/000000/{name}", whole)
+
+
+def test_a_link_that_leads_to_itself_is_one_clear_line(tmp_path, maker):
+    make_recipe, _, _, _, add_frame = maker
+    add_frame(tmp_path, make_recipe(), 0)
+    image = tmp_path / "frames/000000/left.png"
+    image.unlink()
+    image.symlink_to("left.png")
+    with pytest.raises(ValueError, match=r"left\.png: (cannot be read|leads outside)"):
+        FrameStore(tmp_path).read(0, "left.png")
+
+
 def test_places_by_their_names(tmp_path, monkeypatch):
     assert as_location("s3://bucket/name/") == "s3://bucket/name"
     assert as_location("data/demo") == as_location("data/demo/") and join("s3://b/n", "x") == "s3://b/n/x"
     assert as_location(f"file://{tmp_path}") == tmp_path
+    for nothing in ("s3://", "s3:///", "memory://", "file://"):
+        with pytest.raises(ValueError, match=f"{nothing}: names no place; give {nothing.rstrip('/')}//NAME"):
+            as_location(nothing)
     monkeypatch.chdir(tmp_path)
     assert absolute("data") == tmp_path / "data" and absolute("s3://b/n") == "s3://b/n"
 
