@@ -20,7 +20,7 @@ demo: ## render a small dataset, navigate on it blind, and report how accurate t
 
 test: setup lint ## linters, types and the fast tests
 	@echo "test: pytest, the fast tests"
-	@$(BIN)/python -m pytest -m "not slow"
+	@$(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile
 
 test-slow: setup ## the tests that render for longer
 	@echo "test-slow: pytest, the slow tests"
