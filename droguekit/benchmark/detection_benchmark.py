@@ -7,9 +7,9 @@ from importlib.metadata import version
 from typing import NamedTuple
 
 from droguekit.benchmark.detection_boxes import FoundBox
-from droguekit.benchmark.detection_matching import AveragePrecision, Evaluation
+from droguekit.benchmark.detection_matching import Evaluation
 from droguekit.benchmark.detection_result import DetectionDataset, DetectionResult, PairTimes
-from droguekit.benchmark.detection_scores import Threshold, default_split, images_of_split, score_detector
+from droguekit.benchmark.detection_scores import Threshold, images_of_split, score_detector, split_to_score
 from droguekit.benchmark.detection_truth import LEAST_SEEN_FRACTION, DetectionTruth, ImageTruth
 from droguekit.benchmark.statistics import CONFIDENCE
 
@@ -21,12 +21,13 @@ class DetectorRun(NamedTuple):
         boxes: in all images.
         times: that it took, where it was run just now.
         score_threshold: that the detector asks for itself, or None.
-        gflops_per_image: of its network, where they could be counted.
+        parameters, gflops_per_image: of its network, where they could be counted.
     """
 
     boxes: Sequence[FoundBox]
     times: PairTimes | None = None
     score_threshold: float | None = None
+    parameters: int | None = None
     gflops_per_image: float | None = None
 
 
@@ -36,11 +37,6 @@ class ScoredDetections(NamedTuple):
     result: DetectionResult
     evaluations: Mapping[str, Evaluation]
     images: Sequence[ImageTruth]
-
-
-def average_precision(images: Sequence[ImageTruth], found: Sequence[FoundBox]) -> AveragePrecision:
-    """Average precision of boxes on some images, by pycocotools: what a training looks at after an epoch."""
-    return Evaluation(images, found).average_precision(images)
 
 
 def score_detections(
@@ -60,7 +56,7 @@ def score_detections(
     Raises:
         ValueError: no image of that split, or none that shows a drogue.
     """
-    chosen_split = default_split(truth.images) if split is None else split
+    chosen_split = split_to_score(truth.images, split)
     chosen = images_of_split(truth.images, chosen_split)
     evaluations = {name: Evaluation(truth.images, run.boxes) for name, run in runs.items()}
     result = DetectionResult(
@@ -78,7 +74,11 @@ def score_detections(
         least_seen_fraction=LEAST_SEEN_FRACTION,
         detectors={
             name: score_detector(evaluations[name], truth.images, chosen_split, _asked(threshold, run)).model_copy(
-                update={"times": run.times, "gflops_per_image": run.gflops_per_image}
+                update={
+                    "times": run.times,
+                    "parameters": run.parameters,
+                    "gflops_per_image": run.gflops_per_image,
+                }
             )
             for name, run in runs.items()
         },

@@ -56,14 +56,15 @@ def center_box(box_xywh: PixelBox) -> PixelBox:
 
 
 def clipped_box(box_xywh: PixelBox, size_px: tuple[int, int]) -> PixelBox | None:
-    """The part of a corner-counted box that lies on the image, or None where nothing does."""
+    """The part of a corner-counted box that lies on the image, or None where a file would hold nothing of it."""
     lows = [min(max(low, 0.0), float(size)) for low, size in zip(box_xywh[:2], size_px, strict=True)]
     highs = [
         min(max(low + extent, 0.0), float(size))
         for low, extent, size in zip(box_xywh[:2], box_xywh[2:], size_px, strict=True)
     ]
     width, height = highs[0] - lows[0], highs[1] - lows[1]
-    return (lows[0], lows[1], width, height) if width > 0 and height > 0 else None
+    # What is written must not be rounded to a box without an area.
+    return (lows[0], lows[1], width, height) if min(width, height) >= 10**-_BOX_DECIMALS else None
 
 
 def write_detections(path: Path, boxes: Iterable[FoundBox]) -> int:
@@ -114,7 +115,7 @@ def read_detections(path: Path, image_ids: Collection[int]) -> list[FoundBox]:
     for place, entry in enumerate(table):
         try:
             boxes.append(_found_box(entry, known))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             reason = f"has no {error}" if isinstance(error, KeyError) else str(error)
             raise ValueError(f"{path}: result {place}: {reason}") from error
     return boxes

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from droguekit.benchmark.detection_matching import AT_50, RECALLS, Matches
+from droguekit.benchmark.detection_matching import AT_50, Matches
 from geometry.se3 import Array
 
 
@@ -40,24 +40,26 @@ class PrecisionRecallCurve(NamedTuple):
 
 def precision_recall(matches: Matches) -> PrecisionRecallCurve:
     """The curve of all boxes; empty without boxes or without drogues."""
-    count = len(matches.score)
-    if not count or not matches.drogues:
+    if not matches.drogues:
         return PrecisionRecallCurve(np.zeros(0), np.zeros(0), np.zeros(0))
-    # Boxes of equal score pass a threshold together.
-    last = np.flatnonzero(np.append(np.diff(matches.score) != 0, True))
-    true = np.cumsum(matches.is_true[AT_50])[last]
-    return PrecisionRecallCurve(matches.score[last], true / (last + 1), true / matches.drogues)
+    threshold, boxes, true = _passing(matches)
+    return PrecisionRecallCurve(threshold, true / boxes, true / matches.drogues)
 
 
 def best_f1(matches: Matches) -> OperatingPoint | None:
-    """The threshold with the highest F1, the highest among equals; None where no box is right."""
-    curve = precision_recall(matches)
-    if not curve.recall.any():
+    """The threshold with the highest F1, midway to the next lower score or to 0; None where no box is right.
+
+    Of equally good ones it is the lowest: what more it lets through is half right. A training chooses the threshold of
+    its network by the same rule, of the best box of each image.
+    """
+    threshold, boxes, true = _passing(matches)
+    if not true.any():
         return None
-    total = curve.precision + curve.recall
-    f1 = np.where(total > 0, 2 * curve.precision * curve.recall / np.where(total > 0, total, 1), 0.0)
-    best = int(np.argmax(f1))
-    return operating_point(matches, float(curve.threshold[best]))
+    f1 = 2 * true / (boxes + matches.drogues)
+    best = int(len(f1) - 1 - np.argmax(f1[::-1]))
+    # Files of others may have scores below 0.
+    below = float(threshold[best + 1]) if best + 1 < len(f1) else min(0.0, float(threshold[best]))
+    return operating_point(matches, (float(threshold[best]) + below) / 2)
 
 
 def operating_point(matches: Matches, threshold: float) -> OperatingPoint:
@@ -73,12 +75,8 @@ def operating_point(matches: Matches, threshold: float) -> OperatingPoint:
     return OperatingPoint(threshold, precision, recall, f1)
 
 
-def interpolated_precision(curve: PrecisionRecallCurve) -> Array:
-    """(101,) the highest precision at each of COCO's recalls or more; 0 where that recall is not reached."""
-    precision = np.zeros(len(RECALLS))
-    if len(curve.recall):
-        envelope = np.maximum.accumulate(curve.precision[::-1])[::-1]
-        place = np.searchsorted(curve.recall, RECALLS, side="left")
-        reached = place < len(envelope)
-        precision[reached] = envelope[place[reached]]
-    return precision
+def _passing(matches: Matches) -> tuple[Array, Array, Array]:
+    """(m,) scores, highest first, and how many boxes have at least each of them, all and right ones."""
+    # Boxes of equal score pass a threshold together.
+    last = np.flatnonzero(np.append(np.diff(matches.score) != 0, True)[: len(matches.score)])
+    return matches.score[last], last + 1.0, np.cumsum(matches.is_true[AT_50])[last].astype(np.float64)

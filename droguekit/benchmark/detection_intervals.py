@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.sparse import csr_matrix
 
 from droguekit.benchmark.detection_matching import RECALLS, Matches
 from droguekit.benchmark.statistics import CONFIDENCE, RESAMPLES, Interval, keyed_generator
@@ -27,7 +27,8 @@ def average_precision_interval(matches: Matches, overlaps: tuple[int, ...], key:
         key: of the random stream.
 
     Returns:
-        None with fewer than two scenes that show a drogue.
+        None with fewer than two scenes that show a drogue, or where all resamples are alike, as without a single fault:
+        scenes drawn again cannot tell how rare a fault is that none of them shows.
 
     Source: B. Efron, Ann. Statist. 7 (1979) 1, doi:10.1214/aos/1176344552; 1000 resamples of scenes.
     """
@@ -40,7 +41,7 @@ def average_precision_interval(matches: Matches, overlaps: tuple[int, ...], key:
     drawn = times[times @ drogues > 0]
     values = np.mean([resampled_precision(matches, overlap, drawn) for overlap in overlaps], axis=0)
     low, high = np.percentile(values, (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)))
-    return float(low), float(high)
+    return (float(low), float(high)) if low < high else None
 
 
 def resampled_precision(matches: Matches, overlap: int, times: Counts) -> Array:
@@ -59,16 +60,18 @@ def resampled_precision(matches: Matches, overlap: int, times: Counts) -> Array:
     places = np.flatnonzero(true)
     if not len(places):
         return np.zeros(len(times))
-    of_scene = np.zeros((times.shape[1], places[-1] + 1))
-    of_scene[scene[matches.image[: places[-1] + 1]], np.arange(places[-1] + 1)] = 1
-    # Precision falls between true boxes: only what it is at each of them counts.
-    all_boxes = np.cumsum(of_scene, axis=1)[:, places]
-    true_boxes = np.cumsum(of_scene[:, places], axis=1)
+    scene_of_box = scene[matches.image[: places[-1] + 1]]
+    # Precision falls between true boxes: only what it is at each of them counts. (S, T) boxes of each scene since the
+    # true box before, which is nearly nothing everywhere.
+    segment = np.searchsorted(places, np.arange(places[-1] + 1))
+    shape = (times.shape[1], len(places))
+    all_boxes = csr_matrix((np.ones(len(segment)), (scene_of_box, segment)), shape=shape)
+    true_boxes = csr_matrix((np.ones(len(places)), (scene_of_box[places], np.arange(len(places)))), shape=shape)
     step = max(1, _NUMBERS_AT_ONCE // len(places))
     parts = []
     for start in range(0, len(times), step):
         drawn = times[start : start + step].astype(np.float64)
-        hits, boxes = drawn @ true_boxes, drawn @ all_boxes
+        hits, boxes = (np.cumsum(drawn @ counts, axis=1) for counts in (true_boxes, all_boxes))
         precision = np.divide(hits, boxes, out=np.zeros_like(hits), where=boxes > 0)
         envelope = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
         recall = hits / (drawn @ drogues)[:, None]
@@ -85,15 +88,6 @@ def _scenes(matches: Matches) -> tuple[Counts, Counts, Counts]:
 def _sampled_mean(recall: Array, envelope: Array) -> float:
     place = np.searchsorted(recall, RECALLS, side="left")
     return float(envelope[place[place < len(envelope)]].sum() / len(RECALLS))
-
-
-def rate_interval(events: int, trials: int) -> Interval:
-    """Confidence interval of the mean number of events in a trial, where events are rare and independent.
-
-    Source: F. Garwood, Biometrika 28 (1936) 437, doi:10.1093/biomet/28.3-4.437.
-    """
-    low = chi2.ppf((1 - CONFIDENCE) / 2, 2 * events) / 2 if events else 0.0
-    return float(low / trials), float(chi2.ppf((1 + CONFIDENCE) / 2, 2 * events + 2) / 2 / trials)
 
 
 def scene_count(matches: Matches) -> int:

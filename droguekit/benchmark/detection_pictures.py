@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from datasets_manifest.blind import BlindDataset
 from datasets_manifest.records import PixelBox
+from datasets_manifest.storage import Location
 from droguekit.benchmark.contact_sheet import (
     ENLARGE_BELOW,
     TILE_WIDTH_PX,
@@ -51,11 +51,11 @@ class Shown(NamedTuple):
     is_miss: bool = False
 
 
-def detection_pictures(dataset: Path, matches: Matches, threshold: float) -> list[PictureGroup]:
+def detection_pictures(dataset: Location, matches: Matches, threshold: float) -> list[PictureGroup]:
     """Groups of pictures; those without any are left out.
 
     Args:
-        dataset: the dataset's folder.
+        dataset: the dataset's folder or URL.
         matches: of one detector.
         threshold: from which score a box counts.
 

@@ -7,11 +7,13 @@ from pathlib import Path
 from markupsafe import Markup
 
 from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.storage import Location
 from droguekit.benchmark.detection_benchmark import ScoredDetections
 from droguekit.benchmark.detection_figures import MEASURES, curve_panel, distance_panel, score_panel, size_panel
 from droguekit.benchmark.detection_pictures import detection_pictures
 from droguekit.benchmark.detection_result import DetectionResult
 from droguekit.benchmark.detection_scores import LEAST_BOXES, LEAST_SCENES
+from droguekit.benchmark.detection_speed import is_timed, speed_panel
 from droguekit.benchmark.detection_tables import (
     CELL_COLUMNS,
     SUMMARY_COLUMNS,
@@ -26,11 +28,11 @@ from droguekit.benchmark.number_text import plain_number
 from droguekit.benchmark.report import page_template
 
 
-def write_detection_report(dataset: Path, scored: ScoredDetections, out_html: Path) -> None:
+def write_detection_report(dataset: Location, scored: ScoredDetections, out_html: Path) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
     Args:
-        dataset: the dataset's folder, for pictures.
+        dataset: the dataset's folder or URL, for pictures.
         scored: what `score_detections` made of it.
         out_html: where to write.
 
@@ -59,6 +61,7 @@ def write_detection_report(dataset: Path, scored: ScoredDetections, out_html: Pa
         legend=[(name, Markup(legend_key(style))) for name, style in method_styles(list(matches)).items()],
         distance_panels=[Markup(distance_panel(result, measure)) for measure in MEASURES if _has_distances(result)],
         curve=Markup(curve_panel(matches)),
+        speed=Markup(speed_panel(result)) if is_timed(result) else None,
         histograms=histograms,
         pictured=best,
         pictures=detection_pictures(dataset, matches[best], thresholds[best]),

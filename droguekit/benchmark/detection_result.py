@@ -39,9 +39,9 @@ class DetectionRow(ResultModel):
         images, boxes, scenes: images, drogues to be found, and scenes that show one.
         ap, ap50, ap75: average precision over overlaps 0.5 to 0.95, and at two of them; null without drogues.
         ap_interval: of `ap`; the overall row alone has one.
-        ap50_interval: null with fewer than two scenes.
+        ap50_interval: null with fewer than two scenes, or where all resamples of scenes are alike.
         precision, recall: at overlap 0.5, of boxes with at least the operating threshold; null without any.
-        recall_interval: Wilson's.
+        recall_interval: Wilson's, which takes images as independent.
         note: why the row says little, or null.
     """
 
@@ -82,13 +82,16 @@ class FalseAlarms(ResultModel):
         frames: such pairs.
         boxes: found in them, both images together.
         frames_with_any: pairs with at least one.
-        boxes_per_600_frames, interval_per_600_frames: the rate scaled, and Garwood's interval.
+        boxes_per_600_frames: the rate of boxes, scaled.
+        frames_with_any_per_600, interval_per_600_frames: the share of pairs with at least one, scaled, and Wilson's
+            interval of it: boxes of one pair are not independent.
     """
 
     frames: int
     boxes: int
     frames_with_any: int
     boxes_per_600_frames: float
+    frames_with_any_per_600: float
     interval_per_600_frames: Ends
 
 
@@ -112,8 +115,9 @@ class DetectorResult(ResultModel):
         distances, families, eyes: of the same images as `overall`.
         splits: each over its own images, whatever `dataset.split` says.
         times: where the detector was run for this result.
+        parameters: weights and biases of the network's layers, counted where `gflops_per_image` is.
         gflops_per_image: multiplications and additions of the network for one image, in 10^9; null where there is none,
-            or where only its boxes are known.
+            or where only its boxes are known, or where an operation cannot be counted.
     """
 
     operating_threshold: float
@@ -126,6 +130,7 @@ class DetectorResult(ResultModel):
     eyes: dict[str, DetectionRow]
     splits: dict[str, DetectionRow]
     times: PairTimes | None = None
+    parameters: int | None = None
     gflops_per_image: float | None = None
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from datasets_manifest.blind import BlindDataset
 from datasets_manifest.images import StereoImages
+from datasets_manifest.storage import Location
 from drogue_models.parameters import DrogueParameters
 from droguekit.benchmark.detection_boxes import FoundBox, clipped_box, corner_box, image_id_of
 from droguekit.benchmark.detection_result import PairTimes
@@ -31,22 +31,29 @@ class DetectorPass:
         wall_s, cpu_s: time of each pair that was looked at, images already read. [s]
     """
 
-    def __init__(self, dataset: Path, detector_of: Callable[[DrogueParameters], Detector]) -> None:
+    def __init__(
+        self,
+        dataset: Location,
+        detector_of: Callable[[DrogueParameters], Detector],
+        frame_indices: Sequence[int] | None = None,
+    ) -> None:
         """Open the dataset.
 
         Args:
-            dataset: folder.
+            dataset: its folder or URL.
             detector_of: the detector of a drogue; pairs may name different ones.
+            frame_indices: pairs to look at, all of them by default.
 
         Raises:
             ValueError: no such dataset, or one without pairs.
         """
         self._dataset = BlindDataset(dataset)
         self._detector_of = detector_of
-        self.pairs = len(self._dataset.frame_indices)
+        self._frame_indices = self._dataset.frame_indices if frame_indices is None else tuple(frame_indices)
+        self.pairs = len(self._frame_indices)
         if not self.pairs:
             raise ValueError(f"{dataset}: has no pairs")
-        first = detector_of(self._dataset.pair(self._dataset.frame_indices[0]).drogue)
+        first = detector_of(self._dataset.pair(self._frame_indices[0]).drogue)
         self.name = first.name
         # Only networks name one.
         metadata = getattr(first, "metadata", None)
@@ -65,7 +72,7 @@ class DetectorPass:
         Raises:
             ValueError: an image cannot be read; names the file.
         """
-        for index in self._dataset.frame_indices:
+        for index in self._frame_indices:
             pair = self._dataset.pair(index)
             yield from self._look(index, self._detector_of(pair.drogue), pair.images, least_score)
             advance()

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 from droguekit.benchmark.detection_curve import best_f1, operating_point
-from droguekit.benchmark.detection_intervals import average_precision_interval, rate_interval, scene_count
+from droguekit.benchmark.detection_intervals import average_precision_interval, scene_count
 from droguekit.benchmark.detection_matching import AT_50, IOU_THRESHOLDS, Evaluation, Matches
 from droguekit.benchmark.detection_result import (
     BestF1,
@@ -52,9 +52,17 @@ def images_of_split(images: Images, split: str) -> list[ImageTruth]:
     return chosen
 
 
-def default_split(images: Images) -> str:
-    """`test` where a dataset has one, else `all`."""
-    return "test" if any(image.split == "test" for image in images) else "all"
+def split_to_score(images: Images, split: str | None) -> str:
+    """The split that is meant: by None `test` where a dataset has one, else `all`.
+
+    Raises:
+        ValueError: no image of that split, or none that shows a drogue.
+    """
+    if split is None:
+        split = "test" if any(image.split == "test" for image in images) else "all"
+    if all(image.box_xywh is None for image in images_of_split(images, split)):
+        raise ValueError(f"dataset: no image of the split {split!r} shows a drogue that must be found")
+    return split
 
 
 def score_detector(
@@ -65,16 +73,12 @@ def score_detector(
     Args:
         evaluation: of its boxes on all images.
         images: all of the dataset.
-        split: to score on, or `all`.
+        split: to score on, see `split_to_score`.
         threshold: from which boxes count, or None to choose it on the val split, or on the scored images without one.
 
-    Raises:
-        ValueError: no image of that split, or none that shows a drogue.
     """
     chosen = images_of_split(images, split)
     matches = evaluation.matches(chosen)
-    if not matches.drogues:
-        raise ValueError(f"dataset: no image of the split {split!r} shows a drogue that must be found")
     operating = threshold or _best_threshold(evaluation, images, split)
 
     def row(some: Images, key: str) -> DetectionRow:
@@ -115,12 +119,14 @@ def false_alarms(matches: Matches, threshold: float) -> FalseAlarms | None:
         return None
     passing = matches.image[matches.score >= threshold]
     hit = [matches.images[k].frame_index for k in passing.tolist() if matches.images[k].is_known_empty]
-    low, high = rate_interval(len(hit), len(frames))
+    # The images of a pair are not independent, nor are the boxes of an image: pairs with any are.
+    low, high = fraction_interval(len(set(hit)), len(frames))
     return FalseAlarms(
         frames=len(frames),
         boxes=len(hit),
         frames_with_any=len(set(hit)),
         boxes_per_600_frames=FALSE_ALARM_FRAMES * len(hit) / len(frames),
+        frames_with_any_per_600=FALSE_ALARM_FRAMES * len(set(hit)) / len(frames),
         interval_per_600_frames=(FALSE_ALARM_FRAMES * low, FALSE_ALARM_FRAMES * high),
     )
 

@@ -11,7 +11,10 @@ from droguekit.benchmark.detection_result import DetectionResult, DetectionRow, 
 from droguekit.benchmark.number_text import ABSENT, plain_number, three_digits
 
 SUMMARY_COLUMNS = ("precision", "recall", "AP50", "95 % interval", "AP", "95 % interval", "AP75")
-SUMMARY_COLUMNS_MORE = ("GFLOPs", "time of an image [ms]", "false alarms in 600 empty frames", "95 % interval")
+SUMMARY_COLUMNS_MORE = (
+    *("parameters [10⁶]", "GFLOPs", "time of an image [ms]"),
+    *("false alarms in 600 empty frames", "of 600, frames with any", "95 % interval"),
+)
 CELL_COLUMNS = ("scenes", "boxes", "AP50", "95 % interval", "AP", "recall", "95 % interval", "precision", "")
 
 
@@ -42,10 +45,10 @@ def published_rows() -> list[list[str]]:
         [
             row.name,
             *map(share, (row.precision, row.recall, row.ap50)),
-            *[ABSENT] * 4,
+            *[ABSENT] * 5,
             f"{row.gflops:g}",
             f"{1e3 * row.image_s:.1f}",
-            *[ABSENT] * 2,
+            *[ABSENT] * 3,
         ]
         for row in PUBLISHED_DETECTORS
     ]
@@ -104,9 +107,11 @@ def _summary_cells(detector: DetectorResult) -> list[str]:
         share(row.ap),
         shares(row.ap_interval),
         share(row.ap75),
+        ABSENT if detector.parameters is None else three_digits(1e-6 * detector.parameters),
         ABSENT if detector.gflops_per_image is None else three_digits(detector.gflops_per_image),
         ABSENT if times is None else three_digits(times.wall_ms / 2),
         ABSENT if alarms is None else plain_number(alarms.boxes_per_600_frames),
+        ABSENT if alarms is None else plain_number(alarms.frames_with_any_per_600),
         ABSENT if alarms is None else " to ".join(map(plain_number, alarms.interval_per_600_frames)),
     ]
 

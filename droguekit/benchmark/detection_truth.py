@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from datasets_manifest.blind import read_blind_index
 from datasets_manifest.layout import BLIND_FILE
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord, PixelBox, ViewRecord
+from datasets_manifest.storage import Location, open_storage
 from droguekit.benchmark.blind_check import blind_scenes
 from droguekit.benchmark.detection_boxes import FoundBox, clipped_box, corner_box, image_id_of
 from geometry.stereo import EYES, Eye
@@ -64,22 +64,20 @@ class DetectionTruth:
     Attributes:
         name, sha256: of the dataset; an imported one has no hash.
         images: left before right of every pair.
-        size_px: (width, height) of an image.
     """
 
     name: str
     sha256: str | None
     images: tuple[ImageTruth, ...]
-    size_px: tuple[int, int]
 
 
-def read_detection_truth(dataset: Path) -> DetectionTruth:
+def read_detection_truth(dataset: Location) -> DetectionTruth:
     """What is to be found in a dataset: from its records, or from the boxes that came with imported images.
 
     Raises:
         ValueError: no such dataset, a record that cannot be read, or an imported dataset without boxes.
     """
-    if (dataset / BLIND_FILE).exists():
+    if open_storage(dataset).exists(BLIND_FILE):
         return _given_truth(dataset)
     source = Dataset(dataset)
     camera = source.manifest.recipe.rig.camera
@@ -88,7 +86,7 @@ def read_detection_truth(dataset: Path) -> DetectionTruth:
     images = [
         image_truth(source.record(index), eye, splits[index], size_px) for index in source.frame_indices for eye in EYES
     ]
-    return DetectionTruth(source.manifest.name, source.manifest.dataset_sha256, tuple(images), size_px)
+    return DetectionTruth(source.manifest.name, source.manifest.dataset_sha256, tuple(images))
 
 
 def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, int]) -> ImageTruth:
@@ -150,7 +148,7 @@ def _is_ignored(box: FoundBox, image: ImageTruth) -> bool:
     return max(common_x, 0.0) * max(common_y, 0.0) >= _LEAST_SHARE_INSIDE * width * height
 
 
-def _given_truth(dataset: Path) -> DetectionTruth:
+def _given_truth(dataset: Location) -> DetectionTruth:
     """Boxes that came with imported images; an image without one is left out, for nobody said that it is empty."""
     index = read_blind_index(dataset)
     images = [
@@ -171,4 +169,4 @@ def _given_truth(dataset: Path) -> DetectionTruth:
     ]
     if not images:
         raise ValueError(f"{dataset}: has no boxes to compare with; import it with --boxes")
-    return DetectionTruth(index.name, None, tuple(images), (index.rig.camera.width_px, index.rig.camera.height_px))
+    return DetectionTruth(index.name, None, tuple(images))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from datasets_manifest.layout import BLIND_FILE
-from datasets_manifest.storage import open_storage
+from datasets_manifest.storage import Location, open_storage
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument
 from droguekit.cli.detection_pipelines import DetectionOrder, benchmark_detections
@@ -65,7 +65,7 @@ def benchmark(
 
 
 def _lines(
-    dataset: Path, estimates: Path | None, order: DetectionOrder, json_out: Path | None, html_out: Path | None
+    dataset: Location, estimates: Path | None, order: DetectionOrder, json_out: Path | None, html_out: Path | None
 ) -> Iterator[str]:
     wants_detections = bool(order.files or order.detectors)
     if (estimates is not None) == wants_detections:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, DetectorOption
+from droguekit.cli.arguments import DatasetArgument, DetectorOption, local_path
 from droguekit.cli.detection_pipelines import detect_dataset
 
 EXAMPLES = (
@@ -20,7 +20,12 @@ EXAMPLES = (
 
 def detect(
     dataset: DatasetArgument,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE.json", help="Gets the boxes, as COCO results.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", metavar="FILE.json", parser=str, callback=local_path, help="Gets the boxes, as COCO results."
+        ),
+    ],
     detector: DetectorOption = None,
     least_score: Annotated[float, typer.Option("--least-score", help="Boxes that score less are left out.")] = 0.001,
 ) -> None:

@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from datasets_manifest.storage import Location
     from droguekit.batch.progress import ProgressReport
     from droguekit.benchmark.detection_benchmark import DetectorRun
     from droguekit.benchmark.detection_boxes import FoundBox
     from droguekit.benchmark.detection_result import DetectionResult, PairTimes
+    from droguekit.benchmark.detection_run import DetectorPass
+    from droguekit.detector_peers.onnx_cost import NetworkCost
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class DetectionCounts:
 
 
 def detect_dataset(
-    dataset: Path, name_or_file: str | None, out: Path, least_score: float, report: ProgressReport
+    dataset: Location, name_or_file: str | None, out: Path, least_score: float, report: ProgressReport
 ) -> DetectionCounts:
     """Find the drogue in every image without the truth, and write COCO results; the default detector when None.
 
@@ -74,7 +77,7 @@ class DetectionOrder:
 
 
 def benchmark_detections(
-    dataset: Path, order: DetectionOrder, json_out: Path | None, html_out: Path | None, report: ProgressReport
+    dataset: Location, order: DetectionOrder, json_out: Path | None, html_out: Path | None, report: ProgressReport
 ) -> DetectionResult:
     """Compare boxes with the truth, and write the numbers and the report where a place is given for them.
 
@@ -85,13 +88,15 @@ def benchmark_detections(
     from datasets_manifest.atomic import write_text_atomic
     from droguekit.benchmark.detection_benchmark import score_detections
     from droguekit.benchmark.detection_report import write_detection_report
+    from droguekit.benchmark.detection_scores import split_to_score
     from droguekit.benchmark.detection_truth import read_detection_truth
 
     if order.threshold is not None and not 0 <= order.threshold <= 1:
         raise ValueError(f"--threshold: must be from 0 to 1, got {order.threshold:g}")
     truth = read_detection_truth(dataset)
-    runs = _runs(dataset, order, frozenset(image.image_id for image in truth.images), report)
-    scored = score_detections(truth, runs, order.split, order.threshold)
+    # Whatever is wrong is said before a detector looks at the first image.
+    split = split_to_score(truth.images, order.split)
+    scored = score_detections(truth, _runs(dataset, order, report), split, order.threshold)
     if json_out is not None:
         write_text_atomic(json_out, scored.result.to_json())
     if html_out is not None:
@@ -99,43 +104,61 @@ def benchmark_detections(
     return scored.result
 
 
-def _runs(
-    dataset: Path, order: DetectionOrder, image_ids: frozenset[int], report: ProgressReport
-) -> dict[str, DetectorRun]:
-    """Boxes by the name that they are reported under."""
+def _runs(dataset: Location, order: DetectionOrder, report: ProgressReport) -> dict[str, DetectorRun]:
+    """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
+    from datasets_manifest.blind import read_blind_index
     from droguekit.benchmark.detection_benchmark import DetectorRun
-    from droguekit.benchmark.detection_boxes import read_detections
-    from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
+    from droguekit.benchmark.detection_boxes import image_id_of, read_detections
+    from droguekit.benchmark.detection_run import DetectorPass
+    from geometry.stereo import EYES
     from nav.detector.registry import detector_factory
 
-    runs: dict[str, DetectorRun] = {}
-
-    def add(name: str, run: DetectorRun) -> None:
-        if name in runs:
+    # Also of images that are not scored, for a detector answers for all.
+    image_ids = frozenset(image_id_of(frame, eye) for frame in read_blind_index(dataset).frames for eye in EYES)
+    runs = [(file.stem, DetectorRun(read_detections(file, image_ids))) for file in order.files]
+    passes = [(name, DetectorPass(dataset, detector_factory(name))) for name in order.detectors]
+    names = [name for name, _ in runs] + [detecting.name for _, detecting in passes]
+    for name in names:
+        if names.count(name) > 1:
             raise ValueError(f"--detections, --detector: two are named {name!r}; rename a file")
-        runs[name] = run
-
-    for file in order.files:
-        add(file.stem, DetectorRun(read_detections(file, image_ids)))
-    for name_or_file in order.detectors:
-        detecting = DetectorPass(dataset, detector_factory(name_or_file))
-        report.say(f"{detecting.name}: looking for the drogue, without the truth")
-        report.begin("pairs", detecting.pairs)
-        try:
-            boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
-        finally:
-            report.end()
-        cost = _gflops_per_image(name_or_file, detecting.input_size_px)
-        add(detecting.name, DetectorRun(boxes, detecting.times(), detecting.score_threshold, cost))
-    return runs
+    runs += [(detecting.name, _detector_run(name, detecting, report)) for name, detecting in passes]
+    return dict(runs)
 
 
-def _gflops_per_image(name_or_file: str, size_px: tuple[int, int] | None) -> float | None:
-    """Operations of a network in a file, where the package that can count them is installed."""
+def _detector_run(name_or_file: str, detecting: DetectorPass, report: ProgressReport) -> DetectorRun:
+    """What a detector finds in all images."""
+    from droguekit.benchmark.detection_benchmark import DetectorRun
+    from droguekit.benchmark.detection_run import LEAST_SCORE
+
+    report.say(f"{detecting.name}: looking for the drogue, without the truth")
+    report.begin("pairs", detecting.pairs)
+    try:
+        boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
+    finally:
+        report.end()
+    cost = _network_cost(name_or_file, detecting.input_size_px)
+    return DetectorRun(
+        boxes,
+        detecting.times(),
+        detecting.score_threshold,
+        parameters=None if cost is None else cost.parameters,
+        gflops_per_image=None if cost is None else cost.gflops_per_image,
+    )
+
+
+def _network_cost(name_or_file: str, size_px: tuple[int, int] | None) -> NetworkCost | None:
+    """Of a network in a file; None where it cannot be counted, or the package that counts is not installed."""
     from importlib.util import find_spec
 
-    if size_px is None or not Path(name_or_file).is_file() or find_spec("onnx") is None:
+    from nav.detector.registry import network_file
+
+    file = network_file(name_or_file)
+    if file is None or size_px is None or find_spec("onnx") is None:
         return None
     from droguekit.detector_peers.onnx_cost import network_cost
 
-    return network_cost(Path(name_or_file), size_px).gflops_per_image
+    try:
+        return network_cost(file, size_px)
+    except ValueError:
+        # The network runs, and its boxes are not lost for operations that nobody can count.
+        return None

@@ -6,12 +6,13 @@ import os
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from datasets_manifest.storage import Location, as_location
 from droguekit.cli.pipelines import RenderOrder, open_recipe, render_frames
 
 if TYPE_CHECKING:
+    from datasets_manifest.recipe import Recipe
     from droguekit.batch.progress import ProgressReport
     from nav.training.training import TrainingResult
 
@@ -40,6 +41,28 @@ class TrainingOrder:
     workers: int | None
 
 
+class _Recipe(NamedTuple):
+    recipe: Recipe
+    text: str
+
+
+def _find(source: str) -> Location | _Recipe:
+    location = as_location(source)
+    if isinstance(location, str) or location.is_dir():
+        return location
+    return _Recipe(*open_recipe(source, None, None))
+
+
+def _render(source: _Recipe, out: Path, workers: int | None, report: ProgressReport) -> Path:
+    """Make the pairs that are not there yet; the dataset's folder."""
+    recipe, place = source.recipe, out / "datasets" / source.recipe.name
+    report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {place}")
+    summary = render_frames(recipe, source.text, place, range(recipe.frames.count), RenderOrder(workers), report)
+    for drop in summary.drops:
+        report.say(f"{place}: frame {drop.frame_index} is missing: {drop.reason}")
+    return place
+
+
 def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> TrainingResult:
     """Render what is missing, train, evaluate and export.
 
@@ -57,19 +80,15 @@ def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> T
     missing = [name for name in _NEEDED if find_spec(name) is None]
     if missing:
         raise ValueError(f"train: {', '.join(missing)} is missing: pip install 'droguekit[train]'")
-    datasets: list[Location] = []
-    for source in order.sources:
-        location = as_location(source)
-        if isinstance(location, str) or location.is_dir():
-            datasets.append(location)
-            continue
-        recipe, text = open_recipe(source, None, None)
-        datasets.append(out / "datasets" / recipe.name)
-        report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {datasets[-1]}")
-        render_frames(recipe, text, datasets[-1], range(recipe.frames.count), RenderOrder(order.workers), report)
+    found = [_find(source) for source in order.sources]
     # Threads of torch that wait for each other by spinning lose most of their time where others use the cores too.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    from nav.training.training import train
+    from nav.training.training import check_before, train
 
+    # Rendering takes hours: what would stop the training afterwards is looked for first.
+    if not any(not isinstance(each, _Recipe) or each.recipe.split.train > 0 for each in found):
+        raise ValueError(f"{order.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
+    check_before(out, settings)
+    datasets = [_render(each, out, order.workers, report) if isinstance(each, _Recipe) else each for each in found]
     with StopRequest(report.say) as stop:
         return train(datasets, out, settings, report, order.cache, lambda: stop.is_requested)

@@ -6,25 +6,32 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.blind import BlindDataset
+from droguekit.benchmark.detection_matching import Evaluation
+from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection_tables import share
+from droguekit.benchmark.detection_truth import ImageTruth, read_detection_truth
 from droguekit.detector_peers.latency import measure_latency
+from droguekit.detector_peers.one_view import OneViewDetector
 from droguekit.detector_peers.onnx_cost import network_cost
 from nav.detector.interface import Detector
 from nav.detector.onnx_detector import OnnxDetector
 
+ONE_VIEW = "one-view"
+"""Trained on single eyes, and timed with a pass for each: what do both eyes in one batch change?"""
 # The first is what we ship; the others are the seed paper's ablations, and one of views.
 CHANGES: dict[str, tuple[str, ...]] = {
     "eca-asff": (),
     "se": ("--attention", "se"),
     "concat": ("--fusion", "concat"),
     "no-mosaic": ("--no-mosaic",),
-    "one-view": ("--views", "one"),
+    ONE_VIEW: ("--views", "one"),
 }
 _INTERRUPTED = 130
 _TIMED_PAIRS = 4
@@ -72,20 +79,51 @@ def ablate(order: AblationOrder, out: Path, say: Callable[[str], None]) -> list[
         ValueError: a wrong number, or a network that cannot be read.
         OSError: a training failed; says what it said last.
     """
-    results = {name: _trained(order, out / name, changes, say) for name, changes in CHANGES.items()}
-    files = {name: out / name / "detector.onnx" for name in CHANGES}
+    for name, changes in CHANGES.items():
+        _train(order, out / name, changes, say)
+    rows = measured_networks(order, {name: out / name / "detector.onnx" for name in CHANGES}, say)
+    write_text_atomic(out / "ablation.json", json.dumps({"schema": 1, "networks": rows}, indent=1) + "\n")
+    return ablation_lines(rows)
+
+
+def measured_networks(
+    order: AblationOrder, files: dict[str, Path], say: Callable[[str], None]
+) -> dict[str, dict[str, Any]]:
+    """Accuracy on the test split as `benchmark` scores it, time in turns, and cost of networks.
+
+    Args:
+        order: what was trained.
+        files: by name; the one of `ONE_VIEW` gets a pass for each eye.
+        say: takes a line about what goes on.
+
+    Raises:
+        ValueError: a network or the corpus cannot be read.
+    """
     detectors: dict[str, Detector] = {
-        name: OnnxDetector(file, name, order.threads, order.size_px) for name, file in files.items()
+        name: (OneViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, order.threads, order.size_px)
+        for name, file in files.items()
     }
     source = BlindDataset(order.corpus)
     pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
     say("timing in turns")
-    rows: dict[str, dict[str, Any]] = {
-        name: {"test": results[name]["test"]} | latency._asdict() | network_cost(files[name], order.size_px)._asdict()
-        for name, latency in measure_latency(detectors, pairs, order.rounds).items()
+    latencies = measure_latency(detectors, pairs, order.rounds)
+    say("looking for the drogue in the test split")
+    images = [image for image in read_detection_truth(order.corpus).images if image.split == "test"]
+    return {
+        name: {"test": _test_precision(order.corpus, detector, images)}
+        | latencies[name]._asdict()
+        | network_cost(files[name], order.size_px)._asdict()
+        for name, detector in detectors.items()
     }
-    write_text_atomic(out / "ablation.json", json.dumps({"schema": 1, "networks": rows}, indent=1) + "\n")
-    return ablation_lines(rows)
+
+
+def _test_precision(corpus: Path, detector: Detector, images: Sequence[ImageTruth]) -> dict[str, float | None] | None:
+    """Average precision on some images by the rules of `benchmark`; None without images."""
+    if not images:
+        return None
+    looking = DetectorPass(corpus, lambda drogue: detector, sorted({image.frame_index for image in images}))
+    boxes = list(looking.boxes(LEAST_SCORE, lambda: None))
+    return Evaluation(images, boxes).average_precision(images)._asdict()
 
 
 def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
@@ -95,7 +133,7 @@ def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
     ]
     for name, row in rows.items():
         test = row["test"]
-        ap50, ap = ("-", "-") if test is None else (f"{100 * test[key]:.2f} %" for key in ("ap50", "ap"))
+        ap50, ap = (share(None if test is None else test[key]) for key in ("ap50", "ap"))
         lines.append(
             f"{name:<12} {row['parameters']:>11,} {row['gflops_per_image']:7.2f} {ap50:>8} {ap:>8} "
             f"{row['wall_ms'][0]:10.1f} {row['cpu_ms'][0]:9.1f}"
@@ -103,10 +141,8 @@ def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _trained(
-    order: AblationOrder, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]
-) -> dict[str, Any]:
-    """The result of a training, which begins or goes on where there is none."""
+def _train(order: AblationOrder, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]) -> None:
+    """Begin a training, or go on with it, unless it is over."""
     width, height = order.size_px
     options = {
         "--out": folder,
@@ -135,5 +171,3 @@ def _trained(
     if ended.returncode != 0:
         said = (folder / "train.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         raise OSError(f"{folder / 'train.log'}: {said[-1] if said else 'the training failed silently'}")
-    result: dict[str, Any] = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    return result

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.blind import BlindDataset
@@ -18,7 +18,7 @@ from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
 from droguekit.detector_peers.environment import peer_python, peer_variables
 from droguekit.detector_peers.latency import measure_latency
 from droguekit.detector_peers.onnx_cost import network_cost
-from droguekit.detector_peers.yolo_corpus import export_corpus, images_to_train_on
+from droguekit.detector_peers.yolo_corpus import check_corpus, export_corpus, images_to_train_on
 from droguekit.detector_peers.yolo_detector import YoloDetector
 from nav.detector.interface import Detector
 from nav.detector.onnx_detector import OnnxDetector
@@ -85,14 +85,15 @@ def compare_peers(order: PeerOrder, out: Path, say: Say) -> dict[str, Any]:
         ValueError: a wrong number, corpus or file, or a folder of another comparison.
         OSError: the peers' environment cannot be made, a training failed, or a file cannot be written.
     """
+    # Whatever is wrong is said before hours of training.
+    ours = _our_detectors(order)
+    if order.image_passes:
+        check_corpus(order.corpus)
     _check_folder(order, out)
     networks = {name: _peer_network(order, out, name, say) for name in PEERS}
     detectors: dict[str, Detector] = {name: YoloDetector(file, order.threads) for name, file in networks.items()}
-    for file in order.ours:
-        if file.stem in networks:
-            raise ValueError(f"--ours: {file}: another detector is named {file.stem!r}; rename the file")
-        networks[file.stem] = file
-        detectors[file.stem] = OnnxDetector(file, file.stem, order.threads, order.size_px)
+    detectors |= ours
+    networks |= {file.stem: file for file in order.ours}
     say(f"timing {', '.join(detectors)} in turns, {order.threads} threads")
     rows = {
         name: network_cost(file, order.size_px)._asdict() | times
@@ -102,6 +103,9 @@ def compare_peers(order: PeerOrder, out: Path, say: Say) -> dict[str, Any]:
         scores = _scores(order, out, detectors, say)
         rows = {name: row | scores[name] for name, row in rows.items()}
     told = {name: str(value) for name, value in asdict(order).items()}
+    if order.image_passes:
+        length = training_length(order.image_passes, images_to_train_on(order.corpus))
+        told["peer_image_passes"] = str(length.image_passes)
     write_text_atomic(
         out / "comparison.json", json.dumps({"schema": 1, "order": told, "detectors": rows}, indent=1) + "\n"
     )
@@ -132,18 +136,44 @@ def run_script(python: Path, order: Mapping[str, Any], log: Path, variables: Map
         raise OSError(f"{log}: ultralytics ended with status {ended.returncode}: {lines[-1] if lines else 'silently'}")
 
 
-def training_length(image_passes: int, images: int) -> tuple[int, float]:
-    """Epochs, and the share of the images that each of them takes, that make so many passes.
+class TrainingLength(NamedTuple):
+    """How long ultralytics trains.
 
-    ultralytics trains whole epochs: the passes are met by leaving a share of the images out.
+    Attributes:
+        epochs: number of them.
+        fraction: of the images that each takes.
+        image_passes: that this makes.
+    """
+
+    epochs: int
+    fraction: float
+    image_passes: int
+
+
+def training_length(image_passes: int, images: int) -> TrainingLength:
+    """What makes nearly so many passes.
+
+    ultralytics trains whole epochs, and a share of the images would be the same ones in every epoch: the passes are
+    rounded to whole epochs of all images, and only those of less than one leave images out.
 
     Raises:
         ValueError: no images.
     """
     if images < 1:
         raise ValueError("corpus: has no images to train on")
-    epochs = max(1, -(-image_passes // images))
-    return epochs, min(1.0, image_passes / (epochs * images))
+    epochs, fraction = max(1, round(image_passes / images)), min(1.0, image_passes / images)
+    return TrainingLength(epochs, fraction, epochs * round(fraction * images))
+
+
+def _our_detectors(order: PeerOrder) -> dict[str, Detector]:
+    """Ours by name, opened and found countable."""
+    detectors: dict[str, Detector] = {}
+    for file in order.ours:
+        if file.stem in (*PEERS, *detectors):
+            raise ValueError(f"--ours: {file}: another detector is named {file.stem!r}; rename the file")
+        detectors[file.stem] = OnnxDetector(file, file.stem, order.threads, order.size_px)
+        network_cost(file, order.size_px)
+    return detectors
 
 
 def _check_folder(order: PeerOrder, out: Path) -> None:
@@ -156,6 +186,8 @@ def _check_folder(order: PeerOrder, out: Path) -> None:
             before = json.loads(file.read_text(encoding="utf-8"))
         except ValueError as error:
             raise ValueError(f"{file}: is not JSON: {error}") from error
+        if not isinstance(before, dict):
+            raise ValueError(f"{file}: must hold the settings of a comparison, got {type(before).__name__}")
         differing = sorted(name for name in settings if before.get(name) != settings[name])
         if differing:
             raise ValueError(f"{out}: holds a comparison with another {', '.join(differing)}; name a new folder")
@@ -175,22 +207,23 @@ def _peer_network(order: PeerOrder, out: Path, name: str, say: Say) -> Path:
         weights = str(folder / "train" / "weights" / "best.pt")
         over = folder / "trained"
         if not over.exists():
-            data = export_corpus(order.corpus, out / "corpus").resolve()
-            epochs, fraction = training_length(order.image_passes, images_to_train_on(order.corpus))
+            data = export_corpus(order.corpus, out / "pictures", order.size_px).resolve()
+            length = training_length(order.image_passes, images_to_train_on(order.corpus))
             training = {
                 "do": "train",
                 "config": f"{name}.yaml",
                 "data": str(data),
                 "folder": str(folder),
-                "epochs": epochs,
-                "fraction": fraction,
+                "epochs": length.epochs,
+                "fraction": length.fraction,
                 "side_px": max(order.size_px),
                 "batch": order.batch,
                 "threads": order.threads,
                 "device": order.device,
                 "seed": order.seed,
             }
-            say(f"{name}: training, {epochs} epochs of {fraction:.1%} of the images; {folder / 'train.log'}")
+            told = f"{length.epochs} epochs, {length.image_passes} image passes"
+            say(f"{name}: training, {told}; {folder / 'train.log'}")
             run_script(python, training, folder / "train.log", variables)
             write_text_atomic(over, "")
     say(f"{name}: exporting")
@@ -220,9 +253,8 @@ def _scores(order: PeerOrder, out: Path, detectors: Mapping[str, Detector], say:
     result, page = out / "scores.json", out / "scores.html"
     options = [word for file in files for word in ("--detections", str(file))]
     command = [sys.executable, "-P", "-m", "droguekit.cli.main", "benchmark", str(order.corpus), *options]
-    ended = subprocess.run(
-        [*command, "--json", str(result), "--html", str(page)], capture_output=True, text=True, check=False
-    )
+    command += ["--split", "test", "--json", str(result), "--html", str(page)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
     if ended.returncode != 0:
         raise OSError(ended.stderr.strip() or f"benchmark ended with status {ended.returncode}")
     say(f"wrote {page}")

@@ -38,7 +38,7 @@ def measure_latency(
     rounds: int,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, PairLatency]:
-    """Time all detectors on the same pairs; each round takes them in another order.
+    """Time all detectors on the same pairs; each round takes them in an order of its own.
 
     Args:
         detectors: by name; ratios are to the first.
@@ -58,8 +58,7 @@ def measure_latency(
     spent: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
     for number in range(-_WARM_UP_ROUNDS, rounds):
         images = pairs[number % len(pairs)]
-        start = number % len(names)
-        for name in [*names[start:], *names[:start]]:
+        for name in _shuffled(names, number + _WARM_UP_ROUNDS):
             wall_s, cpu_s = time.perf_counter(), time.process_time()
             detectors[name].candidates(images, _LEAST_SCORE)
             wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
@@ -69,6 +68,12 @@ def measure_latency(
             advance()
     table = {name: np.array(times) for name, times in spent.items()}
     return {name: _latency(table[name], table[names[0]]) for name in names}
+
+
+def _shuffled(names: Sequence[str], number: int) -> list[str]:
+    """Another order in every round: where one always follows the same other, it always finds that one's caches."""
+    order = np.random.Generator(np.random.Philox(key=number)).permutation(len(names))
+    return [names[k] for k in order.tolist()]
 
 
 def _latency(

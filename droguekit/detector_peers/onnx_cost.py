@@ -44,7 +44,10 @@ def network_cost(file: Path, size_px: tuple[int, int]) -> NetworkCost:
     del model.graph.value_info[:]
     for output in model.graph.output:
         output.type.tensor_type.ClearField("shape")
-    graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+    try:
+        graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+    except onnx.shape_inference.InferenceError as error:
+        raise ValueError(f"{file}: its shapes cannot be told: {str(error).strip().splitlines()[0]}") from error
     shapes = {
         each.name: [d.dim_value for d in each.type.tensor_type.shape.dim] for each in (*graph.value_info, *graph.output)
     }

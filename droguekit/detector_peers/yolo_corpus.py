@@ -1,55 +1,69 @@
-"""Our corpus as ultralytics reads it: our own export, with the drogue as its only class."""
+"""Our corpus as ultralytics reads it: pictures as our own networks see them, with the drogue as the only class."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from datasets_manifest.atomic import new_folder
+from datasets_manifest.manifest import SplitName
+from datasets_manifest.png import encode_png
 from datasets_manifest.reader import Dataset
-from labelgen.export.log import ExportLog
-from labelgen.export.yolo import write_yolo_detect
+from datasets_manifest.records import PixelBox
+from geometry.stereo import EYES
+from nav.detector.input_image import Letterbox, input_image
 
-_DROGUE_ROW = "0 "
+SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
 
 
-def export_corpus(corpus: Path, out: Path) -> Path:
+def check_corpus(corpus: Path) -> None:
+    """Refuse a corpus that cannot be trained on, or would be scored on what was trained on.
+
+    Raises:
+        ValueError: the corpus cannot be read, or lacks a split.
+    """
+    counts = Dataset(corpus).manifest.counts.by_split
+    if not all(counts.get(split) for split in SPLITS):
+        raise ValueError(f"{corpus}: needs pairs in the splits {', '.join(SPLITS)}, got {dict(counts)}")
+
+
+def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
     """Write images and boxes, unless they are there already.
 
     Args:
-        corpus: a dataset whose images look as a screen wants them.
+        corpus: a dataset.
         out: folder.
+        size_px: width and height of the pictures, which are made like our networks' input: the peers would shrink the
+            images in another way than ours do.
 
     Returns:
         The file `data.yaml`.
 
     Raises:
-        ValueError: the corpus cannot be read, its images are linear or of 12 bits, or it has no pairs to train on.
+        ValueError: the corpus cannot be read.
         OSError: the folder cannot be written; it is then not there.
     """
-    source = Dataset(corpus)
-    sensor = source.manifest.recipe.sensor
-    if (sensor.encoding, sensor.output_bits) != ("gamma", 8):
-        raise ValueError(
-            f"{corpus}: ultralytics takes images of 8 bits, encoded for a screen (gamma), got "
-            f"{sensor.output_bits} bits, {sensor.encoding}; render a recipe with rig.encoding = 'gamma'"
-        )
-    counts = source.manifest.counts.by_split
-    if not counts.get("train") or not counts.get("val"):
-        raise ValueError(f"{corpus}: needs pairs in the splits train and val, got {dict(counts)}")
     data = out / "data.yaml"
-    if not data.exists():
-        with new_folder(out) as folder:
-            # The export makes the folder itself, and wants it not to be there.
-            exported = folder / "corpus"
-            write_yolo_detect(corpus, exported, ExportLog())
-            for labels in (exported / "labels").rglob("*.txt"):
-                rows = labels.read_text(encoding="utf-8").splitlines(keepends=True)
-                labels.write_text("".join(row for row in rows if row.startswith(_DROGUE_ROW)), encoding="utf-8")
-            for entry in exported.iterdir():
-                entry.rename(folder / entry.name)
-            exported.rmdir()
-            splits = "".join(f"{name}: images/{name}\n" for name in ("train", "val", "test") if counts.get(name))
-            (folder / "data.yaml").write_text(f'path: ""\n{splits}names:\n  0: drogue\n', encoding="utf-8")
+    if data.exists():
+        return data
+    source = Dataset(corpus)
+    splits = source.manifest.split_of_frame()
+    with new_folder(out) as folder:
+        for split in SPLITS:
+            for kind in ("images", "labels"):
+                (folder / kind / split).mkdir(parents=True)
+        for index in source.frame_indices:
+            record, images = source.record(index), source.images(index)
+            for eye in EYES:
+                picture, place = input_image(images, eye, size_px)
+                name = f"{splits[index]}/{index:06d}_{eye}"
+                (folder / "images" / f"{name}.png").write_bytes(encode_png(picture))
+                box = (record.views.left if eye == "left" else record.views.right).box_visible_xywh_px
+                row = "" if box is None else _row(box, place, size_px)
+                (folder / "labels" / f"{name}.txt").write_text(row, encoding="utf-8")
+        lines = "".join(f"{split}: images/{split}\n" for split in SPLITS)
+        (folder / "data.yaml").write_text(f'path: ""\n{lines}names:\n  0: drogue\n', encoding="utf-8")
     return data
 
 
@@ -60,3 +74,10 @@ def images_to_train_on(corpus: Path) -> int:
         ValueError: the corpus cannot be read.
     """
     return 2 * Dataset(corpus).manifest.counts.by_split.get("train", 0)
+
+
+def _row(box_px: PixelBox, place: Letterbox, size_px: tuple[int, int]) -> str:
+    """Class, middle and size of an image's box, as shares of the picture."""
+    x, y, width, height = place.to_input(np.array([box_px]))[0].tolist()
+    shares = [(x + width / 2) / size_px[0], (y + height / 2) / size_px[1], width / size_px[0], height / size_px[1]]
+    return f"0 {' '.join(map(repr, shares))}\n"

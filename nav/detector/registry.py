@@ -21,6 +21,13 @@ def detector_names() -> tuple[str, ...]:
     return (COLOR_BLOB, *_SHIPPED)
 
 
+def network_file(name_or_file: str) -> Path | None:
+    """Where the network of a name of `detector_factory` lies, or would; None for a name without one."""
+    if name_or_file in _SHIPPED:
+        return _WEIGHTS / f"{name_or_file}{_SUFFIX}"
+    return Path(name_or_file) if name_or_file.endswith(_SUFFIX) else None
+
+
 def open_detector(name_or_file: str, drogue: DrogueParameters, threads: int = 1) -> Detector:
     """A detector of one drogue, see `detector_factory`."""
     return detector_factory(name_or_file, threads)(drogue)
@@ -40,17 +47,14 @@ def detector_factory(name_or_file: str, threads: int = 1) -> Callable[[DroguePar
         from nav.detector.color_blob import ColorBlobDetector
 
         return ColorBlobDetector
-    if name_or_file in _SHIPPED:
-        file = _WEIGHTS / f"{name_or_file}{_SUFFIX}"
-        if not file.exists():
-            raise ValueError(
-                f"detector: the weights of {name_or_file} are not installed ({file}); name another detector, or a file"
-            )
-    elif name_or_file.endswith(_SUFFIX):
-        file = Path(name_or_file)
-    else:
+    file = network_file(name_or_file)
+    if file is None:
         names = ", ".join(detector_names())
         raise ValueError(f"detector: must be one of {names} or a file *{_SUFFIX}, got {name_or_file!r}")
+    if name_or_file in _SHIPPED and not file.exists():
+        raise ValueError(
+            f"detector: the weights of {name_or_file} are not installed ({file}); name another detector, or a file"
+        )
     from nav.detector.onnx_detector import OnnxDetector
 
     network = OnnxDetector(file, file.stem, threads)

@@ -15,11 +15,12 @@ from pycocotools.cocoeval import COCOeval
 
 from datasets_manifest.records import PixelBox
 from droguekit.benchmark.detection_boxes import FoundBox
-from droguekit.benchmark.detection_curve import best_f1, interpolated_precision, operating_point, precision_recall
-from droguekit.benchmark.detection_intervals import average_precision_interval, rate_interval, resampled_precision
-from droguekit.benchmark.detection_matching import AT_50, Evaluation
+from droguekit.benchmark.detection_curve import best_f1, operating_point, precision_recall
+from droguekit.benchmark.detection_intervals import average_precision_interval, resampled_precision
+from droguekit.benchmark.detection_matching import AT_50, RECALLS, Evaluation, Matches
 from droguekit.benchmark.detection_truth import ImageTruth
 from geometry.stereo import EYES
+from nav.training.score_threshold import best_threshold
 
 BOX: PixelBox = (100.0, 100.0, 40.0, 30.0)
 
@@ -109,8 +110,11 @@ def test_our_curve_is_that_of_pycocotools(rng: np.random.Generator, tmp_path: Pa
     images, boxes = random_corpus(rng)
     matches = Evaluation(images, boxes).matches(images)
     expected = judged(images, boxes, tmp_path).eval["precision"][0, :, 0, 0, -1]
+    curve = precision_recall(matches)
+    # The highest precision at each of its recalls or more; 0 where that recall is not reached.
+    envelope = np.append(np.maximum.accumulate(curve.precision[::-1])[::-1], 0.0)
     # It adds eps to the denominators of precisions, 2e-16 of a box.
-    np.testing.assert_allclose(interpolated_precision(precision_recall(matches)), expected, atol=1e-12)
+    np.testing.assert_allclose(envelope[np.searchsorted(curve.recall, RECALLS)], expected, atol=1e-12)
 
 
 def test_half_of_the_drogues_without_a_false_box_make_51_of_101_recalls() -> None:
@@ -157,6 +161,31 @@ def test_best_f1_is_the_best_of_all_thresholds(rng: np.random.Generator) -> None
     every = [operating_point(matches, float(score)).f1 or 0.0 for score in matches.score]
     assert best.f1 == pytest.approx(max(every), rel=1e-12)
     assert best.f1 == pytest.approx(2 / (1 / (best.precision or 1) + 1 / (best.recall or 1)), rel=1e-12)
+    assert best.threshold not in matches.score
+
+
+def test_the_best_threshold_is_that_which_a_training_would_choose(rng: np.random.Generator) -> None:
+    images = [image(frame) for frame in range(40)]
+    boxes = [
+        found(each, float(rng.uniform()), BOX if rng.uniform() < 0.7 else (500.0, 500.0, 40.0, 30.0)) for each in images
+    ]
+    best = best_f1(Evaluation(images, boxes).matches(images))
+    answers = [(np.array([box.box_xywh]), np.array([box.score])) for box in boxes]
+    assert best is not None
+    assert best.threshold == best_threshold([np.array([BOX])] * len(images), answers, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("scores", "threshold"), [((0.8, 0.6, 0.2), 0.4), ((0.8, 0.6), 0.3), ((-2.0, -3.0), -3.0), ((0.5, -3.0), -3.0)]
+)
+def test_the_best_threshold_lies_midway_below_the_last_box_that_counts(
+    scores: tuple[float, ...], threshold: float
+) -> None:
+    images = [image(frame) for frame in range(2)]
+    # The third box is a second one on a drogue that was found.
+    boxes = [found(images[min(k, 1)], score) for k, score in enumerate(scores)]
+    best = best_f1(Evaluation(images, boxes).matches(images))
+    assert best is not None and best.threshold == pytest.approx(threshold) and best.f1 == 1.0
 
 
 def test_boxes_of_equal_score_pass_a_threshold_together() -> None:
@@ -185,13 +214,39 @@ def test_resampled_scenes_are_as_good_as_copies_of_their_images(rng: np.random.G
     assert resampled_precision(matches, AT_50, times[:1])[0] == pytest.approx(expected[0], abs=1e-12)
 
 
-def test_scenes_that_are_all_alike_leave_nothing_open() -> None:
+def dense_resampled_precision(matches: Matches, times: np.ndarray) -> np.ndarray:
+    """The same from tables of every scene and every box."""
+    scenes, scene = np.unique([each.scene_id for each in matches.images], return_inverse=True)
+    true = matches.is_true[AT_50]
+    drawn = times[:, scene[matches.image]]
+    hits, boxes = np.cumsum(drawn * true, axis=1), np.cumsum(drawn, axis=1)
+    drogues = times @ np.array([np.sum(matches.has_drogue[scene == k]) for k in range(len(scenes))])
+    values = []
+    for k in range(len(times)):
+        precision = np.divide(hits[k], boxes[k], out=np.zeros(len(true)), where=boxes[k] > 0)[true]
+        envelope = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)
+        values.append(envelope[np.searchsorted(hits[k][true] / drogues[k], RECALLS)].mean())
+    return np.array(values)
+
+
+def test_sparse_tables_give_what_dense_ones_do(rng: np.random.Generator) -> None:
+    images, boxes = random_corpus(rng)
+    matches = Evaluation(images, boxes).matches(images)
+    times = rng.multinomial(10, np.full(10, 0.1), 50)
+    expected = dense_resampled_precision(matches, times)
+    # Whole numbers but for the last division.
+    np.testing.assert_allclose(resampled_precision(matches, AT_50, times), expected, rtol=1e-12)
+
+
+def test_scenes_that_are_all_alike_say_nothing_of_how_well_precision_is_known() -> None:
     images = [image(frame, scene=frame // 5) for frame in range(20)]
     boxes = [found(each, 0.9 - 0.01 * each.frame_index) for each in images if each.frame_index % 5 < 4]
     evaluation = Evaluation(images, boxes)
-    interval = average_precision_interval(evaluation.matches(images), (AT_50,), "test")
+    matches = evaluation.matches(images)
     # Four of five drogues found in every scene and no false box: recalls 0 to 0.8.
-    assert interval == pytest.approx((81 / 101, 81 / 101), abs=1e-12)
+    times = np.array([[1, 1, 1, 1], [4, 0, 0, 0], [0, 1, 0, 3]])
+    np.testing.assert_allclose(resampled_precision(matches, AT_50, times), 81 / 101, rtol=1e-12)
+    assert average_precision_interval(matches, (AT_50,), "test") is None
 
 
 def test_an_interval_needs_two_scenes_and_holds_the_value(rng: np.random.Generator) -> None:
@@ -202,9 +257,3 @@ def test_an_interval_needs_two_scenes_and_holds_the_value(rng: np.random.Generat
     interval = average_precision_interval(evaluation.matches(images), (AT_50,), "test")
     assert interval is not None
     assert interval[0] < (evaluation.average_precision(images).ap50 or 0.0) < interval[1]
-
-
-def test_rates_of_rare_events() -> None:
-    # Garwood's table: none seen leaves up to 3.689 expected, three seen 0.6187 to 8.767.
-    assert rate_interval(0, 10) == pytest.approx((0.0, 0.3689), abs=1e-4)
-    assert rate_interval(3, 1) == pytest.approx((0.6187, 8.7673), abs=1e-4)

@@ -17,9 +17,18 @@ from droguekit.benchmark.detection_benchmark import DetectorRun, ScoredDetection
 from droguekit.benchmark.detection_boxes import FoundBox
 from droguekit.benchmark.detection_figures import MEASURES, curve_panel, distance_panel, score_panel, size_panel
 from droguekit.benchmark.detection_pictures import detection_picture, worst_false_alarms, worst_misses
+from droguekit.benchmark.detection_published import PUBLISHED_DETECTORS
 from droguekit.benchmark.detection_report import write_detection_report
 from droguekit.benchmark.detection_result import DetectionResult, PairTimes
-from droguekit.benchmark.detection_tables import detector_lines, share
+from droguekit.benchmark.detection_speed import is_timed, speed_panel
+from droguekit.benchmark.detection_tables import (
+    SUMMARY_COLUMNS,
+    SUMMARY_COLUMNS_MORE,
+    detector_lines,
+    published_rows,
+    share,
+    summary_rows,
+)
 from droguekit.benchmark.detection_truth import DetectionTruth, ImageTruth, read_detection_truth
 from droguekit.benchmark.label_drawing import BOX_RGB, MARKER_RGB
 from geometry.stereo import EYES
@@ -47,7 +56,7 @@ def corpus(scenes: int = 8, pairs: int = 40) -> DetectionTruth:
                     is_known_empty=empty,
                 )
             )
-    return DetectionTruth("corpus", "0" * 64, tuple(images), (1280, 960))
+    return DetectionTruth("corpus", "0" * 64, tuple(images))
 
 
 def boxes_of(truth: DetectionTruth, missed: int = 0, false_score: float = 0.3) -> list[FoundBox]:
@@ -79,8 +88,10 @@ def test_the_test_split_is_scored_by_default_with_a_threshold_from_val() -> None
     detector = scored.result.detectors["mine"]
     assert (scored.result.dataset.split, detector.threshold_from) == ("test", "val")
     val_ids = {image.image_id for image in truth.images if image.split == "val" and image.box_xywh is not None}
-    # All drogues of val were found and score above every false box: the lowest of them is the best threshold.
-    assert detector.operating_threshold == min(box.score for box in low if box.image_id in val_ids)
+    # All drogues of val were found and score above every false box: the best threshold lies between them.
+    assert detector.operating_threshold == pytest.approx(
+        (min(box.score for box in low if box.image_id in val_ids) + 0.3) / 2
+    )
 
 
 def test_a_given_threshold_goes_before_the_detectors_own_and_that_before_val() -> None:
@@ -93,7 +104,25 @@ def test_a_given_threshold_goes_before_the_detectors_own_and_that_before_val() -
     assert given.false_alarms is not None and given.false_alarms.boxes == 0
     assert own.false_alarms is not None and own.false_alarms.boxes == own.false_alarms.frames_with_any == 16
     # One false box in each empty pair.
-    assert own.false_alarms.boxes_per_600_frames == 600
+    assert own.false_alarms.boxes_per_600_frames == own.false_alarms.frames_with_any_per_600 == 600
+
+
+def test_false_alarms_of_both_eyes_tell_no_more_than_those_of_one() -> None:
+    truth = corpus()
+    empty = [image for image in truth.images if image.is_known_empty and image.split == "test"]
+    left = [FoundBox(image.image_id, FALSE_BOX, 0.9) for image in empty[: len(empty) // 2] if image.eye == "left"]
+    both = left + [box._replace(image_id=box.image_id + 1) for box in left]
+    alarms = [
+        score_detections(truth, {"mine": DetectorRun(boxes)}, "test", 0.5).result.detectors["mine"].false_alarms
+        for boxes in (left, both)
+    ]
+    assert alarms[0] is not None and alarms[1] is not None
+    assert alarms[1].boxes == 2 * alarms[0].boxes
+    # Wilson's for a half of n = 16 pairs is 0.5 -+ z / (2 sqrt(n + z^2)), z = 1.959964.
+    half = 1.959964 / (2 * np.sqrt(16 + 1.959964**2))
+    for each in alarms:
+        assert each is not None and each.frames_with_any_per_600 == 300
+        assert each.interval_per_600_frames == pytest.approx((600 * (0.5 - half), 600 * (0.5 + half)), rel=1e-6)
 
 
 def test_rows_with_little_behind_them_say_so() -> None:
@@ -138,7 +167,9 @@ def test_panels_are_wellformed_and_their_ids_differ() -> None:
         truth, {"a<b $x": DetectorRun(boxes_of(truth)), "c": DetectorRun(boxes_of(truth, missed=3))}
     )
     matches = {name: evaluation.matches(scored.images) for name, evaluation in scored.evaluations.items()}
-    panels = [distance_panel(scored.result, measure) for measure in MEASURES]
+    assert not is_timed(scored.result)
+    panels = [speed_panel(timed(scored).result)]
+    panels += [distance_panel(scored.result, measure) for measure in MEASURES]
     panels += [
         curve_panel(matches),
         score_panel("a<b $x", 0, matches["a<b $x"], 0.5),
@@ -149,6 +180,29 @@ def test_panels_are_wellformed_and_their_ids_differ() -> None:
         ids = {element.get("id") for element in ElementTree.fromstring(panel).iter()} - {None}
         assert not ids & seen
         seen |= {name for name in ids if name is not None}
+
+
+def timed(scored: ScoredDetections) -> ScoredDetections:
+    """As if the first detector, a network, had been run just now."""
+    detectors = dict(scored.result.detectors)
+    name = next(iter(detectors))
+    run = {"times": PairTimes(wall_ms=25, cpu_ms=25, pairs=4), "parameters": 3_011_043, "gflops_per_image": 6.1}
+    detectors[name] = detectors[name].model_copy(update=run)
+    return scored._replace(result=scored.result.model_copy(update={"detectors": detectors}))
+
+
+def test_speed_is_shown_beside_that_of_all_published_detectors() -> None:
+    truth = corpus(pairs=10)
+    scored = timed(score_detections(truth, {"mine": DetectorRun(boxes_of(truth)), "file": DetectorRun([])}))
+    panel = speed_panel(scored.result)
+    for row in PUBLISHED_DETECTORS:
+        assert panel.count(f">{row.name}<") == 1
+    assert "hollow: published, other data" in panel
+    mine, untimed = summary_rows(scored.result)
+    assert (mine[8], mine[9], mine[10]) == ("3.01", "6.10", "12.5")
+    assert untimed[8:11] == ["–"] * 3
+    columns = 1 + len(SUMMARY_COLUMNS) + len(SUMMARY_COLUMNS_MORE)
+    assert {len(row) for row in [mine, *published_rows()]} == {columns}
 
 
 def test_misses_come_by_size_and_false_alarms_by_score() -> None:
@@ -219,7 +273,7 @@ def test_the_page_needs_nothing_from_outside_and_names_the_published_rows(
     dataset: tuple[Path, list[PairRecord]], tmp_path: Path
 ) -> None:
     folder, _ = dataset
-    write_detection_report(folder, scored_dataset(folder), tmp_path / "page.html")
+    write_detection_report(folder, timed(scored_dataset(folder)), tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     page = Page()
     page.feed(text)
@@ -229,6 +283,7 @@ def test_the_page_needs_nothing_from_outside_and_names_the_published_rows(
     assert not re.search(r"https?:|//[a-z]|@import|url\((?!#)", without_pictures)
     published = text[text.index("published, other data") :]
     assert "ours-l" in published and "98.23 %" in published
+    assert "Hollow marks are published" in text
     # One family with its four pictures; the better detector misses nothing and raises no false alarm.
     assert page.tags.count("img") == 4
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import uuid
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ import pytest
 from pycocotools.coco import COCO
 
 from datasets_manifest.records import PairRecord, ViewRecord
+from datasets_manifest.storage import open_storage
 from droguekit.benchmark.detection_boxes import (
     FoundBox,
     center_box,
@@ -32,6 +34,15 @@ def changed(view: ViewRecord, visible_share: float = 1.0, marker_fractions: floa
     x, y, width, height = view.box_full_xywh_px
     markers = tuple(marker.model_copy(update={"visible_fraction": marker_fractions}) for marker in view.markers)
     return view.model_copy(update={"box_visible_xywh_px": (x, y, visible_share * width, height), "markers": markers})
+
+
+def memory_copy(folder: Path) -> str:
+    """The dataset at a URL of this process."""
+    location = f"memory://{uuid.uuid4().hex}"
+    for file in folder.rglob("*"):
+        if file.is_file():
+            open_storage(location).write(file.relative_to(folder).as_posix(), file.read_bytes())
+    return location
 
 
 def with_left(record: PairRecord, view: ViewRecord) -> PairRecord:
@@ -79,7 +90,8 @@ def test_a_dataset_is_read_pair_by_pair(dataset: tuple[Path, list[PairRecord]]) 
     truth = read_detection_truth(folder)
     assert [image.image_id for image in truth.images] == list(range(1, 2 * len(records) + 1))
     assert sum(image.box_xywh is not None for image in truth.images) == 18
-    assert truth.size_px == SIZE_PX
+    location = memory_copy(folder)
+    assert read_detection_truth(location) == truth
 
 
 def test_corners_and_centres_are_half_a_pixel_apart_and_come_back() -> None:
@@ -97,7 +109,8 @@ def test_clipping_keeps_the_part_on_the_image(rng: np.random.Generator) -> None:
             max(0.0, min(box[0] + box[2], 1280.0) - max(box[0], 0.0)),
             max(0.0, min(box[1] + box[3], 960.0) - max(box[1], 0.0)),
         ]
-        if min(columns) == 0:
+        # Less than a thousandth of a pixel would be written as nothing.
+        if min(columns) < 1e-3:
             assert clipped is None
         else:
             assert clipped is not None
@@ -116,6 +129,15 @@ def test_files_of_boxes_are_read_by_pycocotools_and_come_back(tmp_path: Path) ->
     with contextlib.redirect_stdout(io.StringIO()):
         loaded = COCO(str(tmp_path / "truth.json")).loadRes(str(path))
     assert [entry["bbox"] for entry in loaded.dataset["annotations"]] == [list(box.box_xywh) for box in boxes]
+
+
+@pytest.mark.parametrize("sliver", [1e-9, 4e-4, 6e-4, 1e-3, 0.0015])
+def test_what_is_left_of_a_box_after_clipping_can_be_read_again(tmp_path: Path, sliver: float) -> None:
+    boxes = [clipped_box((x, 10.0, 50.0, 40.0), SIZE_PX) for x in (sliver - 50.0, 1280.0 - sliver)]
+    kept = [FoundBox(1, box, 0.5) for box in boxes if box is not None]
+    write_detections(tmp_path / "boxes.json", kept)
+    assert len(read_detections(tmp_path / "boxes.json", {1})) == len(kept)
+    assert not (kept and sliver < 9e-4)
 
 
 def test_no_boxes_at_all_are_a_file_too(tmp_path: Path) -> None:
@@ -146,6 +168,7 @@ GOOD = {"image_id": 1, "category_id": 1, "bbox": [1, 2, 3, 4], "score": 0.5}
         (json.dumps([GOOD | {"bbox": [1, 2, -3, 4]}]), "must be x, y, width, height"),
         (json.dumps([GOOD | {"bbox": [1e300, 2, 3, 4]}]), "must be x, y, width, height"),
         (json.dumps([GOOD | {"bbox": None}]), "result 0"),
+        (json.dumps([GOOD]).replace("4]", "4" * 400 + "]"), "result 0"),
         (json.dumps([GOOD | {"score": "high"}]), "must be four finite numbers and one"),
     ],
 )

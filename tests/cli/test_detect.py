@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import uuid
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from pycocotools.cocoeval import COCOeval
 
 from datasets_manifest.estimates import PoseEstimate, read_estimates
 from datasets_manifest.layout import ANNOTATIONS_FOLDER
+from datasets_manifest.storage import open_storage
 from droguekit.benchmark.detection_truth import read_detection_truth
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 
@@ -72,6 +74,60 @@ def test_a_dataset_without_its_truth_gives_the_same_boxes(
     assert json.loads((tmp_path / "boxes.json").read_text()) == json.loads(detections.read_text())
     scores = ["benchmark", str(blind), "--detections", str(tmp_path / "boxes.json")]
     assert run(scores) == WRONG_INPUT
+
+
+@pytest.fixture
+def imported(smoke_dataset: Path, tmp_path: Path) -> Path:
+    """A dataset without truth, where somebody has drawn boxes into three of its images."""
+    folder = tmp_path / "imported"
+    assert run(["export", str(smoke_dataset), "--format", "blind", "--out", str(folder)]) == DONE
+    table = json.loads((smoke_dataset / ANNOTATIONS_FOLDER / "all.json").read_text())
+    drogue = next(each["id"] for each in table["categories"] if each["name"] == "drogue")
+    table["annotations"] = [each for each in table["annotations"] if each["category_id"] == drogue][:3]
+    (folder / ANNOTATIONS_FOLDER).mkdir()
+    (folder / ANNOTATIONS_FOLDER / "all.json").write_text(json.dumps(table))
+    return folder
+
+
+def test_what_detect_finds_in_imported_images_can_be_scored_though_few_have_a_box(
+    imported: Path, tmp_path: Path
+) -> None:
+    found, result = tmp_path / "boxes.json", tmp_path / "scores.json"
+    assert run(["detect", str(imported), "--detector", "color-blob", "--out", str(found)]) == DONE
+    assert len({entry["image_id"] for entry in json.loads(found.read_text())}) > 3
+    assert run(["benchmark", str(imported), "--detections", str(found), "--json", str(result)]) == DONE
+    scores = json.loads(result.read_text())
+    assert (scores["dataset"]["images"], scores["detectors"]["boxes"]["overall"]["boxes"]) == (3, 3)
+
+
+def test_a_dataset_elsewhere_is_scored_like_one_here(smoke_dataset: Path, detections: Path, tmp_path: Path) -> None:
+    url = f"memory://{uuid.uuid4().hex}"
+    for file in smoke_dataset.rglob("*"):
+        if file.is_file():
+            open_storage(url).write(file.relative_to(smoke_dataset).as_posix(), file.read_bytes())
+    options = ["--detections", str(detections), "--detector", "color-blob", "--split", "all"]
+    page = tmp_path / "scores.html"
+    for place, out in ((str(smoke_dataset), tmp_path / "here.json"), (url, tmp_path / "there.json")):
+        assert run(["benchmark", place, *options, "--json", str(out), "--html", str(page)]) == DONE
+    here, there = (json.loads((tmp_path / f"{name}.json").read_text())["detectors"] for name in ("here", "there"))
+    assert here["boxes"] == there["boxes"]
+    assert here["color-blob"] | {"times": None} == there["color-blob"] | {"times": None}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (["--split", "best"], "--split: the dataset has no pairs"),
+        (["--detector", "nobody"], "detector: must be one of"),
+        (["--detector", "color-blob"], "two are named 'color-blob'"),
+    ],
+)
+def test_wrong_input_is_said_before_a_detector_looks(
+    smoke_dataset: Path, capsys: pytest.CaptureFixture[str], wrong: list[str], message: str
+) -> None:
+    assert run(["benchmark", str(smoke_dataset), "--detector", "color-blob", *wrong]) == WRONG_INPUT
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert message in line
 
 
 def test_the_least_score_leaves_boxes_out(smoke_dataset: Path, tmp_path: Path) -> None:

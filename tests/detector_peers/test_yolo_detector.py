@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from datasets_manifest.images import StereoImages
-from droguekit.detector_peers.latency import measure_latency
+from droguekit.detector_peers.latency import _latency, measure_latency
 from droguekit.detector_peers.onnx_cost import network_cost
 from droguekit.detector_peers.yolo_detector import YoloDetector, decode_rows
 from geometry.stereo import Eye
@@ -21,29 +23,6 @@ from nav.detector.interface import Detection, StereoDetection
 def images(width_px: int = 128, height_px: int = 96) -> StereoImages:
     picture = np.full((height_px, width_px, 3), 90, np.uint8)
     return StereoImages(left=picture, right=picture, time_s=0.0, exposure_s=1e-3, encoding="gamma")
-
-
-def rows_network(path: Path, rows: np.ndarray, size_px: tuple[int, int] = (64, 64)) -> Path:
-    """A network that answers the same rows whatever it sees, but for a share of the picture's mean that is zero."""
-    nodes = [
-        helper.make_node("ReduceMean", ["images"], ["mean"], keepdims=0),
-        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
-        helper.make_node("Add", ["rows", "nothing"], ["answer"]),
-    ]
-    constants = [
-        numpy_helper.from_array(rows.astype(np.float32), "rows"),
-        numpy_helper.from_array(np.array(0.0, np.float32), "zero"),
-    ]
-    width, height = size_px
-    graph = helper.make_graph(
-        nodes,
-        "rows",
-        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [2, 3, height, width])],
-        [helper.make_tensor_value_info("answer", TensorProto.FLOAT, list(rows.shape))],
-        constants,
-    )
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), str(path))
-    return path
 
 
 def test_rows_become_corners_best_first_without_doubles() -> None:
@@ -61,7 +40,9 @@ def test_nothing_found_is_no_box() -> None:
     assert (boxes.shape, scores.shape) == ((0, 4), (0,))
 
 
-def test_boxes_stand_in_the_full_sized_image_counted_from_pixel_centres(tmp_path: Path) -> None:
+def test_boxes_stand_in_the_full_sized_image_counted_from_pixel_centres(
+    rows_network: Callable[..., Path], tmp_path: Path
+) -> None:
     rows = np.zeros((2, 5, 3), np.float32)
     # The whole picture of the left eye: 128 x 96 px fit into 64 x 64 as 64 x 48, from row 8 to 56.
     rows[0, :, 0] = [32, 32, 64, 48, 0.8]
@@ -82,7 +63,7 @@ def test_files_that_are_no_networks_are_named(tmp_path: Path, content: bytes | N
         YoloDetector(file, 1)
 
 
-def test_networks_of_another_kind_are_refused(tmp_path: Path) -> None:
+def test_networks_of_another_kind_are_refused(rows_network: Callable[..., Path], tmp_path: Path) -> None:
     file = rows_network(tmp_path / "flat.onnx", np.zeros((2, 5), np.float32))
     with pytest.raises(ValueError, match="must take two images and give rows of boxes"):
         YoloDetector(file, 1)
@@ -124,6 +105,21 @@ def test_what_is_no_network_has_no_cost(tmp_path: Path) -> None:
         network_cost(tmp_path / "bad.onnx", (64, 64))
 
 
+def test_a_network_with_operations_of_somebody_else_has_no_cost(tmp_path: Path) -> None:
+    node = helper.make_node("FusedConv", ["images", "weights"], ["answer"], domain="com.microsoft")
+    weights = helper.make_tensor("weights", TensorProto.FLOAT, [4, 3, 1, 1], [0.0] * 12)
+    graph = helper.make_graph(
+        [node],
+        "of a domain that is not named",
+        [helper.make_tensor_value_info("images", TensorProto.FLOAT, [2, 3, 64, 64])],
+        [helper.make_tensor_value_info("answer", TensorProto.FLOAT, None)],
+        [weights],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)]), str(tmp_path / "odd.onnx"))
+    with pytest.raises(ValueError, match=r"odd\.onnx: its shapes cannot be told"):
+        network_cost(tmp_path / "odd.onnx", (64, 64))
+
+
 class Tallying:
     """Finds nothing, and remembers in which order it was asked."""
 
@@ -139,16 +135,27 @@ class Tallying:
         return {}
 
 
-def test_detectors_take_turns_in_every_place() -> None:
+def test_detectors_take_turns_in_every_order() -> None:
     asked: list[str] = []
     told: list[None] = []
     detectors = {name: Tallying(name, asked) for name in "abc"}
-    latencies = measure_latency(detectors, [images()], 6, lambda: told.append(None))
-    rounds = ["".join(asked[k : k + 3]) for k in range(0, len(asked), 3)][-6:]
-    assert sorted(rounds) == ["abc", "abc", "bca", "bca", "cab", "cab"]
-    assert len(told) == 6
+    latencies = measure_latency(detectors, [images()], 60, lambda: told.append(None))
+    rounds = ["".join(asked[k : k + 3]) for k in range(0, len(asked), 3)][-60:]
+    # One of six orders is missing in 60 rounds with the chance 6 (5/6)^60 = 1e-4, and the draw is always the same.
+    assert set(rounds) == {"".join(order) for order in itertools.permutations("abc")}
+    assert len(told) == 60
     assert list(latencies) == ["a", "b", "c"]
     assert all(list(each.wall_ms) == sorted(each.wall_ms) for each in latencies.values())
+
+
+def test_ratios_are_of_the_same_rounds() -> None:
+    # Wall and CPU time of 101 rounds of 1 to 100 ms: the other takes twice as long in each, at the same time.
+    quick = np.column_stack([np.linspace(1, 101, 101), np.linspace(0, 100, 101) + 1])
+    latency = _latency(quick, 2 * quick)
+    assert latency.ratio == pytest.approx(0.5, rel=1e-12)
+    # Percentiles of equal steps.
+    assert latency.wall_ms == pytest.approx((51.0, 91.0, 100.0))
+    assert latency.mean_cpu_ms == pytest.approx(51.0)
 
 
 def test_timing_nothing_is_refused() -> None:
