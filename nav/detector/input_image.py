@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from datasets_manifest.images import Pixels, StereoImages
 from geometry.se3 import Array
 from geometry.stereo import Eye
-from nav.detector.maps import SIZE_STEP_PX
+from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 PADDING_DN = 114
 """Grey of what the image leaves of the input: between sky and ground, so that its edge is no strong one."""
@@ -57,6 +57,9 @@ def letterbox(image_size_px: tuple[int, int], input_size_px: tuple[int, int]) ->
     if min(input_size_px) < SIZE_STEP_PX or any(side % SIZE_STEP_PX for side in input_size_px):
         width, height = input_size_px
         raise ValueError(f"input_size_px: must be multiples of {SIZE_STEP_PX}, got {width}x{height}")
+    if max(input_size_px) > MOST_SIDE_PX:
+        width, height = input_size_px
+        raise ValueError(f"input_size_px: must be at most {MOST_SIDE_PX} a side, got {width}x{height}")
     fit = min(inside / side for inside, side in zip(input_size_px, image_size_px, strict=True))
     width, height = (max(1, round(side * fit)) for side in image_size_px)
     offset = (input_size_px[0] - width) // 2, (input_size_px[1] - height) // 2
@@ -80,9 +83,14 @@ def input_image(images: StereoImages, eye: Eye, input_size_px: tuple[int, int]) 
     Raises:
         ValueError: an input size that no network takes.
     """
-    place = letterbox(images.size_px, input_size_px)
-    picture = _display_encoded(images.left if eye == "left" else images.right, images)
-    size = round(images.size_px[0] * place.scale[0]), round(images.size_px[1] * place.scale[1])
+    return fit_picture(_display_encoded(images.left if eye == "left" else images.right, images), input_size_px)
+
+
+def fit_picture(picture: NDArray[np.uint8], input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
+    """A display-encoded picture (H, W, 3) or (H, W) in a network's input; the second half of `input_image`."""
+    height, width = picture.shape[:2]
+    place = letterbox((width, height), input_size_px)
+    size = round(width * place.scale[0]), round(height * place.scale[1])
     enlarges = place.scale[0] > 1
     resized = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if enlarges else cv2.INTER_AREA)
     if resized.ndim == 2:

@@ -16,5 +16,8 @@ MAP_CHANNELS = 5
 SIZE_STEP_PX = STRIDES[-1]
 """Width and height of an input image are multiples of it. [px]"""
 
+MOST_SIDE_PX = 4096
+"""Width and height of an input image are at most this: a wrong number is refused before it asks for memory. [px]"""
+
 LOG_DISTANCE_RANGE = (-6.0, 6.0)
 """Beyond it a logarithm of a distance is cut: from a 400th of a stride to 400 strides."""

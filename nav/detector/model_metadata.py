@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from nav.detector.maps import SIZE_STEP_PX
+from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 METADATA_KEY = "droguekit_detector"
 """Under this key an ONNX file has the JSON text of `ModelMetadata`."""
@@ -24,7 +24,8 @@ class ModelMetadata:
         score_threshold: what scores lower is no drogue.
         classes: names, one.
         licence: of the weights.
-        manifest_sha256: of the dataset that it was trained on; empty where it was on none of ours.
+        manifest_sha256: of the dataset that it was trained on; empty where it was none of ours, or several, which
+            `training` tells.
         network: its `NetworkConfig` as a dict; empty where it is none of ours.
         training: what else is told of the training: plain JSON.
     """
@@ -41,7 +42,10 @@ class ModelMetadata:
         sides = self.input_size_px
         if len(sides) != 2 or any(type(side) is not int or side < 1 or side % SIZE_STEP_PX for side in sides):
             raise ValueError(f"input_size_px: must be two multiples of {SIZE_STEP_PX}, got {sides!r}")
-        if not isinstance(self.score_threshold, (int, float)) or not 0 <= self.score_threshold <= 1:
+        if max(sides) > MOST_SIDE_PX:
+            raise ValueError(f"input_size_px: must be at most {MOST_SIDE_PX} a side, got {sides!r}")
+        # A bool is an int to Python.
+        if type(self.score_threshold) not in (int, float) or not 0 <= self.score_threshold <= 1:
             raise ValueError(f"score_threshold: must be 0 to 1, got {self.score_threshold!r}")
         if len(self.classes) != 1 or not all(isinstance(name, str) for name in self.classes):
             raise ValueError(f"classes: must be one name, got {self.classes!r}")

@@ -15,7 +15,7 @@ from geometry.stereo import EYES, Eye
 from nav.detector.decoding import decode
 from nav.detector.input_image import input_image, letterbox, network_input
 from nav.detector.interface import Detection, StereoDetection
-from nav.detector.maps import MAP_CHANNELS, SIZE_STEP_PX, STRIDES
+from nav.detector.maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 
 _FAULTS = (
@@ -129,6 +129,8 @@ def _checked_input(file: Path, session: onnxruntime.InferenceSession) -> tuple[s
         return inputs[0].name, None
     if width % SIZE_STEP_PX or height % SIZE_STEP_PX:
         raise ValueError(f"{file}: width and height must be multiples of {SIZE_STEP_PX}, got {width}x{height}")
+    if max(width, height) > MOST_SIDE_PX:
+        raise ValueError(f"{file}: width and height must be at most {MOST_SIDE_PX}, got {width}x{height}")
     return inputs[0].name, (width, height)
 
 

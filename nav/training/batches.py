@@ -20,7 +20,6 @@ from nav.training.image_views import (
     ImageView,
     ViewRanges,
     Window,
-    fit_scale,
     sample_view,
     show,
     whole_view,
@@ -35,7 +34,7 @@ from nav.training.settings import SizePx, TrainingSettings
 _MOSAIC_FRACTION = 0.8  # of the images while mosaic is on
 _WHOLE_FRACTION = 0.25  # of the others: as they are when the detector is used
 # Scales against the image that just fits the network's input.
-_MOSAIC_RANGES = ViewRanges(scale=(0.3, 1.3), turn_deg=4, flip_fraction=0.5)
+_MOSAIC_RANGES = ViewRanges(scale=(0.4, 1.4), turn_deg=4, flip_fraction=0.5)
 _SINGLE_RANGES = ViewRanges(scale=(0.65, 1.5), turn_deg=4, flip_fraction=0.5)
 _AHEAD_BATCHES = 2
 
@@ -95,7 +94,7 @@ class BatchMaker:
         size = settings.size_at(step)
         views = self._sample_views(rng, members, size, is_mosaic)
         for eye_number, of_eye in enumerate(zip(*members, strict=True)):
-            # The eyes see one scene in one light, but each with its own noise.
+            # The eyes see one scene, but each in light and with noise, occluders and distractors of its own.
             light = generator(settings.seed, epoch, position, f"light {eye_number}")
             yield self._paint(light, list(of_eye), views, size)
 
@@ -110,14 +109,15 @@ class BatchMaker:
         self, rng: np.random.Generator, members: list[list[tuple[int, EyeIndex]]], size: SizePx, is_mosaic: bool
     ) -> list[ImageView]:
         source_wh, canvas_wh = self._corpus.size_px[::-1], size[::-1]
-        fit = fit_scale(source_wh, canvas_wh)
         # What only one eye sees is a reason to look there too.
         boxes = [np.vstack([self._corpus.boxes(*member) for member in sample]) for sample in members]
         if is_mosaic:
-            return sample_mosaic(rng, [source_wh] * len(boxes), boxes, canvas_wh, _MOSAIC_RANGES.times(fit))
+            ranges = _MOSAIC_RANGES.on_canvas(source_wh, canvas_wh)
+            return sample_mosaic(rng, [source_wh] * len(boxes), boxes, canvas_wh, ranges)
         if rng.random() < _WHOLE_FRACTION:
             return [whole_view(source_wh, canvas_wh)]
-        return [sample_view(rng, source_wh, boxes[0], Window(0, 0, *canvas_wh), _SINGLE_RANGES.times(fit))]
+        ranges = _SINGLE_RANGES.on_canvas(source_wh, canvas_wh)
+        return [sample_view(rng, source_wh, boxes[0], Window(0, 0, *canvas_wh), ranges)]
 
     def _paint(
         self, rng: np.random.Generator, members: list[tuple[int, EyeIndex]], views: list[ImageView], size: SizePx

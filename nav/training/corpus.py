@@ -92,18 +92,12 @@ def open_corpus(
         OSError: the cache cannot be written.
         KeyboardInterrupt: it was told to stop.
     """
-
-    def advance() -> None:
-        observer.advance()
-        if should_stop():
-            raise KeyboardInterrupt
-
     datasets = _open_datasets(paths)
     caches = []
     for dataset in datasets:
         observer.begin(f"images of {dataset.path} at {size_text(size_px)}", len(dataset.frame_indices))
         try:
-            caches.append(open_cache(dataset, cache, size_px, threads, advance))
+            caches.append(open_cache(dataset, cache, size_px, threads, observer, should_stop))
         finally:
             observer.end()
         if not any(box is not None for pair in caches[-1].pairs for box in pair.boxes):
@@ -132,6 +126,7 @@ def _open_datasets(paths: Sequence[Location]) -> list[Dataset]:
         of_hash[manifest.dataset_sha256] = dataset.path
         if all(entry.empty for entry in manifest.frames):
             raise ValueError(f"{dataset.path}: has no pair with a drogue; there is nothing to learn from")
+        # Rigs may differ otherwise: a network sees pixels, and how large a drogue is in them, not focal lengths.
         first, camera = datasets[0].manifest.recipe.rig.camera, manifest.recipe.rig.camera
         if (camera.width_px, camera.height_px) != (first.width_px, first.height_px):
             raise ValueError(

@@ -10,11 +10,12 @@ import fcntl
 import json
 import os
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import IO, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -26,11 +27,13 @@ from datasets_manifest.manifest import SplitName
 from datasets_manifest.reader import Dataset
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
+from nav.training.observer import Observer
 from nav.training.ordered_work import in_order
 from nav.training.settings import SizePx, size_text
 
 _VERSION = 1  # grows with every change of what stands in a cache
 _IMAGES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "index.json", ".lock"
+_ASK_AGAIN_S = 0.2
 
 
 class CachedPair(FrozenModel):
@@ -72,7 +75,12 @@ class _ReadPair(NamedTuple):
 
 
 def open_cache(
-    dataset: Dataset, folder: Path, size_px: SizePx, threads: int, advance: Callable[[], None]
+    dataset: Dataset,
+    folder: Path,
+    size_px: SizePx,
+    threads: int,
+    observer: Observer,
+    should_stop: Callable[[], bool],
 ) -> ImageCache:
     """The dataset's cache, made if it is not there: every image is decoded, and all hashes are checked.
 
@@ -81,15 +89,23 @@ def open_cache(
         folder: of all caches.
         size_px: (height, width) of the network's input.
         threads: that decode.
-        advance: called for each pair that is decoded.
+        observer: is told of each pair that is decoded, and if others at work on the caches are waited for.
+        should_stop: asked after each pair, and while waiting.
 
     Raises:
         ValueError: a file of the dataset is missing, damaged or changed; names it.
         OSError: the cache cannot be written.
+        KeyboardInterrupt: it was told to stop.
     """
+
+    def advance() -> None:
+        observer.advance()
+        if should_stop():
+            raise KeyboardInterrupt
+
     place = folder / f"{dataset.manifest.dataset_sha256[:20]}-{size_text(size_px)}"
     folder.mkdir(parents=True, exist_ok=True)
-    with _locked(folder):
+    with _locked(folder, observer, should_stop):
         cache = _read(place, dataset, size_px)
         if cache is None:
             shutil.rmtree(place, ignore_errors=True)
@@ -104,11 +120,26 @@ def open_cache(
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _locked(folder: Path, observer: Observer, should_stop: Callable[[], bool]) -> Iterator[None]:
     """Let others who want the same caches wait; the kernel frees the lock when the process ends, however it ends."""
     with (folder / _LOCK_FILE).open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        said = False
+        while not _takes(lock):
+            if not said:
+                observer.say(f"{folder}: waiting for another training that makes images there")
+                said = True
+            if should_stop():
+                raise KeyboardInterrupt
+            time.sleep(_ASK_AGAIN_S)
         yield
+
+
+def _takes(lock: IO[str]) -> bool:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _read(place: Path, dataset: Dataset, size_px: SizePx) -> ImageCache | None:

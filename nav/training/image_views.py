@@ -12,14 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nav.detector.input_image import PADDING_DN
+from nav.detector.input_image import PADDING_DN, fit_picture, letterbox
 
 Boxes = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 LEAST_VISIBLE_FRACTION = 0.3
 """A drogue of which a view shows less is painted over, for nobody would call what is left a drogue."""
-_SMALLEST_BOX_PX = 7.0  # longer side; at 40 m the paper's camera sees 11 px at an input of 320x416
+# Longer side against the canvas's height: 13 px of 480, 9 px of 320. At 40 m the paper's camera sees 17.5 and 11 px.
+_SMALLEST_BOX_SHARE = 0.027
 _LARGEST_BOX_SHARE = 1.2  # longer side against the window's shorter one; more is mostly cut off
 _SHIFT_SHARE = 0.9  # how much of the freedom to move the crop is used while the drogue stays in it
 
@@ -42,36 +43,42 @@ class ViewRanges:
         scale: smallest and largest magnification; 1 shows a pixel of the image as one of the canvas.
         turn_deg: largest rotation either way.
         flip_fraction: share of views that are mirrored left to right.
+        smallest_box_px: longer side to which a box is reduced at most. [px]
     """
 
     scale: tuple[float, float]
     turn_deg: float
     flip_fraction: float
+    smallest_box_px: float = 0.0
 
-    def times(self, factor: float) -> ViewRanges:
-        """The same with magnifications multiplied by a factor."""
-        return replace(self, scale=(self.scale[0] * factor, self.scale[1] * factor))
+    def on_canvas(self, source_wh: tuple[int, int], canvas_wh: tuple[int, int]) -> ViewRanges:
+        """The same, but magnifications count from the one that just fits the image in; the smallest box is set."""
+        fit = min(canvas_wh[0] / source_wh[0], canvas_wh[1] / source_wh[1])
+        scale = self.scale[0] * fit, self.scale[1] * fit
+        return replace(self, scale=scale, smallest_box_px=_SMALLEST_BOX_SHARE * canvas_wh[1])
 
 
 @dataclass(frozen=True, eq=False)
 class ImageView:
-    """Where an image's points go: `canvas = linear @ source + shift`, both counted from corners, shown in `window`."""
+    """Where an image's points go: `canvas = linear @ source + shift`, both counted from corners, shown in `window`.
+
+    Attributes:
+        linear, shift: of that map.
+        window: of the canvas.
+        is_whole: all of the image on all of the canvas, with the very pixels that the detector sees in use.
+    """
 
     linear: NDArray[np.float64]
     shift: NDArray[np.float64]
     window: Window
-
-
-def fit_scale(source_wh: tuple[int, int], canvas_wh: tuple[int, int]) -> float:
-    """Magnification at which a whole image just fits a canvas."""
-    return min(canvas_wh[0] / source_wh[0], canvas_wh[1] / source_wh[1])
+    is_whole: bool = False
 
 
 def whole_view(source_wh: tuple[int, int], canvas_wh: tuple[int, int]) -> ImageView:
     """The whole image in the middle of the canvas: what is not augmented."""
-    scale = fit_scale(source_wh, canvas_wh)
-    shift = (np.array(canvas_wh) - scale * np.array(source_wh)) / 2
-    return ImageView(np.eye(2) * scale, shift, Window(0, 0, *canvas_wh))
+    place = letterbox(source_wh, canvas_wh)
+    shift = np.array(place.offset_px, dtype=np.float64)
+    return ImageView(np.diag(place.scale), shift, Window(0, 0, *canvas_wh), is_whole=True)
 
 
 def sample_view(
@@ -91,7 +98,7 @@ def sample_view(
         longest_px = float(boxes[0, 2:].max())
         largest_px = _LARGEST_BOX_SHARE * min(window.width, window.height)
         high_scale = max(min(high_scale, largest_px / longest_px), low_scale)
-        low_scale = min(max(low_scale, _SMALLEST_BOX_PX / longest_px), high_scale)
+        low_scale = min(max(low_scale, ranges.smallest_box_px / longest_px), high_scale)
     scale = float(np.exp(rng.uniform(np.log(low_scale), np.log(high_scale))))
     turn = np.radians(rng.uniform(-ranges.turn_deg, ranges.turn_deg))
     mirror = -1.0 if rng.random() < ranges.flip_fraction else 1.0
@@ -109,6 +116,9 @@ def sample_view(
 def draw_view(canvas: Image, image: Image, view: ImageView) -> None:
     """Paint the view into its window of the canvas, grey where the image ends."""
     window = view.window
+    if view.is_whole:
+        canvas[:] = fit_picture(image, (window.width, window.height))[0]
+        return
     source = image
     # Averaging before a strong reduction, which interpolation would alias.
     reduction = int(1 / np.sqrt(abs(np.linalg.det(view.linear))))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nav.training.image_views import Boxes, Image
 
 _OCCLUDED_FRACTION = 0.12  # share of the drogues
-_MOST_HIDDEN = 0.45  # of a drogue's ellipse; an occluder that hides more is not painted
+_MOST_HIDDEN = 0.45  # of a drogue's ellipse; an occluder with which more of any is hidden is not painted
 _DISTRACTED_FRACTION = 0.3  # share of the canvases
 _MOST_DISTRACTORS = 3
 _DISTRACTOR_SIZE = (0.02, 0.25)  # of the canvas's height
@@ -30,17 +30,20 @@ def occlude(rng: np.random.Generator, image: Image, boxes: Boxes) -> Boxes:
         (n, 4) the boxes of what remains visible.
     """
     remaining = boxes.copy()
-    for number, box in enumerate(boxes):
+    hidden = np.zeros(image.shape[:2], dtype=np.uint8)
+    for box in boxes:
         # All draws are made for every box, so that what follows does not depend on what is painted.
         wanted, corners, color = rng.random() < _OCCLUDED_FRACTION, _sample_occluder(rng, box), _sample_color(rng)
         if not wanted:
             continue
-        hidden = np.zeros(image.shape[:2], dtype=np.uint8)
-        cv2.fillConvexPoly(hidden, corners, 1)
-        left = _visible_box(hidden, box)
-        if left is not None:
-            image[hidden.astype(bool)] = color
-            remaining[number] = left
+        with_it = hidden.copy()
+        cv2.fillConvexPoly(with_it, corners, 1)
+        # It may stand before the others too, together with those painted before.
+        left = [_visible_box(with_it, each) for each in boxes]
+        visible = [each for each in left if each is not None]
+        if len(visible) == len(boxes):
+            image[with_it > hidden] = color
+            hidden, remaining = with_it, np.array(visible)
     return remaining
 
 
@@ -61,7 +64,7 @@ def _sample_color(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 
 def _visible_box(hidden: NDArray[np.uint8], box: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The box of what an occluder leaves of the ellipse in a box; None where that is too little."""
+    """The box of what occluders leave of the ellipse in a box; None where that is too little."""
     low = np.floor(box[:2]).astype(int)
     high = np.minimum(np.ceil(box[:2] + box[2:]).astype(int), hidden.shape[::-1])
     y, x = np.mgrid[low[1] : high[1], low[0] : high[0]] + 0.5

@@ -1,6 +1,7 @@
 """Photometric augmentation: exposure, gamma, white balance, colour, blur, noise, low light.
 
-Numbers are gamma-encoded or linear, as the dataset's are; the draws are wide enough for both.
+Images are encoded by the sRGB curve whatever the dataset's sensor (`nav.detector.input_image`), and factors multiply
+encoded numbers: half the number is about a fifth of the light.
 """
 
 from __future__ import annotations
@@ -16,17 +17,20 @@ _TONE_FRACTION, _EXPOSURE, _GAMMA, _BALANCE = 0.8, (0.55, 1.7), (0.7, 1.45), (0.
 _CAST_FRACTION, _CAST = 0.2, (0.6, 1.5)
 _GREY_FRACTION = 0.08  # mono cameras; and colour must not be all that the network knows
 _SATURATION = (0.5, 1.4)
-_LOW_LIGHT_FRACTION, _LOW_LIGHT = 0.12, (0.06, 0.4)
+_LOW_LIGHT_FRACTION, _LOW_LIGHT = 0.12, (0.15, 0.5)
+_LEAST_MEAN_DN = 20.0  # no image is made darker: a drogue that nobody sees would keep its box
 _BLUR_FRACTION, _BLUR_SIGMA_PX = 0.15, (0.4, 1.6)
 _STREAK_FRACTION, _STREAK_PX = 0.08, (3, 9)
 _NOISE_FRACTION, _NOISE_DN = 0.35, (0.5, 6.0)
-_LOW_LIGHT_NOISE_DN = (3.0, 14.0)
+_LOW_LIGHT_NOISE_DN = (2.0, 8.0)
 
 
 def vary_light(rng: np.random.Generator, image: Image) -> Image:
     """The image in other light, by another camera. (H, W, 3) to a new (H, W, 3)."""
     is_dark = rng.random() < _LOW_LIGHT_FRACTION
-    image = cv2.LUT(_mix_colors(rng, image), _tone_curves(rng, is_dark))
+    image = cv2.LUT(_mix_colors(rng, image), _tone_curves(rng))
+    if is_dark:
+        image = _darken(rng, image)
     if rng.random() < _BLUR_FRACTION:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), _log_uniform(rng, _BLUR_SIGMA_PX).item()), dtype=np.uint8)
     if rng.random() < _STREAK_FRACTION:
@@ -51,7 +55,7 @@ def _mix_colors(rng: np.random.Generator, image: Image) -> Image:
     return np.asarray(cv2.transform(image, mix), dtype=np.uint8)
 
 
-def _tone_curves(rng: np.random.Generator, is_dark: bool) -> NDArray[np.uint8]:
+def _tone_curves(rng: np.random.Generator) -> NDArray[np.uint8]:
     """(256, 1, 3) new number for every old one and colour."""
     gain, gamma, balance = np.ones(1), np.ones(1), np.ones(3)
     if rng.random() < _TONE_FRACTION:
@@ -59,11 +63,15 @@ def _tone_curves(rng: np.random.Generator, is_dark: bool) -> NDArray[np.uint8]:
         balance = _log_uniform(rng, _BALANCE, 3)
     if rng.random() < _CAST_FRACTION:
         balance = balance * _log_uniform(rng, _CAST, 3)
-    if is_dark:
-        gain = _log_uniform(rng, _LOW_LIGHT)
     level = (np.arange(256) / 255)[:, None] ** gamma * gain * balance
     curves: NDArray[np.uint8] = np.rint(255 * np.clip(level, 0, 1)).astype(np.uint8)
     return curves[:, None, :]
+
+
+def _darken(rng: np.random.Generator, image: Image) -> Image:
+    """In low light."""
+    gain = max(_log_uniform(rng, _LOW_LIGHT).item(), min(1.0, _LEAST_MEAN_DN / max(float(image.mean()), 1.0)))
+    return np.asarray(cv2.LUT(image, np.rint(gain * np.arange(256)).astype(np.uint8)), dtype=np.uint8)
 
 
 def _streak(rng: np.random.Generator, image: Image) -> Image:

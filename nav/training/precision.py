@@ -43,9 +43,9 @@ def open_computing(settings: TrainingSettings) -> Computing:
 
 @contextmanager
 def own_threads(threads: int) -> Iterator[None]:
-    """Compute with so many threads meanwhile, all cores by 0; images are prepared by threads of their own."""
+    """Compute with so many threads meanwhile, all cores that it may use by 0; images are prepared by others."""
     before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(threads or os.cpu_count() or 1)
+    torch.set_num_threads(threads or len(os.sched_getaffinity(0)))
     cv2.setNumThreads(1)
     try:
         yield

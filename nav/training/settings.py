@@ -10,15 +10,14 @@ from pydantic import Field, ValidationError, model_validator
 
 from datasets_manifest.json_types import FrozenModel
 from drogue_models.presets import explain
-
-STRIDE_PX = 32
-"""Heights and widths of the network's input are multiples of it."""
+from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 SizePx = tuple[int, int]
 """(height, width) of the network's input. [px]"""
 
-# They change where or how fast the work is done, and floats in their last bits, but not what is trained.
-_FREE_TO_CHANGE = ("device", "threads", "loader_threads", "checkpoint_minutes")
+# They change where or how fast the work is done, floats in their last bits, or the file's label, but not what is
+# trained.
+_FREE_TO_CHANGE = ("device", "threads", "loader_threads", "checkpoint_minutes", "licence")
 
 
 class TrainingSettings(FrozenModel):
@@ -42,6 +41,7 @@ class TrainingSettings(FrozenModel):
         threads: that compute; as many as cores by 0.
         loader_threads: that prepare images meanwhile.
         checkpoint_minutes: at least so often the state is saved, besides the end of every epoch.
+        licence: of the weights, written into the files, such as an SPDX name; empty where nobody says.
     """
 
     variant: Literal["l", "s"] = "l"
@@ -49,12 +49,12 @@ class TrainingSettings(FrozenModel):
     fusion: Literal["asff", "concat"] = "asff"
     views: Literal["one", "both"] = "both"
     mosaic: bool = True
-    plain_fraction: float = Field(default=0.2, ge=0, le=1)
+    plain_fraction: float = Field(default=0.15, ge=0, le=1)
     size_px: SizePx = (480, 640)
     final_size_px: SizePx | None = None
-    final_fraction: float = Field(default=1 / 3, gt=0, lt=1)
+    final_fraction: float = Field(default=0.5, gt=0, lt=1)
     image_passes: int = Field(default=40_000, ge=1)
-    batch_images: int = Field(default=8, ge=2)
+    batch_images: int = Field(default=8, ge=2, le=1024)
     optimizer: Literal["adamw", "sgd"] = "adamw"
     learning_rate: float = Field(default=2e-3, gt=0)
     weight_decay: float = Field(default=0.02, ge=0)
@@ -65,15 +65,20 @@ class TrainingSettings(FrozenModel):
     seed: int = Field(default=0, ge=0, lt=2**63)
     precision: Literal["auto", "float32", "bf16"] = "auto"
     device: Literal["cpu", "cuda"] = "cpu"
-    threads: int = Field(default=0, ge=0)
-    loader_threads: int = Field(default=1, ge=1)
+    threads: int = Field(default=0, ge=0, le=1024)
+    loader_threads: int = Field(default=1, ge=1, le=64)
     checkpoint_minutes: float = Field(default=5.0, gt=0)
+    licence: str = Field(default="", max_length=100)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         for name, size in (("size_px", self.size_px), ("final_size_px", self.final_size_px)):
-            if size is not None and not all(side >= STRIDE_PX and side % STRIDE_PX == 0 for side in size):
-                raise ValueError(f"{name}: must be multiples of {STRIDE_PX} px, such as 480x640, got {size_text(size)}")
+            if size is not None and not all(side >= SIZE_STEP_PX and side % SIZE_STEP_PX == 0 for side in size):
+                raise ValueError(
+                    f"{name}: must be multiples of {SIZE_STEP_PX} px, such as 480x640, got {size_text(size)}"
+                )
+            if size is not None and max(size) > MOST_SIDE_PX:
+                raise ValueError(f"{name}: must be at most {MOST_SIDE_PX} px a side, got {size_text(size)}")
         if self.views == "both" and self.batch_images % 2:
             raise ValueError(f"batch_images: must be even for both views at once, got {self.batch_images}")
         return self

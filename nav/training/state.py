@@ -96,6 +96,31 @@ def save_state(out: Path, state: TrainingState, settings: TrainingSettings, data
     save(out / CHECKPOINT_FILE, content)
 
 
+def check_settings(out: Path, settings: TrainingSettings) -> None:
+    """Whether a folder can be trained in with these settings.
+
+    Raises:
+        ValueError: as `restore_state`, but for the datasets.
+    """
+    content = load(out / CHECKPOINT_FILE)
+    if content is not None:
+        _check_same(out / CHECKPOINT_FILE, content, settings, None)
+
+
+def _check_same(
+    path: Path, content: dict[str, Any], settings: TrainingSettings, datasets: Sequence[DatasetStamp] | None
+) -> None:
+    if content.get("version") != _VERSION:
+        raise ValueError(f"{path}: is of another version of droguekit; train into another folder")
+    differing = differing_settings(content.get("settings", {}), settings.model_dump(mode="json"))
+    if datasets is not None and content.get("datasets") != [asdict(stamp) for stamp in datasets]:
+        differing.append("datasets")
+    if differing:
+        raise ValueError(
+            f"{path}: belongs to a training that differs in {', '.join(differing)}; give the same, or another folder"
+        )
+
+
 def restore_state(
     out: Path, state: TrainingState, settings: TrainingSettings, datasets: Sequence[DatasetStamp]
 ) -> None:
@@ -109,15 +134,7 @@ def restore_state(
     content = load(path)
     if content is None:
         return
-    if content.get("version") != _VERSION:
-        raise ValueError(f"{path}: is of another version of droguekit; train into another folder")
-    differing = differing_settings(content.get("settings", {}), settings.model_dump(mode="json"))
-    if content.get("datasets") != [asdict(stamp) for stamp in datasets]:
-        differing.append("datasets")
-    if differing:
-        raise ValueError(
-            f"{path}: belongs to a training that differs in {', '.join(differing)}; give the same, or another folder"
-        )
+    _check_same(path, content, settings, datasets)
     try:
         state.network.load_state_dict(content["network"])
         state.average.network.load_state_dict(content["average"])

@@ -22,10 +22,11 @@ from nav.training.history import VALIDATED, Curves, EpochRow, write_tables
 from nav.training.observer import Observer
 from nav.training.precision import Computing
 from nav.training.schedule import learning_rate
-from nav.training.settings import TrainingSettings
+from nav.training.settings import SizePx, TrainingSettings
 from nav.training.state import TrainingState, save_state
 
 _CURVE_EVERY_STEPS = 10
+_VALIDATED_EPOCHS = 3  # every so many, before the last input size: the best weights are chosen among those after it
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +72,14 @@ class Trainer:
                 self._step(state, batch, curves)
                 state.row_seconds += time.monotonic() - began_s
                 self.observer.advance()
+                stops = self.should_stop()
                 if maker.epoch_after(state.step) > maker.epoch_after(state.step - 1) or state.step == settings.steps:
                     self._end_epoch(state, maker.epoch_after(state.step), curves)
                     saved_s = time.monotonic()
-                elif self.should_stop() or time.monotonic() - saved_s > 60 * settings.checkpoint_minutes:
+                elif stops or time.monotonic() - saved_s > 60 * settings.checkpoint_minutes:
                     self._save(state)
                     saved_s = time.monotonic()
-                if self.should_stop() and state.step < settings.steps:
+                if stops and state.step < settings.steps:
                     self.observer.say(f"stopped after {state.step * settings.batch_images:,} images, which are saved")
                     raise KeyboardInterrupt
                 began_s = time.monotonic()
@@ -116,12 +118,11 @@ class Trainer:
         """Validate, tell, keep the best, save."""
         settings, size = self.settings, self.settings.size_at(state.step - 1)
         began_s = time.monotonic()
-        measure_batch_statistics(state.average.network, self.corpus, size, self.computing)
-        answers = answer(state.average.network, self.corpus, "val", size, settings.batch_images, self.computing)
-        validation = average_precision(answers.truth, answers.found)
+        stage = int(settings.final_size_px is not None and size == settings.final_size_px)
+        leads_to_another = settings.final_size_px is not None and stage == 0 and state.step < settings.steps
+        validation = None if leads_to_another and epoch % _VALIDATED_EPOCHS else self._validate(state, size)
         row = self._row(state, epoch, validation)
         state.rows.append(row)
-        stage = int(settings.final_size_px is not None and size == settings.final_size_px)
         if validation is not None and (stage, validation.ap) > state.best:
             state.best = (stage, validation.ap)
             save(self.out / BEST_FILE, {"network": state.average.network.state_dict(), "step": state.step})
@@ -131,6 +132,12 @@ class Trainer:
         self._save(state)
         left_s = (settings.steps - state.step) * per_step_s
         self.observer.say(row.to_line(settings.steps * settings.batch_images, left_s))
+
+    def _validate(self, state: TrainingState, size: SizePx) -> AveragePrecision | None:
+        network = state.average.network
+        measure_batch_statistics(network, self.corpus, size, self.computing)
+        answers = answer(network, self.corpus, "val", size, self.settings.batch_images, self.computing)
+        return average_precision(answers.truth, answers.found)
 
     def _row(self, state: TrainingState, epoch: int, validation: AveragePrecision | None) -> EpochRow:
         settings = self.settings

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.manifest import SplitName
 from datasets_manifest.storage import Location
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.network.model import DetectorNetwork
 from nav.training.answers import Answers, answer
 from nav.training.average_precision import AveragePrecision, average_precision
+from nav.training.batch_statistics import measure_batch_statistics
 from nav.training.checkpoint import BEST_FILE, load, remove_leftovers
 from nav.training.corpus import Corpus, open_corpus
 from nav.training.observer import Observer
@@ -23,11 +25,10 @@ from nav.training.onnx_export import export_onnx
 from nav.training.precision import Computing, open_computing, own_threads
 from nav.training.score_threshold import best_threshold
 from nav.training.settings import TrainingSettings
-from nav.training.state import TrainingState, new_network, new_state, restore_state
+from nav.training.state import TrainingState, check_settings, new_network, new_state, restore_state
 from nav.training.trainer import Trainer
 
 SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"
-WEIGHTS_LICENCE = "Apache-2.0"
 _LOCK_FILE = ".lock"
 _USUAL_THRESHOLD = 0.5
 
@@ -75,8 +76,7 @@ def train(
         KeyboardInterrupt: it was told to stop, and what was done is saved; the same call goes on.
     """
     computing = open_computing(settings)
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: is a file; give a folder for the training")
+    _check_place(out)
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out), own_threads(settings.threads):
         remove_leftovers(out)
@@ -84,10 +84,29 @@ def train(
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
         state = new_state(settings, computing)
         restore_state(out, state, settings, corpus.datasets)
+        _load_best(out, state)
         write_text_atomic(out / SETTINGS_FILE, json.dumps(settings.model_dump(mode="json"), indent=1) + "\n")
         observer.say(_summary(corpus, settings, computing, state))
         Trainer(corpus, settings, computing, out, observer, should_stop).run(state)
         return _finish(out, corpus, settings, computing, state)
+
+
+def check_before(out: Path, settings: TrainingSettings) -> None:
+    """What can be known of a training before its datasets are there.
+
+    Raises:
+        ValueError: a device that is not there, a folder of other settings, or one in which another run is at work.
+    """
+    open_computing(settings)
+    _check_place(out)
+    if out.exists():
+        with _locked(out):
+            check_settings(out, settings)
+
+
+def _check_place(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is a file; give a folder for the training")
 
 
 @contextmanager
@@ -119,11 +138,15 @@ def _finish(
 ) -> TrainingResult:
     """Evaluate and export the best weights, and the last."""
     best_step, network = _best(out, settings, state)
+    network.to(computing.device)
     size = settings.size_at(settings.steps - 1)
+    # The files are used in float32, so that is how they are measured.
+    exact = Computing(computing.device, bf16=False)
+    for each in (network, state.average.network):
+        measure_batch_statistics(each, corpus, size, exact)
 
-    def answers(split: Any) -> Answers:
-        network_here = network.to(computing.device)
-        return answer(network_here, corpus, split, size, settings.batch_images, computing)
+    def answers(split: SplitName) -> Answers:
+        return answer(network, corpus, split, size, settings.batch_images, exact)
 
     validation, test = answers("val"), answers("test")
     threshold = best_threshold(validation.truth, validation.found, _USUAL_THRESHOLD)
@@ -139,8 +162,8 @@ def _finish(
     metadata = ModelMetadata(
         input_size_px=(size[1], size[0]),
         score_threshold=threshold,
-        licence=WEIGHTS_LICENCE,
-        manifest_sha256=corpus.datasets[0].manifest_sha256,
+        licence=settings.licence,
+        manifest_sha256=corpus.datasets[0].manifest_sha256 if len(corpus.datasets) == 1 else "",
         network=network.config.to_dict(),
         training=table,
     )
@@ -152,12 +175,31 @@ def _finish(
 def _best(out: Path, settings: TrainingSettings, state: TrainingState) -> tuple[int, DetectorNetwork]:
     """The step and the averaged weights that were best on the validation split, or the last where there is none."""
     network = new_network(settings).eval()
-    saved = load(out / BEST_FILE) if state.best[0] >= 0 else None
+    saved = _load_best(out, state)
     if saved is None:
         network.load_state_dict(state.average.network.state_dict())
         return state.step, network
-    network.load_state_dict(saved["network"])
-    return int(saved["step"]), network
+    try:
+        network.load_state_dict(saved["network"])
+        return int(saved["step"]), network
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{out / BEST_FILE}: does not fit this network; train into another folder") from error
+
+
+def _load_best(out: Path, state: TrainingState) -> dict[str, Any] | None:
+    """The best weights so far; None where none were found yet.
+
+    Raises:
+        ValueError: they are missing or damaged.
+    """
+    if state.best[0] < 0:
+        return None
+    saved = load(out / BEST_FILE)
+    if saved is None:
+        raise ValueError(
+            f"{out / BEST_FILE}: is missing, the best weights so far; put it back, or train anew elsewhere"
+        )
+    return saved
 
 
 def _result_table(result: TrainingResult, corpus: Corpus, settings: TrainingSettings) -> dict[str, Any]:

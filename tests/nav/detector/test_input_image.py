@@ -110,3 +110,8 @@ def test_eyes_and_channels_keep_their_order():
 def test_sizes_that_no_network_takes_are_refused(size):
     with pytest.raises(ValueError, match=f"input_size_px: must be multiples of 32, got {size[0]}x{size[1]}"):
         letterbox((1280, 960), size)
+
+
+def test_absurd_sizes_are_refused():
+    with pytest.raises(ValueError, match="input_size_px: must be at most 4096 a side, got 3200x3200000"):
+        letterbox((1280, 960), (3200, 3_200_000))

@@ -116,6 +116,7 @@ def test_a_network_of_fixed_size_needs_no_metadata(red_squares):
         ({"metadata": METADATA, "strides": (4, 8, 16)}, "outputs must be maps of numbers"),
         ({"metadata": METADATA, "shape": (1, 3, 256, 320)}, "takes one image a pass"),
         ({"metadata": METADATA, "shape": ("b", 3, 250, 320)}, "must be multiples of 32, got 320x250"),
+        ({"metadata": METADATA, "shape": ("b", 3, 32, 32_000)}, "must be at most 4096, got 32000x32"),
         ({"metadata": METADATA, "shape": ("b", 1, "h", "w")}, r"one float32 input \(B, 3, H, W\)|not an ONNX network"),
     ],
 )
@@ -133,7 +134,9 @@ def test_networks_of_another_kind_are_refused(red_squares, kwargs, message):
         ("[1]", "metadata: must be an object, got list"),
         ('{"input_size_px": [320, 250]}', "input_size_px: must be two multiples of 32"),
         ('{"input_size_px": 320}', "input_size_px: must be a list"),
+        ('{"input_size_px": [320, 32000]}', "input_size_px: must be at most 4096 a side"),
         ('{"score_threshold": "high"}', "score_threshold: must be 0 to 1"),
+        ('{"score_threshold": true}', "score_threshold: must be 0 to 1, got True"),
         ('{"licence": 5}', "licence: must be a text, got 5"),
         ('{"training": []}', "training: must be an object"),
         ('{"colour": 1}', "metadata: has unknown keys colour"),

@@ -12,7 +12,7 @@ from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.model_metadata import ModelMetadata
-from nav.detector.registry import DEFAULT_DETECTOR, detector_factory, detector_names, open_detector
+from nav.detector.registry import DEFAULT_DETECTOR, detector_factory, detector_names, network_file, open_detector
 from nav.runner import navigate
 
 DROGUE = PRESETS["red-8"]
@@ -27,6 +27,13 @@ def test_the_default_is_among_the_names():
 def test_a_name_that_does_not_exist_lists_those_that_do(name):
     with pytest.raises(ValueError, match=r"detector: must be one of color-blob, mobile-l, mobile-s or a file \*\.onnx"):
         open_detector(name, DROGUE)
+
+
+def test_networks_have_a_file_that_others_may_look_at():
+    assert network_file("color-blob") is None
+    assert str(network_file("other/mine.onnx")) == "other/mine.onnx"
+    shipped = network_file("mobile-s")
+    assert shipped is not None and shipped.name == "mobile-s.onnx" and shipped.is_absolute()
 
 
 def test_a_file_is_opened_once_and_called_by_its_name(red_squares):

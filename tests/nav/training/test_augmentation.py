@@ -40,6 +40,28 @@ def test_occluded_boxes_go_around_what_is_left() -> None:
     assert changed > 10
 
 
+def test_no_drogue_disappears_behind_the_occluder_of_another() -> None:
+    large, small = [10.0, 20.0, 90.0, 80.0], [104.0, 52.0, 14.0, 14.0]
+    rows, columns = np.mgrid[:120, :160] + 0.5
+    covered = 0
+    for seed in range(600):
+        image = np.full((120, 160, 3), 255, np.uint8)
+        boxes = occlude(np.random.default_rng(seed), image, np.array([large, small]))
+        assert boxes.shape == (2, 4)
+        left = (image == 255).all(axis=2)
+        for box, (x, y, width, height) in zip(boxes, (large, small), strict=True):
+            radii = (columns - x - width / 2) / (width / 2), (rows - y - height / 2) / (height / 2)
+            ellipse = radii[0] ** 2 + radii[1] ** 2 <= 1
+            visible = ellipse & left
+            assert visible.sum() >= 0.55 * ellipse.sum()
+            at = np.argwhere(visible)[:, ::-1] + 0.5
+            # Everything visible lies in the box, whose sides are at most a pixel away from it.
+            assert (at > box[:2]).all() and (at < box[:2] + box[2:]).all()
+            np.testing.assert_allclose([at.min(axis=0), at.max(axis=0)], [box[:2], box[:2] + box[2:]], atol=1.5)
+        covered += bool((boxes[1] != small).any())
+    assert covered > 10
+
+
 def test_distractors_never_touch_a_drogue() -> None:
     painted = 0
     for seed in range(300):
@@ -57,6 +79,10 @@ def test_light_varies_and_the_image_given_stays() -> None:
     assert all(each.shape == image.shape and each.dtype == np.uint8 for each in varied)
     means = np.array([each.mean() for each in varied])
     assert means.min() < 40 and means.max() > 180  # low light, and nearly twice the exposure
+    assert means.min() > 18  # 20, less what blur, rounding and cut-off noise change
+    dim = [vary_light(np.random.default_rng(seed), image // 6).mean() for seed in range(200)]
+    # What is dark already is exposed, cast and curved as all images are, by 0.55, 0.7 and a gamma of 1.45 at worst.
+    assert min(dim) > 255 * (21 / 255) ** 1.45 * 0.55 * 0.7
     again = vary_light(np.random.default_rng(7), image)
     np.testing.assert_array_equal(again, varied[7])
 
@@ -118,6 +144,7 @@ def test_an_epoch_shows_every_image_once(ellipse_corpus: Corpus) -> None:
 
 def test_the_last_part_is_larger_and_without_mosaic(ellipse_corpus: Corpus) -> None:
     changes = {"size_px": (64, 96), "final_size_px": (96, 128), "batch_images": 4, "image_passes": 120}
+    changes |= {"final_fraction": 1 / 3, "plain_fraction": 0.2}
     settings = build_settings(None, changes)
     maker = BatchMaker(ellipse_corpus, settings)
     assert [maker.batch(step).images.shape[1:3] for step in (0, 19, 20, 29)] == [(64, 96)] * 2 + [(96, 128)] * 2

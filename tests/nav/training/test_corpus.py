@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import fcntl
 import io
 import json
 import resource
@@ -72,6 +73,21 @@ def test_a_full_disk_leaves_no_cache(split_dataset: Path, tmp_path: Path) -> Non
     assert [each.name for each in tmp_path.iterdir()] == [".lock"]
 
 
+def test_waiting_for_anothers_cache_is_told_once_and_can_be_stopped(split_dataset: Path, tmp_path: Path) -> None:
+    told, asked = io.StringIO(), []
+
+    def stops_at_the_third_time() -> bool:
+        asked.append(True)
+        return len(asked) == 3
+
+    with (tmp_path / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(KeyboardInterrupt):
+            open_corpus([split_dataset], tmp_path, SIZE_PX, 1, PlainProgress(told), stops_at_the_third_time)
+    assert told.getvalue().count("waiting for another training") == 1
+    open_small([split_dataset], tmp_path)
+
+
 def damage_pixels(frame: Path) -> None:
     path = frame / "right.png"
     content = bytearray(path.read_bytes())
@@ -125,7 +141,9 @@ def test_datasets_that_cannot_teach(split_dataset: Path, render_toy: Callable[..
 def test_several_datasets_stand_one_after_another(
     split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path
 ) -> None:
-    second = render_toy(tmp_path / "second", seed="6", frames="{count = 2, scenes = 1}")
+    # Another rig, whose images have the same size.
+    rig = '{preset = "rgb-ideal", width_px = 320, height_px = 240, focal_px = 220.0}'
+    second = render_toy(tmp_path / "second", seed="6", frames="{count = 2, scenes = 1}", rig=rig)
     corpus = open_small([split_dataset, second], tmp_path / "cache")
     assert [stamp.name for stamp in corpus.datasets] == ["toy", "toy"]
     assert len(corpus.places) == 10

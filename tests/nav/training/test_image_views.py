@@ -3,9 +3,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from datasets_manifest.images import StereoImages
-from nav.detector.input_image import PADDING_DN, input_image
+from nav.detector.input_image import PADDING_DN, input_image, network_input
+from nav.training.answers import to_tensor, whole_image
+from nav.training.corpus import Corpus
+from nav.training.image_cache import CachedPair, ImageCache
 from nav.training.image_views import (
     LEAST_VISIBLE_FRACTION,
     ImageView,
@@ -19,6 +23,7 @@ from nav.training.image_views import (
     whole_view,
 )
 from nav.training.mosaic import sample_windows
+from nav.training.precision import Computing
 
 SOURCE_WH = (160, 120)
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])
@@ -37,6 +42,15 @@ def box_of_bright(canvas: np.ndarray) -> np.ndarray:
     return np.array([columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]], dtype=float)
 
 
+def center_of(canvas: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Centre of gravity of what is bright in and around a box, counted from the canvas's corner."""
+    rows, columns = np.mgrid[: canvas.shape[0], : canvas.shape[1]] + 0.5
+    low, high = box[:2] - 4, box[:2] + box[2:] + 4  # without the grey where the image ends
+    is_near = (columns > low[0]) & (columns < high[0]) & (rows > low[1]) & (rows < high[1])
+    weights = np.where(is_near, canvas[..., 0], 0.0)
+    return np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
+
+
 def test_boxes_go_where_the_pixels_go() -> None:
     window, compared = Window(20, 10, 200, 170), 0
     for seed in range(30):
@@ -47,8 +61,31 @@ def test_boxes_go_where_the_pixels_go() -> None:
         if shares[0] == 1:  # what is cut off is not round any more
             # Interpolation blurs an edge by about a pixel of the coarser of the two images, of up to 1.6 px here.
             np.testing.assert_allclose(box_of_bright(canvas), visible[0], atol=2.5)
+            # An edge's blur is the same on both sides: what is left is rounding to levels, and interpolation's phases.
+            np.testing.assert_allclose(center_of(canvas, visible[0]), visible[0, :2] + visible[0, 2:] / 2, atol=0.1)
             compared += 1
     assert compared > 5
+
+
+def test_a_mirrored_view_is_the_mirrored_image() -> None:
+    image = np.random.default_rng(1).integers(0, 256, (SOURCE_WH[1], SOURCE_WH[0], 3), dtype=np.uint8)
+    mirrored = ImageView(np.diag([-1.0, 1.0]), np.array([SOURCE_WH[0], 0.0]), Window(0, 0, *SOURCE_WH))
+    canvas = np.zeros_like(image)
+    draw_view(canvas, image, mirrored)
+    np.testing.assert_array_equal(canvas, image[:, ::-1])
+    # 160 - 60 - 50
+    np.testing.assert_array_equal(moved_boxes(BOX, mirrored), [[50.0, 40.0, 50.0, 36.0]])
+
+
+def test_no_view_makes_a_drogue_smaller_than_any_in_use() -> None:
+    canvas_wh, box = (416, 320), np.array([[100.0, 80.0, 11.0, 11.0]])
+    ranges = ViewRanges((0.1, 2.0), 0, 0.5).on_canvas(canvas_wh, canvas_wh)
+    heights = []
+    for seed in range(200):
+        view = sample_view(np.random.default_rng(seed), canvas_wh, box, Window(100, 50, 200, 180), ranges)
+        heights.append(moved_boxes(box, view)[0, 3])
+    # The paper's drogue at 40 m has 17.5 px of 480; three quarters of its share are the limit.
+    assert min(heights) == pytest.approx(0.75 * 17.5 / 480 * 320, rel=0.05)
 
 
 def test_the_rest_of_the_canvas_stays() -> None:
@@ -102,6 +139,20 @@ def test_the_whole_view_is_what_the_detector_sees() -> None:
     shown = show(canvas, cached, cached_place.to_input(boxes), whole_view((256, 192), (128, 96)))
     np.testing.assert_allclose(shown, place.to_input(boxes), atol=1e-9)  # sums of a few numbers
     np.testing.assert_array_equal(canvas, at_once)
+
+
+def test_validation_sees_what_the_network_is_given_in_use() -> None:
+    picture = np.random.default_rng(2).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+    stereo = StereoImages(picture, picture, 0.0, 1e-3, encoding="gamma")
+    in_use, place = input_image(stereo, "left", (416, 320))
+    assert place.offset_px == (0, 4)  # a reduction by 1.54, and margins
+    pairs = (CachedPair(frame_index=0, split="val", boxes=((31.0, 50.0, 100.0, 81.0), None)),)
+    corpus = Corpus((), (480, 640), (ImageCache(np.stack([picture, picture])[None], pairs),), np.array([[0, 0]]))
+    image, boxes = whole_image(corpus, 0, 0, (320, 416))
+    given = to_tensor(image[None], Computing(torch.device("cpu"), bf16=False))
+    np.testing.assert_allclose(given.numpy(), network_input([in_use]), atol=1e-7)  # division or product in float32
+    # Records count from pixel centres, a corpus from corners.
+    np.testing.assert_allclose(boxes, place.to_input(np.array([[30.5, 49.5, 100, 81]])), atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from nav.training.answers import to_tensor, whole_image
 from nav.training.average_precision import average_precision
+from nav.training.batch_statistics import measure_batch_statistics
 from nav.training.checkpoint import load, save
+from nav.training.corpus import Corpus
 from nav.training.moving_average import MovingAverage
+from nav.training.precision import Computing
 from nav.training.schedule import learning_rate
 from nav.training.score_threshold import best_threshold
 from nav.training.settings import TrainingSettings, build_settings, parse_size
@@ -77,6 +81,42 @@ def test_the_moving_average_takes_in_weights_and_running_means() -> None:
         torch.testing.assert_close(value, start[name] + gone, rtol=1e-5, atol=1e-5)  # float32 next to numbers of 1
 
 
+def test_batch_statistics_are_those_of_one_pass_over_all_images(ellipse_corpus: Corpus) -> None:
+    size_px, computing = (64, 96), Computing(torch.device("cpu"), bf16=False)
+    network = new_network(TrainingSettings(variant="s")).eval()
+    weights = {name: value.clone() for name, value in network.named_parameters()}
+    momenta = [layer.momentum for layer in normalizations(network)]
+    measure_batch_statistics(network, ellipse_corpus, size_px, computing)
+    first = {name: value.clone() for name, value in network.state_dict().items()}
+    # The input of the first one does not depend on any before it.
+    images = np.stack([whole_image(ellipse_corpus, pair, eye, size_px)[0] for pair in range(12) for eye in (0, 1)])
+    seen: list[tuple[torch.nn.Module, torch.Tensor]] = []
+    hooks = [
+        layer.register_forward_pre_hook(lambda layer, inputs: seen.append((layer, inputs[0])))
+        for layer in normalizations(network)
+    ]
+    with torch.no_grad():
+        network(to_tensor(images, computing))
+    for hook in hooks:
+        hook.remove()
+    layer, values = seen[0]
+    # The batches, of every second image, weigh equally. Each sums 18,432 numbers in float32, one after another: up to
+    # so many roundings of 6e-8, which are alike where the images are plain black.
+    torch.testing.assert_close(layer.running_mean, values.mean(dim=(0, 2, 3)), rtol=1e-3, atol=1e-4)
+    within = torch.stack([batch.var(dim=(0, 2, 3)) for batch in (values[::2], values[1::2])]).mean(dim=0)
+    torch.testing.assert_close(layer.running_var, within, rtol=1e-3, atol=1e-4)
+    measure_batch_statistics(network, ellipse_corpus, size_px, computing)
+    for name, value in network.state_dict().items():
+        torch.testing.assert_close(value, first[name], rtol=1e-5, atol=1e-6)
+    assert all(torch.equal(value, weights[name]) for name, value in network.named_parameters())
+    assert [layer.momentum for layer in normalizations(network)] == momenta
+    assert not any(module.training for module in network.modules())
+
+
+def normalizations(network: torch.nn.Module) -> list[torch.nn.BatchNorm2d]:
+    return [module for module in network.modules() if isinstance(module, torch.nn.BatchNorm2d)]
+
+
 def test_weights_follow_from_the_seed_and_torchs_generator_is_left_alone() -> None:
     before = torch.random.get_rng_state()
     first, second, other = (new_network(TrainingSettings(variant="s", seed=seed)) for seed in (1, 1, 2))
@@ -119,7 +159,11 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
     [
         ({"size_px": (480, 650)}, "size_px: must be multiples of 32 px"),
         ({"size_px": (0, 640)}, "size_px: must be multiples of 32 px"),
+        ({"size_px": (4128, 640)}, "size_px: must be at most 4096 px a side, got 4128x640"),
+        ({"final_size_px": (480, 320_000)}, "final_size_px: must be at most 4096 px a side"),
         ({"batch_images": 5}, "batch_images: must be even"),
+        ({"batch_images": 2048}, "batch_images:"),
+        ({"loader_threads": 65}, "loader_threads:"),
         ({"variant": "m"}, "variant:"),
         ({"learning_rate": float("nan")}, "learning_rate:"),
         ({"image_passes": 0}, "image_passes:"),

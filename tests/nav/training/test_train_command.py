@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 
@@ -34,8 +35,28 @@ def test_a_recipe_becomes_a_detector(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (out / "detector.onnx").stat().st_size > 0 and (out / "datasets" / "two-scenes" / "manifest.json").is_file()
     assert "at 64x96" in told.err and "at 96x128" in told.err
     assert run([*command, "--no-mosaic"]) == WRONG_INPUT
+    # Known before it looks at the rendered pairs again.
     refused = capsys.readouterr().err.splitlines()[-1]
     assert "belongs to a training that differs in mosaic;" in refused
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "message"),
+    [
+        (RECIPE.replace("train = 0.5, val = 0.5", "train = 0.0, val = 1.0"), [], "has no split to train on"),
+        (RECIPE, ["--device", "cuda"], "torch sees no CUDA device"),
+    ],
+    ids=["no split", "no device"],
+)
+def test_nothing_is_rendered_for_a_training_that_cannot_be(
+    text: str, options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "cuda" in options and torch.cuda.is_available():
+        pytest.skip("there is a CUDA device")
+    recipe, out = tmp_path / "recipe.toml", tmp_path / "out"
+    recipe.write_text(text)
+    assert run(["train", str(recipe), "--out", str(out), *options]) == WRONG_INPUT
+    assert message in capsys.readouterr().err and not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -1,27 +1,34 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
+import torch
 
 from droguekit.batch.progress import PlainProgress
+from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.training.answers import answer
+from nav.training.answers import answer, to_tensor, whole_image
 from nav.training.average_precision import average_precision
+from nav.training.batch_statistics import measure_batch_statistics
+from nav.training.checkpoint import BEST_FILE, CHECKPOINT_FILE, load
 from nav.training.corpus import open_corpus
-from nav.training.precision import open_computing, own_threads
+from nav.training.precision import Computing, open_computing, own_threads
 from nav.training.settings import build_settings
-from nav.training.state import new_state, restore_state
-from nav.training.training import TrainingResult, train
+from nav.training.state import new_network, new_state, restore_state
+from nav.training.training import TrainingResult, check_before, train
 
 # One thread and float32: the same sums in the same order, whoever else uses the machine.
 SMALL = {
@@ -70,7 +77,7 @@ def test_a_killed_training_goes_on_with_the_same_curve(split_dataset: Path, tmp_
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     run(split_dataset, whole, image_passes=24)
     # Asked after each of 8 pairs that are decoded, then in every step; two steps are an epoch of 4 pairs.
-    script = KILLED.replace("KILLED_AT", "12")
+    script = KILLED.replace("KILLED_AT", "11")
     command = [sys.executable, "-c", script, str(split_dataset), str(killed), settings.model_dump_json()]
     died = subprocess.run(command, capture_output=True, text=True, check=False)
     assert died.returncode == -signal.SIGKILL, died.stderr
@@ -91,14 +98,17 @@ def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset
     settings = build_settings(None, {**SMALL, "image_passes": 24})
     told = io.StringIO()
     with pytest.raises(KeyboardInterrupt):
-        train([split_dataset], tmp_path, settings, PlainProgress(told), tmp_path / "cache", Calls(12))
-    assert "which are saved" in told.getvalue()
+        # After the eight pairs that are decoded it is asked once a step.
+        train([split_dataset], tmp_path, settings, PlainProgress(told), tmp_path / "cache", Calls(11))
+    assert "stopped after 12 images, which are saved" in told.getvalue()
+    assert len(step_losses(tmp_path)) == 3
+    assert load(tmp_path / CHECKPOINT_FILE)["step"] == 3
     for changes, keys in (({"learning_rate": 0.5, "mosaic": False}, "mosaic, learning_rate"), ({"seed": 3}, "seed")):
         other = settings.model_copy(update=changes)
         with pytest.raises(ValueError, match=rf"checkpoint\.pt: belongs to a training that differs in {keys};"):
             train([split_dataset], tmp_path, other, PlainProgress(told))
     # Where and with how many threads it computes may change.
-    elsewhere = settings.model_copy(update={"loader_threads": 2, "checkpoint_minutes": 1.0})
+    elsewhere = settings.model_copy(update={"loader_threads": 2, "checkpoint_minutes": 1.0, "licence": "MIT"})
     train([split_dataset], tmp_path, elsewhere, PlainProgress(told))
     assert len(step_losses(tmp_path)) == settings.steps
 
@@ -115,13 +125,14 @@ class Calls:
 
 
 def test_what_a_training_leaves(split_dataset: Path, tmp_path: Path) -> None:
-    result, told = run(split_dataset, tmp_path, image_passes=16, views="one", attention="se", fusion="concat")
+    changes = {"image_passes": 16, "views": "one", "attention": "se", "fusion": "concat", "licence": "CC-BY-4.0"}
+    result, told = run(split_dataset, tmp_path, **changes)
     assert result.validation is not None and result.test is not None
     assert told.count("val AP50") == 2 and "left" in told
     metadata = {entry.key: entry.value for entry in onnx.load(result.file).metadata_props}
     stated = ModelMetadata.from_json(metadata[METADATA_KEY])
     manifest = json.loads((split_dataset / "manifest.json").read_text())
-    assert stated.licence == "Apache-2.0" and stated.manifest_sha256 == manifest["manifest_sha256"]
+    assert stated.licence == "CC-BY-4.0" and stated.manifest_sha256 == manifest["manifest_sha256"]
     assert stated.input_size_px == (128, 96)
     assert stated.network == {"variant": "s", "attention": "se", "fusion": "concat"}
     assert stated.training == json.loads((tmp_path / "result.json").read_text())
@@ -131,13 +142,61 @@ def test_what_a_training_leaves(split_dataset: Path, tmp_path: Path) -> None:
         "tensorboard",
     }  # fmt: skip
     # A finished training that is asked for again only evaluates and exports.
-    again, told = run(split_dataset, tmp_path, image_passes=16, views="one", attention="se", fusion="concat")
+    again, told = run(split_dataset, tmp_path, **changes)
     assert again == result and "epoch" not in told
+    (tmp_path / BEST_FILE).unlink()
+    with pytest.raises(ValueError, match=r"best\.pt: is missing"):
+        run(split_dataset, tmp_path, **changes)
+
+
+def test_a_training_in_bf16_exports_what_float32_computes(split_dataset: Path, tmp_path: Path) -> None:
+    result, _ = run(split_dataset, tmp_path, image_passes=4, precision="bf16")
+    settings = build_settings(None, SMALL)
+    corpus = open_corpus([split_dataset], tmp_path / "cache", settings.size_px, 1, PlainProgress(io.StringIO()))
+    network, exact = new_network(settings).eval(), Computing(torch.device("cpu"), bf16=False)
+    network.load_state_dict(load(tmp_path / BEST_FILE)["network"])
+    measure_batch_statistics(network, corpus, settings.size_px, exact)
+    image, _ = whole_image(corpus, 0, 0, settings.size_px)
+    with torch.no_grad():
+        expected = network(to_tensor(image[None], exact))
+    session = onnxruntime.InferenceSession(result.file.read_bytes(), providers=["CPUExecutionProvider"])
+    for got, reference in zip(session.run(None, {"images": network_input([image])}), expected, strict=True):
+        # Float32 summed in another order; statistics measured in bfloat16 are off by hundredths.
+        np.testing.assert_allclose(got, reference, atol=2e-4 * max(1.0, float(reference.abs().max())))
+
+
+def test_several_datasets_have_no_hash_of_one(
+    split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path
+) -> None:
+    second = render_toy(tmp_path / "second", seed="6", frames="{count = 2, scenes = 1}")
+    changes = {"image_passes": 4, "final_size_px": (64, 96), "final_fraction": 0.5}
+    settings, out = build_settings(None, {**SMALL, **changes}), tmp_path / "out"
+    result = train([split_dataset, second], out, settings, PlainProgress(io.StringIO()))
+    (entry,) = onnx.load(result.file).metadata_props
+    stated = ModelMetadata.from_json(entry.value)
+    assert stated.manifest_sha256 == "" and stated.licence == ""
+    assert len({each["manifest_sha256"] for each in stated.training["datasets"]}) == 2
+
+
+def test_what_stops_a_training_is_seen_before_there_is_data(split_dataset: Path, tmp_path: Path) -> None:
+    settings = build_settings(None, {**SMALL, "image_passes": 4})
+    check_before(tmp_path / "none", settings)
+    assert not (tmp_path / "none").exists()
+    out = tmp_path / "out"
+    run(split_dataset, out, image_passes=4)
+    check_before(out, settings)
+    with pytest.raises(ValueError, match="differs in seed;"):
+        check_before(out, settings.model_copy(update={"seed": 3}))
+    with (out / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(ValueError, match="another training is at work"):
+            check_before(out, settings)
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="file: is a file"):
+        check_before(tmp_path / "file", settings)
 
 
 def test_a_device_that_is_not_there_is_refused(split_dataset: Path, tmp_path: Path) -> None:
-    import torch
-
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
     with pytest.raises(ValueError, match="device: torch sees no CUDA device"):
@@ -145,8 +204,6 @@ def test_a_device_that_is_not_there_is_refused(split_dataset: Path, tmp_path: Pa
 
 
 def test_a_folder_in_use_is_refused(split_dataset: Path, tmp_path: Path) -> None:
-    import fcntl
-
     with (tmp_path / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(ValueError, match="another training is at work"):
