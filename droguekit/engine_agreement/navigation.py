@@ -43,8 +43,8 @@ class PairedDatasets:
 def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> tuple[Recipe, str]:
     """What is rendered at one distance, and the text that it comes from.
 
-    Every pixel gets as many samples by either engine: where one of them spent more on the markers' edges, its poses
-    would err less for that alone.
+    Every pixel of the drogue gets as many samples by either engine: where one of them spent more on the markers' edges,
+    its poses would err less for that alone.
     """
     recipe, text = load_recipe(RECIPE, seed)
     side = 2 * round(np.sqrt(_SAMPLES_AT_5_M) * distance_m / 5.0 / 2)
@@ -58,7 +58,6 @@ def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> tup
             "samples_per_px": samples,
             "open_samples_per_px": samples,
             "edge_samples_per_px": samples,
-            "surround_samples_per_px": samples,
         },
     }
     return Recipe.model_validate({**recipe.model_dump(), **changes}), text
