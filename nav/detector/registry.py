@@ -10,22 +10,21 @@ from nav.detector.interface import Detector
 
 COLOR_BLOB = "color-blob"
 DEFAULT_DETECTOR = COLOR_BLOB
-# Networks whose weights belong to the package, by the name of their file.
-_SHIPPED = ("mobile-l", "mobile-s")
+# Networks that belong to the package lie here, each under its name.
 _WEIGHTS = Path(__file__).parent / "weights"
 _SUFFIX = ".onnx"
 
 
 def detector_names() -> tuple[str, ...]:
-    """Names that `open_detector` knows, whether or not their weights are there."""
-    return (COLOR_BLOB, *_SHIPPED)
+    """Names that `open_detector` knows."""
+    return (COLOR_BLOB, *sorted(file.stem for file in _WEIGHTS.glob(f"*{_SUFFIX}")))
 
 
 def network_file(name_or_file: str) -> Path | None:
-    """Where the network of a name of `detector_factory` lies, or would; None for a name without one."""
-    if name_or_file in _SHIPPED:
-        return _WEIGHTS / f"{name_or_file}{_SUFFIX}"
-    return Path(name_or_file) if name_or_file.endswith(_SUFFIX) else None
+    """Where the network of a name of `detector_factory` lies; None for a name without one."""
+    if name_or_file.endswith(_SUFFIX):
+        return Path(name_or_file)
+    return _WEIGHTS / f"{name_or_file}{_SUFFIX}" if name_or_file in detector_names()[1:] else None
 
 
 def open_detector(name_or_file: str, drogue: DrogueParameters, threads: int = 1) -> Detector:
@@ -51,10 +50,6 @@ def detector_factory(name_or_file: str, threads: int = 1) -> Callable[[DroguePar
     if file is None:
         names = ", ".join(detector_names())
         raise ValueError(f"detector: must be one of {names} or a file *{_SUFFIX}, got {name_or_file!r}")
-    if name_or_file in _SHIPPED and not file.exists():
-        raise ValueError(
-            f"detector: the weights of {name_or_file} are not installed ({file}); name another detector, or a file"
-        )
     from nav.detector.onnx_detector import OnnxDetector
 
     network = OnnxDetector(file, file.stem, threads)

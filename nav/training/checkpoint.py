@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import io
-import os
 import pickle
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from datasets_manifest.atomic import PART_SUFFIX, part_path, sync_folder
+from datasets_manifest.atomic import PART_SUFFIX, open_bytes_atomic
 
 CHECKPOINT_FILE, BEST_FILE = "checkpoint.pt", "best.pt"
 
@@ -25,19 +23,8 @@ def save(path: Path, state: dict[str, Any]) -> None:
     # torch's own writer reports a full disk as an internal error.
     stream = io.BytesIO()
     torch.save(state, stream)
-    part = part_path(path)
-    try:
-        with part.open("xb") as file:
-            file.write(stream.getbuffer())
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
+    with open_bytes_atomic(path) as file:
+        file.write(stream.getbuffer())
 
 
 def load(path: Path) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@ from datasets_manifest.blind import BlindDataset
 from datasets_manifest.estimates import NoFix
 from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
+from nav.detector import registry
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.registry import DEFAULT_DETECTOR, detector_factory, detector_names, network_file, open_detector
@@ -25,15 +26,22 @@ def test_the_default_is_among_the_names():
 
 @pytest.mark.parametrize("name", ["", "yolo", "mobile-xl", "weights.pt"])
 def test_a_name_that_does_not_exist_lists_those_that_do(name):
-    with pytest.raises(ValueError, match=r"detector: must be one of color-blob, mobile-l, mobile-s or a file \*\.onnx"):
+    with pytest.raises(ValueError, match=r"detector: must be one of color-blob.* or a file \*\.onnx"):
         open_detector(name, DROGUE)
 
 
 def test_networks_have_a_file_that_others_may_look_at():
     assert network_file("color-blob") is None
     assert str(network_file("other/mine.onnx")) == "other/mine.onnx"
-    shipped = network_file("mobile-s")
-    assert shipped is not None and shipped.name == "mobile-s.onnx" and shipped.is_absolute()
+
+
+def test_networks_of_the_package_are_known_by_name_and_only_where_they_are(red_squares, monkeypatch):
+    file = red_squares(metadata=ModelMetadata(input_size_px=(320, 256)))
+    assert network_file("squares") is None
+    monkeypatch.setattr(registry, "_WEIGHTS", file.parent)
+    assert detector_names() == ("color-blob", "squares")
+    assert network_file("squares") == file
+    assert open_detector("squares", DROGUE).name == "squares"
 
 
 def test_a_file_is_opened_once_and_called_by_its_name(red_squares):
