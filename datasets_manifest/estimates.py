@@ -40,6 +40,61 @@ class Mode(FrozenModel):
     weight: float = Field(ge=0, le=1)
 
 
+class Region(FrozenModel):
+    """Where in one image the drogue was looked for.
+
+    Attributes:
+        eye: which image.
+        box_xywh_px: x, y of the low corner, width, height in pixel-centre coordinates; may reach over the image's edge.
+        source: `detector`, or the name of the tracker that followed it here.
+        score: 0 to 1.
+    """
+
+    eye: Eye
+    box_xywh_px: tuple[float, float, float, float]
+    source: str = Field(min_length=1, max_length=80)
+    score: float = Field(ge=0, le=1)
+
+
+class Motion(FrozenModel):
+    """How the drogue moves against the left camera, at the time of the images.
+
+    Attributes:
+        velocity_m_s: of the drogue's origin, in the left camera's axes. [m/s]
+        rate_rad_s: of its attitude, `R' = [w]x R`, in the left camera's axes. [rad/s]
+        covariance: (6, 6) of both in this order.
+    """
+
+    velocity_m_s: tuple[float, float, float]
+    rate_rad_s: tuple[float, float, float]
+    covariance: Matrix6
+
+
+class Docking(FrozenModel):
+    """The drogue as the probe sees it, in the receiver's body axes: forward, right, down.
+
+    Attributes:
+        mouth_from_tip_m: (3,) centre of the drogue's rim from the probe's tip. [m]
+        mouth_sd_m: (3,) standard deviations of that. [m]
+        closure_m_s: how fast the forward part shrinks; null where the motion is not known. [m/s]
+        miss_m: distance of the tip from the drogue's axis when it comes to the plane of the rim, if both go on as they
+            move now; null unless they close. [m]
+        miss_sd_m: standard deviation of that. [m]
+        contact_s: until then; null unless they close. [s]
+        captured: whether `miss_m` lies within the capture radius; null where there is no `miss_m`.
+        capture_radius_m: that radius; null for the drogue's own. [m]
+    """
+
+    mouth_from_tip_m: tuple[float, float, float]
+    mouth_sd_m: tuple[float, float, float]
+    closure_m_s: float | None = None
+    miss_m: float | None = Field(default=None, ge=0)
+    miss_sd_m: float | None = Field(default=None, ge=0)
+    contact_s: float | None = Field(default=None, ge=0)
+    captured: bool | None = None
+    capture_radius_m: float | None = Field(default=None, gt=0)
+
+
 class PoseEstimate(FrozenModel):
     """A pose of the drogue.
 
@@ -49,6 +104,10 @@ class PoseEstimate(FrozenModel):
         modes: every pose that explains the images, the best first; weights sum to 1.
         features: what was measured.
         stage_s: seconds by stage. [s]
+        regions: where the drogue was looked for, at most one an eye.
+        motion: where a filter knows it.
+        docking: where it was asked for.
+        latency_s: from the arrival of the images to this answer, where they came at a rate. [s]
     """
 
     status: Literal["fix"] = "fix"
@@ -60,6 +119,10 @@ class PoseEstimate(FrozenModel):
     modes: tuple[Mode, ...] = ()
     features: tuple[Feature, ...] = ()
     stage_s: dict[str, float] = Field(default_factory=dict)
+    regions: tuple[Region, ...] = ()
+    motion: Motion | None = None
+    docking: Docking | None = None
+    latency_s: float | None = Field(default=None, ge=0)
 
 
 class NoFix(FrozenModel):
@@ -71,6 +134,8 @@ class NoFix(FrozenModel):
     reason: str = Field(min_length=1)
     features: tuple[Feature, ...] = ()
     stage_s: dict[str, float] = Field(default_factory=dict)
+    regions: tuple[Region, ...] = ()
+    latency_s: float | None = Field(default=None, ge=0)
 
 
 Estimate = PoseEstimate | NoFix

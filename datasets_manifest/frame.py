@@ -11,6 +11,7 @@ from datasets_manifest.board import PlacedBoard
 from datasets_manifest.environment_map import EnvironmentMap
 from datasets_manifest.ground import GroundKind
 from datasets_manifest.json_types import FrozenModel, Points3, Rig, Transform, Vector6
+from datasets_manifest.loss import Loss
 from datasets_manifest.target import Bystander, DrogueCondition
 from datasets_manifest.weather import CloudLayer, Mist, Moon
 from drogue_models.parameters import DrogueParameters, ReflectanceRgb
@@ -94,12 +95,16 @@ class Optics(FrozenModel):
             grows with the fourth power of the distance from the principal point.
         focus_distance_m: planar depth that is sharp; without it everything is. [m]
         pixel_pitch_um: with the focal length in pixels it gives the one in metres, and so the aperture. [um]
+        scattered_fraction: of the light of sun or moon on the lens, spread over the picture as glare; 0.01 is
+            a clean lens, a fogged one may have a tenth (our choice).
     """
 
     natural_vignetting: bool = False
     mechanical_falloff_fraction: float = Field(default=0.0, ge=0, lt=1)
     focus_distance_m: float | None = Field(default=None, gt=0.05, le=1e6)
     pixel_pitch_um: float = Field(default=3.75, ge=0.5, le=100)
+    # Left out where the lens is clean, so that the hashes of other datasets do not know of it.
+    scattered_fraction: float = Field(default=0.01, ge=0, le=0.5, exclude_if=lambda fraction: fraction == 0.01)
 
 
 class Sensor(FrozenModel):
@@ -159,6 +164,7 @@ class FrameSpec(FrozenModel):
         hose_nodes_left_m: (K, 3) centre line from coupling to pod in the left camera at mid-exposure, or None. [m]
         rig, sensor, exposure, environment: as named.
         rangefinder_reading_m: of the distance of the rim centre along the optical axis, or None without one. [m]
+        loss: what is coming to keep the cameras from seeing the drogue, keeps them, or is going; or None.
     """
 
     seed: int = Field(ge=0)
@@ -184,6 +190,7 @@ class FrameSpec(FrozenModel):
     exposure: Exposure
     environment: Environment
     rangefinder_reading_m: float | None = Field(default=None, exclude_if=lambda reading_m: reading_m is None)
+    loss: Loss | None = Field(default=None, exclude_if=lambda loss: loss is None)
 
     @model_validator(mode="after")
     def _drogue_has_a_pose(self) -> Self:

@@ -30,11 +30,19 @@ _ENGINES_WITH_LENSES = ("analytic", "mitsuba", "blender")
 
 
 class FrameCounts(FrozenModel):
-    """How many pairs, over how many scenes, how many without a drogue."""
+    """How many pairs, over how many scenes, how many without a drogue.
+
+    Attributes:
+        in_turn: scenes, families and drogue variants follow each other in the order in which they are given, the family
+            changing from scene to scene and the variant when all families had a scene; else in a drawn order. So a
+            few sequences have every combination.
+    """
 
     count: int = Field(ge=1, le=10_000_000)
     scenes: int = Field(default=1, ge=1, le=1_000_000)
     empty_fraction: Fraction = 0.0
+    # Left out where it says nothing, so that the hashes of other recipes do not know of it.
+    in_turn: bool = Field(default=False, exclude_if=lambda in_turn: not in_turn)
 
 
 class RenderSettings(FrozenModel):
@@ -148,6 +156,11 @@ class Recipe(FrozenModel):
         names = [family.name for family in self.families]
         if len(set(names)) < len(names):
             raise ValueError(f"families: each needs a name of its own, got {', '.join(names)}")
+        if self.frames.in_turn and len({family.weight for family in self.families}) > 1:
+            raise ValueError("families: have equal weights where frames.in_turn is true; leave weight out")
+        for part in self.families or (self,):
+            if self.frames.in_turn and len({variant.weight for variant in part.target.variants}) > 1:
+                raise ValueError("target.variants: have equal weights where frames.in_turn is true; leave weight out")
         return self
 
     @model_validator(mode="after")
@@ -177,8 +190,15 @@ class Recipe(FrozenModel):
             return self
         if self.frames.empty_fraction > 0:
             raise ValueError("frames.empty_fraction: must be 0 with [sequence], where every pair has the drogue")
+        losses = self.sequence.losses
+        if losses is not None and "occlusion" in losses.kinds and self.render.engine == "analytic":
+            raise ValueError(
+                "render.engine: analytic draws no obstacles, and sequence.losses has occlusion; use mitsuba"
+            )
         for part in self.families or (self,):
             check_singles(part.pose, part.target)
+            if losses is not None:
+                losses.check_sun(part.pose, part.environment)
             longest_s = part.exposure.auto_time_s.high if part.exposure.time_s is None else part.exposure.time_s
             period_s = 1 / self.sequence.frame_rate_hz
             if longest_s > period_s:

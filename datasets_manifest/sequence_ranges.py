@@ -9,6 +9,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from datasets_manifest.hose import Hose
 from datasets_manifest.json_types import FrozenModel
+from datasets_manifest.loss_ranges import LossRanges
 from datasets_manifest.pose_ranges import Pose
 from datasets_manifest.ranges import Range
 from datasets_manifest.target_ranges import TargetRanges
@@ -109,6 +110,7 @@ class SequenceRanges(FrozenModel):
         release_m: where the drogue's coupling is let go at the beginning, at rest: aft, right, up of the pod; without
             it the hose has moved with the air for a while. [m]
         receiver: what it does.
+        losses: stretches over which the cameras lose the drogue, or none.
     """
 
     frames_per_sequence: int = Field(ge=1, le=100_000)
@@ -118,6 +120,8 @@ class SequenceRanges(FrozenModel):
     tanker_motion_m: float = Field(default=0.05, ge=0, le=5)
     release_m: tuple[float, float, float] | None = None
     receiver: Receiver = Receiver()
+    # Left out where there is none, so that the hashes of other recipes do not know of it.
+    losses: LossRanges | None = Field(default=None, exclude_if=lambda losses: losses is None)
 
     @field_validator("turbulence", mode="before")
     @classmethod
@@ -146,6 +150,11 @@ class SequenceRanges(FrozenModel):
                     f"frames_per_sequence: {manoeuvre} takes {needed_s:.4g} s, which is "
                     f"{int(needed_s * self.frame_rate_hz) + 2} frames, got {self.frames_per_sequence}"
                 )
+        if self.losses is not None and span_s < self.losses.end_s:
+            raise ValueError(
+                f"frames_per_sequence: losses last until {self.losses.end_s:.4g} s, which is "
+                f"{int(self.losses.end_s * self.frame_rate_hz) + 2} frames, got {self.frames_per_sequence}"
+            )
         return self
 
     @property
@@ -154,10 +163,10 @@ class SequenceRanges(FrozenModel):
         return min(self.receiver.nearest_m(manoeuvre) for manoeuvre in self.receiver.manoeuvres)
 
     def check_view(self, rig: StereoRig, rim_radius_m: float) -> None:
-        """Check that both eyes see the whole drogue along the intended path.
+        """Check that both eyes see the whole drogue along the intended path, but for what `losses` asks for.
 
         Raises:
-            ValueError: they do not.
+            ValueError: they do not, or a turn that is to lose the drogue does not.
         """
         receiver = self.receiver
         for manoeuvre in receiver.manoeuvres:
@@ -166,6 +175,8 @@ class SequenceRanges(FrozenModel):
             for depth_m, share in ends:
                 field = rig.common_field_m(depth_m, rim_radius_m)
                 across, down = receiver.offset_right_m, receiver.offset_down_m
+                if self.losses is not None:
+                    self.losses.check_turn(rig, rim_radius_m, depth_m, share * max(-across.low, across.high))
                 right = [rig.baseline_m / 2 + share * end for end in (across.low, across.high)]
                 below = [share * end for end in (down.low, down.high)]
                 seen = field is not None and (

@@ -11,8 +11,7 @@ from scenes.light import SUN_RADIUS_RAD
 from scenes.surroundings import surroundings
 
 # Polished and coated glass scatters 1 / (a^2 + theta^2) around a source (the ABg law of optical
-# design with g = 2); level and core are our choice for a clean lens of several elements: one percent in all.
-_SCATTERED_FRACTION = 0.01
+# design with g = 2); the core is our choice for a lens of several elements.
 _CORE_RAD = 0.01
 _WIDEST_RAD = np.pi / 2
 # A hood shades the front lens from suns this far outside the axis: full shade beyond the second angle.
@@ -20,13 +19,13 @@ _HOOD_BEGINS_RAD, _HOOD_ENDS_RAD = np.radians(25.0), np.radians(45.0)
 _DARKEST_LUX = 1.0
 
 
-def glare_spread_per_sr(angle_rad: NDArray[np.float32]) -> NDArray[np.float32]:
+def glare_spread_per_sr(angle_rad: NDArray[np.float32], scattered_fraction: float) -> NDArray[np.float32]:
     """Veiling luminance per illuminance of the lens, by the angle from the source. [1/sr]
 
-    Its integral over the half sphere before the lens, for small angles, is the scattered fraction of one percent.
+    Its integral over the half sphere before the lens, for small angles, is the scattered fraction.
     """
     inside = np.log1p((_WIDEST_RAD / _CORE_RAD) ** 2)
-    level = _SCATTERED_FRACTION / (np.pi * inside)
+    level = scattered_fraction / (np.pi * inside)
     spread: NDArray[np.float32] = (level / (np.float32(_CORE_RAD**2) + angle_rad * angle_rad)).astype(np.float32)
     return spread
 
@@ -54,7 +53,8 @@ def sun_glare(frame: FrameSpec, seen: EyeRadiance) -> NDArray[np.float32] | None
     y = ((np.arange(camera.height_px) - camera.cy_px) / camera.fy_px).astype(np.float32)[:, None]
     sun = to_sun.astype(np.float32)
     cosine = (x * sun[0] + y * sun[1] + sun[2]) / np.sqrt(1.0 + x * x + y * y)
-    spread = glare_spread_per_sr(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    spread = glare_spread_per_sr(angle, frame.sensor.optics.scattered_fraction)
     veil: NDArray[np.float32] = spread[..., None] * falling.astype(np.float32)
     return veil
 

@@ -11,10 +11,13 @@ from scenes.seeding import generator
 def family_of_scene(recipe: Recipe, scene_id: int) -> Family | None:
     """The family of a scene, or None in a recipe without families.
 
-    Every family gets its share of the scenes, rounded by largest remainders, and which ones is drawn.
+    Every family gets its share of the scenes, rounded by largest remainders, and which ones is drawn, unless they come
+    in turn.
     """
     if not recipe.families:
         return None
+    if recipe.frames.in_turn:
+        return recipe.families[scene_id % len(recipe.families)]
     scenes = recipe.frames.scenes
     place = int(np.flatnonzero(generator(recipe.seed, 0, "families").permutation(scenes) == scene_id)[0])
     ends = np.cumsum(scenes_per_family(recipe))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from datasets_manifest.loss import Loss
+from datasets_manifest.target import Bystander
 from geometry.se3 import Array, RigidTransform
 
 
@@ -19,6 +21,9 @@ class Moment:
         camera_offset_m: east and north, as in `Environment`. [m]
         left_twist_per_s, drogue_twist_per_s: (6,) body twists. [m/s, rad/s]
         hose_nodes_left_m: (K, 3) from the coupling to the pod, or None without a drogue. [m]
+        loss: as in `FrameSpec`.
+        obstacle: a bar before the cameras, or None.
+        sun_deg: elevation and azimuth of the sun where it is not the scene's, or None. [deg]
     """
 
     sequence_id: int | None
@@ -30,3 +35,6 @@ class Moment:
     drogue_twist_per_s: Array
     hose_nodes_left_m: Array | None
     camera_offset_m: tuple[float, float] = (0.0, 0.0)
+    loss: Loss | None = None
+    obstacle: Bystander | None = None
+    sun_deg: tuple[float, float] | None = None

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from datasets_manifest.board import PlacedBoard
-from datasets_manifest.frame import FrameSpec
+from datasets_manifest.frame import Environment, FrameSpec
 from datasets_manifest.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
@@ -33,10 +33,13 @@ def scene_of_frame(recipe: Recipe, frame_index: int) -> int:
     """Which scene a frame belongs to: every run of as many frames as there are scenes visits each once.
 
     All frames of a sequence belong to one scene: every run of as many sequences as there are scenes visits each once.
+    The order is drawn for each run, unless the recipe has them in turn.
     """
     scenes, unit = recipe.frames.scenes, frame_index
     if recipe.sequence is not None:
         unit = frame_index // recipe.sequence.frames_per_sequence
+    if recipe.frames.in_turn:
+        return unit % scenes
     order = generator(recipe.seed, unit // scenes, "scene order").permutation(scenes)
     return int(order[unit % scenes])
 
@@ -70,9 +73,10 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     moment = _moment_of_frame(recipe, drogue, frame_index)
     pose = moment.left_from_drogue
     if moment.sequence_id is not None:
-        environment = environment.model_copy(update={"camera_offset_m": moment.camera_offset_m})
+        environment = _where_it_flies(environment, moment)
     # What stands beside a sequence stays there all along.
     stands = frame_index if moment.sequence_id is None else moment.sequence_id
+    bystanders = sample_bystanders(generator(seed, stands, "bystanders"), recipe, pose)
     return FrameSpec(
         seed=seed,
         frame_index=frame_index,
@@ -83,7 +87,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         drogue=None if pose is None else drogue,
         sought=drogue if pose is None and recipe.target.variants else None,
         condition=None if pose is None else condition_of_scene(recipe, scene_id, drogue),
-        bystanders=sample_bystanders(generator(seed, stands, "bystanders"), recipe, pose),
+        bystanders=bystanders if moment.obstacle is None else (*bystanders, moment.obstacle),
         board=_place_board(recipe, frame_index),
         left_from_drogue=pose,
         world_from_left=moment.world_from_left,
@@ -96,7 +100,16 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         exposure=meter(recipe.exposure, environment, recipe.rig.camera, moment.world_from_left, recipe.sensor),
         environment=environment,
         rangefinder_reading_m=_read_distance_m(recipe, frame_index, pose),
+        loss=moment.loss,
     )
+
+
+def _where_it_flies(environment: Environment, moment: Moment) -> Environment:
+    """A scene's environment from the place of a sequence's pair, with the sun where the sequence needs it."""
+    changes: dict[str, object] = {"camera_offset_m": moment.camera_offset_m}
+    if moment.sun_deg is not None:
+        changes |= {"sun_elevation_deg": moment.sun_deg[0], "sun_azimuth_deg": moment.sun_deg[1]}
+    return environment.model_copy(update=changes)
 
 
 def sample_left_from_drogue(recipe: Recipe, frame_index: int) -> RigidTransform | None:

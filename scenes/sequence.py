@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -12,10 +12,13 @@ from datasets_manifest.recipe import Recipe
 from datasets_manifest.sequence_ranges import SequenceRanges
 from drogue_models.parameters import DrogueParameters
 from geometry.body_axes import FRD_FROM_OPTICAL
+from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, exp_twist, log_twist
 from scenes.drogue_attitude import drogue_rotation, still_mouth_direction
 from scenes.environment import draw
+from scenes.framing import outline
 from scenes.hose_dynamics import HoseModel
+from scenes.loss import HidingBar, flown_m, hiding_bar, sample_loss, sun_beside
 from scenes.moment import Moment
 from scenes.oscillation import sample_oscillation
 from scenes.receiver import sample_attitude, wanted_places
@@ -52,7 +55,7 @@ def moment_of_sequence(recipe: Recipe, sequence: SequenceRanges, drogue: DrogueP
     """
     sequence_id, place = divmod(frame_index, sequence.frames_per_sequence)
     flight = _flight(recipe.seed, sequence_id, sequence, drogue, recipe.pose, recipe.rig.baseline_m)
-    return flight.moment(place)
+    return flight.moment(place, recipe.rig.camera)
 
 
 # A recipe's frames come in order, more or less: the last sequences that were flown are enough.
@@ -97,6 +100,8 @@ class Flight:
         self._attitude = sample_oscillation(shaking, [attitude_rad] * 3, *_ATTITUDE_HZ)
         vibration = [receiver.vibration_m] * 3 + [vibration_rad] * 3
         self._vibration = sample_oscillation(shaking, vibration, *_VIBRATION_HZ)
+        self._baseline_m = baseline_m
+        self._loss = sample_loss(generator(seed, sequence_id, "loss"), sequence.losses, sequence_id)
         around, settling_s = self._surroundings(seed, baseline_m, tail_m)
         release_m = None if sequence.release_m is None else np.array(sequence.release_m)
         self._trajectory = Trajectory(simulate(sequence.hose, around, release_m), settling_s)
@@ -126,7 +131,7 @@ class Flight:
         around = Surroundings(gusts, pod.at, from_drogue[..., None], source, receiver.body_radius_m, receiver.follower)
         return around, settling_s
 
-    def moment(self, place: int) -> Moment:
+    def moment(self, place: int, camera: PinholeCamera) -> Moment:
         """The pair at a place of the sequence.
 
         Raises:
@@ -134,29 +139,74 @@ class Flight:
         """
         time_s = place / self._sequence.frame_rate_hz
         tanker_from_left = self.tanker_from_left(time_s)
-        tanker_from_drogue = self.tanker_from_drogue(time_s)
         left_from_axes = tanker_from_left.inverse()
-        left_from_drogue = left_from_axes @ tanker_from_drogue
-        self._check_seen(left_from_drogue, time_s)
+        self._check_seen(time_s)
         nodes = self._trajectory.nodes_m(time_s)
-        forward_m = np.array([-self._sequence.hose.airspeed_m_s * time_s, 0.0, 0.0])
-        east_m, north_m, _ = (WORLD_FROM_TANKER @ (forward_m + tanker_from_left.translation_m)).tolist()
+        east_m, north_m = self._camera_offset_m(time_s, tanker_from_left.translation_m)
         pod = RigidTransform(np.eye(3), nodes[0])
         length_s = self._sequence.frames_per_sequence / self._sequence.frame_rate_hz
         return Moment(
             sequence_id=self._id,
             time_s=self._id * (length_s + _PAUSE_S) + time_s,
-            left_from_drogue=left_from_drogue,
-            world_from_left=RigidTransform(WORLD_FROM_TANKER @ tanker_from_left.rotation, np.zeros(3)),
+            left_from_drogue=left_from_axes @ self.tanker_from_drogue(time_s),
+            world_from_left=RigidTransform(self._world_from_tanker(time_s) @ tanker_from_left.rotation, np.zeros(3)),
             left_from_tanker=left_from_axes @ pod,
             left_twist_per_s=_twist(self.tanker_from_left, time_s),
             drogue_twist_per_s=_twist(self.tanker_from_drogue, time_s),
             hose_nodes_left_m=left_from_axes.apply(nodes[::-1]),
             camera_offset_m=(east_m, north_m),
+            loss=self._loss.kind if self._loss is not None and self._loss.acts(time_s) else None,
+            obstacle=None if self._bar is None else self._bar.at(time_s, camera),
+            sun_deg=self._sun_deg,
         )
+
+    def _world_from_tanker(self, time_s: float) -> Array:
+        """(3, 3) attitude of the formation: eastwards, unless it turns into the sun."""
+        if self._loss is None or self._loss.kind != "glare":
+            return WORLD_FROM_TANKER
+        headed: Array = self._loss.headed(time_s) @ WORLD_FROM_TANKER
+        return headed
+
+    def _camera_offset_m(self, time_s: float, eye_m: Array) -> tuple[float, float]:
+        """East and north of the camera from where the pod was at the sequence's start. [m]"""
+        speed_m_s = self._sequence.hose.airspeed_m_s
+        if self._loss is None or self._loss.kind != "glare":
+            east_m, north_m, _ = (WORLD_FROM_TANKER @ (np.array([-speed_m_s * time_s, 0.0, 0.0]) + eye_m)).tolist()
+            return east_m, north_m
+        place_m = flown_m(self._loss, speed_m_s, time_s) + (self._world_from_tanker(time_s) @ eye_m)[:2]
+        return float(place_m[0]), float(place_m[1])
+
+    def _left_from_drogue(self, time_s: float) -> RigidTransform:
+        pose: RigidTransform = self.tanker_from_left(time_s).inverse() @ self.tanker_from_drogue(time_s)
+        return pose
+
+    @cached_property
+    def _bar(self) -> HidingBar | None:
+        """What hides the drogue in this sequence."""
+        if self._loss is None or self._loss.kind != "occlusion":
+            return None
+        return hiding_bar(self._loss, outline(self._drogue), self._baseline_m, self._left_from_drogue)
+
+    @cached_property
+    def _sun_deg(self) -> tuple[float, float] | None:
+        """Elevation and azimuth of the sun, where this sequence needs it somewhere. [deg]"""
+        if self._loss is None or self._loss.kind != "glare":
+            return None
+        middle_s = self._loss.middle_s
+        rotation = self._world_from_tanker(middle_s) @ self.tanker_from_left(middle_s).rotation
+        world_from_left = RigidTransform(rotation, np.zeros(3))
+        middle_m = self._left_from_drogue(middle_s).translation_m
+        return sun_beside(self._loss, world_from_left, middle_m, self._drogue.rim_radius_m)
 
     def tanker_from_left(self, time_s: float) -> RigidTransform:
         """Pose of the left eye in axes that fly along with the tanker."""
+        steady = self._steady_tanker_from_left(time_s)
+        if self._loss is None or self._loss.kind != "out-of-view":
+            return steady
+        return RigidTransform(steady.rotation @ self._loss.turned(time_s), steady.translation_m)
+
+    def _steady_tanker_from_left(self, time_s: float) -> RigidTransform:
+        """The same of a receiver that does not turn aside."""
         shake = self._vibration.at(time_s)
         turn = exp_twist(np.concatenate([np.zeros(3), self._attitude.at(time_s) + shake[3:]])).rotation
         rotation = self._tanker_from_left @ turn
@@ -167,7 +217,9 @@ class Flight:
         rotation = drogue_rotation(self._trajectory.mouth(time_s), self._roll_rad)
         return RigidTransform(rotation, self._trajectory.nodes_m(time_s)[-1] - rotation @ self._drogue_from_tail_m)
 
-    def _check_seen(self, left_from_drogue: RigidTransform, time_s: float) -> None:
+    def _check_seen(self, time_s: float) -> None:
+        # Of a receiver that does not turn aside: which side of the drogue it sees does not depend on where it looks.
+        left_from_drogue = self._steady_tanker_from_left(time_s).inverse() @ self.tanker_from_drogue(time_s)
         depth_m = float(left_from_drogue.translation_m[2])
         what = f"sequence {self._id}: leaves the visible volume at {time_s:.2f} s"
         if depth_m - self._drogue.rim_radius_m < _NEAREST_M:

@@ -32,6 +32,8 @@ def drogue_of_scene(recipe: Recipe, scene_id: int) -> DrogueParameters:
     variants = recipe.target.variants
     if not variants:
         return recipe.drogue
+    if recipe.frames.in_turn:
+        return variants[scene_id // max(len(recipe.families), 1) % len(variants)].drogue
     shares = np.cumsum([variant.weight for variant in variants])
     place = generator(recipe.seed, scene_id, "drogue variant").random() * shares[-1]
     return variants[int(np.searchsorted(shares, place, side="right"))].drogue
@@ -97,7 +99,7 @@ def _probe(recipe: Recipe) -> Bystander:
     return Bystander(
         kind="probe",
         shape=BystanderShape(form="probe", radius_m=recipe.target.probe_radius_m, length_m=_PROBE_LENGTH_M),
-        left_from_object=RigidTransform(_rotation_with_z(backwards), tip_m),
+        left_from_object=RigidTransform(rotation_with_z(backwards), tip_m),
         reflectance_rgb=_PROBE_GREY,
     )
 
@@ -111,7 +113,7 @@ def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Bystander:
     return Bystander(
         kind="obstacle",
         shape=shape,
-        left_from_object=RigidTransform(_rotation_with_z(along / np.linalg.norm(along)), place),
+        left_from_object=RigidTransform(rotation_with_z(along / np.linalg.norm(along)), place),
         reflectance_rgb=_BLACK_RUBBER,
     )
 
@@ -140,7 +142,7 @@ def _point_in_view(rng: np.random.Generator, rig: StereoRig, depth_m: float) -> 
     return np.array([(u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px, 1.0]) * depth_m
 
 
-def _rotation_with_z(direction: Array) -> Array:
+def rotation_with_z(direction: Array) -> Array:
     """A rotation whose third column is a (3,) unit vector."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
     x = np.cross(helper, direction)

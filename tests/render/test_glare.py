@@ -27,12 +27,21 @@ def eye(frame, coverage=0.0):
     return EyeRadiance(nothing, full, np.zeros(shape, dtype=np.uint8), full, nothing, {})
 
 
-def test_one_percent_of_the_light_is_scattered():
+@pytest.mark.parametrize("fraction", [0.01, 0.1])
+def test_the_stated_share_of_the_light_is_scattered(fraction):
     """Integral of the spread over small angles up to a right angle, in closed form and by quadrature."""
     angle = np.geomspace(1e-5, np.pi / 2, 20_000)
-    integrand = 2 * np.pi * angle * glare_spread_per_sr(angle.astype(np.float32))
+    integrand = 2 * np.pi * angle * glare_spread_per_sr(angle.astype(np.float32), fraction)
     total = float(np.sum(0.5 * (integrand[1:] + integrand[:-1]) * np.diff(angle)))
-    assert total == pytest.approx(0.01, rel=0.01)  # quadrature in steps of 0.06 %, float32
+    assert total == pytest.approx(fraction, rel=0.01)  # quadrature in steps of 0.06 %, float32
+
+
+def test_a_fogged_lens_has_as_much_more_veil(make_recipe):
+    frame = with_sun(make_recipe, 14.0, 0.0)
+    optics = frame.sensor.optics.model_copy(update={"scattered_fraction": 0.1})
+    fogged = frame.model_copy(update={"sensor": frame.sensor.model_copy(update={"optics": optics})})
+    # Float32.
+    np.testing.assert_allclose(sun_glare(fogged, eye(fogged)), 10 * sun_glare(frame, eye(frame)), rtol=1e-5)
 
 
 def test_veil_falls_with_the_square_of_the_angle(make_recipe):
