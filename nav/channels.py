@@ -11,6 +11,8 @@ from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import Eye
 
+# Left, top, right, bottom of a part of an image, the last two exclusive. [px]
+Window = tuple[int, int, int, int]
 # A paint counts as coloured when its strongest component leads the others by this share of itself; the shipped red
 # leads by 0.95, white by 0.
 _SATURATED_FRACTION = 0.5
@@ -37,7 +39,9 @@ def marker_color(drogue: DrogueParameters) -> int | None:
     return strongest if rgb[strongest] - others > _SATURATED_FRACTION * rgb[strongest] else None
 
 
-def marker_channel(images: StereoImages, eye: Eye, color: int | None, others_weight: float = PLAIN) -> Pixels:
+def marker_channel(
+    images: StereoImages, eye: Eye, color: int | None, others_weight: float = PLAIN, window: Window | None = None
+) -> Pixels:
     """Linear picture of how much a pixel looks like a marker.
 
     With a colour it is `max(c - max(the other two), 0)`, the paper's subtraction of channels; sites of that colour in a
@@ -49,14 +53,20 @@ def marker_channel(images: StereoImages, eye: Eye, color: int | None, others_wei
         eye: which of the two.
         color: see `marker_color`.
         others_weight: how much of the stronger of the other two colours is taken off.
+        window: left, top, right, bottom (the last two exclusive) of the part that is wanted; everything when None.
 
     Returns:
         (H, W) of unsigned integers on the image's own grid, proportional to light above the black level.
     """
     image, mosaic = (images.left, images.left_mosaic) if eye == "left" else (images.right, images.right_mosaic)
+    left, top, right, bottom = window or (0, 0, *images.size_px)
     if color is not None and mosaic is not None:
-        return _from_mosaic(mosaic, color, others_weight)
-    linear = _linear(image, images)
+        # Whole cells, and one more on each side, so that what is brought to the full grid is that of the whole mosaic.
+        low_x, low_y = max(0, left // 2 * 2 - 2), max(0, top // 2 * 2 - 2)
+        cells = mosaic[low_y : bottom // 2 * 2 + 4, low_x : right // 2 * 2 + 4]
+        channel = _from_mosaic(cells, color, others_weight)
+        return np.asarray(channel[top - low_y : bottom - low_y, left - low_x : right - low_x])
+    linear = _linear(image[top:bottom, left:right], images)
     if linear.ndim == 2:
         return linear
     planes = cv2.split(linear)
@@ -123,7 +133,8 @@ def _linear(image: Pixels, images: StereoImages) -> Pixels:
     """The image proportional to light, black level removed."""
     if images.encoding == "linear":
         black = round(images.black_level_dn)
-        return image if black == 0 else np.maximum(image, image.dtype.type(black)) - image.dtype.type(black)
+        # OpenCV's subtraction ends at zero.
+        return image if black == 0 or image.size == 0 else np.asarray(cv2.subtract(image, (black, black, black, 0)))
     codes = np.arange(2**images.bits) / (2**images.bits - 1)
     black = images.black_level_dn / (2**images.bits - 1)
     light = np.maximum(_srgb_to_linear(codes) - _srgb_to_linear(np.array(black)), 0)

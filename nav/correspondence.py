@@ -55,7 +55,7 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
         What the estimators work on, with one eye's places empty where only the other shows a ring; or why there is
         nothing to work on.
     """
-    rings = [match_ring(centroids.blobs, layout) for centroids in (left, right)]
+    rings = [centroids.ring or match_ring(centroids.blobs, layout) for centroids in (left, right)]
     permutations = symmetry_permutations(layout)
     if rings[0] is None and rings[1] is None:
         return NoFixReason(f"{no_ring(left, 'left')}, and {no_ring(right, 'right')}")

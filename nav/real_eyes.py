@@ -24,10 +24,12 @@ _LEAST_PX_PER_M = 1.0
 
 def ideal_centroids(centroids: Centroids, rig: StereoRig, eye: Eye) -> Centroids:
     """Regions of a real image where the ideal one would show them; the same for an ideal eye."""
+    if rig.lenses is None:
+        return centroids
     blobs = centroids.blobs
     round_shapes = blobs.radii_px[:, None, None] * np.eye(2)
     centers, cov = ideal_places(rig, eye, blobs.centers_px, round_shapes, centroids.cov_px2)
-    return replace(centroids, blobs=replace(blobs, centers_px=centers), cov_px2=cov)
+    return Centroids(replace(blobs, centers_px=centers), cov)
 
 
 def ideal_places(rig: StereoRig, eye: Eye, centers_px: Array, shapes_px: Array, cov_px2: Array) -> tuple[Array, Array]:

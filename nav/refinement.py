@@ -21,7 +21,7 @@ from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.patches import OUTER_DIFFERENCE_PX, WHOLE_RADIUS_PX
 from nav.centroids.surroundings import Surroundings
 from nav.channels import PLAIN, balancing_weight
-from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation
+from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation, Solution
 from nav.pose.joint import joint
 from nav.pose.mono import mono_lm
 from nav.real_eyes import ideal_places, real_places
@@ -38,8 +38,13 @@ _SEEN_PX = OUTER_DIFFERENCE_PX + 2.0
 _BALANCED_BELOW_PX = 8.0
 
 
+def rough_pose(observation: Observation) -> Solution | NoFixReason:
+    """The pose of matched markers without the hub, from both eyes or from the only one that shows any."""
+    return joint(observation) if observation.seen.any(axis=1).all() else mono_lm(observation)
+
+
 def refine(
-    images: StereoImages, color: int | None, observation: Observation, others_weight: float = PLAIN
+    images: StereoImages, color: int | None, observation: Observation, rough: Solution, others_weight: float = PLAIN
 ) -> Observation:
     """The same markers by the edge model, and the hub where it can be seen.
 
@@ -47,15 +52,13 @@ def refine(
         images: the pair.
         color: see `nav.channels.marker_color`.
         observation: matched markers, placed to half a pixel or so.
+        rough: their pose, see `rough_pose`.
         others_weight: see `nav.channels.marker_channel`.
 
     Returns:
         Edge-fitted markers; those that the fit rejects (clipped, cut, shadowed, occluded) are left out. Where too few
         fit, the markers as they were. Hub edges are measured where the pose of the markers shows them.
     """
-    rough = joint(observation) if observation.seen.any(axis=1).all() else mono_lm(observation)
-    if isinstance(rough, NoFixReason):
-        return observation
     rig, layout = observation.rig, observation.layout
     eyes, index = np.nonzero(observation.seen)
     depth_m = rough.left_from_drogue.translation_m[2]

@@ -7,7 +7,7 @@ is) need no rule of their own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,8 @@ _SIZE_FACTOR = 1.6
 # Tolerances as a share of a marker's radius: for two-point guesses, which ignore tilt, and for the fitted map.
 _GUESS_TOLERANCE = 0.8
 _FIT_TOLERANCE = 0.4
+# Markers whose places span less than this across their longest line lie on it; the smallest singular value of the fit.
+_ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
 # A complete ring this near its map needs no second guess.
@@ -50,7 +52,13 @@ class RingMatch:
     @property
     def scale_px_per_m(self) -> float:
         """Largest stretch of the map: focal length over distance. [px/m]"""
-        return float(np.linalg.svd(self.affine[:, :2], compute_uv=False)[0])
+        return _stretches(self.affine)[0]
+
+    def moved(self, shift_px: tuple[float, float]) -> RingMatch:
+        """The same where all blobs lie further right and down by x and y. [px]"""
+        affine = self.affine.copy()
+        affine[:, 2] += shift_px
+        return replace(self, affine=affine)
 
 
 def least_markers(layout: MarkerLayout) -> int:
@@ -77,9 +85,17 @@ def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
     if len(blobs) < least_markers(layout):
         return None
     best: RingMatch | None = None
+    permutations = symmetry_permutations(layout)
+    tried: set[bytes] = set()
     for turn, shift in _best_guesses(blobs, layout):
         affine = np.array([[turn.real, -turn.imag, shift.real], [turn.imag, turn.real, shift.imag]])
-        match = _fit(affine, blobs, layout)
+        blob_of_marker = _nearest_blobs(affine, blobs, layout, _GUESS_TOLERANCE)
+        # Most guesses are turns of one ring: from the same blobs, named after another turn, comes the same map turned.
+        key = min(blob_of_marker[permutation].tobytes() for permutation in permutations)
+        if key in tried:
+            continue
+        tried.add(key)
+        match = _fit(blob_of_marker, blobs, layout)
         if match is not None and (best is None or _rank(match) > _rank(best)):
             best = match
         if best is not None and best.count == layout.count and best.rms_fraction < _GOOD_RMS_FRACTION:
@@ -143,26 +159,48 @@ def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.comple
     return np.concatenate(turns), np.concatenate(shifts)
 
 
-def _fit(affine: Array, blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
-    """Affine map refined on the blobs that it hits, or None where they cannot be the drogue."""
+def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
+    """Affine map refined from the blobs that a guess hits, or None where they cannot be the drogue."""
     places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
-    for tolerance in (_GUESS_TOLERANCE, _GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE):
-        stretch = np.linalg.svd(affine[:, :2], compute_uv=False)
-        radius = layout.radius_m * np.sqrt(stretch[0] * stretch[1])
-        distance = np.linalg.norm((places @ affine.T)[:, None] - blobs.centers_px, axis=2)
-        sizes = blobs.radii_px
-        alike = (sizes < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * sizes)
-        distance = np.where(alike, distance, np.inf)
-        nearest = distance.argmin(axis=1)
-        hit = distance[np.arange(layout.count), nearest] < tolerance * radius
+    for tolerance in (_GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE, None):
+        hit = blob_of_marker >= 0
         if hit.sum() < least_markers(layout):
             return None
-        seen = places[hit]
-        if np.linalg.matrix_rank(seen, tol=1e-6) < 3:
+        seen, centers_px = places[hit], blobs.centers_px[blob_of_marker[hit]]
+        solution, _, _, singular = np.linalg.lstsq(seen, centers_px, rcond=None)
+        if singular[-1] <= _ON_A_LINE:
             return None
-        affine = np.linalg.lstsq(seen, blobs.centers_px[nearest[hit]], rcond=None)[0].T
-    stretch = np.linalg.svd(affine[:, :2], compute_uv=False)
-    if np.linalg.det(affine[:, :2]) <= 0 or stretch[1] < _STRONGEST_TILT_COSINE * stretch[0]:
+        affine = solution.T
+        if tolerance is not None:
+            blob_of_marker = _nearest_blobs(affine, blobs, layout, tolerance)
+    largest, smallest = _stretches(affine)
+    if _determinant(affine) <= 0 or smallest < _STRONGEST_TILT_COSINE * largest:
         return None
-    residual = np.linalg.norm(seen @ affine.T - blobs.centers_px[nearest[hit]], axis=1)
-    return RingMatch(affine, np.where(hit, nearest, -1), float(np.sqrt(np.mean(residual**2)) / radius))
+    residual = seen @ affine.T - centers_px
+    rms_px = np.sqrt((residual**2).sum(axis=1).mean())
+    radius_px = layout.radius_m * np.sqrt(_determinant(affine))
+    return RingMatch(affine, blob_of_marker, float(rms_px / radius_px))
+
+
+def _nearest_blobs(affine: Array, blobs: Blobs, layout: MarkerLayout, tolerance: float) -> NDArray[np.int64]:
+    """(N,) the blob nearest to each marker's image, -1 where none of about its size lies within the tolerance."""
+    places_px = layout.centers_m[:, :2] @ affine[:, :2].T + affine[:, 2]
+    radius_px = layout.radius_m * np.sqrt(abs(_determinant(affine)))
+    gaps = places_px[:, None] - blobs.centers_px
+    distance = np.sqrt(gaps[..., 0] ** 2 + gaps[..., 1] ** 2)
+    alike = (blobs.radii_px < _SIZE_FACTOR * radius_px) & (radius_px < _SIZE_FACTOR * blobs.radii_px)
+    distance[:, ~alike] = np.inf
+    nearest = distance.argmin(axis=1)
+    hit = distance[np.arange(layout.count), nearest] < tolerance * radius_px
+    return np.where(hit, nearest, -1)
+
+
+def _determinant(affine: Array) -> float:
+    return float(affine[0, 0] * affine[1, 1] - affine[0, 1] * affine[1, 0])
+
+
+def _stretches(affine: Array) -> tuple[float, float]:
+    """Largest and smallest stretch of a map: the singular values of its linear part, in closed form."""
+    (a, b), (c, d) = affine[:, :2].tolist()
+    even, odd = np.hypot(a + d, b - c) / 2, np.hypot(a - d, b + c) / 2
+    return float(even + odd), float(abs(even - odd))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 
 from datasets_manifest.blind import BlindDataset
-from datasets_manifest.estimates import Estimate
-from drogue_models.parameters import DrogueParameters
-from nav.detector.interface import Detector
+from datasets_manifest.estimates import Estimate, NoFix
 from nav.detector.registry import DEFAULT_DETECTOR, detector_factory
-from nav.navigator import CENTROID_CHOICES, CentroidChoice, Navigator
+from nav.navigator import CENTROID_CHOICES, CentroidChoice
 from nav.pose.registry import method_names, pose_method
+from nav.sequence_navigator import LatePair, PairAnswers, SequenceNavigator, SequenceSettings
+from nav.sequence_smoother import SequenceSmoother
 
-__all__ = ["CENTROID_CHOICES", "method_names", "navigate"]
+LATE = "late: newer images had come before this pair could be worked on"
+
+__all__ = ["CENTROID_CHOICES", "answers_of", "method_names", "navigate", "open_navigator", "with_smoothed"]
 
 
 def navigate(
@@ -21,7 +23,7 @@ def navigate(
     centroids: CentroidChoice = "own",
     detector: str = DEFAULT_DETECTOR,
 ) -> Iterator[Estimate]:
-    """Estimates of all methods for all pairs, frame by frame.
+    """Estimates of all methods for all pairs, frame by frame, each pair for itself.
 
     Args:
         dataset: images, rig and drogue.
@@ -35,18 +37,35 @@ def navigate(
     Raises:
         ValueError: a method or detector that does not exist, before any image is read, or an image that cannot be read.
     """
-    for method in methods:
+    settings = SequenceSettings(tuple(methods), centroids)
+    return with_smoothed(answers_of(dataset, open_navigator(settings, detector)), settings)
+
+
+def open_navigator(settings: SequenceSettings, detector: str) -> SequenceNavigator:
+    """A navigator before its first pair.
+
+    Raises:
+        ValueError: a method, detector, tracker or setting that cannot be.
+    """
+    for method in settings.methods:
         pose_method(method)
-    return _navigate(dataset, methods, centroids, detector_factory(detector))
+    return SequenceNavigator(settings, detector_factory(detector))
 
 
-def _navigate(
-    dataset: BlindDataset,
-    methods: Sequence[str],
-    centroids: CentroidChoice,
-    make_detector: Callable[[DrogueParameters], Detector],
-) -> Iterator[Estimate]:
-    for index in dataset.frame_indices:
-        pair = dataset.pair(index)
-        navigator = Navigator(pair.rig, pair.drogue, make_detector(pair.drogue), centroids)
-        yield from navigator.estimate(pair.frame_index, pair.images, methods)
+def answers_of(dataset: BlindDataset, navigator: SequenceNavigator) -> Generator[PairAnswers]:
+    """Answers to all pairs of a dataset, each when it is asked for."""
+    return (navigator.answer(dataset.pair(index)) for index in dataset.frame_indices)
+
+
+def with_smoothed(answers: Iterable[PairAnswers | LatePair], settings: SequenceSettings) -> Iterator[Estimate]:
+    """The estimates of all answers, and the smoothed ones of each sequence after it where the settings ask for them."""
+    smoother = SequenceSmoother(settings) if settings.smoothed else None
+    for each in answers:
+        if isinstance(each, LatePair):
+            yield from (NoFix(frame_index=each.frame_index, method=name, reason=LATE) for name in settings.names)
+            continue
+        if smoother is not None:
+            yield from smoother.add(each)
+        yield from each.estimates
+    if smoother is not None:
+        yield from smoother.finish()

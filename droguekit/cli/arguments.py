@@ -16,14 +16,14 @@ else:
     Place = type("folder or URL", (), {})
 
 
-def local_path(text: str | None) -> Path | None:
-    """The callback of an option `--out` of type `Path`, which has `parser=str`: what it writes is no URL.
+def local_path(option: typer.CallbackParam, text: str | None) -> Path | None:
+    """The callback of an option of type `Path` that names what is written; it has `parser=str`, and takes no URL.
 
     Raises:
         ValueError: it is one, which would become the name of a folder.
     """
     if text is not None and "://" in text:
-        raise ValueError(f"--out: must be a folder or file of this machine, got {text}")
+        raise ValueError(f"{option.opts[0]}: must be a folder or file of this machine, got {text}")
     return None if text is None else Path(text)
 
 

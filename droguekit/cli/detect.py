@@ -15,6 +15,7 @@ EXAMPLES = (
     "droguekit detect data/demo --out detections.json",
     "droguekit detect data/demo --detector color-blob --out color-blob.json",
     "droguekit detect data/flight --detector my-network.onnx --out detections.json",
+    "droguekit detect data/docking-10m --tracker bernoulli --out tracked.json",
 )
 
 
@@ -28,13 +29,22 @@ def detect(
     ],
     detector: DetectorOption = None,
     least_score: Annotated[float, typer.Option("--least-score", help="Boxes that score less are left out.")] = 0.001,
+    tracker: Annotated[
+        str | None,
+        typer.Option(
+            "--tracker",
+            metavar="NAME",
+            help="Follow the drogue from pair to pair with bernoulli, flow, mil or pose-predict; the detector looks "
+            "where it is lost, and at every 25th pair. docs/tracking.md.",
+        ),
+    ] = None,
 ) -> None:
     """Find the drogue in every image of a dataset, from images, rig and drogue alone.
 
     Image ids are those of the dataset's annotations/all.json, also where there is no such file: twice the pair's index,
     and 1 for the left or 2 for the right image.
     """
-    counts = detect_dataset(dataset, detector, out, least_score, progress_report())
+    counts = detect_dataset(dataset, detector, out, least_score, progress_report(), tracker)
     typer.echo(
         f"{counts.detector}: {counts.boxes} boxes in {counts.images_with_boxes} of {2 * counts.pairs} images, "
         f"median {counts.times.wall_ms:.1f} ms a pair ({counts.times.cpu_ms:.1f} ms CPU)"

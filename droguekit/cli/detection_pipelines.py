@@ -29,12 +29,20 @@ class DetectionCounts:
 
 
 def detect_dataset(
-    dataset: Location, name_or_file: str | None, out: Path, least_score: float, report: ProgressReport
+    dataset: Location,
+    name_or_file: str | None,
+    out: Path,
+    least_score: float,
+    report: ProgressReport,
+    tracker: str | None = None,
 ) -> DetectionCounts:
     """Find the drogue in every image without the truth, and write COCO results; the default detector when None.
 
+    With a tracker, pairs are taken to follow each other in time, and the detector looks only where the drogue is lost,
+    and at every so manieth pair to check.
+
     Raises:
-        ValueError: no such dataset or detector, a score that is none, or an image that cannot be read.
+        ValueError: no such dataset, detector or tracker, a score that is none, or an image that cannot be read.
         OSError: the file cannot be written; it is then left as it was.
     """
     from droguekit.benchmark.detection_boxes import write_detections
@@ -43,7 +51,12 @@ def detect_dataset(
 
     if not 0 <= least_score <= 1:
         raise ValueError(f"--least-score: must be from 0 to 1, got {least_score:g}")
-    detecting = DetectorPass(dataset, detector_factory(DEFAULT_DETECTOR if name_or_file is None else name_or_file))
+    detector_of = detector_factory(DEFAULT_DETECTOR if name_or_file is None else name_or_file)
+    if tracker is not None:
+        from nav.tracking.tracked_detector import tracked_detector_factory
+
+        detector_of = tracked_detector_factory(detector_of, tracker)
+    detecting = DetectorPass(dataset, detector_of)
     images = set()
 
     def counted() -> Iterator[FoundBox]:

@@ -6,20 +6,17 @@ without one.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from droguekit.cli.interrupts import interrupts_wait
+from droguekit.cli.navigation_pipeline import navigate_dataset
 
 if TYPE_CHECKING:
-    from datasets_manifest.estimates import Estimate
     from datasets_manifest.recipe import Recipe
     from datasets_manifest.storage import Location
-    from droguekit.bars.image_tiers import TierData
-    from droguekit.bars.table import BarTable
     from droguekit.batch.local import RunSummary
     from droguekit.batch.progress import ProgressReport
     from droguekit.benchmark.benchmark import BenchmarkResult
@@ -101,58 +98,6 @@ def render_frames(
     return render_dataset(recipe, text, out, frames, spread, report)
 
 
-@dataclass(frozen=True)
-class Fixes:
-    """How many poses a method found in how many pairs."""
-
-    method: str
-    fixes: int
-    pairs: int
-
-
-def navigate_dataset(
-    dataset: Location,
-    methods: Sequence[str],
-    out: Path,
-    report: ProgressReport,
-    centroids: str = "own",
-    detector: str | None = None,
-) -> list[Fixes]:
-    """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
-
-    Raises:
-        ValueError: no such dataset, method, detector or way to measure centroids, or an image that cannot be read.
-        OSError: the estimates cannot be written.
-    """
-    from datasets_manifest.blind import BlindDataset
-    from datasets_manifest.estimates import write_estimates
-    from nav.detector.registry import DEFAULT_DETECTOR
-    from nav.runner import CENTROID_CHOICES, method_names, navigate
-
-    choice = next((name for name in CENTROID_CHOICES if name == centroids), None)
-    if choice is None:
-        raise ValueError(f"--centroids: must be one of {', '.join(CENTROID_CHOICES)}, got {centroids!r}")
-    chosen = list(dict.fromkeys(methods)) or list(method_names())
-    blind = BlindDataset(dataset)
-    estimates = navigate(blind, chosen, choice, DEFAULT_DETECTOR if detector is None else detector)
-    fixes: Counter[str] = Counter()
-
-    def counted() -> Iterator[Estimate]:
-        for number, estimate in enumerate(estimates, start=1):
-            fixes[estimate.method] += estimate.status == "fix"
-            yield estimate
-            if number % len(chosen) == 0:
-                report.advance()
-
-    out.parent.mkdir(parents=True, exist_ok=True)
-    report.begin("pairs", len(blind.frame_indices))
-    try:
-        write_estimates(out, counted())
-    finally:
-        report.end()
-    return [Fixes(method, fixes[method], len(blind.frame_indices)) for method in chosen]
-
-
 def benchmark_dataset(
     dataset: Location, estimates: Path, json_out: Path | None, html_out: Path | None
 ) -> BenchmarkResult:
@@ -163,15 +108,17 @@ def benchmark_dataset(
         OSError: a result cannot be written.
     """
     from datasets_manifest.writer import write_text_atomic
+    from droguekit.bars.one_thread import one_thread
     from droguekit.benchmark.benchmark import run_benchmark
     from droguekit.benchmark.report import write_report
 
-    result = run_benchmark(dataset, estimates)
-    if json_out is not None:
-        write_text_atomic(json_out, result.to_json())
-    if html_out is not None:
-        html_out.parent.mkdir(parents=True, exist_ok=True)
-        write_report(dataset, estimates, result, html_out)
+    with one_thread():
+        result = run_benchmark(dataset, estimates)
+        if json_out is not None:
+            write_text_atomic(json_out, result.to_json())
+        if html_out is not None:
+            html_out.parent.mkdir(parents=True, exist_ok=True)
+            write_report(dataset, estimates, result, html_out)
     return result
 
 
@@ -183,15 +130,17 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         OSError: a result cannot be written.
     """
     from datasets_manifest.writer import write_text_atomic
+    from droguekit.bars.one_thread import one_thread
     from droguekit.benchmark.blind_check import check_blind
     from droguekit.benchmark.blind_report import write_blind_report
 
-    check = check_blind(dataset, estimates)
-    if json_out is not None:
-        write_text_atomic(json_out, check.to_json())
-    if html_out is not None:
-        html_out.parent.mkdir(parents=True, exist_ok=True)
-        write_blind_report(dataset, estimates, check, html_out)
+    with one_thread():
+        check = check_blind(dataset, estimates)
+        if json_out is not None:
+            write_text_atomic(json_out, check.to_json())
+        if html_out is not None:
+            html_out.parent.mkdir(parents=True, exist_ok=True)
+            write_blind_report(dataset, estimates, check, html_out)
     return check
 
 
@@ -268,80 +217,3 @@ def _bench_recipe(count: int, distance: dict[str, object], quality: str, engine:
         "render": {**demo.render.model_dump(), **_BENCH_SAMPLES[quality]},
     }
     return Recipe.model_validate({**demo.model_dump(), **changes})
-
-
-@dataclass(frozen=True)
-class BarsOrder:
-    """Which bars to measure, and how much to spend on them.
-
-    Attributes:
-        tier: `a`, `b`, `c`, `d` or `speed`.
-        seed: of everything drawn.
-        pairs_per_station: rendered pairs at each distance, the recipe's when None; tiers a and b.
-        draws: frames of a cell, the protocol's when None; tiers c and d, and speed.
-        workers: that render, as many as the machine holds when None.
-    """
-
-    tier: str
-    seed: int
-    pairs_per_station: int | None
-    draws: int | None
-    workers: int | None
-
-
-def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
-    """Measure the bars of a tier and write bars.json and bars.md; what an earlier run finished is kept.
-
-    Raises:
-        ValueError: no such tier, a wrong number, or a folder of something else.
-        OSError: the folder cannot be written.
-    """
-    from importlib.metadata import version
-
-    from datasets_manifest.writer import write_text_atomic
-    from droguekit.bars.image_tiers import IMAGE_TIERS, LIGHTS
-    from droguekit.bars.speed import bars_speed
-    from droguekit.bars.table import BarRow, BarTable
-    from droguekit.bars.tier_c import bars_tier_c
-    from droguekit.bars.tier_d import bars_tier_d
-
-    drawn = {"c": bars_tier_c, "d": bars_tier_d, "speed": bars_speed}
-    rows: list[BarRow] = []
-    if order.tier in IMAGE_TIERS:
-        for light in LIGHTS:
-            rows += IMAGE_TIERS[order.tier](_tier_data(order, light, out, report))
-    elif order.tier in drawn:
-        rows += drawn[order.tier](out, order.seed, order.draws, report)
-    else:
-        raise ValueError(f"tier: there is none named {order.tier!r}; there are a, b, c, d, speed")
-    table = BarTable(tier=order.tier, seed=order.seed, code_version=version("droguekit"), rows=tuple(rows))
-    write_text_atomic(out / "bars.json", table.to_json())
-    write_text_atomic(out / "bars.md", table.to_markdown())
-    return table
-
-
-def _tier_data(order: BarsOrder, light: Literal["day", "dusk"], out: Path, report: ProgressReport) -> TierData:
-    """Render, navigate and benchmark one dataset of a tier."""
-    from droguekit.bars.image_tiers import METHODS, TierData, recipe_of
-    from droguekit.bars.navigated import is_navigated, mark_navigated
-
-    recipe, text = open_recipe(recipe_of(order.tier, light), order.seed, None)
-    stations = len(recipe.distance.stations_m or ())
-    most = recipe.frames.count // stations
-    pairs = most if order.pairs_per_station is None else order.pairs_per_station
-    if not 1 <= pairs <= most:
-        raise ValueError(f"--pairs-per-station: must be from 1 to {most}, got {pairs}")
-    folder = out / light
-    estimates = folder / "estimates.jsonl"
-    report.say(f"{light}: rendering {stations * pairs} pairs of {recipe.name} into {folder / 'dataset'}")
-    summary = render_frames(
-        recipe, text, folder / "dataset", range(stations * pairs), RenderOrder(order.workers), report
-    )
-    if is_navigated(estimates, summary.dataset_sha256, METHODS):
-        report.say(f"{light}: {estimates} is there already")
-    else:
-        navigate_dataset(folder / "dataset", METHODS, estimates, report)
-        mark_navigated(estimates, summary.dataset_sha256, METHODS)
-    report.say(f"{light}: comparing with the truth")
-    result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
-    return TierData(light, folder / "dataset", estimates, result)

@@ -13,11 +13,13 @@ from datasets_manifest.images import Pixels
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from nav.blobs import Blobs, disc_like_blobs
-from nav.ring_match import match_ring
+from nav.channels import Window
+from nav.ring_match import RingMatch, match_ring
 
 # Share of the box added on every side, so that a box that is a little too small cuts no marker.
 _BOX_MARGIN_FRACTION = 0.06
 _LEAST_AREA_PX2 = 7.0
+_LEAST_SIDE_PX = 3
 # A drogue has some ten discs; more regions than this in its box are noise.
 _MOST_BLOBS = 60
 # Below this diameter the 3x3 median and opening eat the disc's outline (0.2 px instead of 0.09 px at 5 px), and the
@@ -34,10 +36,12 @@ class Centroids:
     Attributes:
         blobs: centres [px] and areas, in full-image coordinates.
         cov_px2: (M, 2, 2) covariances of the centres.
+        ring: the drogue's ring among them, where it has been looked for and found.
     """
 
     blobs: Blobs
     cov_px2: Array
+    ring: RingMatch | None = None
 
 
 NOTHING = Centroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
@@ -46,30 +50,40 @@ NOTHING = Centroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
 def binary_centroids(
     channel: Pixels, box_xywh_px: tuple[float, float, float, float], layout: MarkerLayout
 ) -> Centroids:
-    """Centres of mass of the regions above Otsu's threshold in a box.
+    """As `window_centroids`, of the window of a box.
+
+    Args:
+        channel: (H, W) marker channel of the whole image.
+        box_xywh_px: the detector's box in pixel-centre coordinates.
+        layout: the drogue's markers.
+    """
+    left, top, right, bottom = box_window((channel.shape[1], channel.shape[0]), box_xywh_px)
+    return window_centroids(channel[top:bottom, left:right], (left, top), layout)
+
+
+def window_centroids(channel: Pixels, corner_px: tuple[int, int], layout: MarkerLayout) -> Centroids:
+    """Centres of mass of the regions above Otsu's threshold in a part of an image.
 
     Where that does not show the whole ring of markers, Otsu's thresholds of its brighter class (white markers that run
     together with a bright sky) and of its darker class (markers in shade beside sunlit ones) are tried. Median and
-    opening are left out where the discs are smaller than they can stand. Regions that touch the edge of the box or of
+    opening are left out where the discs are smaller than they can stand. Regions that touch the edge of the part or of
     the image are dropped: their centre of mass is not the marker's.
 
     Args:
-        channel: (H, W) marker channel.
-        box_xywh_px: the detector's box in pixel-centre coordinates.
+        channel: (H, W) marker channel of the part, see `box_window`.
+        corner_px: column and row of its first pixel in the image.
         layout: the drogue's markers.
 
     Source: the seed paper, section 3.2; Otsu, doi:10.1109/TSMC.1979.4310076.
     """
-    left, top, right, bottom = _crop(channel.shape, box_xywh_px)
-    if right - left < 3 or bottom - top < 3:
+    if min(channel.shape) < _LEAST_SIDE_PX:
         return NOTHING
-    roi = np.ascontiguousarray(channel[top:bottom, left:right])
-    blobs, opened = _best_regions(roi, layout)
-    moved = Blobs(blobs.centers_px + np.array([left, top]), blobs.areas_px2)
+    blobs, opened, ring = _best_regions(channel, layout)
+    moved = Blobs(blobs.centers_px + np.array(corner_px), blobs.areas_px2)
     variance = quantisation_variance_px2(moved.radii_px)
     if opened:
         variance = variance + morphology_variance_px2(moved.radii_px)
-    return Centroids(moved, variance[:, None, None] * np.eye(2))
+    return Centroids(moved, variance[:, None, None] * np.eye(2), None if ring is None else ring.moved(corner_px))
 
 
 def _otsu(levels: Pixels) -> float:
@@ -77,18 +91,19 @@ def _otsu(levels: Pixels) -> float:
     return float(cv2.threshold(levels, 0, 1, cv2.THRESH_BINARY | cv2.THRESH_OTSU)[0])
 
 
-def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool]:
-    """Regions by the first of three thresholds that shows most of the ring of markers."""
+def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool, RingMatch | None]:
+    """Regions by the first of three thresholds that shows most of the ring of markers, and that ring."""
     best, most = (Blobs(np.zeros((0, 2)), np.zeros(0)), False), -1
+    shown: RingMatch | None = None
     for level in _thresholds(roi):
         regions = _regions(roi, level)
         ring = match_ring(regions[0], layout)
         count = 0 if ring is None else ring.count
         if count > most:
-            best, most = regions, count
+            best, most, shown = regions, count, ring
         if most == layout.count:
             break
-    return best
+    return *best, shown
 
 
 def _thresholds(roi: Pixels) -> Iterator[float]:
@@ -129,11 +144,11 @@ def morphology_variance_px2(radii_px: Array) -> Array:
     return variance
 
 
-def _crop(shape: tuple[int, ...], box_xywh_px: tuple[float, float, float, float]) -> tuple[int, int, int, int]:
-    """Columns and rows (left, top, right, bottom) of the widened box on the image, the last two exclusive."""
+def box_window(size_px: tuple[int, int], box_xywh_px: tuple[float, float, float, float]) -> Window:
+    """The widened box on an image of (width, height), empty where it lies beside it."""
     x, y, width, height = box_xywh_px
     margin_x, margin_y = _BOX_MARGIN_FRACTION * width + 1, _BOX_MARGIN_FRACTION * height + 1
     left, top = max(0, int(np.floor(x - margin_x))), max(0, int(np.floor(y - margin_y)))
-    right = min(shape[1], int(np.ceil(x + width + margin_x)) + 1)
-    bottom = min(shape[0], int(np.ceil(y + height + margin_y)) + 1)
-    return left, top, right, bottom
+    right = min(size_px[0], int(np.ceil(x + width + margin_x)) + 1)
+    bottom = min(size_px[1], int(np.ceil(y + height + margin_y)) + 1)
+    return left, top, max(left, right), max(top, bottom)

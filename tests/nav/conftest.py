@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from datasets_manifest.blind import BlindPair
 from datasets_manifest.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parameters import DrogueParameters, even_ring
+from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
+from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, angles_from_axis, exp_twist, log_twist, rotation_from_angles
 from geometry.stereo import EYES, StereoRig, paper_rig
 from nav.pose.interface import Observation
@@ -127,6 +130,28 @@ def draw_pair(
 def draw() -> Callable[..., StereoImages]:
     """`draw(rig, drogue, left_from_drogue, rng, kind=..., hidden=..., extra_discs=...)`."""
     return draw_pair
+
+
+# A quarter of the seed paper's pixels behind half its focal length, so that whole flights are quick to draw.
+FLIGHT_RIG = StereoRig(PinholeCamera(640, 480, 3200 / 3, 3200 / 3, 319.5, 239.5), 0.12)
+
+
+def fly_by(places: Sequence[RigidTransform | None], times_s: Sequence[float] | None = None) -> list[BlindPair]:
+    """Pairs of one drogue at these places, None where it is hidden; 25 a second unless told otherwise."""
+    pairs = []
+    for index, place in enumerate(places):
+        drogue = None if place is None else PRESETS["red-8"]
+        anywhere = make_left_from_drogue(0, 0, 5) if place is None else place
+        images = draw_pair(FLIGHT_RIG, drogue, anywhere, np.random.default_rng([77, index]))
+        time_s = index / 25 if times_s is None else times_s[index]
+        pairs.append(BlindPair(index, replace(images, time_s=time_s), FLIGHT_RIG, PRESETS["red-8"]))
+    return pairs
+
+
+@pytest.fixture(scope="session")
+def fly() -> Callable[..., list[BlindPair]]:
+    """`fly(left_from_drogue of each pair, times_s=None)`."""
+    return fly_by
 
 
 @dataclass(frozen=True)

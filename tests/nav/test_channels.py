@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.images import StereoImages
-from nav.channels import PLAIN, balancing_weight
+from nav.channels import PLAIN, balancing_weight, marker_channel
 
 MIDDLES_PX = np.array([[60.0, 50.0], [58.0, 50.0]])
 RIM_PX = 12.0
@@ -46,3 +46,26 @@ def test_black_night_and_a_drogue_beyond_the_image_change_nothing():
     assert balancing_weight(pictures((0, 0, 0)), 0, MIDDLES_PX, RIM_PX) == PLAIN
     away = np.array([[500.0, 500.0], [-300.0, 40.0]])
     assert balancing_weight(pictures((60, 90, 120)), 0, away, RIM_PX, 1.4) == 1.4
+
+
+@pytest.mark.parametrize("window", [(0, 0, 120, 100), (37, 21, 80, 64), (64, 50, 119, 99), (101, 0, 120, 33)])
+@pytest.mark.parametrize("color", [0, 1, 2, None])
+@pytest.mark.parametrize("kind", ["linear", "gamma", "mono", "mosaic"])
+def test_part_of_the_channel_is_that_part_of_the_whole(window, color, kind):
+    rng = np.random.default_rng(5)
+    shape = (100, 120) if kind == "mono" else (100, 120, 3)
+    images = StereoImages(
+        *rng.integers(0, 4096, (2, *shape)).astype(np.uint16),
+        time_s=0.0,
+        exposure_s=1e-3,
+        bits=12,
+        encoding="gamma" if kind == "gamma" else "linear",
+        black_level_dn=64.0,
+        left_mosaic=rng.integers(0, 4096, (100, 120)).astype(np.uint16) if kind == "mosaic" else None,
+    )
+    left, top, right, bottom = window
+    whole = marker_channel(images, "left", color, 1.4)
+    part = marker_channel(images, "left", color, 1.4, window)
+    assert part.shape == (bottom - top, right - left)
+    assert (part == whole[top:bottom, left:right]).all()
+    assert whole.any()

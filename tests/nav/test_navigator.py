@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.blind import BlindDataset
-from datasets_manifest.estimates import PoseEstimate, read_estimates, write_estimates
+from datasets_manifest.estimates import PoseEstimate, Region, read_estimates, write_estimates
 from datasets_manifest.recipe import load_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
@@ -136,7 +136,7 @@ def test_estimates_survive_the_disk(draw, make_pose, tmp_path):
     assert {e.status for e in estimates if e.frame_index == 5} == {"no_fix"}
     fixes = {e.method: e for e in estimates if e.frame_index == 3}
     assert set(fixes["paper"].stage_s) == {"detect", "centroids", "correspond", "pose"}
-    assert set(fixes["joint"].stage_s) == {"detect", "centroids", "correspond", "refine", "pose"}
+    assert set(fixes["joint"].stage_s) == {"detect", "centroids", "correspond", "rough", "refine", "pose"}
     assert sum(f.index != "hub" for f in fixes["joint"].features) == 16
     assert sum(mode.weight for mode in fixes["joint"].modes) == pytest.approx(1)
     path = tmp_path / "estimates.jsonl"
@@ -230,3 +230,12 @@ def test_haze_of_a_low_sun_is_not_taken_for_red_paint(frame_index):
     truth_m = frame.left_from_drogue.translation_m
     # 0.1 px of every centroid is 0.2 % of the depth at 40 m.
     assert np.linalg.norm(estimate.left_from_drogue.translation_m - truth_m) < 0.002 * truth_m[2]
+
+
+def test_a_region_beside_the_image_shows_nothing(draw, make_pose):
+    images = draw(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None)
+    beside = Region(eye="left", box_xywh_px=(1290.0, 100.0, 50.0, 50.0), source="tracker", score=1.0)
+    before = Region(eye="right", box_xywh_px=(-90.0, 100.0, 50.0, 50.0), source="tracker", score=1.0)
+    seen = NAVIGATOR.measure(images, (beside, before)).observation
+    assert isinstance(seen, NoFixReason)
+    assert seen.reason.startswith("no ring of markers among 0 regions of the left image")

@@ -13,9 +13,10 @@ from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
-from nav.navigator import Navigator, Sighting, estimate_pose
+from nav.navigator import Navigator
 from nav.pose.interface import NoFixReason, Observation
 from nav.pose.registry import METHODS, pose_method
+from nav.sighting import Sighting, estimate_pose
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]

@@ -1,0 +1,91 @@
+"""One measured pose into one state: innovation, its chi-square, and the Kalman update."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+
+from geometry.se3 import Array, RigidTransform
+from nav.filtering.error_state import SIZE, MotionState, orthonormal, symmetric
+from nav.filtering.fixes import pose_difference
+from nav.filtering.motion_model import seen_from_turning, vibration_covariance
+from nav.filtering.settings import FilterSettings
+
+_POSE = 6
+_VIBRATION = slice(12, 18)
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What a measured pose says beyond the prediction.
+
+    Attributes:
+        error: (6,) from the predicted to the measured pose, in the tangent of `datasets_manifest.estimates`.
+        jacobian: (6, 18) of the predicted pose by the error of the state.
+        factor: (6, 6) lower Cholesky factor of its covariance.
+        nis: its square in that covariance, chi-square with 6 degrees of freedom.
+        log_likelihood: logarithm of its density.
+    """
+
+    error: Array
+    jacobian: Array
+    factor: Array
+    nis: float
+    log_likelihood: float
+
+
+def innovation_of(state: MotionState, pose: RigidTransform, covariance: Array) -> Innovation:
+    """Compare a measured pose with a predicted state.
+
+    Args:
+        state: at the time of the images.
+        pose: measured, with the roll that is nearest to the state's.
+        covariance: (6, 6) of it, positive definite.
+    """
+    jacobian = state.pose_jacobian()
+    error = pose_difference(state.pose(), pose)
+    factor = np.linalg.cholesky(symmetric(jacobian @ state.covariance @ jacobian.T + covariance))
+    white = solve_triangular(factor, error, lower=True)
+    nis = float(white @ white)
+    log_likelihood = -nis / 2 - float(np.log(np.diag(factor)).sum()) - _POSE / 2 * np.log(2 * np.pi)
+    return Innovation(error, jacobian, factor, nis, log_likelihood)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What a fix makes of a state.
+
+    Attributes:
+        state: after it.
+        kept: (18, 18) `I - K H`, what is left of the error before.
+    """
+
+    state: MotionState
+    kept: Array
+
+
+def correct(state: MotionState, innovation: Innovation, covariance: Array) -> Correction:
+    """Take a measured pose of a (6, 6) covariance.
+
+    The covariance is updated in Joseph's form, which keeps it positive definite.
+    """
+    cross = state.covariance @ innovation.jacobian.T
+    gain = cho_solve((innovation.factor, True), cross.T).T
+    kept = np.eye(SIZE) - gain @ innovation.jacobian
+    posterior = kept @ state.covariance @ kept.T + gain @ covariance @ gain.T
+    return Correction(state.moved(gain @ innovation.error, posterior), kept)
+
+
+def first_state(pose: RigidTransform, covariance: Array, settings: FilterSettings) -> MotionState:
+    """What one measured pose tells: where the drogue is but for the shaking, and nothing of its motion."""
+    shaking = vibration_covariance(pose.translation_m, settings)
+    initial = np.zeros((SIZE, SIZE))
+    initial[:_POSE, :_POSE] = covariance + shaking
+    initial[:_POSE, _VIBRATION] = initial[_VIBRATION, :_POSE] = -shaking
+    initial[_VIBRATION, _VIBRATION] = shaking
+    drogue2, camera2 = (settings.start_speed_m_s**2, settings.start_rate_rad_s**2), settings.start_turn_rad_s**2
+    initial[6:12, 6:12] = seen_from_turning(pose.translation_m, *drogue2, camera2)
+    zero = np.zeros(3)
+    return MotionState(pose.translation_m, orthonormal(pose.rotation), zero, zero, zero, zero, symmetric(initial))

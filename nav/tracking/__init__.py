@@ -1,0 +1,1 @@
+"""The drogue's box from pair to pair, without the detector."""

@@ -1,0 +1,128 @@
+"""The piece of an image that a tracker looks at, brought to a size that does not grow with the drogue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.images import Pixels, StereoImages
+from geometry.se3 import Array
+from geometry.stereo import Eye
+
+Box = tuple[float, float, float, float]
+"""x, y of the low corner, width, height in pixel-centre coordinates. [px]"""
+
+# Where a pixel of the piece stands for many of the image, so many along each axis are averaged; more cost time only.
+_AVERAGED = 3
+# 12 bits to 8 by a square root, under which shot noise is even and a dark scene keeps its steps.
+_TO_8_BIT: NDArray[np.uint8] = np.round(np.sqrt(np.arange(4096) / 4095) * 255).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class EyeImage:
+    """What one eye saw.
+
+    Attributes:
+        pixels: (H, W, 3) or (H, W), as in `StereoImages`.
+        time_s: mid-exposure. [s]
+    """
+
+    pixels: Pixels
+    time_s: float
+
+
+def eye_image(images: StereoImages, eye: Eye) -> EyeImage:
+    """One eye's part of a pair."""
+    return EyeImage(images.left if eye == "left" else images.right, images.time_s)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRegion:
+    """A piece of an image on a grid of its own.
+
+    Attributes:
+        pixels: (h, w, C) of 8 bit; C is 3, or 1 of a mono image.
+        origin_px: (2,) centre of the first of these pixels in the image. [px]
+        step_px: (2,) image pixels from one of them to the next. [px]
+    """
+
+    pixels: NDArray[np.uint8]
+    origin_px: Array
+    step_px: Array
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Columns and rows."""
+        return int(self.pixels.shape[1]), int(self.pixels.shape[0])
+
+    def grid(self, points_px: Array) -> Array:
+        """(..., 2) columns and rows of (..., 2) places in the image."""
+        places: Array = (points_px - self.origin_px) / self.step_px
+        return places
+
+    def image(self, places: Array) -> Array:
+        """(..., 2) places in the image of (..., 2) columns and rows. [px]"""
+        points: Array = self.origin_px + places * self.step_px
+        return points
+
+    def grey(self) -> NDArray[np.uint8]:
+        """(h, w) brightness."""
+        if self.pixels.shape[2] == 1:
+            return self.pixels[:, :, 0]
+        return np.asarray(cv2.cvtColor(self.pixels, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def image_region(image: EyeImage, window: Box, step_px: float) -> ImageRegion | None:
+    """The part of a window that lies on the image; None where that is less than three pixels wide or high.
+
+    Args:
+        image: of one eye.
+        window: what to look at.
+        step_px: image pixels that one pixel of the region stands for; below 1 the image is enlarged. [px]
+    """
+    height, width = image.pixels.shape[:2]
+    left, top = max(0, int(np.floor(window[0] + 0.5))), max(0, int(np.floor(window[1] + 0.5)))
+    right = min(width, int(np.ceil(window[0] + window[2] + 0.5)))
+    bottom = min(height, int(np.ceil(window[1] + window[3] + 0.5)))
+    if right - left < 3 or bottom - top < 3:
+        return None
+    stride = max(1, int(step_px / _AVERAGED))
+    part = np.ascontiguousarray(image.pixels[top:bottom:stride, left:right:stride])
+    taken = np.array([part.shape[1], part.shape[0]])
+    size = np.maximum(1, np.round(taken * stride / step_px)).astype(int)
+    shrink = taken / size
+    flags = cv2.INTER_AREA if step_px > 1 else cv2.INTER_LINEAR
+    pixels = np.asarray(cv2.resize(part, (int(size[0]), int(size[1])), interpolation=flags))
+    if pixels.dtype == np.uint16:
+        pixels = _TO_8_BIT[np.minimum(pixels, len(_TO_8_BIT) - 1)]
+    origin = np.array([left, top]) + (0.5 * shrink - 0.5) * stride
+    return ImageRegion(pixels.reshape(size[1], size[0], -1).astype(np.uint8, copy=False), origin, shrink * stride)
+
+
+def box_center(box: Box) -> Array:
+    """(2,) its middle. [px]"""
+    return np.array([box[0] + box[2] / 2, box[1] + box[3] / 2])
+
+
+def box_around(center_px: Array, width_px: float, height_px: float) -> Box:
+    """The box of a middle and a size."""
+    x, y = float(center_px[0]), float(center_px[1])
+    return x - width_px / 2, y - height_px / 2, width_px, height_px
+
+
+def box_size(box: Box) -> float:
+    """Side of the square of its area. [px]"""
+    return float(np.sqrt(box[2] * box[3]))
+
+
+def grown(box: Box, margin_x_px: float, margin_y_px: float) -> Box:
+    """The box with a margin on every side."""
+    return box[0] - margin_x_px, box[1] - margin_y_px, box[2] + 2 * margin_x_px, box[3] + 2 * margin_y_px
+
+
+def moved(box: Box, center_px: Array, scale: float) -> Box:
+    """The box about another middle, its sides multiplied."""
+    return box_around(center_px, box[2] * scale, box[3] * scale)

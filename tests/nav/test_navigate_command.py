@@ -1,0 +1,206 @@
+"""`droguekit navigate` on an imported flight: tracker, filter, smoother, real time, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import threading
+
+import cv2
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from datasets_manifest.estimates import NoFix, PoseEstimate, read_estimates
+from datasets_manifest.importers.dataset import ImportSettings, write_imported
+from datasets_manifest.importers.source import SourcePair
+from droguekit.batch.progress import PlainProgress
+from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.cli.navigation_pipeline import NavigationOrder, navigate_dataset
+from geometry.se3 import RigidTransform, rotation_from_angles
+
+PAIRS = 6
+
+
+class Flight:
+    """Drawn pairs as an importer reads them."""
+
+    left_out = ()
+
+    def __init__(self, pairs):
+        self._pairs, self.count = pairs, len(pairs)
+
+    def __iter__(self):
+        for pair in self._pairs:
+            name = f"{pair.frame_index}.png"
+            yield SourcePair((name, name), pair.images.time_s, pair.images.left, pair.images.right)
+
+
+@pytest.fixture(scope="module")
+def flight(fly, tmp_path_factory):
+    """A dataset without truth of a drogue that comes nearer."""
+    turn = rotation_from_angles(*np.radians([4, -3, 5]))
+    pairs = fly([RigidTransform(turn, np.array([0.02 * k, -0.01 * k, 5.0 - 0.02 * k])) for k in range(PAIRS)])
+    out = tmp_path_factory.mktemp("flight") / "data"
+    settings = ImportSettings("flight", pairs[0].rig, pairs[0].drogue, encoding="linear")
+    write_imported(Flight(pairs), settings, out, lambda: None)
+    return out
+
+
+def by_method(path):
+    found = {}
+    for estimate in read_estimates(path):
+        found.setdefault(estimate.method, []).append(estimate)
+    return found
+
+
+def test_all_of_it_together(flight, tmp_path, capsys):
+    out = tmp_path / "estimates.jsonl"
+    options = ["--method", "joint-hub", "--tracker", "bernoulli", "--redetect-every", "3", "--filter", "--smooth"]
+    assert run(["navigate", str(flight), *options, "--capture-radius", "0.2", "--out", str(out)]) == DONE
+    found = by_method(out)
+    assert list(found) == ["joint-hub", "joint-hub+filter", "joint-hub+smoother"]
+    for estimates in found.values():
+        assert [e.frame_index for e in estimates] == list(range(PAIRS))
+        assert all(isinstance(e, PoseEstimate) for e in estimates)
+        assert [{r.source for r in e.regions} for e in estimates][:2] == [{"detector"}, {"bernoulli"}]
+    told = capsys.readouterr().out.splitlines()
+    assert told == [*(f"{name:<18} {PAIRS} fixes in {PAIRS} pairs" for name in found), f"wrote {out}"]
+
+
+def test_without_options_the_detector_looks_at_every_pair_and_there_are_no_others(flight, tmp_path):
+    out = tmp_path / "estimates.jsonl"
+    assert run(["navigate", str(flight), "--method", "joint", "--out", str(out)]) == DONE
+    (estimates,) = by_method(out).values()
+    assert {region.source for estimate in estimates for region in estimate.regions} == {"detector"}
+    assert all(estimate.latency_s is None for estimate in estimates)
+
+
+def test_in_real_time_every_pair_is_worked_on_or_told_to_be_late(flight, tmp_path, capsys):
+    out, latency = tmp_path / "estimates.jsonl", tmp_path / "latency.json"
+    # Faster than any machine works, so that pairs are late.
+    options = ["--method", "joint", "--tracker", "flow", "--filter", "--rate", "10000", "--latency", str(latency)]
+    assert run(["navigate", str(flight), *options, "--out", str(out)]) == DONE
+    told = json.loads(latency.read_text())
+    assert (told["schema"], told["rate_hz"], told["pairs"]) == (1, 10000.0, PAIRS)
+    assert 0 < told["late"] < PAIRS
+    for estimates in by_method(out).values():
+        assert [e.frame_index for e in estimates] == list(range(PAIRS))
+        late = [e for e in estimates if isinstance(e, NoFix) and e.reason.startswith("late:")]
+        assert len(late) == told["late"]
+        assert isinstance(estimates[-1], PoseEstimate)
+        latencies_ms = [1e3 * e.latency_s for e in estimates if isinstance(e, PoseEstimate)]
+        assert told["latency"]["max_ms"] == pytest.approx(max(latencies_ms))
+    percentiles = [told["latency"][name] for name in ("p50_ms", "p95_ms", "p99_ms", "max_ms")]
+    assert percentiles == sorted(percentiles)
+    assert {"read", "wait", "handover", "centroids", "pose", "filter", "output"} <= set(told["stages"])
+    printed = capsys.readouterr().out
+    assert f"{PAIRS} pairs at 10000 Hz, {told['late']} late\n" in printed
+    assert re.search(rf"^whole +{told['latency']['p50_ms']:.1f} ", printed, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--redetect-every", "5"], "--redetect-every: needs --tracker"),
+        (["--tracker", "mil", "--redetect-every", "0"], "--redetect-every: must be at least 1, got 0"),
+        (["--tracker", "guess"], "tracker: must be one of bernoulli"),
+        (["--capture-radius", "0.1"], "--capture-radius: needs --filter or --smooth"),
+        (["--filter", "--capture-radius", "nan"], "--capture-radius: must be above 0 m, got nan"),
+        (["--rate", "0"], "--rate: must be from 0.001 to 10000 Hz, got 0"),
+        (["--rate", "nan"], "--rate: must be from 0.001 to 10000 Hz, got nan"),
+        (["--latency", "latency.json"], "--latency: needs --rate"),
+        (["--centroids", "grey"], "--centroids: must be one of own, binary, edge"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(flight, tmp_path, capsys, options, message):
+    out = tmp_path / "estimates.jsonl"
+    assert run(["navigate", str(flight), *options, "--out", str(out)]) == WRONG_INPUT
+    told = capsys.readouterr().err
+    assert message in told
+    assert len(told.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_places_that_cannot_take_results_are_refused_before_the_work(flight, tmp_path, capsys):
+    folder, out = tmp_path / "folder", tmp_path / "estimates.jsonl"
+    folder.mkdir()
+    other_name = folder / ".." / out.name
+    for out_place, latency, message in (
+        (folder, None, "--out: must be a file, got the folder"),
+        (out, folder, "--latency: must be a file, got the folder"),
+        (out, other_name, "--latency: must be another file than --out"),
+        (out, "s3://bucket/latency.json", "--latency: must be a folder or file of this machine"),
+    ):
+        options = ["--out", str(out_place), *([] if latency is None else ["--rate", "9", "--latency", str(latency)])]
+        assert run(["navigate", str(flight), "--method", "constant", *options]) == WRONG_INPUT
+        told = capsys.readouterr().err
+        assert message in told
+        assert len(told.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == [folder]
+    assert list(folder.iterdir()) == []
+
+
+def test_a_damaged_pair_in_real_time_leaves_no_estimates(flight, tmp_path, capsys):
+    data = tmp_path / "data"
+    for file in flight.rglob("*"):
+        if file.is_file():
+            copy = data / file.relative_to(flight)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(file.read_bytes()[: 5000 if file.match("*/000005/right.png") else None])
+    out = tmp_path / "estimates.jsonl"
+    assert run(["navigate", str(data), "--method", "constant", "--rate", "1000", "--out", str(out)]) == WRONG_INPUT
+    assert re.search(r"000005/right\.png: the PNG is truncated", capsys.readouterr().err)
+    assert not out.exists()
+
+
+def library_threads():
+    """How many threads OpenCV takes, and the linear algebra of each library that is loaded."""
+    return [cv2.getNumThreads(), *(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")]
+
+
+class InterruptedProgress(PlainProgress):
+    """Ctrl-C after the second pair; remembers how many threads libraries took until then."""
+
+    def __init__(self, stream):
+        super().__init__(stream)
+        self._pairs = 0
+        self.threads = []
+
+    def advance(self):
+        self._pairs += 1
+        self.threads += library_threads()
+        if self._pairs == 2:
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("rate_hz", [None, 500.0])
+def test_an_interrupt_leaves_the_old_file_no_thread_and_all_settings(flight, tmp_path, capsys, rate_hz):
+    out = tmp_path / "estimates.jsonl"
+    out.write_text("old")
+    threads, handler = set(threading.enumerate()), signal.signal(signal.SIGINT, signal.default_int_handler)
+    cores, order = cv2.getNumThreads(), NavigationOrder(rate_hz=rate_hz)
+    try:
+        cv2.setNumThreads(2)
+        with (
+            threadpool_limits(2, "blas"),
+            pytest.raises(KeyboardInterrupt),
+            capsys.disabled(),
+            (tmp_path / "log").open("w") as log,
+        ):
+            before, progress = library_threads(), InterruptedProgress(log)
+            try:
+                navigate_dataset(flight, ["constant"], out, progress, order)
+            finally:
+                after = library_threads()
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        cv2.setNumThreads(cores)
+    assert out.read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["estimates.jsonl", "log"]
+    left = {t for t in set(threading.enumerate()) - threads if not t.name.startswith("other-eye")}
+    assert left == set()
+    assert set(progress.threads) == {1}
+    # Libraries that were loaded meanwhile come last.
+    assert after[: len(before)] == before

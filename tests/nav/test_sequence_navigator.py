@@ -1,0 +1,220 @@
+"""Pairs in their order: tracker and detector, loss and return, filters and docking, and where sequences begin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from datasets_manifest.estimates import NoFix, PoseEstimate
+from drogue_models.presets import PRESETS
+from geometry.se3 import RigidTransform, rotation_from_angles
+from geometry.stereo import EYES
+from nav.detector.color_blob import ColorBlobDetector
+from nav.detector.interface import Detection, StereoDetection
+from nav.filtering.settings import FilterSettings
+from nav.navigator import Navigator
+from nav.runner import open_navigator, with_smoothed
+from nav.sequence_navigator import SequenceNavigator, SequenceSettings
+from nav.tracked_observer import TrackedObserver
+from nav.tracking.registry import tracker_names
+
+DETECTOR = "color-blob"
+STEP_M = (0.012, -0.006, -0.02)
+HIDDEN = range(4, 8)
+
+
+class CountedDetector(ColorBlobDetector):
+    """Remembers which time stamps it was shown."""
+
+    def __init__(self, drogue):
+        super().__init__(drogue)
+        self.shown_s = []
+
+    def detect(self, images):
+        self.shown_s.append(images.time_s)
+        return super().detect(images)
+
+
+def place(x_m, y_m, z_m):
+    return RigidTransform(rotation_from_angles(*np.radians([4, -3, 5])), np.array([x_m, y_m, z_m]))
+
+
+def way(count, start=(0.0, 0.05, 5.0)):
+    """Places of a drogue that comes nearer and moves by some pixels from pair to pair."""
+    return [place(*(np.array(start) + k * np.array(STEP_M))) for k in range(count)]
+
+
+@pytest.fixture(scope="module")
+def steady(fly):
+    """A drogue that is always in view."""
+    return fly(way(12))
+
+
+@pytest.fixture(scope="module")
+def hidden_places():
+    """Places of a drogue that hides in the pairs of `HIDDEN` and comes back a ring's width beside where it went."""
+    before = HIDDEN.start
+    return [*way(before), *(None for _ in HIDDEN), *way(5, start=(0.5, -0.3, 4.8))]
+
+
+@pytest.fixture(scope="module")
+def hidden_flight(fly, hidden_places):
+    return fly(hidden_places)
+
+
+def answers_by_method(pairs, settings, detector=None):
+    """{method: [estimate of each pair]} and the detector that was used."""
+    shown = CountedDetector(PRESETS["red-8"])
+    navigator = SequenceNavigator(settings, lambda drogue: shown)
+    found = {name: [] for name in settings.names}
+    for estimate in with_smoothed((navigator.answer(pair) for pair in pairs), settings):
+        found[estimate.method].append(estimate)
+    return found, shown
+
+
+def sources(estimate):
+    return {region.source for region in estimate.regions}
+
+
+@pytest.mark.parametrize("tracker", tracker_names())
+def test_a_tracker_finds_the_same_poses_as_the_detector(steady, tracker):
+    alone, _ = answers_by_method(steady[:8], SequenceSettings(("joint-hub",)))
+    followed, detector = answers_by_method(steady[:8], SequenceSettings(("joint-hub",), tracker=tracker))
+    for one, other in zip(alone["joint-hub"], followed["joint-hub"], strict=True):
+        # Other boxes are other Otsu thresholds, from which the same edges are fitted: a hundredth of a pixel in
+        # disparity is 2 mm of depth here, and the fits start that near each other at worst.
+        np.testing.assert_allclose(one.left_from_drogue.translation_m, other.left_from_drogue.translation_m, atol=2e-3)
+        assert sources(one) == {"detector"}
+    assert [sources(estimate) for estimate in followed["joint-hub"]] == [{"detector"}] + 7 * [{tracker}]
+    assert detector.shown_s == [0.0]
+
+
+def test_the_detector_checks_at_every_nth_pair(steady):
+    _, detector = answers_by_method(steady[:10], SequenceSettings(("joint",), tracker="bernoulli", redetect_every=3))
+    assert np.rint(25 * np.array(detector.shown_s)).tolist() == [0, 3, 6, 9]
+
+
+@pytest.mark.parametrize("tracker", [None, *tracker_names()])
+def test_a_hidden_drogue_has_no_pose_and_is_found_again(hidden_flight, hidden_places, tracker):
+    settings = SequenceSettings(("joint-hub", "paper"), tracker=tracker, filtered=True, smoothed=True)
+    found, detector = answers_by_method(hidden_flight, settings)
+    for name, estimates in found.items():
+        assert [e.frame_index for e in estimates] == list(range(len(hidden_places))), name
+        assert all(isinstance(estimates[index], NoFix) for index in HIDDEN), name
+        assert all(estimates[index].reason for index in HIDDEN), name
+    for index, (where, estimate) in enumerate(zip(hidden_places, found["joint-hub"], strict=True)):
+        if where is not None:
+            assert isinstance(estimate, PoseEstimate), (index, estimate.reason)
+            # Position noise at 5 m is a few millimetres: 0.03 px of disparity are worth 6 mm.
+            off_m = estimate.left_from_drogue.translation_m - where.translation_m
+            assert np.linalg.norm(off_m) < 0.03
+    if tracker is not None:
+        # At the first pair, while it is hidden, and when it is there again.
+        assert np.rint(25 * np.array(detector.shown_s)).tolist() == [0, *HIDDEN, HIDDEN.stop]
+
+
+class TightTracker:
+    """Answers with boxes at the right place, so tight that they cut the markers off."""
+
+    name = "tight"
+
+    def start(self, images, found):
+        """Learn nothing."""
+
+    def correct(self, images, found):
+        """Learn nothing."""
+
+    def follow(self, images, predicted):
+        tight = []
+        for eye in EYES:
+            x, y, width, height = predicted.of(eye).box_xywh_px
+            # The overlap with the whole box is 0.72 squared, above one half.
+            tight.append(Detection((x + 0.14 * width, y + 0.14 * height, 0.72 * width, 0.72 * height), 1.0))
+        return StereoDetection(*tight)
+
+
+def test_where_boxes_at_the_right_place_show_no_markers_those_of_the_detector_count(steady):
+    rig, drogue = steady[0].rig, steady[0].drogue
+    navigator = Navigator(rig, drogue)
+    observer = TrackedObserver(navigator, TightTracker(), rig, drogue, 25, FilterSettings())
+    for pair in steady[:4]:
+        followed, alone = observer.observe(pair.images), navigator.observe(pair.images)
+        assert followed.markers == alone.markers == (8, 16)
+        assert {region.source for region in followed.regions} == {"detector"}
+
+
+def test_a_pair_that_the_filter_does_not_believe_has_a_fix_and_no_filtered_pose(fly, steady):
+    (elsewhere,) = fly([place(0.8, 0.3, 6.0)], [steady[7].images.time_s])
+    pairs = [*steady[:7], replace(elsewhere, frame_index=7), *steady[8:10]]
+    found, _ = answers_by_method(pairs, SequenceSettings(("joint-hub",), filtered=True))
+    assert all(isinstance(estimate, PoseEstimate) for estimate in found["joint-hub"])
+    stay = [isinstance(estimate, PoseEstimate) for estimate in found["joint-hub+filter"]]
+    assert stay == 7 * [True] + [False] + 2 * [True]
+    assert found["joint-hub+filter"][7].reason.startswith("the filter does not take the fix: ")
+    assert found["joint-hub+filter"][7].features == found["joint-hub"][7].features
+
+
+@pytest.mark.parametrize(("radius_m", "captured"), [(50.0, True), (1e-6, False)])
+def test_filtered_and_smoothed_estimates_tell_of_motion_and_docking(steady, radius_m, captured):
+    settings = SequenceSettings(("joint-hub",), filtered=True, smoothed=True, capture_radius_m=radius_m)
+    found, _ = answers_by_method(steady, settings)
+    assert all(e.motion is None and e.docking is None for e in found["joint-hub"])
+    for suffix in ("+filter", "+smoother"):
+        last = found[f"joint-hub{suffix}"][-1]
+        # Within four of the deviations that the filter itself states.
+        off_m_s = np.array(last.motion.velocity_m_s) - 25 * np.array(STEP_M)
+        assert (np.abs(off_m_s) < 4 * np.sqrt(np.diag(last.motion.covariance)[:3])).all()
+        assert last.docking.captured is captured
+
+
+def test_a_filter_of_a_method_without_covariance_says_so(steady):
+    found, _ = answers_by_method(steady[:2], SequenceSettings(("mean-plane",), filtered=True))
+    assert isinstance(found["mean-plane"][0], PoseEstimate)
+    assert "no covariance" in found["mean-plane+filter"][0].reason
+
+
+def restamped(pairs, times_s):
+    return [
+        replace(pair, images=replace(pair.images, time_s=time_s)) for pair, time_s in zip(pairs, times_s, strict=True)
+    ]
+
+
+def test_sequences_begin_where_time_stamps_jump(steady):
+    pairs = restamped(steady[:8], [0.0, 0.04, 1.04, 2.05, 2.09, 2.09, 1.0, 1.04])
+    navigator = open_navigator(SequenceSettings(("constant",)), DETECTOR)
+    begins = [navigator.seek(pair).begins for pair in pairs]
+    assert begins == [True, False, False, True, False, True, True, False]
+
+
+def test_a_new_sequence_knows_nothing_of_the_one_before(steady):
+    settings = SequenceSettings(("joint-hub",), tracker="bernoulli", filtered=True, smoothed=True)
+    times_s = [*(k / 25 for k in range(6)), *(10 + k / 25 for k in range(6))]
+    pairs = restamped([*steady[6:], *steady[:6]], times_s)
+    both, _ = answers_by_method(pairs, settings)
+    alone, _ = answers_by_method(pairs[6:], settings)
+    for name in settings.names:
+        for one, other in zip(both[name][6:], alone[name], strict=True):
+            # Rounding.
+            np.testing.assert_allclose(one.left_from_drogue.as_matrix(), other.left_from_drogue.as_matrix(), atol=1e-9)
+
+
+def test_another_drogue_begins_another_sequence(steady):
+    smaller = PRESETS["red-8"].model_copy(update={"marker_radius_m": 0.049})
+    pairs = [*steady[:2], replace(steady[2], drogue=smaller)]
+    navigator = open_navigator(SequenceSettings(("constant",), tracker="bernoulli"), DETECTOR)
+    assert [navigator.seek(pair).begins for pair in pairs] == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"tracker": "kcf"}, "tracker: must be one of bernoulli"),
+        ({"methods": ("magic",)}, "method: there is no pose method named 'magic'"),
+        ({"tracker": "mil", "redetect_every": 0}, "redetect_every: must be at least 1, got 0"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_refused_before_the_first_pair(settings, message):
+    with pytest.raises(ValueError, match=message):
+        open_navigator(SequenceSettings(**{"methods": ("joint",), **settings}), DETECTOR)
