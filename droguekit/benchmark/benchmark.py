@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,6 +19,8 @@ from droguekit.benchmark.ranking import PAPER_METHOD, best_method
 from droguekit.benchmark.reference import Reference, build_reference
 from droguekit.benchmark.result import BenchmarkResult, BinRow, DatasetFacts, EmptyFrames, MethodResult
 from droguekit.benchmark.result_parts import Comparison
+from droguekit.benchmark.sequence_scores import score_sequences
+from droguekit.benchmark.sequence_truth import TrueSequence, moment, true_sequences
 from droguekit.benchmark.statistics import CONFIDENCE, fraction_interval
 from droguekit.benchmark.summary import FrameScore, summarize
 
@@ -40,13 +42,28 @@ def run_benchmark(dataset: Location, estimates: Path) -> BenchmarkResult:
     """
     data = Dataset(dataset)
     methods = by_method(read_estimates(estimates), data.frame_indices, str(estimates))
-    truths = {index: drogue_truth(data.record(index)) for index in data.frame_indices}
+    truths, moments = {}, []
+    for index in data.frame_indices:
+        record = data.record(index)
+        truths[index] = drogue_truth(record)
+        moments.append(moment(record))
     facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(data.frame_indices))
-    return score(facts, truths, methods)
+    return score(facts, truths, methods, true_sequences(moments))
 
 
-def score(facts: DatasetFacts, truths: Truths, methods: Mapping[str, Mapping[int, Estimate]]) -> BenchmarkResult:
+def score(
+    facts: DatasetFacts,
+    truths: Truths,
+    methods: Mapping[str, Mapping[int, Estimate]],
+    sequences: Sequence[TrueSequence] = (),
+) -> BenchmarkResult:
     """Score estimates that are sorted by method and frame against the truth of each frame.
+
+    Args:
+        facts: of the dataset.
+        truths: by frame.
+        methods: estimates by method and frame.
+        sequences: the same frames as they follow each other, where they do.
 
     Raises:
         ValueError: no pair shows a drogue, or a feature that the drogue does not have.
@@ -68,6 +85,7 @@ def score(facts: DatasetFacts, truths: Truths, methods: Mapping[str, Mapping[int
         reference=reference.bins,
         methods=rows,
         comparisons=_comparisons(drogues, rows, scores, reference),
+        sequences=score_sequences(sequences, drogues, methods),
     )
 
 

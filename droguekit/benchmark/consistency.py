@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -14,8 +14,13 @@ from droguekit.benchmark.result_parts import ComponentRatios, Nees, NeesPart, No
 from droguekit.benchmark.statistics import mean_square_region, rms_upper_limit, root_mean_square
 from geometry.se3 import Array
 
+Parts = Mapping[str, slice]
+
+# A square beyond this tells of a covariance that is no measure of anything, and means of such squares of no method.
+_MOST_SQUARE = 1e100
+
 # Position, attitude and both together, as slices of the five components.
-_PARTS = {"position": slice(0, 3), "attitude": slice(3, 5), "pose": slice(0, 5)}
+_PARTS: Parts = {"position": slice(0, 3), "attitude": slice(3, 5), "pose": slice(0, 5)}
 
 
 def squared_errors(estimate: PoseEstimate, error: PoseError) -> Array | None:
@@ -26,24 +31,51 @@ def squared_errors(estimate: PoseEstimate, error: PoseError) -> Array | None:
         error: of its pose.
 
     Returns:
-        (3,) of 3, 2 and 5 degrees of freedom, or None where the covariance is not positive definite or stands in
-        another tangent than ours.
+        (3,) of 3, 2 and 5 degrees of freedom, or None where the covariance is not positive definite, too small or too
+        large for floats, or stands in another tangent than ours.
 
     Source: e^T C^-1 e, Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
     """
     if estimate.covariance is None or estimate.tangent != TANGENT:
         return None
-    covariance = component_covariance(estimate.left_from_drogue, estimate.covariance)
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariance = component_covariance(estimate.left_from_drogue, estimate.covariance)
+    return normalized_squares(error.components, covariance, _PARTS)
+
+
+def normalized_squares(error: Array, covariance: Array, parts: Parts) -> Array | None:
+    """(len(parts),) `e^T C^-1 e` of parts of an error.
+
+    Returns:
+        None where the covariance is not positive definite, or too small or too large for floats.
+    """
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0))
     if not deviations.all():
         return None
-    scaled, whole = covariance / np.outer(deviations, deviations), error.components / deviations
-    try:
-        return np.array(
-            [whole[part] @ cho_solve(cho_factor(scaled[part, part]), whole[part]) for part in _PARTS.values()]
-        )
-    except LinAlgError:
-        return None
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        scaled, whole = covariance / np.outer(deviations, deviations), error / deviations
+        if not np.isfinite(scaled).all():
+            return None
+        try:
+            squares = np.array(
+                [whole[part] @ cho_solve(cho_factor(scaled[part, part]), whole[part]) for part in parts.values()]
+            )
+        except (LinAlgError, ValueError):
+            # The latter where the error over its deviation is no float.
+            return None
+    return squares if (squares < _MOST_SQUARE).all() else None
+
+
+def nees_parts(squares: Array, parts: Parts) -> dict[str, NeesPart]:
+    """Means over (n, len(parts)) `normalized_squares`; empty without any."""
+    if not len(squares):
+        return {}
+    found = {}
+    for k, (name, part) in enumerate(parts.items()):
+        freedom = part.stop - part.start
+        low, high = mean_square_region(freedom * len(squares))
+        found[name] = NeesPart(freedom=freedom, per_freedom=float(squares[:, k].mean()) / freedom, low=low, high=high)
+    return found
 
 
 def nees(squares: Sequence[Array | None]) -> Nees | None:
@@ -55,13 +87,7 @@ def nees(squares: Sequence[Array | None]) -> Nees | None:
     if not squares:
         return None
     usable = np.array([row for row in squares if row is not None])
-    parts = {}
-    for k, (name, part) in enumerate(_PARTS.items()):
-        freedom = part.stop - part.start
-        if len(usable):
-            low, high = mean_square_region(freedom * len(usable))
-            mean = float(usable[:, k].mean()) / freedom
-            parts[name] = NeesPart(freedom=freedom, per_freedom=mean, low=low, high=high)
+    parts = nees_parts(usable, _PARTS)
     return Nees(
         n=len(usable),
         unusable=len(squares) - len(usable),

@@ -8,10 +8,12 @@ from typing import NamedTuple
 
 from droguekit.benchmark.detection_boxes import FoundBox
 from droguekit.benchmark.detection_matching import Evaluation
-from droguekit.benchmark.detection_result import DetectionDataset, DetectionResult, PairTimes
+from droguekit.benchmark.detection_result import DetectionDataset, DetectionResult, DetectorResult, PairTimes
 from droguekit.benchmark.detection_scores import Threshold, images_of_split, score_detector, split_to_score
-from droguekit.benchmark.detection_truth import LEAST_SEEN_FRACTION, DetectionTruth, ImageTruth
+from droguekit.benchmark.detection_truth import DetectionTruth, ImageTruth
 from droguekit.benchmark.statistics import CONFIDENCE
+from droguekit.benchmark.tracking import track_found_boxes
+from droguekit.benchmark.visibility import LEAST_SEEN_FRACTION
 
 
 class DetectorRun(NamedTuple):
@@ -59,6 +61,21 @@ def score_detections(
     chosen_split = split_to_score(truth.images, split)
     chosen = images_of_split(truth.images, chosen_split)
     evaluations = {name: Evaluation(truth.images, run.boxes) for name, run in runs.items()}
+    frames = {image.frame_index for image in chosen}
+    sequences = [sequence for sequence in truth.sequences if sequence.moments[0].frame_index in frames]
+
+    def scored(name: str) -> DetectorResult:
+        run = runs[name]
+        row = score_detector(evaluations[name], truth.images, chosen_split, _asked(threshold, run))
+        return row.model_copy(
+            update={
+                "times": run.times,
+                "parameters": run.parameters,
+                "gflops_per_image": run.gflops_per_image,
+                "sequences": track_found_boxes(sequences, run.boxes, row.operating_threshold),
+            }
+        )
+
     result = DetectionResult(
         dataset=DetectionDataset(
             name=truth.name,
@@ -72,16 +89,7 @@ def score_detections(
         code_version=version("droguekit"),
         confidence=CONFIDENCE,
         least_seen_fraction=LEAST_SEEN_FRACTION,
-        detectors={
-            name: score_detector(evaluations[name], truth.images, chosen_split, _asked(threshold, run)).model_copy(
-                update={
-                    "times": run.times,
-                    "parameters": run.parameters,
-                    "gflops_per_image": run.gflops_per_image,
-                }
-            )
-            for name, run in runs.items()
-        },
+        detectors={name: scored(name) for name in runs},
     )
     return ScoredDetections(result, evaluations, chosen)
 

@@ -26,6 +26,7 @@ from droguekit.benchmark.detection_tables import (
 from droguekit.benchmark.figures import legend_key, method_styles
 from droguekit.benchmark.number_text import plain_number
 from droguekit.benchmark.report import page_template
+from droguekit.benchmark.tracking_tables import tracking_part
 
 
 def write_detection_report(dataset: Location, scored: ScoredDetections, out_html: Path) -> None:
@@ -44,6 +45,7 @@ def write_detection_report(dataset: Location, scored: ScoredDetections, out_html
     matches = {name: evaluation.matches(scored.images) for name, evaluation in scored.evaluations.items()}
     thresholds = {name: detector.operating_threshold for name, detector in result.detectors.items()}
     best = best_detector(result)
+    styles = method_styles(list(matches))
     histograms = [
         Markup(panel(name, number, matches[name], thresholds[name]))
         for number, name in enumerate(matches)
@@ -58,11 +60,14 @@ def write_detection_report(dataset: Location, scored: ScoredDetections, out_html
         published=published_rows(),
         cell_columns=CELL_COLUMNS,
         tables=cell_tables(result),
-        legend=[(name, Markup(legend_key(style))) for name, style in method_styles(list(matches)).items()],
+        legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
         distance_panels=[Markup(distance_panel(result, measure)) for measure in MEASURES if _has_distances(result)],
         curve=Markup(curve_panel(matches)),
         speed=Markup(speed_panel(result)) if is_timed(result) else None,
         histograms=histograms,
+        tracking=tracking_part(
+            {name: d.sequences for name, d in result.detectors.items() if d.sequences is not None}, "detector", styles
+        ),
         pictured=best,
         pictures=detection_pictures(dataset, matches[best], thresholds[best]),
         least=(LEAST_BOXES, LEAST_SCENES),

@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from droguekit.benchmark.result_parts import ResultModel
+from droguekit.benchmark.tracking_result import Tracking
 
 Ends = tuple[float, float]
 
@@ -118,6 +119,8 @@ class DetectorResult(ResultModel):
         parameters: weights and biases of the network's layers, counted where `gflops_per_image` is.
         gflops_per_image: multiplications and additions of the network for one image, in 10^9; null where there is none,
             or where only its boxes are known, or where an operation cannot be counted.
+        sequences: its best box of each image of the scored split that passes the threshold, as a tracker's; left out
+            without sequences.
     """
 
     operating_threshold: float
@@ -132,6 +135,7 @@ class DetectorResult(ResultModel):
     times: PairTimes | None = None
     parameters: int | None = None
     gflops_per_image: float | None = None
+    sequences: Tracking | None = Field(default=None, exclude_if=lambda tracking: tracking is None)
 
 
 class DetectionResult(ResultModel):

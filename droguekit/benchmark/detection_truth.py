@@ -9,19 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from datasets_manifest.blind import read_blind_index
 from datasets_manifest.layout import BLIND_FILE
 from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord, PixelBox, ViewRecord
+from datasets_manifest.records import PairRecord, PixelBox
 from datasets_manifest.storage import Location, open_storage
 from droguekit.benchmark.blind_check import blind_scenes
 from droguekit.benchmark.detection_boxes import FoundBox, clipped_box, corner_box, image_id_of
+from droguekit.benchmark.sequence_truth import TrueSequence, moment, true_sequences
+from droguekit.benchmark.visibility import LEAST_SEEN_FRACTION, seen_fraction
 from geometry.stereo import EYES, Eye
 
-LEAST_SEEN_FRACTION = 0.5
-"""A drogue of which a smaller share is seen is ignored (our choice)."""
 # So much of a box must lie in an ignored drogue's for it to count as that drogue's: COCO's rule for crowds at IoU 0.5.
 _LEAST_SHARE_INSIDE = 0.5
 
@@ -64,11 +62,13 @@ class DetectionTruth:
     Attributes:
         name, sha256: of the dataset; an imported one has no hash.
         images: left before right of every pair.
+        sequences: the same pairs as they follow each other, where they do.
     """
 
     name: str
     sha256: str | None
     images: tuple[ImageTruth, ...]
+    sequences: tuple[TrueSequence, ...] = ()
 
 
 def read_detection_truth(dataset: Location) -> DetectionTruth:
@@ -83,10 +83,13 @@ def read_detection_truth(dataset: Location) -> DetectionTruth:
     camera = source.manifest.recipe.rig.camera
     size_px = (camera.width_px, camera.height_px)
     splits = source.manifest.split_of_frame()
-    images = [
-        image_truth(source.record(index), eye, splits[index], size_px) for index in source.frame_indices for eye in EYES
-    ]
-    return DetectionTruth(source.manifest.name, source.manifest.dataset_sha256, tuple(images))
+    images, moments = [], []
+    for index in source.frame_indices:
+        record = source.record(index)
+        images += [image_truth(record, eye, splits[index], size_px) for eye in EYES]
+        moments.append(moment(record))
+    manifest = source.manifest
+    return DetectionTruth(manifest.name, manifest.dataset_sha256, tuple(images), true_sequences(moments))
 
 
 def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, int]) -> ImageTruth:
@@ -101,7 +104,7 @@ def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, in
     view = record.views.left if eye == "left" else record.views.right
     box = ignored = None
     if view.box_full_xywh_px is not None:
-        if view.box_visible_xywh_px is not None and seen_fraction(view) >= LEAST_SEEN_FRACTION:
+        if view.box_visible_xywh_px is not None and seen_fraction(record, eye) >= LEAST_SEEN_FRACTION:
             box = corner_box(view.box_visible_xywh_px)
         else:
             ignored = clipped_box(corner_box(view.box_full_xywh_px), size_px)
@@ -116,19 +119,6 @@ def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, in
         ignored_xywh=ignored,
         is_known_empty=record.left_from_drogue is None,
     )
-
-
-def seen_fraction(view: ViewRecord) -> float:
-    """How much of the drogue an image shows: the lesser of two shares, 0 where nothing is seen.
-
-    They are the visible box's area over the full one's, which falls where the image's edge cuts the drogue off, and the
-    mean visible fraction of the markers, which falls where something stands before it too.
-    """
-    full, visible = view.box_full_xywh_px, view.box_visible_xywh_px
-    if full is None or visible is None:
-        return 0.0
-    share = visible[2] * visible[3] / (full[2] * full[3])
-    return min(share, float(np.mean([marker.visible_fraction for marker in view.markers]))) if view.markers else share
 
 
 def scored_boxes(images: Sequence[ImageTruth], found: Sequence[FoundBox]) -> list[FoundBox]:

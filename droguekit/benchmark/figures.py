@@ -46,7 +46,7 @@ PANEL_IN = (4.4, 3.3)
 
 # With more methods than this, panels are larger and intervals fainter, or nothing could be told apart.
 FEW_METHODS = 6
-_LARGE_PANEL_IN = (6.6, 5.0)
+LARGE_PANEL_IN = (6.6, 5.0)
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
     """
     names = list(result.methods)
     few = len(names) <= FEW_METHODS
-    with drawing(PANEL_IN if few else _LARGE_PANEL_IN) as (figure, axes):
+    with drawing(PANEL_IN if few else LARGE_PANEL_IN) as (figure, axes):
         styles = method_styles(names)
         # A little apart, so that methods do not cover each other, and all within an eighth of the true distance.
         step = min(1.03, 1.25 ** (1 / len(names)))
@@ -108,7 +108,7 @@ def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
             shift = step ** (k - (len(names) - 1) / 2)
             _draw_method(axes, result.methods[name], quantity, styles[name], (shift, 1.0 if few else 0.3))
         _draw_bound(axes, result.reference, quantity)
-        _finish_axes(axes, quantity)
+        finish_distance_axes(axes, quantity.title)
         return svg_element(figure, quantity.key, f"{quantity.title} against distance, by method")
 
 
@@ -135,7 +135,7 @@ def _draw_method(
     points = [(row, value) for row, value in rows if value is not None and value > 0]
     if not points:
         return
-    x = np.array([_middle(row.low_m, row.high_m) * shift for row, _ in points])
+    x = np.array([middle_m(row.low_m, row.high_m) * shift for row, _ in points])
     y = np.array([value for _, value in points])
     ends = np.array([row.intervals[quantity.key] for row, _ in points])
     bars = np.abs(ends - y[:, None]).T
@@ -154,7 +154,7 @@ def _draw_method(
 
 
 def _draw_bound(axes: Axes, reference: Sequence[ReferenceBin], quantity: Quantity) -> None:
-    places = [(_middle(b.low_m, b.high_m), getattr(b.bound, quantity.bound_key)) for b in reference if b.bound]
+    places = [(middle_m(b.low_m, b.high_m), getattr(b.bound, quantity.bound_key)) for b in reference if b.bound]
     drawn = [(x, y * quantity.scale) for x, y in places if y > 0]
     if drawn:
         # A single distance has no line: a cross stands for it.
@@ -162,10 +162,11 @@ def _draw_bound(axes: Axes, reference: Sequence[ReferenceBin], quantity: Quantit
         axes.plot(x, y, color=INK, linestyle=(0, (4, 2)), linewidth=1.6, marker="+", markersize=5, zorder=5)
 
 
-def _finish_axes(axes: Axes, quantity: Quantity) -> None:
+def finish_distance_axes(axes: Axes, title: str) -> None:
+    """Both axes logarithmic, with plain numbers, a grid and a title."""
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_title(quantity.title, fontsize=10.5, loc="left")
+    axes.set_title(title, fontsize=10.5, loc="left")
     axes.set_xlabel("Distance [m]")
     axes.grid(True, color=INK, alpha=0.15, linewidth=0.6)
     low, high = axes.get_ylim()
@@ -179,7 +180,8 @@ def _finish_axes(axes: Axes, quantity: Quantity) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _middle(low_m: float, high_m: float) -> float:
+def middle_m(low_m: float, high_m: float) -> float:
+    """Middle of a bin of distances on a logarithmic axis. [m]"""
     return float(np.sqrt(low_m * high_m))
 
 

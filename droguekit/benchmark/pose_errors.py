@@ -7,11 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.estimates import Estimate
+from datasets_manifest.estimates import Estimate, PoseEstimate
 from geometry.se3 import Array, RigidTransform, angles_from_axis
 
 COMPONENTS = ("x", "y", "z", "pitch", "yaw")
 """Order of errors and bounds: X, Y, Z in the left camera [m], then pitch and yaw [deg]."""
+
+# Larger than anything that flies, and its square far from overflow.
+_MOST = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,8 @@ def by_method(
         source: what to call the file in errors.
 
     Raises:
-        ValueError: no estimates at all, one for a pair that the dataset lacks, or two of a method for the same pair.
+        ValueError: no estimates at all, one for a pair that the dataset lacks, two of a method for the same pair, or a
+            number that is no measure of anything here, and whose square no float can hold.
     """
     known = set(frame_indices)
     methods: dict[str, dict[int, Estimate]] = {}
@@ -68,7 +72,28 @@ def by_method(
         frames = methods.setdefault(method, {})
         if index in frames:
             raise ValueError(f"{source}: method {method!r}: frame {index} occurs twice")
+        largest = _largest_number(estimate)
+        if largest > _MOST:
+            raise ValueError(
+                f"{source}: method {method!r}: frame {index}: lengths, speeds and times must be at most {_MOST:g} "
+                f"in SI units, got {largest:g}"
+            )
         frames[index] = estimate
     if not methods:
         raise ValueError(f"{source}: holds no estimates; run an estimator on this dataset first")
     return methods
+
+
+def _largest_number(estimate: Estimate) -> float:
+    """The largest length, speed or time of an estimate. [m, m/s, rad/s, s]"""
+    numbers = [estimate.latency_s or 0.0, *estimate.stage_s.values()]
+    if isinstance(estimate, PoseEstimate):
+        numbers += estimate.left_from_drogue.translation_m.tolist()
+        if estimate.motion is not None:
+            numbers += [*estimate.motion.velocity_m_s, *estimate.motion.rate_rad_s]
+        if estimate.docking is not None:
+            told = estimate.docking
+            numbers += [*told.mouth_from_tip_m, *told.mouth_sd_m]
+            numbers += [told.closure_m_s or 0.0, told.miss_m or 0.0, told.miss_sd_m or 0.0, told.contact_s or 0.0]
+            numbers.append(told.capture_radius_m or 0.0)
+    return max(abs(number) for number in numbers)

@@ -27,6 +27,8 @@ from droguekit.benchmark.report_tables import (
     rangefinder_tables,
 )
 from droguekit.benchmark.result import BenchmarkResult
+from droguekit.benchmark.sequence_latency import WAITING
+from droguekit.benchmark.sequence_report import sequence_section
 
 
 def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, out_html: Path) -> None:
@@ -67,6 +69,7 @@ def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, ou
         ],
         has_readings=any(method.overall.rangefinder is not None for method in result.methods.values()),
         times=stage_times_ms(estimates),
+        sequences=None if result.sequences is None else sequence_section(result.sequences, styles),
     )
     write_text_atomic(out_html, page)
 
@@ -113,7 +116,7 @@ def dataset_facts(manifest: Manifest, estimates_name: str) -> list[tuple[str, st
 
 
 def stage_times_ms(estimates: Path) -> list[tuple[str, str, str]]:
-    """Median time for a pair by method: name, total, and the stages. [ms]
+    """Median time for a pair by method: name, total without waiting, and the stages. [ms]
 
     Methods that report no times are left out.
     """
@@ -121,7 +124,8 @@ def stage_times_ms(estimates: Path) -> list[tuple[str, str, str]]:
     for estimate in read_estimates(estimates):
         if not estimate.stage_s:
             continue
-        for stage, seconds in {**estimate.stage_s, "": sum(estimate.stage_s.values())}.items():
+        work_s = sum(seconds for stage, seconds in estimate.stage_s.items() if stage not in WAITING)
+        for stage, seconds in {**estimate.stage_s, "": work_s}.items():
             stages.setdefault(estimate.method, {}).setdefault(stage, []).append(1e3 * seconds)
     return [
         (

@@ -28,12 +28,18 @@ class Group:
 
 @dataclass(frozen=True)
 class Table:
-    """A table whose first two columns are the group's label and the method's name."""
+    """A table whose first two columns are the group's label and the row's name.
+
+    Attributes:
+        first, second: what these two are.
+    """
 
     anchor: str
     title: str
     columns: list[str]
     groups: list[Group]
+    first: str = "distance"
+    second: str = "method"
 
 
 def overall_table(result: BenchmarkResult) -> Table:

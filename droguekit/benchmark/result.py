@@ -19,6 +19,7 @@ from droguekit.benchmark.result_parts import (
     RangefinderErrors,
     ResultModel,
 )
+from droguekit.benchmark.sequence_result import SequencesResult
 
 
 class Row(ResultModel):
@@ -167,7 +168,11 @@ class DatasetFacts(ResultModel):
 
 
 class BenchmarkResult(ResultModel):
-    """Everything that `benchmark.json` holds."""
+    """Everything that `benchmark.json` holds.
+
+    Attributes:
+        sequences: left out where the dataset has none, or no estimate says what is only defined over them.
+    """
 
     schema_version: Literal[1] = Field(default=1, alias="schema")
     dataset: DatasetFacts
@@ -176,11 +181,15 @@ class BenchmarkResult(ResultModel):
     reference: list[ReferenceBin]
     methods: dict[str, MethodResult]
     comparisons: list[Comparison]
+    sequences: SequencesResult | None = None
 
     @model_serializer(mode="plain")
     def _with_schema(self) -> dict[str, Any]:
         """`schema` is the key on disk, but the name of a method of every pydantic model."""
-        return {"schema" if name == "schema_version" else name: getattr(self, name) for name in type(self).model_fields}
+        fields = {name: getattr(self, name) for name in type(self).model_fields}
+        if self.sequences is None:
+            del fields["sequences"]
+        return {"schema" if name == "schema_version" else name: value for name, value in fields.items()}
 
     def to_json(self) -> str:
         """The text of `benchmark.json`, indented."""

@@ -141,3 +141,26 @@ def _ratio_ends(above: Array, below: Array) -> Interval | None:
         return None
     low, high = np.percentile(above / below, (50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)))
     return float(low), float(high)
+
+
+def rate_interval(count: int, exposure: float) -> Interval:
+    """Confidence interval of a rate from a number of events; also where none happened.
+
+    Source: F. Garwood, Biometrika 28 (1936) 437, doi:10.1093/biomet/28.3-4.437.
+    """
+    low = float(chi2.ppf((1 - CONFIDENCE) / 2, 2 * count)) / 2 if count else 0.0
+    return low / exposure, float(chi2.ppf((1 + CONFIDENCE) / 2, 2 * count + 2)) / 2 / exposure
+
+
+def mean_interval(values: Array, blocks: Sequence[int], key: str) -> Interval | None:
+    """Bootstrap interval of the mean of values of which those of a block are drawn together.
+
+    Args:
+        values: (n,).
+        blocks: (n,) what each belongs to.
+        key: of the random stream.
+
+    Returns:
+        None with fewer than two blocks, which cannot tell how much they differ.
+    """
+    return ratio_intervals(values[:, None], np.ones((len(values), 1)), blocks, key)[0]

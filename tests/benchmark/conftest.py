@@ -21,7 +21,7 @@ from datasets_manifest.writer import encode_files, write_frame
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters, HubParameters, even_ring
 from geometry.circles import disc_outline, project_disc_centers
-from geometry.se3 import RigidTransform, angles_from_rotation, exp_twist, rotation_from_angles
+from geometry.se3 import RigidTransform, angles_from_rotation, exp_twist, log_twist, rotation_from_angles
 from geometry.stereo import EYES, Eye, paper_rig
 
 RIG = paper_rig()
@@ -194,13 +194,15 @@ def _picture(record: PairRecord, eye: Eye) -> np.ndarray:
     return picture
 
 
-def make_dataset(folder: Path, records: Sequence[PairRecord]) -> Path:
-    """A dataset on disk of records made here, with plain pictures."""
+def make_dataset(folder: Path, records: Sequence[PairRecord], alike: bool = False) -> Path:
+    """A dataset on disk of records made here, with plain pictures; where they are `alike`, all have the first's."""
     parts = {eye: np.zeros((RIG.camera.height_px, RIG.camera.width_px), np.uint8) for eye in EYES}
     for record in records:
-        left, right = (_picture(record, eye) for eye in EYES)
-        images = StereoImages(left=left, right=right, time_s=0.0, exposure_s=1e-3)
-        write_frame(folder, record, encode_files(images, parts))
+        if not alike or record is records[0]:
+            left, right = (_picture(record, eye) for eye in EYES)
+            images = StereoImages(left=left, right=right, time_s=0.0, exposure_s=1e-3)
+            files = encode_files(images, parts)
+        write_frame(folder, record, files)
     recipe = parse_recipe(
         f'name = "bench-test"\ndescription = "Flat pictures of a drogue."\nframes = {{count = {len(records)}}}\n'
         'distance = {law = "uniform", low_m = 1.7, high_m = 40}'
@@ -249,6 +251,46 @@ def make_records(stations_m: Sequence[float], count: int, rng: np.random.Generat
     return [*records, *(make_record(len(records) + k, None) for k in range(empty))]
 
 
+FRAME_RATE_HZ = 25.0
+
+
+def make_sequence(
+    pose_at: Callable[[float], RigidTransform], count: int, sequence_id: int = 0, hidden: Sequence[int] = ()
+) -> list[PairRecord]:
+    """Pairs of a drogue that moves, at 25 Hz; `hidden` are the places of those that show nothing of it.
+
+    Indices and times go on from the sequence before, of as many pairs, 10 s later.
+    """
+    records = []
+    for k in range(count):
+        time_s, step_s = k / FRAME_RATE_HZ, 1e-4
+        twist = log_twist(pose_at(time_s - step_s).inverse() @ pose_at(time_s + step_s)) / (2 * step_s)
+        record = make_record(sequence_id * count + k, pose_at(time_s))
+        changes = {
+            "time_s": sequence_id * (count / FRAME_RATE_HZ + 10) + time_s,
+            "sequence_id": sequence_id,
+        }
+        frame = record.frame.model_copy(update={**changes, "drogue_twist_per_s": twist})
+        views = (
+            record.views
+            if k not in hidden
+            else StereoViews(left=_unseen(record.views.left), right=_unseen(record.views.right))
+        )
+        records.append(record.model_copy(update={**changes, "frame": frame, "views": views}))
+    return records
+
+
+def _unseen(view: ViewRecord) -> ViewRecord:
+    markers = tuple(marker.model_copy(update={"visible_fraction": 0.0}) for marker in view.markers)
+    return view.model_copy(update={"markers": markers, "box_visible_xywh_px": None, "visible_drogue_px": 0})
+
+
+def swinging(time_s: float) -> RigidTransform:
+    """A drogue that comes nearer, swings with 1.1 Hz and nods with 0.7 Hz."""
+    swing, nod = np.sin(2 * np.pi * 1.1 * time_s), np.sin(2 * np.pi * 0.7 * time_s + 0.4)
+    return make_pose(0.06 + 0.1 * swing, 0.05 * nod, 6.0 - 0.5 * time_s + 0.03 * nod, 4 * nod, 3 * swing, 10.0)
+
+
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[PairRecord]]:
     """Nine pairs at three stations and one without a drogue."""
@@ -268,6 +310,8 @@ def build() -> SimpleNamespace:
         records=make_records,
         estimates=make_estimates,
         dataset=make_dataset,
+        sequence=make_sequence,
+        swinging=swinging,
         rig=RIG,
     )
 

@@ -1,3 +1,4 @@
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -79,6 +80,22 @@ def test_covariances_that_say_nothing_are_counted(build: SimpleNamespace, covari
     row = nees(squares)
     assert (row.n, row.unusable, row.pose) == (0, 4, None)
     assert nees([]) is None
+
+
+@pytest.mark.parametrize("size", [1e-320, 5e-324, 1e-200, 1e305, 1.7e308])
+def test_covariances_that_no_float_can_work_with_are_unusable(build: SimpleNamespace, size: float) -> None:
+    """Their squares are infinite, and a JSON file has no place for that."""
+    error = PoseError(np.full(5, 1e-3), 0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        squares = squared_errors(estimate_of(build.pose(0, 0, 5, 3, 4), size * np.eye(6)), error)
+        row = nees([squares] * 3)
+    assert row is not None
+    if size < 1:
+        assert (row.n, row.unusable) == (0, 3)
+    else:
+        # Too large ones say truly that nothing is known, as long as they are numbers.
+        assert row.pose is None or row.pose.per_freedom == pytest.approx(0)
 
 
 def test_normalized_errors_are_over_the_bound_of_their_own_frame() -> None:

@@ -20,7 +20,7 @@ from droguekit.benchmark.detection_pictures import detection_picture, worst_fals
 from droguekit.benchmark.detection_published import PUBLISHED_DETECTORS
 from droguekit.benchmark.detection_report import write_detection_report
 from droguekit.benchmark.detection_result import DetectionResult, PairTimes
-from droguekit.benchmark.detection_speed import is_timed, speed_panel
+from droguekit.benchmark.detection_speed import is_timed, published_name, speed_panel
 from droguekit.benchmark.detection_tables import (
     SUMMARY_COLUMNS,
     SUMMARY_COLUMNS_MORE,
@@ -196,7 +196,7 @@ def test_speed_is_shown_beside_that_of_all_published_detectors() -> None:
     scored = timed(score_detections(truth, {"mine": DetectorRun(boxes_of(truth)), "file": DetectorRun([])}))
     panel = speed_panel(scored.result)
     for row in PUBLISHED_DETECTORS:
-        assert panel.count(f">{row.name}<") == 1
+        assert panel.count(f">{published_name(row.name)}<") == 1
     assert "hollow: published, other data" in panel
     mine, untimed = summary_rows(scored.result)
     assert (mine[8], mine[9], mine[10]) == ("3.01", "6.10", "12.5")

@@ -23,7 +23,8 @@ from droguekit.benchmark.detection_boxes import (
     read_detections,
     write_detections,
 )
-from droguekit.benchmark.detection_truth import LEAST_SEEN_FRACTION, image_truth, read_detection_truth, seen_fraction
+from droguekit.benchmark.detection_truth import image_truth, read_detection_truth
+from droguekit.benchmark.visibility import LEAST_SEEN_FRACTION, seen_fraction
 
 SIZE_PX = (1280, 960)
 
@@ -69,8 +70,27 @@ def test_a_drogue_that_is_mostly_cut_off_or_hidden_is_ignored(
     view = changed(record.views.left, visible_share, markers)
     truth = image_truth(with_left(record, view), "left", "test", SIZE_PX)
     assert (truth.box_xywh is not None, truth.ignored_xywh is None) == (counts, counts)
-    assert seen_fraction(view) == pytest.approx(min(visible_share, markers))
-    assert (seen_fraction(view) >= LEAST_SEEN_FRACTION) is counts
+    share = seen_fraction(with_left(record, view), "left")
+    assert share == pytest.approx(min(visible_share, markers))
+    assert (share >= LEAST_SEEN_FRACTION) is counts
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 15.0])
+def test_markers_too_small_for_any_pixel_hide_nothing(build: SimpleNamespace, tilt_deg: float) -> None:
+    """A drogue in plain sight whose markers are a hundredth of a pixel, and one whose real markers something covers."""
+    pose = build.pose(0.1013, 0.0, 20.0, tilt_deg)
+    tiny = build.drogue().model_copy(update={"marker_radius_m": 1e-4})
+    for drogue, expected in ((tiny, 0.8), (build.drogue(), 0.0)):
+        record = build.record(0, pose, drogue)
+        record = with_left(record, changed(record.views.left, 0.8, 0.0))
+        assert seen_fraction(record, "left") == pytest.approx(expected)
+        found = image_truth(record, "left", "test", SIZE_PX)
+        assert (found.box_xywh is not None) is (expected > 0)
+    # Markers beyond the edge tell that the drogue is cut off, whatever their size.
+    record = build.record(0, pose, tiny)
+    view = changed(record.views.left, 0.8, 0.0)
+    outside = tuple(marker.model_copy(update={"in_image": False}) for marker in view.markers)
+    assert seen_fraction(with_left(record, view.model_copy(update={"markers": outside})), "left") == 0
 
 
 def test_an_ignored_drogue_is_known_by_its_full_box_inside_the_image(build: SimpleNamespace) -> None:

@@ -17,7 +17,7 @@ from droguekit.benchmark.figures import QUANTITIES, error_panel, method_styles
 from droguekit.benchmark.narrative import result_sentences
 from droguekit.benchmark.number_text import distance_text, percent, plain_number, three_digits
 from droguekit.benchmark.ranking import best_method
-from droguekit.benchmark.report import write_report
+from droguekit.benchmark.report import stage_times_ms, write_report
 from droguekit.benchmark.result import BenchmarkResult
 
 DatasetFixture = tuple[Path, list[PairRecord]]
@@ -102,6 +102,15 @@ def test_the_page_has_every_figure_picture_and_table(
     assert "prefers-color-scheme: dark" in text
     assert "@media print" in text
     assert three_digits(1e3 * result.methods["paper"].overall.position_mean_m) in text
+
+
+def test_times_of_a_pair_leave_out_waiting(build: SimpleNamespace, tmp_path: Path) -> None:
+    stage_s = {"read": 0.512, "wait": 0.256, "handover": 0.128, "track": 0.004, "pose": 0.002}
+    told = build.estimate(0, build.pose(0, 0, 5)).model_copy(update={"stage_s": stage_s})
+    write_estimates(tmp_path / "e.jsonl", [told])
+    ((method, total, stages),) = stage_times_ms(tmp_path / "e.jsonl")
+    assert (method, total) == ("joint", "6.00")
+    assert stages == "read 512, wait 256, handover 128, track 4.00, pose 2.00"
 
 
 def test_the_page_is_the_same_every_time(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
