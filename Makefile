@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
 # where the folder lies.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-c bars-nav-d publish clean
+.PHONY: help setup demo test test-slow torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -68,6 +68,10 @@ bars-nav-b: ## accuracy bars, tier B: path-traced images, day and dusk, 64 pairs
 	@scripts/setup mitsuba
 	@$(BIN)/droguekit bars b --out out/bars/b
 
+bars-nav-b-blender: ## accuracy bars, tier B by the engine Blender (hours; installs Blender; goes on where it stopped)
+	@scripts/setup all
+	@$(BIN)/droguekit bars b --out out/bars/b-blender --engine blender
+
 bars-nav-c: ## accuracy bars, tier C: noise, flips, covariances and tolerances at the level of centroids (minutes)
 	@scripts/setup mitsuba
 	@$(BIN)/droguekit bars c --out out/bars/c
@@ -75,6 +79,14 @@ bars-nav-c: ## accuracy bars, tier C: noise, flips, covariances and tolerances a
 bars-nav-d: ## accuracy bars, tier D: markers measured wrongly, at the level of centroids (minutes)
 	@scripts/setup mitsuba
 	@$(BIN)/droguekit bars d --out out/bars/d
+
+bars-nav-e: ## accuracy bars, tier E: sequences behind a swinging drogue, with tracker and filter (hours; goes on where it stopped)
+	@scripts/setup mitsuba
+	@$(BIN)/droguekit bars e --out out/bars/e
+
+bars-nav-docking: ## accuracy bars of whole docking runs, by both engines and beside by two other sensors (days; goes on where it stopped)
+	@scripts/setup all
+	@$(BIN)/droguekit bars docking --out out/bars/docking --engine mitsuba --engine blender --rig rgb-ideal --rig paper-colour --rig mono
 
 publish: ## make the published manifests of the small recipes anew (minutes); after a change of pixels or recipes
 	@scripts/setup mitsuba

@@ -10,7 +10,8 @@ from pathlib import Path
 from datasets_manifest.atomic import write_text_atomic
 from droguekit.bars.cell_store import code_fingerprint
 
-_ROOMS = ("geometry", "drogue_models", "nav")
+# Whatever lies between the pixels and the estimates; those of readers and estimates among it.
+_ROOMS = ("geometry", "drogue_models", "datasets_manifest", "nav")
 
 
 def is_navigated(estimates: Path, dataset_sha256: str, methods: Sequence[str]) -> bool:

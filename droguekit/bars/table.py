@@ -7,12 +7,15 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, ConfigDict
 
+GOAL, BESIDE = "goal", "beside"
+
 
 class BarRow(BaseModel):
     """One bar.
 
     Attributes:
-        bar: its number in docs/bars.md, or `goal` for what is aimed at without being demanded.
+        bar: its number in docs/bars.md, `goal` for what is aimed at without being demanded, or `beside` for what stands
+            there to be compared with.
         quantity: what is measured, with its unit.
         low, high: between which limits it must lie; no lower one when None.
         measured: None where nothing could be measured.
@@ -56,7 +59,7 @@ class BarTable(BaseModel):
     @property
     def missed(self) -> int:
         """How many numbered bars are not met."""
-        return sum(not row.met for row in self.rows if row.bar != "goal")
+        return sum(not row.met for row in self.rows if row.bar not in _WITHOUT_NUMBER)
 
     def to_json(self) -> str:
         """The text of bars.json."""
@@ -65,7 +68,7 @@ class BarTable(BaseModel):
     def to_markdown(self) -> str:
         """The text of bars.md."""
         head = f"# Bars of tier {self.tier}, seed {self.seed}, droguekit {self.code_version}\n\n"
-        numbered = sum(row.bar != "goal" for row in self.rows)
+        numbered = sum(row.bar not in _WITHOUT_NUMBER for row in self.rows)
         count = f"{numbered - self.missed} of {numbered} bars are met. Limits are one-sided, 95 %.\n\n"
         lines = ["| " + " | ".join(cells) + " |" for cells in (_HEADINGS, ["---"] * len(_HEADINGS), *self._cells())]
         return head + count + "\n".join(lines) + "\n"
@@ -80,6 +83,7 @@ class BarTable(BaseModel):
         return [_row_cells(row) for row in self.rows]
 
 
+_WITHOUT_NUMBER = (GOAL, BESIDE)
 _HEADINGS = ["bar", "quantity", "must be", "measured", "95 % limit", "n", "met", "note"]
 
 
@@ -118,7 +122,7 @@ def _row_cells(row: BarRow) -> list[str]:
     wanted = f"<= {row.high:.4g}" if row.low is None else f"{row.low:.4g} to {row.high:.4g}"
     measured = "-" if row.measured is None else f"{row.measured:.4g}"
     limits = [f"{limit:.4g}" for limit in (row.limit_low, row.limit_high) if limit is not None]
-    met = "yes" if row.met else "NO" if row.bar != "goal" else "no"
+    met = "yes" if row.met else "NO" if row.bar not in _WITHOUT_NUMBER else "no"
     return [row.bar, row.quantity, wanted, measured, " to ".join(limits) or "-", str(row.n), met, row.note]
 
 

@@ -9,16 +9,20 @@ import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import WorkersOption
+from droguekit.cli.bars_pipeline import DEFAULT_RIG, DEFAULT_TRACKER, BarsOrder, FlightOrder, run_bars
 from droguekit.cli.main import FAULT
-from droguekit.cli.pipelines import BarsOrder, run_bars
 
 EXAMPLES = (
     "droguekit bars c --out out/bars/c",
     "droguekit bars a --out out/bars/a --pairs-per-station 20   (a first look; the full number later goes on from it)",
     "droguekit bars d --out /tmp/d --draws 50 --seed 7",
     "droguekit bars speed --out /tmp/speed",
+    "droguekit bars e --out out/bars/e",
+    "droguekit bars b --out out/bars/b --engine blender",
+    "droguekit bars docking --out out/bars/docking --engine mitsuba --engine blender",
+    "droguekit bars docking --out /tmp/docking --recipe docking-10m --sequences 1 --rig rgb-ideal --rig mono",
 )
-_IMAGE_TIERS = ("a", "b")
+_IMAGE_TIERS, _FLIGHT_TIERS = ("a", "b"), ("e", "docking")
 
 
 def bars(
@@ -26,7 +30,8 @@ def bars(
         str,
         typer.Argument(
             metavar="TIER",
-            help="a: analytic images, b: path-traced images, c: centroid noise and tolerances, d: bad markers, speed.",
+            help="a: analytic images, b: path-traced images, c: centroid noise and tolerances, d: bad markers, "
+            "e: swing sequences, docking: whole flights and the paper's bench, speed.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Keeps what is finished; gets bars.json, bars.md.")],
@@ -36,6 +41,37 @@ def bars(
     draws: Annotated[
         int | None, typer.Option("--draws", help="Tiers c and d: frames a cell; the protocol's by default.")
     ] = None,
+    recipe: Annotated[
+        list[str] | None,
+        typer.Option("--recipe", metavar="NAME", help="Tiers e and docking: only this recipe; may be repeated."),
+    ] = None,
+    sequences: Annotated[
+        int | None,
+        typer.Option(
+            "--sequences",
+            help="Tiers e and docking: of each recipe, or parts of 90 pairs of a bench; a full measurement by default.",
+        ),
+    ] = None,
+    engine: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--engine", metavar="NAME", help="Tiers b, e and docking: instead of the recipe's; may be repeated."
+        ),
+    ] = None,
+    rig: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rig",
+            metavar="NAME",
+            help=f"Tiers e and docking: may be repeated; {DEFAULT_RIG} by default, figures of others stand beside.",
+        ),
+    ] = None,
+    tracker: Annotated[
+        str | None,
+        typer.Option(
+            "--tracker", metavar="NAME", help=f"Tiers e and docking: in the loop; {DEFAULT_TRACKER} by default."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything drawn; 1 is for development.")] = 1,
     workers: WorkersOption = None,
 ) -> None:
@@ -44,14 +80,33 @@ def bars(
     Stopped and started again, it goes on with what is finished; results of other code are made again. Exit code 1 says
     that a bar is missed.
     """
-    images = tier in _IMAGE_TIERS
-    if images and draws is not None:
-        raise ValueError("--draws: is for tiers c and d and speed; tiers a and b take --pairs-per-station")
+    images, flights = tier in _IMAGE_TIERS, tier in _FLIGHT_TIERS
+    if (images or flights) and draws is not None:
+        raise ValueError("--draws: is for tiers c and d and speed; the others take --pairs-per-station or --sequences")
     if not images and pairs_per_station is not None:
-        raise ValueError("--pairs-per-station: is for tiers a and b; the others take --draws")
+        raise ValueError("--pairs-per-station: is for tiers a and b; the others take --draws or --sequences")
+    if not flights and any(value is not None for value in (recipe, sequences, rig, tracker)):
+        raise ValueError("--recipe, --sequences, --rig, --tracker: are for tiers e and docking")
+    if engine is not None and not (flights or tier == "b"):
+        raise ValueError("--engine: is for tiers b, e and docking; tier a is of analytic images")
     if draws is not None and draws < 2:
         raise ValueError(f"--draws: must be at least 2, got {draws}")
-    table = run_bars(BarsOrder(tier, seed, pairs_per_station, draws, workers), out, progress_report())
+    what = FlightOrder(
+        recipes=tuple(dict.fromkeys(recipe or ())),
+        rigs=tuple(dict.fromkeys(rig or (DEFAULT_RIG,))),
+        sequences=sequences,
+        tracker=tracker or DEFAULT_TRACKER,
+    )
+    order = BarsOrder(
+        tier=tier,
+        seed=seed,
+        pairs_per_station=pairs_per_station,
+        draws=draws,
+        engines=tuple(dict.fromkeys(engine or ())),
+        workers=workers,
+        flights=what,
+    )
+    table = run_bars(order, out, progress_report())
     for line in table.to_lines():
         typer.echo(line)
     typer.echo(f"wrote {out / 'bars.json'} and {out / 'bars.md'}")
