@@ -1,0 +1,48 @@
+"""A file of estimates, read once: the contenders' estimates in it, and its hash."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from datasets_manifest.estimates import Estimate, read_estimates
+from droguekit.benchmark.pose_errors import by_method
+from droguekit.paper_report.contenders import CONTENDERS, Contender, present
+from droguekit.paper_report.provenance import file_sha256
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatesFile:
+    """What a file of estimates says of the contenders.
+
+    Attributes:
+        path: where it lies.
+        sha256: of its contents.
+        methods: by name and frame.
+    """
+
+    path: Path
+    sha256: str
+    methods: Mapping[str, Mapping[int, Estimate]]
+
+    @property
+    def contenders(self) -> list[Contender]:
+        """Those of which there are estimates."""
+        return present(self.methods)
+
+
+def read_estimates_file(path: Path, frame_indices: Sequence[int]) -> EstimatesFile:
+    """Read the contenders' estimates.
+
+    Raises:
+        ValueError: the file cannot be read, names other frames than the dataset's, or holds none of the contenders.
+    """
+    names = [contender.method for contender in CONTENDERS]
+    found = by_method(read_estimates(path), frame_indices, str(path))
+    methods = {name: estimates for name, estimates in found.items() if name in names}
+    if not methods:
+        raise ValueError(
+            f"{path}: holds none of the methods {', '.join(names)}; name them to droguekit navigate by --method"
+        )
+    return EstimatesFile(path, file_sha256(path), methods)
