@@ -40,23 +40,41 @@ def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int |
         ValueError: no such pairs, or one that cannot be read.
         OSError: it cannot be written.
     """
-    indices = _chosen(dataset, count, sequence_id)
-    records = [dataset.record(index) for index in indices]
-    period_s = _period_s(records)
+    records = [dataset.record(index) for index in _chosen(dataset, count, sequence_id)]
+    length_s = period_s(records)
     side_view = SideView(records)
-    pictures = (side_view.draw(record, dataset.images(record.frame_index)) for record in records)
+    write_movie(path, (side_view.draw(record, dataset.images(record.frame_index)) for record in records), length_s)
+    return len(records), len(records) * length_s
+
+
+def write_movie(path: Path, pictures: Iterable[Picture], picture_s: float) -> None:
+    """Write pictures of one size as GIF or MP4, which takes its name when it is whole.
+
+    Args:
+        path: ends in .gif or .mp4.
+        pictures: (H, W, 3) each, at least one.
+        picture_s: time that each stands. [s]
+
+    Raises:
+        OSError: it cannot be written; one line that names it. Nothing is left behind.
+    """
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     part = part_path(path)
     part = part.with_name(part.name + path.suffix.lower())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write(part, pictures, period_s)
+        write(part, pictures, picture_s)
         part.replace(path)
     except OSError as error:
         raise OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)
-    return len(indices), len(indices) * period_s
+
+
+def evenly(indices: Sequence[int], count: int) -> list[int]:
+    """Up to `count` of them, spread evenly, in order."""
+    places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
+    return [indices[int(place)] for place in places]
 
 
 def _chosen(dataset: Dataset, count: int, sequence_id: int | None) -> list[int]:
@@ -65,8 +83,7 @@ def _chosen(dataset: Dataset, count: int, sequence_id: int | None) -> list[int]:
     if not fitting:
         which = "" if sequence_id is None else f" of sequence {sequence_id}"
         raise ValueError(f"{dataset.path}: holds no pairs{which} with drogue and tanker to animate")
-    places = np.linspace(0, len(fitting) - 1, min(count, len(fitting))).round()
-    return [fitting[int(place)] for place in places]
+    return evenly(fitting, count)
 
 
 def _with_drogue(dataset: Dataset, sequence_id: int | None) -> Iterator[int]:
@@ -76,16 +93,16 @@ def _with_drogue(dataset: Dataset, sequence_id: int | None) -> Iterator[int]:
             yield index
 
 
-def _period_s(records: Sequence[PairRecord]) -> float:
+def period_s(records: Sequence[PairRecord]) -> float:
     """Time that each picture stands: as long as in flight for pairs of sequences. [s]"""
     if records[0].sequence_id is None or len(records) < 2:
         return _SLIDE_S
     return float(np.clip(np.median(np.diff([record.time_s for record in records])), _FASTEST_S, _SLOWEST_S))
 
 
-def _write_gif(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
+def _write_gif(path: Path, pictures: Iterable[Picture], picture_s: float) -> None:
     frames = [_with_palette(picture) for picture in pictures]
-    tick_ms = max(2 * _GIF_TICK_MS, round(1000 * period_s / _GIF_TICK_MS) * _GIF_TICK_MS)
+    tick_ms = max(2 * _GIF_TICK_MS, round(1000 * picture_s / _GIF_TICK_MS) * _GIF_TICK_MS)
     frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], duration=tick_ms, loop=0)
 
 
@@ -95,12 +112,12 @@ def _with_palette(picture: Picture) -> Image.Image:
     return Image.fromarray(small).quantize(_GIF_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 
-def _write_mp4(path: Path, pictures: Iterable[Picture], period_s: float) -> None:
+def _write_mp4(path: Path, pictures: Iterable[Picture], picture_s: float) -> None:
     writer, written = None, 0
     for picture in pictures:
         height, width = picture.shape[:2]
         if writer is None:
-            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 1.0 / period_s, (width, height))
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 1.0 / picture_s, (width, height))
             if not writer.isOpened():
                 raise OSError(None, "OpenCV cannot write MP4 there; try .gif")
         writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

@@ -19,6 +19,7 @@ EXAMPLES = (
     "droguekit preview data/demo --out sheet.jpg --count 6 --columns 2 --tile-width 640",
     "droguekit preview data/world --out sheet.jpg --by-family --count 30   (no labels, a row for each family)",
     "droguekit preview data/docking-10m --animate docking.gif --sequence 1   (the flight from the side)",
+    "droguekit preview data/docking-10m --overlay overlay.mp4 --estimates estimates.jsonl --method joint --sequence 0",
 )
 _COLUMNS, _TILE_WIDTH_PX = 4, 400
 
@@ -31,7 +32,9 @@ def preview(
     ] = None,
     count: Annotated[
         int | None,
-        typer.Option("--count", help="How many pairs, spread evenly; 20, or 150 of an animation.", show_default=False),
+        typer.Option(
+            "--count", help="How many pairs, spread evenly; 20, or 150 of an animation or overlay.", show_default=False
+        ),
     ] = None,
     columns: Annotated[int, typer.Option("--columns", help="Tiles in a row, or families side by side.")] = _COLUMNS,
     tile_width: Annotated[int, typer.Option("--tile-width", metavar="PX", help="Width of a tile.")] = _TILE_WIDTH_PX,
@@ -40,24 +43,56 @@ def preview(
     ] = False,
     animate: Annotated[
         Path | None,
-        typer.Option("--animate", metavar="FILE", help="A .gif or .mp4 file: the flight from the side, in time."),
+        typer.Option(
+            "--animate",
+            metavar="FILE",
+            parser=str,
+            callback=local_path,
+            help="A .gif or .mp4 file: the flight from the side, in time.",
+        ),
     ] = None,
-    sequence: Annotated[int | None, typer.Option("--sequence", help="Only this sequence, in an animation.")] = None,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            "--overlay",
+            metavar="FILE",
+            parser=str,
+            callback=local_path,
+            help="An .mp4 or .gif file: left images with boxes, outlines, estimates, errors.",
+        ),
+    ] = None,
+    estimates: Annotated[
+        Path | None, typer.Option("--estimates", metavar="FILE.jsonl", help="Poses to draw in an overlay.")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option("--method", metavar="NAME", help="Whose, where the file holds several methods.")
+    ] = None,
+    sequence: Annotated[
+        int | None, typer.Option("--sequence", help="Only this sequence, in an animation or overlay.")
+    ] = None,
 ) -> None:
     """Draw a contact sheet of left images with the drogue's box, the features' centres and the distance.
 
-    A dataset without truth, such as an imported one, is drawn without them.
+    A dataset without truth, such as an imported one, is drawn without them. Instead of a sheet: --animate makes a film
+    of the flight from the side, --overlay one of the left images with truth and estimates; both need a dataset with
+    its truth.
     """
     from datasets_manifest.reader import Dataset
 
-    if (out is None) == (animate is None):
-        raise ValueError("--out, --animate: give one of them, a file for a sheet or for an animation")
-    if animate is not None and (by_family or columns != _COLUMNS or tile_width != _TILE_WIDTH_PX):
-        raise ValueError("--by-family, --columns, --tile-width: go with --out; leave them out of an animation")
-    if sequence is not None and animate is None:
-        raise ValueError("--sequence: goes with --animate; leave it out for a sheet")
+    if sum(file is not None for file in (out, animate, overlay)) != 1:
+        raise ValueError("--out, --animate, --overlay: give one of them, a file for a sheet or for a film")
+    if out is None and (by_family or columns != _COLUMNS or tile_width != _TILE_WIDTH_PX):
+        raise ValueError("--by-family, --columns, --tile-width: go with --out; leave them out of a film")
+    if sequence is not None and out is not None:
+        raise ValueError("--sequence: goes with --animate or --overlay; leave it out for a sheet")
+    if overlay is None and (estimates is not None or method is not None):
+        raise ValueError("--estimates, --method: go with --overlay")
+    if method is not None and estimates is None:
+        raise ValueError("--method: goes with --estimates, a file that holds it")
     if animate is not None:
         _animate(Dataset(dataset), animate, 150 if count is None else count, sequence)
+    if overlay is not None:
+        _overlay(Dataset(dataset), overlay, 150 if count is None else count, sequence, (estimates, method))
     if out is not None:
         _check_sheet(out, 20 if count is None else count, columns, tile_width)
         sheet, shown, pairs = _draw_sheet(dataset, 20 if count is None else count, columns, tile_width, by_family)
@@ -66,14 +101,32 @@ def preview(
 
 
 def _animate(source: Dataset, path: Path, count: int, sequence: int | None) -> None:
-    from droguekit.cli.animation import SUFFIXES, write_animation
+    from droguekit.cli.animation import write_animation
 
-    if not 1 <= count <= 2000:
-        raise ValueError(f"--count: must be from 1 to 2000 in an animation, got {count}")
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"--animate: must end in {' or '.join(SUFFIXES)}, got {path}")
+    _check_film("--animate", path, count)
     shown, length_s = write_animation(source, path, count, sequence)
     typer.echo(f"wrote {path}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")
+
+
+def _overlay(
+    source: Dataset, path: Path, count: int, sequence: int | None, chosen: tuple[Path | None, str | None]
+) -> None:
+    from droguekit.cli.overlay_video import read_method, write_overlay_video
+
+    _check_film("--overlay", path, count)
+    estimates, method = chosen
+    answers = ("", {}) if estimates is None else read_method(estimates, source, method)
+    shown, length_s = write_overlay_video(source, path, count, sequence, answers)
+    typer.echo(f"wrote {path}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")
+
+
+def _check_film(option: str, path: Path, count: int) -> None:
+    from droguekit.cli.animation import SUFFIXES
+
+    if not 1 <= count <= 2000:
+        raise ValueError(f"--count: must be from 1 to 2000 in a film, got {count}")
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{option}: must end in {' or '.join(SUFFIXES)}, got {path}")
 
 
 def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:

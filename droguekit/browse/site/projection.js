@@ -1,0 +1,58 @@
+/* Where the images show what a pose says. Frames and pixels are those of the dataset: x right, y down, z forward, and
+   pixel (0, 0) is the centre of the top-left one. Every later script adds to `droguekit`. */
+"use strict";
+var droguekit = {};
+
+(function () {
+  // Nearer than this to an eye's plane nothing can be drawn. [m]
+  const NEAREST_M = 0.05;
+
+  /** A point of the drogue in the left camera's frame. [m] `pose` holds the upper three rows of the matrix. */
+  function placed(pose, point) {
+    const [x, y, z] = point;
+    return [0, 4, 8].map((row) => pose[row] * x + pose[row + 1] * y + pose[row + 2] * z + pose[row + 3]);
+  }
+
+  /** Pixel of an ideal camera for a direction with z = 1. [px] */
+  function pixel(camera, x, y) {
+    return [camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px];
+  }
+
+  /** Where a real lens shows a direction of the rectified rig (Brown and Conrady, with OpenCV's coefficients). [px] */
+  function throughLens(lens, direction) {
+    const turn = lens.real_from_ideal;
+    const [u, v, w] = [0, 3, 6].map(
+      (row) => turn[row] * direction[0] + turn[row + 1] * direction[1] + turn[row + 2] * direction[2],
+    );
+    const [x, y] = [u / w, v / w];
+    const [k1, k2, p1, p2, k3] = lens.distortion;
+    const r2 = x * x + y * y;
+    const radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    return pixel(
+      lens.camera,
+      x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+      y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    );
+  }
+
+  /** Pixel of a point of the left camera's frame [m] in an eye, "left" or "right". [px] */
+  function imageOf(rig, eye, point) {
+    const direction = [(point[0] - (eye === "right" ? rig.baseline_m : 0)) / point[2], point[1] / point[2], 1];
+    if (rig.lenses === null) return pixel(rig.camera, direction[0], direction[1]);
+    return throughLens(rig.lenses[eye === "left" ? 0 : 1], direction);
+  }
+
+  /** Corners of a ring's image in an eye [px], or null where it reaches behind the eye. */
+  droguekit.ringImage = function (rig, eye, pose, ring) {
+    const corners = [];
+    for (let k = 0; k < ring.points; k++) {
+      const angle = (2 * Math.PI * k) / ring.points;
+      const [x, y, z] = ring.center_m;
+      const at = [x + ring.radius_m * Math.cos(angle), y + ring.radius_m * Math.sin(angle), z];
+      const point = placed(pose, at);
+      if (point[2] <= NEAREST_M) return null;
+      corners.push(imageOf(rig, eye, point));
+    }
+    return corners;
+  };
+})();

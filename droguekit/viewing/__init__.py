@@ -1,0 +1,1 @@
+"""Pairs, poses and errors as a recording of the rerun viewer."""
