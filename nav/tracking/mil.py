@@ -5,6 +5,8 @@ Babenko et al., "Robust object tracking with online multiple instance learning",
 
 from __future__ import annotations
 
+import ctypes
+
 import cv2
 import numpy as np
 
@@ -13,6 +15,8 @@ from nav.detector.interface import Detection
 from nav.tracking.likeness import ALIKE, Likeness
 from nav.tracking.region import Box, EyeImage, ImageRegion, box_around, box_center, box_size, image_region
 
+# MIL loses one box in ten over the edge of an image at once, which ones is a matter of the draws.
+_SEED = 5
 # The box is looked at with so many pixels across it, not enlarged.
 _GRID = 64
 # How far it searches about the last place, on that grid; OpenCV's own choice, whose square is its cost.
@@ -26,10 +30,7 @@ _SAME_PLACE = 2.0
 
 
 class MilEyeTracker:
-    """One eye of the tracker `mil`; what tells whether the drogue is still there is `nav.tracking.likeness`.
-
-    OpenCV draws its features and samples from generators of the whole process, so that boxes depend on what ran before.
-    """
+    """One eye of the tracker `mil`; what tells whether the drogue is still there is `nav.tracking.likeness`."""
 
     _box: Box
     _step_px: float
@@ -69,6 +70,7 @@ class MilEyeTracker:
         if self._mil is None:
             return None
         region = self._whole(image)
+        _begin_draws()
         found, answer = self._mil.update(region.pixels)
         if not found:
             return None
@@ -93,6 +95,7 @@ class MilEyeTracker:
         if size.min() >= _LEAST_SIDE and (np.array(region.size) - size).min() >= _LEAST_ROOM:
             settings = cv2.TrackerMIL.Params()
             settings.samplerSearchWinSize = _SEARCH
+            _begin_draws()
             self._mil = cv2.TrackerMIL.create(settings)
             self._mil.init(region.pixels, (int(low[0]), int(low[1]), int(size[0]), int(size[1])))
 
@@ -103,3 +106,13 @@ class MilEyeTracker:
         assert region is not None
         # It works on grey, and takes nothing but three channels or one.
         return ImageRegion(region.grey(), region.origin_px, region.step_px)
+
+
+def _begin_draws() -> None:
+    """Let OpenCV draw the same features and samples whatever ran before.
+
+    It takes them from its own generator and from the C library's, which both belong to the process; nothing else here
+    draws from either.
+    """
+    cv2.setRNGSeed(_SEED)
+    ctypes.CDLL(None).srand(_SEED)

@@ -169,8 +169,7 @@ def test_an_eye_that_lost_the_drogue_looks_where_the_other_sees_it() -> None:
     assert found[7:, 1].min() > 0.9
 
 
-# Not MIL, which OpenCV lets draw from generators of the whole process.
-@pytest.mark.parametrize("name", ["bernoulli", "flow", "pose-predict"])
+@pytest.mark.parametrize("name", tracker_names())
 def test_the_same_pairs_give_the_same_boxes(name: str) -> None:
     places = [Place(300 + 6 * index, 240 - 3 * index, 60 + index) for index in range(6)]
     pairs = film(places, Look(noise_dn=2.0))
