@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from datasets_manifest.frame import FrameSpec
 from geometry.stereo import Eye
 from render.mitsuba_engine.camera_rays import CameraRays
+from render.mitsuba_engine.launches import rows_of
 from render.mitsuba_engine.scene import DrogueScene, by_shape
 from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, slipped_through
 from render.traced import TracedEye, amodal_counts
@@ -96,7 +97,7 @@ class CenterPasses:
         ray = self._center_rays(mi.UInt32(pixel), place=place)
         hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
         dr.eval(hit.p, hit.n)
-        return np.array(hit.p).T, np.array(hit.n).T
+        return rows_of(hit.p), rows_of(hit.n)
 
     def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
         """Pixel centres that each marker and the hub would cover alone, on the image's grid."""

@@ -100,6 +100,15 @@ def means_by_pixel(channels: list[Any], count: int) -> NDArray[np.float32]:
     return means
 
 
+def rows_of(vector: Any) -> NDArray[np.float32]:
+    """(P, 3) numbers of an evaluated vector.
+
+    Converted as a whole, it would go through a kernel of its own for every P.
+    """
+    axes: NDArray[np.float32] = np.stack([np.array(axis) for axis in vector])
+    return axes.T
+
+
 def and_some_again(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
     """Pixels, then every so many of them a second time."""
     return np.concatenate([pixel, pixel[::TWICE_EVERY]])

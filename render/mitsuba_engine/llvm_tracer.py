@@ -16,6 +16,7 @@ from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.center_passes import CenterPasses
 from render.mitsuba_engine.launches import FrameRays, Sampled
 from render.mitsuba_engine.path_launches import trace_paths
+from render.mitsuba_engine.registry import reserve_numbers
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.smoothed_launches import SmoothedPaths
 from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, Traced, plan_pixels
@@ -29,6 +30,7 @@ class LlvmTracer:
 
     def __init__(self) -> None:
         dr.set_thread_count(1)
+        self._last_number = reserve_numbers()
         self._scenes = SceneCache()
 
     def trace(self, frame: FrameSpec, settings: RenderSettings, around: Surroundings) -> Traced:

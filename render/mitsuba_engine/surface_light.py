@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drogue_models.parts import Part
-from render.mitsuba_engine.launches import FrameRays, means_by_pixel
+from render.mitsuba_engine.launches import FrameRays, means_by_pixel, rows_of
 from render.mitsuba_engine.scene import by_shape
 from render.mitsuba_engine.sun_sky_paths import trace_first, trace_rest
 
@@ -48,6 +48,8 @@ class SurfaceLight:
         self._place = mi.UInt32(place)
         surface = self._surface(mi.UInt32(pixel))
         shape: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+        # Else each use of them would send the rays again.
+        dr.eval(surface.n, surface.p, shape)
         smoothing_m = np.full(256, SMOOTHING_M, dtype=np.float32)
         for part, part_m in _SMOOTHING_BY_PART_M.items():
             smoothing_m[part] = part_m
@@ -209,5 +211,5 @@ def _gathered(rows: Any, row: Any) -> Any:
 def _rows(vector: Any, last: NDArray[np.float32]) -> Any:
     """(P + 1, 4) numbers in one array, by pixel; row P is of pixels whose centres see nothing, its last number -1."""
     rows = np.full((len(last) + 1, 4), -1.0, dtype=np.float32)
-    rows[:-1, :3], rows[:-1, 3] = np.array(vector).T, last
+    rows[:-1, :3], rows[:-1, 3] = rows_of(vector), last
     return mi.Float(rows.ravel())
