@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from datasets_manifest.atomic import open_text_atomic
 from datasets_manifest.json_types import FrozenModel, Matrix6, Transform
 from geometry.stereo import Eye
 
@@ -147,17 +148,15 @@ def write_estimates(path: Path, estimates: Iterable[Estimate]) -> int:
 
     Returns:
         How many were written.
+
+    Raises:
+        OSError: the file cannot be written; names it. What was there stays.
     """
-    part = path.with_name(path.name + ".part")
     count = 0
-    try:
-        with part.open("w", encoding="utf-8") as stream:
-            for estimate in estimates:
-                stream.write(estimate.model_dump_json() + "\n")
-                count += 1
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with open_text_atomic(path) as stream:
+        for estimate in estimates:
+            stream.write(estimate.model_dump_json() + "\n")
+            count += 1
     return count
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.images import Pixels, StereoImages
 from datasets_manifest.layout import (
     FRAMES_FOLDER,
@@ -25,8 +24,6 @@ from datasets_manifest.png import encode_png
 from datasets_manifest.records import PairRecord
 from datasets_manifest.storage import Location, open_storage
 from geometry.stereo import Eye
-
-__all__ = ["encode_files", "remove_leftovers", "write_frame", "write_text_atomic"]
 
 
 def encode_files(images: StereoImages, part_ids: Mapping[Eye, NDArray[np.uint8]]) -> dict[str, bytes]:

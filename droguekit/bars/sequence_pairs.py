@@ -15,6 +15,7 @@ from droguekit.benchmark.centroid_errors import centroid_errors
 from droguekit.benchmark.frame_truth import DrogueTruth, drogue_truth
 from droguekit.benchmark.pose_errors import by_method, pose_error
 from droguekit.benchmark.reference import build_reference
+from droguekit.benchmark.sequence_latency import worked_s
 from droguekit.benchmark.sequence_truth import Sight, moment
 from geometry.se3 import Array
 
@@ -60,7 +61,7 @@ class ScoredPair:
         sd_m: root of the trace of the position's reported covariance; None without one. [m]
         over_bound: (5,) error over its bound at the centroid noise measured in its family; None without either.
         reason: why there is no pose; empty where there is one, or no word at all.
-        work_s: of all stages, where it is told. [s]
+        work_s: of all stages but those in which the pair waits, where they are told. [s]
     """
 
     pair: TruePair
@@ -131,7 +132,7 @@ def _bounds(pairs: Sequence[TruePair], methods: Mapping[str, Mapping[int, Estima
 
 
 def _scored(pair: TruePair, answer: Estimate | None, bound: Array | None) -> ScoredPair:
-    work_s = sum(answer.stage_s.values()) if answer is not None and answer.stage_s else None
+    work_s = None if answer is None else worked_s(answer.stage_s)
     if not isinstance(answer, PoseEstimate):
         reason = "" if answer is None else answer.reason
         return ScoredPair(pair, None, None, None, reason, work_s)

@@ -27,7 +27,7 @@ from droguekit.benchmark.report_tables import (
     rangefinder_tables,
 )
 from droguekit.benchmark.result import BenchmarkResult
-from droguekit.benchmark.sequence_latency import WAITING
+from droguekit.benchmark.sequence_latency import worked_s
 from droguekit.benchmark.sequence_report import sequence_section
 
 
@@ -118,13 +118,13 @@ def dataset_facts(manifest: Manifest, estimates_name: str) -> list[tuple[str, st
 def stage_times_ms(estimates: Path) -> list[tuple[str, str, str]]:
     """Median time for a pair by method: name, total without waiting, and the stages. [ms]
 
-    Methods that report no times are left out.
+    Pairs on which no time was worked, and methods that report none, are left out.
     """
     stages: dict[str, dict[str, list[float]]] = {}
     for estimate in read_estimates(estimates):
-        if not estimate.stage_s:
+        work_s = worked_s(estimate.stage_s)
+        if work_s is None:
             continue
-        work_s = sum(seconds for stage, seconds in estimate.stage_s.items() if stage not in WAITING)
         for stage, seconds in {**estimate.stage_s, "": work_s}.items():
             stages.setdefault(estimate.method, {}).setdefault(stage, []).append(1e3 * seconds)
     return [

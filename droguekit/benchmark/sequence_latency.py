@@ -12,8 +12,18 @@ from droguekit.benchmark.sequence_result import Latency, LatencyBin, Percentiles
 
 LATE = "late:"
 """How the reason begins of a pair that was not worked on, because newer ones had come."""
-WAITING = frozenset({"read", "wait", "handover"})
-"""Stages in which a pair waits, or is only on its way, and nobody works on it."""
+# Stages in which a pair waits, or is only on its way, and nobody works on it.
+_WAITING = frozenset({"read", "wait", "handover"})
+
+
+def worked_s(stage_s: Mapping[str, float]) -> float | None:
+    """Time that was worked on a pair; None where no such stage is told. [s]
+
+    Args:
+        stage_s: seconds by stage, of an estimate.
+    """
+    work = [seconds for stage, seconds in stage_s.items() if stage not in _WAITING]
+    return sum(work) if work else None
 
 
 def latency(data: SequenceData, estimates: Mapping[int, Estimate]) -> Latency | None:

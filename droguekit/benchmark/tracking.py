@@ -8,7 +8,7 @@ import numpy as np
 
 from datasets_manifest.estimates import Estimate, Region
 from droguekit.benchmark.detection_boxes import FoundBox, center_box
-from droguekit.benchmark.sequence_latency import WAITING
+from droguekit.benchmark.sequence_latency import worked_s
 from droguekit.benchmark.sequence_truth import TrueSequence
 from droguekit.benchmark.tracking_result import SourceTracking, Tracking
 from droguekit.benchmark.tracking_scores import (
@@ -82,8 +82,7 @@ def _source_tracking(source: str, tracks: Sequence[EyeTrack], stages_s: StageTim
         index for track in tracks for index, own in zip(track.frame_index, is_own(track).tolist(), strict=True) if own
     }
     told = [stages_s[index] for index in sorted(pairs & stages_s.keys())]
-    work = [[spent_s for stage, spent_s in stages.items() if stage not in WAITING] for stages in told]
-    times_ms = [1e3 * sum(spent_s) for spent_s in work if spent_s]
+    times_ms = [1e3 * work_s for work_s in map(worked_s, told) if work_s is not None]
     box_ms = [
         1e3 * sum(spent_s for stage, spent_s in stages.items() if stage in _BOX_STAGES)
         for stages in told

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,12 +16,12 @@ else:
     Place = type("folder or URL", (), {})
 
 
-def local_path(option: typer.CallbackParam, text: str | None) -> Path | None:
-    """The callback of an option of type `Path` that names what is written; it has `parser=str`, and takes no URL.
+def output_option(name: str, metavar: str, help: str) -> Any:
+    """An option of type `Path` that names what is written, on this machine: a URL would become the name of a folder."""
+    return typer.Option(name, metavar=metavar, parser=str, callback=_local_path, help=help)
 
-    Raises:
-        ValueError: it is one, which would become the name of a folder.
-    """
+
+def _local_path(option: typer.CallbackParam, text: str | None) -> Path | None:
     if text is not None and "://" in text:
         raise ValueError(f"{option.opts[0]}: must be a folder or file of this machine, got {text}")
     return None if text is None else Path(text)

@@ -70,7 +70,7 @@ def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
     """
     from importlib.metadata import version
 
-    from datasets_manifest.writer import write_text_atomic
+    from datasets_manifest.atomic import write_text_atomic
     from droguekit.bars.flight_data import FLIGHT_TIERS
     from droguekit.bars.image_tiers import IMAGE_TIERS
     from droguekit.bars.speed import bars_speed

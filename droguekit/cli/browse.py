@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from droguekit.cli.arguments import DatasetArgument, WorkersOption, local_path
+from droguekit.cli.arguments import DatasetArgument, WorkersOption, output_option
 from droguekit.cli.main import FAULT
 
 EXAMPLES = (
@@ -19,12 +19,7 @@ EXAMPLES = (
 
 def browse(
     dataset: DatasetArgument,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", metavar="DIR", parser=str, callback=local_path, help="The page's folder; open index.html."
-        ),
-    ],
+    out: Annotated[Path, output_option("--out", "DIR", "The page's folder; open index.html.")],
     estimates: Annotated[
         Path | None, typer.Option("--estimates", metavar="FILE.jsonl", help="Poses to show beside the truth.")
     ] = None,

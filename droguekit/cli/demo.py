@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import RecipeArgument, WorkersOption, local_path
+from droguekit.cli.arguments import RecipeArgument, WorkersOption, output_option
 from droguekit.cli.main import FAULT
 from droguekit.cli.pipelines import run_demo
 
@@ -21,10 +21,7 @@ EXAMPLES = (
 
 def demo(
     recipe: RecipeArgument = "demo",
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="DIR", parser=str, callback=local_path, help="Where everything goes."),
-    ] = Path("out/demo"),
+    out: Annotated[Path, output_option("--out", "DIR", "Where everything goes.")] = Path("out/demo"),
     workers: WorkersOption = None,
 ) -> None:
     """Render a small dataset of a drogue from 40 m down to 1.7 m, navigate on it blind, and write a report.

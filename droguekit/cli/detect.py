@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, DetectorOption, local_path
+from droguekit.cli.arguments import DatasetArgument, DetectorOption, output_option
 from droguekit.cli.detection_pipelines import detect_dataset
 
 EXAMPLES = (
@@ -21,12 +21,7 @@ EXAMPLES = (
 
 def detect(
     dataset: DatasetArgument,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", metavar="FILE.json", parser=str, callback=local_path, help="Gets the boxes, as COCO results."
-        ),
-    ],
+    out: Annotated[Path, output_option("--out", "FILE.json", "Gets the boxes, as COCO results.")],
     detector: DetectorOption = None,
     least_score: Annotated[float, typer.Option("--least-score", help="Boxes that score less are left out.")] = 0.001,
     tracker: Annotated[

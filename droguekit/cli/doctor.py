@@ -25,6 +25,7 @@ _PACKAGES = (
     "mitsuba",
     "drjit",
     "bpy",
+    "rerun-sdk",
 )
 # What Blender's Python package loads from the system, and Debian's packages of them.
 _BLENDER_LIBRARIES = {
@@ -45,6 +46,8 @@ def doctor() -> None:
     """
     _show_machine()
     _show_packages()
+    _show_viewer()
+    _show_browser()
     if not _show_engines():
         raise typer.Exit(FAULT)
 
@@ -68,6 +71,27 @@ def _show_packages() -> None:
         except PackageNotFoundError:
             found = "missing"
         typer.echo(f"package    {package} {found}")
+
+
+def _show_viewer() -> None:
+    """Load the rerun viewer's library, which is optional: nothing but `view` needs it."""
+    try:
+        import rerun
+    except ImportError as error:
+        typer.echo(f"viewer     rerun is optional: {error}; pip install 'droguekit[viz]'")
+        return
+    typer.echo(f"viewer     rerun {rerun.__version__}, for droguekit view")
+
+
+def _show_browser() -> None:
+    """Look for a browser, which is optional: nothing but the PDF of `report` needs it."""
+    from droguekit.paper_report.print_pdf import NO_BROWSER, find_browser
+
+    found = find_browser()
+    if found is None:
+        typer.echo(f"browser    Chromium is optional: {NO_BROWSER}")
+        return
+    typer.echo(f"browser    {found}, for droguekit report --pdf")
 
 
 def _show_engines() -> bool:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, local_path
+from droguekit.cli.arguments import DatasetArgument, output_option
 from labelgen.export.formats import FORMATS, write_export
 from labelgen.export.log import ExportLog
 
@@ -22,12 +22,7 @@ EXAMPLES = (
 def export(
     dataset: DatasetArgument,
     format_: Annotated[str, typer.Option("--format", metavar="NAME", help="One of the formats below.")],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", metavar="DIR2", parser=str, callback=local_path, help="Folder for the files; made if missing."
-        ),
-    ],
+    out: Annotated[Path, output_option("--out", "DIR2", "Folder for the files; made if missing.")],
 ) -> None:
     """Write a dataset's labels in another format, with the images where the format has them.
 

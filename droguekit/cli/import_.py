@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import local_path
+from droguekit.cli.arguments import output_option
 
 if TYPE_CHECKING:
     from datasets_manifest.importers.source import PairSource
@@ -25,10 +25,7 @@ _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 def import_(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A folder of images, or a ROS bag.")],
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="DIR", parser=str, callback=local_path, help="The new dataset's folder."),
-    ],
+    out: Annotated[Path, output_option("--out", "DIR", "The new dataset's folder.")],
     calibration: Annotated[
         Path | None,
         typer.Option("--calibration", metavar="FILE", help="OpenCV's M1, D1, M2, D2, R, T; a bag's own if left out."),

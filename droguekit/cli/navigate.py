@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, DetectorOption, local_path
+from droguekit.cli.arguments import DatasetArgument, DetectorOption, output_option
 from droguekit.cli.navigation_pipeline import NavigationOrder, navigate_dataset
 
 EXAMPLES = (
@@ -23,10 +23,7 @@ EXAMPLES = (
 
 def navigate(
     dataset: DatasetArgument,
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="FILE.jsonl", parser=str, callback=local_path, help="Gets one estimate a line."),
-    ],
+    out: Annotated[Path, output_option("--out", "FILE.jsonl", "Gets one estimate a line.")],
     method: Annotated[
         list[str] | None, typer.Option("--method", metavar="NAME", help="May be repeated; all methods unless given.")
     ] = None,
@@ -66,10 +63,7 @@ def navigate(
         typer.Option(metavar="HZ", help="Real time: pairs come at this rate, and those that come too late are told."),
     ] = None,
     latency: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.json", parser=str, callback=local_path, help="Gets the latencies of --rate by stage."
-        ),
+        Path | None, output_option("--latency", "FILE.json", "Gets the latencies of --rate by stage.")
     ] = None,
 ) -> None:
     """Estimate the drogue's pose in every pair of a dataset, from images, rig and drogue alone."""

@@ -107,7 +107,7 @@ def benchmark_dataset(
         ValueError: a dataset or estimates that cannot be read.
         OSError: a result cannot be written.
     """
-    from datasets_manifest.writer import write_text_atomic
+    from datasets_manifest.atomic import write_text_atomic
     from droguekit.bars.one_thread import one_thread
     from droguekit.benchmark.benchmark import run_benchmark
     from droguekit.benchmark.report import write_report
@@ -117,7 +117,6 @@ def benchmark_dataset(
         if json_out is not None:
             write_text_atomic(json_out, result.to_json())
         if html_out is not None:
-            html_out.parent.mkdir(parents=True, exist_ok=True)
             write_report(dataset, estimates, result, html_out)
     return result
 
@@ -129,7 +128,7 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         ValueError: a dataset or estimates that cannot be read.
         OSError: a result cannot be written.
     """
-    from datasets_manifest.writer import write_text_atomic
+    from datasets_manifest.atomic import write_text_atomic
     from droguekit.bars.one_thread import one_thread
     from droguekit.benchmark.blind_check import check_blind
     from droguekit.benchmark.blind_report import write_blind_report
@@ -139,7 +138,6 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         if json_out is not None:
             write_text_atomic(json_out, check.to_json())
         if html_out is not None:
-            html_out.parent.mkdir(parents=True, exist_ok=True)
             write_blind_report(dataset, estimates, check, html_out)
     return check
 

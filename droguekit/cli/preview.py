@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from droguekit.cli.arguments import DatasetArgument, local_path
+from droguekit.cli.arguments import DatasetArgument, output_option
 
 if TYPE_CHECKING:
     from datasets_manifest.reader import Dataset
@@ -26,10 +26,7 @@ _COLUMNS, _TILE_WIDTH_PX = 4, 400
 
 def preview(
     dataset: DatasetArgument,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="FILE", parser=str, callback=local_path, help="A .png or .jpg file."),
-    ] = None,
+    out: Annotated[Path | None, output_option("--out", "FILE", "A .png or .jpg file.")] = None,
     count: Annotated[
         int | None,
         typer.Option(
@@ -42,23 +39,12 @@ def preview(
         bool, typer.Option("--by-family", help="A row for each family of conditions, without labels.")
     ] = False,
     animate: Annotated[
-        Path | None,
-        typer.Option(
-            "--animate",
-            metavar="FILE",
-            parser=str,
-            callback=local_path,
-            help="A .gif or .mp4 file: the flight from the side, in time.",
-        ),
+        Path | None, output_option("--animate", "FILE", "A .gif or .mp4 file: the flight from the side, in time.")
     ] = None,
     overlay: Annotated[
         Path | None,
-        typer.Option(
-            "--overlay",
-            metavar="FILE",
-            parser=str,
-            callback=local_path,
-            help="An .mp4 or .gif file: left images with boxes, outlines, estimates, errors.",
+        output_option(
+            "--overlay", "FILE", "An .mp4 or .gif file: left images with boxes, outlines, estimates, errors."
         ),
     ] = None,
     estimates: Annotated[
@@ -174,14 +160,7 @@ def _draw_sheet(
 def _write_picture(path: Path, picture: Picture) -> None:
     import cv2
 
-    from datasets_manifest.atomic import part_path
+    from datasets_manifest.atomic import write_bytes_atomic
 
     _, data = cv2.imencode(path.suffix.lower(), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    part = part_path(path)
-    try:
-        part.write_bytes(data.tobytes())
-        part.replace(path)
-    except OSError as error:
-        raise OSError(error.errno, f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    write_bytes_atomic(path, data.tobytes())

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import WorkersOption, local_path
+from droguekit.cli.arguments import WorkersOption, output_option
 from droguekit.cli.training_pipeline import TrainingOrder, train_detector
 
 EXAMPLES = (
@@ -27,12 +27,7 @@ def train(
             help="Datasets' folders or URLs, and recipes, shipped or .toml, which are rendered into OUT/datasets.",
         ),
     ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", metavar="DIR", parser=str, callback=local_path, help="The training's folder; made if missing."
-        ),
-    ],
+    out: Annotated[Path, output_option("--out", "DIR", "The training's folder; made if missing.")],
     variant: Annotated[Literal["l", "s"] | None, typer.Option("--variant", help="Large or small network.")] = None,
     attention: Annotated[
         Literal["eca", "se"] | None, typer.Option("--attention", help="Attention to channels.")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from droguekit.cli.arguments import DatasetArgument, local_path, parse_frames
+from droguekit.cli.arguments import DatasetArgument, output_option, parse_frames
 from droguekit.cli.main import FAULT
 
 EXAMPLES = (
@@ -27,14 +27,7 @@ def view(
         str | None, typer.Option("--frames", metavar="A:B", help="Only frames from A up to B - 1.")
     ] = None,
     save: Annotated[
-        Path | None,
-        typer.Option(
-            "--save",
-            metavar="FILE.rrd",
-            parser=str,
-            callback=local_path,
-            help="Write a recording instead of opening the viewer.",
-        ),
+        Path | None, output_option("--save", "FILE.rrd", "Write a recording instead of opening the viewer.")
     ] = None,
 ) -> None:
     """Show a dataset in the rerun viewer: both eyes, boxes and markers, the drogue in 3-D, errors over time.

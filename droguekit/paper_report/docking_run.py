@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.estimates import Estimate, PoseEstimate
-from datasets_manifest.manifest import Manifest
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
 from datasets_manifest.storage import Location
@@ -18,9 +17,7 @@ from droguekit.benchmark.benchmark import score
 from droguekit.benchmark.frame_truth import drogue_truth
 from droguekit.benchmark.pose_errors import pose_error
 from droguekit.benchmark.result import BenchmarkResult, DatasetFacts
-from droguekit.paper_report.contenders import Contender
-from droguekit.paper_report.estimates_file import EstimatesFile, read_estimates_file
-from droguekit.paper_report.provenance import source_text
+from droguekit.paper_report.estimates_file import NavigatedData, read_estimates_file
 from geometry.se3 import Array, RigidTransform
 
 
@@ -43,41 +40,22 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
-class DockingData:
+class DockingData(NavigatedData):
     """Everything that the page needs of the docking runs.
 
     Attributes:
-        dataset: that was navigated.
-        file: the estimates on it.
         records: of every pair that shows a drogue, by frame.
         first_frames: first pair of every sequence, whether it shows a drogue or not; None stands for no sequence.
         result: scores of the contenders.
     """
 
-    dataset: Dataset
-    file: EstimatesFile
     records: Mapping[int, PairRecord]
     first_frames: Mapping[int | None, int]
     result: BenchmarkResult
 
     @property
-    def manifest(self) -> Manifest:
-        """Of the dataset."""
-        return self.dataset.manifest
-
-    @property
-    def source(self) -> str:
-        """What the dataset is called and which engines made it."""
-        return source_text(self.manifest)
-
-    @property
-    def contenders(self) -> list[Contender]:
-        """Those of which there are estimates."""
-        return self.file.contenders
-
-    @property
     def methods(self) -> Mapping[str, Mapping[int, Estimate]]:
-        """Their estimates by method and frame."""
+        """The contenders' estimates by method and frame."""
         return self.file.methods
 
     def pose_errors(self, method: str) -> dict[int, Array]:

@@ -1,4 +1,4 @@
-"""A file of estimates, read once: the contenders' estimates in it, and its hash."""
+"""A file of estimates, read once: the contenders' estimates in it, and its hash; and the dataset that they are of."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datasets_manifest.estimates import Estimate, read_estimates
+from datasets_manifest.manifest import Manifest
+from datasets_manifest.reader import Dataset
 from droguekit.benchmark.pose_errors import by_method
 from droguekit.paper_report.contenders import CONTENDERS, Contender, present
-from droguekit.paper_report.provenance import file_sha256
+from droguekit.paper_report.provenance import file_sha256, source_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +28,33 @@ class EstimatesFile:
     sha256: str
     methods: Mapping[str, Mapping[int, Estimate]]
 
+
+@dataclass(frozen=True, eq=False)
+class NavigatedData:
+    """A dataset with estimates.
+
+    Attributes:
+        dataset: that was navigated.
+        file: the estimates on it.
+    """
+
+    dataset: Dataset
+    file: EstimatesFile
+
+    @property
+    def manifest(self) -> Manifest:
+        """Of the dataset."""
+        return self.dataset.manifest
+
+    @property
+    def source(self) -> str:
+        """What the dataset is called and which engines made it."""
+        return source_text(self.manifest)
+
     @property
     def contenders(self) -> list[Contender]:
         """Those of which there are estimates."""
-        return present(self.methods)
+        return present(self.file.methods)
 
 
 def read_estimates_file(path: Path, frame_indices: Sequence[int]) -> EstimatesFile:

@@ -79,8 +79,8 @@ def build_page(inputs: ReportInputs) -> str:
     if not (docking or bench or detection or corpus):
         raise ValueError("report: nothing to report on; give --docking, --semi-physical, --detection or --corpus")
     facts = code_facts()
-    for manifest, file in [*((d.manifest, d.file) for d in docking), *((run.manifest, run.file) for run in bench)]:
-        facts += [*dataset_facts(manifest), (f"Estimates {file.path.name}", file.sha256)]
+    for data in (*docking, *bench):
+        facts += [*dataset_facts(data.manifest), (f"Estimates {data.file.path.name}", data.file.sha256)]
     if detection is not None and inputs.detection is not None:
         facts += _detection_facts(detection, inputs.detection)
     if corpus is not None:

@@ -14,6 +14,10 @@ from pathlib import Path
 from datasets_manifest.atomic import write_bytes_atomic
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+NO_BROWSER = (
+    f"none of {', '.join(BROWSERS)} is on the search path; install one (apt-get install chromium), "
+    "or print the page from any browser"
+)
 TIMEOUT_S = 120.0
 
 
@@ -36,10 +40,7 @@ def print_pdf(page: str, out: Path, timeout_s: float = TIMEOUT_S) -> None:
     """
     browser = find_browser()
     if browser is None:
-        raise ValueError(
-            f"{out}: a PDF needs Chromium or Chrome, and none of {', '.join(BROWSERS)} is on the search path; "
-            "install one (apt-get install chromium), or print the page from any browser"
-        )
+        raise ValueError(f"{out}: a PDF needs Chromium or Chrome, and {NO_BROWSER}")
     # Beside the PDF and by a plain name: a browser in a container of its own, as from snap, has another /tmp and sees
     # no hidden folders.
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +68,7 @@ def _command(browser: str, page: Path, printed: Path, profile: Path) -> list[str
 
 def _run(command: Sequence[str], timeout_s: float, out: Path) -> str:
     """Run the browser to its end; what it says on the error stream."""
-    # In a session of its own, so that the processes which it starts end with it.
+    # In a process group of its own, so that the processes which it starts end with it.
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
     ) as process:

@@ -14,6 +14,7 @@ from droguekit.benchmark.detection_result import DetectionResult
 from droguekit.benchmark.detection_speed import is_timed, speed_panel
 from droguekit.benchmark.figures import MethodStyle, legend_key, method_styles
 from droguekit.benchmark.number_text import ABSENT, plain_number, three_digits
+from droguekit.benchmark.sequence_latency import worked_s
 from droguekit.paper_report.contenders import FILTERED, OURS, PAPER, Contender, absent, style_of
 from droguekit.paper_report.corpus_figures import CorpusBoxes, place_panel, shape_panel, size_panel
 from droguekit.paper_report.docking_run import DockingData, Run
@@ -151,7 +152,7 @@ def failures(docking: DockingData) -> list[tuple[str, str, int]]:
 
 
 def time_rows(docking: DockingData) -> list[list[str]]:
-    """Median time by method, in all and by stage, and percentiles of the latency, where the file has them. [ms]"""
+    """Median time by method, without waiting and by stage, and percentiles of the latency, where they are told. [ms]"""
     rows = []
     for contender in docking.contenders:
         estimates = docking.methods[contender.method].values()
@@ -161,7 +162,8 @@ def time_rows(docking: DockingData) -> list[list[str]]:
         for estimate in estimates:
             for stage, seconds in estimate.stage_s.items():
                 stages.setdefault(stage, []).append(1e3 * seconds)
-        totals = [1e3 * sum(estimate.stage_s.values()) for estimate in estimates if estimate.stage_s]
+        work = [worked_s(estimate.stage_s) for estimate in estimates]
+        totals = [1e3 * work_s for work_s in work if work_s is not None]
         if totals or told:
             listed = ", ".join(f"{stage} {_median(times)}" for stage, times in stages.items())
             rows.append([contender.method, _median(totals), " / ".join(told) or ABSENT, listed or ABSENT])

@@ -9,14 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from datasets_manifest.estimates import Estimate, Feature, PoseEstimate
-from datasets_manifest.manifest import Manifest
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
 from datasets_manifest.storage import Location
 from drogue_models.marker_layout import marker_layout
-from droguekit.paper_report.contenders import Contender
-from droguekit.paper_report.estimates_file import EstimatesFile, read_estimates_file
-from droguekit.paper_report.provenance import source_text
+from droguekit.paper_report.estimates_file import NavigatedData, read_estimates_file
 from geometry.se3 import Array
 
 # Centroids lie within a pixel of their markers. Five markers in the place of seven lie 10 degrees off in the median, on
@@ -56,32 +53,18 @@ class StationErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class SemiPhysicalRun:
+class SemiPhysicalRun(NavigatedData):
     """One dataset of the experiment.
 
     Attributes:
-        manifest: of the dataset.
-        file: the estimates on it.
         markers: of the drogue.
         stations_m: (S,) ascending. [m]
         methods: by name.
     """
 
-    manifest: Manifest
-    file: EstimatesFile
     markers: int
     stations_m: Array
     methods: Mapping[str, StationErrors]
-
-    @property
-    def source(self) -> str:
-        """What the dataset is called and which engines made it."""
-        return source_text(self.manifest)
-
-    @property
-    def contenders(self) -> list[Contender]:
-        """Those of which there are estimates."""
-        return self.file.contenders
 
 
 def read_semi_physical(dataset: Location, estimates: Path) -> SemiPhysicalRun:
@@ -104,7 +87,7 @@ def read_semi_physical(dataset: Location, estimates: Path) -> SemiPhysicalRun:
     _check_markers(file.methods, shown, markers, f"{estimates}, for {dataset}")
     places = np.array(sorted(stations))
     methods = {name: _station_errors(records, of_method, places) for name, of_method in file.methods.items()}
-    return SemiPhysicalRun(data.manifest, file, markers, places, methods)
+    return SemiPhysicalRun(data, file, markers, places, methods)
 
 
 def _check_markers(

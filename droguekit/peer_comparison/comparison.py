@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from datasets_manifest.atomic import write_text_atomic
 from droguekit.batch.workers import run_alone
 from droguekit.peer_comparison.noise_search import Cost, NoiseAt
 from droguekit.peer_comparison.own_path import measure_own_path
@@ -55,11 +56,7 @@ def station_file(out: Path, distance_m: float) -> Path:
 
 def write_station(out: Path, found: dict[str, Any]) -> None:
     """Keep what was found at a distance; a file is there whole or not at all."""
-    out.mkdir(parents=True, exist_ok=True)
-    file = station_file(out, found["distance_m"])
-    part = file.with_suffix(".part")
-    part.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    part.replace(file)
+    write_text_atomic(station_file(out, found["distance_m"]), json.dumps(found, indent=1) + "\n")
 
 
 def read_station(out: Path, distance_m: float, seed: int, full_samples: int | None) -> dict[str, Any] | None:

@@ -25,14 +25,14 @@ class ShownPair(NamedTuple):
     record: PairRecord | None
 
 
-class PairSource(NamedTuple):
+class ShownPairs(NamedTuple):
     """The indices of a dataset's pairs, ascending, and how to read one."""
 
     frame_indices: tuple[int, ...]
     read: Callable[[int], ShownPair]
 
 
-def open_pairs(dataset: Location) -> PairSource:
+def open_pairs(dataset: Location) -> ShownPairs:
     """The pairs of a dataset, with or without truth.
 
     Raises:
@@ -45,7 +45,7 @@ def open_pairs(dataset: Location) -> PairSource:
             pair = blind.pair(index)
             return ShownPair(index, pair.images, pair.rig, pair.drogue, None)
 
-        return PairSource(blind.frame_indices, read_blind)
+        return ShownPairs(blind.frame_indices, read_blind)
     source = Dataset(dataset)
 
     def read(index: int) -> ShownPair:
@@ -53,4 +53,4 @@ def open_pairs(dataset: Location) -> PairSource:
         drogue = record.frame.drogue or record.frame.sought or source.manifest.recipe.drogue
         return ShownPair(index, source.images(index), record.frame.rig, drogue, record)
 
-    return PairSource(source.frame_indices, read)
+    return ShownPairs(source.frame_indices, read)

@@ -18,7 +18,7 @@ import rerun as rr
 from datasets_manifest.atomic import part_path
 from datasets_manifest.estimates import Estimate
 from droguekit.batch.progress import ProgressReport
-from droguekit.viewing.pair_sources import PairSource
+from droguekit.viewing.pair_sources import ShownPairs
 from droguekit.viewing.recording import APPLICATION, PairRecorder, blueprint
 
 # Only this machine may tell the viewer anything.
@@ -36,7 +36,7 @@ class ViewSummary:
 
 
 def view_pairs(
-    source: PairSource,
+    source: ShownPairs,
     frames: Sequence[int],
     answers: Mapping[str, Mapping[int, Estimate]],
     save: Path | None,
@@ -118,7 +118,7 @@ def _answers(port: int) -> bool:
 
 def _tell(
     recording: rr.RecordingStream,
-    source: PairSource,
+    source: ShownPairs,
     frames: Sequence[int],
     answers: Mapping[str, Mapping[int, Estimate]],
     report: ProgressReport,

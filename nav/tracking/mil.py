@@ -15,7 +15,8 @@ from nav.detector.interface import Detection
 from nav.tracking.likeness import ALIKE, Likeness
 from nav.tracking.region import Box, EyeImage, ImageRegion, box_around, box_center, box_size, image_region
 
-# MIL loses one box in ten over the edge of an image at once, which ones is a matter of the draws.
+# Any will do. With each of them MIL loses at once one in ten of the boxes that reach over an image's edge; which ones
+# changes with the seed.
 _SEED = 5
 # The box is looked at with so many pixels across it, not enlarged.
 _GRID = 64

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -92,6 +93,31 @@ def test_plan_counts_without_rendering(capsys: pytest.CaptureFixture[str]) -> No
 def test_doctor_names_the_engine_that_works(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["doctor"]) == DONE
     assert re.search(r"^engine +mitsuba works as (llvm_ad_rgb|scalar_rgb): ", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_doctor_names_viewer_and_browser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("droguekit.cli.doctor._show_engines", lambda: True)
+    monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(__version__="0.99.1"))
+    (tmp_path / "chromium").touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert run(["doctor"]) == DONE
+    shown = capsys.readouterr().out
+    assert re.search(r"^viewer +rerun 0\.99\.1, for droguekit view$", shown, re.MULTILINE)
+    assert re.search(rf"^browser +{tmp_path}/chromium, for droguekit report --pdf$", shown, re.MULTILINE)
+
+
+def test_doctor_tells_how_to_get_viewer_and_browser_and_finds_no_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("droguekit.cli.doctor._show_engines", lambda: True)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert run(["doctor"]) == DONE
+    shown = capsys.readouterr().out
+    assert re.search(r"^viewer +rerun is optional: .*; pip install 'droguekit\[viz\]'$", shown, re.MULTILINE)
+    assert re.search(r"^browser +Chromium is optional: .*apt-get install chromium", shown, re.MULTILINE)
 
 
 @pytest.mark.mitsuba

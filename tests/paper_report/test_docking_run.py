@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.estimates import read_estimates, write_estimates
 from datasets_manifest.reader import Dataset
 from drogue_models.marker_layout import marker_layout
 from droguekit.benchmark.number_text import ABSENT
@@ -80,6 +81,15 @@ def test_filtered_poses_have_no_interval(docking: Path, estimates_of: WriteEstim
 def test_times_are_medians_of_the_pairs(docking: Path, estimates_of: WriteEstimates) -> None:
     data = read_docking(docking, estimates_of(docking, OFFSETS))
     assert time_rows(data) == [[m, "12.0", ABSENT, "detect 10.0, pose 2.00"] for m in ("joint-hub", "paper")]
+
+
+def test_times_of_a_pair_leave_out_waiting(docking: Path, estimates_of: WriteEstimates) -> None:
+    path = estimates_of(docking, {"paper": OFFSETS["paper"]})
+    waiting = {"read": 0.512, "wait": 0.256, "handover": 0.128, "track": 0.004, "pose": 0.002}
+    told = [estimate.model_copy(update={"stage_s": waiting}) for estimate in read_estimates(path)]
+    write_estimates(path, told)
+    (row,) = time_rows(read_docking(docking, path))
+    assert row == ["paper", "6.00", ABSENT, "read 512, wait 256, handover 128, track 4.00, pose 2.00"]
 
 
 def test_a_file_without_any_contender_is_refused(docking: Path, estimates_of: WriteEstimates) -> None:
