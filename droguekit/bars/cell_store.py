@@ -13,15 +13,16 @@ from droguekit.bars.monte_carlo import Cell, CellResult, run_cell
 from droguekit.bars.reporter import Reporter
 
 CELLS_FILE = "cells.json"
+_MAKE_RESULTS = {".py", ".onnx"}
 _ROOMS = ("geometry", "drogue_models", "nav", "droguekit.bars", "droguekit.benchmark")
 
 
 def code_fingerprint(rooms: Sequence[str] = _ROOMS) -> str:
-    """Hash of the sources on which results rest: other code makes other results."""
+    """Hash of the sources and networks on which results rest: others make other results."""
     digest = hashlib.sha256()
     for room in rooms:
         folder = Path(str(files(room)))
-        for path in sorted(folder.rglob("*.py")):
+        for path in sorted(path for path in folder.rglob("*") if path.suffix in _MAKE_RESULTS):
             digest.update(f"{room}/{path.relative_to(folder).as_posix()}\0".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()
