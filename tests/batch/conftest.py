@@ -16,14 +16,12 @@ from datasets_manifest.recipe import parse_recipe
 from droguekit.batch.local import RunSummary, Spread, render_dataset
 from droguekit.batch.progress import PlainProgress
 
-TINY_RECIPE = """
+from ..small_datasets import RIG_160_PX, RIG_320_PX
+
+TINY_RECIPE = f"""
 name = "tiny"
 seed = 5
-[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.0
+{RIG_320_PX}
 [frames]
 count = 4
 scenes = 2
@@ -89,14 +87,10 @@ class TroubledEngine(AnalyticEngine):
 """
 
 # Pairs of 160 x 120 pixels without a renderer.
-QUICK_RECIPE = """
+QUICK_RECIPE = f"""
 name = "quick"
 seed = 5
-[rig]
-preset = "rgb-ideal"
-width_px = 160
-height_px = 120
-focal_px = 266.0
+{RIG_160_PX}
 [frames]
 count = 8
 scenes = 2

@@ -25,25 +25,9 @@ from droguekit.browse.browse import write_browse
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.se3 import RigidTransform
 
-RECIPE = """
-name = "tiny"
-seed = 2
-[rig]
-preset = "rgb-ideal"
-width_px = 160
-height_px = 120
-focal_px = 266.0
-[frames]
-count = 4
-scenes = 2
-empty_fraction = 0.3
-[distance]
-law = "uniform"
-low_m = 2.0
-high_m = 5.0
-[render]
-engine = "analytic"
-"""
+from ..small_datasets import rendered, single_pairs_recipe
+
+RECIPE = single_pairs_recipe(2)
 
 
 def told() -> PlainProgress:
@@ -52,9 +36,7 @@ def told() -> PlainProgress:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("tiny") / "dataset"
-    render_dataset(parse_recipe(RECIPE), RECIPE, out, range(4), 0, told())
-    return out
+    return rendered(RECIPE, tmp_path_factory.mktemp("tiny") / "dataset")
 
 
 def catalogue(page: Path) -> dict[str, Any]:
@@ -117,19 +99,17 @@ def test_a_second_run_keeps_pictures_and_makes_missing_ones(tiny: Path, tmp_path
 
 
 def test_pictures_of_other_pixels_are_replaced(tiny: Path, tmp_path: Path) -> None:
-    other = RECIPE.replace("seed = 2", "seed = 3")
-    render_dataset(parse_recipe(other), other, tmp_path / "other", range(4), 0, told())
+    other = rendered(single_pairs_recipe(3), tmp_path / "other")
     write_browse(tiny, tmp_path / "page", None, 0, told())
-    assert write_browse(tmp_path / "other", tmp_path / "page", None, 0, told()).kept == 0
-    write_browse(tmp_path / "other", tmp_path / "fresh", None, 0, told())
+    assert write_browse(other, tmp_path / "page", None, 0, told()).kept == 0
+    write_browse(other, tmp_path / "fresh", None, 0, told())
     assert contents(tmp_path / "page") == contents(tmp_path / "fresh")
 
 
 def test_a_run_that_is_stopped_leaves_the_page_as_it_was(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other, page = RECIPE.replace("seed = 2", "seed = 3"), tmp_path / "page"
-    render_dataset(parse_recipe(other), other, tmp_path / "other", range(4), 0, told())
+    other, page = rendered(single_pairs_recipe(3), tmp_path / "other"), tmp_path / "page"
     write_browse(tiny, page, None, 0, told())
     before = contents(page)
     steps = iter(range(2))
@@ -140,7 +120,7 @@ def test_a_run_that_is_stopped_leaves_the_page_as_it_was(
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_browse(tmp_path / "other", page, None, 0, Stopped(io.StringIO()))
+        write_browse(other, page, None, 0, Stopped(io.StringIO()))
     after = contents(page)
     assert len(after) > len(before) and {name: after[name] for name in before} == before
     write_browse(tiny, page, None, 0, told())
@@ -148,14 +128,9 @@ def test_a_run_that_is_stopped_leaves_the_page_as_it_was(
 
 
 def test_a_false_fix_is_drawn_as_the_drogue_that_was_looked_for(tmp_path: Path) -> None:
-    text = (
-        RECIPE.replace("empty_fraction = 0.3", "empty_fraction = 0.5")
-        .replace("count = 4", "count = 6")
-        .replace("scenes = 2", "scenes = 6")
-    )
+    text = single_pairs_recipe(2, count=6, scenes=6, empty_fraction=0.5)
     text += '[target]\nvariants = [{ drogue = "red-8" }, { drogue = "white-5" }]\n'
-    render_dataset(parse_recipe(text), text, tmp_path / "dataset", range(6), 0, told())
-    dataset = Dataset(tmp_path / "dataset")
+    dataset = Dataset(rendered(text, tmp_path / "dataset"))
     write_browse(tmp_path / "dataset", tmp_path / "page", None, 0, told())
     drogues, empty, named = catalogue(tmp_path / "page")["drogues"], 0, set()
     for index in dataset.frame_indices:

@@ -16,6 +16,8 @@ from typing import Any, Literal, NamedTuple
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, sync_playwright
 
+from .browsed_dataset import BrowsedDataset, browse_dataset
+
 PHONE_PX = 360
 DESKTOP_PX = 1280
 
@@ -274,3 +276,9 @@ def open_page(browser: Browser) -> Iterator[OpenPage]:
     yield opened
     for context in contexts:
         context.close()
+
+
+@pytest.fixture(scope="session")
+def browsed(tmp_path_factory: pytest.TempPathFactory) -> BrowsedDataset:
+    """Twelve pairs with estimates of several methods, and their page; to be read only (copy it to damage it)."""
+    return browse_dataset(tmp_path_factory.mktemp("<b>&amp; 'page\" #1%20"))

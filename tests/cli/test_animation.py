@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,42 +11,15 @@ import pytest
 from PIL import Image
 
 from datasets_manifest.reader import Dataset
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import render_dataset
-from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, run
 from labelgen.dataset_validation import validate_dataset
 
-RECIPE = """
-name = "tiny-docking"
-seed = 3
-[rig]
-preset = "rgb-ideal"
-width_px = 160
-height_px = 120
-focal_px = 266.0
-[frames]
-count = 12
-scenes = 2
-[sequence]
-frames_per_sequence = 6
-frame_rate_hz = 2
-[sequence.receiver]
-start_m = 2.4
-end_m = 1.7
-closure_m_s = 1.0
-hold_s = 0.0
-[render]
-engine = "analytic"
-"""
+from ..small_datasets import docking_recipe, rendered
 
 
 @pytest.fixture(scope="module")
 def docking(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out, told = tmp_path_factory.mktemp("docking") / "dataset", io.StringIO()
-    summary = render_dataset(parse_recipe(RECIPE), RECIPE, out, range(12), 0, PlainProgress(told))
-    assert summary.drops == (), told.getvalue()
-    return out
+    return rendered(docking_recipe(sequences=2), tmp_path_factory.mktemp("docking") / "dataset")
 
 
 def test_a_rendered_sequence_is_sound_and_says_what_is_in_view(docking: Path) -> None:

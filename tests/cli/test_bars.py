@@ -28,14 +28,12 @@ from droguekit.cli.bars_pipeline import (
 from droguekit.cli.main import WRONG_INPUT, run
 from nav.runner import method_names
 
-RECIPE = """
+from ..small_datasets import RIG_320_PX
+
+RECIPE = f"""
 name = "small-flights"
 seed = 3
-[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.0
+{RIG_320_PX}
 [frames]
 count = 20
 scenes = 1
@@ -63,13 +61,9 @@ onset_s = 0.16
 """
 
 # A drogue that hangs steeply, and receivers of all attitudes: with seed 10 the second one does not look into the mouth.
-TURNED = """
+TURNED = f"""
 name = "turned"
-[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.0
+{RIG_320_PX}
 [frames]
 count = 2
 [pose]
@@ -80,7 +74,8 @@ engine = "analytic"
 frames_per_sequence = 2
 turbulence = "none"
 release_m = [0.5, 0, -1.5]
-hose = { preset = "small-uav", airspeed_m_s = 3 }
+hose.preset = "small-uav"
+hose.airspeed_m_s = 3
 [sequence.receiver]
 manoeuvres = ["station"]
 start_m = 3.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,23 +12,18 @@ from PIL import Image
 
 from datasets_manifest.estimates import Estimate, Feature, NoFix, PoseEstimate, write_estimates
 from datasets_manifest.reader import Dataset
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import render_dataset
-from droguekit.batch.progress import PlainProgress
 from droguekit.benchmark.label_drawing import Rgb
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.cli.overlay_video import ESTIMATE_RGB, TRUE_RGB, draw_overlay, write_overlay_video
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
 
-RECIPE = """
+from ..small_datasets import RIG_320_PX, rendered
+
+RECIPE = f"""
 name = "flight"
 seed = 5
-[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.0
+{RIG_320_PX}
 [frames]
 count = 6
 scenes = 2
@@ -48,8 +42,7 @@ OFFSET_M = np.array([0.4, 0.0, 0.0])
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("flight") / "dataset"
-    render_dataset(parse_recipe(RECIPE), RECIPE, out, range(6), 0, PlainProgress(io.StringIO()))
+    out = rendered(RECIPE, tmp_path_factory.mktemp("flight") / "dataset")
     assert any(entry.empty for entry in Dataset(out).manifest.frames)
     return out
 

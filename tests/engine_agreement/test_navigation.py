@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from datasets_manifest.reader import Dataset
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import render_dataset
 from droguekit.batch.progress import PlainProgress
 from droguekit.engine_agreement.agreement import navigation_bars
 from droguekit.engine_agreement.navigation import (
@@ -21,6 +19,8 @@ from droguekit.engine_agreement.navigation import (
     station_recipe,
 )
 from droguekit.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios
+
+from ..small_datasets import rendered
 
 
 def drawn(seed, other_size=1.0, shift=0.0):
@@ -113,9 +113,7 @@ samples_per_px = 4
 
 
 def small_dataset(folder, engine, seed=1):
-    text = SMALL % (seed, engine)
-    render_dataset(parse_recipe(text), text, folder, [0], 0, PlainProgress(io.StringIO()))
-    return folder
+    return rendered(SMALL % (seed, engine), folder)
 
 
 def test_datasets_of_other_frames_are_refused(tmp_path):

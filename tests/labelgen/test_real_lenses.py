@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-
 import cv2
 import numpy as np
 import pytest
@@ -11,8 +9,6 @@ import pytest
 from datasets_manifest.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID
-from droguekit.batch.local import render_dataset
-from droguekit.batch.progress import PlainProgress
 from geometry.stereo import EYES
 from labelgen.dataset_validation import validate_dataset
 from labelgen.frame_labels import label_frame
@@ -21,6 +17,8 @@ from render.engine import load_engine
 from render.optics import light_on_sensor
 from render.sensor import expose
 from scenes.sampler import sample_frame
+
+from ..small_datasets import rendered
 
 TABLE = """
 name = "real-lenses"
@@ -97,7 +95,5 @@ def test_vignetting_of_real_eyes_is_centred_on_their_axes(made):
 
 
 def test_a_dataset_of_real_eyes_is_valid(tmp_path):
-    recipe = parse_recipe(TABLE % SMALL)
-    summary = render_dataset(recipe, TABLE % SMALL, tmp_path / "set", range(2), 0, PlainProgress(io.StringIO()))
-    assert summary.drops == ()
-    assert validate_dataset(tmp_path / "set").faults == []
+    dataset = rendered(TABLE % SMALL, tmp_path / "set", range(2))
+    assert validate_dataset(dataset).faults == []

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import io
-
 import pytest
 from pycocotools.coco import COCO
 
 from datasets_manifest.blind import BlindDataset
 from datasets_manifest.reader import Dataset
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import render_dataset
-from droguekit.batch.progress import PlainProgress
 from labelgen.dataset_validation import validate_dataset
 
-TABLE = """
+from ..small_datasets import RIG_320_PX, rendered
+
+TABLE = f"""
 name = "variants"
 seed = 2
-[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.0
+{RIG_320_PX}
 [frames]
 count = 10
 scenes = 10
@@ -30,8 +23,11 @@ empty_fraction = 0.2
 law = "stations"
 stations_m = [2.0, 4.0]
 [target]
-variants = [{ drogue = "red-8" }, { drogue = "white-5" }]
 missing_marker_fraction = 0.2
+[[target.variants]]
+drogue = "red-8"
+[[target.variants]]
+drogue = "white-5"
 [render]
 engine = "analytic"
 """
@@ -39,11 +35,7 @@ engine = "analytic"
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    recipe = parse_recipe(TABLE)
-    folder = tmp_path_factory.mktemp("variants") / "set"
-    summary = render_dataset(recipe, TABLE, folder, range(10), 0, PlainProgress(io.StringIO()))
-    assert summary.drops == ()
-    return folder
+    return rendered(TABLE, tmp_path_factory.mktemp("variants") / "set")
 
 
 def test_it_is_valid(dataset):

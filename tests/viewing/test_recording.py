@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 import sys
 from pathlib import Path
@@ -16,53 +15,12 @@ import rerun as rr
 from datasets_manifest import layout
 from datasets_manifest.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from datasets_manifest.reader import Dataset
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import render_dataset
-from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.se3 import RigidTransform, rotation_from_angles
 
-RECIPE = """
-name = "tiny-docking"
-seed = 3
-[rig]
-preset = "rgb-ideal"
-width_px = 160
-height_px = 120
-focal_px = 266.0
-[frames]
-count = 6
-scenes = 1
-[sequence]
-frames_per_sequence = 6
-frame_rate_hz = 2
-[sequence.receiver]
-start_m = 2.4
-end_m = 1.7
-closure_m_s = 1.0
-hold_s = 0.0
-[render]
-engine = "analytic"
-"""
-SINGLE_PAIRS = """
-name = "single-pairs"
-seed = 3
-[rig]
-preset = "rgb-ideal"
-width_px = 160
-height_px = 120
-focal_px = 266.0
-[frames]
-count = 8
-scenes = 2
-empty_fraction = 0.4
-[distance]
-law = "uniform"
-low_m = 2.0
-high_m = 5.0
-[render]
-engine = "analytic"
-"""
+from ..small_datasets import docking_recipe, rendered, single_pairs_recipe
+
+SINGLE_PAIRS = single_pairs_recipe(3, count=8, empty_fraction=0.4)
 METHOD = "joint+filter/2"
 LOST = 3
 OFFSET_M = np.array([0.003, 0.0, 0.004])
@@ -71,9 +29,7 @@ TURN_DEG = 2.0
 
 @pytest.fixture(scope="module")
 def docking(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out, told = tmp_path_factory.mktemp("docking") / "dataset", io.StringIO()
-    render_dataset(parse_recipe(RECIPE), RECIPE, out, range(6), 0, PlainProgress(told))
-    return out
+    return rendered(docking_recipe(sequences=1), tmp_path_factory.mktemp("docking") / "dataset")
 
 
 @pytest.fixture(scope="module")
@@ -219,8 +175,7 @@ def test_without_a_pair_to_show_nothing_is_written(
 
 
 def test_the_distance_stops_where_there_is_no_drogue(tmp_path: Path) -> None:
-    recipe = SINGLE_PAIRS
-    render_dataset(parse_recipe(recipe), recipe, tmp_path / "dataset", range(8), 0, PlainProgress(io.StringIO()))
+    rendered(SINGLE_PAIRS, tmp_path / "dataset")
     out = tmp_path / "a.rrd"
     assert run(["view", str(tmp_path / "dataset"), "--save", str(out)]) == DONE
     dataset = Dataset(tmp_path / "dataset")
@@ -238,9 +193,7 @@ def test_the_distance_stops_where_there_is_no_drogue(tmp_path: Path) -> None:
 
 
 def test_frames_that_the_dataset_lacks_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    render_dataset(
-        parse_recipe(SINGLE_PAIRS), SINGLE_PAIRS, tmp_path / "dataset", range(0, 8, 7), 0, PlainProgress(io.StringIO())
-    )
+    rendered(SINGLE_PAIRS, tmp_path / "dataset", (0, 7))
     assert run(["view", str(tmp_path / "dataset"), "--frames", "2:5", "--save", str(tmp_path / "a.rrd")]) == WRONG_INPUT
     assert "--frames: the dataset holds none of these pairs, got 2:5" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["dataset"]

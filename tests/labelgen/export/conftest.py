@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration import write_calibration
 from datasets_manifest.frame import FrameSpec
-from datasets_manifest.manifest import build_manifest, write_manifest
 from datasets_manifest.recipe import Recipe, parse_recipe
-from datasets_manifest.writer import encode_files, write_frame
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform
-from labelgen.export.coco import write_annotations
 from scenes.sampler import sample_frame
+
+from ..drawn_pairs import Pair, write_drawn_dataset
 
 SMALL = """
 name = "mixed"
@@ -39,8 +37,6 @@ train = 0.4
 val = 0.3
 test = 0.3
 """
-
-DatasetMaker = Callable[[Path, Recipe, Iterable[FrameSpec]], Path]
 
 
 def small_recipe_of(preset: str, more: str = "") -> Recipe:
@@ -70,26 +66,7 @@ def moved(frame: FrameSpec, right_m: float) -> FrameSpec:
 
 
 @pytest.fixture(scope="session")
-def make_dataset(pairs: list) -> DatasetMaker:
-    """Draws frames and writes a whole dataset of them."""
-    draw = type(pairs[0])
-
-    def make(folder: Path, recipe: Recipe, frames: Iterable[FrameSpec]) -> Path:
-        for frame in frames:
-            pair = draw(frame)
-            parts = {"left": pair.radiance.left.part_id, "right": pair.radiance.right.part_id}
-            write_frame(folder, pair.record, encode_files(pair.images, parts))
-        splits = ("train", "val", "test")
-        write_manifest(folder, build_manifest(folder, recipe, "1", lambda scene_id: splits[scene_id % 3]))
-        write_calibration(folder, recipe.rig)
-        write_annotations(folder, folder / "annotations")
-        return folder
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def mixed_dataset(tmp_path_factory: pytest.TempPathFactory, make_dataset: DatasetMaker) -> Path:
+def mixed_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three drogues, empty frames, a drogue that both images cut off, and one that none shows; to be read only."""
     recipe = mixed_recipe()
     frames = [sample_frame(recipe, index) for index in range(recipe.frames.count)]
@@ -102,18 +79,16 @@ def mixed_dataset(tmp_path_factory: pytest.TempPathFactory, make_dataset: Datase
     x_m = frames[cut].left_from_drogue.translation_m[0]
     frames[cut] = moved(frames[cut], 80 / 266 * z_m[cut] - x_m)
     frames[outside] = moved(frames[outside], 320 / 266 * z_m[outside])
-    return make_dataset(tmp_path_factory.mktemp("mixed") / "dataset", recipe, frames)
+    return write_drawn_dataset(tmp_path_factory.mktemp("mixed") / "dataset", recipe, map(Pair, frames))
 
 
 @pytest.fixture(scope="session")
-def dataset_by_preset(
-    tmp_path_factory: pytest.TempPathFactory, make_dataset: DatasetMaker
-) -> Callable[[str, str], Path]:
+def dataset_by_preset(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
     """A dataset of three pairs by a rig; to be read only."""
 
     def make(preset: str, more: str = "") -> Path:
         recipe = small_recipe_of(preset, more)
-        frames = [sample_frame(recipe, index) for index in range(3)]
-        return make_dataset(tmp_path_factory.mktemp(preset) / "dataset", recipe, frames)
+        drawn = [Pair(sample_frame(recipe, index)) for index in range(3)]
+        return write_drawn_dataset(tmp_path_factory.mktemp(preset) / "dataset", recipe, drawn)
 
     return make

@@ -1,0 +1,133 @@
+"""Damaged files, each through the functions that read it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from datasets_manifest.calibration import opencv_stereo
+from datasets_manifest.estimates import read_estimates
+from datasets_manifest.importers.ros_bag import RosBag
+from datasets_manifest.importers.stereo_calibration import read_opencv_stereo, rig_of_calibration
+from datasets_manifest.layout import frame_folder
+from datasets_manifest.manifest import read_manifest
+from datasets_manifest.passes import decode_exr, read_passes
+from datasets_manifest.png import decode_png
+from datasets_manifest.recipe import load_recipe, parse_recipe
+from datasets_manifest.rigs import resolve_rig
+from labelgen.export.formats import write_export
+from labelgen.export.log import ExportLog
+from scenes.sampler import sample_frame
+from scenes.surroundings import surroundings
+
+from .strategies import HOSTILE, byte_edits, fuzz, json_edits, quietly
+from .whole_dataset import RECIPE
+
+
+@fuzz(60)
+@given(edits=st.lists(byte_edits(), min_size=1, max_size=3), swap=st.tuples(st.integers(0, 400), HOSTILE))
+def test_damaged_recipes(edits, swap):
+    text = load_recipe("smoke")[1] if swap[0] % 2 else RECIPE
+    lines = text.splitlines()
+    line = swap[0] % len(lines)
+    if " = " in lines[line]:
+        key, _, _ = lines[line].partition(" = ")
+        lines[line] = f"{key} = {json.dumps(swap[1])}"
+    data = "\n".join(lines).encode("utf-8", "surrogatepass")
+    for edit in edits[1:]:
+        data = edit(data)
+    damaged = data.decode("utf-8", "replace")
+
+    def use():
+        recipe = parse_recipe(damaged)
+        sample_frame(recipe, 0)
+
+    quietly(use)
+
+
+@fuzz(30)
+@given(edit=st.one_of(byte_edits(), json_edits()), other=byte_edits(), is_once=st.booleans())
+def test_damaged_estimates(edit, other, is_once):
+    pose = np.eye(4).tolist()
+    line = json.dumps({"status": "fix", "frame_index": 0, "method": "mine", "left_from_drogue": pose}).encode()
+    data = edit(line) + b"\n" + line
+    with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
+        path = Path(place) / "estimates.jsonl"
+        path.write_bytes(data if is_once else other(data))
+        quietly(lambda: list(read_estimates(path)))
+
+
+@fuzz(30)
+@given(edit=byte_edits(), other=byte_edits(), suffix=st.sampled_from([".exr", ".hdr"]))
+def test_damaged_environment_maps(edit, other, suffix):
+    picture = np.full((8, 16, 3), 500.0, np.float32)
+    with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
+        path = Path(place) / f"map{suffix}"
+        if suffix == ".hdr":
+            cv2.imwrite(str(path), picture)
+        else:
+            OpenEXR.File({}, {name: picture[..., 0].copy() for name in "RGB"}).write(str(path))
+        path.write_bytes(edit(other(path.read_bytes())))
+        text = RECIPE.replace("[environment.clouds]", f'[environment]\nmap = "{path.name}"\n[environment.clouds]')
+        quietly(lambda: surroundings(sample_frame(parse_recipe(text, Path(place)), 0).environment))
+
+
+@pytest.fixture(scope="module")
+def bag(whole):
+    """The dataset as a ROS 2 bag."""
+    write_export("rosbag", whole, whole.with_name("bag"), ExportLog())
+    (file,) = whole.with_name("bag").rglob("*.mcap")
+    return file.parent
+
+
+@fuzz(40)
+@given(edit=byte_edits(), other=byte_edits(), name=st.sampled_from([".mcap", ".mcap", "metadata.yaml"]))
+def test_damaged_bags(bag, edit, other, name):
+    with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
+        copy = Path(place) / "bag"
+        shutil.copytree(bag, copy)
+        path = next(path for path in copy.iterdir() if path.name.endswith(name))
+        path.write_bytes(edit(other(path.read_bytes())))
+
+        def use():
+            source = RosBag(copy)
+            assert len(list(source)) == source.count
+            rig_of_calibration(source.calibration())
+
+        quietly(use)
+
+
+@fuzz(30)
+@given(edit=byte_edits(), other=byte_edits())
+def test_damaged_images(whole, edit, other):
+    for name in ("left.png", "right_parts.png"):
+        data = (frame_folder(whole, 0) / name).read_bytes()
+        quietly(lambda data=data: decode_png(edit(other(data)), "image"))
+
+
+@fuzz(40)
+@given(edit=byte_edits(), other=byte_edits())
+def test_damaged_passes(whole, edit, other):
+    data = edit(other((frame_folder(whole, 0) / "left.exr").read_bytes()))
+    camera = read_manifest(whole).recipe.rig.camera
+    quietly(lambda: read_passes(data, "passes", camera))
+    quietly(lambda: decode_exr(data))
+
+
+@fuzz(20)
+@given(edit=byte_edits(), other=byte_edits())
+def test_damaged_calibrations(edit, other):
+    text = opencv_stereo(resolve_rig("paper-real", 3)[0])
+    with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
+        path = Path(place) / "calibration.yaml"
+        path.write_bytes(edit(other(text.encode())))
+        quietly(lambda: rig_of_calibration(read_opencv_stereo(path)))

@@ -1,0 +1,51 @@
+"""The dataset that is damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from datasets_manifest.calibration import write_calibration
+from datasets_manifest.manifest import build_manifest, write_manifest
+from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.writer import write_frame
+from droguekit.batch.frame_task import make_frame
+from labelgen.export.coco import write_annotations
+from render.engine import load_engine
+
+RECIPE = """
+name = "fuzz"
+seed = 5
+[rig]
+preset = "rgb-ideal"
+width_px = 48
+height_px = 36
+focal_px = 80.0
+[frames]
+count = 3
+scenes = 2
+empty_fraction = 0.3
+[distance]
+law = "stations"
+stations_m = [2.5]
+[environment.clouds]
+scene_fraction = 0.0
+[render]
+engine = "analytic"
+[outputs]
+exr = true
+[split]
+train = 0.5
+test = 0.5
+"""
+
+
+def write_whole_dataset(folder: Path) -> None:
+    """Three tiny pairs with EXR files, and all that stands beside them."""
+    recipe, engine = parse_recipe(RECIPE), load_engine("analytic")
+    for index in range(recipe.frames.count):
+        record, files, _ = make_frame(recipe, index, engine)
+        write_frame(folder, record, files)
+    write_manifest(folder, build_manifest(folder, recipe, "1", lambda scene_id: ("train", "test")[scene_id % 2]))
+    write_calibration(folder, recipe.rig)
+    write_annotations(folder, folder / "annotations")
+    (folder / "recipe.toml").write_text(RECIPE)
