@@ -68,6 +68,10 @@ class Dataset:
         """
         return self._parse_record(frame_index, self.frames.read(frame_index, RECORD_FILE))
 
+    def drogue_sought(self, record: PairRecord) -> DrogueParameters:
+        """What navigation looks for in a pair, whether it is there or not."""
+        return record.frame.drogue or record.frame.sought or self.manifest.recipe.drogue
+
     def _parse_record(self, frame_index: int, data: bytes) -> PairRecord:
         path = self.frames.where(frame_index, RECORD_FILE)
         table = _parse_table(data, path)

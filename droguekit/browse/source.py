@@ -99,7 +99,7 @@ class TruePairs(_Opened):
     def entry(self, frame_index: int) -> FrameEntry:
         """From its record."""
         known, record = self._known[frame_index], self._dataset.record(frame_index)
-        drogue = record.frame.drogue or record.frame.sought or self._dataset.manifest.recipe.drogue
+        drogue = self._dataset.drogue_sought(record)
         return frame_entry(record, drogue, known.split, known.record_sha256)
 
     def images(self, frame_index: int) -> StereoImages:

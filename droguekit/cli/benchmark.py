@@ -11,7 +11,7 @@ import typer
 from datasets_manifest.layout import BLIND_FILE
 from datasets_manifest.storage import Location, open_storage
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument
+from droguekit.cli.arguments import DatasetArgument, output_option
 from droguekit.cli.detection_pipelines import DetectionOrder, benchmark_detections
 from droguekit.cli.pipelines import benchmark_dataset, check_blind_dataset
 
@@ -49,8 +49,8 @@ def benchmark(
         float | None,
         typer.Option("--threshold", help="Detectors: score from which a box counts in recall and false alarms."),
     ] = None,
-    json_: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Gets the numbers.")] = None,
-    html: Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Gets the report, one page.")] = None,
+    json_: Annotated[Path | None, output_option("--json", "FILE", "Gets the numbers.")] = None,
+    html: Annotated[Path | None, output_option("--html", "FILE", "Gets the report, one page.")] = None,
 ) -> None:
     """Compare pose estimates, or a detector's boxes, with the truth of a dataset.
 

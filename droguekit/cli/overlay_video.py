@@ -94,7 +94,7 @@ def write_overlay_video(
     method, answers = estimates
 
     def draw(record: PairRecord) -> Picture:
-        drogue = record.frame.drogue or record.frame.sought or dataset.manifest.recipe.drogue
+        drogue = dataset.drogue_sought(record)
         index = record.frame_index
         return draw_overlay(record, dataset.images(index), drogue, method, answers.get(index))
 

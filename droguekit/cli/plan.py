@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from droguekit.batch.progress import duration
-from droguekit.cli.arguments import EngineOption, RecipeArgument, SeedOption, WorkersOption, human_size
+from droguekit.cli.arguments import EngineOption, RecipeArgument, SeedOption, WorkersOption, human_size, output_option
 from droguekit.cli.pipelines import open_recipe
 
 if TYPE_CHECKING:
@@ -41,9 +41,7 @@ def plan(
     ] = True,
     workers: WorkersOption = None,
     engine: EngineOption = None,
-    html: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write the plan with its plots as one page.")
-    ] = None,
+    html: Annotated[Path | None, output_option("--html", "FILE", "Write the plan with its plots as one page.")] = None,
 ) -> None:
     """Show what a recipe will make, how long it will take and how large it will get, without making it."""
     from droguekit.batch.machine import default_workers

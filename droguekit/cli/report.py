@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from datasets_manifest.storage import as_location
-from droguekit.cli.arguments import Place
+from droguekit.cli.arguments import Place, output_option
 
 if TYPE_CHECKING:
     from droguekit.paper_report.page import Navigated, ReportInputs
@@ -51,10 +51,8 @@ def report(
         Place | None,
         typer.Option("--corpus", metavar="DIR", parser=str, help="The detectors' dataset: Figure 10."),
     ] = None,
-    html: Annotated[Path | None, typer.Option("--html", metavar="FILE", help="Gets the page, one file.")] = None,
-    pdf: Annotated[
-        Path | None, typer.Option("--pdf", metavar="FILE", help="Gets it for print; needs Chromium or Chrome.")
-    ] = None,
+    html: Annotated[Path | None, output_option("--html", "FILE", "Gets the page, one file.")] = None,
+    pdf: Annotated[Path | None, output_option("--pdf", "FILE", "Gets it for print; needs Chromium or Chrome.")] = None,
 ) -> None:
     """Put our numbers beside the seed paper's: its tables and figures, as one page and as a PDF.
 

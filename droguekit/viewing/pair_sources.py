@@ -50,7 +50,7 @@ def open_pairs(dataset: Location) -> ShownPairs:
 
     def read(index: int) -> ShownPair:
         record = source.record(index)
-        drogue = record.frame.drogue or record.frame.sought or source.manifest.recipe.drogue
+        drogue = source.drogue_sought(record)
         return ShownPair(index, source.images(index), record.frame.rig, drogue, record)
 
     return ShownPairs(source.frame_indices, read)

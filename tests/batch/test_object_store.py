@@ -330,6 +330,10 @@ def test_places_that_cannot_be_used_are_one_clear_line(
         ),
         (["export", str(local), "--format", "coco", "--out", "s3://b/x"], "--out: must be a folder or file of this"),
         (["import", "x", "--out", "s3://b/x"], "--out: must be a folder or file of this machine, got s3://b/x"),
+        (["benchmark", str(local), "--json", "s3://b/x"], "--json: must be a folder or file of this machine"),
+        (["benchmark", str(local), "--html", "s3://b/x"], "--html: must be a folder or file of this machine"),
+        (["plan", "smoke", "--html", "s3://b/x"], "--html: must be a folder or file of this machine"),
+        (["report", "--corpus", str(local), "--pdf", "s3://b/x"], "--pdf: must be a folder or file of this machine"),
         (["train", "smoke", "--out", "s3://b/x"], "--out: must be a folder or file of this machine, got s3://b/x"),
         (["render", "smoke", "--out", "s4://b/x"], "s4://b/x: is no place that can be used: Protocol not known: s4"),
     ):
