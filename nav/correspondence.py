@@ -66,14 +66,14 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
         return Observation(rig, layout, *_beside_nothing(only, eye))
     upright = permutations[_turn_nearest_to_zero(rings[0], layout)]
     first = _markers(left, rings[0]).turned(upright)
-    others = [_markers(right, rings[1]).turned(permutation) for permutation in permutations]
+    second = _markers(right, rings[1])
     disparity_px = rig.baseline_m * rings[0].scale_px_per_m
-    costs = [_cost_px(first.centers_px, other.centers_px, disparity_px) for other in others]
+    costs = _costs_px(first.centers_px, second.centers_px[permutations], disparity_px)
     best = int(np.argmin(costs))
     gap_px = _smallest_gap_m(layout) * rings[0].scale_px_per_m
     if costs[best] > _LARGEST_COST_FRACTION * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
-    return Observation(rig, layout, *_without_bad_pairs(first, others[best]))
+    return Observation(rig, layout, *_without_bad_pairs(first, second.turned(permutations[best])))
 
 
 def no_ring(centroids: Centroids, eye: Eye) -> str:
@@ -111,16 +111,24 @@ def _turn_nearest_to_zero(ring: RingMatch, layout: MarkerLayout) -> int:
     return int(np.round(roll * order / (2 * np.pi))) % order
 
 
-def _cost_px(left_px: Array, right_px: Array, disparity_px: float) -> float:
-    """Root mean square of the row differences and of the disparities against the ring's size. [px]"""
-    difference = left_px - right_px - (disparity_px, 0.0)
-    both = np.isfinite(difference).all(axis=1)
-    return float(np.sqrt(np.mean(difference[both] ** 2))) if both.any() else np.inf
+def _costs_px(left_px: Array, right_px: Array, disparity_px: float) -> Array:
+    """(T,) root mean squares of row differences, and of disparities against the ring's size, infinite without pairs.
+
+    Args:
+        left_px: (N, 2) markers.
+        right_px: (T, N, 2) the same in every turn.
+        disparity_px: by the ring's size.
+    """
+    squares = (left_px - right_px - (disparity_px, 0.0)) ** 2
+    both = np.isfinite(squares)
+    count = both.sum(axis=(1, 2))
+    costs: Array = np.sqrt(np.where(both, squares, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1))
+    return np.where(count > 0, costs, np.inf)
 
 
 def _smallest_gap_m(layout: MarkerLayout) -> float:
-    gaps = np.linalg.norm(layout.centers_m[:, None] - layout.centers_m, axis=2)
-    return float(gaps[np.triu_indices(layout.count, 1)].min())
+    squares = ((layout.centers_m[:, None] - layout.centers_m) ** 2).sum(axis=2)
+    return float(np.sqrt(squares[np.triu_indices(layout.count, 1)].min()))
 
 
 def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers) -> tuple[Array, Array]:

@@ -130,15 +130,16 @@ def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> li
     """The hub's inner and outer edge in both eyes as a pose shows them; nothing without a hub or with it behind."""
     if layout.hub_center_m is None or pose.apply(layout.hub_center_m)[2] <= 0:
         return []
-    edges = []
-    for radius_m in (layout.hub_inner_radius_m, layout.hub_outer_radius_m):
-        outline = disc_outline(pose, layout.hub_center_m, radius_m, _OUTLINE_POINTS)
-        points = np.stack([rig.image(outline, eye) for eye in EYES])
-        place = layout.hub_center_m[None], np.array([radius_m])
-        centers = np.concatenate([disc_image_centers(rig, pose, *place, eye) for eye in EYES])
-        shapes = outline_shapes(points - points.mean(axis=1, keepdims=True))
-        edges.append(Ellipses(np.array([0, 1]), centers, shapes))
-    return edges
+    radii_m = layout.hub_inner_radius_m, layout.hub_outer_radius_m
+    outlines = np.stack([disc_outline(pose, layout.hub_center_m, radius_m, _OUTLINE_POINTS) for radius_m in radii_m])
+    points = np.stack([rig.image(outlines, eye) for eye in EYES], axis=1)
+    shapes = outline_shapes((points - points.mean(axis=2, keepdims=True)).reshape(-1, _OUTLINE_POINTS, 2))
+    places = np.stack([layout.hub_center_m] * HUB_EDGES), np.array(radii_m)
+    centers = np.stack([disc_image_centers(rig, pose, *places, eye) for eye in EYES], axis=1)
+    return [
+        Ellipses(np.arange(len(EYES)), centers[edge], shapes.reshape(HUB_EDGES, len(EYES), 2, 2)[edge])
+        for edge in (INNER_EDGE, OUTER_EDGE)
+    ]
 
 
 def _together(groups: list[Ellipses]) -> Ellipses:

@@ -8,6 +8,7 @@ is) need no rule of their own.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,12 +67,14 @@ def least_markers(layout: MarkerLayout) -> int:
     return min(layout.count, max(4, -(-3 * layout.count // 5)))
 
 
+@lru_cache(maxsize=16)
 def symmetry_permutations(layout: MarkerLayout) -> NDArray[np.int64]:
     """(order, N) for each turn that maps the layout onto itself: which marker comes to lie on marker i."""
     turns = np.exp(2j * np.pi * np.arange(layout.symmetry_order) / layout.symmetry_order)
     places = _complex(layout.centers_m[:, :2])
     gaps = np.abs(turns[:, None, None] * places[None, None, :] - places[None, :, None])
     permutations: NDArray[np.int64] = np.argmin(gaps, axis=2)
+    permutations.flags.writeable = False
     return permutations
 
 
@@ -147,30 +150,31 @@ def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.comple
     # One marker of each orbit of the symmetry is enough as the first: the others give the same maps, turned.
     first_markers = np.unique(symmetry_permutations(layout).min(axis=0))
     for i in first_markers:
-        for j in range(layout.count):
-            if j == i:
-                continue
-            scale = gaps / abs(places[j] - places[i])
-            plausible = alike & (scale < _SIZE_FACTOR * size_scale) & (size_scale < _SIZE_FACTOR * scale)
-            p, q = np.nonzero(plausible)
-            turn = (image[q] - image[p]) / (places[j] - places[i])
-            turns.append(turn)
-            shifts.append(image[p] - turn * places[i])
+        arms = np.delete(places, i) - places[i]
+        scale = gaps / np.abs(arms)[:, None, None]
+        plausible = alike & (scale < _SIZE_FACTOR * size_scale) & (size_scale < _SIZE_FACTOR * scale)
+        j, p, q = np.nonzero(plausible)
+        turn = (image[q] - image[p]) / arms[j]
+        turns.append(turn)
+        shifts.append(image[p] - turn * places[i])
     return np.concatenate(turns), np.concatenate(shifts)
 
 
 def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
     """Affine map refined from the blobs that a guess hits, or None where they cannot be the drogue."""
     places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
+    fitted = None
     for tolerance in (_GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE, None):
-        hit = blob_of_marker >= 0
-        if hit.sum() < least_markers(layout):
-            return None
-        seen, centers_px = places[hit], blobs.centers_px[blob_of_marker[hit]]
-        solution, _, _, singular = np.linalg.lstsq(seen, centers_px, rcond=None)
-        if singular[-1] <= _ON_A_LINE:
-            return None
-        affine = solution.T
+        # Mostly the first guess hits the right blobs already, and the same blobs have the same map.
+        if fitted is None or (blob_of_marker != fitted).any():
+            fitted, hit = blob_of_marker, blob_of_marker >= 0
+            if hit.sum() < least_markers(layout):
+                return None
+            seen, centers_px = places[hit], blobs.centers_px[blob_of_marker[hit]]
+            solution, _, _, singular = np.linalg.lstsq(seen, centers_px, rcond=None)
+            if singular[-1] <= _ON_A_LINE:
+                return None
+            affine = solution.T
         if tolerance is not None:
             blob_of_marker = _nearest_blobs(affine, blobs, layout, tolerance)
     largest, smallest = _stretches(affine)

@@ -20,11 +20,12 @@ from nav.centroids.annulus_model import (
     annulus_start,
     azimuth_basis,
     in_free_parameters,
+    light_above,
     radial_slopes,
-    share_and_light,
+    shares_of,
     tied_to_pose,
 )
-from nav.centroids.annulus_response import RESPONSE_PICTURES, response_pictures, with_pictures
+from nav.centroids.annulus_response import response_pictures, starting_with_pictures, with_pictures
 from nav.centroids.centroid_quality import NoiseModel, measure_noise, residual_spread, sector_index
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
@@ -122,7 +123,7 @@ def fit_annuli(
     model = in_free_parameters(annulus_model(pixels, turns, beyond), start, ties)
     final, weights = _weighted_fit(pixels, turns, (start, ties), model, first)
     parameters = all_parameters(start, ties, final)
-    between, light = share_and_light(parameters, pixels, turns)
+    between, light = shares_of(final, ties)[0], light_above(parameters, turns)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
     sectors = sector_index(pixels.x_px, pixels.y_px, _SECTORS)
     inflation = residual_spread(final.residuals, weights, sectors, contrast, final.parameters.shape[1]).inflation
@@ -156,13 +157,13 @@ def _weighted_fit(
         model: in the free parameters.
         first: fit of equal weights.
     """
-    parameters = all_parameters(*shape, first)
-    model = with_pictures(model, response_pictures(pixels, parameters, share_and_light(parameters, pixels, turns)[1]))
-    free = np.pad(first.parameters, ((0, 0), (0, RESPONSE_PICTURES)))
-    begin = evaluate(model, pixels.values, pixels.present, free)
+    parameters, ties = all_parameters(*shape, first), shape[1]
+    pictures = response_pictures(pixels, parameters, shares_of(first, ties), light_above(parameters, turns))
+    model = with_pictures(model, pictures)
+    begin = starting_with_pictures(first, pictures)
     first = minimise(model, pixels.values, pixels.present, begin, _RESPONSE_STEPS, FIRST_SMALL_STEP_PX)
     parameters = all_parameters(*shape, first)
-    between, light = share_and_light(parameters, pixels, turns)
+    between, light = shares_of(first, ties)[0], light_above(parameters, turns)
     leverages = np.minimum(first.leverages(first.covariance(), pixels.present), _MOST_LEVERAGE)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
     noise = measure_noise(first.residuals**2 / (1 - leverages), pixels.present, between, contrast)

@@ -36,7 +36,7 @@ def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         width = parameters[:, WIDTH]
-        outer, inner = both_edges(parameters, x, y)
+        outer, inner = _both_edges(parameters, x, y)
         rest = parameters[:, BACKGROUND:].astype(np.float32)
         background, hole = rest[:, 0, None], rest[:, 1, None]
         light = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
@@ -56,7 +56,7 @@ def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
     return model
 
 
-def both_edges(parameters: Array, x_px: Array32, y_px: Array32) -> tuple[Edge, Edge]:
+def _both_edges(parameters: Array, x_px: Array32, y_px: Array32) -> tuple[Edge, Edge]:
     """Outer and inner edge of (N, P) parameters at (N, K) places, in one go: small arrays cost by the call."""
     count = len(parameters)
     ellipses = np.concatenate([parameters[:, OUTER], parameters[:, INNER]])
@@ -65,12 +65,20 @@ def both_edges(parameters: Array, x_px: Array32, y_px: Array32) -> tuple[Edge, E
     return edges.take(slice(None, count)), edges.take(slice(count, None))
 
 
-def share_and_light(parameters: Array, pixels: PixelSet, turns: Array32) -> tuple[Array32, Array32]:
-    """Share of each pixel that lies on the annulus, and the annulus's light above the background there."""
-    outer, inner = both_edges(parameters, pixels.x_px, pixels.y_px)
+def shares_of(fit: Minimum, ties: Array) -> tuple[Array32, Array32]:
+    """(N, K) how much of each pixel lies on the annulus, and how much in the hole.
+
+    They are the derivatives by the annulus's mean light and by the hole's, whose parameters are free ones.
+    """
+    tied = ties.shape[2] - (ties.shape[1] - WIDTH)
+    return fit.jacobian[:, tied + AMPLITUDE - WIDTH], fit.jacobian[:, tied + HOLE - WIDTH]
+
+
+def light_above(parameters: Array, turns: Array32) -> Array32:
+    """(N, K) the annulus's light above the background. [DN]"""
     rest = parameters[:, BACKGROUND:].astype(np.float32)
-    light = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
-    return outer.inside - inner.inside, light - rest[:, 0, None]
+    light: Array32 = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
+    return light - rest[:, 0, None]
 
 
 def azimuth_basis(pixels: PixelSet, order: int) -> Array32:
@@ -126,11 +134,13 @@ def tied_to_pose(start: Array, thin: bool) -> Array:
 
 def in_free_parameters(model: Model, start: Array, ties: Array) -> Model:
     """The model in its free parameters, counted from the start."""
-    across = ties.transpose(0, 2, 1).astype(np.float32)
+    # Both ellipses follow the first few; all others are free themselves.
+    tied = ties.shape[2] - (ties.shape[1] - WIDTH)
+    across = ties[:, :WIDTH, :tied].transpose(0, 2, 1).astype(np.float32)
 
     def in_free(free: Array) -> tuple[Array32, Array32]:
         values, jacobian = model(start + np.einsum("npq,nq->np", ties, free))
-        return values, np.matmul(across, jacobian)
+        return values, np.concatenate([np.matmul(across, jacobian[:, :WIDTH]), jacobian[:, WIDTH:]], axis=1)
 
     return in_free
 

@@ -20,6 +20,10 @@ _TINY = np.float32(1e-12)
 _ERF_P = np.float32(0.3275911)
 _ERF_HALVES = tuple(np.float32(a / 2) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
 
+# Of z^2. Beyond it S is 0 or 1 in single precision, and exp(-z^2) adds nothing to any sum. Left as it is, it and its
+# products become denormal numbers a little further out, for each of which a processor takes a hundred times as long.
+_FAR = np.float32(36)
+
 # Centre x, y; elements xx, yy, xy of the inverse shape.
 ELLIPSE_PARAMETERS = 5
 
@@ -84,11 +88,16 @@ def edge_profile(ellipse: Array, width_px: Array, x_px: Array32, y_px: Array32, 
 def blurred_step(z: Array32) -> tuple[Array32, Array32]:
     """`(1 + erf(z)) / 2` to 2.5e-7, single precision's rounding included, and `exp(-z^2)`, which it is made of.
 
+    The latter is zero where it is smaller than 2.4e-16.
+
     Three to six times as fast as an error function that is exact to the last bit. Both sides of the step are alike.
 
     Source: M. Abramowitz and I. Stegun, Handbook of Mathematical Functions, 7.1.26.
     """
-    bell: Array32 = np.exp(-(z * z))
+    bell: Array32 = z * z
+    np.copyto(bell, np.inf, where=bell > _FAR)
+    np.negative(bell, out=bell)
+    np.exp(bell, out=bell)
     t = np.abs(z)
     t *= _ERF_P
     t += 1

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from geometry.se3 import Array
 from nav.filtering.correction import Innovation
@@ -65,10 +64,8 @@ class Agitation:
         if settings.agitation_per_s == 0:
             return Agitation(self.log_factor, self.variance, sensitivity)
         by_log = innovation.jacobian @ self.sensitivity @ innovation.jacobian.T
-        half = solve_triangular(innovation.factor, by_log, lower=True)
-        white = solve_triangular(innovation.factor, half.T, lower=True)
-        error = solve_triangular(innovation.factor, innovation.error, lower=True)
-        score = float(error @ white @ error - np.trace(white)) / 2
+        white = innovation.whitener @ by_log @ innovation.whitener.T
+        score = float(innovation.white @ white @ innovation.white - np.trace(white)) / 2
         variance = 1 / (1 / self.variance + float((white * white).sum()) / 2)
         moved = self.log_factor + float(np.clip(variance * score, -_LARGEST_STEP, _LARGEST_STEP))
         return Agitation(float(np.clip(moved, -_LARGEST_LOG, _LARGEST_LOG)), variance, sensitivity)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
 
 from geometry.se3 import Array, RigidTransform
 from nav.filtering.error_state import SIZE, MotionState, orthonormal, symmetric
@@ -24,14 +23,16 @@ class Innovation:
     Attributes:
         error: (6,) from the predicted to the measured pose, in the tangent of `datasets_manifest.estimates`.
         jacobian: (6, 18) of the predicted pose by the error of the state.
-        factor: (6, 6) lower Cholesky factor of its covariance.
-        nis: its square in that covariance, chi-square with 6 degrees of freedom.
+        whitener: (6, 6) inverse of the lower Cholesky factor of its covariance.
+        white: (6,) `whitener @ error`.
+        nis: its square, chi-square with 6 degrees of freedom.
         log_likelihood: logarithm of its density.
     """
 
     error: Array
     jacobian: Array
-    factor: Array
+    whitener: Array
+    white: Array
     nis: float
     log_likelihood: float
 
@@ -44,13 +45,15 @@ def innovation_of(state: MotionState, pose: RigidTransform, covariance: Array) -
         pose: measured, with the roll that is nearest to the state's.
         covariance: (6, 6) of it, positive definite.
     """
-    jacobian = state.pose_jacobian()
-    error = pose_difference(state.pose(), pose)
+    jacobian = state.pose_jacobian
+    error = pose_difference(state.pose, pose)
     factor = np.linalg.cholesky(symmetric(jacobian @ state.covariance @ jacobian.T + covariance))
-    white = solve_triangular(factor, error, lower=True)
+    # Of so small a matrix the inverse costs less than three checked calls that solve with the factor.
+    whitener = np.linalg.inv(factor)
+    white = whitener @ error
     nis = float(white @ white)
     log_likelihood = -nis / 2 - float(np.log(np.diag(factor)).sum()) - _POSE / 2 * np.log(2 * np.pi)
-    return Innovation(error, jacobian, factor, nis, log_likelihood)
+    return Innovation(error, jacobian, whitener, white, nis, log_likelihood)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +75,7 @@ def correct(state: MotionState, innovation: Innovation, covariance: Array) -> Co
     The covariance is updated in Joseph's form, which keeps it positive definite.
     """
     cross = state.covariance @ innovation.jacobian.T
-    gain = cho_solve((innovation.factor, True), cross.T).T
+    gain = cross @ innovation.whitener.T @ innovation.whitener
     kept = np.eye(SIZE) - gain @ innovation.jacobian
     posterior = kept @ state.covariance @ kept.T + gain @ covariance @ gain.T
     return Correction(state.moved(gain @ innovation.error, posterior), kept)

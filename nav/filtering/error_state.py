@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from nav.filtering.so3 import exp_rotation, left_jacobian, log_rotation
 # Where what lies in an error: the drogue's place and turn without the camera's shaking, their rates, and the shaking.
 PLACE, TURN, VELOCITY, RATE, SHIFT, SHAKE = (slice(3 * part, 3 * part + 3) for part in range(6))
 SIZE = 18
+_AXES = np.eye(3)
 # Errors of what the filter tells: place and turn as the camera sees them, velocity, rate.
 TOLD = 12
 
@@ -38,9 +40,10 @@ class MotionState:
     shake_rad: Array
     covariance: Array
 
+    @cached_property
     def pose(self) -> RigidTransform:
         """`left_from_drogue` as the camera sees it, vibration included."""
-        return RigidTransform(exp_rotation(self.shake_rad) @ self.rotation, self.translation_m + self.shift_m)
+        return RigidTransform(self._shaken @ self.rotation, self.translation_m + self.shift_m)
 
     def moved(self, error: Array, covariance: Array) -> MotionState:
         """The state that differs by an (18,) error.
@@ -74,20 +77,27 @@ class MotionState:
             ]
         )
 
+    @cached_property
     def pose_jacobian(self) -> Array:
         """(6, 18) error of the pose that the camera sees, by the error of the state."""
         jacobian = np.zeros((6, SIZE))
-        jacobian[:3, PLACE] = jacobian[:3, SHIFT] = np.eye(3)
-        jacobian[3:, TURN] = exp_rotation(self.shake_rad)
+        jacobian[:3, PLACE] = jacobian[:3, SHIFT] = _AXES
+        jacobian[3:, TURN] = self._shaken
         jacobian[3:, SHAKE] = left_jacobian(self.shake_rad)
         return jacobian
 
+    @cached_property
     def told_covariance(self) -> Array:
         """(12, 12) covariance of the pose that the camera sees, velocity and rate."""
         jacobian = np.zeros((TOLD, SIZE))
-        jacobian[:6] = self.pose_jacobian()
-        jacobian[6:9, VELOCITY] = jacobian[9:, RATE] = np.eye(3)
+        jacobian[:6] = self.pose_jacobian
+        jacobian[6:9, VELOCITY] = jacobian[9:, RATE] = _AXES
         return symmetric(jacobian @ self.covariance @ jacobian.T)
+
+    @cached_property
+    def _shaken(self) -> Array:
+        """(3, 3) turn that comes from vibration."""
+        return exp_rotation(self.shake_rad)
 
 
 def symmetric(matrix: Array) -> Array:
@@ -97,7 +107,9 @@ def symmetric(matrix: Array) -> Array:
 
 
 def orthonormal(rotation: Array) -> Array:
-    """The rotation nearest to a product of many, which rounding has bent."""
-    u, _, vt = np.linalg.svd(rotation)
-    nearest: Array = u @ vt
+    """The rotation nearest to a product of rotations, which rounding has bent.
+
+    One step of Newton's iteration for the polar factor, which squares what is off: from rounding to nothing.
+    """
+    nearest: Array = rotation @ (1.5 * _AXES - 0.5 * (rotation.T @ rotation))
     return nearest

@@ -76,7 +76,7 @@ def state_of(bank: Bank, time_s: float, coasted_s: float) -> FilterState:
     best = bank[0].state
     return FilterState(
         time_s=time_s,
-        left_from_drogue=best.pose(),
+        left_from_drogue=best.pose,
         velocity_m_s=best.velocity_m_s,
         rate_rad_s=best.rate_rad_s,
         covariance=bank_covariance(bank),
@@ -95,12 +95,12 @@ def _modes(bank: Bank) -> tuple[Mode, ...]:
         else:
             different[same] = (different[same][0], different[same][1] + one.weight)
     ordered = [different[0], *sorted(different[1:], key=lambda each: -each[1])]
-    return tuple(Mode(left_from_drogue=one.state.pose(), weight=min(weight, 1.0)) for one, weight in ordered)
+    return tuple(Mode(left_from_drogue=one.state.pose, weight=min(weight, 1.0)) for one, weight in ordered)
 
 
 def _is_same_pose(one: Hypothesis, other: Hypothesis) -> bool:
     if one.mode != other.mode:
         return False
-    covariance = sum(each.state.told_covariance()[:_POSE, :_POSE] for each in (one, other))
-    away = pose_difference(one.state.pose(), other.state.pose())
+    covariance = sum(each.state.told_covariance[:_POSE, :_POSE] for each in (one, other))
+    away = pose_difference(one.state.pose, other.state.pose)
     return float(away @ np.linalg.solve(covariance, away)) < _SAME_POSE

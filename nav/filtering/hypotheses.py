@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from geometry.se3 import Array
 from nav.filtering.agitation import Agitation
 from nav.filtering.correction import Innovation, correct, first_state, innovation_of
-from nav.filtering.error_state import TOLD, MotionState, symmetric
+from nav.filtering.error_state import MotionState, symmetric
 from nav.filtering.fixes import Fix, nearest_roll, pose_difference
 from nav.filtering.motion_model import Step, advance
 from nav.filtering.settings import FilterSettings
@@ -119,7 +119,7 @@ def correct_bank(bank: Bank, fix: Fix, settings: FilterSettings, symmetry_order:
     nearest, pairs = np.inf, []
     for hypothesis in bank:
         for mode, (pose, weight) in enumerate(zip(fix.poses, fix.weights, strict=True)):
-            rolled = nearest_roll(pose, hypothesis.state.pose().rotation, symmetry_order)
+            rolled = nearest_roll(pose, hypothesis.state.pose.rotation, symmetry_order)
             innovation = innovation_of(hypothesis.state, rolled, fix.covariance)
             nearest = min(nearest, innovation.nis)
             if innovation.nis <= gate:
@@ -163,7 +163,7 @@ def _same(one: Hypothesis, turning: bool, state: MotionState) -> bool:
     """Whether the pose and motion of a hypothesis and another cannot be told apart, and both turn or neither."""
     if one.turning != turning:
         return False
-    covariance = symmetric(one.state.told_covariance() + state.told_covariance())
+    covariance = symmetric(one.state.told_covariance + state.told_covariance)
     away = told_difference(one.state, state)
     return float(away @ np.linalg.solve(covariance, away)) < _SAME_SIGMAS**2
 
@@ -172,7 +172,7 @@ def told_difference(one: MotionState, other: MotionState) -> Array:
     """(12,) difference of pose, velocity and rate from one state to another."""
     return np.concatenate(
         [
-            pose_difference(one.pose(), other.pose()),
+            pose_difference(one.pose, other.pose),
             other.velocity_m_s - one.velocity_m_s,
             other.rate_rad_s - one.rate_rad_s,
         ]
@@ -182,8 +182,8 @@ def told_difference(one: MotionState, other: MotionState) -> Array:
 def bank_covariance(bank: Bank) -> Array:
     """(12, 12) second moment of pose, velocity and rate about the best hypothesis: it covers the others too."""
     best = bank[0].state
-    moment = np.zeros((TOLD, TOLD))
-    for hypothesis in bank:
+    moment = bank[0].weight * best.told_covariance
+    for hypothesis in bank[1:]:
         away = told_difference(best, hypothesis.state)
-        moment += hypothesis.weight * (hypothesis.state.told_covariance() + np.outer(away, away))
+        moment += hypothesis.weight * (hypothesis.state.told_covariance + np.outer(away, away))
     return symmetric(moment)

@@ -28,6 +28,7 @@ from nav.filtering.settings import FilterSettings
 from nav.filtering.so3 import exp_rotation, left_jacobian
 
 _VIBRATION = slice(12, 18)
+_AXES = np.eye(3)
 # Far below any centroid's worth, so that covariances have inverses where nothing shakes. [m, rad]
 _LEAST_SHAKING = 1e-9
 
@@ -68,14 +69,15 @@ def advance(
     turn = exp_rotation(turn_rad)
     persists = float(np.exp(-duration_s / settings.vibration_s))
     transition = np.eye(SIZE)
-    transition[PLACE, VELOCITY] = duration_s * np.eye(3)
+    transition[PLACE, VELOCITY] = duration_s * _AXES
     transition[TURN, TURN] = turn
     transition[TURN, RATE] = duration_s * left_jacobian(turn_rad)
     transition[_VIBRATION, _VIBRATION] = persists * np.eye(6)
     velocity, curve = state.velocity_m_s, np.zeros(3)
     if turn_rad2_s3 > 0:
-        velocity, curve = turn @ velocity, np.cross(state.rate_rad_s, velocity) * duration_s**2 / 2
-        transition[PLACE, VELOCITY] += skew(state.rate_rad_s) * duration_s**2 / 2
+        bend = skew(state.rate_rad_s) * duration_s**2 / 2
+        velocity, curve = turn @ velocity, bend @ velocity
+        transition[PLACE, VELOCITY] += bend
         transition[PLACE, RATE] = -skew(state.velocity_m_s) * duration_s**2 / 2
         transition[VELOCITY, VELOCITY] = turn
         transition[VELOCITY, RATE] = -skew(velocity) @ transition[TURN, RATE]
@@ -85,7 +87,9 @@ def advance(
         ),
         duration_s,
     )
-    noise = rough + _noise(seen_from_turning(state.translation_m, 0.0, 0.0, turn_rad2_s3), duration_s)
+    noise = rough.copy()
+    if turn_rad2_s3 > 0:
+        noise += _noise(seen_from_turning(state.translation_m, 0.0, 0.0, turn_rad2_s3), duration_s)
     noise[_VIBRATION, _VIBRATION] = (1 - persists**2) * vibration_covariance(state.translation_m, settings)
     moved = replace(
         state,
@@ -128,8 +132,8 @@ def seen_from_turning(translation_m: Array, along2: float, about2: float, camera
     """
     lever = skew(translation_m)
     seen = np.zeros((6, 6))
-    seen[:3, :3] = along2 * np.eye(3) + camera2 * lever @ lever.T
+    seen[:3, :3] = along2 * _AXES + camera2 * lever @ lever.T
     seen[:3, 3:] = -camera2 * lever
     seen[3:, :3] = seen[:3, 3:].T
-    seen[3:, 3:] = (about2 + camera2) * np.eye(3)
+    seen[3:, 3:] = (about2 + camera2) * _AXES
     return seen

@@ -92,7 +92,9 @@ def told(memory: Memory, time_s: float, settings: FilterSettings) -> FilterState
     coasted_s = -1.0 if track is None else time_s - track.time_s
     if track is None or not 0 <= coasted_s <= settings.max_coast_s:
         return None
-    return state_of(advance_bank(track.bank, coasted_s, settings), time_s, coasted_s)
+    # Right after a fix, which is when most ask, there is nowhere to go on to.
+    bank = advance_bank(track.bank, coasted_s, settings) if coasted_s > 0 else track.bank
+    return state_of(bank, time_s, coasted_s)
 
 
 def _started(time_s: float, fix: Fix, settings: FilterSettings) -> Track:

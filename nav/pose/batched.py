@@ -19,7 +19,7 @@ from nav.pose.adjustment import Adjusted, adjust, information_at, inverse_inform
 from nav.pose.features import Features, stack_features
 from nav.pose.reprojection import SQUARES, Loss
 from nav.pose.tolerances import EXACT, StatedTolerances
-from nav.pose.two_fold_start import sight_rotations, two_fold_start
+from nav.pose.two_fold_start import cross, sight_rotations, two_fold_start
 
 # Standard deviation of pitch and of yaw, of drogues that swing within 10 degrees uniformly: 5.8 degrees.
 TILT_PRIOR_RAD = np.radians(6.0)
@@ -80,9 +80,9 @@ def solve_joint_batch(
 
 def solve_features(features: Features) -> JointBatch:
     """As `solve_joint_batch`, from stacked features."""
+    if features.frames <= _CHUNK:
+        return _solve(features)
     parts = [_solve(features.take(slice(i, i + _CHUNK))) for i in range(0, features.frames, _CHUNK)]
-    if len(parts) == 1:
-        return parts[0]
     return JointBatch(*(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True)))
 
 
@@ -170,7 +170,7 @@ def _weights(pairs: _Pairs, prior_rad: float) -> Array:
     possible[:, 1] &= np.linalg.norm(axes[:, 0] - axes[:, 1], axis=-1) > _SAME_TURN_RAD
     # Whoever has only impossible poses keeps the first; it is not sound.
     possible[:, 0] |= ~possible.any(axis=1)
-    log_weights = np.where(possible, np.nan_to_num(log_weights, nan=0.0), -np.inf)
+    log_weights = np.where(possible, np.where(np.isfinite(log_weights), log_weights, 0.0), -np.inf)
     weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
     shares: Array = weights / weights.sum(axis=1, keepdims=True)
     return shares
@@ -183,7 +183,7 @@ def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Ar
     covariance, determined = inverse_information(information_at(features, frontal, translations_m))
     variance = (covariance[:, 3, 3] + covariance[:, 4, 4]) / 2
     # 1 - cos loses small tilts to rounding; the cross product does not.
-    tilt = np.linalg.norm(np.cross(rotations[:, :, 2], frontal[:, :, 2]), axis=1)
+    tilt = np.sqrt((cross(rotations[:, :, 2], frontal[:, :, 2]) ** 2).sum(axis=1))
     reliable: NDArray[np.bool_] = determined & (tilt > _RELIABLE_SIGMAS * np.sqrt(variance))
     return reliable
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from geometry.se3 import Array
@@ -93,19 +95,20 @@ def _another_rig(observation: Observation) -> NoFixReason | None:
     """Whether disparities and the ring's size speak of different distances, as they do with another rig's baseline."""
     paired = observation.paired
     first, second = np.triu_indices(int(paired.sum()), 1)
-    places = observation.layout.centers_m[paired]
-    gaps_m = np.linalg.norm(places[first] - places[second], axis=1)
-    gaps_px = np.linalg.norm(
-        observation.pixels_px[:, paired][:, first] - observation.pixels_px[:, paired][:, second], axis=2
-    )
-    # Medians, so that a bad marker or two tell nothing of the rig; but where only neighbours of a tilted ring are seen,
-    # all gaps are shortened alike, and the longest axis of the map from drogue to image is not.
-    expected_px = observation.rig.baseline_m * float(np.median(gaps_px / gaps_m))
-    untilted_px = observation.rig.baseline_m * _largest_scale_px_per_m(observation)
-    disparity_px = float(np.median(observation.pixels_px[0, paired, 0] - observation.pixels_px[1, paired, 0]))
-    for size_px in (expected_px, untilted_px):
-        if abs(disparity_px - size_px) <= _RIG_MISS_FRACTION * min(disparity_px, size_px) + _RIG_MISS_PX:
-            return None
+    places, pixels = observation.layout.centers_m[paired], observation.pixels_px[:, paired]
+    gaps_m, gaps_px = places[first] - places[second], pixels[:, first] - pixels[:, second]
+    # Medians, so that a bad marker or two tell nothing of the rig.
+    px_per_m = np.sqrt((gaps_px**2).sum(axis=2) / (gaps_m**2).sum(axis=1))
+    expected_px = observation.rig.baseline_m * float(np.median(px_per_m))
+    disparity_px = float(np.median(pixels[0, :, 0] - pixels[1, :, 0]))
+
+    def fits(size_px: float) -> bool:
+        return abs(disparity_px - size_px) <= _RIG_MISS_FRACTION * min(disparity_px, size_px) + _RIG_MISS_PX
+
+    # Where only neighbours of a tilted ring are seen, all gaps are shortened alike, and the longest axis of the map
+    # from drogue to image is not.
+    if fits(expected_px) or fits(observation.rig.baseline_m * _largest_scale_px_per_m(observation)):
+        return None
     return NoFixReason(
         f"rig and drogue do not fit: markers this large have a disparity of {expected_px:.1f} px, "
         f"these have {disparity_px:.1f} px"
@@ -122,5 +125,8 @@ def _largest_scale_px_per_m(observation: Observation) -> float:
 
 
 def _on_a_line(points: Array) -> bool:
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] <= _COLLINEAR_FRACTION * spread[0])
+    # The squared spreads along and across are the eigenvalues of the (2, 2) second moment, here in closed form.
+    arms = points - points.sum(axis=0) / len(points)
+    (xx, xy), (_, yy) = (arms.T @ arms).tolist()
+    middle, apart = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
+    return bool(middle - apart <= _COLLINEAR_FRACTION**2 * (middle + apart))

@@ -74,9 +74,9 @@ def _modes(batch: JointBatch) -> tuple[PoseMode, ...]:
 def misfit(features: Features, rotation: Array, translation_m: Array) -> NoFixReason | None:
     """Why one frame's features cannot be the drogue's in a pose, or None when they can."""
     predicted = predicted_px(features, State.nominal(features, rotation[None], translation_m[None]))
-    residual = np.linalg.norm(predicted - np.moveaxis(features.measured[:2], 0, -1), axis=-1)[features.seen]
+    squares = ((predicted - features.measured[:2].transpose(1, 2, 3, 0)) ** 2).sum(axis=-1)[features.seen]
     radius_px = features.camera.fx_px * features.radii_m[0] / translation_m[2]
-    miss_px = float(np.sqrt(np.mean(residual**2)))
+    miss_px = float(np.sqrt(squares.mean()))
     if miss_px <= max(_LEAST_MISS_PX, _LARGEST_MISS_FRACTION * float(radius_px)):
         return None
     return NoFixReason(f"the markers do not fit the drogue: they miss their places by {miss_px:.1f} px (rms)")

@@ -9,6 +9,9 @@ import numpy as np
 from geometry.se3 import Array
 from nav.pose.features import Features
 
+# Of the axes x, y, z the one after each, and the one before.
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+
 
 @dataclass(frozen=True, eq=False)
 class State:
@@ -88,7 +91,7 @@ def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Lineari
         if np.isfinite(loss.huber_sigmas):
             costs = _weigh(jacobian[:, :, :size], residuals[:, :size], loss.huber_sigmas, features)
         else:
-            costs = (residuals[:, :size] ** 2).sum(axis=1) / 2
+            costs = _half_squares(residuals[:, :size])
         if with_tilt:
             axes = state.rotations[:, :, 2] / loss.tilt_prior_rad
             residuals[:, size : size + 2] = axes[:, :2]
@@ -97,77 +100,83 @@ def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Lineari
         if free:
             residuals[:, -free:] = state.departures
             jacobian[:, 6:, -free:] = np.eye(free)
-        costs += (residuals[:, size:] ** 2).sum(axis=1) / 2
+        if with_tilt or free:
+            costs += _half_squares(residuals[:, size:])
     return Linearised(jacobian, residuals, np.where(in_front & np.isfinite(costs), costs, np.inf))
 
 
 def predicted_px(features: Features, state: State) -> Array:
     """(S, E, F, 2) ellipse centres that the poses would show. [px]"""
-    _, _, x_z, y_z, _ = _images(features, state)
-    u = features.camera.fx_px * x_z + features.camera.cx_px
-    v = features.camera.fy_px * y_z + features.camera.cy_px
-    return np.stack([u, np.broadcast_to(v, u.shape)], axis=-1)
+    _, _, slopes, _ = _images(features, state)
+    camera = features.camera
+    return slopes.transpose(0, 2, 3, 1) * (camera.fx_px, camera.fy_px) + (camera.cx_px, camera.cy_px)
 
 
 def _fill_features(features: Features, state: State, jacobian: Array, residuals: Array) -> Array:
     """Write the features' part of both arrays; (S,) whether all features lie in front of the cameras."""
-    u, v, a, b, c = features.measured
-    camera = features.camera
-    rows = jacobian.reshape(*jacobian.shape[:2], 2, *u.shape[1:])
-    arms, depth, x_z, y_z, z = _images(features, state)
-    ax, ay, az = (arms[:, None, :, axis] for axis in range(3))
-    off_u = camera.fx_px * x_z + camera.cx_px - u
-    if features.disparity_sigma_px > 0:
-        off_u[:, 1] += features.disparity_sigma_px * state.departures[:, -1:]
-    off_v = camera.fy_px * y_z + camera.cy_px - v
-    both = residuals.reshape(len(residuals), 2, *u.shape[1:])
-    both[:, 0] = a * off_u
-    both[:, 1] = b * off_u + c * off_v
+    # Few frames have few numbers, and time goes by the number of array operations: both rows of the whitening matrix,
+    # and the three axes, are worked on at once.
+    weights, offsets = features.whitening
+    shape = weights.shape[3:]
+    rows = jacobian.reshape(*jacobian.shape[:2], 2, *shape)
+    both = residuals.reshape(len(residuals), 2, *shape)
+    arms, depth, slopes, z = _images(features, state)
+    whitened = weights[:, 0] * slopes[:, :1] + weights[:, 1] * slopes[:, 1:]
+    np.add(whitened, offsets, out=both)
 
-    by_x, by_y = camera.fx_px / z, camera.fy_px / z
-    ux, vx, vy = a * by_x, b * by_x, c * by_y
-    uz, vz = -ux * x_z, -vx * x_z - vy * y_z
-    rows[:, 0, 0], rows[:, 2, 0] = ux, uz
-    rows[:, 0, 1], rows[:, 1, 1], rows[:, 2, 1] = vx, vy, vz
-    rows[:, 3, 0], rows[:, 4, 0], rows[:, 5, 0] = ay * uz, az * ux - ax * uz, -ay * ux
-    rows[:, 3, 1], rows[:, 4, 1], rows[:, 5, 1] = ay * vz - az * vy, az * vx - ax * vz, ax * vy - ay * vx
+    by_place = rows[:, :3]
+    np.divide(weights, z[:, None, None, None], out=by_place[:, :2])
+    np.divide(whitened, -z[:, None, None], out=by_place[:, 2])
+    # The derivative by the turn is the cross product of the arm and that by the place.
+    arms = arms[:, :, None, None]
+    np.multiply(arms[:, _NEXT], by_place[:, _LAST], out=rows[:, 3:6])
+    rows[:, 3:6] -= arms[:, _LAST] * by_place[:, _NEXT]
     if len(features.shifts_m):
-        turned = features.shifts_m @ np.swapaxes(state.rotations, 1, 2)[:, None]
-        sx, sy, sz = (turned[:, :, None, :, axis] for axis in range(3))
+        turned = np.swapaxes(features.shifts_m @ np.swapaxes(state.rotations, 1, 2)[:, None], 2, 3)
         shifted = rows[:, 6 : 6 + len(features.shifts_m)]
-        shifted[:, :, 0] = sx * ux[:, None] + sz * uz[:, None]
-        shifted[:, :, 1] = sx * vx[:, None] + sy * vy[:, None] + sz * vz[:, None]
+        shifted[:] = (turned[:, :, :, None, None] * by_place[:, None]).sum(axis=2)
     if features.disparity_sigma_px > 0:
-        rows[:, -1, 0, 1] = features.disparity_sigma_px * a[:, 1]
-        rows[:, -1, 1, 1] = features.disparity_sigma_px * b[:, 1]
+        a, b = features.measured[2:4, :, 1]
+        rows[:, -1, 0, 1] = features.disparity_sigma_px * a
+        rows[:, -1, 1, 1] = features.disparity_sigma_px * b
+        both[:, :, 1] += rows[:, -1, :, 1] * state.departures[:, -1:, None]
     if features.coupling is not None and len(features.eye_x_m) > 1:
         _couple(both, features.coupling)
         _couple(rows, features.coupling[:, :, None])
-    in_front: Array = (depth > 0).all(axis=(1, 2))
+    in_front: Array = (depth > 0).all(axis=1)
     return in_front
 
 
-def _images(features: Features, state: State) -> tuple[Array, Array, Array, Array, Array]:
+def _images(features: Features, state: State) -> tuple[Array, Array, Array, Array]:
     """Where the features are and where their ellipse centres appear.
 
     Returns:
-        arms (S, F, 3) from the drogue's origin [m], depths (S, 1, F) [m], slopes x/z (S, E, F) and y/z (S, 1, F) of the
-        ellipse centres, and the depths (S, 1, F) that belong to them [m]. Rectified eyes share depth and y.
+        arms (S, 3, F) from the drogue's origin [m], depths (S, F) [m], slopes x/z and y/z (S, 2, E, F) of the ellipse
+        centres, and the depths (S, F) that belong to them [m]. Rectified eyes share depth and y.
     """
-    points = features.points_m
+    points = features.points_m.T
     if len(features.shifts_m):
         shared = state.departures[:, : len(features.shifts_m)] @ features.shifts_m.reshape(len(features.shifts_m), -1)
-        points = points + shared.reshape(-1, *points.shape)
-    arms = points @ np.swapaxes(state.rotations, 1, 2)
-    tx, ty, tz = (state.translations_m[:, axis, None, None] for axis in range(3))
-    nx, ny, nz = (state.rotations[:, axis, 2, None, None] for axis in range(3))
-    depth = arms[:, None, :, 2] + tz
+        points = points + np.swapaxes(shared.reshape(-1, *features.points_m.shape), 1, 2)
+    arms = state.rotations @ points
+    places = arms + state.translations_m[:, :, None]
+    normals = state.rotations[:, :, 2]
+    depth = places[:, 2]
     # The ellipse centre is the image of `t - (r^2 / t_z) (e_z - n_z n)` (geometry.circles).
-    shift = features.radii_m**2 / depth
-    z = depth - shift * (1 - nz * nz)
-    x_z = (arms[:, None, :, 0] + tx - features.eye_x_m[:, None] + shift * (nz * nx)) / z
-    y_z = (arms[:, None, :, 1] + ty + shift * (nz * ny)) / z
-    return arms, depth, x_z, y_z, z
+    shift = normals * normals[:, 2:]
+    shift[:, 2] -= 1
+    virtual = places + shift[:, :, None] * (features.radii_m**2 / depth)[:, None]
+    z = virtual[:, 2]
+    slopes = np.empty((len(z), 2, len(features.eye_x_m), z.shape[1]))
+    np.divide(virtual[:, None, 0] - features.eye_x_m[:, None], z[:, None], out=slopes[:, 0])
+    slopes[:, 1] = (virtual[:, 1] / z)[:, None]
+    return arms, depth, slopes, z
+
+
+def _half_squares(residuals: Array) -> Array:
+    """(S,) half the sum of squares of (S, M)."""
+    sums: Array = np.einsum("sm,sm->s", residuals, residuals)
+    return sums / 2
 
 
 def _couple(rows: Array, coupling: Array) -> None:

@@ -21,6 +21,14 @@ def test_a_blurred_step_is_the_error_function():
     np.testing.assert_allclose(bell, np.exp(-(exact**2)), rtol=3e-6, atol=1e-12)
 
 
+def test_far_from_an_edge_there_are_no_denormal_numbers():
+    # Nor in products of two of them, which the normal equations are made of.
+    _, bell = blurred_step(np.linspace(-20, 20, 20_001, dtype=np.float32))
+    squares = bell[bell != 0].astype(np.float64) ** 2
+    assert squares.min() > np.finfo(np.float32).tiny
+    assert (bell == 0).any()
+
+
 def test_both_sides_of_a_blurred_step_are_alike():
     z = np.linspace(0, 6, 5001, dtype=np.float32)[1:]
     high, low = blurred_step(z)[0], blurred_step(-z)[0]

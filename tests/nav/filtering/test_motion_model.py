@@ -58,9 +58,9 @@ def test_the_measurement_jacobian_is_the_derivative_of_the_seen_pose(
     state = _state(rng)
     columns = []
     for axis in np.eye(SIZE):
-        ends = [state.moved(sign * STEP * axis, state.covariance).pose() for sign in (1, -1)]
+        ends = [state.moved(sign * STEP * axis, state.covariance).pose for sign in (1, -1)]
         columns.append(pose_difference(ends[1], ends[0]) / (2 * STEP))
-    jacobian = innovation_of(state, state.pose(), covariance).jacobian
+    jacobian = innovation_of(state, state.pose, covariance).jacobian
     np.testing.assert_allclose(jacobian, np.stack(columns, axis=1), atol=DERIVATIVE)
 
 
@@ -131,7 +131,7 @@ def test_a_turn_adds_what_the_camera_makes_and_that_is_not_the_airs(rng: np.rand
 def test_at_a_first_fix_the_camera_may_turn(covariance: Array) -> None:
     place, turn = np.array([0.2, 0.1, 6.0]), np.array([0.3, -0.5, 0.2])
     settings = FilterSettings(start_speed_m_s=1e-6, start_rate_rad_s=1e-6, start_turn_rad_s=0.7)
-    speeds = first_state(RigidTransform(np.eye(3), place), covariance, settings).told_covariance()[6:, 6:]
+    speeds = first_state(RigidTransform(np.eye(3), place), covariance, settings).told_covariance[6:, 6:]
     # What the turn makes of velocity and rate is as likely as the turn itself.
     seen = np.concatenate([-np.cross(turn, place), -turn])
     assert seen @ np.linalg.solve(speeds, seen) == pytest.approx(turn @ turn / 0.7**2, rel=1e-6)
@@ -140,5 +140,5 @@ def test_at_a_first_fix_the_camera_may_turn(covariance: Array) -> None:
 def test_a_first_fix_tells_the_pose_as_well_as_it_was_measured(covariance: Array) -> None:
     pose = RigidTransform(Rotation.random(random_state=2).as_matrix(), np.array([0.2, 0.1, 6.0]))
     state = first_state(pose, covariance, FilterSettings())
-    np.testing.assert_allclose(state.told_covariance()[:6, :6], covariance, atol=1e-15)
+    np.testing.assert_allclose(state.told_covariance[:6, :6], covariance, atol=1e-15)
     np.linalg.cholesky(state.covariance)
