@@ -27,7 +27,7 @@ class DetectorPass:
         name: of the detector.
         pairs: how many there are.
         score_threshold: that the detector asks for itself, or None.
-        input_size_px: width and height of a network's input; None where there is no network. [px]
+        pass_sizes_px: width and height of a network's input in each of its passes; none where there is no network. [px]
         wall_s, cpu_s: time of each pair that was looked at, images already read. [s]
     """
 
@@ -58,7 +58,7 @@ class DetectorPass:
         # Only networks name one.
         metadata = getattr(first, "metadata", None)
         self.score_threshold: float | None = None if metadata is None else metadata.score_threshold
-        self.input_size_px: tuple[int, int] | None = getattr(first, "input_size_px", None)
+        self.pass_sizes_px: tuple[tuple[int, int], ...] = getattr(first, "pass_sizes_px", ())
         self.wall_s: list[float] = []
         self.cpu_s: list[float] = []
 

@@ -149,7 +149,7 @@ def _detector_run(name_or_file: str, detecting: DetectorPass, report: ProgressRe
         boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
     finally:
         report.end()
-    cost = _network_cost(name_or_file, detecting.input_size_px)
+    cost = _network_cost(name_or_file, detecting.pass_sizes_px)
     return DetectorRun(
         boxes,
         detecting.times(),
@@ -159,19 +159,20 @@ def _detector_run(name_or_file: str, detecting: DetectorPass, report: ProgressRe
     )
 
 
-def _network_cost(name_or_file: str, size_px: tuple[int, int] | None) -> NetworkCost | None:
-    """Of a network in a file; None where it cannot be counted, or the package that counts is not installed."""
+def _network_cost(name_or_file: str, sizes_px: tuple[tuple[int, int], ...]) -> NetworkCost | None:
+    """Of all passes through a network in a file; None where they cannot be counted, or what counts is missing."""
     from importlib.util import find_spec
 
     from nav.detector.registry import network_file
 
     file = network_file(name_or_file)
-    if file is None or size_px is None or find_spec("onnx") is None:
+    if file is None or not sizes_px or find_spec("onnx") is None:
         return None
-    from droguekit.detector_peers.onnx_cost import network_cost
+    from droguekit.detector_peers.onnx_cost import NetworkCost, network_cost
 
     try:
-        return network_cost(file, size_px)
+        costs = [network_cost(file, size_px) for size_px in sizes_px]
     except ValueError:
         # The network runs, and its boxes are not lost for operations that nobody can count.
         return None
+    return NetworkCost(costs[0].parameters, sum(cost.gflops_per_image for cost in costs))

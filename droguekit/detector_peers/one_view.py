@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from datasets_manifest.images import StereoImages
 from geometry.stereo import EYES, Eye
-from nav.detector.decoding import decode
-from nav.detector.input_image import input_image, network_input
+from nav.detector.input_image import input_image
 from nav.detector.interface import Detection, StereoDetection
 from nav.detector.onnx_detector import OnnxDetector
 
 
 class OneViewDetector(OnnxDetector):
-    """The same network and boxes, but two passes of one picture each."""
+    """The same network and boxes, but each eye in passes of its own."""
 
     def detect(self, images: StereoImages) -> StereoDetection:
         """The best box in each image, where it scores as much as the file asks for."""
@@ -23,7 +22,7 @@ class OneViewDetector(OnnxDetector):
         answers: dict[Eye, tuple[Detection, ...]] = {}
         for eye in EYES:
             picture, place = input_image(images, eye, self.input_size_px)
-            ((boxes, scores),) = decode(self._run(network_input([picture])), least_score)
+            ((boxes, scores),) = self._found([picture], least_score, most=20)
             answers[eye] = tuple(
                 Detection((x, y, width, height), score)
                 for (x, y, width, height), score in zip(place.to_image(boxes).tolist(), scores.tolist(), strict=True)

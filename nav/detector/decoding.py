@@ -46,11 +46,11 @@ def _decode_one(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, m
     finite = np.isfinite(all_boxes).all(axis=1)
     all_scores, all_boxes = all_scores[finite], all_boxes[finite]
     order = np.argsort(-all_scores, kind="stable")[:_MOST_CELLS]
-    kept = _without_overlaps(all_boxes[order], most)
+    kept = without_overlaps(all_boxes[order], most)
     return all_boxes[order][kept], all_scores[order][kept]
 
 
-def _without_overlaps(boxes: Array, most: int) -> list[int]:
+def without_overlaps(boxes: Array, most: int) -> list[int]:
     """Indices of the boxes, best first, that overlap no better one (non-maximum suppression)."""
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
     area = boxes[:, 2] * boxes[:, 3]

@@ -22,6 +22,8 @@ class ModelMetadata:
     Attributes:
         input_size_px: width and height that it was made for; multiples of 32.
         score_threshold: what scores lower is no drogue.
+        large_from_px: boxes whose longer side is as long in the input come from a second pass at half the size; 0 for a
+            single pass. [px]
         classes: names, one.
         licence: of the weights.
         manifest_sha256: of the dataset that it was trained on; empty where it was none of ours, or several, which
@@ -32,6 +34,7 @@ class ModelMetadata:
 
     input_size_px: tuple[int, int] = (640, 480)
     score_threshold: float = 0.5
+    large_from_px: float = 0.0
     classes: tuple[str, ...] = ("drogue",)
     licence: str = ""
     manifest_sha256: str = ""
@@ -47,6 +50,8 @@ class ModelMetadata:
         # A bool is an int to Python.
         if type(self.score_threshold) not in (int, float) or not 0 <= self.score_threshold <= 1:
             raise ValueError(f"score_threshold: must be 0 to 1, got {self.score_threshold!r}")
+        if type(self.large_from_px) not in (int, float) or not 0 <= self.large_from_px <= MOST_SIDE_PX:
+            raise ValueError(f"large_from_px: must be 0 to {MOST_SIDE_PX}, got {self.large_from_px!r}")
         if len(self.classes) != 1 or not all(isinstance(name, str) for name in self.classes):
             raise ValueError(f"classes: must be one name, got {self.classes!r}")
         for name, kind in (("licence", str), ("manifest_sha256", str), ("network", Mapping), ("training", Mapping)):

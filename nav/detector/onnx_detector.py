@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from onnxruntime.capi import onnxruntime_pybind11_state as faults
 from datasets_manifest.images import StereoImages
 from geometry.stereo import EYES, Eye
 from nav.detector.decoding import decode
-from nav.detector.input_image import input_image, letterbox, network_input
+from nav.detector.input_image import fit_picture, input_image, letterbox, network_input
 from nav.detector.interface import Detection, StereoDetection
 from nav.detector.maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
+from nav.detector.two_scales import Found, at_full_size, half_size_px, joined
 
 _FAULTS = (
     faults.EPFail, faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf,
@@ -27,12 +29,13 @@ _LOG_ERRORS = 4
 
 
 class OnnxDetector:
-    """Both eyes in one pass through a network.
+    """Both eyes in one batch through a network.
 
     Attributes:
         name: how it is called in results.
         metadata: what the file says of itself.
         input_size_px: width, height of what the network is given. [px]
+        pass_sizes_px: those of all passes for a pair: also half the size where the file asks for it.
     """
 
     def __init__(
@@ -60,6 +63,13 @@ class OnnxDetector:
         if fixed_size and self.input_size_px != fixed_size:
             raise ValueError(f"{file}: takes {fixed_size[0]}x{fixed_size[1]} px only, asked for {self.input_size_px}")
         letterbox(self.input_size_px, self.input_size_px)
+        if fixed_size and self.metadata.large_from_px:
+            raise ValueError(
+                f"{file}: large_from_px: takes {fixed_size[0]}x{fixed_size[1]} px only, and not half of it"
+            )
+        self.pass_sizes_px: tuple[tuple[int, int], ...] = (self.input_size_px,)
+        if self.metadata.large_from_px:
+            self.pass_sizes_px += (half_size_px(self.input_size_px),)
         probe = fixed_size or (SIZE_STEP_PX, 2 * SIZE_STEP_PX)
         self._check_maps(self._run(np.zeros((len(EYES), 3, probe[1], probe[0]), np.float32)), probe)
 
@@ -74,14 +84,22 @@ class OnnxDetector:
 
     def _candidates(self, images: StereoImages, least_score: float, most: int) -> dict[Eye, tuple[Detection, ...]]:
         pictures, places = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
-        maps = self._run(network_input(pictures))
         answers: dict[Eye, tuple[Detection, ...]] = {}
-        for eye, place, (boxes, scores) in zip(EYES, places, decode(maps, least_score, most), strict=True):
+        for eye, place, (boxes, scores) in zip(EYES, places, self._found(pictures, least_score, most), strict=True):
             answers[eye] = tuple(
                 Detection((x, y, width, height), score)
                 for (x, y, width, height), score in zip(place.to_image(boxes).tolist(), scores.tolist(), strict=True)
             )
         return answers
+
+    def _found(self, pictures: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[Found]:
+        """Of each picture the boxes in corner coordinates of the input, and scores."""
+        full = decode(self._run(network_input(pictures)), least_score)
+        if len(self.pass_sizes_px) == 1:
+            return [(boxes[:most], scores[:most]) for boxes, scores in full]
+        halves, places = zip(*(fit_picture(each, self.pass_sizes_px[1]) for each in pictures), strict=True)
+        half = map(at_full_size, decode(self._run(network_input(halves)), least_score), places)
+        return [joined(*both, self.metadata.large_from_px, most) for both in zip(full, half, strict=True)]
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
         try:

@@ -9,7 +9,7 @@ from drogue_models.parameters import DrogueParameters
 from nav.detector.interface import Detector
 
 COLOR_BLOB = "color-blob"
-DEFAULT_DETECTOR = COLOR_BLOB
+DEFAULT_DETECTOR = "mobile-s"
 # Networks that belong to the package lie here, each under its name.
 _WEIGHTS = Path(__file__).parent / "weights"
 _SUFFIX = ".onnx"

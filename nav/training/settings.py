@@ -17,7 +17,7 @@ SizePx = tuple[int, int]
 
 # They change where or how fast the work is done, floats in their last bits, or the file's label, but not what is
 # trained.
-_FREE_TO_CHANGE = ("device", "threads", "loader_threads", "checkpoint_minutes", "licence")
+_FREE_TO_CHANGE = ("device", "threads", "loader_threads", "checkpoint_minutes", "large_from_px", "licence")
 
 
 class TrainingSettings(FrozenModel):
@@ -41,6 +41,8 @@ class TrainingSettings(FrozenModel):
         threads: that compute; as many as cores by 0.
         loader_threads: that prepare images meanwhile.
         checkpoint_minutes: at least so often the state is saved, besides the end of every epoch.
+        large_from_px: longer side in the network's input from which on users of the file look for drogues at half the
+            size, by a second pass; 0 for a single one. [px]
         licence: of the weights, written into the files, such as an SPDX name; empty where nobody says.
     """
 
@@ -68,6 +70,7 @@ class TrainingSettings(FrozenModel):
     threads: int = Field(default=0, ge=0, le=1024)
     loader_threads: int = Field(default=1, ge=1, le=64)
     checkpoint_minutes: float = Field(default=5.0, gt=0)
+    large_from_px: float = Field(default=160.0, ge=0, le=MOST_SIDE_PX)
     licence: str = Field(default="", max_length=100)
 
     @model_validator(mode="after")

@@ -162,6 +162,7 @@ def _finish(
     metadata = ModelMetadata(
         input_size_px=(size[1], size[0]),
         score_threshold=threshold,
+        large_from_px=settings.large_from_px,
         licence=settings.licence,
         manifest_sha256=corpus.datasets[0].manifest_sha256 if len(corpus.datasets) == 1 else "",
         network=network.config.to_dict(),

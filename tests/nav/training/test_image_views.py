@@ -58,7 +58,8 @@ def test_boxes_go_where_the_pixels_go() -> None:
         visible, shares = clipped_boxes(moved_boxes(BOX, view), window)
         canvas = np.zeros((200, 240, 3), np.uint8)
         draw_view(canvas, ellipse_image(), view)
-        if shares[0] == 1:  # what is cut off is not round any more
+        # What is cut off is not round any more. A whole box's share may miss one by its rounding.
+        if shares[0] > 1 - 1e-9:
             # Interpolation blurs an edge by about a pixel of the coarser of the two images, of up to 1.6 px here.
             np.testing.assert_allclose(box_of_bright(canvas), visible[0], atol=2.5)
             # An edge's blur is the same on both sides: what is left is rounding to levels, and interpolation's phases.

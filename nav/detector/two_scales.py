@@ -1,0 +1,65 @@
+"""Boxes of one picture at two scales: large drogues from a pass at half the size, all others from that at full size.
+
+Drogues nearer than those of most training pictures are larger than a network has learned to box; at half the size they
+are as large as those that it knows best.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from geometry.se3 import Array
+from nav.detector.decoding import without_overlaps
+from nav.detector.input_image import Letterbox
+from nav.detector.maps import SIZE_STEP_PX
+
+Found = tuple[Array, Array]
+"""(n, 4) boxes x, y, width, height in corner coordinates of the input [px], and (n,) scores, the best first."""
+
+# Around the limit both passes answer, so that no drogue falls between them.
+_SHARED_FACTOR = 1.25
+# What lies in a large drogue's box by more than this is a part of the drogue, such as a marker.
+_MOST_INSIDE = 0.5
+
+
+def half_size_px(input_size_px: tuple[int, int]) -> tuple[int, int]:
+    """Half of a width and height, rounded up to sizes that networks take."""
+    width, height = (-(-side // (2 * SIZE_STEP_PX)) * SIZE_STEP_PX for side in input_size_px)
+    return width, height
+
+
+def at_full_size(found: Found, place: Letterbox) -> Found:
+    """What was found in a reduced picture, in corner coordinates of the whole one, which lies in it as `place` says."""
+    boxes, scores = found
+    # Pixel-centre to corner coordinates.
+    return place.to_image(boxes) + np.array([0.5, 0.5, 0.0, 0.0]), scores
+
+
+def joined(full: Found, half: Found, large_from_px: float, most: int) -> Found:
+    """The boxes of both passes, each of the sizes that it is for, without those that overlap a better one.
+
+    Args:
+        full, half: of the two passes, both in coordinates of the full size.
+        large_from_px: longer side from which on a box is large.
+        most: how many boxes at most.
+    """
+    small = full[0][:, 2:].max(axis=1, initial=0) < large_from_px * _SHARED_FACTOR
+    large = half[0][:, 2:].max(axis=1, initial=0) >= large_from_px / _SHARED_FACTOR
+    boxes = np.concatenate([half[0][large], full[0][small]])
+    scores = np.concatenate([half[1][large], full[1][small]])
+    is_large = np.arange(len(boxes)) < large.sum()
+    order = np.argsort(-scores, kind="stable")
+    boxes, scores, is_large = boxes[order], scores[order], is_large[order]
+    whole = ~_is_part(boxes, is_large)
+    boxes, scores = boxes[whole], scores[whole]
+    kept = without_overlaps(boxes, most)
+    return boxes[kept], scores[kept]
+
+
+def _is_part(boxes: Array, is_large: Array) -> Array:
+    """(n,) which of the boxes, best first, lie mostly in a better large one."""
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    sides = np.maximum(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0)
+    inside = sides.prod(axis=2) > _MOST_INSIDE * boxes[:, 2:].prod(axis=1)[:, None]
+    is_part: Array = np.tril(inside & is_large, k=-1).any(axis=1)
+    return is_part

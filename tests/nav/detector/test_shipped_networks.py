@@ -1,0 +1,64 @@
+"""The networks in the package: what they say of themselves, and that they find rendered drogues."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets_manifest.images import StereoImages
+from datasets_manifest.recipe import load_recipe
+from droguekit.cli.main import DONE, run
+from nav.detector.onnx_detector import OnnxDetector
+from nav.detector.registry import COLOR_BLOB, DEFAULT_DETECTOR, detector_names, network_file
+
+NETWORKS = [name for name in detector_names() if name != COLOR_BLOB]
+CARD = Path(__file__).parents[3] / "docs" / "detector.md"
+
+
+def shipped(name: str) -> OnnxDetector:
+    file = network_file(name)
+    assert file is not None
+    return OnnxDetector(file)
+
+
+def test_the_default_is_a_network_that_ships():
+    assert DEFAULT_DETECTOR in NETWORKS
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_says_where_it_comes_from(name):
+    file, metadata = network_file(name), shipped(name).metadata
+    assert file is not None and file.stat().st_size <= 12e6
+    assert metadata.licence == "Apache-2.0"
+    assert metadata.network["variant"] == name.removeprefix("mobile-")
+    (corpus,) = metadata.training["datasets"]
+    assert corpus["name"] == "detector-train" and corpus["manifest_sha256"] == metadata.manifest_sha256
+    # Who reads the card finds the corpus.
+    assert corpus["dataset_sha256"] in CARD.read_text(encoding="utf-8")
+
+
+def test_no_test_scene_is_one_that_was_learned():
+    # Scenes follow from a recipe's seed and their number.
+    assert load_recipe("detector-train")[0].seed != load_recipe("detector-test")[0].seed
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_finds_all_drogues_of_rendered_pairs(name, smoke_dataset, tmp_path):
+    scores = tmp_path / "scores.json"
+    told = ["--detector", name, "--split", "all", "--json", str(scores)]
+    assert run(["benchmark", str(smoke_dataset), *told]) == DONE
+    (result,) = json.loads(scores.read_text())["detectors"].values()
+    assert result["overall"]["boxes"] >= 8
+    assert result["overall"]["recall"] == 1 and result["overall"]["precision"] == 1
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_finds_nothing_where_nothing_is(name):
+    # Mist, and noise as of a sensor in the dark.
+    noise = np.random.default_rng(5).normal(20, 6, (480, 640, 3)).clip(0, 255).astype(np.uint8)
+    mist = np.full((480, 640, 3), 150, np.uint8)
+    found = shipped(name).detect(StereoImages(mist, noise, time_s=0.0, exposure_s=1e-3, encoding="gamma"))
+    assert found.left is None and found.right is None

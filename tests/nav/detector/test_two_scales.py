@@ -1,0 +1,89 @@
+"""Boxes of a pass at full size and one at half: which pass answers for which drogue."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.images import StereoImages
+from nav.detector.input_image import letterbox
+from nav.detector.model_metadata import ModelMetadata
+from nav.detector.onnx_detector import OnnxDetector
+from nav.detector.two_scales import at_full_size, half_size_px, joined
+
+LARGE_PX = 160.0
+NONE = (np.zeros((0, 4)), np.zeros(0))
+
+
+def found(*rows):
+    """Boxes and scores of rows x, y, side, score."""
+    return np.array([[x, y, side, side] for x, y, side, _ in rows], float), np.array([row[3] for row in rows], float)
+
+
+@pytest.mark.parametrize("side_px", [20.0, 127.0, 129.0, 160.0, 199.0, 201.0, 400.0])
+def test_every_size_is_answered_once_where_both_passes_find_it(side_px):
+    boxes, scores = joined(found((10, 10, side_px, 0.8)), found((11, 10, side_px, 0.7)), LARGE_PX, 20)
+    assert len(boxes) == 1
+    # Well below the limit by the full size, well above by half of it, between by the better one.
+    assert scores[0] == (0.7 if side_px > 1.25 * LARGE_PX else 0.8)
+
+
+@pytest.mark.parametrize("side_px", [150.0, 170.0])
+def test_near_the_limit_either_pass_is_enough(side_px):
+    only = found((10, 10, side_px, 0.6))
+    assert len(joined(only, NONE, LARGE_PX, 20)[0]) == len(joined(NONE, only, LARGE_PX, 20)[0]) == 1
+
+
+def test_parts_of_a_large_drogue_are_none_themselves():
+    large, marker, aside = (100, 100, 300, 0.8), (150, 150, 40, 0.7), (500, 20, 40, 0.6)
+    boxes, scores = joined(found(marker, aside), found(large), LARGE_PX, 20)
+    assert scores.tolist() == [0.8, 0.6] and boxes[1, 0] == 500
+    # A large box that is worse than what lies in it takes nothing away.
+    boxes, _ = joined(found((150, 150, 40, 0.9)), found(large), LARGE_PX, 20)
+    assert len(boxes) == 2
+
+
+def test_no_more_boxes_than_asked_for_and_none_of_nothing():
+    many = found(*((50 * index, 0, 30, 0.9 - 0.1 * index) for index in range(6)))
+    assert joined(many, NONE, LARGE_PX, 2)[1].tolist() == pytest.approx([0.9, 0.8])
+    assert len(joined(NONE, NONE, LARGE_PX, 20)[0]) == 0
+
+
+def test_half_a_size_is_one_that_networks_take():
+    assert half_size_px((640, 480)) == (320, 256)
+    assert half_size_px((64, 32)) == (32, 32)
+
+
+def test_boxes_come_back_from_half_the_size():
+    # 640 x 480 lies in the middle of 320 x 256, eight pixels of grey above and below it.
+    place = letterbox((640, 480), (320, 256))
+    boxes, _ = at_full_size((np.array([[10.0, 28.0, 50.0, 60.0]]), np.array([0.5])), place)
+    np.testing.assert_allclose(boxes, [[20.0, 40.0, 100.0, 120.0]], atol=1e-9)
+
+
+def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares):
+    # The network of these tests answers boxes of two cells, of 8 px and more, around red cells.
+    image = np.full((256, 320, 3), 90, np.uint8)
+    image[64:192, 64:192] = (255, 0, 0)
+    images = StereoImages(image, image, time_s=0.0, exposure_s=1e-3, encoding="gamma")
+    sides = {}
+    for large_from_px in (0.0, 12.0):
+        metadata = ModelMetadata(input_size_px=(320, 256), score_threshold=0.6, large_from_px=large_from_px)
+        detector = OnnxDetector(red_squares(metadata=metadata))
+        assert len(detector.pass_sizes_px) == 1 + (large_from_px > 0)
+        sides[large_from_px] = min(box.box_xywh_px[2] for box in detector.candidates(images, 0.6)["left"])
+    # At full size boxes of 16 px are too large to be answered from 12 px on.
+    assert sides[0.0] == pytest.approx(16) and sides[12.0] == pytest.approx(32)
+
+
+def test_a_network_of_one_size_cannot_have_a_second_pass(red_squares):
+    metadata = ModelMetadata(input_size_px=(320, 256), large_from_px=100.0)
+    file = red_squares(metadata=metadata, shape=(2, 3, 256, 320))
+    with pytest.raises(ValueError, match="large_from_px: takes 320x256 px only, and not half of it"):
+        OnnxDetector(file)
+
+
+@pytest.mark.parametrize("wrong", [-1, float("nan"), 5000, "160", True])
+def test_wrong_limits_are_named(wrong):
+    with pytest.raises(ValueError, match="large_from_px: must be 0 to 4096"):
+        ModelMetadata(large_from_px=wrong)
