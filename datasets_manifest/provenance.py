@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Collection, Mapping
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ CONVENTIONS = {
     "time": "of the middle of the exposure",
 }
 
+_CPU_INFO = Path("/proc/cpuinfo")
 _SOFTWARE = ("droguekit", "numpy", "scipy", "opencv-python-headless", "pydantic", "trimesh", "mitsuba", "drjit", "bpy")
 
 
@@ -38,11 +41,23 @@ def software_versions() -> dict[str, str]:
 
 
 def cpu_features() -> list[str]:
-    """Instruction sets that numpy found on this machine; they decide the last bits of derived numbers."""
+    """Instruction sets that numpy found on this machine, and the processor's maker where the system tells it.
+
+    They decide the last bits of derived numbers: libraries choose their code by both.
+    """
     # numpy's stubs leave out the form with `mode`.
     report: dict[str, Any] = np.show_config(mode="dicts")  # type: ignore[call-arg, assignment, func-returns-value]
     extensions = report["SIMD Extensions"]
-    return [*extensions.get("baseline", ()), *extensions.get("found", ())]
+    return [*extensions.get("baseline", ()), *extensions.get("found", ()), *_maker(_CPU_INFO)]
+
+
+def _maker(cpu_info: Path) -> list[str]:
+    """The maker of a Linux machine's processor, such as `GenuineIntel`; nothing where the file does not name one."""
+    try:
+        found = re.search(r"^vendor_id\s*:\s*(\S+)", cpu_info.read_text(encoding="utf-8", errors="replace"), re.M)
+    except OSError:
+        return []
+    return [] if found is None else [found.group(1)]
 
 
 def differing_builds(

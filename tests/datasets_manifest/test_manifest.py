@@ -3,6 +3,7 @@ import random
 
 import pytest
 
+from datasets_manifest import provenance
 from datasets_manifest.layout import frame_folder
 from datasets_manifest.manifest import Drop, build_manifest, dataset_sha256, read_manifest, write_manifest
 from datasets_manifest.provenance import cpu_features, software_versions
@@ -119,6 +120,17 @@ def test_a_record_in_the_wrong_folder_cannot_be_described(tiny, maker):
     frame_folder(tiny, 1).rename(frame_folder(tiny, 2))
     with pytest.raises(ValueError, match=r"000002/record\.json: belongs to frame 1"):
         build_manifest(tiny, make_recipe(), "1", split_of_scene)
+
+
+def test_processors_of_two_makers_are_two(tmp_path, monkeypatch):
+    told = set()
+    for maker in ("GenuineIntel", "AuthenticAMD"):
+        (tmp_path / maker).write_text(f"processor\t: 0\nvendor_id\t: {maker}\nmodel name\t: any\n")
+        monkeypatch.setattr(provenance, "_CPU_INFO", tmp_path / maker)
+        told.add(frozenset(cpu_features()))
+    monkeypatch.setattr(provenance, "_CPU_INFO", tmp_path / "missing")
+    nobody = frozenset(cpu_features())
+    assert len(told | {nobody}) == 3 and frozenset.intersection(*told) == nobody
 
 
 def test_machine_description():
