@@ -49,6 +49,6 @@ def test_new_scenes_and_other_pixels_take_the_same_kernels(kernels, make_recipe)
         new.append(len(taken - known))
         known |= taken
     assert new[0] > 6
-    # A few kernels have variants for arrays that lie on 64 bytes and for those that do not. With numbers of shapes or
-    # pixels compiled in, six and more were new for each scene.
-    assert sum(new[6:]) <= 8, new
+    # Kernels have variants for arrays that lie on 64 bytes and for those that do not: one or two are new now and then.
+    # With numbers of shapes or pixels compiled in, five and more are new for each of these eight scenes.
+    assert sum(new[6:]) <= 24, new
