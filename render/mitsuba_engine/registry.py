@@ -13,9 +13,12 @@ _NUMBERS = 1024
 def reserve_numbers() -> Any:
     """Raise the highest number that was ever given to a shape, a paint or a lamp, before the first scene.
 
-    Calls into scenes compile how many numbers there are into their kernels, as the distance between tables. The
-    registry gives free numbers again, and its highest one never falls. So kernels stay as they are while scenes of
-    other drogues, paints and bystanders come and go; else each new scene would compile all of them anew.
+    Calls into scenes compile how many numbers there are into their kernels, as the distance between tables. Free
+    numbers are given again, and the count falls only when the highest one is free. So kernels stay as they are while
+    scenes of other drogues, paints and bystanders come and go; else each new scene would compile all of them anew.
+
+    Returns:
+        The shape with the highest number, to be kept for as long as there are scenes.
     """
     lamp = {
         "type": "rectangle",
