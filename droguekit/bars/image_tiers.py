@@ -23,7 +23,6 @@ from droguekit.bars.scored_frames import score_frames
 from droguekit.bars.table import BarRow
 from droguekit.benchmark.result import BenchmarkResult
 
-LIGHTS: tuple[Literal["day", "dusk"], ...] = ("day", "dusk")
 # What must be navigated for the bars: our best method, and the seed paper's.
 METHODS = (BEST, CHAIN)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,7 @@ from droguekit.cli.main import FAULT
 EXAMPLES = (
     "droguekit bars c --out out/bars/c",
     "droguekit bars a --out out/bars/a --pairs-per-station 20   (a first look; the full number later goes on from it)",
+    "droguekit bars b --out out/bars/b --light day   (the other one can follow)",
     "droguekit bars d --out /tmp/d --draws 50 --seed 7",
     "droguekit bars speed --out /tmp/speed",
     "droguekit bars e --out out/bars/e",
@@ -23,6 +25,13 @@ EXAMPLES = (
     "droguekit bars docking --out /tmp/docking --recipe docking-10m --sequences 1 --rig rgb-ideal --rig mono",
 )
 _IMAGE_TIERS, _FLIGHT_TIERS = ("a", "b"), ("e", "docking")
+
+
+class Light(StrEnum):
+    """Which dataset of a tier that has two."""
+
+    DAY = "day"
+    DUSK = "dusk"
 
 
 def bars(
@@ -37,6 +46,9 @@ def bars(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Keeps what is finished; gets bars.json, bars.md.")],
     pairs_per_station: Annotated[
         int | None, typer.Option("--pairs-per-station", help="Tiers a and b: pairs at each distance; all by default.")
+    ] = None,
+    light: Annotated[
+        list[Light] | None, typer.Option("--light", help="Tiers a and b: only this; both by default.")
     ] = None,
     draws: Annotated[
         int | None, typer.Option("--draws", help="Tiers c and d: frames a cell; the protocol's by default.")
@@ -85,6 +97,8 @@ def bars(
         raise ValueError("--draws: is for tiers c and d and speed; the others take --pairs-per-station or --sequences")
     if not images and pairs_per_station is not None:
         raise ValueError("--pairs-per-station: is for tiers a and b; the others take --draws or --sequences")
+    if not images and light is not None:
+        raise ValueError("--light: is for tiers a and b; the others have no day and dusk")
     if not flights and any(value is not None for value in (recipe, sequences, rig, tracker)):
         raise ValueError("--recipe, --sequences, --rig, --tracker: are for tiers e and docking")
     if engine is not None and not (flights or tier == "b"):
@@ -103,6 +117,7 @@ def bars(
         pairs_per_station=pairs_per_station,
         draws=draws,
         engines=tuple(dict.fromkeys(engine or ())),
+        lights=tuple(dict.fromkeys(each.value for each in light or Light)),
         workers=workers,
         flights=what,
     )

@@ -48,6 +48,7 @@ class BarsOrder:
         pairs_per_station: rendered pairs at each distance, the recipe's when None; tiers a and b.
         draws: frames of a cell, the protocol's when None; tiers c and d, and speed.
         engines: that render; the recipes' own when empty. Tiers b, e and docking.
+        lights: to measure by, in tiers a and b.
         workers: that render, as many as the machine holds when None.
         flights: of the tiers e and docking.
     """
@@ -57,6 +58,7 @@ class BarsOrder:
     pairs_per_station: int | None = None
     draws: int | None = None
     engines: tuple[str, ...] = ()
+    lights: tuple[Literal["day", "dusk"], ...] = ("day", "dusk")
     workers: int | None = None
     flights: FlightOrder = FlightOrder()
 
@@ -112,7 +114,7 @@ class PlannedData:
 
 
 def image_bars(order: BarsOrder, out: Path, report: ProgressReport) -> list[BarRow]:
-    """Measure the bars of tier `a` or `b`, by day and at dusk, engine by engine.
+    """Measure the bars of tier `a` or `b`, engine by engine and light by light.
 
     Raises:
         ValueError: no such engine, a wrong number, or pairs that could not be made.
@@ -140,11 +142,11 @@ def plan_images(order: BarsOrder) -> list[tuple[Literal["day", "dusk"], PlannedD
     Raises:
         ValueError: no such engine, or a wrong number.
     """
-    from droguekit.bars.image_tiers import LIGHTS, recipe_of
+    from droguekit.bars.image_tiers import recipe_of
 
     plans = []
     for engine in order.engines or (None,):
-        for light in LIGHTS:
+        for light in order.lights:
             recipe, text = open_recipe(recipe_of(order.tier, light), order.seed, engine)
             stations = len(recipe.distance.stations_m or ())
             most = recipe.frames.count // stations

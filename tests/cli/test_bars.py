@@ -200,6 +200,15 @@ def test_tier_b_has_a_dataset_for_each_engine_that_is_named() -> None:
     assert [plan.names for _, plan in plan_images(BarsOrder("b", 3))] == [("day",), ("dusk",)]
 
 
+def test_one_light_alone_has_the_dataset_that_it_has_beside_the_other() -> None:
+    (_, (_, beside)), ((light, alone),) = (
+        plan_images(BarsOrder("a", 3)),
+        plan_images(BarsOrder("a", 3, lights=("dusk",))),
+    )
+    assert light == "dusk" and (alone.names, alone.count) == (beside.names, beside.count)
+    assert alone.recipe.model_dump_json() == beside.recipe.model_dump_json()
+
+
 @pytest.mark.slow
 def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> None:
     tier_b = BarsOrder("b", 3, pairs_per_station=1, engines=("analytic",), workers=0)
@@ -212,6 +221,7 @@ def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> No
     ("arguments", "fault"),
     [
         (["a", "--engine", "blender"], "--engine: is for tiers b, e and docking"),
+        (["c", "--light", "day"], "--light: is for tiers a and b"),
         (["b", "--tracker", "flow"], "--recipe, --sequences, --rig, --tracker: are for tiers e and docking"),
     ],
 )
