@@ -56,10 +56,10 @@ class RenderSettings(FrozenModel):
             pixel on hub and coupling; `samples_per_px` if that is more.
         surround_samples_per_px: the same for hose and tanker.
         max_depth: longest path, counted in segments.
-        denoise: whether light that reaches a matt drogue by way of other surfaces is smoothed over each surface (engine
-            mitsuba). Paths then start from pixel centres, `samples_per_px` where the smoothing is wide and up to
-            `edge_samples_per_px` where the drogue is far away; insides take `open_samples_per_px` rays, and edges the
-            fewer the more pixels are inside.
+        denoise: whether light that reaches a matt drogue, and what stands around it, by way of other surfaces is
+            smoothed over each surface (engine mitsuba). Paths then start from pixel centres, `samples_per_px` where the
+            smoothing is wide and up to `edge_samples_per_px` where the drogue is far away; insides take
+            `open_samples_per_px` rays, and edges the fewer the more pixels are inside.
     """
 
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)

@@ -159,3 +159,11 @@ def bar(start_m: ArrayLike, end_m: ArrayLike, width_along: ArrayLike, size_m: tu
     thick = np.cross(along, wide / np.linalg.norm(wide)) * size_m[1] / 2
     corners = np.array([-wide - thick, wide - thick, wide + thick, -wide + thick])
     return loft(np.stack([start + corners, end + corners]))
+
+
+def with_creases(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The same surface for interpolated normals: round where it is round, with edges where faces meet at an angle.
+
+    Faces that meet by more than 30 degrees share no vertices any more, so that the mesh is not closed.
+    """
+    return trimesh.graph.smooth_shade(mesh, angle=np.radians(30.0), facet_minarea=None)

@@ -74,14 +74,14 @@ def _wing() -> trimesh.Trimesh:
 
 def _fairings() -> list[trimesh.Trimesh]:
     """Slender bodies over the flap tracks that break up the wing's lower side."""
-    share = np.linspace(0.0, 1.0, 13)
+    share = np.linspace(0.0, 1.0, 25)
     half_m = 0.16 * np.sqrt(np.maximum(0.0, 1 - (2 * share - 1) ** 2))
     fairings = []
     for y_m in (4.0, 8.5, 13.0):
         length_m = 0.5 * _chord_m(y_m)
         profile = np.stack([half_m, length_m * share], axis=-1)
         profile[[0, -1], 0] = 0.0
-        body = _along_x(revolve(profile, 16))
+        body = _along_x(revolve(profile, 32))
         body.apply_translation([_nose_x_m(y_m) + 0.62 * _chord_m(y_m), y_m, _wing_z_m(y_m) - 0.05 * _chord_m(y_m)])
         fairings.append(body)
     return fairings

@@ -12,6 +12,9 @@ from drogue_models.parts import FIRST_MARKER_ID, SURROUNDING_PARTS, Part
 from scenes.dirt import DIRT_RGB, dirt_map
 from scenes.sky import REC709_LUMINANCE
 
+SMOOTH_PARTS = (Part.RIM, Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
+"""Parts with interpolated normals, which those with edges too must have creases for; others have flat faces."""
+
 
 def surface_condition(frame: FrameSpec, part_id: int) -> SurfaceCondition:
     """State of a marker or the hub; other parts age as one, see `even_reflectance_rgb`."""

@@ -10,8 +10,10 @@ from datasets_manifest.frame import FrameSpec
 from drogue_models.materials import part_satin
 from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name
+from drogue_models.solids import with_creases
 from render.blender_engine.messages import FrameSetup, Light, Look, PartMesh, StageThings
 from render.surfaces import (
+    SMOOTH_PARTS,
     even_reflectance_rgb,
     lamp_radiance_rgb,
     missing_parts,
@@ -19,9 +21,6 @@ from render.surfaces import (
     surface_condition,
 )
 from scenes.surroundings import Surroundings
-
-# Curved parts get interpolated normals; the others have flat faces and sharp edges.
-_SMOOTH_PARTS = (Part.RIM, Part.HOSE)
 
 
 class Stage:
@@ -76,10 +75,10 @@ def _moved_meshes(frame: FrameSpec) -> _Meshes:
     if frame.drogue is not None and frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None:
         nodes = stage_from_left.apply(frame.hose_nodes_left_m)
         meshes["hose"] = int(Part.HOSE), hose_mesh(nodes, frame.drogue.hose_radius_m)
-        meshes["tanker"] = int(Part.TANKER), tanker_mesh()
+        meshes["tanker"] = int(Part.TANKER), with_creases(tanker_mesh())
         meshes["tanker"][1].apply_transform((stage_from_left @ frame.left_from_tanker).as_matrix())
     for index, bystander in enumerate(frame.bystanders):
-        mesh = bystander_mesh(bystander.shape)
+        mesh = with_creases(bystander_mesh(bystander.shape))
         mesh.apply_transform((stage_from_left @ bystander.left_from_object).as_matrix())
         meshes[f"bystander_{index}"] = int(Part[bystander.kind.upper()]), mesh
     return meshes
@@ -120,7 +119,7 @@ def _part_mesh(frame: FrameSpec, part: int, mesh: trimesh.Trimesh) -> PartMesh:
             center_m = np.asarray(frame.drogue.marker_positions_m[part - FIRST_MARKER_ID])
             radius_m = frame.drogue.marker_radius_m
         places = ((vertices[:, :2] - center_m) / (2 * radius_m) + 0.5).astype(np.float32)
-    return PartMesh(part, vertices, np.asarray(mesh.faces, dtype=np.int32), part in _SMOOTH_PARTS, places)
+    return PartMesh(part, vertices, np.asarray(mesh.faces, dtype=np.int32), part in SMOOTH_PARTS, places)
 
 
 def _look(frame: FrameSpec, part: int) -> Look:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -43,6 +43,10 @@ class Sampled:
     light_again: NDArray[np.float32]
     error_again: NDArray[np.float32]
 
+    def beside(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> Sampled:
+        """The same with other pixels that were traced once."""
+        return replace(self, pixel=np.concatenate([self.pixel, pixel]), light=np.concatenate([self.light, light]))
+
 
 class FrameRays:
     """Cameras, lights and random numbers of one frame."""
@@ -52,6 +56,7 @@ class FrameRays:
         self.scene = scene.scene
         self.width_px = frame.rig.camera.width_px
         self.size = self.width_px * frame.rig.camera.height_px
+        self.focal_px = frame.rig.camera.fx_px
         self._cameras = [CameraRays(frame, eye) for eye in EYES]
         self._seeds = generator(frame.seed, frame.frame_index, "mitsuba samples")
         to_sun, sun_lux = scene.sun

@@ -19,6 +19,7 @@ from render.mitsuba_engine.path_launches import trace_paths
 from render.mitsuba_engine.registry import reserve_numbers
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.smoothed_launches import SmoothedPaths
+from render.mitsuba_engine.surround_launches import trace_around
 from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, Traced, plan_pixels
 from render.motion import blur_px
 from render.traced import TracedEye
@@ -80,20 +81,23 @@ def _sampled(
     eyes: dict[Eye, TracedEye],
     plans: dict[Eye, Plan],
 ) -> Sampled:
-    """What samples say, smoothed where that is asked for and all of the drogue is matt."""
+    """What samples say, smoothed where that is asked for; light on a drogue only if all of it is matt."""
     scene, around = stage
-    matt = frame.drogue is not None and frame.drogue.satin is None
     centers = _centers(eyes, plans)
-    seen = any(len(pixel) > 0 for pixel in centers.values())
-    if not (settings.denoise and matt and seen):
-        return trace_paths(FrameRays(frame, scene, around, IN_OPEN), plans, settings)
-    assert frame.left_from_drogue is not None
-    # Ribs have narrow sides that few centres see: what is smoothed had better vary little with the direction.
+    matt = frame.drogue is not None and frame.drogue.satin is None
+    smoothed = settings.denoise and matt and any(len(pixel) > 0 for pixel in centers.values())
     in_open = IN_OPEN.copy()
-    in_open[Part.RIBS] = 1
-    rays = FrameRays(frame, scene, around, in_open)
-    px_per_m = frame.rig.camera.fx_px / float(frame.left_from_drogue.translation_m[2])
-    return SmoothedPaths(rays, settings, px_per_m, blur_px(frame)).trace(plans, centers)
+    # Ribs have narrow sides that few centres see: what is smoothed had better vary little with the direction.
+    in_open[Part.RIBS] = smoothed
+    rays, moves_px = FrameRays(frame, scene, around, in_open), blur_px(frame)
+    if smoothed:
+        assert frame.left_from_drogue is not None
+        px_per_m = frame.rig.camera.fx_px / float(frame.left_from_drogue.translation_m[2])
+        found = SmoothedPaths(rays, settings, px_per_m, moves_px).trace(plans, centers)
+    else:
+        found = trace_paths(rays, plans, settings)
+    pixel, met = rays.of_both(plans, "surround"), np.concatenate([eyes[eye].part_id.reshape(-1) > 0 for eye in EYES])
+    return found.beside(pixel, trace_around(rays, pixel, met, settings, moves_px))
 
 
 def _centers(eyes: dict[Eye, TracedEye], plans: dict[Eye, Plan]) -> dict[str, NDArray[np.int64]]:

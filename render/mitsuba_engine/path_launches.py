@@ -14,7 +14,7 @@ from geometry.stereo import Eye
 from render.mitsuba_engine.launches import FrameRays, Sampled, and_some_again, means_by_pixel
 from render.mitsuba_engine.noise import TWICE_EVERY
 from render.mitsuba_engine.sun_sky_paths import trace_first, trace_rest
-from render.mitsuba_engine.traced import SURROUND_DEPTH, Plan
+from render.mitsuba_engine.traced import Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +39,8 @@ class PathLight:
 
 
 def trace_paths(rays: FrameRays, plans: dict[Eye, Plan], settings: RenderSettings) -> Sampled:
-    """Trace all planned pixels, and some of the drogue's once more."""
-    opened, sheltered, deep, edges, surround = (
-        rays.of_both(plans, kind) for kind in ("open", "sheltered", "deep", "edges", "surround")
-    )
+    """Trace the planned pixels of the drogue, and some of them once more."""
+    opened, sheltered, deep, edges = (rays.of_both(plans, kind) for kind in ("open", "sheltered", "deep", "edges"))
     deep_edges = rays.of_both(plans, "deep_edges")
     deep = np.concatenate([deep, deep_edges])
     depth, count = settings.max_depth, settings.samples_per_px
@@ -53,13 +51,11 @@ def trace_paths(rays: FrameRays, plans: dict[Eye, Plan], settings: RenderSetting
     of_edges = mean_light(rays, and_some_again(edges), count, depth)
     if fine > count:
         of_edges = of_edges.with_first_of(mean_light(rays, and_some_again(edges), fine, 1))
-    of_surround = mean_light(rays, surround, settings.surround_samples_per_px, SURROUND_DEPTH)
     twice = [(opened, of_open), (sheltered, of_sheltered), (deep, of_deep), (edges, of_edges)]
-    parts = [*twice, (surround, of_surround)]
     again = np.concatenate([pixel[::TWICE_EVERY] for pixel, _ in twice])
     return Sampled(
-        np.concatenate([pixel for pixel, _ in parts]),
-        np.concatenate([light[: len(pixel)].seen() for pixel, light in parts]),
+        np.concatenate([pixel for pixel, _ in twice]),
+        np.concatenate([light[: len(pixel)].seen() for pixel, light in twice]),
         again,
         np.concatenate([light[len(pixel) :].seen() for pixel, light in twice]),
         np.zeros((len(again), 3), dtype=np.float32),

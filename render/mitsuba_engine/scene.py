@@ -12,11 +12,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
 from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part
+from drogue_models.solids import with_creases
 from geometry.se3 import RigidTransform
 from render.mitsuba_engine.shapes import bystander_name, bystander_shapes, drogue_shapes, front_faces
 from render.mitsuba_engine.sky_irradiance import as_mitsuba_reads
@@ -48,7 +50,7 @@ class DrogueScene:
 
     def __init__(self, frame: FrameSpec) -> None:
         self._has_surround = frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None
-        self._tanker_vertices = np.asarray(tanker_mesh().vertices)
+        self._tanker = with_creases(tanker_mesh())
         shapes, features = bystander_shapes(frame), {}
         if frame.drogue is not None:
             gone = missing_parts(frame)
@@ -60,7 +62,7 @@ class DrogueScene:
             }
             if self._has_surround:
                 meshes[int(Part.HOSE)] = hose_mesh(self._hose_nodes(frame), frame.drogue.hose_radius_m)
-                meshes[int(Part.TANKER)] = tanker_mesh()
+                meshes[int(Part.TANKER)] = self._tanker
             shapes |= drogue_shapes(frame, meshes)
             features = drogue_shapes(frame, fronts)
         # Merging meshes would lose the parts' identity.
@@ -82,8 +84,7 @@ class DrogueScene:
             assert frame.left_from_tanker is not None and frame.drogue is not None
             hose = hose_mesh(self._hose_nodes(frame), frame.drogue.hose_radius_m)
             self._set_vertices(f"part_{int(Part.HOSE)}", np.asarray(hose.vertices), np.asarray(hose.vertex_normals))
-            stage_from_tanker = stage_from_left @ frame.left_from_tanker
-            self._set_vertices(f"part_{int(Part.TANKER)}", stage_from_tanker.apply(self._tanker_vertices), None)
+            self._set_moved(f"part_{int(Part.TANKER)}", stage_from_left @ frame.left_from_tanker, self._tanker)
         self._set_bystanders(frame, stage_from_left)
         self._set_looks(frame)
         self._set_lights(stage_from_left @ frame.world_from_left.inverse(), around)
@@ -93,8 +94,7 @@ class DrogueScene:
         for index, bystander in enumerate(frame.bystanders):
             name = bystander_name(index, int(Part[bystander.kind.upper()]))
             stage_from_object = stage_from_left @ bystander.left_from_object
-            vertices = np.asarray(bystander_mesh(bystander.shape).vertices)
-            self._set_vertices(name, stage_from_object.apply(vertices), None)
+            self._set_moved(name, stage_from_object, with_creases(bystander_mesh(bystander.shape)))
             self._parameters[f"{name}.bsdf.reflectance.value"] = mi.Color3f(list(bystander.reflectance_rgb))
 
     def _set_looks(self, frame: FrameSpec) -> None:
@@ -128,10 +128,13 @@ class DrogueScene:
         )
         self._parameters["sun.irradiance.value"] = mi.Color3f(around.beam_illuminance_lux.tolist())
 
-    def _set_vertices(self, name: str, vertices_m: NDArray[np.float64], normals: NDArray[np.float64] | None) -> None:
+    def _set_moved(self, name: str, stage_from_mesh: RigidTransform, mesh: trimesh.Trimesh) -> None:
+        vertices_m, normals = stage_from_mesh.apply(mesh.vertices), stage_from_mesh.rotate(mesh.vertex_normals)
+        self._set_vertices(name, vertices_m, normals)
+
+    def _set_vertices(self, name: str, vertices_m: NDArray[np.float64], normals: NDArray[np.float64]) -> None:
         self._set_buffer(f"{name}.vertex_positions", vertices_m)
-        if normals is not None:
-            self._set_buffer(f"{name}.vertex_normals", normals)
+        self._set_buffer(f"{name}.vertex_normals", normals)
 
     def _set_buffer(self, key: str, rows: NDArray[np.float64]) -> None:
         # The buffer's type depends on the variant.

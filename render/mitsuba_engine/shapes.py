@@ -16,18 +16,16 @@ from drogue_models.materials import part_satin
 from drogue_models.meshes import bystander_mesh
 from drogue_models.parameters import SatinPaint
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from render.surfaces import even_reflectance_rgb, lamp_radiance_rgb, surface_condition
+from drogue_models.solids import with_creases
+from render.surfaces import SMOOTH_PARTS, even_reflectance_rgb, lamp_radiance_rgb, surface_condition
 from scenes.dirt import DIRT_MAP_PX
-
-# Curved parts get interpolated normals; the others have flat faces and sharp edges.
-_SMOOTH_PARTS = (Part.RIM, Part.HOSE)
 
 
 def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any]) -> Any:
     """A Mitsuba shape from a mesh; `look` holds its material, and its lamp if it is one."""
     path = folder / f"{part}.ply"
     mesh.export(path)
-    shape = {"type": "ply", "filename": str(path), "face_normals": part not in _SMOOTH_PARTS, **look}
+    shape = {"type": "ply", "filename": str(path), "face_normals": part not in SMOOTH_PARTS, **look}
     return mi.load_dict(shape)
 
 
@@ -98,7 +96,7 @@ def bystander_shapes(frame: FrameSpec) -> dict[str, Any]:
             part = int(Part[bystander.kind.upper()])
             name = bystander_name(index, part)
             look = _even(np.array(bystander.reflectance_rgb))
-            shapes[name] = _shape(bystander_mesh(bystander.shape), part, Path(folder), look)
+            shapes[name] = _shape(with_creases(bystander_mesh(bystander.shape)), part, Path(folder), look)
             shapes[name].set_id(name)
     return shapes
 

@@ -5,6 +5,7 @@ import pytest
 
 from drogue_models.bystanders import BystanderShape
 from drogue_models.meshes import bystander_mesh
+from drogue_models.solids import with_creases
 
 SHAPES = [
     BystanderShape(form="probe", radius_m=0.04, length_m=5.0),
@@ -42,3 +43,21 @@ def test_a_probe_has_its_tip_at_the_origin_and_its_nozzle_in_front():
     assert vertices[:, 2].min() == 0.0
     assert np.hypot(vertices[:, 0], vertices[:, 1]).max() == pytest.approx(0.04)
     assert vertices[:, 2].max() == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.form)
+def test_creases_move_no_surface(shape):
+    mesh, creased = bystander_mesh(shape), with_creases(bystander_mesh(shape))
+    places = [np.sort(each.triangles_center, axis=0) for each in (mesh, creased)]
+    np.testing.assert_allclose(places[0], places[1], atol=1e-12)
+    assert creased.volume == pytest.approx(mesh.volume)
+
+
+def test_a_ball_is_round_and_a_disc_keeps_its_edge():
+    ball = with_creases(bystander_mesh(SHAPES[2]))
+    radial = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
+    # Normals of a mesh of 64 x 32 faces: a small part of the 5.6 degrees between two faces.
+    assert (radial * ball.vertex_normals).sum(axis=1).min() > np.cos(np.radians(1.0))
+    disc = with_creases(bystander_mesh(SHAPES[3]))
+    along = np.abs(disc.vertex_normals[:, 2])
+    assert np.all((along < 1e-6) | (along > 1 - 1e-6))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -94,3 +95,39 @@ def redness_centroid(seen, marker):
     # Beyond the marker's own surroundings other things are bluer than the face.
     near = (u - red.shape[1] / 2 + 0.5) ** 2 + (v - red.shape[0] / 2 + 0.5) ** 2 < (min(red.shape) / 2) ** 2
     return np.array([np.sum((values * red)[near]) for values in (u, v)]) / np.sum(red[near])
+
+
+@pytest.fixture(scope="module")
+def below_the_wing(engine, make_recipe):
+    """A frame that shows pod and wing, its recipe, and what many paths through every pixel make of it."""
+    recipe = make_recipe(scale=1 / 3, stations_m=(12.0,))
+    frame = next(frame for index in range(50) if shows_the_tanker(frame := sample_frame(recipe, index)))
+    many = {"surround_samples_per_px": 1024, "denoise": False}
+    return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
+
+
+def shows_the_tanker(frame):
+    """Whether the hose leaves the pod well within the left image."""
+    camera, origin = frame.rig.camera, frame.left_from_tanker.translation_m
+    u, v = origin[:2] / origin[2] * camera.fx_px + (camera.cx_px, camera.cy_px)
+    return 60 < u < camera.width_px - 60 and 60 < v < camera.height_px - 60
+
+
+def on_the_tanker(seen):
+    """(P, 3) light of pixels on pod and wing away from their outlines. [cd/m2]"""
+    inside = cv2.erode((seen.part_id == Part.TANKER).astype(np.uint8), np.ones((3, 3), dtype=np.uint8)) > 0
+    return seen.radiance_cd_m2[inside]
+
+
+def test_smoothing_leaves_no_speckles_on_the_tanker(engine, below_the_wing):
+    recipe, frame, truth = below_the_wing
+    settled = on_the_tanker(truth.left)
+    assert len(settled) > 2000
+    errors = []
+    for denoise in (True, False):
+        seen = engine.render(frame, recipe.render.model_copy(update={"denoise": denoise}))
+        errors.append(on_the_tanker(seen.left) - settled)
+    smoothed, alone = (np.sqrt(np.mean(error**2)) for error in errors)
+    # Some eighty neighbours' paths against a pixel's own four; what is left is blur on narrow parts.
+    assert smoothed < 0.4 * alone
+    assert np.mean(errors[0]) == pytest.approx(0.0, abs=0.01 * settled.mean())
