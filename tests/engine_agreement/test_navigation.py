@@ -72,7 +72,7 @@ def test_pairs_are_spread_over_distances():
 
 def test_samples_grow_with_distance_and_stay_within_their_bounds():
     samples = [station_recipe("blender", d, 1, 0)[0].render.samples_per_px for d in (1.7, 5.0, 10.0, 40.0)]
-    assert samples == [4, 16, 64, 144]
+    assert samples == [4, 64, 256, 576]
 
 
 @pytest.mark.parametrize("distance_m", [5.0, 40.0])
