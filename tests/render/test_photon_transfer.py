@@ -69,7 +69,7 @@ def test_gains_of_pixels_are_what_stays_in_the_mean_of_many_shots(frame, prnu_fr
     assert np.sqrt(fixed) / shots.mean() == pytest.approx(prnu_fraction, rel=WITHIN)
 
 
-def lit_electrons(frame, power=1.0):
+def lit_electrons(frame, power=1.0, engine="analytic"):
     """Mean electrons of the red channel in the cores of the lit markers, read off the images, and their luminance."""
     drogue = frame.drogue.model_copy(
         update={"marker_luminance_cd_m2": 2000.0 * power, "marker_emission_rgb": (1.0, 1.0, 1.0)}
@@ -80,7 +80,7 @@ def lit_electrons(frame, power=1.0):
     means = []
     for shown in (drogue, dark):
         shot = frame.model_copy(update={"drogue": shown})
-        radiance = load_engine("analytic").render(shot, RenderSettings(engine="analytic"))
+        radiance = load_engine(engine).render(shot, RenderSettings(engine=engine))
         images = expose(shot, radiance)
         markers = radiance.left.part_id >= FIRST_MARKER_ID
         # Cores: pixels whose neighbours out to the lens's reach see markers too.
@@ -93,9 +93,9 @@ def lit_electrons(frame, power=1.0):
     return (means[0] - means[1]) / dn_per_electron(frame.sensor, frame.exposure.gain)
 
 
-def lit_frame(make_recipe, time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0):
+def lit_frame(make_recipe, time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0, scale=1.0):
     """A frame in thick dusk: what the sun lights is taken off again anyway."""
-    frame = sample_frame(make_recipe(stations_m=(distance_m,)), 0)
+    frame = sample_frame(make_recipe(scale=scale, stations_m=(distance_m,)), 0)
     assert frame.drogue is not None and load_drogue("red-8").marker_count == 8
     changes = {
         "sensor": frame.sensor.model_copy(update={"output_bits": 12, "full_well_e": 1e6}),
@@ -119,12 +119,23 @@ def lit_frame(make_recipe, time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0):
 def test_electrons_of_a_lit_marker(make_recipe, power, time_s, f_number, distance_m, gain):
     """L t q pi / (4 N^2) through the air of the distance; the luminance of an area does not fall with distance."""
     frame = lit_frame(make_recipe, time_s, f_number, distance_m, gain)
-    air = np.exp(-frame.environment.extinction_per_m * distance_m)
-    luminance = 2000.0 * power
-    responsivity = frame.sensor.responsivity_e_per_lux_s
-    expected = luminance * air * np.pi / (4 * f_number**2) * responsivity * time_s
     assert REC709_LUMINANCE.sum() == pytest.approx(1.0)
-    assert lit_electrons(frame, power) == pytest.approx(expected, rel=WITHIN)
+    assert lit_electrons(frame, power) == pytest.approx(expected_electrons(frame, power, distance_m), rel=WITHIN)
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize(("power", "f_number", "distance_m"), [(1.0, 2.8, 3.0), (3.0, 1.4, 1.7)])
+def test_electrons_of_a_lit_marker_by_path_tracing(make_recipe, engine, power, f_number, distance_m):
+    frame = lit_frame(make_recipe, f_number=f_number, distance_m=distance_m, scale=0.4)
+    assert lit_electrons(frame, power, engine.name) == pytest.approx(
+        expected_electrons(frame, power, distance_m), rel=WITHIN
+    )
+
+
+def expected_electrons(frame, power, distance_m):
+    air, exposure = np.exp(-frame.environment.extinction_per_m * distance_m), frame.exposure
+    lux_s = 2000.0 * power * air * np.pi / (4 * exposure.f_number**2) * exposure.time_s
+    return lux_s * frame.sensor.responsivity_e_per_lux_s
 
 
 def test_light_of_a_whole_marker_falls_with_the_square_of_its_distance(make_recipe):
