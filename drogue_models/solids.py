@@ -164,6 +164,8 @@ def bar(start_m: ArrayLike, end_m: ArrayLike, width_along: ArrayLike, size_m: tu
 def with_creases(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The same surface for interpolated normals: round where it is round, with edges where faces meet at an angle.
 
-    Faces that meet by more than 30 degrees share no vertices any more, so that the mesh is not closed.
+    Faces that meet by more than 15 degrees share no vertices any more, so that the mesh is not closed. That is little
+    more than what round parts have between two faces: a normal that were tilted where a tube ends would look away from
+    a camera close beside the tube over all of its length.
     """
-    return trimesh.graph.smooth_shade(mesh, angle=np.radians(30.0), facet_minarea=None)
+    return trimesh.graph.smooth_shade(mesh, angle=np.radians(15.0), facet_minarea=None)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drogue_models.bystanders import BystanderShape
+from drogue_models.bystanders import SECTIONS, BystanderShape
 from drogue_models.meshes import bystander_mesh
 from drogue_models.solids import with_creases
 
@@ -61,3 +61,14 @@ def test_a_ball_is_round_and_a_disc_keeps_its_edge():
     disc = with_creases(bystander_mesh(SHAPES[3]))
     along = np.abs(disc.vertex_normals[:, 2])
     assert np.all((along < 1e-6) | (along > 1 - 1e-6))
+
+
+def test_normals_of_a_tube_are_not_tilted_by_its_ends():
+    probe = with_creases(bystander_mesh(SHAPES[0]))
+    vertices, normals = probe.vertices, probe.vertex_normals
+    # Past the nozzle's last corner there is nothing but the tube, and its end cap.
+    tube = (vertices[:, 2] > 0.04 * 6.0 - 1e-9) & (np.abs(normals[:, 2]) < 0.9)
+    assert tube.sum() >= 2 * SECTIONS
+    on_nozzle = tube & (np.abs(normals[:, 2]) > 0.3)
+    assert np.abs(normals[tube & ~on_nozzle, 2]).max() < 1e-6
+    assert (vertices[on_nozzle, 2] < 0.04 * 6.0 + 1e-9).all()
