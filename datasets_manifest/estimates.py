@@ -47,7 +47,7 @@ class Region(FrozenModel):
     Attributes:
         eye: which image.
         box_xywh_px: x, y of the low corner, width, height in pixel-centre coordinates; may reach over the image's edge.
-        source: `detector`, or the name of the tracker that followed it here.
+        source: `detector`, the name of the tracker that followed it, or `other eye` where that one alone had found it.
         score: 0 to 1.
     """
 

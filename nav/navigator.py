@@ -28,10 +28,11 @@ from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.tolerances import EXACT, StatedTolerances
 from nav.real_eyes import ideal_centroids
 from nav.refinement import refine
+from nav.rim_boxes import rim_boxes
 from nav.sighting import Sighting, estimate_pose, regions_of
 
-# The source of a region that no tracker has followed.
-DETECTOR = "detector"
+# Sources of regions that no tracker has followed: the detector, or the other eye where that alone had found the drogue.
+DETECTOR, OTHER_EYE = "detector", "other eye"
 NOT_DETECTED = NoFixReason("no drogue detected in the left image, nor in the right one")
 # To hand a smaller box to another thread takes as long as to work on it.
 _WORTH_A_THREAD_PX2 = 1e5
@@ -56,7 +57,7 @@ class Navigator:
     ) -> None:
         self._centroids = centroids
         self._tolerances = tolerances
-        self._rig = rig
+        self._rig, self._rim_radius_m = rig, drogue.rim_radius_m
         self._layout = marker_layout(drogue)
         self._color = marker_color(drogue)
         self._detector: Detector = ColorBlobDetector(drogue) if detector is None else detector
@@ -75,7 +76,21 @@ class Navigator:
         regions = regions_of(self._detector.detect(images), DETECTOR)
         stage_s = {"detect": perf_counter() - start}
         sighting = self.measure(images, regions)
-        return replace(sighting, stage_s={**stage_s, **sighting.stage_s})
+        return self._with_other_eye(images, replace(sighting, stage_s={**stage_s, **sighting.stage_s}))
+
+    def _with_other_eye(self, images: StereoImages, sighting: Sighting) -> Sighting:
+        """What both eyes show, where only one did: its pose of the ring says where the other one must see it."""
+        both_or_none = sighting.markers[0] > 0 or sighting.markers[1] == 0
+        one = sighting if both_or_none else sighting.with_rough()
+        if both_or_none or not isinstance(one.rough, Solution):
+            return one
+        assert isinstance(one.observation, Observation)
+        (found,) = (region for region in one.regions if one.observation.seen[EYES.index(region.eye)].any())
+        ahead = regions_of(rim_boxes(self._rig, self._rim_radius_m, one.rough.left_from_drogue), OTHER_EYE)
+        both = {region.eye: region.model_copy(update={"score": found.score}) for region in ahead} | {found.eye: found}
+        again = self.measure(images, tuple(both[eye] for eye in EYES if eye in both))
+        spent_s = one.stage_s | {stage: one.stage_s.get(stage, 0.0) + s for stage, s in again.stage_s.items()}
+        return replace(again if again.markers > one.markers else one, stage_s=spent_s)
 
     def measure(self, images: StereoImages, regions: tuple[Region, ...]) -> Sighting:
         """Measure the markers of one pair by the binary chain, where somebody has found the drogue, and match them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.se3 import angles_from_rotation
 from geometry.stereo import EYES, paper_rig
+from nav.detector.interface import Detection
 from nav.navigator import CENTROID_CHOICES, Navigator
 from nav.pose.interface import NoFixReason
 from nav.pose.tolerances import EXACT, StatedTolerances
@@ -239,3 +241,43 @@ def test_a_region_beside_the_image_shows_nothing(draw, make_pose):
     seen = NAVIGATOR.measure(images, (beside, before)).observation
     assert isinstance(seen, NoFixReason)
     assert seen.reason.startswith("no ring of markers among 0 regions of the left image")
+
+
+class OneEyed:
+    """A detector that overlooks the drogue in one image, or takes something else for it."""
+
+    name = "one-eyed"
+
+    def __init__(self, blind, box_xywh_px=None):
+        self._inner, self._blind = NAVIGATOR.detector, blind
+        self._instead = None if box_xywh_px is None else Detection(box_xywh_px, 0.9)
+
+    def detect(self, images):
+        return replace(self._inner.detect(images), **{self._blind: self._instead})
+
+    def candidates(self, images, least_score):
+        return self._inner.candidates(images, least_score)
+
+
+@pytest.mark.parametrize("box_xywh_px", [None, (3.0, 4.0, 60.0, 50.0)], ids=["nothing", "another place"])
+@pytest.mark.parametrize("blind", EYES)
+@pytest.mark.parametrize("z_m", [1.7, 10.0, 40.0])
+def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(draw, make_pose, z_m, blind, box_xywh_px):
+    place = make_pose(0.05, -0.04, z_m, 4.0, -6.0, 3.0)
+    images = draw(RIG, DROGUE, place, np.random.default_rng(3))
+    (known,) = NAVIGATOR.estimate(0, images, ["joint"])
+    (estimate,) = Navigator(RIG, DROGUE, OneEyed(blind, box_xywh_px)).estimate(0, images, ["joint"])
+    assert isinstance(known, PoseEstimate) and isinstance(estimate, PoseEstimate)
+    assert {region.eye: region.source for region in estimate.regions}[blind] == "other eye"
+    np.testing.assert_allclose(
+        estimate.left_from_drogue.translation_m, known.left_from_drogue.translation_m, atol=1e-3 * z_m**2 / 1e2
+    )
+
+
+def test_what_only_one_eye_can_see_is_not_made_up_in_the_other(draw, make_pose):
+    place = make_pose(0.05, -0.04, 5.0, 4.0, -6.0, 3.0)
+    images = draw(RIG, DROGUE, place, np.random.default_rng(4))
+    images = replace(images, right=np.full_like(images.right, int(np.median(images.right))))
+    (estimate,) = NAVIGATOR.estimate(0, images, ["joint-hub"])
+    assert not isinstance(estimate, PoseEstimate) and "one eye only" in estimate.reason
+    assert [region.eye for region in estimate.regions] == ["left"]
