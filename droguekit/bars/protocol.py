@@ -11,6 +11,6 @@ DOCKING_RANGE_M = (1.7, 10.0)
 BATCHED_DRAWS = 10_000
 SINGLE_DRAWS = 1000
 # The order of 5, 7 and 8 markers differs by two percent in the mean at least: so many draws tell it.
-ORDER_DRAWS = 16_000
+ORDER_DRAWS = 48_000
 # By ten and more for the robust method, which takes longer.
 ROBUST_ORDER_DRAWS = 2000
