@@ -80,15 +80,19 @@ class Navigator:
 
     def _with_other_eye(self, images: StereoImages, sighting: Sighting) -> Sighting:
         """What both eyes show, where only one did: its pose of the ring says where the other one must see it."""
-        both_or_none = sighting.markers[0] > 0 or sighting.markers[1] == 0
-        one = sighting if both_or_none else sighting.with_rough()
-        if both_or_none or not isinstance(one.rough, Solution):
+        observation = sighting.observation
+        if isinstance(observation, NoFixReason) or observation.seen.any(axis=1).all():
+            return sighting
+        one = sighting.with_rough()
+        if not isinstance(one.rough, Solution):
             return one
-        assert isinstance(one.observation, Observation)
-        (found,) = (region for region in one.regions if one.observation.seen[EYES.index(region.eye)].any())
-        ahead = regions_of(rim_boxes(self._rig, self._rim_radius_m, one.rough.left_from_drogue), OTHER_EYE)
-        both = {region.eye: region.model_copy(update={"score": found.score}) for region in ahead} | {found.eye: found}
-        again = self.measure(images, tuple(both[eye] for eye in EYES if eye in both))
+        boxes = rim_boxes(self._rig, self._rim_radius_m, one.rough.left_from_drogue)
+        (found,) = (region for region in one.regions if observation.seen[EYES.index(region.eye)].any())
+        ahead = [region for region in regions_of(boxes, OTHER_EYE) if region.eye != found.eye]
+        if not ahead:
+            return one
+        both = {found.eye: found, ahead[0].eye: ahead[0].model_copy(update={"score": found.score})}
+        again = self.measure(images, tuple(both[eye] for eye in EYES))
         spent_s = one.stage_s | {stage: one.stage_s.get(stage, 0.0) + s for stage, s in again.stage_s.items()}
         return replace(again if again.markers > one.markers else one, stage_s=spent_s)
 

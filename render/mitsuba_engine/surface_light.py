@@ -26,7 +26,7 @@ SMOOTHING_M = 0.008
 """Standard deviation of the smoothing on a surface: ribs are this wide. [m]"""
 # The hub's light is even; the coupling has a recess of 0.1 m whose walls get darker quickly. Shadows of the sky under a
 # wing are as wide as pods are thick. [m]
-_SMOOTHING_BY_PART_M = {Part.HUB: 0.016, Part.COUPLING: 0.005, Part.TANKER: 0.25, Part.BOARD: 0.05}
+_SMOOTHING_BY_PART_M = {Part.HUB: 0.016, Part.COUPLING: 0.005, Part.TANKER: 0.25}
 # A neighbour's plane may miss a point by this much [m], or by this share of the weights' reach: large parts are round.
 _SAME_PLANE_M = 0.005
 _SAME_PLANE_PER_REACH = 0.25
