@@ -12,6 +12,7 @@ from datasets_manifest.frame import FrameSpec
 from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye
+from render.mitsuba_engine.jit_arrays import jit_array
 from render.motion import pose_polynomial
 
 
@@ -72,4 +73,4 @@ def _corner_slopes(lens: Lens) -> tuple[Any, Any]:
     camera = lens.camera
     u, v = np.meshgrid(np.arange(camera.width_px + 1) - 0.5, np.arange(camera.height_px + 1) - 0.5)
     rays = lens.rays(np.stack([u, v], axis=-1)).astype(np.float32)
-    return mi.Float(rays[..., 0].ravel()), mi.Float(rays[..., 1].ravel())
+    return jit_array(mi.Float, rays[..., 0].ravel()), jit_array(mi.Float, rays[..., 1].ravel())

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from datasets_manifest.frame import FrameSpec
 from geometry.stereo import Eye
 from render.mitsuba_engine.camera_rays import CameraRays
+from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.launches import rows_of
 from render.mitsuba_engine.scene import DrogueScene, by_shape
 from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, slipped_through
@@ -44,7 +45,7 @@ class CenterPasses:
         pixel = np.flatnonzero(OF_DROGUE[part_id])
         if len(pixel):
             to_sun, _ = self._scene.sun
-            ray = self._center_rays(mi.UInt32(pixel), (s + 1) / 2)
+            ray = self._center_rays(jit_array(mi.UInt32, pixel), (s + 1) / 2)
             surface = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
             faces = surface.is_valid() & (dr.dot(surface.n, to_sun) > 0)
             sunlit.reshape(-1)[pixel] = np.array(faces & ~self._scene.scene.ray_test(surface.spawn_ray(to_sun), faces))
@@ -53,7 +54,7 @@ class CenterPasses:
     @staticmethod
     def _hits(scene: Any, ray: Any) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
-        table = mi.UInt32(by_shape(scene, np.arange(256, dtype=np.uint32)))
+        table = jit_array(mi.UInt32, by_shape(scene, np.arange(256, dtype=np.uint32)))
         number: Any = dr.reinterpret_array(mi.UInt32, hit.shape)
         ids = dr.gather(mi.UInt32, table, number, hit.is_valid())
         dr.eval(ids, hit.t)
@@ -74,7 +75,9 @@ class CenterPasses:
                 again = np.flatnonzero(leaked)
                 aside = covered[again]
                 points[again], normals[again] = self._surface(aside, place)
-                ids, distances = self._hits(self._scene.scene, self._center_rays(mi.UInt32(aside), place=place))
+                ids, distances = self._hits(
+                    self._scene.scene, self._center_rays(jit_array(mi.UInt32, aside), place=place)
+                )
                 part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
                 leaked[again] = slipped_through(ids, normals[again], points[again] - pose[:, 3])
             met = part_id.reshape(-1)[covered] > 0
@@ -94,7 +97,7 @@ class CenterPasses:
         self, pixel: NDArray[np.int64], place: tuple[float, float]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(P, 3) points and normals in the drogue frame."""
-        ray = self._center_rays(mi.UInt32(pixel), place=place)
+        ray = self._center_rays(jit_array(mi.UInt32, pixel), place=place)
         hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
         dr.eval(hit.p, hit.n)
         return rows_of(hit.p), rows_of(hit.n)
@@ -107,5 +110,5 @@ class CenterPasses:
         # Where a hidden feature would be, something else is seen: what is covered bounds the features too.
         window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         pixel = np.arange(part_id.size, dtype=np.uint32).reshape(self._shape)[window].ravel()
-        alone_id, alone_m = self._hits(self._scene.features, self._center_rays(mi.UInt32(pixel)))
+        alone_id, alone_m = self._hits(self._scene.features, self._center_rays(jit_array(mi.UInt32, pixel)))
         return amodal_counts(part_id[window].ravel(), distance_m[window].ravel(), alone_id, alone_m)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from datasets_manifest.frame import FrameSpec
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.camera_rays import CameraRays
+from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.noise import TWICE_EVERY
 from render.mitsuba_engine.scene import DrogueScene, by_shape
 from render.mitsuba_engine.sky_irradiance import SkyIrradiance, as_mitsuba_reads
@@ -65,7 +66,7 @@ class FrameRays:
             to_sun,
             sun_lux,
             SkyIrradiance(as_mitsuba_reads(around.light_map), world_from_stage.rotation),
-            mi.Float(by_shape(scene.scene, in_open)),
+            jit_array(mi.Float, by_shape(scene.scene, in_open)),
             frame.drogue is not None and frame.drogue.marker_luminance_cd_m2 > 0,
         )
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe import RenderSettings
 from geometry.stereo import Eye
+from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.launches import FrameRays, Sampled, and_some_again, means_by_pixel
 from render.mitsuba_engine.noise import TWICE_EVERY
 from render.mitsuba_engine.sun_sky_paths import trace_first, trace_rest
@@ -83,7 +84,7 @@ def _launch(rays: FrameRays, pixel: NDArray[np.int64], count: int, max_depth: in
         return sums
     lanes = len(pixel) * count
     sampler = rays.sampler(lanes, count)
-    of_pixel = dr.gather(mi.UInt32, mi.UInt32(pixel), dr.arange(mi.UInt32, lanes) // count)
+    of_pixel = dr.gather(mi.UInt32, jit_array(mi.UInt32, pixel), dr.arange(mi.UInt32, lanes) // count)
     ray = rays.through(of_pixel, sampler.next_2d(), sampler.next_1d())
     first, hit, surface, known = trace_first(rays.scene, rays.lights, ray)
     channels = [*first, dr.select(hit, mi.Float(1.0), 0.0)]

@@ -20,6 +20,7 @@ from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanke
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.solids import with_creases
 from geometry.se3 import RigidTransform
+from render.mitsuba_engine.jit_arrays import jit_array, jit_tensor
 from render.mitsuba_engine.shapes import bystander_name, bystander_shapes, drogue_shapes, front_faces
 from render.mitsuba_engine.sky_irradiance import as_mitsuba_reads
 from render.surfaces import (
@@ -107,7 +108,7 @@ class DrogueScene:
             if part in _BYSTANDER_PARTS:
                 continue
             if f"{name}.bsdf.reflectance.data" in self._parameters:
-                self._parameters[f"{name}.bsdf.reflectance.data"] = mi.TensorXf(reflectance_map(frame, part))
+                self._parameters[f"{name}.bsdf.reflectance.data"] = jit_tensor(reflectance_map(frame, part))
             else:
                 paint = even_reflectance_rgb(frame, part).tolist()
                 place = "bsdf" if f"{name}.bsdf.reflectance.value" in self._parameters else "bsdf.bsdf_0"
@@ -138,7 +139,7 @@ class DrogueScene:
 
     def _set_buffer(self, key: str, rows: NDArray[np.float64]) -> None:
         # The buffer's type depends on the variant.
-        self._parameters[key] = type(self._parameters[key])(rows.astype(np.float32).ravel())
+        self._parameters[key] = jit_array(type(self._parameters[key]), rows.ravel())
 
 
 def by_shape(scene: Any, of_part: NDArray[Any]) -> NDArray[Any]:
@@ -173,7 +174,7 @@ def _lights() -> dict[str, Any]:
 def _map_tensor(light_map: NDArray[np.float32]) -> mi.TensorXf:
     """The map with its columns reversed and one wrapped column on either side, as Mitsuba keeps it."""
     reversed_map = as_mitsuba_reads(light_map)[:, ::-1]
-    return mi.TensorXf(np.concatenate([reversed_map[:, -1:], reversed_map, reversed_map[:, :1]], axis=1))
+    return jit_tensor(np.concatenate([reversed_map[:, -1:], reversed_map, reversed_map[:, :1]], axis=1))
 
 
 def _homogeneous(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
+from render.mitsuba_engine.jit_arrays import jit_tensor
 from scenes.light import Radiance
 
 # Light by direction of the plate is so smooth that linear interpolation between 3.75 degrees errs by 5e-4 at most.
@@ -94,7 +95,7 @@ class SkyIrradiance:
         self._columns = plates.shape[1]
         # The type is chosen with the variant, which type checkers do not see.
         texture: Any = mi.Texture2f
-        self._texture = texture(mi.TensorXf(wrapped), wrap_mode=dr.WrapMode.Clamp)
+        self._texture = texture(jit_tensor(wrapped), wrap_mode=dr.WrapMode.Clamp)
         # Plain numbers would become part of the compiled kernel.
         self._rotation = [[dr.opaque(mi.Float, float(value)) for value in row] for row in world_from_stage]
 

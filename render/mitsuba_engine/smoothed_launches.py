@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe import RenderSettings
 from geometry.stereo import Eye
+from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.launches import FrameRays, Sampled, and_some_again, means_by_pixel
 from render.mitsuba_engine.noise import TWICE_EVERY
 from render.mitsuba_engine.sun_sky_paths import trace_first
@@ -87,7 +88,7 @@ def _launch(
         return np.zeros((0, 7), dtype=np.float32)
     lanes = len(pixel) * count
     sampler = rays.sampler(lanes, count)
-    of_pixel = dr.gather(mi.UInt32, mi.UInt32(pixel), dr.arange(mi.UInt32, lanes) // count)
+    of_pixel = dr.gather(mi.UInt32, jit_array(mi.UInt32, pixel), dr.arange(mi.UInt32, lanes) // count)
     place = sampler.next_2d()
     ray = rays.through(of_pixel, place, sampler.next_1d())
     radiance, hit, surface, known = trace_first(rays.scene, rays.lights, ray)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drogue_models.parts import Part
+from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.launches import FrameRays, means_by_pixel, rows_of
 from render.mitsuba_engine.scene import by_shape
 from render.mitsuba_engine.sun_sky_paths import trace_first, trace_rest
@@ -57,8 +58,8 @@ class SurfaceLight:
         self._cells = self._columns * -(-2 * rays.size // rays.width_px // every_px)
         place = np.full(self._cells + 1, self._none, dtype=np.uint32)
         place[self._cell_of(pixel)] = np.arange(len(pixel))
-        self._place = mi.UInt32(place)
-        surface = self._surface(mi.UInt32(pixel))
+        self._place = jit_array(mi.UInt32, place)
+        surface = self._surface(jit_array(mi.UInt32, pixel))
         shape: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
         # Else each use of them would send the rays again.
         normal = surface.sh_frame.n
@@ -66,8 +67,8 @@ class SurfaceLight:
         smoothing_m = np.full(256, SMOOTHING_M, dtype=np.float32)
         for part, part_m in _SMOOTHING_BY_PART_M.items():
             smoothing_m[part] = part_m
-        self._smoothing_m = dr.gather(mi.Float, mi.Float(by_shape(rays.scene, smoothing_m)), shape)
-        self._part = mi.UInt32(by_shape(rays.scene, np.arange(256, dtype=np.uint32)))
+        self._smoothing_m = dr.gather(mi.Float, jit_array(mi.Float, by_shape(rays.scene, smoothing_m)), shape)
+        self._part = jit_array(mi.UInt32, by_shape(rays.scene, np.arange(256, dtype=np.uint32)))
         self._part_of_row = np.array(dr.gather(mi.UInt32, self._part, shape))
         known = np.array(dr.gather(mi.Float, rays.lights.in_open, shape))
         self._normal, self._point = _rows(normal, known), _rows(surface.p, np.array(surface.t))
@@ -92,7 +93,7 @@ class SurfaceLight:
         for half in halves:
             half[self._none + 1 :] = self._by_part(half[: self._none])
         mean, error = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / 2
-        self._mean, self._error = mi.Float(mean.ravel()), mi.Float(error.ravel())
+        self._mean, self._error = jit_array(mi.Float, mean.ravel()), jit_array(mi.Float, error.ravel())
 
     def _by_part(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """(256, 4) means by part id, 0 where no centre sees a part."""
@@ -109,7 +110,7 @@ class SurfaceLight:
 
     def _launch(self, pixel: NDArray[np.int64], count: int, max_depth: int) -> NDArray[np.float32]:
         rays, lanes = self._rays, len(pixel) * count
-        of_pixel = dr.gather(mi.UInt32, mi.UInt32(pixel), dr.arange(mi.UInt32, lanes) // count)
+        of_pixel = dr.gather(mi.UInt32, jit_array(mi.UInt32, pixel), dr.arange(mi.UInt32, lanes) // count)
         ray = rays.through(of_pixel, mi.Point2f(0.5, 0.5), dr.opaque(mi.Float, 0.5))
         _, hit, surface, known = trace_first(rays.scene, rays.lights, ray)
         rest = trace_rest(rays.scene, rays.lights, rays.sampler(lanes, count), (surface, hit, known), max_depth)
@@ -123,11 +124,11 @@ class SurfaceLight:
             mask: (P,) which.
             most_px: largest standard deviation of the weights over the distance between places.
         """
-        row = mi.UInt32(np.flatnonzero(mask))
+        row = jit_array(mi.UInt32, np.flatnonzero(mask))
         if not len(row):
             return
         normal, point = (_gathered(rows, row) for rows in (self._normal, self._point))
-        pixel = mi.UInt32(self.pixel[mask])
+        pixel = jit_array(mi.UInt32, self.pixel[mask])
         sigma_m = dr.minimum(dr.gather(mi.Float, self._smoothing_m, row), self._width_m(point.w, most_px))
         mean, error = self._around(pixel, (normal, point), sigma_m, math.ceil(2 * most_px / self._every_px))
         smoothed = [dr.copy(self._mean), dr.copy(self._error)]
@@ -241,4 +242,4 @@ def _rows(vector: Any, last: NDArray[np.float32]) -> Any:
     """(P + 1, 4) numbers in one array, by pixel; row P is of pixels whose centres see nothing, all of it -1."""
     rows = np.full((len(last) + 1, 4), -1.0, dtype=np.float32)
     rows[:-1, :3], rows[:-1, 3] = rows_of(vector), last
-    return mi.Float(rows.ravel())
+    return jit_array(mi.Float, rows.ravel())

@@ -49,6 +49,7 @@ def test_new_scenes_and_other_pixels_take_the_same_kernels(kernels, make_recipe)
         new.append(len(taken - known))
         known |= taken
     assert new[0] > 6
-    # Kernels have variants for arrays that lie on 64 bytes and for those that do not: one or two are new now and then.
-    # With numbers of shapes or pixels compiled in, five and more are new for each of these eight scenes.
-    assert sum(new[6:]) <= 24, new
+    # A ray that slips between the drogue's parts is sent again, by two kernels of its own. Were arrays used where NumPy
+    # has put them, there would be variants for those that lie on 64 bytes and for those that do not, one or two a
+    # scene; with numbers of shapes or pixels compiled in, five and more.
+    assert sum(new[6:]) <= 2, str(new)
