@@ -10,7 +10,7 @@ from drogue_models.parameters import WHITE_PAINT
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
 from scenes.light import luminance
-from scenes.surroundings import surroundings
+from scenes.surroundings import Surroundings, surroundings
 
 _METER_COLUMNS, _METER_ROWS = 16, 12
 _DARKEST_CD_M2 = 1e-9  # a millionth of a starlit sky; both limits are reached long before
@@ -19,7 +19,7 @@ _DARKEST_CD_M2 = 1e-9  # a millionth of a starlit sky; both limits are reached l
 def meter(
     law: ExposureLaw, environment: Environment, camera: PinholeCamera, world_from_left: RigidTransform, sensor: Sensor
 ) -> Exposure:
-    """Exposure that puts the brighter of the view's mean and a white plate facing the camera at the law's level.
+    """Exposure that puts what the law's meter looks at, see `ExposureLaw`, at its level.
 
     Time comes first, for it makes signal; gain only makes up for what the limits of time leave.
     """
@@ -27,14 +27,10 @@ def meter(
     if law.time_s is not None and gain.low == gain.high:
         return Exposure(time_s=law.time_s, f_number=law.f_number, gain=gain.low)
     around = surroundings(environment)
-    u, v = np.meshgrid(
-        (np.arange(_METER_COLUMNS) + 0.5) * camera.width_px / _METER_COLUMNS,
-        (np.arange(_METER_ROWS) + 0.5) * camera.height_px / _METER_ROWS,
-    )
-    rays = world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1)))
-    view = around.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
     plate = around.plate_illuminance_lux(-world_from_left.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
-    brightest = max(float(luminance(view).mean()), float(luminance(plate)), _DARKEST_CD_M2)
+    brightest = max(float(luminance(plate)), _DARKEST_CD_M2)
+    if law.auto_meter == "view":
+        brightest = max(brightest, _mean_luminance(around, camera, world_from_left))
     one_second = Exposure(time_s=1.0, f_number=law.f_number)
     wanted_s = law.auto_level_fraction * sensor.full_well_e / (sensor.electrons_per_cd_m2(one_second) * brightest)
     time_s = law.time_s
@@ -43,3 +39,14 @@ def meter(
         time_s = float(np.clip(wanted_s / nearest_to_one, law.auto_time_s.low, law.auto_time_s.high))
     gain_used = float(np.clip(wanted_s / time_s, gain.low, gain.high))
     return Exposure(time_s=time_s, f_number=law.f_number, gain=gain_used)
+
+
+def _mean_luminance(around: Surroundings, camera: PinholeCamera, world_from_left: RigidTransform) -> float:
+    """Of what the camera would see without a drogue. [cd/m2]"""
+    u, v = np.meshgrid(
+        (np.arange(_METER_COLUMNS) + 0.5) * camera.width_px / _METER_COLUMNS,
+        (np.arange(_METER_ROWS) + 0.5) * camera.height_px / _METER_ROWS,
+    )
+    rays = world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1)))
+    view = around.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
+    return float(luminance(view).mean())

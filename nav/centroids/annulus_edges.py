@@ -46,9 +46,12 @@ _MOST_BEYOND = 0.8
 _FIRST_STEPS, _RESPONSE_STEPS, _SECOND_STEPS = 6, 2, 3
 _MOST_LEVERAGE = np.float32(0.9)
 _SECTORS = 16
-# Both eyes see the same shadow: what it adds does not average out between them, and so counts twice; and the light's
-# azimuthal terms hide two thirds of it from the residuals (path-traced frames of partly shaded hubs, 1.7 to 5 m).
-_SHADOW_FACTOR = 6.0
+# Both eyes see the same shadow: what it adds does not average out between them; and the light's azimuthal terms hide
+# much of it from the residuals (path-traced frames of partly shaded hubs, 1.7 to 5 m).
+_SHADOW_FACTOR = 3.0
+# Mean square of a sector's summed noise that one even annulus in six exceeds. In little light noise hides most of what
+# a shadow leaves in the residuals, and none of what it does to the centre: a higher limit would overlook it.
+_EVEN_SECTOR_CHI2 = 1.35
 _LEAST_CONTRAST_SIGMA = 4.0
 # So much of the annulus must be lit: less does not tell where its middle is.
 _LEAST_LIT_FRACTION = 0.5
@@ -126,9 +129,10 @@ def fit_annuli(
     between, light = shares_of(final, ties)[0], light_above(parameters, turns)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
     sectors = sector_index(pixels.x_px, pixels.y_px, _SECTORS)
-    inflation = residual_spread(final.residuals, weights, sectors, contrast, final.parameters.shape[1]).inflation
+    spread = residual_spread(final.residuals, weights, sectors, contrast, final.parameters.shape[1])
+    inflation = 1 + _SHADOW_FACTOR * np.maximum(spread.sector_chi2 - _EVEN_SECTOR_CHI2, 0)
     # The first two free parameters are the common shift.
-    cov = final.covariance()[:, :2, :2] * (1 + _SHADOW_FACTOR * (inflation - 1))[:, None, None]
+    cov = final.covariance()[:, :2, :2] * inflation[:, None, None]
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])

@@ -24,6 +24,8 @@ SECTORS = 8
 _PIECES = 16
 _STEEP_SHARE = 0.03
 _TINY = 1e-12
+# Deviation of a centre of which a linear fit tells half the variance.
+_NOT_LINEAR_PX = 0.2
 # A shadow or a thing before the disc leaves residuals beyond so many deviations of a sector's mean, and beyond this
 # share of the contrast; what is smaller moves the centre by less than the noise of one edge pixel.
 _SECTOR_SIGMA = 4.0
@@ -180,6 +182,20 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
     expected = np.maximum((1 - swallowed / alone).sum(axis=1), 1.0)
     usual = found / expected <= _ODD_FACTOR * np.median(found / expected)
     return max(1.0, float(found[usual].sum() / expected[usual].sum()))
+
+
+def beyond_linear(cov_px2: Array) -> Array:
+    """Covariances of centres, widened by what the derivatives at the solution do not tell of faint discs.
+
+    Where the noise moves a centre by a fifth of a pixel, a third of an edge's width, its square is twice what they say;
+    half as much adds a quarter (measured on discs of 3 to 20 px and contrasts of 1.5 to 6 deviations of a pixel).
+
+    Args:
+        cov_px2: (N, 2, 2). [px^2]
+    """
+    variance = np.einsum("nii->n", cov_px2) / 2
+    widened: Array = cov_px2 * (1 + variance / _NOT_LINEAR_PX**2)[:, None, None]
+    return widened
 
 
 def sector_index(x_px: Array32, y_px: Array32, count: int) -> NDArray[np.int64]:

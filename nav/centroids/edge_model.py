@@ -10,6 +10,7 @@ import numpy as np
 from nav.centroids.centroid_quality import (
     SECTORS,
     NoiseModel,
+    beyond_linear,
     edge_noise_factor,
     measure_noise,
     residual_spread,
@@ -106,7 +107,7 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
     sectors = sector_index(pixels.x_px, pixels.y_px, SECTORS)
     spread = residual_spread(final.residuals, judged, sectors, contrast, final.parameters.shape[1])
     factor = edge_noise_factor(final, judged, pixels.x_px, pixels.y_px)
-    cov = final.covariance()[:, :2, :2] * factor * spread.inflation[:, None, None]
+    cov = beyond_linear(final.covariance()[:, :2, :2] * factor * spread.inflation[:, None, None])
     reasons = rejection_reasons(discs, pixels, final, inside, cov, noise, spread)
     return DiscFits(
         _fitted(discs, pixels, final, reasons),

@@ -31,7 +31,7 @@ class Ellipses:
             raise ValueError(f"centers_px: must be ({count}, 2) finite numbers, got {self.centers_px.shape}")
         if self.shapes_px.shape != (count, 2, 2) or not np.isfinite(self.shapes_px).all():
             raise ValueError(f"shapes_px: must be ({count}, 2, 2) finite numbers, got {self.shapes_px.shape}")
-        if count and min(_determinants(self.shapes_px).min(), np.trace(self.shapes_px, axis1=1, axis2=2).min()) <= 0:
+        if not are_positive(self.shapes_px).all():
             raise ValueError("shapes_px: must be positive, got a semi-axis of zero or less")
 
     def __len__(self) -> int:
@@ -45,6 +45,12 @@ class Ellipses:
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Ellipses:
         """Some of them."""
         return Ellipses(self.eyes[index], self.centers_px[index], self.shapes_px[index])
+
+
+def are_positive(shapes_px: Array) -> NDArray[np.bool_]:
+    """(M,) whether symmetric matrices (M, 2, 2) have two semi-axes above zero."""
+    positive: NDArray[np.bool_] = (_determinants(shapes_px) > 0) & (np.trace(shapes_px, axis1=1, axis2=2) > 0)
+    return positive
 
 
 def circles(eyes: ArrayLike, centers_px: ArrayLike, radii_px: ArrayLike) -> Ellipses:
