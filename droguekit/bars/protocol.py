@@ -10,6 +10,8 @@ DOCKING_RANGE_M = (1.7, 10.0)
 # Draws of a cell for methods that are solved in batches, and for those that are not.
 BATCHED_DRAWS = 10_000
 SINGLE_DRAWS = 1000
+# The binomial error of a rate is then at most 0.0025: of 108 cells the unluckiest is still told from 0.02.
+FLIP_DRAWS = 40_000
 # The order of 5, 7 and 8 markers differs by two percent in the mean at least: so many draws tell it.
 ORDER_DRAWS = 48_000
 # By ten and more for the robust method, which takes longer.

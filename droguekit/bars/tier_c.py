@@ -12,7 +12,7 @@ from drogue_models.presets import RING_RADIUS_M
 from droguekit.bars.cell_store import run_cells
 from droguekit.bars.confidence import Limited, nees_limits, paired_rms_ratio_limit
 from droguekit.bars.monte_carlo import Cell, CellResult
-from droguekit.bars.protocol import BATCHED_DRAWS, MARKER_COUNTS, SIGMAS_PX, STATIONS_M
+from droguekit.bars.protocol import BATCHED_DRAWS, FLIP_DRAWS, MARKER_COUNTS, SIGMAS_PX, STATIONS_M
 from droguekit.bars.reporter import Reporter
 from droguekit.bars.table import BarRow, at_most, between, worst
 from droguekit.bars.tolerances import AS_BUILT, RING_ONLY, TOLERANCED, Tolerances, stated_tolerances
@@ -39,8 +39,8 @@ def bars_tier_c(out: Path, seed: int, draws: int | None, report: Reporter) -> li
         ValueError: a wrong seed or number, or a folder of something else.
         OSError: the folder cannot be written.
     """
-    count = BATCHED_DRAWS if draws is None else draws
-    ring, hub = as_built_cells("joint", seed, count), as_built_cells("joint-hub", seed, count)
+    count = draws or BATCHED_DRAWS
+    ring, hub = as_built_cells("joint", seed, draws or FLIP_DRAWS), as_built_cells("joint-hub", seed, count)
     every, ring_only = (toleranced_cells(tolerances, seed, count) for tolerances in (TOLERANCED, RING_ONLY))
     results = run_cells([*ring, *hub, *every, *ring_only], out, report)
     return [
