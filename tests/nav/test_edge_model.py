@@ -2,96 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from datasets_manifest.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
-from droguekit.benchmark.centroid_bounds import PixelLight, center_bound_px, outline_coverage
+from droguekit.benchmark.centroid_bounds import center_bound_px
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
-from nav.centroids.centroid_quality import SECTORS, NoiseModel, residual_spread, sector_index
-from nav.centroids.disc_model import LEVEL, contrasts, disc_model, disc_start
-from nav.centroids.disc_rejection import rejection_reasons
+from nav.centroids.disc_model import disc_model
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.edge_profile import START_WIDTH_PX, ellipse_parameters
-from nav.centroids.ellipses import Ellipses, circles
+from nav.centroids.ellipses import circles
 from nav.centroids.grey_centroid import grey_centroids
-from nav.centroids.least_squares import evaluate
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.patches import disc_pixels
 from nav.centroids.surroundings import Surroundings, shares_beyond
 
-DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
-DUSK = PixelLight(60, 240, 4.8, 11_700 / 255 / 16, 0.5, 0.01)
-COUNT = 8
-
-
-def tilted_shape(radius_px, rng, ratio=0.97):
-    angle = rng.uniform(0, np.pi)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return turn @ np.diag([radius_px, ratio * radius_px]) @ turn.T
-
-
-def coverage(shape, center, grid):
-    count = int(8 * 2 * np.pi * np.linalg.norm(shape)) + 64
-    angle = 2 * np.pi * np.arange(count) / count
-    arms = np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ shape
-    tangents = np.stack([-np.sin(angle), np.cos(angle)], axis=-1) @ shape * (2 * np.pi / count)
-    return outline_coverage(center + arms, tangents, grid, grid, 0.5)
-
-
-def expose(light, mean_e, rng):
-    if rng is None:
-        return (mean_e / light.step_e).astype(np.float32)
-    gains = 1 + light.prnu_fraction * rng.standard_normal(mean_e.shape)
-    electrons = rng.poisson(mean_e) * gains + light.read_noise_e * rng.standard_normal(mean_e.shape)
-    return np.round(electrons / light.step_e).astype(np.float32)
-
-
-def draw_discs(radius_px, light, rng, shading=0.0, noisy=True, spoil=None, difference=True):
-    """Signals of COUNT discs in each eye, and their true outlines; `spoil(light of one disc, x, y, number)`."""
-    cell = int(2 * radius_px + 18)
-    grid = np.arange(cell, dtype=np.float64)
-    signals, centers, shapes = [], [], []
-    for eye in range(2):
-        mean_e = np.zeros((cell, cell * COUNT))
-        for number in range(COUNT):
-            center, shape = cell / 2 + rng.uniform(-0.5, 0.5, 2), tilted_shape(radius_px, rng)
-            x, y = grid[None, :] - center[0], grid[:, None] - center[1]
-            slope = shading * x / radius_px
-            lit = light.background_e + light.contrast_e * (1 + slope) * coverage(shape, center, grid)
-            if spoil is not None and eye == 0:
-                lit = spoil(lit, x, y, number)
-            mean_e[:, number * cell : (number + 1) * cell] = lit
-            centers.append(center + np.array([number * cell, 0]))
-            shapes.append(shape)
-        values = expose(light, mean_e, rng if noisy else None)
-        signals.append(MarkerSignal(values, values >= 255, (0.0, 0.0), 1, difference))
-    return signals, Ellipses(np.repeat([0, 1], COUNT), np.array(centers), np.array(shapes))
-
-
-def rough_start(truth, rng):
-    """Circles of the right area, as far off as binary centroids are."""
-    return circles(truth.eyes, truth.centers_px + rng.normal(0, 0.1, (len(truth), 2)), 1.02 * truth.radii_px)
+from .drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
 
 
 @pytest.mark.parametrize("light", [DAY, DUSK], ids=["day", "dusk"])
 @pytest.mark.parametrize("z_m", [2, 5, 10, 20, 40])
 def test_error_reaches_the_bound_and_the_covariance_tells_it(light, z_m):
     radius, rng = 2133.333 * 0.05 / z_m, np.random.default_rng([5, z_m])
-    errors, covariances, radial = [], [], []
-    for _ in range(8):
-        signals, truth = draw_discs(radius, light, rng)
-        fits = fit_discs(signals, rough_start(truth, rng))
-        assert fits.accepted.all()
-        errors.append(fits.ellipses.centers_px - truth.centers_px)
-        covariances.append(fits.cov_px2)
-        radial.append(fits.ellipses.radii_px - truth.radii_px)
-    error, cov = np.concatenate(errors), np.concatenate(covariances)
+    error, cov, radial = fit_many(radius, light, rng)
     rms, bound = np.sqrt(np.mean(error**2)), center_bound_px(0.985 * radius, light)
     # 256 errors know their rms to 4.4 %; the plane of shading, fitted down to 7.5 px, costs up to a fifth.
     assert 0.88 < rms / bound < 1.35
@@ -101,62 +37,7 @@ def test_error_reaches_the_bound_and_the_covariance_tells_it(light, z_m):
     # Four standard errors of the mean of 128.
     assert np.abs(error.mean(axis=0)).max() < 4 * rms / np.sqrt(128)
     # A curved edge blurred by s moves inwards by s^2 / (2 r), all around, and so leaves the centre.
-    assert np.mean(np.concatenate(radial)) == pytest.approx(-(START_WIDTH_PX**2) / (2 * radius), abs=0.02)
-
-
-def faint(contrast_sigma):
-    """Light in which a pixel of a disc stands so many deviations of its own noise above the pixels beside it."""
-    background_e = 20.0
-    other_e2 = background_e + DUSK.read_noise_e**2
-    contrast_e = contrast_sigma**2 / 2 + np.sqrt(contrast_sigma**4 / 4 + contrast_sigma**2 * other_e2)
-    return replace(DUSK, background_e=background_e, contrast_e=contrast_e)
-
-
-@pytest.mark.parametrize(("z_m", "contrast_sigma"), [(2, 3.3), (5, 3.3), (10, 3.3), (20, 4.0), (40, 4.5)])
-def test_faint_discs_are_fitted_to_the_bound_and_the_covariance_tells_it(z_m, contrast_sigma):
-    radius, light, rng = 2133.333 * 0.05 / z_m, faint(contrast_sigma), np.random.default_rng([15, z_m])
-    errors, covariances = [], []
-    for _ in range(8):
-        signals, truth = draw_discs(radius, light, rng)
-        fits = fit_discs(signals, rough_start(truth, rng))
-        assert fits.accepted.all()
-        errors.append(fits.ellipses.centers_px - truth.centers_px)
-        covariances.append(fits.cov_px2)
-    error, cov = np.concatenate(errors), np.concatenate(covariances)
-    # As in better light: 256 errors know their rms to 4.4 %, and the plane of shading costs up to a fifth.
-    assert 0.88 < np.sqrt(np.mean(error**2)) / center_bound_px(0.985 * radius, light) < 1.4
-    assert 0.7 < np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 2 < 1.3
-
-
-def test_what_is_too_faint_is_rejected_and_never_an_outline_without_inside():
-    rng, reasons = np.random.default_rng(16), set()
-    for contrast_sigma in (0.5, 1.0, 1.5, 2.7):
-        for _ in range(6):
-            signals, truth = draw_discs(3.0, faint(contrast_sigma), rng)
-            fits = fit_discs(signals, rough_start(truth, rng))
-            assert np.sqrt(np.einsum("nii->n", fits.cov_px2[fits.accepted]) / 2).max(initial=0) < 0.2
-            if contrast_sigma < 2:
-                reasons |= set(fits.reasons)
-    assert {"no contrast"} <= reasons and None not in reasons
-
-
-def test_an_outline_turned_inside_out_is_no_disc():
-    rng = np.random.default_rng(17)
-    signals, truth = draw_discs(10.0, DAY, rng)
-    pixels = disc_pixels(signals, truth)
-    fit = evaluate(
-        disc_model(pixels, False, False), pixels.values, pixels.present, disc_start(pixels, truth.shapes_px, 0)
-    )
-    inside, noise = fit.jacobian[:, LEVEL], NoiseModel(50.0, 0.02, 0.0)
-    cov = np.tile(1e-4 * np.eye(2), (len(truth), 1, 1))
-    spread = residual_spread(
-        fit.residuals, pixels.present / 50, sector_index(pixels.x_px, pixels.y_px, SECTORS), contrasts(fit), 8
-    )
-    turned = fit.parameters.copy()
-    turned[0, 2:5] *= -1
-    reasons = rejection_reasons(truth, pixels, replace(fit, parameters=turned), inside, cov, noise, spread)
-    assert reasons[0] == "the fit left the disc"
-    assert "the fit left the disc" not in reasons[1:]
+    assert np.mean(radial) == pytest.approx(-(START_WIDTH_PX**2) / (2 * radius), abs=0.02)
 
 
 @pytest.mark.parametrize("z_m", [2, 5, 10])
