@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.circles import disc_image_centers, disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
-from nav.centroids.annulus_edges import fit_annuli
+from nav.centroids.annulus_edges import AnnulusFits, fit_annuli
 from nav.centroids.centroid_quality import NoiseModel
 from nav.centroids.disc_rejection import LARGEST_SCALE
 from nav.centroids.edge_model import fit_discs
@@ -155,24 +156,38 @@ def _with_hub(observation: Observation, signals: tuple[MarkerSignal, MarkerSigna
     solution = joint(observation)
     if isinstance(solution, NoFixReason):
         return observation
+    collar_factor = observation.layout.collar_radius_m / observation.layout.hub_outer_radius_m
+    found: list[tuple[AnnulusFits, Array]] = []
+    for edges in _hub_places(observation, solution):
+        outer, inner = edges[OUTER_EDGE], edges[INNER_EDGE]
+        found.append((fit_annuli(signals, outer, inner, noise, collar_factor), outer.shapes_px))
+        if found[-1][0].certain:
+            break
+    best = max(found, key=lambda each: each[0].evidence_per_px2, default=None)
+    if best is None or not best[0].accepted.any():
+        return observation
+    fits, shapes_px = best
+    pixels = np.full((len(EYES), HUB_EDGES, 2), np.nan)
+    cov = np.full((len(EYES), HUB_EDGES, 2, 2), np.nan)
+    pixels[fits.accepted, OUTER_EDGE] = fits.centers_px[fits.accepted]
+    cov[fits.accepted, OUTER_EDGE] = fits.cov_px2[fits.accepted]
+    shapes = np.stack([shapes_px] * HUB_EDGES, axis=1)
+    for side, eye in enumerate(EYES):
+        pixels[side], cov[side] = ideal_places(observation.rig, eye, pixels[side], shapes[side], cov[side])
+    return replace(observation, hub_px=pixels, hub_cov_px2=cov)
+
+
+def _hub_places(observation: Observation, solution: Solution) -> Iterator[list[Ellipses]]:
+    """The hub's edges by each pose that is likely enough, the likeliest first, unless it shows them at the same place.
+
+    The light on a hub is uneven: a fit that begins where it is not may end on part of it, or on something else.
+    """
     tried: list[Array] = []
     for mode in solution.modes:
         edges = _hub_edges(observation.rig, observation.layout, mode.left_from_drogue)
         if not edges or (tried and mode.weight < _LEAST_WEIGHT):
             continue
-        centers = edges[OUTER_EDGE].centers_px
-        if any(np.abs(centers - other).max() < _LEAST_STEP_PX for other in tried):
-            continue
-        tried.append(centers)
-        collar_factor = observation.layout.collar_radius_m / observation.layout.hub_outer_radius_m
-        fits = fit_annuli(signals, edges[OUTER_EDGE], edges[INNER_EDGE], noise, collar_factor)
-        if fits.accepted.any():
-            pixels = np.full((len(EYES), HUB_EDGES, 2), np.nan)
-            cov = np.full((len(EYES), HUB_EDGES, 2, 2), np.nan)
-            pixels[fits.accepted, OUTER_EDGE] = fits.centers_px[fits.accepted]
-            cov[fits.accepted, OUTER_EDGE] = fits.cov_px2[fits.accepted]
-            shapes = np.stack([edges[OUTER_EDGE].shapes_px] * HUB_EDGES, axis=1)
-            for side, eye in enumerate(EYES):
-                pixels[side], cov[side] = ideal_places(observation.rig, eye, pixels[side], shapes[side], cov[side])
-            return replace(observation, hub_px=pixels, hub_cov_px2=cov)
-    return observation
+        centers_px = edges[OUTER_EDGE].centers_px
+        if all(np.abs(centers_px - other).max() >= _LEAST_STEP_PX for other in tried):
+            tried.append(centers_px)
+            yield edges

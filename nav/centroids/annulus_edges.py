@@ -26,7 +26,7 @@ from nav.centroids.annulus_model import (
     tied_to_pose,
 )
 from nav.centroids.annulus_response import response_pictures, starting_with_pictures, with_pictures
-from nav.centroids.centroid_quality import NoiseModel, measure_noise, residual_spread, sector_index
+from nav.centroids.centroid_quality import NoiseModel, beyond_linear, measure_noise, residual_spread, sector_index
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
@@ -59,6 +59,8 @@ _LIT_SHARE = 0.3
 _MOST_CLIPPED_FRACTION = 0.05
 _LARGEST_MOVE_FRACTION = 0.3
 _LARGEST_SCALE = 1.25
+# Fits that end beside the hub state far more, right ones at dusk hardly ever so much (docs/centroids.md). [px]
+_CERTAIN_SIGMA_PX = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +88,17 @@ class AnnulusFits:
     def accepted(self) -> NDArray[np.bool_]:
         """(M,) which annuli were not rejected."""
         return np.array([reason is None for reason in self.reasons], dtype=np.bool_)
+
+    @property
+    def certain(self) -> bool:
+        """Whether all annuli were found, and none so vaguely that it may be another thing."""
+        return bool(self.accepted.all() and (np.einsum("nii->n", self.cov_px2) < 2 * _CERTAIN_SIGMA_PX**2).all())
+
+    @property
+    def evidence_per_px2(self) -> float:
+        """How precisely the accepted ones are placed, together. [1/px^2]"""
+        accepted = self.accepted
+        return float((1 / np.einsum("nii->n", self.cov_px2[accepted])).sum())
 
 
 def fit_annuli(
@@ -132,7 +145,7 @@ def fit_annuli(
     spread = residual_spread(final.residuals, weights, sectors, contrast, final.parameters.shape[1])
     inflation = 1 + _SHADOW_FACTOR * np.maximum(spread.sector_chi2 - _EVEN_SECTOR_CHI2, 0)
     # The first two free parameters are the common shift.
-    cov = final.covariance()[:, :2, :2] * inflation[:, None, None]
+    cov = beyond_linear(final.covariance()[:, :2, :2] * inflation[:, None, None])
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
