@@ -18,6 +18,7 @@ from time import monotonic
 from typing import Protocol
 
 from datasets_manifest.blind import BlindPair
+from nav.centroids.first_fits import fit_once
 from nav.handover import Handover, NewestFirst
 from nav.sequence_navigator import LatePair, PairAnswers, SequenceNavigator, SoughtPair
 
@@ -103,6 +104,7 @@ def play(
     """
     if not 0 < rate_hz < float("inf"):
         raise ValueError(f"rate_hz: must be positive and finite, got {rate_hz:g}")
+    fit_once()
     return _Player(source, navigator, rate_hz, clock).answers()
 
 

@@ -26,7 +26,7 @@ from nav.centroids.annulus_model import (
     tied_to_pose,
 )
 from nav.centroids.annulus_response import response_pictures, starting_with_pictures, with_pictures
-from nav.centroids.centroid_quality import NoiseModel, beyond_linear, measure_noise, residual_spread, sector_index
+from nav.centroids.centroid_quality import NoiseModel, beyond_linear, measure_noise, residual_spread
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
@@ -141,8 +141,7 @@ def fit_annuli(
     parameters = all_parameters(start, ties, final)
     between, light = shares_of(final, ties)[0], light_above(parameters, turns)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
-    sectors = sector_index(pixels.x_px, pixels.y_px, _SECTORS)
-    spread = residual_spread(final.residuals, weights, sectors, contrast, final.parameters.shape[1])
+    spread = residual_spread(final.residuals, weights, pixels, _SECTORS, contrast, final.parameters.shape[1])
     inflation = 1 + _SHADOW_FACTOR * np.maximum(spread.sector_chi2 - _EVEN_SECTOR_CHI2, 0)
     # The first two free parameters are the common shift.
     cov = beyond_linear(final.covariance()[:, :2, :2] * inflation[:, None, None])

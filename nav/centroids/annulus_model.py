@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, Edge, edge_profile, ellipse_parameters
+from nav.centroids.edge_pictures import draw_annuli
+from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_widths, ellipse_parameters
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.least_squares import Minimum, Model
 from nav.centroids.marker_signal import Array32
+from nav.centroids.matrix_loops import tie_rows
 from nav.centroids.patches import PixelSet, edge_distances
 
 # Places in the vector of parameters.
@@ -31,38 +33,16 @@ def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
         turns: (N, T, K) functions of the azimuth whose sum is A.
         beyond: (N, K) share F of what lies beyond the annulus's surroundings and is lighter by k than they are.
     """
-    further = turns[:, :BEYOND_TURNS] * beyond[:, None]
     x, y = pixels.x_px, pixels.y_px
+    count = AMPLITUDE + turns.shape[1]
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
-        width = parameters[:, WIDTH]
-        outer, inner = _both_edges(parameters, x, y)
-        rest = parameters[:, BACKGROUND:].astype(np.float32)
-        background, hole = rest[:, 0, None], rest[:, 1, None]
-        light = np.matmul(rest[:, None, AMPLITUDE - BACKGROUND :], turns)[:, 0]
-        jacobian = np.empty((len(x), parameters.shape[1], x.shape[1]), np.float32)
-        up, down = (light - background) * outer.density, (hole - light) * inner.density
-        np.multiply(outer.slopes, up[:, None], out=jacobian[:, OUTER])
-        np.multiply(inner.slopes, down[:, None], out=jacobian[:, INNER])
-        spread = up * outer.distance_px + down * inner.distance_px
-        jacobian[:, WIDTH] = -spread / width[:, None].astype(np.float32)
-        jacobian[:, BACKGROUND], jacobian[:, HOLE], jacobian[:, BEYOND] = 1 - outer.inside, inner.inside, further
-        between = outer.inside - inner.inside
-        np.multiply(turns, between[:, None], out=jacobian[:, AMPLITUDE:])
-        picture = background * (1 - outer.inside) + light * between + hole * inner.inside
-        picture += np.matmul(parameters[:, None, BEYOND].astype(np.float32), further)[:, 0]
+        picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
+        given, widths = parameters.astype(np.float32), edge_widths(parameters[:, WIDTH])
+        draw_annuli(given, widths, x, y, turns, beyond, BEYOND_TURNS, picture, jacobian)
         return picture, jacobian
 
     return model
-
-
-def _both_edges(parameters: Array, x_px: Array32, y_px: Array32) -> tuple[Edge, Edge]:
-    """Outer and inner edge of (N, P) parameters at (N, K) places, in one go: small arrays cost by the call."""
-    count = len(parameters)
-    ellipses = np.concatenate([parameters[:, OUTER], parameters[:, INNER]])
-    widths = np.tile(parameters[:, WIDTH], 2)
-    edges = edge_profile(ellipses, widths, np.concatenate([x_px, x_px]), np.concatenate([y_px, y_px]))
-    return edges.take(slice(None, count)), edges.take(slice(count, None))
 
 
 def shares_of(fit: Minimum, ties: Array) -> tuple[Array32, Array32]:
@@ -71,7 +51,8 @@ def shares_of(fit: Minimum, ties: Array) -> tuple[Array32, Array32]:
     They are the derivatives by the annulus's mean light and by the hole's, whose parameters are free ones.
     """
     tied = ties.shape[2] - (ties.shape[1] - WIDTH)
-    return fit.jacobian[:, tied + AMPLITUDE - WIDTH], fit.jacobian[:, tied + HOLE - WIDTH]
+    between, in_hole = (fit.jacobian[:, tied + place - WIDTH] for place in (AMPLITUDE, HOLE))
+    return np.ascontiguousarray(between), np.ascontiguousarray(in_hole)
 
 
 def light_above(parameters: Array, turns: Array32) -> Array32:
@@ -136,11 +117,13 @@ def in_free_parameters(model: Model, start: Array, ties: Array) -> Model:
     """The model in its free parameters, counted from the start."""
     # Both ellipses follow the first few; all others are free themselves.
     tied = ties.shape[2] - (ties.shape[1] - WIDTH)
-    across = ties[:, :WIDTH, :tied].transpose(0, 2, 1).astype(np.float32)
+    across = np.ascontiguousarray(ties[:, :WIDTH, :tied].transpose(0, 2, 1), np.float32)
 
     def in_free(free: Array) -> tuple[Array32, Array32]:
         values, jacobian = model(start + np.einsum("npq,nq->np", ties, free))
-        return values, np.concatenate([np.matmul(across, jacobian[:, :WIDTH]), jacobian[:, WIDTH:]], axis=1)
+        by_free = np.empty((len(jacobian), ties.shape[2], jacobian.shape[2]), np.float32)
+        tie_rows(jacobian, across, by_free)
+        return values, by_free
 
     return in_free
 

@@ -6,14 +6,11 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.centroids.annulus_model import BACKGROUND, HOLE, INNER, OUTER
+from nav.centroids.edge_pictures import add_box_pictures
 from nav.centroids.least_squares import Minimum, Model, NormalEquations
 from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet
-from nav.centroids.pixel_response import box_edges
-
-_PICTURES = 3
-# Shares of light from within between which an edge is seen.
-_SEEN = (1e-3, 1 - 1e-3)
+from nav.centroids.pixel_response import BOX_PICTURES
 
 
 def response_pictures(pixels: PixelSet, parameters: Array, shares: tuple[Array32, Array32], light: Array32) -> Array32:
@@ -26,21 +23,18 @@ def response_pictures(pixels: PixelSet, parameters: Array, shares: tuple[Array32
         light: (N, K) of the annulus above the background.
     """
     hole = (parameters[:, HOLE] - parameters[:, BACKGROUND]).astype(np.float32)[:, None]
-    pictures = np.zeros((len(parameters), _PICTURES, pixels.x_px.shape[1]), np.float32)
+    pictures = np.zeros((len(parameters), BOX_PICTURES, pixels.x_px.shape[1]), np.float32)
     between, in_hole = shares
     for place, inside, step in ((OUTER, between + in_hole, light), (INNER, in_hole, hole - light)):
-        patch, pixel = np.nonzero((inside > _SEEN[0]) & (inside < _SEEN[1]) & (pixels.present > 0))
-        ellipse = parameters[patch, place].astype(np.float32)
-        boxes = box_edges(ellipse, pixels.x_px[patch, pixel], pixels.y_px[patch, pixel])
-        for picture, box in enumerate(boxes):
-            pictures[patch, picture, pixel] += step[patch, pixel] * (box - inside[patch, pixel])
+        ellipses = parameters[:, place].astype(np.float32)
+        add_box_pictures(ellipses, pixels.x_px, pixels.y_px, pixels.present, inside, step, pictures)
     return pictures
 
 
 def starting_with_pictures(fit: Minimum, pictures: Array32) -> Minimum:
     """Where a fit of the model without pictures (N, S, K) ended, as a start of that with them: there are none yet."""
     jacobian = np.concatenate([fit.jacobian, pictures], axis=1)
-    normal = NormalEquations(jacobian, fit.residuals, fit.normal.roots)
+    normal = NormalEquations(jacobian, fit.residuals, fit.normal.weights)
     parameters = np.pad(fit.parameters, ((0, 0), (0, pictures.shape[1])))
     return Minimum(parameters, fit.residuals, jacobian, normal)
 

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from geometry.se3 import Array
 from nav.centroids.least_squares import Minimum
 from nav.centroids.marker_signal import Array32
+from nav.centroids.patches import PixelSet
+from nav.centroids.pixel_sums import piece_sums, sector_sums, zone_sums
 
 # Rounding to integers. [DN^2]
 _QUANTISATION_DN2 = 1 / 12
-# Shares of light from within that count as one side, and as the edge.
-_ONE_SIDE, _EDGE = 0.03, (0.2, 0.8)
+# Shares of light from within that count as outside, as the edge, and as inside.
+_ZONES = np.array([(-np.inf, 0.03), (0.2, 0.8), (0.97, np.inf)], np.float32)
 # Of an outline whose residuals are so much above the usual, none tells of the sensor.
 _ODD_FACTOR = 3.0
 # Of the noise on a marker, what is left beside it at least: coarse numbers may hide the noise of a dark background.
@@ -65,14 +67,12 @@ def measure_noise(squares: Array32, present: Array32, inside: Array32, contrast:
         inside: (N, K) share of the light from within.
         contrast: (N,) [DN]
     """
-    mean = (squares * present).sum(axis=1) / np.maximum(present.sum(axis=1), 1)
+    sums = zone_sums(squares, present, inside, _ZONES)
+    mean = sums[:, 0, 0] / np.maximum(sums[:, 0, 1], 1)
     usual = mean <= _ODD_FACTOR * np.median(mean)
-    squares, present, inside = squares[usual], present[usual], inside[usual]
     level = float(np.median(contrast[usual]))
-    zones = (inside < _ONE_SIDE, (inside > _EDGE[0]) & (inside < _EDGE[1]), inside > 1 - _ONE_SIDE)
-    dark, edge, bright = (
-        float((squares * present * zone).sum() / max(1.0, float((present * zone).sum()))) for zone in zones
-    )
+    totals, counts = sums[usual, 1:].sum(axis=0).T
+    dark, edge, bright = (totals / np.maximum(counts, 1)).tolist()
     dark = max(dark, _LEAST_DARK_SHARE * bright, _QUANTISATION_DN2)
     bright = max(bright, dark)
     mean_shape = 0.83  # of 4 S (1 - S) over the edge's zone
@@ -110,31 +110,21 @@ class ResidualSpread:
 
 
 def residual_spread(
-    residuals: Array32,
-    weights: Array32,
-    sectors: NDArray[np.int64],
-    contrast: Array,
-    fitted: int,
+    residuals: Array32, weights: Array32, pixels: PixelSet, sectors: int, contrast: Array, fitted: int
 ) -> ResidualSpread:
     """Residuals summed over the patch and over sectors.
 
     Args:
         residuals: (N, K). [DN]
         weights: (N, K) inverse variances, 0 for padding. [1/DN^2]
-        sectors: (N, K) in 0..S-1.
+        pixels: whose they are.
+        sectors: how many about the centre.
         contrast: (N,) [DN]
         fitted: number of parameters.
     """
-    count = int(sectors.max()) + 1
-    index = (sectors + count * np.arange(len(residuals))[:, None]).ravel()
-
-    def by_sector(values: Array32) -> Array:
-        sums = np.bincount(index, values.ravel(), len(residuals) * count)
-        return sums.reshape(len(residuals), count).astype(np.float64)
-
-    weight = np.maximum(by_sector(weights), 1e-12)
-    summed = by_sector(weights * residuals)
-    squares = (weights * residuals * residuals).sum(axis=1, dtype=np.float64)
+    sums = sector_sums(pixels.x_px, pixels.y_px, residuals, weights, sectors)
+    weight, summed = np.maximum(sums[..., 0], 1e-12), sums[..., 1]
+    squares = sums[..., 2].sum(axis=1)
     dof = np.maximum((weights > 0).sum(axis=1) - fitted, 1)
     sigma = np.abs(summed) / np.sqrt(weight)
     mean = np.abs(summed) / weight
@@ -164,19 +154,9 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
         Factor in the variance of the frame's outlines, 1 or more.
     """
     # Along the outline the derivative by the centre is as steep as the edge; elsewhere no pixel tells of its place.
-    # No overflow to guard against here: hypot would, at four times the price.
-    steepness = np.sqrt(fit.jacobian[:, 0] ** 2 + fit.jacobian[:, 1] ** 2)
-    patch, pixel = np.nonzero(steepness * (weights > 0) > _STEEP_SHARE * steepness.max(axis=1, keepdims=True))
-    piece = sector_index(x_px[patch, pixel], y_px[patch, pixel], _PIECES) + _PIECES * patch
-    steep, jacobian = steepness[patch, pixel], fit.jacobian[patch, :, pixel]
-    weighted = weights[patch, pixel] * steep
-
-    def by_piece(values: Array32) -> Array:
-        sums = np.bincount(piece, weighted * values, len(weights) * _PIECES)
-        return sums.reshape(-1, _PIECES).astype(np.float64)
-
-    shift, alone = by_piece(fit.residuals[patch, pixel]), np.maximum(by_piece(steep), _TINY)
-    coupled = np.stack([by_piece(column) for column in jacobian.T], axis=2)
+    sums = np.zeros((len(weights), _PIECES, 2 + fit.jacobian.shape[1]))
+    piece_sums(x_px, y_px, fit.jacobian, fit.residuals, weights, np.float32(_STEEP_SHARE), sums)
+    shift, alone, coupled = sums[..., 0], np.maximum(sums[..., 1], _TINY), sums[..., 2:]
     swallowed = np.einsum("nsp,nsp->ns", np.matmul(coupled, fit.covariance()), coupled)
     found = (shift**2 / alone).sum(axis=1)
     expected = np.maximum((1 - swallowed / alone).sum(axis=1), 1.0)
@@ -196,10 +176,3 @@ def beyond_linear(cov_px2: Array) -> Array:
     variance = np.einsum("nii->n", cov_px2) / 2
     widened: Array = cov_px2 * (1 + variance / _NOT_LINEAR_PX**2)[:, None, None]
     return widened
-
-
-def sector_index(x_px: Array32, y_px: Array32, count: int) -> NDArray[np.int64]:
-    """Which of so many equal sectors about the origin a place lies in."""
-    turn = np.arctan2(y_px, x_px) / (2 * np.pi)
-    sectors: NDArray[np.int64] = np.floor(turn * count).astype(np.int64) % count
-    return sectors

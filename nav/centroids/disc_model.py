@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_profile, ellipse_parameters
-from nav.centroids.least_squares import Minimum, Model, patch_blocks
+from nav.centroids.edge_pictures import draw_discs
+from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_widths, ellipse_parameters
+from nav.centroids.least_squares import Minimum, Model
 from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet, edge_distances
 
 # Places in the vector of parameters, after those of the ellipse.
 WIDTH, BACKGROUND, LEVEL = ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS + 1, ELLIPSE_PARAMETERS + 2
-_PLAIN_COUNT = ELLIPSE_PARAMETERS + 3
+_PLAIN_COUNT = LEVEL + 1
 # An initial outline may be this far off; pixels this far from it show one side only. [px]
 _CLEAR_PX = 1.0
 
@@ -27,52 +28,17 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, furthe
         further: (N, E, K) shares F of other backgrounds, whose lights k above b are fitted, the last parameters.
     """
     x, y = pixels.x_px, pixels.y_px
-    own_count = _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside
-    count = own_count + (0 if further is None else further.shape[1])
-
-    blocks = patch_blocks(len(x), count * x.shape[1])
+    if further is None:
+        further = np.zeros((len(x), 0, x.shape[1]), np.float32)
+    count = _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside + further.shape[1]
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
-        for part in blocks:
-            _draw(parameters[part], x[part], y[part], (slope_outside, slope_inside), jacobian[part], picture[part])
-            if further is not None:
-                jacobian[part, own_count:] = further[part]
-                lights = parameters[part, None, own_count:].astype(np.float32)
-                picture[part] += np.matmul(lights, further[part])[:, 0]
+        given, widths = parameters.astype(np.float32), edge_widths(parameters[:, WIDTH])
+        draw_discs(given, widths, (slope_outside, slope_inside), x, y, further, picture, jacobian)
         return picture, jacobian
 
     return model
-
-
-def _draw(
-    parameters: Array, x: Array32, y: Array32, slopes: tuple[bool, bool], jacobian: Array32, picture: Array32
-) -> None:
-    """Fill picture and derivatives of a few patches, without other backgrounds; `slopes` outside and inside."""
-    by_ellipse = jacobian[:, :ELLIPSE_PARAMETERS]
-    edge = edge_profile(parameters[:, :ELLIPSE_PARAMETERS], parameters[:, WIDTH], x, y, by_ellipse)
-    rest = parameters[:, BACKGROUND:].astype(np.float32)[:, :, None]
-    inside, outside = jacobian[:, LEVEL], jacobian[:, BACKGROUND]
-    inside[:] = edge.inside
-    np.subtract(1, inside, out=outside)
-    dark, bright = rest[:, 0], rest[:, 1]
-    place = _PLAIN_COUNT
-    if slopes[0]:
-        dark = dark + rest[:, 2] * x + rest[:, 3] * y
-        np.multiply(x, outside, out=jacobian[:, place])
-        np.multiply(y, outside, out=jacobian[:, place + 1])
-        place += 2
-    if slopes[1]:
-        bright = bright + rest[:, place - BACKGROUND] * x + rest[:, place + 1 - BACKGROUND] * y
-        np.multiply(x, inside, out=jacobian[:, place])
-        np.multiply(y, inside, out=jacobian[:, place + 1])
-    contrast = bright - dark
-    steep = contrast * edge.density
-    by_ellipse *= steep[:, None]
-    steep *= edge.distance_px
-    np.divide(steep, -parameters[:, WIDTH, None].astype(np.float32), out=jacobian[:, WIDTH])
-    np.multiply(contrast, inside, out=picture)
-    picture += dark
 
 
 def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:

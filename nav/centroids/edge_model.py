@@ -14,7 +14,6 @@ from nav.centroids.centroid_quality import (
     edge_noise_factor,
     measure_noise,
     residual_spread,
-    sector_index,
 )
 from nav.centroids.disc_fits import DiscFits, merged, unfitted
 from nav.centroids.disc_location import located
@@ -89,7 +88,7 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
         model = disc_model(pixels, sloped, shaded, shares_beyond(around, found, pixels, width_px))
         first = evaluate(model, pixels.values, pixels.present, first.parameters)
     # The derivative by the disc's level is the share of light from within.
-    inside = first.jacobian[:, LEVEL]
+    inside = np.ascontiguousarray(first.jacobian[:, LEVEL])
     if not plain:
         first, beyond_gaussian = without_pixel_response(first, pixels, inside, contrasts(first))
         pixels = replace(pixels, values=pixels.values - beyond_gaussian)
@@ -104,8 +103,7 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
     # What a plain picture shows beside a disc says nothing about the disc.
     judged = weights * (final.jacobian[:, LEVEL] > _ON_THE_DISC) if plain else weights
     contrast = contrasts(final)
-    sectors = sector_index(pixels.x_px, pixels.y_px, SECTORS)
-    spread = residual_spread(final.residuals, judged, sectors, contrast, final.parameters.shape[1])
+    spread = residual_spread(final.residuals, judged, pixels, SECTORS, contrast, final.parameters.shape[1])
     factor = edge_noise_factor(final, judged, pixels.x_px, pixels.y_px)
     cov = beyond_linear(final.covariance()[:, :2, :2] * factor * spread.inflation[:, None, None])
     reasons = rejection_reasons(discs, pixels, final, inside, cov, noise, spread)

@@ -10,6 +10,14 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.centroids.marker_signal import Array32
+from nav.centroids.matrix_loops import (
+    add_rows,
+    couplings,
+    damped_steps,
+    leverages,
+    normal_equations,
+    weighted_squares,
+)
 
 # Values (N, K) and their derivatives (N, P, K) at (N, P) parameters.
 Model = Callable[[Array], tuple[Array32, Array32]]
@@ -22,8 +30,6 @@ _TINY_CURVATURE = 1e-12
 _RIDGE = 1e-6
 # Relative to the cost, below which single precision tells no better from worse.
 _ROUNDING = 1e-6
-# In single precision, 1 MiB.
-_CACHED_NUMBERS = 262_144
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,24 +39,20 @@ class NormalEquations:
     Attributes:
         jacobian: (N, P, K).
         residuals: (N, K).
-        roots: (N, K) of the weights.
+        weights: (N, K).
     """
 
     jacobian: Array32
     residuals: Array32
-    roots: Array32
+    weights: Array32
 
     @cached_property
     def _products(self) -> tuple[Array, Array]:
         """(N, P, P) normal matrices `J W J^T` and (N, P) gradients."""
-        count, size, length = self.jacobian.shape
-        normal, gradient = np.empty((count, size, size), np.float32), np.empty((count, size, 1), np.float32)
-        for part in patch_blocks(count, size * length):
-            rooted = self.jacobian[part] * self.roots[part, None]
-            # An array with its own transpose: half of the product is computed and mirrored.
-            np.matmul(rooted, rooted.transpose(0, 2, 1), out=normal[part])
-            np.matmul(rooted, (self.residuals[part] * self.roots[part])[:, :, None], out=gradient[part])
-        return normal.astype(np.float64), gradient[..., 0].astype(np.float64)
+        count, size, _ = self.jacobian.shape
+        normal, gradient = np.empty((count, size, size)), np.empty((count, size))
+        normal_equations(self.jacobian, self.residuals, self.weights, normal, gradient)
+        return normal, gradient
 
     @cached_property
     def _scales(self) -> Array:
@@ -73,9 +75,7 @@ class NormalEquations:
 
     def step(self, damping: Array) -> Array:
         """(N, P) steps with (N,) dampings."""
-        damped = self._scaled + damping[:, None, None] * np.eye(self._scaled.shape[1])
-        step: Array = np.linalg.solve(damped, (self._products[1] * self._scales)[..., None])[..., 0] * self._scales
-        return step
+        return damped_steps(self._scaled, self._products[1] * self._scales, damping) * self._scales
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,27 +100,25 @@ class Minimum:
 
     def given(self, residuals: Array32, weights: Array32) -> Minimum:
         """Where one undamped step ends from here if the residuals were these; (N, K) each."""
-        gradient = np.matmul(self.jacobian, (weights * residuals)[:, :, None]).astype(np.float64)
+        gradient = np.empty((*self.parameters.shape, 1))
+        couplings(self.jacobian, residuals[:, None], weights, gradient)
         step = np.matmul(self.covariance(), gradient)[..., 0]
-        left = residuals - np.matmul(step[:, None].astype(np.float32), self.jacobian)[:, 0]
+        left = residuals.copy()
+        add_rows(self.jacobian, -step.astype(np.float32), left)
         return replace(self, parameters=self.parameters + step, residuals=left)
 
     def leverages(self, covariance: Array, weights: Array32) -> Array32:
         """(N, K) share of each pixel's noise that its own fit swallows."""
-        root = np.linalg.cholesky(covariance).astype(np.float32).transpose(0, 2, 1)
-        leverages = np.empty_like(weights)
-        for part in patch_blocks(len(root), self.jacobian[0].size):
-            swallowed = np.matmul(root[part], self.jacobian[part])
-            np.einsum("npk,npk->nk", swallowed, swallowed, out=leverages[part])
-        leverages *= weights
-        return leverages
+        filled = np.empty_like(weights)
+        leverages(self.jacobian, np.linalg.cholesky(covariance).astype(np.float32), weights, filled)
+        return filled
 
 
 def evaluate(model: Model, data: Array32, weights: Array32, parameters: Array) -> Minimum:
     """Where an iteration starts: the model at (N, P) parameters; other arguments as for `minimise`."""
     values, jacobian = model(parameters)
     residuals = data - values
-    normal = NormalEquations(jacobian, residuals, np.sqrt(weights))
+    normal = NormalEquations(jacobian, residuals, weights)
     return Minimum(parameters, residuals, jacobian, normal)
 
 
@@ -138,10 +136,9 @@ def minimise(
         small_step_px: the iteration ends when no place moves more.
     """
     parameters, residuals, jacobian = start.parameters, start.residuals, start.jacobian
-    roots = np.sqrt(weights)
-    cost = _cost(residuals, roots)
+    cost = _costs(residuals, weights)
     damping = np.full(len(parameters), _FIRST_DAMPING)
-    normal = NormalEquations(jacobian, residuals, roots)
+    normal = NormalEquations(jacobian, residuals, weights)
     for _ in range(most_steps):
         step = normal.step(damping)
         tried = parameters + step
@@ -149,7 +146,7 @@ def minimise(
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             values, new_jacobian = model(tried)
             new_residuals = data - values
-            new_cost = _cost(new_residuals, roots)
+            new_cost = _costs(new_residuals, weights)
         better = new_cost <= cost * (1 + _ROUNDING)
         if better.all():
             parameters, cost, residuals, jacobian = tried, new_cost, new_residuals, new_jacobian
@@ -160,19 +157,12 @@ def minimise(
             jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
         damping = np.where(better, np.maximum(damping / 10, _SMALLEST_DAMPING), damping * 10)
         converged = np.abs(step[:, :2]).max(axis=1) < small_step_px
-        normal = NormalEquations(jacobian, residuals, roots)
+        normal = NormalEquations(jacobian, residuals, weights)
         if converged.all():
             break
     return Minimum(parameters, residuals, jacobian, normal)
 
 
-def _cost(residuals: Array32, roots: Array32) -> Array:
-    rooted = residuals * roots
-    cost = np.einsum("nk,nk->n", rooted, rooted).astype(np.float64)
-    return np.where(np.isfinite(cost), cost, np.inf)
-
-
-def patch_blocks(count: int, length: int) -> list[slice]:
-    """Slices of `count` patches of `length` numbers, such that those of one slice fit a core's cache."""
-    step = max(1, _CACHED_NUMBERS // length)
-    return [slice(low, low + step) for low in range(0, count, step)]
+def _costs(residuals: Array32, weights: Array32) -> Array:
+    costs = weighted_squares(residuals, weights)
+    return np.where(np.isfinite(costs), costs, np.inf)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from datasets_manifest.images import Pixels
 from geometry.se3 import Array
 from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
 from nav.centroids.marker_signal import Array32, MarkerSignal
+from nav.centroids.window_cells import choose_cells, take_cells
 
 # Pixels this far outside the edge are seen; a plain picture needs more of them to know its background. [px]
 OUTER_DIFFERENCE_PX = 2.5
@@ -23,7 +24,6 @@ _BAND_PX = 2.5
 _THIN = 4
 
 _Picture = Array32 | Pixels | NDArray[np.bool_]
-_Chooser = Callable[[Array32, Array32, NDArray[np.bool_]], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,104 +77,78 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
 
 def disc_pixels(signals: Sequence[MarkerSignal], discs: Ellipses, everything: bool = False) -> PixelSet:
     """Pixels in and around discs; with `everything`, those far from the edge of large discs too."""
-    outer = np.float32(OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
     whole = everything or bool(discs.radii_px.max() <= WHOLE_RADIUS_PX)
-
-    def choose(x: Array32, y: Array32, thin: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        distance = edge_distances(discs.shapes_px, x, y)
-        chosen: NDArray[np.bool_] = distance >= -outer
-        if not whole:
-            taken = distance <= _BAND_PX
-            if outer > _BAND_PX:
-                taken &= distance >= -_BAND_PX
-            taken |= thin
-            chosen &= taken
-        return chosen
-
-    return _gather(signals, discs, float(outer), choose)
+    return _gather(signals, discs, thin=1 if whole else _THIN)
 
 
 def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
     """One in four by four of the pixels in and around discs."""
-    outer = np.float32(OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
-
-    def choose(x: Array32, y: Array32, thin: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        chosen: NDArray[np.bool_] = edge_distances(discs.shapes_px, x, y) >= -outer
-        return chosen
-
-    return _gather(signals, discs, float(outer), choose, _THIN)
+    return _gather(signals, discs, every=_THIN)
 
 
 def annulus_pixels(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses) -> PixelSet:
     """Pixels on and around annuli; of the hole only what lies near its edge."""
-    reach = np.float32(OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
-    shift = (inner.centers_px - outer.centers_px).astype(np.float32)[:, :, None, None]
-
-    def choose(x: Array32, y: Array32, thin: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        to_outer = edge_distances(outer.shapes_px, x, y)
-        to_inner = edge_distances(inner.shapes_px, x - shift[:, 0], y - shift[:, 1])
-        chosen: NDArray[np.bool_] = (to_outer >= -reach) & (to_inner <= _BAND_PX)
-        return chosen & ((np.abs(to_outer) <= _BAND_PX) | (np.abs(to_inner) <= _BAND_PX) | thin)
-
-    return _gather(signals, outer, float(reach), choose)
+    return _gather(signals, outer, thin=_THIN, holes=inner)
 
 
 def _gather(
-    signals: Sequence[MarkerSignal], outlines: Ellipses, reach_px: float, choose: _Chooser, every: int = 1
+    signals: Sequence[MarkerSignal], outlines: Ellipses, every: int = 1, thin: int = 1, holes: Ellipses | None = None
 ) -> PixelSet:
-    """Pixels of squares around the outlines that `choose` takes; it is given places and a sparse grid."""
+    """Pixels in and around outlines, not in their holes.
+
+    Args:
+        signals: of both eyes.
+        outlines: of both eyes.
+        every: pixels between the rows, and the columns, that are looked at.
+        thin: far from edges, one in so many by so many of those is taken.
+        holes: within the outlines.
+    """
     pitch = signals[0].pitch_px
+    reach_px = OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX
     extents = np.sqrt(np.einsum("mij,mij->mi", outlines.shapes_px, outlines.shapes_px)) + reach_px
-    half = int(np.ceil(extents.max() / pitch)) + 1
-    steps = np.arange(-half, half + 1, every)
-    firsts = np.array([signal.first_px for signal in signals])[outlines.eyes]
-    middles = np.rint((outlines.centers_px - firsts) / pitch).astype(np.int64)
-    starts = (firsts + pitch * middles - outlines.centers_px).astype(np.float32)
-    along = (pitch * steps).astype(np.float32)
-    x, y = starts[:, 0, None, None] + along[:, None].T, starts[:, 1, None, None] + along[:, None]
-    chosen = choose(x, y, (steps[:, None] % _THIN == 0) & (steps % _THIN == 0))
-    columns, rows = (middles[:, axis, None] + steps for axis in (0, 1))
-    heights, widths = np.array([signal.values.shape for signal in signals]).T[:, outlines.eyes, None]
-    on_image = (rows >= 0) & (rows < heights), (columns >= 0) & (columns < widths)
-    truncated = np.zeros(len(outlines), np.bool_)
-    if not (on_image[0].all() and on_image[1].all()):
-        seen = on_image[0][:, :, None] & on_image[1][:, None]
-        truncated = (chosen & ~seen).any(axis=(1, 2))
-        chosen &= seen
-    # Flat indices are found and split faster than those of three axes.
-    cell = np.flatnonzero(chosen)
-    patch = cell // len(steps) ** 2
-    cell -= len(steps) ** 2 * patch
-    row = cell // len(steps)
-    column = cell - len(steps) * row
-    counts = np.bincount(patch, minlength=len(outlines))
+    half = (int(np.ceil(extents.max() / pitch)) + 1) // every * every
+    size = 2 * (half // every) + 1
+    firsts_px = np.array([signal.first_px for signal in signals])[outlines.eyes]
+    middles = np.rint((outlines.centers_px - firsts_px) / pitch).astype(np.int64)
+    starts = (firsts_px + pitch * middles - outlines.centers_px).astype(np.float32)
+    offsets = (pitch * (every * np.arange(size) - half)).astype(np.float32)
+    windows = middles - half
+    # Cells of the windows that lie on the image, column and row, from the first to behind the last.
+    sides = np.array([signal.values.shape[::-1] for signal in signals])[outlines.eyes]
+    frames = np.concatenate([-(windows // every), (sides - windows + every - 1) // every], axis=1)
+    inside = np.zeros((0, 2), np.float32), np.zeros((0, 2, 2), np.float32), np.zeros(0, np.float32)
+    if holes is not None:
+        inside = (holes.centers_px - outlines.centers_px).astype(np.float32), *_inverses_and_radii(holes)
+    limits = np.float32(reach_px), np.float32(_BAND_PX)
+    cells = np.empty((len(outlines), size * size), np.int32)
+    outline = _inverses_and_radii(outlines)
+    counts, truncated = choose_cells(offsets, starts, outline, inside, limits, thin, frames, cells)
     present = np.arange(max(1, int(counts.max()))) < counts[:, None]
-    eye = outlines.eyes[patch]
-    sites = [
-        (mine, middles[patch[mine], 1] + steps[row[mine]], middles[patch[mine], 0] + steps[column[mine]])
-        for mine in (np.flatnonzero(eye == index) for index in range(len(signals)))
-    ]
+    cells = np.where(present, cells[:, : present.shape[1]], -1)
 
-    def padded(values: Array32 | NDArray[np.bool_]) -> Array32:
-        array = np.zeros(present.shape, np.float32)
-        array[present] = values
-        return array
-
-    def at_sites(pictures: Sequence[_Picture]) -> Array32:
-        values = np.empty(len(patch), np.float32)
-        for picture, (mine, at_rows, at_columns) in zip(pictures, sites, strict=True):
-            values[mine] = picture[at_rows, at_columns]
+    def taken(pictures: Sequence[_Picture]) -> Array32:
+        values = np.zeros(present.shape, np.float32)
+        for eye, picture in enumerate(pictures):
+            mine = np.flatnonzero(outlines.eyes == eye)
+            filled = np.zeros((len(mine), present.shape[1]), np.float32)
+            take_cells(picture, windows[mine], every, size, cells[mine], filled)
+            values[mine] = filled
         return values
 
-    values = at_sites([signal.values for signal in signals])
+    values = taken([signal.values for signal in signals])
     own = [signal.own for signal in signals if signal.own is not None]
+    column, row = cells % size, cells // size
     return PixelSet(
-        padded(starts[patch, 0] + along[column]),
-        padded(starts[patch, 1] + along[row]),
-        padded(values),
+        np.where(present, starts[:, :1] + offsets[column], np.float32(0)),
+        np.where(present, starts[:, 1:] + offsets[row], np.float32(0)),
+        values,
         present.astype(np.float32),
-        padded(at_sites([signal.clipped for signal in signals])) > 0,
+        taken([signal.clipped for signal in signals]) > 0,
         outlines.centers_px,
         truncated,
-        padded(at_sites(own) - values) if len(own) == len(signals) else None,
+        taken(own) - values if len(own) == len(signals) else None,
     )
+
+
+def _inverses_and_radii(outlines: Ellipses) -> tuple[Array32, Array32]:
+    return shape_inverses(outlines.shapes_px).astype(np.float32), outlines.radii_px.astype(np.float32)

@@ -8,7 +8,7 @@ from scipy.special import erf
 
 from nav.centroids.edge_profile import blurred_step
 from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
-from nav.centroids.least_squares import evaluate, minimise, patch_blocks
+from nav.centroids.least_squares import evaluate, minimise
 
 
 def test_a_blurred_step_is_the_error_function():
@@ -53,12 +53,6 @@ def test_an_ellipse_has_positive_semi_axes(axes):
     shapes = np.stack([np.eye(2), np.diag(axes)])
     with pytest.raises(ValueError, match="shapes_px: must be positive"):
         Ellipses(np.zeros(2, np.int64), np.zeros((2, 2)), shapes)
-
-
-def test_blocks_cover_all_patches_once():
-    for count, length in ((1, 10), (16, 20_000), (40, 100_000), (7, 10**9)):
-        covered = np.concatenate([np.arange(count)[part] for part in patch_blocks(count, length)])
-        assert covered.tolist() == list(range(count))
 
 
 @pytest.mark.parametrize("length", [40, 60_000])

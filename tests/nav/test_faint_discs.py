@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from droguekit.benchmark.centroid_bounds import center_bound_px
-from nav.centroids.centroid_quality import SECTORS, NoiseModel, residual_spread, sector_index
+from nav.centroids.centroid_quality import SECTORS, NoiseModel, residual_spread
 from nav.centroids.disc_model import LEVEL, contrasts, disc_model, disc_start
 from nav.centroids.disc_rejection import rejection_reasons
 from nav.centroids.edge_model import fit_discs
@@ -56,9 +56,7 @@ def test_an_outline_turned_inside_out_is_no_disc():
     )
     inside, noise = fit.jacobian[:, LEVEL], NoiseModel(50.0, 0.02, 0.0)
     cov = np.tile(1e-4 * np.eye(2), (len(truth), 1, 1))
-    spread = residual_spread(
-        fit.residuals, pixels.present / 50, sector_index(pixels.x_px, pixels.y_px, SECTORS), contrasts(fit), 8
-    )
+    spread = residual_spread(fit.residuals, pixels.present / 50, pixels, SECTORS, contrasts(fit), 8)
     turned = fit.parameters.copy()
     turned[0, 2:5] *= -1
     reasons = rejection_reasons(truth, pixels, replace(fit, parameters=turned), inside, cov, noise, spread)
