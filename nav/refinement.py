@@ -68,7 +68,8 @@ def refine(
     seen = zip(EYES, observation.pixels_px, strict=True)
     rough_px = np.stack([real_places(rig, eye, places, sizes) for eye, places in seen])
     discs = Ellipses(eyes, rough_px[eyes, index], marker_shapes(rig, layout, rough.left_from_drogue)[eyes, index])
-    hubs = [hub for mode in rough.modes for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
+    likely = [rough.modes[0], *(mode for mode in rough.modes[1:] if mode.weight >= _LEAST_WEIGHT)]
+    hubs = [hub for mode in likely for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
     around = _surroundings(layout, index, radius_px / layout.radius_m)
     if around is not None and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
         middles_px = np.stack([rig.image(rough.left_from_drogue.translation_m, eye) for eye in EYES])

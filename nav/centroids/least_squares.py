@@ -62,20 +62,16 @@ class NormalEquations:
         return scales
 
     @cached_property
-    def _scaled(self) -> Array:
-        """(N, P, P) matrices with a unit diagonal, kept invertible where single precision would not."""
-        scaled: Array = self._products[0] * self._scales[:, :, None] * self._scales[:, None, :]
-        return scaled + _RIDGE * np.eye(scaled.shape[1])
-
-    @cached_property
     def inverse(self) -> Array:
-        """(N, P, P) inverse matrices."""
-        inverse: Array = np.linalg.inv(self._scaled) * self._scales[:, :, None] * self._scales[:, None, :]
+        """(N, P, P) inverse matrices, of those with a diagonal of one kept invertible where single precision is not."""
+        scales = self._scales[:, :, None] * self._scales[:, None, :]
+        inverse: Array = np.linalg.inv(self._products[0] * scales + _RIDGE * np.eye(scales.shape[1])) * scales
         return inverse
 
     def step(self, damping: Array) -> Array:
         """(N, P) steps with (N,) dampings."""
-        return damped_steps(self._scaled, self._products[1] * self._scales, damping) * self._scales
+        normal, gradient = self._products
+        return damped_steps(normal, self._scales, gradient, damping + _RIDGE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,23 +74,25 @@ def weighted_squares(residuals: Array32, weights: Array32) -> Array:
 
 
 @compiled
-def damped_steps(matrices: Array, gradients: Array, dampings: Array) -> Array:
-    """Solutions (N, P) of systems with matrices (N, P, P), dampings (N,) added to their diagonals, by Cholesky.
+def damped_steps(matrices: Array, scales: Array, gradients: Array, dampings: Array) -> Array:
+    """Solutions (N, P) of systems with matrices (N, P, P) and right sides (N, P), by Cholesky.
 
-    What no matrix with a positive diagonal would give is no number.
+    Rows and columns are scaled (N, P), and then dampings (N,) added to the diagonals. What a matrix that is not
+    positive would give is no number.
     """
     count, size = gradients.shape
     steps, root = np.empty((count, size)), np.empty((size, size))
     for n in range(count):
+        scale = scales[n]
         for i in range(size):
             for j in range(i + 1):
-                rest = matrices[n, i, j] + (dampings[n] if i == j else 0.0)
+                rest = matrices[n, i, j] * scale[i] * scale[j] + (dampings[n] if i == j else 0.0)
                 for m in range(j):
                     rest -= root[i, m] * root[j, m]
                 root[i, j] = np.sqrt(rest) if i == j else rest / root[j, j]
         step = steps[n]
         for i in range(size):
-            rest = gradients[n, i]
+            rest = gradients[n, i] * scale[i]
             for m in range(i):
                 rest -= root[i, m] * step[m]
             step[i] = rest / root[i, i]
@@ -100,6 +102,8 @@ def damped_steps(matrices: Array, gradients: Array, dampings: Array) -> Array:
             for m in range(i + 1, size):
                 rest -= root[m, i] * step[m]
             step[i] = rest / root[i, i]
+        for i in range(size):
+            step[i] *= scale[i]
     return steps
 
 

@@ -49,13 +49,14 @@ def test_damped_steps_solve_their_systems():
     rng = np.random.default_rng(2)
     arms = rng.normal(size=(6, 9, 9))
     matrices, gradients, dampings = arms @ arms.transpose(0, 2, 1) + np.eye(9), rng.normal(size=(6, 9)), rng.random(6)
-    steps = matrix_loops.damped_steps(matrices, gradients, dampings)
-    damped = matrices + dampings[:, None, None] * np.eye(9)
+    scales = rng.uniform(0.1, 3, (6, 9))
+    steps = matrix_loops.damped_steps(matrices, scales, gradients, dampings)
+    # What is added to a scaled diagonal is the more in the matrix's own units, the smaller the scale is.
+    damped = matrices + (dampings[:, None] / scales**2)[:, None] * np.eye(9)
     np.testing.assert_allclose(steps, np.linalg.solve(damped, gradients[..., None])[..., 0], rtol=1e-9)
     matrices[0] *= -1
-    assert np.isnan(matrix_loops.damped_steps(matrices, gradients, 0 * dampings)).any(axis=1).tolist() == [True] + 5 * [
-        False
-    ]
+    steps = matrix_loops.damped_steps(matrices, scales, gradients, 0 * dampings)
+    assert np.isnan(steps).any(axis=1).tolist() == [True] + 5 * [False]
 
 
 @pytest.mark.parametrize("count", [8, 16])
