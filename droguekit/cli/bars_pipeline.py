@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 DEFAULT_TRACKER, DEFAULT_RIG = "pose-predict", "rgb-ideal"
 # Engine and recipe; data of another rig than the bars' name it besides.
 _NAMES_OF_BARS = 2
+# At each distance, whose centroids are timed.
+_TIMED_PAIRS = 8
 
 
 @dataclass(frozen=True)
@@ -80,15 +82,17 @@ def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
     from droguekit.bars.tier_c import bars_tier_c
     from droguekit.bars.tier_d import bars_tier_d
 
-    drawn = {"c": bars_tier_c, "d": bars_tier_d, "speed": bars_speed}
+    drawn = {"c": bars_tier_c, "d": bars_tier_d}
     if order.tier in IMAGE_TIERS:
         rows = image_bars(order, out, report)
     elif order.tier in drawn:
         rows = drawn[order.tier](out, order.seed, order.draws, report)
+    elif order.tier == "speed":
+        rows = bars_speed(_timed_pairs(order, out, report), order.seed, order.draws, report)
     elif order.tier in FLIGHT_TIERS:
         rows = flight_bars(order, FLIGHT_TIERS[order.tier], out, report)
     else:
-        tiers = ", ".join((*IMAGE_TIERS, *drawn, *FLIGHT_TIERS))
+        tiers = ", ".join((*IMAGE_TIERS, *drawn, *FLIGHT_TIERS, "speed"))
         raise ValueError(f"tier: there is none named {order.tier!r}; there are {tiers}")
     table = BarTable(tier=order.tier, seed=order.seed, code_version=version("droguekit"), rows=tuple(rows))
     write_text_atomic(out / "bars.json", table.to_json())
@@ -156,6 +160,16 @@ def plan_images(order: BarsOrder) -> list[tuple[Literal["day", "dusk"], PlannedD
             names = (light,) if engine is None else (engine, light)
             plans.append((light, PlannedData(recipe, text, stations * pairs, names)))
     return plans
+
+
+def _timed_pairs(order: BarsOrder, out: Path, report: ProgressReport) -> Path:
+    """A dataset of analytic pairs by day at every distance."""
+    from droguekit.bars.image_tiers import recipe_of
+
+    recipe, text = open_recipe(recipe_of("a", "day"), order.seed, None)
+    plan = PlannedData(recipe, text, _TIMED_PAIRS * len(recipe.distance.stations_m or ()), ())
+    _render(plan, out, order, report)
+    return out / "dataset"
 
 
 def flight_bars(order: BarsOrder, data: Sequence[FlightData], out: Path, report: ProgressReport) -> list[BarRow]:
