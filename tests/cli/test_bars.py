@@ -217,6 +217,17 @@ def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> No
     assert (tmp_path / "analytic" / "day" / "benchmark.json").exists()
 
 
+def test_centroids_are_timed_on_pairs_that_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("droguekit.cli.bars_pipeline._TIMED_PAIRS", 1)
+    told = io.StringIO()
+    tables = [run_bars(BarsOrder("speed", 3, draws=2, workers=0), tmp_path, PlainProgress(told)) for _ in range(2)]
+    assert "9 of 9 pairs are there already" in told.getvalue()
+    for table in tables:
+        measured = {row.quantity: row.measured for row in table.rows}
+        near, far = (measured[f"centroids of both eyes, {z_m} m, median [ms]"] for z_m in (2, 10))
+        assert near is not None and far is not None and min(near, far) > 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "fault"),
     [
