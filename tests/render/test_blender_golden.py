@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import importlib.util
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
 from drogue_models.parts import Part
 from geometry.stereo import EYES
 from scenes.light import REC709_LUMINANCE
 from scenes.sampler import sample_frame
+
+from .golden_frame import GOLDEN, golden_recipe
 
 pytestmark = [
     pytest.mark.blender,
@@ -21,26 +21,8 @@ pytestmark = [
     ),
 ]
 
-GOLDEN = Path(__file__).parent / "golden_render.npz"
 RENDERS = 8
-# The frame of the stored file, see test_golden_render.py.
-RECIPE = """
-name = "golden"
-seed = 8
-rig = { preset = "rgb-ideal", width_px = 96, height_px = 72, focal_px = 160.0 }
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [2.2]
-[environment]
-ground = "sea"
-sun_elevation_deg = { low = 40, high = 40 }
-[render]
-engine = "blender"
-samples_per_px = 16
-surround_samples_per_px = 16
-"""
+RENDER_LINES = 'engine = "blender"', "samples_per_px = 16", "surround_samples_per_px = 16"
 
 
 def test_renders_scatter_around_the_other_path_tracer_s_mean():
@@ -48,7 +30,7 @@ def test_renders_scatter_around_the_other_path_tracer_s_mean():
 
     with np.load(GOLDEN) as stored:
         mean, variance, parts = stored["mean"].astype(float), stored["variance"].astype(float), stored["parts"]
-    recipe = parse_recipe(RECIPE)
+    recipe = golden_recipe(*RENDER_LINES)
     frame = sample_frame(recipe, 0)
     blender = BlenderEngine()
     images = []

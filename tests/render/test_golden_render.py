@@ -7,50 +7,33 @@ After a change that is meant to change radiance, make the stored file anew and l
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
 from geometry.stereo import EYES
 from render.engine import load_engine
 from scenes.light import REC709_LUMINANCE
 from scenes.sampler import sample_frame
 
+from .golden_frame import GOLDEN, golden_recipe
+
 pytestmark = pytest.mark.mitsuba
 
-GOLDEN = Path(__file__).parent / "golden_render.npz"
 RENDERS, MORE_RENDERS = 200, 60
-RECIPE = """
-name = "golden"
-seed = 8
-rig = { preset = "rgb-ideal", width_px = 96, height_px = 72, focal_px = 160.0 }
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [2.2]
-[environment]
-ground = "sea"
-sun_elevation_deg = { low = 40, high = 40 }
-[render]
-edge_samples_per_px = 64
-denoise = false
-"""
+RENDER_LINES = "edge_samples_per_px = 64", "denoise = false"
 
 
 def luminance(engine, index):
     """(2, H, W) luminance of both eyes by the samples of seed `index`."""
-    recipe = parse_recipe(RECIPE)
+    recipe = golden_recipe(*RENDER_LINES)
     frame = sample_frame(recipe, 0).model_copy(update={"seed": index})
     radiance = engine.render(frame, recipe.render)
     return np.stack([getattr(radiance, eye).radiance_cd_m2 @ REC709_LUMINANCE for eye in EYES])
 
 
 def stored_parts(engine):
-    recipe = parse_recipe(RECIPE)
+    recipe = golden_recipe(*RENDER_LINES)
     radiance = engine.render(sample_frame(recipe, 0), recipe.render)
     return np.stack([getattr(radiance, eye).part_id for eye in EYES])
 
