@@ -147,9 +147,10 @@ def test_table_2_of_the_paper_has_its_order(draw_poses):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma_px", [0.1, 0.2, 0.35])
-@pytest.mark.parametrize("method", [paper, joint_robust])
-def test_table_2_has_its_order_at_any_noise(draw_poses, method, sigma_px):
-    five, seven, eight = order_of_table_2(draw_poses, method, sigma_px, 1500, 37)
+# Errors of the paper's method have long tails: of 1,500 draws the ratio of means, 0.95, has a deviation of 0.03.
+@pytest.mark.parametrize(("method", "count"), [(paper, 15_000), (joint_robust, 1500)])
+def test_table_2_has_its_order_at_any_noise(draw_poses, method, count, sigma_px):
+    five, seven, eight = order_of_table_2(draw_poses, method, sigma_px, count, 37)
     assert eight < seven < five
 
 
