@@ -106,7 +106,7 @@ def _gather(
     pitch = signals[0].pitch_px
     reach_px = OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX
     extents = np.sqrt(np.einsum("mij,mij->mi", outlines.shapes_px, outlines.shapes_px)) + reach_px
-    half = (int(np.ceil(extents.max() / pitch)) + 1) // every * every
+    half = -(-(int(np.ceil(extents.max() / pitch)) + 1) // every) * every
     size = 2 * (half // every) + 1
     firsts_px = np.array([signal.first_px for signal in signals])[outlines.eyes]
     middles = np.rint((outlines.centers_px - firsts_px) / pitch).astype(np.int64)
