@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from datasets_manifest.atomic import write_text_atomic
-from datasets_manifest.blind import BlindDataset
+from datasets_manifest.blind import BlindDataset, read_blind_index
 from droguekit.benchmark.detection_matching import Evaluation
 from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
 from droguekit.benchmark.detection_tables import share
@@ -42,7 +42,8 @@ class AblationOrder:
     """What is trained.
 
     Attributes:
-        corpus: dataset to train and to test on.
+        corpus: dataset to train on.
+        test: dataset whose test split is scored.
         variant: of the network, `l` or `s`.
         image_passes: through each network.
         size_px: width and height of its input.
@@ -51,6 +52,7 @@ class AblationOrder:
     """
 
     corpus: Path
+    test: Path
     variant: str
     image_passes: int
     size_px: tuple[int, int]
@@ -76,9 +78,10 @@ def ablate(order: AblationOrder, out: Path, say: Callable[[str], None]) -> list[
         The table's lines; `ablation.json` has the numbers.
 
     Raises:
-        ValueError: a wrong number, or a network that cannot be read.
+        ValueError: a wrong number, or a network or the test dataset that cannot be read.
         OSError: a training failed; says what it said last.
     """
+    read_blind_index(order.test)  # before hours of training
     for name, changes in CHANGES.items():
         _train(order, out / name, changes, say)
     rows = measured_networks(order, {name: out / name / "detector.onnx" for name in CHANGES}, say)
@@ -97,31 +100,31 @@ def measured_networks(
         say: takes a line about what goes on.
 
     Raises:
-        ValueError: a network or the corpus cannot be read.
+        ValueError: a network or the test dataset cannot be read.
     """
     detectors: dict[str, Detector] = {
         name: (OneViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, order.threads, order.size_px)
         for name, file in files.items()
     }
-    source = BlindDataset(order.corpus)
+    source = BlindDataset(order.test)
     pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
     say("timing in turns")
     latencies = measure_latency(detectors, pairs, order.rounds)
     say("looking for the drogue in the test split")
-    images = [image for image in read_detection_truth(order.corpus).images if image.split == "test"]
+    images = [image for image in read_detection_truth(order.test).images if image.split == "test"]
     return {
-        name: {"test": _test_precision(order.corpus, detector, images)}
+        name: {"test": _test_precision(order.test, detector, images)}
         | latencies[name]._asdict()
         | network_cost(files[name], order.size_px)._asdict()
         for name, detector in detectors.items()
     }
 
 
-def _test_precision(corpus: Path, detector: Detector, images: Sequence[ImageTruth]) -> dict[str, float | None] | None:
+def _test_precision(dataset: Path, detector: Detector, images: Sequence[ImageTruth]) -> dict[str, float | None] | None:
     """Average precision on some images by the rules of `benchmark`; None without images."""
     if not images:
         return None
-    looking = DetectorPass(corpus, lambda drogue: detector, sorted({image.frame_index for image in images}))
+    looking = DetectorPass(dataset, lambda drogue: detector, sorted({image.frame_index for image in images}))
     boxes = list(looking.boxes(LEAST_SCORE, lambda: None))
     return Evaluation(images, boxes).average_precision(images)._asdict()
 

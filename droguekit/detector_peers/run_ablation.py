@@ -21,12 +21,17 @@ from droguekit.detector_peers.options import (
 
 _EXAMPLES = """Examples:
 
-  python -m droguekit.detector_peers.run_ablation --corpus data/detector-small --image-passes 5000"""
+  python -m droguekit.detector_peers.run_ablation --corpus data/detector-small --image-passes 5000
+  python -m droguekit.detector_peers.run_ablation --corpus data/detector-train --test data/detector-test"""
 
 
 def main(
     corpus: CorpusOption,
     out: Annotated[Path, typer.Option("--out", help="Folder; trainings found there go on.")] = Path("out/ablation"),
+    test: Annotated[
+        Path | None,
+        typer.Option("--test", metavar="DIR", help="Dataset whose test split is scored, the corpus's own by default."),
+    ] = None,
     variant: Annotated[str, typer.Option("--variant", help="Of the network: l or s.")] = "s",
     image_passes: PassesOption = 5_000,
     size: SizeOption = "320x416",
@@ -37,7 +42,9 @@ def main(
 ) -> None:
     """Train our network with one thing changed at a time, on the same budget: accuracy and time of each."""
     try:
-        order = AblationOrder(corpus, variant, image_passes, input_size_px(size), threads, seed, device, rounds)
+        order = AblationOrder(
+            corpus, test or corpus, variant, image_passes, input_size_px(size), threads, seed, device, rounds
+        )
         lines = ablate(order, out, tell)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)

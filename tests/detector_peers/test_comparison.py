@@ -20,7 +20,14 @@ from droguekit.benchmark.detection_benchmark import DetectorRun, score_detection
 from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
 from droguekit.benchmark.detection_truth import read_detection_truth
 from droguekit.cli.main import DONE, run
-from droguekit.detector_peers.ablation import CHANGES, ONE_VIEW, AblationOrder, ablation_lines, measured_networks
+from droguekit.detector_peers.ablation import (
+    CHANGES,
+    ONE_VIEW,
+    AblationOrder,
+    ablate,
+    ablation_lines,
+    measured_networks,
+)
 from droguekit.detector_peers.comparison import PEERS, PeerOrder, compare_peers, run_script, training_length
 from droguekit.detector_peers.one_view import OneViewDetector
 from droguekit.detector_peers.options import input_size_px
@@ -208,7 +215,8 @@ def test_ablations_are_scored_like_everything_and_one_view_finds_the_same_boxes(
     screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
 ) -> None:
     file = maps_network(tmp_path / "detector.onnx")
-    ablation = AblationOrder(screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
+    nowhere = tmp_path / "nowhere"
+    ablation = AblationOrder(nowhere, screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
     rows = measured_networks(ablation, {"eca-asff": file, ONE_VIEW: file}, lambda line: None)
     truth = read_detection_truth(screen_dataset)
     boxes = list(DetectorPass(screen_dataset, lambda drogue: OnnxDetector(file)).boxes(LEAST_SCORE, lambda: None))
@@ -267,4 +275,11 @@ def test_tables_have_a_line_for_each_network() -> None:
     ablation = ablation_lines({name: row | {"test": None} for name in CHANGES})
     assert len(ablation) == 1 + len(CHANGES)
     with pytest.raises(ValueError, match="--image-passes: must be at least 1, got 0"):
-        AblationOrder(Path(), "s", 0, (64, 64), 1, 0, "cpu", 1)
+        AblationOrder(Path(), Path(), "s", 0, (64, 64), 1, 0, "cpu", 1)
+
+
+def test_a_test_that_is_not_there_is_found_before_training(screen_dataset: Path, tmp_path: Path) -> None:
+    ablation = AblationOrder(screen_dataset, tmp_path / "nowhere", "s", 8, (64, 64), 1, 0, "cpu", 1)
+    with pytest.raises(ValueError, match="nowhere"):
+        ablate(ablation, tmp_path / "out", lambda line: None)
+    assert not (tmp_path / "out").exists()
