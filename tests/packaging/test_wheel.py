@@ -93,7 +93,8 @@ def test_every_data_folder_is_packaged() -> None:
         for package in PACKAGES
         for path in (REPOSITORY / package).rglob("*")
         if path.is_file()
-        and path.suffix not in (".py", ".pyc")
+        and path.suffix != ".py"
+        and path.parent.name != "__pycache__"
         and path.name != "py.typed"
         and str(path.relative_to(REPOSITORY)) not in named
     ]
