@@ -109,6 +109,7 @@ def _slopes_by_center(
         by_y[k] = -steepness[k] * (b * g0 + c * g1)
 
 
+# As above once more: with five rows to fill at once the compiler would take one pixel at a time.
 @compiled
 def _slopes_by_shape(
     x: Array32,
@@ -314,13 +315,13 @@ def _add_box_row(
         r0, r1, r2 = _boxes_along(inwards + _SIDE_3 * across, down)
         area = _HALF / (across * down)
         seen = (inside[k] > _SEEN_LOW) & (inside[k] < _SEEN_HIGH) & (present[k] > _F(0))
-        step = steps[k] if seen else _F(0)
+        step = steps[k]
         middle = (n1 - m_1) * area - inside[k]
         sides = ((m_1 - l1) + (r1 - n1) + (n0 - m_0) + (n2 - m_2)) * (area / _F(4)) - inside[k]
         ends = ((m_0 - l0) + (r0 - n0) + (m_2 - l2) + (r2 - n2)) * (area / _F(4)) - inside[k]
-        own[k] += step * middle
-        beside[k] += step * sides
-        corners[k] += step * ends
+        own[k] += step * middle if seen else _F(0)
+        beside[k] += step * sides if seen else _F(0)
+        corners[k] += step * ends if seen else _F(0)
 
 
 @compiled

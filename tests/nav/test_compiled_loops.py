@@ -59,6 +59,15 @@ def test_damped_steps_solve_their_systems():
     assert np.isnan(steps).any(axis=1).tolist() == [True] + 5 * [False]
 
 
+def test_pixels_that_see_no_edge_get_no_picture_whatever_the_outline_is():
+    x, y, ones = float32(np.random.default_rng(6), 3, 2, 50)
+    pictures, inside = np.zeros((2, 3, 50), np.float32), np.full((2, 50), np.nan, np.float32)
+    inside[1] = 1.0
+    ellipses = np.array([5 * [np.nan], [0.0, 0.0, np.nan, 0.1, 0.0]], np.float32)
+    edge_pictures.add_box_pictures(ellipses, x, y, np.ones_like(x), inside, ones, pictures)
+    assert not pictures.any()
+
+
 @pytest.mark.parametrize("count", [8, 16])
 def test_sectors_are_those_of_the_arc_tangent(count):
     rng = np.random.default_rng(3)
