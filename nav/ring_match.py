@@ -26,6 +26,8 @@ _FIT_TOLERANCE = 0.4
 _ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
+# A marker that was not found lies this many times as far off the map as the others at most.
+_MOST_OFF = 3.0
 # A complete ring this near its map needs no second guess.
 _GOOD_RMS_FRACTION = 0.1
 _CHUNK = 2048
@@ -54,6 +56,15 @@ class RingMatch:
     def scale_px_per_m(self) -> float:
         """Largest stretch of the map: focal length over distance. [px/m]"""
         return _stretches(self.affine)[0]
+
+    def cut(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+        """(N,) markers whose images do not lie wholly within a picture of (width, height)."""
+        places_px = layout.centers_m[:, :2] @ self.affine[:, :2].T + self.affine[:, 2]
+        # As far as a disc reaches to all sides, less what the map may be off.
+        sure_px = layout.radius_m * _stretches(self.affine)[1] * (1 - _MOST_OFF * self.rms_fraction)
+        inside = (places_px > sure_px) & (places_px < np.array(size_px) - 1 - sure_px)
+        cut: NDArray[np.bool_] = ~inside.all(axis=1)
+        return cut
 
     def moved(self, shift_px: tuple[float, float]) -> RingMatch:
         """The same where all blobs lie further right and down by x and y. [px]"""

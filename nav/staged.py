@@ -18,7 +18,7 @@ from time import monotonic
 from typing import Protocol
 
 from datasets_manifest.blind import BlindPair
-from nav.centroids.first_fits import fit_once
+from nav.first_fits import fit_once
 from nav.handover import Handover, NewestFirst
 from nav.sequence_navigator import LatePair, PairAnswers, SequenceNavigator, SoughtPair
 

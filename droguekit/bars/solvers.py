@@ -19,8 +19,6 @@ from nav.pose.tolerances import EXACT, StatedTolerances
 from nav.pose.two_fold_start import two_fold_start
 
 BATCHED = ("joint", "joint-hub")
-# Frames that are solved together: their derivatives then fit into a core's cache.
-_CHUNK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +111,9 @@ def _batched(method: str, measured: Measured) -> Solved:
 
 def _best(features: Features) -> Poses:
     """Of the two poses that both starts lead to, the one with the smaller residuals."""
-    parts = []
-    for low in range(0, features.frames, _CHUNK):
-        some = features.take(slice(low, low + _CHUNK))
-        both = solve_from(some, *two_fold_start(some))
-        chosen = 2 * np.arange(some.frames) + both.costs.reshape(-1, 2).argmin(axis=1)
-        parts.append(Poses(both.rotations[chosen], both.translations_m[chosen]))
-    return Poses(np.concatenate([p.rotations for p in parts]), np.concatenate([p.translations_m for p in parts]))
+    both = solve_from(features, *two_fold_start(features))
+    chosen = 2 * np.arange(features.frames) + both.costs.reshape(-1, 2).argmin(axis=1)
+    return Poses(both.rotations[chosen], both.translations_m[chosen])
 
 
 def _one_by_one(method: str, measured: Measured) -> Solved:

@@ -64,10 +64,10 @@ def binary_centroids(
 def window_centroids(channel: Pixels, corner_px: tuple[int, int], layout: MarkerLayout) -> Centroids:
     """Centres of mass of the regions above Otsu's threshold in a part of an image.
 
-    Where that does not show the whole ring of markers, Otsu's thresholds of its brighter class (white markers that run
-    together with a bright sky) and of its darker class (markers in shade beside sunlit ones) are tried. Median and
-    opening are left out where the discs are smaller than they can stand. Regions that touch the edge of the part or of
-    the image are dropped: their centre of mass is not the marker's.
+    Where that does not show all markers that the part's edge leaves whole, Otsu's thresholds of its brighter
+    class (white markers that run together with a bright sky) and of its darker class (markers in shade beside sunlit
+    ones) are tried. Median and opening are left out where the discs are smaller than they can stand. Regions that touch
+    the edge of the part or of the image are dropped: their centre of mass is not the marker's.
 
     Args:
         channel: (H, W) marker channel of the part, see `box_window`.
@@ -92,7 +92,10 @@ def _otsu(levels: Pixels) -> float:
 
 
 def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool, RingMatch | None]:
-    """Regions by the first of three thresholds that shows most of the ring of markers, and that ring."""
+    """Regions by the first of three thresholds that shows most of the ring of markers, and that ring.
+
+    Where all markers that the part's edge does not cut are found, no other threshold is tried.
+    """
     best, most = (Blobs(np.zeros((0, 2)), np.zeros(0)), False), -1
     shown: RingMatch | None = None
     for level in _thresholds(roi):
@@ -101,7 +104,7 @@ def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool, RingM
         count = 0 if ring is None else ring.count
         if count > most:
             best, most, shown = regions, count, ring
-        if most == layout.count:
+        if shown is not None and most + shown.cut(layout, (roi.shape[1], roi.shape[0])).sum() >= layout.count:
             break
     return *best, shown
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from nav.centroids.compiled import compiled, float_of_bits
 from nav.centroids.marker_signal import Array32
 from nav.centroids.rows import add_row, multiply_rows
+from nav.compiled import compiled, float_of_bits
 
 _F = np.float32
 _ONE, _HALF = _F(1), _F(0.5)

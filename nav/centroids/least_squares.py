@@ -13,11 +13,11 @@ from nav.centroids.marker_signal import Array32
 from nav.centroids.matrix_loops import (
     add_rows,
     couplings,
-    damped_steps,
     leverages,
     normal_equations,
     weighted_squares,
 )
+from nav.damped_steps import damped_steps
 
 # Values (N, K) and their derivatives (N, P, K) at (N, P) parameters.
 Model = Callable[[Array], tuple[Array32, Array32]]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.compiled import compiled
 from nav.centroids.marker_signal import Array32
 from nav.centroids.rows import add_row, dot, multiply_rows
+from nav.compiled import compiled
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -71,40 +71,6 @@ def weighted_squares(residuals: Array32, weights: Array32) -> Array:
             total += weights[n, k] * residuals[n, k] * residuals[n, k]
         costs[n] = total
     return costs
-
-
-@compiled
-def damped_steps(matrices: Array, scales: Array, gradients: Array, dampings: Array) -> Array:
-    """Solutions (N, P) of systems with matrices (N, P, P) and right sides (N, P), by Cholesky.
-
-    Rows and columns are scaled (N, P), and then dampings (N,) added to the diagonals. What a matrix that is not
-    positive would give is no number.
-    """
-    count, size = gradients.shape
-    steps, root = np.empty((count, size)), np.empty((size, size))
-    for n in range(count):
-        scale = scales[n]
-        for i in range(size):
-            for j in range(i + 1):
-                rest = matrices[n, i, j] * scale[i] * scale[j] + (dampings[n] if i == j else 0.0)
-                for m in range(j):
-                    rest -= root[i, m] * root[j, m]
-                root[i, j] = np.sqrt(rest) if i == j else rest / root[j, j]
-        step = steps[n]
-        for i in range(size):
-            rest = gradients[n, i] * scale[i]
-            for m in range(i):
-                rest -= root[i, m] * step[m]
-            step[i] = rest / root[i, i]
-        for back in range(size):
-            i = size - 1 - back
-            rest = step[i]
-            for m in range(i + 1, size):
-                rest -= root[m, i] * step[m]
-            step[i] = rest / root[i, i]
-        for i in range(size):
-            step[i] *= scale[i]
-    return steps
 
 
 @compiled

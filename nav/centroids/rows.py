@@ -1,14 +1,14 @@
 """The simplest loops, over one row of pixels, that the other compiled ones call.
 
-Caches of those others do not see a change here (`nav.centroids.compiled`): delete `__pycache__` after one.
+Caches of those others do not see a change here (`nav.compiled`): delete `__pycache__` after one.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from nav.centroids.compiled import compiled
 from nav.centroids.marker_signal import Array32
+from nav.compiled import compiled
 
 
 @compiled

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nav.centroids.compiled import compiled
 from nav.centroids.marker_signal import Array32
+from nav.compiled import compiled
 
 # Of whole numbers, or a picture's.
 Cells = NDArray[Any]

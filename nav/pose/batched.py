@@ -27,8 +27,6 @@ TILT_PRIOR_RAD = np.radians(6.0)
 _RELIABLE_SIGMAS = 3.0
 # Two starts that end this near each other found one minimum.
 _SAME_TURN_RAD = 1e-4
-# Poses that are adjusted together; their derivatives then fit into a core's cache.
-_CHUNK = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,19 +78,6 @@ def solve_joint_batch(
 
 def solve_features(features: Features) -> JointBatch:
     """As `solve_joint_batch`, from stacked features."""
-    if features.frames <= _CHUNK:
-        return _solve(features)
-    parts = [_solve(features.take(slice(i, i + _CHUNK))) for i in range(0, features.frames, _CHUNK)]
-    return JointBatch(*(np.concatenate(arrays) for arrays in zip(*(vars(p).values() for p in parts), strict=True)))
-
-
-def solve_from(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARES) -> Adjusted:
-    """Adjust (B, 2) starts; the results lie frame by frame, two after each other."""
-    twice = features.take(np.repeat(np.arange(features.frames), 2))
-    return adjust(twice, rotations.reshape(-1, 3, 3), translations_m.reshape(-1, 3), loss)
-
-
-def _solve(features: Features) -> JointBatch:
     frames = np.arange(features.frames)
     found = _Pairs.of(solve_from(features, *two_fold_start(features)))
     order = np.argsort(found.costs, axis=1, kind="stable")
@@ -127,6 +112,12 @@ def _solve(features: Features) -> JointBatch:
         found.costs,
         weights,
     )
+
+
+def solve_from(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARES) -> Adjusted:
+    """Adjust (B, 2) starts; the results lie frame by frame, two after each other."""
+    twice = features.take(np.repeat(np.arange(features.frames), 2))
+    return adjust(twice, rotations.reshape(-1, 3, 3), translations_m.reshape(-1, 3), loss)
 
 
 @dataclass(frozen=True, eq=False)

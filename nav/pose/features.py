@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,21 +59,6 @@ class Features:
         """(B, E, F) which features were measured."""
         seen: NDArray[np.bool_] = self.measured[2] > 0
         return seen
-
-    @cached_property
-    def whitening(self) -> tuple[Array, Array]:
-        """Whitened residuals from slopes x/z and y/z of ellipse centres: sums of products, and what is to be added.
-
-        Returns:
-            (B, 2, 2, E, F) by which axis of the image and which of the two residuals, and (B, 2, E, F) by the latter.
-        """
-        u, v, a, b, c = self.measured
-        camera = self.camera
-        weights = np.empty((len(u), 2, 2, *u.shape[1:]))
-        weights[:, 0, 0], weights[:, 0, 1] = camera.fx_px * a, camera.fx_px * b
-        weights[:, 1, 0], weights[:, 1, 1] = 0.0, camera.fy_px * c
-        off_u, off_v = camera.cx_px - u, camera.cy_px - v
-        return weights, np.stack([a * off_u, b * off_u + c * off_v], axis=1)
 
     def take(self, frames: NDArray[np.int64] | slice) -> Features:
         """The features of some frames, in that order; a frame may appear often."""

@@ -10,7 +10,7 @@ from nav.pose.batched import JointBatch, solve_features
 from nav.pose.faults import fault, hub_fault
 from nav.pose.features import Features, observed_features
 from nav.pose.interface import NoFixReason, Observation, PoseMode, Solution
-from nav.pose.reprojection import State, predicted_px
+from nav.pose.reprojection import predicted_px
 
 # Matched features miss their places by this share of a marker's own radius only when they are not the drogue's.
 _LARGEST_MISS_FRACTION = 0.5
@@ -73,7 +73,7 @@ def _modes(batch: JointBatch) -> tuple[PoseMode, ...]:
 
 def misfit(features: Features, rotation: Array, translation_m: Array) -> NoFixReason | None:
     """Why one frame's features cannot be the drogue's in a pose, or None when they can."""
-    predicted = predicted_px(features, State.nominal(features, rotation[None], translation_m[None]))
+    predicted = predicted_px(features, rotation[None], translation_m[None])
     squares = ((predicted - features.measured[:2].transpose(1, 2, 3, 0)) ** 2).sum(axis=-1)[features.seen]
     radius_px = features.camera.fx_px * features.radii_m[0] / translation_m[2]
     miss_px = float(np.sqrt(squares.mean()))

@@ -8,9 +8,7 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.pose.features import Features
-
-# Of the axes x, y, z the one after each, and the one before.
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+from nav.pose.reprojection_loops import Shared, linearise_frames, predict_centers
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,119 +79,48 @@ def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Lineari
         state: S poses.
         loss: how residuals count.
     """
-    count, size = len(state.rotations), 2 * features.measured.shape[2] * features.measured.shape[3]
-    with_tilt, free = np.isfinite(loss.tilt_prior_rad), features.departures
-    jacobian = np.zeros((count, 6 + free, size + 2 * with_tilt + free))
-    residuals = np.empty((count, jacobian.shape[2]))
-    # A trial step may put a feature at a camera's own depth; its infinite cost turns the step down.
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        in_front = _fill_features(features, state, jacobian[:, :, :size], residuals[:, :size])
-        if np.isfinite(loss.huber_sigmas):
-            costs = _weigh(jacobian[:, :, :size], residuals[:, :size], loss.huber_sigmas, features)
-        else:
-            costs = _half_squares(residuals[:, :size])
-        if with_tilt:
-            axes = state.rotations[:, :, 2] / loss.tilt_prior_rad
-            residuals[:, size : size + 2] = axes[:, :2]
-            jacobian[:, 4, size], jacobian[:, 5, size] = axes[:, 2], -axes[:, 1]
-            jacobian[:, 3, size + 1], jacobian[:, 5, size + 1] = -axes[:, 2], axes[:, 0]
-        if free:
-            residuals[:, -free:] = state.departures
-            jacobian[:, 6:, -free:] = np.eye(free)
-        if with_tilt or free:
-            costs += _half_squares(residuals[:, size:])
-    return Linearised(jacobian, residuals, np.where(in_front & np.isfinite(costs), costs, np.inf))
+    count, free = len(state.rotations), features.departures
+    rows = 2 * features.measured.shape[2] * features.measured.shape[3] + 2 * np.isfinite(loss.tilt_prior_rad) + free
+    result = Linearised(np.empty((count, 6 + free, rows)), np.empty((count, rows)), np.empty(count))
+    places = (_plain(array) for array in (state.rotations, state.translations_m, state.departures))
+    linearise_frames(shared_of(features, loss), *arrays_of(features), *places, *vars(result).values())
+    return result
 
 
-def predicted_px(features: Features, state: State) -> Array:
-    """(S, E, F, 2) ellipse centres that the poses would show. [px]"""
-    _, _, slopes, _ = _images(features, state)
+def predicted_px(features: Features, rotations: Array, translations_m: Array) -> Array:
+    """(S, E, F, 2) ellipse centres that poses of the nominal drogue would show. [px]"""
+    pixels = np.empty((len(rotations), len(features.eye_x_m), len(features.points_m), 2))
+    predict_centers(shared_of(features, SQUARES), _plain(rotations), _plain(translations_m), pixels)
+    return pixels
+
+
+def shared_of(features: Features, loss: Loss) -> Shared:
+    """What the compiled loops take that all frames have in common."""
     camera = features.camera
-    return slopes.transpose(0, 2, 3, 1) * (camera.fx_px, camera.fy_px) + (camera.cx_px, camera.cy_px)
+    return Shared(
+        float(camera.fx_px),
+        float(camera.fy_px),
+        float(camera.cx_px),
+        float(camera.cy_px),
+        _plain(features.eye_x_m),
+        _plain(features.points_m),
+        _plain(features.radii_m),
+        _plain(features.shifts_m),
+        float(features.disparity_sigma_px),
+        float(loss.huber_sigmas),
+        float(loss.tilt_prior_rad),
+    )
 
 
-def _fill_features(features: Features, state: State, jacobian: Array, residuals: Array) -> Array:
-    """Write the features' part of both arrays; (S,) whether all features lie in front of the cameras."""
-    # Few frames have few numbers, and time goes by the number of array operations: both rows of the whitening matrix,
-    # and the three axes, are worked on at once.
-    weights, offsets = features.whitening
-    shape = weights.shape[3:]
-    rows = jacobian.reshape(*jacobian.shape[:2], 2, *shape)
-    both = residuals.reshape(len(residuals), 2, *shape)
-    arms, depth, slopes, z = _images(features, state)
-    whitened = weights[:, 0] * slopes[:, :1] + weights[:, 1] * slopes[:, 1:]
-    np.add(whitened, offsets, out=both)
-
-    by_place = rows[:, :3]
-    np.divide(weights, z[:, None, None, None], out=by_place[:, :2])
-    np.divide(whitened, -z[:, None, None], out=by_place[:, 2])
-    # The derivative by the turn is the cross product of the arm and that by the place.
-    arms = arms[:, :, None, None]
-    np.multiply(arms[:, _NEXT], by_place[:, _LAST], out=rows[:, 3:6])
-    rows[:, 3:6] -= arms[:, _LAST] * by_place[:, _NEXT]
-    if len(features.shifts_m):
-        turned = np.swapaxes(features.shifts_m @ np.swapaxes(state.rotations, 1, 2)[:, None], 2, 3)
-        shifted = rows[:, 6 : 6 + len(features.shifts_m)]
-        shifted[:] = (turned[:, :, :, None, None] * by_place[:, None]).sum(axis=2)
-    if features.disparity_sigma_px > 0:
-        a, b = features.measured[2:4, :, 1]
-        rows[:, -1, 0, 1] = features.disparity_sigma_px * a
-        rows[:, -1, 1, 1] = features.disparity_sigma_px * b
-        both[:, :, 1] += rows[:, -1, :, 1] * state.departures[:, -1:, None]
-    if features.coupling is not None and len(features.eye_x_m) > 1:
-        _couple(both, features.coupling)
-        _couple(rows, features.coupling[:, :, None])
-    in_front: Array = (depth > 0).all(axis=1)
-    return in_front
+def arrays_of(features: Features) -> tuple[Array, Array]:
+    """What they take of each frame: measurements (5, B, E, F), and couplings (4, B, F) or none (4, B, 0)."""
+    coupling = features.coupling
+    if coupling is None:
+        coupling = np.empty((4, features.frames, 0))
+    return _plain(features.measured), _plain(coupling)
 
 
-def _images(features: Features, state: State) -> tuple[Array, Array, Array, Array]:
-    """Where the features are and where their ellipse centres appear.
-
-    Returns:
-        arms (S, 3, F) from the drogue's origin [m], depths (S, F) [m], slopes x/z and y/z (S, 2, E, F) of the ellipse
-        centres, and the depths (S, F) that belong to them [m]. Rectified eyes share depth and y.
-    """
-    points = features.points_m.T
-    if len(features.shifts_m):
-        shared = state.departures[:, : len(features.shifts_m)] @ features.shifts_m.reshape(len(features.shifts_m), -1)
-        points = points + np.swapaxes(shared.reshape(-1, *features.points_m.shape), 1, 2)
-    arms = state.rotations @ points
-    places = arms + state.translations_m[:, :, None]
-    normals = state.rotations[:, :, 2]
-    depth = places[:, 2]
-    # The ellipse centre is the image of `t - (r^2 / t_z) (e_z - n_z n)` (geometry.circles).
-    shift = normals * normals[:, 2:]
-    shift[:, 2] -= 1
-    virtual = places + shift[:, :, None] * (features.radii_m**2 / depth)[:, None]
-    z = virtual[:, 2]
-    slopes = np.empty((len(z), 2, len(features.eye_x_m), z.shape[1]))
-    np.divide(virtual[:, None, 0] - features.eye_x_m[:, None], z[:, None], out=slopes[:, 0])
-    slopes[:, 1] = (virtual[:, 1] / z)[:, None]
-    return arms, depth, slopes, z
-
-
-def _half_squares(residuals: Array) -> Array:
-    """(S,) half the sum of squares of (S, M)."""
-    sums: Array = np.einsum("sm,sm->s", residuals, residuals)
-    return sums / 2
-
-
-def _couple(rows: Array, coupling: Array) -> None:
-    """Add the first eye's whitened rows (..., 2, E, F), times the coupling (4, ..., F), to the second's in place."""
-    first, second = rows[..., 0, 0, :], rows[..., 1, 0, :]
-    rows[..., 0, 1, :] += coupling[0] * first + coupling[1] * second
-    rows[..., 1, 1, :] += coupling[2] * first + coupling[3] * second
-
-
-def _weigh(jacobian: Array, residuals: Array, threshold: float, features: Features) -> Array:
-    """Weigh both arrays in place by the roots of Huber's weights; (S,) costs by Huber's loss."""
-    eyes, count = features.measured.shape[2:]
-    pairs = residuals.reshape(len(residuals), 2, eyes, count)
-    norms = np.sqrt((pairs**2).sum(axis=1))
-    costs: Array = np.where(norms <= threshold, norms**2 / 2, threshold * (norms - threshold / 2)).sum(axis=(1, 2))
-    roots = np.sqrt(threshold / np.maximum(norms, threshold))
-    pairs *= roots[:, None]
-    rows = jacobian.reshape(*jacobian.shape[:2], 2, eyes, count)
-    rows *= roots[:, None, None]
-    return costs
+def _plain(array: Array) -> Array:
+    """As loops are compiled for: they would be compiled anew for another layout, or for what is not to be written."""
+    plain: Array = np.require(array, requirements=["C", "W"])
+    return plain

@@ -1,4 +1,4 @@
-"""The compiled loops over pixels against numpy, and when they are compiled."""
+"""The compiled loops against numpy, and when they are compiled."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import sys
 import numpy as np
 import pytest
 
+from nav import damped_steps
 from nav.centroids import edge_pictures, matrix_loops, pixel_sums, window_cells
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.patches import annulus_pixels, disc_pixels
 from nav.centroids.pixel_sums import sector_sums, zone_sums
+from nav.pose import reprojection_loops
 
 
 def float32(rng, *shape):
@@ -50,12 +52,12 @@ def test_damped_steps_solve_their_systems():
     arms = rng.normal(size=(6, 9, 9))
     matrices, gradients, dampings = arms @ arms.transpose(0, 2, 1) + np.eye(9), rng.normal(size=(6, 9)), rng.random(6)
     scales = rng.uniform(0.1, 3, (6, 9))
-    steps = matrix_loops.damped_steps(matrices, scales, gradients, dampings)
+    steps = damped_steps.damped_steps(matrices, scales, gradients, dampings)
     # What is added to a scaled diagonal is the more in the matrix's own units, the smaller the scale is.
     damped = matrices + (dampings[:, None] / scales**2)[:, None] * np.eye(9)
     np.testing.assert_allclose(steps, np.linalg.solve(damped, gradients[..., None])[..., 0], rtol=1e-9)
     matrices[0] *= -1
-    steps = matrix_loops.damped_steps(matrices, scales, gradients, 0 * dampings)
+    steps = damped_steps.damped_steps(matrices, scales, gradients, 0 * dampings)
     assert np.isnan(steps).any(axis=1).tolist() == [True] + 5 * [False]
 
 
@@ -164,15 +166,18 @@ def test_an_outline_over_the_edge_of_the_image_is_cut():
 def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile():
     code = """
 from datasets_manifest.recipe import load_recipe
+from nav import damped_steps
+from nav import damped_steps
 from nav.centroids import edge_pictures, matrix_loops, pixel_sums, window_cells
-from nav.centroids.first_fits import fit_once
+from nav.first_fits import fit_once
 from nav.navigator import Navigator
+from nav.pose import reprojection_loops
 from render.engine import load_engine
 from render.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
-    loops = (edge_pictures, matrix_loops, pixel_sums, window_cells)
+    loops = (damped_steps, edge_pictures, matrix_loops, pixel_sums, reprojection_loops, window_cells)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
@@ -193,7 +198,9 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
     assert set(later) <= {"take_cells"}
 
 
-@pytest.mark.parametrize("loops", [edge_pictures, matrix_loops, pixel_sums, window_cells])
+@pytest.mark.parametrize(
+    "loops", [damped_steps, edge_pictures, matrix_loops, pixel_sums, reprojection_loops, window_cells]
+)
 def test_loops_can_be_cached_beside_their_file_or_at_home(loops):
     found = [loop for loop in vars(loops).values() if hasattr(loop, "signatures")]
     assert found and all(loop.stats.cache_path for loop in found)

@@ -186,3 +186,31 @@ def test_a_mirrored_ring_is_no_ring():
     assert good.count == 5
     mirrored = match_ring(Blobs(centers[:, :2] * (-400, 400) + 600, areas_px2), layout)
     assert mirrored is None or mirrored.count < 5
+
+
+def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leaves_whole(make_pose):
+    layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(9)
+    told = {"whole": 0, "cut": 0}
+    for _ in range(200):
+        place = make_pose(0, 0, rng.uniform(1.7, 6), *rng.uniform(-10, 10, 2), rng.uniform(-180, 180))
+        centers = project_disc_centers(RIG, place, layout.centers_m, layout.radius_m, "left")
+        areas = np.array([disc_area_px2(RIG, place, center, layout.radius_m, "left") for center in layout.centers_m])
+        radii = np.sqrt(areas / np.pi)[:, None]
+        # A picture's corner somewhere in the ring's upper left, its other sides far away.
+        moved = centers - (centers.min(axis=0) + rng.uniform(-1.5, 1.5, 2) * radii.max())
+        size = (2000, 2000)
+        # A disc at 10 degrees is narrower than its mean radius by 1 %, and nobody sees less than half a pixel.
+        whole = (moved > 1.02 * radii + 0.5).all(axis=1)
+        if whole.sum() < least_markers(layout):
+            continue
+        match = match_ring(Blobs(moved[whole], areas[whole]), layout)
+        assert match is not None and match.count == whole.sum()
+        cut = match.cut(layout, size)
+        assert not cut[match.blob_of_marker >= 0].any()
+        # Perspective moves markers off the map by up to a third of their radius.
+        clearly = (moved < 0.6 * radii).any(axis=1)
+        assert cut.sum() >= clearly.sum()
+        told["whole"] += int(whole.sum())
+        told["cut"] += int(clearly.sum())
+    # Both happen.
+    assert min(told.values()) > 100

@@ -1,4 +1,4 @@
-"""Compilation of loops over pixels for this machine's processor."""
+"""Compilation of loops over numbers for this machine's processor."""
 
 from __future__ import annotations
 

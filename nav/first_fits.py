@@ -6,24 +6,38 @@ from functools import cache
 
 import numpy as np
 
+from drogue_models.marker_layout import marker_layout
+from drogue_models.presets import PRESETS
+from geometry.stereo import paper_rig
 from nav.centroids.annulus_edges import fit_annuli
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.edge_profile import blurred_step
 from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
+from nav.pose.features import stack_features
+from nav.pose.joint import solve_one
+from nav.pose.prediction import predict_px
 
 _RADII_PX = 12.0, 8.0
 _SIDE_PX, _MIDDLE_PX = 40, 20.0
 _LIGHT_DN = 100.0
+_DISTANCE_M = 5.0
 
 
 @cache
 def fit_once() -> None:
-    """Fit a drawn disc and a drawn annulus in each eye.
+    """Fit a drawn disc and a drawn annulus in each eye, and a pose.
 
-    The loops over pixels take seconds to compile when they are first used on a machine, and tenths of a second to load
+    The loops take seconds to compile when they are first used on a machine, and tenths of a second to load
     in every other process. In real time the pairs that come meanwhile would be late.
     """
+    _fit_edges()
+    rig, layout = paper_rig(), marker_layout(PRESETS["red-8"])
+    pixels = predict_px(rig, layout, np.eye(3)[None], np.array([[0.1, 0.1, _DISTANCE_M]]))
+    solve_one(stack_features(rig, layout, pixels, np.eye(2)), np.ones(pixels.shape[1:3], dtype=bool))
+
+
+def _fit_edges() -> None:
     row = np.arange(_SIDE_PX) - _MIDDLE_PX
     distance = np.hypot(row, row[:, None])
     outer, inner = (
