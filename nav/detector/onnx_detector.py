@@ -13,12 +13,11 @@ from onnxruntime.capi import onnxruntime_pybind11_state as faults
 
 from datasets_manifest.images import StereoImages
 from geometry.stereo import EYES, Eye
-from nav.detector.decoding import decode
-from nav.detector.input_image import fit_picture, input_image, letterbox, network_input
+from nav.detector.input_image import input_image, letterbox, network_input
 from nav.detector.interface import Detection, StereoDetection
 from nav.detector.maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.two_scales import Found, at_full_size, half_size_px, joined
+from nav.detector.two_scales import Found, find_at_scales, half_size_px
 
 _FAULTS = (
     faults.EPFail, faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf,
@@ -94,12 +93,9 @@ class OnnxDetector:
 
     def _found(self, pictures: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[Found]:
         """Of each picture the boxes in corner coordinates of the input, and scores."""
-        full = decode(self._run(network_input(pictures)), least_score)
-        if len(self.pass_sizes_px) == 1:
-            return [(boxes[:most], scores[:most]) for boxes, scores in full]
-        halves, places = zip(*(fit_picture(each, self.pass_sizes_px[1]) for each in pictures), strict=True)
-        half = map(at_full_size, decode(self._run(network_input(halves)), least_score), places)
-        return [joined(*both, self.metadata.large_from_px, most) for both in zip(full, half, strict=True)]
+        return find_at_scales(
+            pictures, lambda some: self._run(network_input(some)), self.metadata.large_from_px, least_score, most
+        )
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
         try:

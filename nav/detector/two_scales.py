@@ -6,11 +6,15 @@ are as large as those that it knows best.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.detector.decoding import without_overlaps
-from nav.detector.input_image import Letterbox
+from nav.detector.decoding import decode, without_overlaps
+from nav.detector.input_image import Letterbox, fit_picture
 from nav.detector.maps import SIZE_STEP_PX
 
 Found = tuple[Array, Array]
@@ -26,6 +30,31 @@ def half_size_px(input_size_px: tuple[int, int]) -> tuple[int, int]:
     """Half of a width and height, rounded up to sizes that networks take."""
     width, height = (-(-side // (2 * SIZE_STEP_PX)) * SIZE_STEP_PX for side in input_size_px)
     return width, height
+
+
+def find_at_scales(
+    pictures: Sequence[NDArray[np.uint8]],
+    run: Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[Any]]],
+    large_from_px: float,
+    least_score: float,
+    most: int,
+) -> list[Found]:
+    """What a network finds in pictures of one size, with a second pass where it asks for one.
+
+    Args:
+        pictures: (H, W, 3) each, as `nav.detector.input_image` makes them.
+        run: the network, from pictures of one size to maps, see `nav.detector.maps`.
+        large_from_px: see `joined`; 0 for a single pass.
+        least_score: what scores lower is left out.
+        most: how many boxes a picture has at most.
+    """
+    full = decode(run(pictures), least_score)
+    if large_from_px == 0:
+        return [(boxes[:most], scores[:most]) for boxes, scores in full]
+    height, width = pictures[0].shape[:2]
+    halves, places = zip(*(fit_picture(each, half_size_px((width, height))) for each in pictures), strict=True)
+    half = map(at_full_size, decode(run(halves), least_score), places)
+    return [joined(*both, large_from_px, most) for both in zip(full, half, strict=True)]
 
 
 def at_full_size(found: Found, place: Letterbox) -> Found:

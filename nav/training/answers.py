@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from datasets_manifest.manifest import SplitName
-from nav.detector.decoding import decode
 from nav.detector.input_image import PADDING_DN
+from nav.detector.two_scales import find_at_scales
 from nav.training.average_precision import MOST_BOXES
 from nav.training.corpus import Corpus
 from nav.training.image_views import Boxes, Image, show, whole_view
@@ -43,7 +44,13 @@ class Answers:
 
 
 def answer(
-    network: nn.Module, corpus: Corpus, split: SplitName, size_px: SizePx, batch_images: int, computing: Computing
+    network: nn.Module,
+    corpus: Corpus,
+    split: SplitName,
+    size_px: SizePx,
+    batch_images: int,
+    large_from_px: float,
+    computing: Computing,
 ) -> Answers:
     """What a network finds on both eyes' images of a split, which are shown as they are.
 
@@ -53,6 +60,7 @@ def answer(
         split: which of them.
         size_px: (height, width) of the network's input.
         batch_images: at a time.
+        large_from_px: from which side on boxes come from a second pass at half the size, as the detector does it.
         computing: where and how.
     """
     members = [(int(pair), eye) for pair in corpus.split(split) for eye in (0, 1)]
@@ -63,10 +71,13 @@ def answer(
     def read(group: Sequence[tuple[int, int]]) -> list[tuple[Image, Boxes]]:
         return [whole_image(corpus, pair, eye, size_px) for pair, eye in group]
 
-    for group in in_order(read, groups, threads=1, ahead=2):
+    def run(images: Sequence[Image]) -> list[NDArray[Any]]:
         with torch.inference_mode(), computing.autocast():
-            maps = network(to_tensor(np.stack([image for image, _ in group]), computing))
-        found += decode([each.float().cpu().numpy() for each in maps], _LEAST_SCORE, MOST_BOXES)
+            maps = network(to_tensor(np.stack(images), computing))
+        return [each.float().cpu().numpy() for each in maps]
+
+    for group in in_order(read, groups, threads=1, ahead=2):
+        found += find_at_scales([image for image, _ in group], run, large_from_px, _LEAST_SCORE, MOST_BOXES)
         truth += [boxes for _, boxes in group]
     return Answers(truth, found)
 

@@ -136,7 +136,10 @@ class Trainer:
     def _validate(self, state: TrainingState, size: SizePx) -> AveragePrecision | None:
         network = state.average.network
         measure_batch_statistics(network, self.corpus, size, self.computing)
-        answers = answer(network, self.corpus, "val", size, self.settings.batch_images, self.computing)
+        settings = self.settings
+        answers = answer(
+            network, self.corpus, "val", size, settings.batch_images, settings.large_from_px, self.computing
+        )
         return average_precision(answers.truth, answers.found)
 
     def _row(self, state: TrainingState, epoch: int, validation: AveragePrecision | None) -> EpochRow:

@@ -146,7 +146,7 @@ def _finish(
         measure_batch_statistics(each, corpus, size, exact)
 
     def answers(split: SplitName) -> Answers:
-        return answer(network, corpus, split, size, settings.batch_images, exact)
+        return answer(network, corpus, split, size, settings.batch_images, settings.large_from_px, exact)
 
     validation, test = answers("val"), answers("test")
     threshold = best_threshold(validation.truth, validation.found, _USUAL_THRESHOLD)

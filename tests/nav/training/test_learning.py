@@ -55,6 +55,17 @@ def test_the_threshold_parts_right_answers_from_wrong_ones() -> None:
     assert best_threshold(truth, [NONE] * 4, 0.1) == 0.1
 
 
+def test_the_threshold_lies_in_the_middle_of_those_that_chance_does_not_tell_apart() -> None:
+    empty = np.zeros((0, 4))
+    # Nine drogues are found, then wrong and right answers come in turns, and one drogue is missed. From the eighth
+    # answer on, four or five of all are wrong or missing.
+    right = [0.99 - 0.01 * k for k in range(9)]
+    mixed = [(0.8, False), (0.7, True), (0.6, False), (0.5, True), (0.4, False), (0.3, True), (0.2, False)]
+    truth = [BOX] * 9 + [BOX if is_right else empty for _, is_right in mixed] + [BOX]
+    answers = [found(score) for score in right] + [found(score) for score, _ in mixed] + [NONE]
+    assert best_threshold(truth, answers, 0.1) == pytest.approx(right[7] / 2)
+
+
 def test_the_learning_rate_rises_then_falls_by_a_cosine() -> None:
     settings = TrainingSettings(
         image_passes=8800, batch_images=8, warmup_passes=800, learning_rate=0.5, floor_fraction=0.02
