@@ -20,14 +20,15 @@ EXAMPLES = ("droguekit bench", "droguekit bench --repeat 5", "droguekit bench --
 
 def bench(
     repeat: Annotated[int, typer.Option("--repeat", help="Pairs at each distance.")] = 2,
-    pairs: Annotated[int, typer.Option("--pairs", help="Pairs over the uniform law, for each quality.")] = 20,
+    pairs: Annotated[int, typer.Option("--pairs", help="Pairs over the uniform law, for each quality.")] = 40,
     engine: EngineOption = None,
 ) -> None:
     """Measure the CPU time of a full-size pair by distance and stage, everything included.
 
     One process with one thread, 16 samples a pixel, after one pair that is not counted. Then the mean over distances
-    uniform from 2 to 40 m, with 16 and with 64 samples, the renderer's noise on the drogue against the sensor's (root
-    mean square over pairs), and how much more memory the process holds after the last pair than after the first fifth.
+    uniform from 2 to 40 m in eight scenes, with 16 and with 64 samples, the renderer's noise on the drogue against the
+    sensor's (root mean square over pairs), and how much more memory the process holds after the last pair than after
+    the first fifth.
     """
     from droguekit.batch.measure import measure_closely, measure_frames
 

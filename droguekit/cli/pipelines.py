@@ -172,6 +172,7 @@ def run_demo(recipe_name: str, out: Path, workers: int | None, report: ProgressR
 
 
 _BENCH_STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
+_BENCH_SCENES = 8
 
 
 _BENCH_SAMPLES = {
@@ -190,11 +191,11 @@ def open_bench_recipe(repeat: int, engine: str | None) -> Recipe:
     if repeat < 1:
         raise ValueError(f"--repeat: must be at least 1, got {repeat}")
     distance: dict[str, object] = {"law": "stations", "stations_m": _BENCH_STATIONS_M}
-    return _bench_recipe(repeat * len(_BENCH_STATIONS_M), distance, "corpus", engine)
+    return _bench_recipe({"count": repeat * len(_BENCH_STATIONS_M)}, distance, "corpus", engine)
 
 
 def open_uniform_bench_recipe(pairs: int, quality: str, engine: str | None) -> Recipe:
-    """The recipe by which a corpus's mean speed is measured: distances uniform from 2 to 40 m.
+    """The recipe by which a corpus's mean speed and noise are measured: distances uniform from 2 to 40 m, some scenes.
 
     Raises:
         ValueError: fewer than one pair, or no such engine.
@@ -202,15 +203,17 @@ def open_uniform_bench_recipe(pairs: int, quality: str, engine: str | None) -> R
     if pairs < 1:
         raise ValueError(f"--pairs: must be at least 1, got {pairs}")
     distance: dict[str, object] = {"law": "uniform", "low_m": _BENCH_STATIONS_M[0], "high_m": _BENCH_STATIONS_M[-1]}
-    return _bench_recipe(pairs, distance, quality, engine)
+    # The noise of one sky is up to a fifth more or less than that of another.
+    frames = {"count": pairs, "scenes": min(pairs, _BENCH_SCENES)}
+    return _bench_recipe(frames, distance, quality, engine)
 
 
-def _bench_recipe(count: int, distance: dict[str, object], quality: str, engine: str | None) -> Recipe:
+def _bench_recipe(frames: dict[str, int], distance: dict[str, object], quality: str, engine: str | None) -> Recipe:
     from datasets_manifest.recipe import Recipe
 
     demo, _ = open_recipe("demo", None, engine)
     changes = {
-        "frames": {"count": count},
+        "frames": frames,
         "distance": distance,
         "render": {**demo.render.model_dump(), **_BENCH_SAMPLES[quality]},
     }
