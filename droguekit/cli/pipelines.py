@@ -203,7 +203,7 @@ def open_uniform_bench_recipe(pairs: int, quality: str, engine: str | None) -> R
     if pairs < 1:
         raise ValueError(f"--pairs: must be at least 1, got {pairs}")
     distance: dict[str, object] = {"law": "uniform", "low_m": _BENCH_STATIONS_M[0], "high_m": _BENCH_STATIONS_M[-1]}
-    # The noise of one sky is up to a fifth more or less than that of another.
+    # One sky has up to two and a half times the noise of another.
     frames = {"count": pairs, "scenes": min(pairs, _BENCH_SCENES)}
     return _bench_recipe(frames, distance, quality, engine)
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
+from nav.pose.adjustment_loops import adjust_frames
 from nav.pose.features import Features
 from nav.pose.reprojection import SQUARES, Loss, State, arrays_of, linearise, shared_of
-from nav.pose.reprojection_loops import adjust_frames
 
 
 @dataclass(frozen=True, eq=False)
