@@ -105,8 +105,14 @@ def fit_picture(picture: NDArray[np.uint8], input_size_px: tuple[int, int]) -> t
 
 def network_input(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
     """(B, 3, H, W) from 0 to 1 of B pictures (H, W, 3)."""
-    batch = np.stack([picture.transpose(2, 0, 1) for picture in pictures])
-    return np.ascontiguousarray(batch, dtype=np.float32) * np.float32(1 / 255)
+    height, width = pictures[0].shape[:2]
+    batch = np.empty((len(pictures), 3, height, width), np.float32)
+    for picture, planes in zip(pictures, batch, strict=True):
+        # OpenCV takes half the time of numpy's walk with steps of three.
+        for channel, plane in enumerate(cv2.split(picture)):
+            planes[channel] = plane
+    batch *= np.float32(1 / 255)
+    return batch
 
 
 def _display_encoded(image: Pixels, images: StereoImages) -> NDArray[np.uint8]:

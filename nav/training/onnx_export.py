@@ -42,8 +42,9 @@ def export_onnx(network: DetectorNetwork, path: Path, metadata: ModelMetadata) -
 
 
 def _traced(network: DetectorNetwork) -> bytes:
-    """The network as ONNX, batch normalisation folded into the convolutions."""
+    """The network as ONNX, the images' gain and batch normalisation folded into the convolutions."""
     still = copy.deepcopy(network).to("cpu", torch.float32).eval()
+    still.fold_gain()
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         # The exporter by tracing is to go in a later torch than the one that is pinned; the new one takes eight times

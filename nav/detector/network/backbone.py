@@ -102,6 +102,13 @@ class MobileNetV3(nn.Module):
         self.stages = nn.ModuleList(nn.Sequential(*built[low:high]) for low, high in pairwise(bounds))
         self.channels = tuple(blocks[high - 1].outputs for high in bounds[1:])
 
+    @property
+    def first_weights(self) -> Tensor:
+        """(16, 3, 3, 3) of the first convolution, which has no bias."""
+        convolution = self.stem[0]
+        assert isinstance(convolution, nn.Conv2d)
+        return convolution.weight
+
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         """(B, 3, H, W) -> three maps of `channels` at strides 8, 16, 32."""
         features: Tensor = self.stem(images)

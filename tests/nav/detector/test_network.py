@@ -211,3 +211,16 @@ def test_complexity_leaves_the_network_as_it_was():
     assert large == pytest.approx(4 * small, rel=1e-3)
     assert torch_network.training
     assert all(torch.equal(value, before[name]) for name, value in torch_network.state_dict().items())
+
+
+def test_the_gain_of_images_can_be_folded_into_the_first_layer(network):
+    folded = network(NetworkConfig("s")).eval()
+    images = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        before = folded(images)
+        folded.fold_gain()
+        after = folded(images)
+    # Both gain and folding are powers of two and products, which no rounding tells apart, at the borders neither.
+    for one, other in zip(before, after, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-6)
+    assert folded.gain == 1
