@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -11,6 +11,9 @@ from datasets_manifest.ranges import Fraction, Range
 from drogue_models.parameters import DrogueParameters
 
 CONSTANT_ONE = Range(low=1, high=1)
+
+DistractorForm = Literal["ball", "disc", "ring"]
+_ALL_FORMS: tuple[DistractorForm, ...] = ("ball", "disc", "ring")
 
 
 class DrogueVariant(FrozenModel):
@@ -42,6 +45,7 @@ class TargetRanges(FrozenModel):
         obstacle_frame_fraction: share of frames in which a bar close to the cameras may hide part of the drogue.
         distractor_frame_fraction: share of frames with other round things; in frames without a drogue they are the
             hard negatives.
+        distractor_forms: from which each is chosen with equal chances; a form may stand in it several times.
     """
 
     variants: tuple[DrogueVariant, ...] = ()
@@ -56,6 +60,9 @@ class TargetRanges(FrozenModel):
     probe_radius_m: float = Field(default=0.04, gt=0, le=0.5)
     obstacle_frame_fraction: Fraction = 0.0
     distractor_frame_fraction: Fraction = 0.0
+    distractor_forms: tuple[DistractorForm, ...] = Field(
+        default=_ALL_FORMS, min_length=1, exclude_if=lambda forms: forms == _ALL_FORMS
+    )
 
     @model_validator(mode="after")
     def _ranges(self) -> Self:

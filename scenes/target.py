@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 
 from datasets_manifest.recipe import Recipe
@@ -23,7 +21,6 @@ _PROBE_GREY: ReflectanceRgb = (0.45, 0.45, 0.44)
 _BLACK_RUBBER: ReflectanceRgb = (0.04, 0.04, 0.04)
 _ORANGE: ReflectanceRgb = (0.60, 0.16, 0.03)
 _DISTRACTOR_PAINTS = (RED_PAINT, WHITE_PAINT, _BLACK_RUBBER, _ORANGE)
-_DISTRACTOR_FORMS: tuple[Literal["ball", "disc", "ring"], ...] = ("ball", "disc", "ring")
 _MOST_DISTRACTORS = 3
 
 
@@ -87,7 +84,7 @@ def sample_bystanders(
         found.append(obstacle)
     count = int(rng.integers(1, _MOST_DISTRACTORS + 1))
     nearest_m = 2.5 if left_from_drogue is None else float(left_from_drogue.translation_m[2]) + 1.0
-    distractors = [_sample_distractor(rng, recipe.rig, nearest_m) for _ in range(count)]
+    distractors = [_sample_distractor(rng, recipe, nearest_m) for _ in range(count)]
     return (*found, *(distractors if distracted else ()))
 
 
@@ -118,11 +115,12 @@ def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Bystander:
     )
 
 
-def _sample_distractor(rng: np.random.Generator, rig: StereoRig, nearest_m: float) -> Bystander:
+def _sample_distractor(rng: np.random.Generator, recipe: Recipe, nearest_m: float) -> Bystander:
     """Something round beyond a distance: a ball, a plate or a ring, about as large in the image as a drogue."""
     depth_m = nearest_m + 40.0 * rng.random() ** 2
     size_m = float(rng.uniform(0.1, 0.45)) * max(1.0, depth_m / 12.0)
-    form = _DISTRACTOR_FORMS[int(rng.integers(len(_DISTRACTOR_FORMS)))]
+    forms = recipe.target.distractor_forms
+    form = forms[int(rng.integers(len(forms)))]
     shape = BystanderShape(form=form, radius_m=size_m, length_m=0.02, tube_radius_m=size_m * rng.uniform(0.08, 0.3))
     pitch, yaw, roll = np.radians(rng.uniform(-1.0, 1.0, 3) * (40.0, 40.0, 180.0))
     attitude = rotation_from_angles(pitch, yaw, roll)
@@ -130,7 +128,7 @@ def _sample_distractor(rng: np.random.Generator, rig: StereoRig, nearest_m: floa
     return Bystander(
         kind="distractor",
         shape=shape,
-        left_from_object=RigidTransform(attitude, _point_in_view(rng, rig, depth_m)),
+        left_from_object=RigidTransform(attitude, _point_in_view(rng, recipe.rig, depth_m)),
         reflectance_rgb=paint,
     )
 

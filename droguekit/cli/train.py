@@ -15,6 +15,7 @@ EXAMPLES = (
     "droguekit train detector-small --out out/detector   (renders the recipe first)",
     "droguekit train data/mine data/more --out out/mine --variant s --image-passes 20000 --size 320x416",
     "droguekit train data/mine --out out/mine --size 320x416 --final-size 480x640   (large images in the last half)",
+    "droguekit train data/mine --out out/mine --start-from out/l/best.pt --image-passes 8000   (from other weights)",
     "droguekit train data/mine --out out/mine --settings mine.toml   (learning rate, batch, seed and so on)",
 )
 
@@ -61,6 +62,12 @@ def train(
     cache: Annotated[
         Path | None, typer.Option("--cache", metavar="DIR", help="For images at the network's size; OUT/cache.")
     ] = None,
+    start_from: Annotated[
+        Path | None,
+        typer.Option(
+            "--start-from", metavar="FILE", help="Start from these weights, best.pt of another training; random ones."
+        ),
+    ] = None,
     workers: WorkersOption = None,
 ) -> None:
     """Train a detector on datasets, evaluate it on their test splits, and export it as ONNX.
@@ -79,7 +86,7 @@ def train(
         "threads": threads,
     }
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    order = TrainingOrder(tuple(sources), settings, changes, size, final_size, cache, workers)
+    order = TrainingOrder(tuple(sources), settings, changes, size, final_size, cache, start_from, workers)
     result = train_detector(order, out, progress_report())
     for split, reached in (("val", result.validation), ("test", result.test)):
         if reached is not None:

@@ -29,6 +29,7 @@ class TrainingOrder:
         changes: to both the file and the defaults.
         size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
         cache: folder for images at the network's size, or None for the training's own.
+        start_from: file of weights to start from, or None for random ones.
         workers: that render, as many as the machine holds when None.
     """
 
@@ -38,6 +39,7 @@ class TrainingOrder:
     size: str | None
     final_size: str | None
     cache: Path | None
+    start_from: Path | None
     workers: int | None
 
 
@@ -83,12 +85,14 @@ def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> T
     found = [_find(source) for source in order.sources]
     # Threads of torch that wait for each other by spinning lose most of their time where others use the cores too.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from nav.training.starting_weights import read_starting_weights
     from nav.training.training import check_before, train
 
+    start = None if order.start_from is None else read_starting_weights(order.start_from)
     # Rendering takes hours: what would stop the training afterwards is looked for first.
     if not any(not isinstance(each, _Recipe) or each.recipe.split.train > 0 for each in found):
         raise ValueError(f"{order.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
-    check_before(out, settings)
+    check_before(out, settings, start)
     datasets = [_render(each, out, order.workers, report) if isinstance(each, _Recipe) else each for each in found]
     with StopRequest(report.say) as stop:
-        return train(datasets, out, settings, report, order.cache, lambda: stop.is_requested)
+        return train(datasets, out, settings, report, order.cache, lambda: stop.is_requested, start)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,10 @@ _OCCLUDED_FRACTION = 0.12  # share of the drogues
 _MOST_HIDDEN = 0.45  # of a drogue's ellipse; an occluder with which more of any is hidden is not painted
 _DISTRACTED_FRACTION = 0.3  # share of the canvases
 _MOST_DISTRACTORS = 3
-_DISTRACTOR_SIZE = (0.02, 0.25)  # of the canvas's height
+_DISTRACTOR_SIZE = (0.02, 0.6)  # of the canvas's height
+_RING_TUBE_FRACTION = (0.08, 0.3)  # radius of a ring's tube over the ring's
+_LEAST_TUBE_PX = 0.5
+_RING_AMBIENT_FRACTION = (0.2, 0.9)  # of the brightness that a lamp before it would give
 # Red and orange (paint, lamps), white, dark: the colours of drogues, markers, pods and probes.
 _COLORS = ((200, 30, 30), (225, 95, 35), (150, 20, 30), (235, 235, 235), (35, 35, 38), (120, 122, 125))
 _COLOR_SPREAD = 20
@@ -97,19 +102,80 @@ def distract(rng: np.random.Generator, image: Image, boxes: Boxes) -> None:
         size = float(np.exp(rng.uniform(*np.log(_DISTRACTOR_SIZE)))) * height
         center, axes = rng.uniform(0, (width, height)), size / 2 * rng.uniform(0.5, 1, 2)
         turn_deg, kind, color = rng.uniform(0, 180), rng.integers(3), _sample_color(rng).tolist()
+        tube, ambient, toward_lamp = _sample_ring(rng)
         if _meets(center, size, boxes):
             continue
         at, halves = (round(center[0]), round(center[1])), (max(round(axes[0]), 1), max(round(axes[1]), 1))
         if kind == 0:
             cv2.ellipse(image, at, halves, turn_deg, 0, 360, color, -1, cv2.LINE_AA)
         elif kind == 1:
-            cv2.ellipse(image, at, halves, turn_deg, 0, 360, color, max(round(size / 10), 1), cv2.LINE_AA)
+            ring = axes / (1 + tube)
+            tube_px = max(tube * float(ring.max()), _LEAST_TUBE_PX)
+            paint_ring(image, center, ring, turn_deg, tube_px, color, ambient, toward_lamp)
         else:
             corners = cv2.boxPoints((center.tolist(), (2 * axes[0], axes[1] / 2), turn_deg))
             cv2.fillConvexPoly(image, np.rint(corners).astype(np.int32), color, cv2.LINE_AA)
+
+
+def _sample_ring(rng: np.random.Generator) -> tuple[float, float, NDArray[np.float64]]:
+    """Radius of the tube over the ring's, share of light from all around, direction to the lamp."""
+    tube, ambient = float(rng.uniform(*_RING_TUBE_FRACTION)), float(rng.uniform(*_RING_AMBIENT_FRACTION))
+    toward_lamp = rng.standard_normal(3)
+    toward_lamp[2] = abs(toward_lamp[2])
+    return tube, ambient, toward_lamp / np.linalg.norm(toward_lamp)
 
 
 def _meets(center: NDArray[np.float64], size: float, boxes: Boxes) -> bool:
     """Whether a shape would stand before, or touch, a drogue."""
     low, high = boxes[:, :2] - size, boxes[:, :2] + boxes[:, 2:] + size
     return bool(((center > low) & (center < high)).all(axis=1).any())
+
+
+def paint_ring(
+    image: Image,
+    center_px: NDArray[np.float64],
+    half_axes_px: NDArray[np.float64],
+    turn_deg: float,
+    tube_px: float,
+    color: Sequence[int],
+    ambient_fraction: float,
+    toward_lamp: NDArray[np.float64],
+) -> None:
+    """Paint a matt torus as seen from afar: the bare ring that looks most like a drogue.
+
+    Its tube is as wide all around: a tilted ring gets flatter, its tube does not. Distances to the ellipse are of
+    the first order, good near it (Sampson 1982, doi:10.1016/0146-664X(82)90101-0).
+
+    Args:
+        image: (H, W, 3), changed in place.
+        center_px: (2,) x, y.
+        half_axes_px: (2,) of the ellipse along the tube's middle, above 0.
+        turn_deg: from the image's x to the first axis, towards y.
+        tube_px: radius of the tube.
+        color: red, green, blue of what faces the lamp.
+        ambient_fraction: brightness of what faces away from it, 0 to 1.
+        toward_lamp: (3,) unit vector to it: x, y of the image and towards the camera.
+    """
+    height, width = image.shape[:2]
+    reach = float(half_axes_px.max()) + tube_px + 1
+    low = np.maximum(np.floor(center_px - reach).astype(int), 0)
+    high = np.minimum(np.ceil(center_px + reach).astype(int), (width, height))
+    if (low >= high).any():
+        return
+    y, x = np.mgrid[low[1] : high[1], low[0] : high[0]].astype(np.float32) + 0.5
+    turn = np.radians(turn_deg)
+    along = (x - center_px[0]) * np.cos(turn) + (y - center_px[1]) * np.sin(turn)
+    across = (y - center_px[1]) * np.cos(turn) - (x - center_px[0]) * np.sin(turn)
+    radius = np.maximum(np.hypot(along / half_axes_px[0], across / half_axes_px[1]), 1e-6)
+    slope_along, slope_across = along / half_axes_px[0] ** 2 / radius, across / half_axes_px[1] ** 2 / radius
+    slope = np.maximum(np.hypot(slope_along, slope_across), 1e-6)
+    distance_px = (radius - 1) / slope
+    cover = np.clip(tube_px + 0.5 - np.abs(distance_px), 0, 1)[..., None]
+    outwards = np.clip(distance_px / tube_px, -1, 1)
+    normal_x = (slope_along * np.cos(turn) - slope_across * np.sin(turn)) / slope * outwards
+    normal_y = (slope_along * np.sin(turn) + slope_across * np.cos(turn)) / slope * outwards
+    facing = normal_x * toward_lamp[0] + normal_y * toward_lamp[1] + np.sqrt(1 - outwards**2) * toward_lamp[2]
+    brightness = ambient_fraction + (1 - ambient_fraction) * np.clip(facing, 0, 1)
+    painted = np.array(color) * brightness[..., None]
+    patch = image[low[1] : high[1], low[0] : high[0]]
+    patch[:] = np.rint(patch * (1 - cover) + painted * cover)

@@ -43,6 +43,8 @@ class TrainingSettings(FrozenModel):
         checkpoint_minutes: at least so often the state is saved, besides the end of every epoch.
         large_from_px: longer side in the network's input from which on users of the file look for drogues at half the
             size, by a second pass; 0 for a single one. [px]
+        start_sha256: of the file of weights that it starts from, as `settings_from_start` puts it in; empty for random
+            ones.
         licence: of the weights, written into the files, such as an SPDX name; empty where nobody says.
     """
 
@@ -71,6 +73,7 @@ class TrainingSettings(FrozenModel):
     loader_threads: int = Field(default=1, ge=1, le=64)
     checkpoint_minutes: float = Field(default=5.0, gt=0)
     large_from_px: float = Field(default=160.0, ge=0, le=MOST_SIDE_PX)
+    start_sha256: str = Field(default="", pattern="^([0-9a-f]{64})?$", exclude_if=lambda digest: not digest)
     licence: str = Field(default="", max_length=100)
 
     @model_validator(mode="after")

@@ -19,6 +19,7 @@ from nav.training.history import EpochRow
 from nav.training.moving_average import MovingAverage
 from nav.training.precision import Computing
 from nav.training.settings import TrainingSettings, differing_settings
+from nav.training.starting_weights import StartingWeights
 
 _VERSION = 1  # grows with every change of what stands in a checkpoint
 
@@ -57,9 +58,16 @@ def new_network(settings: TrainingSettings) -> DetectorNetwork:
         return DetectorNetwork(config)
 
 
-def new_state(settings: TrainingSettings, computing: Computing) -> TrainingState:
-    """The state before the first step."""
-    network = new_network(settings).to(computing.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+def new_state(settings: TrainingSettings, computing: Computing, start: StartingWeights | None = None) -> TrainingState:
+    """The state before the first step, with random weights or others.
+
+    Raises:
+        ValueError: the others do not fit the network.
+    """
+    network = new_network(settings)
+    if start is not None:
+        start.put_into(network)
+    network.to(computing.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return TrainingState(network, MovingAverage(network, settings.ema_decay), _new_optimizer(network, settings))
 
 

@@ -25,6 +25,7 @@ from nav.training.onnx_export import export_onnx
 from nav.training.precision import Computing, open_computing, own_threads
 from nav.training.score_threshold import best_threshold
 from nav.training.settings import TrainingSettings
+from nav.training.starting_weights import StartingWeights, settings_from_start
 from nav.training.state import TrainingState, check_settings, new_network, new_state, restore_state
 from nav.training.trainer import Trainer
 
@@ -58,6 +59,7 @@ def train(
     observer: Observer,
     cache: Path | None = None,
     should_stop: Callable[[], bool] = lambda: False,
+    start: StartingWeights | None = None,
 ) -> TrainingResult:
     """Train, evaluate on the split `test` and export; what an earlier run in this folder did is kept.
 
@@ -68,13 +70,15 @@ def train(
         observer: is told how far it is.
         cache: folder for images at the network's size; `out / "cache"` by default.
         should_stop: asked after every step.
+        start: weights to start from instead of random ones.
 
     Raises:
-        ValueError: a dataset that cannot be used, a device that is not there, a folder of another training, or one in
-            which another run is at work; names the path.
+        ValueError: a dataset that cannot be used, a device that is not there, weights of another network, a folder of
+            another training, or one in which another run is at work; names the path.
         OSError: a file cannot be written.
         KeyboardInterrupt: it was told to stop, and what was done is saved; the same call goes on.
     """
+    settings = settings_from_start(settings, start)
     computing = open_computing(settings)
     _check_place(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -82,7 +86,7 @@ def train(
         remove_leftovers(out)
         size, threads = settings.largest_size_px, settings.loader_threads
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
-        state = new_state(settings, computing)
+        state = new_state(settings, computing, start)
         restore_state(out, state, settings, corpus.datasets)
         _load_best(out, state)
         write_text_atomic(out / SETTINGS_FILE, json.dumps(settings.model_dump(mode="json"), indent=1) + "\n")
@@ -91,13 +95,15 @@ def train(
         return _finish(out, corpus, settings, computing, state)
 
 
-def check_before(out: Path, settings: TrainingSettings) -> None:
+def check_before(out: Path, settings: TrainingSettings, start: StartingWeights | None = None) -> None:
     """What can be known of a training before its datasets are there.
 
     Raises:
-        ValueError: a device that is not there, a folder of other settings, or one in which another run is at work.
+        ValueError: a device that is not there, weights of another network, a folder of other settings, or one in which
+            another run is at work.
     """
-    open_computing(settings)
+    settings = settings_from_start(settings, start)
+    new_state(settings, open_computing(settings), start)
     _check_place(out)
     if out.exists():
         with _locked(out):

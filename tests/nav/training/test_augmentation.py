@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from nav.training.batches import BatchMaker
 from nav.training.corpus import Corpus
-from nav.training.painted_shapes import distract, occlude
+from nav.training.painted_shapes import distract, occlude, paint_ring
 from nav.training.photometry import vary_light
 from nav.training.seeding import generator
 from nav.training.settings import build_settings
@@ -70,6 +71,54 @@ def test_distractors_never_touch_a_drogue() -> None:
         assert (image[40:76, 60:110] == white_ellipse()[40:76, 60:110]).all()
         painted += (image != white_ellipse()).any()
     assert painted > 30
+
+
+def paint(half_axes_px: list[float], turn_deg: float, ambient_fraction: float = 1.0) -> np.ndarray:
+    image = np.zeros((200, 200, 3), np.uint8)
+    lamp = np.array([0.6, 0.0, 0.8])
+    axes = np.array(half_axes_px)
+    paint_ring(image, np.array([100.0, 100.0]), axes, turn_deg, 8.0, (200, 100, 50), ambient_fraction, lamp)
+    return image
+
+
+@pytest.mark.parametrize(("turn_deg", "minor_px"), [(0, 60), (0, 40), (30, 50), (120, 45)])
+def test_a_painted_ring_is_the_outline_of_a_torus(turn_deg: float, minor_px: float) -> None:
+    # From afar a torus is all that lies within its tube's radius of its middle's ellipse, here as OpenCV draws it.
+    image = paint([60.0, minor_px], turn_deg)
+    scale = 16
+    large = np.zeros((200 * scale, 200 * scale), np.uint8)
+    angles = np.linspace(0, 2 * np.pi, 2000)
+    along, across = 60 * np.cos(angles), minor_px * np.sin(angles)
+    turn = np.radians(turn_deg)
+    middle = np.stack([along * np.cos(turn) - across * np.sin(turn), along * np.sin(turn) + across * np.cos(turn)], 1)
+    cv2.polylines(large, [np.rint((middle + 100) * scale).astype(np.int32)], True, 255, thickness=16 * scale)
+    coverage = cv2.resize(large, (200, 200), interpolation=cv2.INTER_AREA) / 255
+    # The distance is of the first order: at the flattest ends it is wrong by tube^2 / (2 radius of curvature) there,
+    # 8^2 / (2 * 40^2 / 60) = 1.2 px at most, on a few edges.
+    difference = np.abs(image[..., 0] / 200 - coverage)
+    assert difference.mean() < 0.005 and (difference > 0.6).sum() < 60
+    assert image[100, 100].max() == 0
+
+
+def test_a_painted_ring_is_lit_from_one_side() -> None:
+    image = paint([60.0, 60.0], 0, ambient_fraction=0.3).astype(float)
+    # Normals there: 0.5 of the tube's radius outwards, to the right and to the left of the ring's right part.
+    outer, inner = image[100, 163].mean(), image[100, 155].mean()
+    normal = np.array([0.4375, 0, np.sqrt(1 - 0.4375**2)])  # the middle of pixel 163 is 3.5 px beyond the tube's middle
+    expected = np.mean([200, 100, 50]) * (0.3 + 0.7 * normal @ [0.6, 0.0, 0.8])
+    assert outer == pytest.approx(expected, abs=1)
+    assert inner < outer - 10
+    np.testing.assert_allclose(image[..., 1], image[..., 0] / 2, atol=1)
+
+
+def test_rings_that_the_edge_cuts_are_painted_as_far_as_they_reach() -> None:
+    whole, cut = np.zeros((200, 200, 3), np.uint8), np.zeros((100, 100, 3), np.uint8)
+    for image in (whole, cut):
+        lamp = np.array([0.0, 0.0, 1.0])
+        paint_ring(image, np.array([95.0, 90.0]), np.array([40.0, 30.0]), 20, 6.0, (200, 30, 30), 0.5, lamp)
+    np.testing.assert_array_equal(cut, whole[:100, :100])
+    paint_ring(cut, np.array([-300.0, 50.0]), np.array([40.0, 30.0]), 20, 6.0, (9, 9, 9), 0.5, lamp)
+    np.testing.assert_array_equal(cut, whole[:100, :100])
 
 
 def test_light_varies_and_the_image_given_stays() -> None:

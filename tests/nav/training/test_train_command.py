@@ -67,6 +67,7 @@ def test_nothing_is_rendered_for_a_training_that_cannot_be(
         ([".", "--size", "100x100"], "size_px: must be multiples of 32 px"),
         ([".", "--image-passes", "0"], "image_passes:"),
         ([".", "--settings", "none.toml"], "none.toml: cannot be read"),
+        (["nav", "--start-from", "none.pt"], "none.pt: is missing"),
         (["nav"], "manifest.json: is missing"),
     ],
 )

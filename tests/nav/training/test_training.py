@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import fcntl
+import hashlib
 import io
 import json
 import signal
@@ -23,10 +24,11 @@ from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.training.answers import answer, to_tensor, whole_image
 from nav.training.average_precision import average_precision
 from nav.training.batch_statistics import measure_batch_statistics
-from nav.training.checkpoint import BEST_FILE, CHECKPOINT_FILE, load
+from nav.training.checkpoint import BEST_FILE, CHECKPOINT_FILE, load, save
 from nav.training.corpus import open_corpus
 from nav.training.precision import Computing, open_computing, own_threads
 from nav.training.settings import build_settings
+from nav.training.starting_weights import read_starting_weights
 from nav.training.state import new_network, new_state, restore_state
 from nav.training.training import TrainingResult, check_before, train
 
@@ -194,6 +196,44 @@ def test_what_stops_a_training_is_seen_before_there_is_data(split_dataset: Path,
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="file: is a file"):
         check_before(tmp_path / "file", settings)
+
+
+def test_a_training_starts_from_the_weights_of_another(split_dataset: Path, tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    run(split_dataset, first, image_passes=16)
+    start = read_starting_weights(first / BEST_FILE)
+    # A rate at which nothing is learned leaves the other's weights; those of the seed are far from them.
+    settings = build_settings(None, {**SMALL, "image_passes": 4, "learning_rate": 1e-12, "seed": 5})
+    told = PlainProgress(io.StringIO())
+    result = train([split_dataset], second, settings, told, start=start)
+    found, random = read_starting_weights(second / CHECKPOINT_FILE).values, new_network(settings).state_dict()
+    for name in (name for name, value in start.values.items() if value.ndim == 4):
+        torch.testing.assert_close(found[name], start.values[name], rtol=0, atol=1e-6)
+        assert (found[name] - random[name]).abs().max() > 1e-3
+    metadata = {entry.key: entry.value for entry in onnx.load(result.file).metadata_props}
+    digest = hashlib.sha256((first / BEST_FILE).read_bytes()).hexdigest()
+    assert ModelMetadata.from_json(metadata[METADATA_KEY]).training["settings"]["start_sha256"] == digest
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: belongs to a training that differs in start_sha256;"):
+        train([split_dataset], second, settings, told)
+    with pytest.raises(ValueError, match=r"start_sha256: 0{64} is not that of the weights given"):
+        train([split_dataset], second, settings.model_copy(update={"start_sha256": "0" * 64}), told, start=start)
+    with pytest.raises(ValueError, match=r"best\.pt: holds weights of another network;"):
+        check_before(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "is missing;"), (b"PK truncated", "is truncated or no checkpoint;"), ({"step": 3}, "holds no weights;")],
+    ids=["missing", "damaged", "no weights"],
+)
+def test_weights_to_start_from_that_cannot_be_read(content: Any, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "best.pt"
+    if isinstance(content, dict):
+        save(path, content)
+    elif content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"best\.pt: {message}"):
+        read_starting_weights(path)
 
 
 def test_a_device_that_is_not_there_is_refused(split_dataset: Path, tmp_path: Path) -> None:
