@@ -135,16 +135,17 @@ def describe_croissant(dataset: Location, manifest: Manifest) -> dict[str, Any]:
 
 
 def _file(storage: Storage, name: str, description: str) -> dict[str, Any]:
-    data = storage.read(name)
+    with storage.open(name) as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
     return {
         "@type": "cr:FileObject",
         "@id": name,
         "name": name.rpartition("/")[2],
         "description": description,
         "contentUrl": name,
-        "contentSize": f"{len(data)} B",
+        "contentSize": f"{storage.size(name)} B",
         "encodingFormat": "application/json",
-        "sha256": hashlib.sha256(data).hexdigest(),
+        "sha256": digest,
     }
 
 

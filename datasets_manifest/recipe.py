@@ -65,7 +65,7 @@ class RenderSettings(FrozenModel):
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)
     samples_per_px: int = Field(default=16, ge=1, le=65536)
     open_samples_per_px: int = Field(default=4, ge=1, le=65536)
-    edge_samples_per_px: int = Field(default=256, ge=1, le=65536)
+    edge_samples_per_px: int = Field(default=324, ge=1, le=65536)
     surround_samples_per_px: int = Field(default=4, ge=1, le=65536)
     max_depth: int = Field(default=4, ge=2, le=64)
     denoise: bool = True

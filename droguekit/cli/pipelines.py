@@ -176,7 +176,7 @@ _BENCH_SCENES = 8
 
 
 _BENCH_SAMPLES = {
-    "corpus": {"samples_per_px": 16, "open_samples_per_px": 4, "edge_samples_per_px": 256},
+    "corpus": {"samples_per_px": 16, "open_samples_per_px": 4, "edge_samples_per_px": 324},
     "benchmark": {"samples_per_px": 64, "open_samples_per_px": 8, "edge_samples_per_px": 400},
 }
 BENCH_QUALITIES = tuple(_BENCH_SAMPLES)

@@ -10,10 +10,6 @@ from numpy.typing import NDArray
 
 from geometry.se3 import Array
 from nav.centroids.annulus_model import (
-    AMPLITUDE,
-    BACKGROUND,
-    INNER,
-    OUTER,
     SLOPE_TURNS,
     all_parameters,
     annulus_model,
@@ -25,6 +21,7 @@ from nav.centroids.annulus_model import (
     shares_of,
     tied_to_pose,
 )
+from nav.centroids.annulus_places import AMPLITUDE, BACKGROUND, INNER, OUTER
 from nav.centroids.annulus_response import response_pictures, starting_with_pictures, with_pictures
 from nav.centroids.centroid_quality import NoiseModel, beyond_linear, measure_noise, residual_spread
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX

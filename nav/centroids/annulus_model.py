@@ -5,24 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
+from nav.centroids.annulus_places import AMPLITUDE, BACKGROUND, CENTERS, HOLE, INNER, OUTER, WIDTH
 from nav.centroids.edge_pictures import draw_annuli
-from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_widths, ellipse_parameters
+from nav.centroids.edge_profile import START_WIDTH_PX, edge_widths, ellipse_parameters
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.least_squares import Minimum, Model
 from nav.centroids.marker_signal import Array32
 from nav.centroids.matrix_loops import tie_rows
 from nav.centroids.patches import PixelSet, edge_distances
 
-# Places in the vector of parameters.
-OUTER = slice(0, ELLIPSE_PARAMETERS)
-INNER = slice(ELLIPSE_PARAMETERS, 2 * ELLIPSE_PARAMETERS)
-WIDTH, BACKGROUND, HOLE = (2 * ELLIPSE_PARAMETERS + i for i in range(3))
-# What lies beyond is lighter towards one side than towards another: a constant and the first two orders of the azimuth.
-BEYOND_TURNS = 5
-BEYOND = slice(HOLE + 1, HOLE + 1 + BEYOND_TURNS)
-AMPLITUDE = BEYOND.stop
 SLOPE_TURNS = 5
-CENTERS = np.array([0, 1, ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS + 1])
 
 
 def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
@@ -39,7 +31,7 @@ def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
     def model(parameters: Array) -> tuple[Array32, Array32]:
         picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
         given, widths = parameters.astype(np.float32), edge_widths(parameters[:, WIDTH])
-        draw_annuli(given, widths, x, y, turns, beyond, BEYOND_TURNS, picture, jacobian)
+        draw_annuli(given, widths, x, y, turns, beyond, picture, jacobian)
         return picture, jacobian
 
     return model

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.annulus_model import BACKGROUND, HOLE, INNER, OUTER
+from nav.centroids.annulus_places import BACKGROUND, HOLE, INNER, OUTER
 from nav.centroids.edge_pictures import add_box_pictures
 from nav.centroids.least_squares import Minimum, Model, NormalEquations
 from nav.centroids.marker_signal import Array32

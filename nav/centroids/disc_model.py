@@ -5,15 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
+from nav.centroids.disc_places import BACKGROUND, ELLIPSE_PARAMETERS, LEVEL, REST, WIDTH
 from nav.centroids.edge_pictures import draw_discs
-from nav.centroids.edge_profile import ELLIPSE_PARAMETERS, START_WIDTH_PX, edge_widths, ellipse_parameters
+from nav.centroids.edge_profile import START_WIDTH_PX, edge_widths, ellipse_parameters
 from nav.centroids.least_squares import Minimum, Model
 from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet, edge_distances
 
-# Places in the vector of parameters, after those of the ellipse.
-WIDTH, BACKGROUND, LEVEL = ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS + 1, ELLIPSE_PARAMETERS + 2
-_PLAIN_COUNT = LEVEL + 1
 # An initial outline may be this far off; pixels this far from it show one side only. [px]
 _CLEAR_PX = 1.0
 
@@ -30,7 +28,7 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, furthe
     x, y = pixels.x_px, pixels.y_px
     if further is None:
         further = np.zeros((len(x), 0, x.shape[1]), np.float32)
-    count = _PLAIN_COUNT + 2 * slope_outside + 2 * slope_inside + further.shape[1]
+    count = REST + 2 * slope_outside + 2 * slope_inside + further.shape[1]
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
@@ -43,7 +41,7 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, furthe
 
 def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
     """(N, P) parameters of the initial outlines with the mean levels on either side of them, all further ones zero."""
-    parameters = np.zeros((len(shapes_px), _PLAIN_COUNT + further_count))
+    parameters = np.zeros((len(shapes_px), REST + further_count))
     parameters[:, :ELLIPSE_PARAMETERS] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
     parameters[:, WIDTH] = START_WIDTH_PX
     distance = edge_distances(shapes_px, pixels.x_px, pixels.y_px)

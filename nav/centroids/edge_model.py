@@ -17,7 +17,8 @@ from nav.centroids.centroid_quality import (
 )
 from nav.centroids.disc_fits import DiscFits, merged, unfitted
 from nav.centroids.disc_location import located
-from nav.centroids.disc_model import BACKGROUND, LEVEL, WIDTH, contrasts, disc_model, disc_start
+from nav.centroids.disc_model import contrasts, disc_model, disc_start
+from nav.centroids.disc_places import BACKGROUND, LEVEL, WIDTH
 from nav.centroids.disc_rejection import rejection_reasons
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from nav.centroids import annulus_places, disc_places
 from nav.centroids.marker_signal import Array32
 from nav.centroids.rows import add_row, multiply_rows
 from nav.compiled import compiled, float_of_bits
@@ -166,8 +167,7 @@ def draw_discs(
     """Fill pictures and derivatives of N discs; see `nav.centroids.disc_model.disc_model`.
 
     Args:
-        parameters: (N, P) ellipse, width, levels outside and inside, slopes of those lights that have any, lights of
-            other backgrounds.
+        parameters: (N, P) as `disc_places` says: slopes of those lights that have any, lights of other backgrounds.
         widths: (N,) as they are drawn.
         slopes: whether the light outside has any, and that inside.
         x, y: (N, K).
@@ -180,12 +180,12 @@ def draw_discs(
     for n in range(len(x)):
         own, rows, xs, ys, width = parameters[n], jacobian[n], x[n], y[n], widths[n]
         ellipse = (own[0], own[1], own[2], own[3], own[4])
-        outside, inside, at = rows[6], rows[7], 8
+        outside, inside, at = rows[disc_places.BACKGROUND], rows[disc_places.LEVEL], disc_places.REST
         _place(xs, ys, ellipse, distance, by_q, by_gradient)
         blurred_steps(distance, _F(_SQRT_HALF) / width, inside, bell)
         for k in range(len(xs)):
             outside[k] = _ONE - inside[k]
-        dark[:], bright[:] = own[6], own[7]
+        dark[:], bright[:] = own[disc_places.BACKGROUND], own[disc_places.LEVEL]
         if slopes[0]:
             _shade(xs, ys, own[at : at + 2], outside, dark, rows[at : at + 2])
             at += 2
@@ -195,7 +195,7 @@ def draw_discs(
         _mix(dark, bright, inside, bell, _F(_BELL_PEAK) / width, picture[n])
         _slopes_by_center(xs, ys, ellipse, by_q, by_gradient, bell, rows)
         _slopes_by_shape(xs, ys, ellipse, by_q, by_gradient, bell, rows)
-        multiply_rows(bell, distance, -_ONE / width, rows[5])
+        multiply_rows(bell, distance, -_ONE / width, rows[disc_places.WIDTH])
         for other in range(further.shape[1]):
             rows[at + other] = further[n, other]
             add_row(further[n, other], own[at + other], picture[n])
@@ -209,20 +209,17 @@ def draw_annuli(
     y: Array32,
     turns: Array32,
     beyond: Array32,
-    beyond_turns: int,
     picture: Array32,
     jacobian: Array32,
 ) -> None:
     """Fill pictures and derivatives of N annuli; see `nav.centroids.annulus_model.annulus_model`.
 
     Args:
-        parameters: (N, P) outer and inner ellipse, width, levels beside the annulus and in the hole, lights beyond by
-            the azimuth, lights on the annulus by the azimuth.
+        parameters: (N, P) as `annulus_places` says, lights beyond and on the annulus by the azimuth.
         widths: (N,) as they are drawn.
         x, y: (N, K).
         turns: (N, T, K) functions of the azimuth.
         beyond: (N, K).
-        beyond_turns: how many of those functions the lights beyond follow.
         picture: (N, K).
         jacobian: (N, P, K).
     """
@@ -230,12 +227,13 @@ def draw_annuli(
     to_outer, to_inner, up, down = (np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0]))
     for n in range(len(x)):
         own, rows, xs, ys, width = parameters[n], jacobian[n], x[n], y[n], widths[n]
-        outside, in_hole, between = rows[11], rows[12], rows[13 + beyond_turns]
-        background, hole = own[11], own[12]
+        outside, in_hole = rows[annulus_places.BACKGROUND], rows[annulus_places.HOLE]
+        between = rows[annulus_places.AMPLITUDE]
+        background, hole = own[annulus_places.BACKGROUND], own[annulus_places.HOLE]
         outer, inner = (own[0], own[1], own[2], own[3], own[4]), (own[5], own[6], own[7], own[8], own[9])
         light[:] = _F(0)
         for turn in range(turns.shape[1]):
-            add_row(turns[n, turn], own[13 + beyond_turns + turn], light)
+            add_row(turns[n, turn], own[annulus_places.AMPLITUDE + turn], light)
         # The slopes need what `_place` leaves, so one edge is done before the other; `between` is the outer share till
         # the inner one is known.
         _place(xs, ys, outer, to_outer, by_q, by_gradient)
@@ -249,9 +247,9 @@ def draw_annuli(
         blurred_steps(to_inner, _F(_SQRT_HALF) / width, in_hole, down)
         for k in range(len(xs)):
             down[k] *= peak * (hole - light[k])
-        _slopes_by_center(xs, ys, inner, by_q, by_gradient, down, rows[5:])
-        _slopes_by_shape(xs, ys, inner, by_q, by_gradient, down, rows[5:])
-        by_width = rows[10]
+        _slopes_by_center(xs, ys, inner, by_q, by_gradient, down, rows[disc_places.ELLIPSE_PARAMETERS :])
+        _slopes_by_shape(xs, ys, inner, by_q, by_gradient, down, rows[disc_places.ELLIPSE_PARAMETERS :])
+        by_width = rows[annulus_places.WIDTH]
         for k in range(len(xs)):
             by_width[k] = -(up[k] * to_outer[k] + down[k] * to_inner[k]) / width
         for k in range(len(xs)):
@@ -259,12 +257,13 @@ def draw_annuli(
             between[k] -= in_hole[k]
         for k in range(len(xs)):
             picture[n, k] = background * outside[k] + light[k] * between[k] + hole * in_hole[k]
-        for turn in range(beyond_turns):
-            multiply_rows(turns[n, turn], beyond[n], _ONE, rows[13 + turn])
-            add_row(rows[13 + turn], own[13 + turn], picture[n])
+        for turn in range(annulus_places.BEYOND_TURNS):
+            place = annulus_places.BEYOND + turn
+            multiply_rows(turns[n, turn], beyond[n], _ONE, rows[place])
+            add_row(rows[place], own[place], picture[n])
         # The first function is one, so its row is `between` itself, from which the others follow.
         for turn in range(1, turns.shape[1]):
-            multiply_rows(turns[n, turn], between, _ONE, rows[13 + beyond_turns + turn])
+            multiply_rows(turns[n, turn], between, _ONE, rows[annulus_places.AMPLITUDE + turn])
 
 
 # Sides of the pixel and its neighbours, from its middle. [px]

@@ -13,8 +13,6 @@ from nav.centroids.marker_signal import Array32
 START_WIDTH_PX = float(np.sqrt(0.25 + 1 / 12))
 # Below this an edge lies within one pixel and its width says nothing. [px]
 _SMALLEST_WIDTH_PX = 0.2
-# Centre x, y; elements xx, yy, xy of the inverse shape.
-ELLIPSE_PARAMETERS = 5
 
 
 def edge_widths(width_px: Array) -> Array32:

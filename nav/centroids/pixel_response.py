@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
+from nav.centroids.disc_places import ELLIPSE_PARAMETERS
 from nav.centroids.edge_pictures import add_box_pictures
-from nav.centroids.edge_profile import ELLIPSE_PARAMETERS
 from nav.centroids.least_squares import Minimum
 from nav.centroids.marker_signal import Array32
 from nav.centroids.matrix_loops import add_rows, couplings, normal_equations

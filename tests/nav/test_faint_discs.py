@@ -9,7 +9,8 @@ import pytest
 
 from droguekit.benchmark.centroid_bounds import center_bound_px
 from nav.centroids.centroid_quality import SECTORS, NoiseModel, residual_spread
-from nav.centroids.disc_model import LEVEL, contrasts, disc_model, disc_start
+from nav.centroids.disc_model import contrasts, disc_model, disc_start
+from nav.centroids.disc_places import LEVEL
 from nav.centroids.disc_rejection import rejection_reasons
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.least_squares import evaluate
