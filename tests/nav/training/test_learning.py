@@ -63,7 +63,11 @@ def test_the_threshold_lies_in_the_middle_of_those_that_chance_does_not_tell_apa
     mixed = [(0.8, False), (0.7, True), (0.6, False), (0.5, True), (0.4, False), (0.3, True), (0.2, False)]
     truth = [BOX] * 9 + [BOX if is_right else empty for _, is_right in mixed] + [BOX]
     answers = [found(score) for score in right] + [found(score) for score, _ in mixed] + [NONE]
-    assert best_threshold(truth, answers, 0.1) == pytest.approx(right[7] / 2)
+    # As many images without a drogue as with one, thirteen each.
+    even = truth + [empty] * 9, answers + [NONE] * 9
+    assert best_threshold(*even, 0.1) == pytest.approx(right[7] / 2)
+    # With four, each answer in one of them counts for 13 / 4: those from the first on are worse than but for chance.
+    assert best_threshold(truth, answers, 0.1) == pytest.approx((right[7] + 0.8) / 2)
 
 
 def test_the_learning_rate_rises_then_falls_by_a_cosine() -> None:
