@@ -92,6 +92,15 @@ def test_distractors_stay_behind_the_drogue():
         assert depths_m and min(depths_m) >= frame.left_from_drogue.translation_m[2] + 1.0
 
 
+def test_distractors_have_the_forms_that_are_named_as_often_as_they_are():
+    lines = 'distractor_frame_fraction = 1\ndistractor_forms = ["ring", "ring", "ring", "disc"]'
+    forms = [each.shape.form for index in range(150) for each in sample_frame(recipe(lines, 1.0), index).bystanders]
+    assert set(forms) == {"ring", "disc"}
+    assert within_chance(forms.count("ring") / len(forms), 0.75, len(forms))
+    # Recipes that name none are written as they were before there were names.
+    assert "distractor_forms" not in recipe("distractor_frame_fraction = 1").model_dump_json()
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
 def test_dirt_covers_the_share_that_is_asked_for(share):
     dirt = dirt_map(7, share)
@@ -108,6 +117,8 @@ def test_dirt_covers_the_share_that_is_asked_for(share):
         ('variants = [{ drogue = "red-9" }]', "red-9"),
         ("variants = [{ weight = 1 }]", "target.variants.0.drogue"),
         ("probe_radius_m = 0", "target.probe_radius_m"),
+        ("distractor_forms = []", "target.distractor_forms"),
+        ('distractor_forms = ["cube"]', "target.distractor_forms.0"),
     ],
 )
 def test_a_wrong_section_is_named(line, fault):
