@@ -5,7 +5,6 @@ Source: Croissant Format Specification 1.0, MLCommons, http://mlcommons.org/croi
 
 from __future__ import annotations
 
-import hashlib
 import json
 from typing import Any
 
@@ -21,7 +20,7 @@ from datasets_manifest.layout import (
     parts_file,
 )
 from datasets_manifest.manifest import Manifest
-from datasets_manifest.shard_index import read_pairs_per_tar
+from datasets_manifest.shard_index import read_pairs_per_tar, sha256_of
 from datasets_manifest.storage import Location, Storage, join, open_storage
 from geometry.stereo import EYES
 
@@ -136,7 +135,7 @@ def describe_croissant(dataset: Location, manifest: Manifest) -> dict[str, Any]:
 
 def _file(storage: Storage, name: str, description: str) -> dict[str, Any]:
     with storage.open(name) as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+        digest = sha256_of(stream)
     return {
         "@type": "cr:FileObject",
         "@id": name,
