@@ -1,7 +1,8 @@
 """Which region of which image is which marker.
 
 In each image the drogue's ring is found among the regions (`nav.ring_match`), which orders the markers up to the
-layout's symmetry and leaves gaps where one is missing. Then every turn of the right image's order against the left's is
+layout's symmetry and leaves gaps where one is missing; an image that shows too few of them for a ring by itself is
+looked at where the other one's ring must be. Then every turn of the right image's order against the left's is
 tried, and the one with the smallest epipolar and disparity cost is taken.
 """
 
@@ -17,7 +18,7 @@ from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
 from nav.centroids.binary_chain import Centroids
 from nav.pose.interface import NoFixReason, Observation
-from nav.ring_match import RingMatch, match_ring, symmetry_permutations
+from nav.ring_match import RingMatch, match_ring, match_ring_near, symmetry_permutations
 
 # The best turn must explain the pairs within this share of the gap between neighbours; a wrong turn misses by a gap.
 _LARGEST_COST_FRACTION = 0.35
@@ -55,7 +56,7 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
         What the estimators work on, with one eye's places empty where only the other shows a ring; or why there is
         nothing to work on.
     """
-    rings = [centroids.ring or match_ring(centroids.blobs, layout) for centroids in (left, right)]
+    rings = _rings(left, right, rig, layout)
     permutations = symmetry_permutations(layout)
     if rings[0] is None and rings[1] is None:
         return NoFixReason(f"{no_ring(left, 'left')}, and {no_ring(right, 'right')}")
@@ -74,6 +75,18 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
     if costs[best] > _LARGEST_COST_FRACTION * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
     return Observation(rig, layout, *_without_bad_pairs(first, second.turned(permutations[best])))
+
+
+def _rings(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayout) -> list[RingMatch | None]:
+    """The ring in each image; where only one shows it by itself, the other is looked at where it must be."""
+    rings = [centroids.ring or match_ring(centroids.blobs, layout) for centroids in (left, right)]
+    for eye, blobs, toward_px in ((0, left.blobs, 1.0), (1, right.blobs, -1.0)):
+        other = rings[1 - eye]
+        if rings[eye] is None and other is not None:
+            disparity_px = rig.baseline_m * other.scale_px_per_m
+            rings[eye] = match_ring_near(blobs, layout, other.moved((toward_px * disparity_px, 0.0)).affine)
+            break
+    return rings
 
 
 def no_ring(centroids: Centroids, eye: Eye) -> str:

@@ -26,6 +26,7 @@ _FIT_TOLERANCE = 0.4
 _ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
+_LEAST_NEAR = 4  # markers where the ring is known to be
 # A marker that was not found lies this many times as far off the map as the others at most.
 _MOST_OFF = 3.0
 # A complete ring this near its map needs no second guess.
@@ -109,12 +110,27 @@ def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
         if key in tried:
             continue
         tried.add(key)
-        match = _fit(blob_of_marker, blobs, layout)
+        match = _fit(blob_of_marker, blobs, layout, least_markers(layout))
         if match is not None and (best is None or _rank(match) > _rank(best)):
             best = match
         if best is not None and best.count == layout.count and best.rms_fraction < _GOOD_RMS_FRACTION:
             break
     return best
+
+
+def match_ring_near(blobs: Blobs, layout: MarkerLayout, affine: Array) -> RingMatch | None:
+    """The markers among blobs where a ring is known to be, or None.
+
+    Four are enough then, where a ring that may be anywhere needs more to be told from other things.
+
+    Args:
+        blobs: of one image.
+        layout: the drogue's markers.
+        affine: (2, 3) map from the rim plane [m] to pixels, right to some tenths of a marker's radius.
+    """
+    if len(blobs) < _LEAST_NEAR:
+        return None
+    return _fit(_nearest_blobs(affine, blobs, layout, _GUESS_TOLERANCE), blobs, layout, _LEAST_NEAR)
 
 
 def _rank(match: RingMatch) -> tuple[int, float]:
@@ -171,7 +187,7 @@ def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.comple
     return np.concatenate(turns), np.concatenate(shifts)
 
 
-def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
+def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
     """Affine map refined from the blobs that a guess hits, or None where they cannot be the drogue."""
     places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
     fitted = None
@@ -179,7 +195,7 @@ def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout) 
         # Mostly the first guess hits the right blobs already, and the same blobs have the same map.
         if fitted is None or (blob_of_marker != fitted).any():
             fitted, hit = blob_of_marker, blob_of_marker >= 0
-            if hit.sum() < least_markers(layout):
+            if hit.sum() < least:
                 return None
             seen, centers_px = places[hit], blobs.centers_px[blob_of_marker[hit]]
             solution, _, _, singular = np.linalg.lstsq(seen, centers_px, rcond=None)

@@ -66,6 +66,35 @@ def test_all_markers_at_every_roll(make_pose, count, z_m):
         assert worst_match_px(observation, layout, place) < 0.46
 
 
+@pytest.mark.parametrize("z_m", [1.7, 5, 40])
+@pytest.mark.parametrize("blind", EYES)
+def test_four_markers_are_enough_where_the_other_image_says_where_they_are(make_pose, blind, z_m):
+    layout = marker_layout(PRESETS["red-8"])
+    rng = np.random.default_rng([EYES.index(blind), int(z_m)])
+    for roll_deg in (-170, -25, 0, 40):
+        place = make_pose(0.06, 0, z_m, *rng.uniform(-15, 15, 2), roll_deg)
+        hidden = {eye: (0, 1, 2, 3) if eye == blind else (1, 2) for eye in EYES}
+        # A disc where no marker is, as large as one, changes nothing.
+        shown = [centroids(layout, place, eye, rng, hidden[eye], [(0.5, 0.2, 1.0)]) for eye in EYES]
+        assert match_ring(shown[EYES.index(blind)].blobs, layout) is None
+        observation = correspond(*shown, RIG, layout)
+        assert not isinstance(observation, NoFixReason), observation.reason
+        assert sorted(observation.seen.sum(axis=1)) == [4, 6] and observation.paired.sum() == 4
+        assert worst_match_px(observation, layout, place) < 0.46
+
+
+def test_four_discs_elsewhere_are_no_ring_beside_the_other_images(make_pose):
+    layout = marker_layout(PRESETS["red-8"])
+    rng = np.random.default_rng(1)
+    left = centroids(layout, make_pose(0.06, 0, 5, 5, -5, 0), "left", rng)
+    # By three radii of a marker further to the side than the ring in the left image puts it.
+    off_m = 3 * layout.radius_m
+    right = centroids(layout, make_pose(0.06 + off_m, 0, 5, 5, -5, 0), "right", rng, hidden=(0, 1, 2, 3))
+    observation = correspond(left, right, RIG, layout)
+    assert not isinstance(observation, NoFixReason)
+    assert observation.seen.sum(axis=1).tolist() == [8, 0]
+
+
 @pytest.mark.parametrize("count", [5, 7, 8])
 @pytest.mark.parametrize("missing", [0, 2, 4])
 def test_one_missing_marker_leaves_a_gap(make_pose, count, missing):
@@ -134,7 +163,7 @@ def test_too_few_regions_in_one_eye_leave_the_other(make_pose, eye):
     rng = np.random.default_rng(6)
     place = make_pose(0.06, 0, 5)
     parts = {other: centroids(layout, place, other, rng) for other in EYES}
-    parts[eye] = centroids(layout, place, eye, rng, hidden=range(4))
+    parts[eye] = centroids(layout, place, eye, rng, hidden=range(5))
     observation = correspond(parts["left"], parts["right"], RIG, layout)
     assert not isinstance(observation, NoFixReason), observation.reason
     assert observation.seen.sum(axis=1).tolist() == [0 if other == eye else 8 for other in EYES]
