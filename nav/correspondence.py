@@ -85,7 +85,6 @@ def _rings(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayo
         if rings[eye] is None and other is not None:
             disparity_px = rig.baseline_m * other.scale_px_per_m
             rings[eye] = match_ring_near(blobs, layout, other.moved((toward_px * disparity_px, 0.0)).affine)
-            break
     return rings
 
 

@@ -65,7 +65,7 @@ def train(
     start_from: Annotated[
         Path | None,
         typer.Option(
-            "--start-from", metavar="FILE", help="Start from these weights, best.pt of another training; random ones."
+            "--start-from", metavar="FILE", help="Weights to begin with, best.pt of another training, not random ones."
         ),
     ] = None,
     workers: WorkersOption = None,

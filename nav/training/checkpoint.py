@@ -27,8 +27,12 @@ def save(path: Path, state: dict[str, Any]) -> None:
         file.write(stream.getbuffer())
 
 
-def load(path: Path) -> dict[str, Any] | None:
+def load(path: Path, advice: str = "delete it, or train into another folder") -> dict[str, Any] | None:
     """What `save` wrote; None where there is no such file.
+
+    Args:
+        path: of the file.
+        advice: what to do about a file that is damaged.
 
     Raises:
         ValueError: truncated, or another kind of file; names it.
@@ -43,9 +47,9 @@ def load(path: Path) -> dict[str, Any] | None:
         # Nothing but tensors and plain values is accepted: a file runs no code.
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path}: is truncated or no checkpoint; delete it, or train into another folder") from error
+        raise ValueError(f"{path}: is truncated or no checkpoint; {advice}") from error
     if not isinstance(state, dict):
-        raise ValueError(f"{path}: is no checkpoint; delete it, or train into another folder")
+        raise ValueError(f"{path}: is no checkpoint; {advice}")
     return state
 
 

@@ -48,12 +48,13 @@ def read_starting_weights(path: Path) -> StartingWeights:
     Raises:
         ValueError: missing, truncated, or a file of something else; names it.
     """
-    content: dict[str, Any] | None = load(path)
+    advice = "give best.pt from a training's folder"
+    content: dict[str, Any] | None = load(path, advice)
     if content is None:
-        raise ValueError(f"{path}: is missing; give best.pt from a training's folder")
+        raise ValueError(f"{path}: is missing; {advice}")
     values = content.get("average", content.get("network"))
     if not isinstance(values, dict) or not all(isinstance(value, torch.Tensor) for value in values.values()):
-        raise ValueError(f"{path}: holds no weights; give best.pt from a training's folder")
+        raise ValueError(f"{path}: holds no weights; {advice}")
     return StartingWeights(path, hashlib.sha256(path.read_bytes()).hexdigest(), values)
 
 

@@ -93,10 +93,10 @@ def test_a_painted_ring_is_the_outline_of_a_torus(turn_deg: float, minor_px: flo
     middle = np.stack([along * np.cos(turn) - across * np.sin(turn), along * np.sin(turn) + across * np.cos(turn)], 1)
     cv2.polylines(large, [np.rint((middle + 100) * scale).astype(np.int32)], True, 255, thickness=16 * scale)
     coverage = cv2.resize(large, (200, 200), interpolation=cv2.INTER_AREA) / 255
-    # The distance is of the first order: at the flattest ends it is wrong by tube^2 / (2 radius of curvature) there,
-    # 8^2 / (2 * 40^2 / 60) = 1.2 px at most, on a few edges.
+    # A ramp of one pixel for an edge is off by 0.1 where it runs askew, and the painted edge, exact on both axes of the
+    # ellipse, by a fifth of a pixel between them. Over the image that is the mean: the edges pass 3 % of its pixels.
     difference = np.abs(image[..., 0] / 200 - coverage)
-    assert difference.mean() < 0.005 and (difference > 0.6).sum() < 60
+    assert difference.max() < 0.3 and difference.mean() < 0.03 * 0.1
     assert image[100, 100].max() == 0
 
 

@@ -232,7 +232,7 @@ def test_weights_to_start_from_that_cannot_be_read(content: Any, message: str, t
         save(path, content)
     elif content is not None:
         path.write_bytes(content)
-    with pytest.raises(ValueError, match=rf"best\.pt: {message}"):
+    with pytest.raises(ValueError, match=rf"best\.pt: {message} give best\.pt from a training's folder"):
         read_starting_weights(path)
 
 
@@ -263,6 +263,6 @@ def test_forty_pairs_are_learned_by_heart(toy_dataset: Path, tmp_path: Path) -> 
     state = new_state(settings, computing)
     restore_state(tmp_path, state, settings, corpus.datasets)
     with own_threads(1):
-        answers = answer(state.average.network, corpus, "train", settings.size_px, 8, computing)
+        answers = answer(state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, computing)
     reached = average_precision(answers.truth, answers.found)
     assert reached is not None and reached.ap50 >= 0.95
