@@ -14,6 +14,7 @@ from droguekit.detector_peers.options import (
     PassesOption,
     SeedOption,
     SizeOption,
+    TestOption,
     ThreadsOption,
     input_size_px,
     tell,
@@ -24,12 +25,15 @@ _EXAMPLES = """Examples:
 
   python -m droguekit.detector_peers --corpus data/detector-small --ours out/detector/detector.onnx
 
+  python -m droguekit.detector_peers --corpus data/detector-train --test data/detector-test --image-passes 8000
+
   python -m droguekit.detector_peers --corpus data/demo --image-passes 0"""
 
 
 def main(
     corpus: CorpusOption,
     out: Annotated[Path, typer.Option("--out", help="Folder; stages found there stand.")] = Path("out/detector-peers"),
+    test: TestOption = None,
     ours: Annotated[
         list[Path] | None, typer.Option("--ours", metavar="FILE.onnx", help="Of our own detectors. Repeatable.")
     ] = None,
@@ -51,6 +55,7 @@ def main(
     try:
         order = PeerOrder(
             corpus=corpus,
+            test=test or corpus,
             ours=tuple(ours or ()),
             image_passes=image_passes,
             size_px=input_size_px(size),

@@ -37,7 +37,8 @@ class PeerOrder:
     """What is compared.
 
     Attributes:
-        corpus: dataset to train and to score on.
+        corpus: dataset to train on.
+        test: dataset whose test split is scored; may be the corpus.
         ours: ONNX files of our detectors, trained elsewhere on the same corpus.
         image_passes: through each peer; 0 leaves them untrained, and times them only.
         size_px: width and height of every network's input.
@@ -50,6 +51,7 @@ class PeerOrder:
     """
 
     corpus: Path
+    test: Path
     ours: tuple[Path, ...]
     image_passes: int
     size_px: tuple[int, int]
@@ -88,7 +90,7 @@ def compare_peers(order: PeerOrder, out: Path, say: Say) -> dict[str, Any]:
     # Whatever is wrong is said before hours of training.
     ours = _our_detectors(order)
     if order.image_passes:
-        check_corpus(order.corpus)
+        check_corpus(order.corpus, order.test)
     _check_folder(order, out)
     networks = {name: _peer_network(order, out, name, say) for name in PEERS}
     detectors: dict[str, Detector] = {name: YoloDetector(file, order.threads) for name, file in networks.items()}
@@ -179,7 +181,8 @@ def _our_detectors(order: PeerOrder) -> dict[str, Detector]:
 def _check_folder(order: PeerOrder, out: Path) -> None:
     """Refuse a folder of another comparison, and claim a new one."""
     settings = {name: str(value) for name, value in asdict(order).items() if name not in _FREE_TO_CHANGE}
-    settings["corpus"] = Dataset(order.corpus).manifest.dataset_sha256
+    for name, dataset in (("corpus", order.corpus), ("test", order.test)):
+        settings[name] = Dataset(dataset).manifest.dataset_sha256
     file = out / "settings.json"
     if file.exists():
         try:
@@ -235,7 +238,7 @@ def _peer_network(order: PeerOrder, out: Path, name: str, say: Say) -> Path:
 
 
 def _latencies(order: PeerOrder, detectors: Mapping[str, Detector]) -> list[dict[str, Any]]:
-    source = BlindDataset(order.corpus)
+    source = BlindDataset(order.test)
     pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
     return [latency._asdict() for latency in measure_latency(detectors, pairs, order.rounds).values()]
 
@@ -249,10 +252,10 @@ def _scores(order: PeerOrder, out: Path, detectors: Mapping[str, Detector], say:
         # Our own may have been trained anew under the same name.
         if not file.exists() or name not in PEERS:
             say(f"{name}: looking for the drogue")
-            _detect(order.corpus, detector, file)
+            _detect(order.test, detector, file)
     result, page = out / "scores.json", out / "scores.html"
     options = [word for file in files for word in ("--detections", str(file))]
-    command = [sys.executable, "-P", "-m", "droguekit.cli.main", "benchmark", str(order.corpus), *options]
+    command = [sys.executable, "-P", "-m", "droguekit.cli.main", "benchmark", str(order.test), *options]
     command += ["--split", "test", "--json", str(result), "--html", str(page)]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     if ended.returncode != 0:

@@ -7,7 +7,11 @@ from typing import Annotated
 
 import typer
 
-CorpusOption = Annotated[Path, typer.Option("--corpus", metavar="DIR", help="Dataset to train and to score on.")]
+CorpusOption = Annotated[Path, typer.Option("--corpus", metavar="DIR", help="Dataset to train on.")]
+TestOption = Annotated[
+    Path | None,
+    typer.Option("--test", metavar="DIR", help="Dataset whose test split is scored, the corpus's own by default."),
+]
 PassesOption = Annotated[int, typer.Option("--image-passes", min=0, help="Images that go through each network.")]
 SizeOption = Annotated[str, typer.Option("--size", metavar="HxW", help="Every network's input, multiples of 32.")]
 ThreadsOption = Annotated[int, typer.Option("--threads", min=1, help="Of training and timing.")]

@@ -14,6 +14,7 @@ from droguekit.detector_peers.options import (
     PassesOption,
     SeedOption,
     SizeOption,
+    TestOption,
     ThreadsOption,
     input_size_px,
     tell,
@@ -28,10 +29,7 @@ _EXAMPLES = """Examples:
 def main(
     corpus: CorpusOption,
     out: Annotated[Path, typer.Option("--out", help="Folder; trainings found there go on.")] = Path("out/ablation"),
-    test: Annotated[
-        Path | None,
-        typer.Option("--test", metavar="DIR", help="Dataset whose test split is scored, the corpus's own by default."),
-    ] = None,
+    test: TestOption = None,
     variant: Annotated[str, typer.Option("--variant", help="Of the network: l or s.")] = "s",
     image_passes: PassesOption = 5_000,
     size: SizeOption = "320x416",

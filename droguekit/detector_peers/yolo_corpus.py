@@ -17,15 +17,22 @@ from nav.detector.input_image import Letterbox, input_image
 SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
 
 
-def check_corpus(corpus: Path) -> None:
-    """Refuse a corpus that cannot be trained on, or would be scored on what was trained on.
+def check_corpus(corpus: Path, test: Path) -> None:
+    """Refuse a corpus that cannot be trained on, and a test dataset that would be scored on what was trained on.
+
+    Args:
+        corpus: needs pairs to train on and to choose by.
+        test: needs pairs to score; may be the corpus.
 
     Raises:
-        ValueError: the corpus cannot be read, or lacks a split.
+        ValueError: a dataset cannot be read, or lacks a split.
     """
-    counts = Dataset(corpus).manifest.counts.by_split
-    if not all(counts.get(split) for split in SPLITS):
-        raise ValueError(f"{corpus}: needs pairs in the splits {', '.join(SPLITS)}, got {dict(counts)}")
+    needed: dict[Path, tuple[SplitName, ...]] = {corpus: ("train", "val")}
+    needed[test] = (*needed.get(test, ()), "test")
+    for dataset, splits in needed.items():
+        counts = Dataset(dataset).manifest.counts.by_split
+        if not all(counts.get(split) for split in splits):
+            raise ValueError(f"{dataset}: needs pairs in the splits {', '.join(splits)}, got {dict(counts)}")
 
 
 def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:

@@ -32,7 +32,7 @@ from droguekit.detector_peers.comparison import PEERS, PeerOrder, compare_peers,
 from droguekit.detector_peers.one_view import OneViewDetector
 from droguekit.detector_peers.options import input_size_px
 from droguekit.detector_peers.table import comparison_lines
-from droguekit.detector_peers.yolo_corpus import export_corpus, images_to_train_on
+from droguekit.detector_peers.yolo_corpus import check_corpus, export_corpus, images_to_train_on
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.detector.onnx_detector import OnnxDetector
@@ -56,6 +56,7 @@ def screen_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def order(corpus: Path, folder: Path, **changes: object) -> PeerOrder:
     values: dict[str, object] = {
         "corpus": corpus,
+        "test": corpus,
         "ours": (),
         "image_passes": 100,
         "size_px": (64, 64),
@@ -110,6 +111,17 @@ def test_a_corpus_that_would_be_scored_on_what_was_trained_on_is_refused(smoke_d
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_corpus_without_a_test_split_is_scored_on_another_dataset(
+    screen_dataset: Path, smoke_dataset: Path, tmp_path: Path
+) -> None:
+    # The one lacks pairs to choose by, so it serves to be scored on but not to train on.
+    compared = order(screen_dataset, tmp_path, test=smoke_dataset)
+    check_corpus(compared.corpus, compared.test)
+    with pytest.raises(ValueError, match="needs pairs in the splits train, val, got"):
+        compare_peers(order(smoke_dataset, tmp_path, test=screen_dataset), tmp_path / "out", print)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("passes", "images", "expected"),
     [
@@ -149,7 +161,7 @@ def test_a_folder_of_another_comparison_is_refused(screen_dataset: Path, tmp_pat
     out = tmp_path / "out"
     out.mkdir()
     (out / "settings.json").write_text(json.dumps({"image_passes": "7"}))
-    with pytest.raises(ValueError, match="holds a comparison with another batch, corpus, image_passes, seed, size_px"):
+    with pytest.raises(ValueError, match="holds a comparison with another batch, corpus, image_passes, seed, size_px, test"):
         compare_peers(order(screen_dataset, tmp_path), out, print)
     (out / "settings.json").write_text("[1]")
     with pytest.raises(ValueError, match=r"settings\.json: must hold the settings of a comparison, got list"):
