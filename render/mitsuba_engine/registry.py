@@ -15,7 +15,8 @@ def reserve_numbers() -> Any:
 
     Calls into scenes compile how many numbers there are into their kernels, as the distance between tables. Free
     numbers are given again, and the count falls only when the highest one is free. So kernels stay as they are while
-    scenes of other drogues, paints and bystanders come and go; else each new scene would compile all of them anew.
+    scenes with other drogues and bystanders of the same kinds of paint come and go; else each new scene would compile
+    all of them anew.
 
     Returns:
         The shape with the highest number, to be kept for as long as there are scenes.

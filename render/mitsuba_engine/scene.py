@@ -32,7 +32,8 @@ from render.surfaces import (
 )
 from scenes.surroundings import Surroundings
 
-_KEPT_SCENES = 8
+# Scenes that an engine keeps; building one takes longer than tracing a frame.
+KEPT_SCENES = 8
 _BYSTANDER_PARTS = (Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
 
 # Mitsuba's map has +y up, its first column looks along -z and the next ones turn towards +x; ours starts in the east
@@ -209,7 +210,7 @@ class SceneCache:
         key = _scene_key(frame)
         scene = self._scenes.pop(key, None) or DrogueScene(frame)
         self._scenes[key] = scene
-        if len(self._scenes) > _KEPT_SCENES:
+        if len(self._scenes) > KEPT_SCENES:
             self._scenes.popitem(last=False)
         scene.set_frame(frame, around)
         return scene
