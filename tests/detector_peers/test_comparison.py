@@ -161,7 +161,9 @@ def test_a_folder_of_another_comparison_is_refused(screen_dataset: Path, tmp_pat
     out = tmp_path / "out"
     out.mkdir()
     (out / "settings.json").write_text(json.dumps({"image_passes": "7"}))
-    with pytest.raises(ValueError, match="holds a comparison with another batch, corpus, image_passes, seed, size_px, test"):
+    with pytest.raises(
+        ValueError, match="holds a comparison with another batch, corpus, image_passes, seed, size_px, test"
+    ):
         compare_peers(order(screen_dataset, tmp_path), out, print)
     (out / "settings.json").write_text("[1]")
     with pytest.raises(ValueError, match=r"settings\.json: must hold the settings of a comparison, got list"):
