@@ -24,6 +24,8 @@ _LEAST_DARK_SHARE = 0.05
 SECTORS = 8
 # Of an outline; twice as many as the fit of an ellipse follows leave enough to tell.
 _PIECES = 16
+# Outlines that are as restless as their pixels tell, beside those of the frame: few pieces know the factor badly.
+_PRIOR_PIECES = 8.0
 _STEEP_SHARE = 0.03
 _TINY = 1e-12
 # Deviation of a centre of which a linear fit tells half the variance.
@@ -139,11 +141,11 @@ def residual_spread(
 
 
 def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array32) -> float:
-    """How much more the outlines of a frame move about, piece by piece, than uncorrelated noise lets them.
+    """Variance with which the outlines of a frame move about, piece by piece, over what their pixels' noise tells.
 
     Noise that a lens has spread over neighbouring pixels, as that of a renderer, is stronger along an outline than
-    pixel by pixel. Every piece's own shift, against what its pixels' variances and the fit's freedom lead one to
-    expect, tells.
+    pixel by pixel; what lies beside narrow faces passes for noise of the pixels and does not move an outline. Every
+    piece's own shift, against what its pixels' variances and the fit's freedom lead one to expect, tells.
 
     Args:
         fit: of N outlines; its first two parameters are the centre.
@@ -151,7 +153,7 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
         x_px, y_px: (N, K) places about the centres.
 
     Returns:
-        Factor in the variance of the frame's outlines, 1 or more.
+        Factor in the variance of the frame's outlines.
     """
     # Along the outline the derivative by the centre is as steep as the edge; elsewhere no pixel tells of its place.
     sums = np.zeros((len(weights), _PIECES, 2 + fit.jacobian.shape[1]))
@@ -161,7 +163,7 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
     found = (shift**2 / alone).sum(axis=1)
     expected = np.maximum((1 - swallowed / alone).sum(axis=1), 1.0)
     usual = found / expected <= _ODD_FACTOR * np.median(found / expected)
-    return max(1.0, float(found[usual].sum() / expected[usual].sum()))
+    return float((found[usual].sum() + _PRIOR_PIECES) / (expected[usual].sum() + _PRIOR_PIECES))
 
 
 def beyond_linear(cov_px2: Array) -> Array:

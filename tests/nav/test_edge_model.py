@@ -40,6 +40,26 @@ def test_error_reaches_the_bound_and_the_covariance_tells_it(light, z_m):
     assert np.mean(radial) == pytest.approx(-(START_WIDTH_PX**2) / (2 * radius), abs=0.02)
 
 
+@pytest.mark.parametrize("radius_px", [5.0, 10.0])
+def test_what_lies_beside_discs_does_not_widen_their_covariance(radius_px):
+    rng = np.random.default_rng([6, round(radius_px)])
+
+    def rough_beside(lit, x, y, _):
+        # Three times the noise of a pixel, from where hardly any light of the disc comes.
+        return lit + 150 * rng.standard_normal(lit.shape) * (np.hypot(x, y) > radius_px + 1.5)
+
+    squares = []
+    for _ in range(16):
+        signals, truth = draw_discs(radius_px, DAY, rng, spoil=rough_beside)
+        spoilt = truth.take(np.flatnonzero(truth.eyes == 0))
+        fits = fit_discs(signals, rough_start(spoilt, rng))
+        assert fits.accepted.all(), fits.reasons
+        error = fits.ellipses.centers_px - spoilt.centers_px
+        squares.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.cov_px2), error) / 2)
+    # Chi-square of 256: standard deviation of the mean square 0.088. By the noise of pixels alone it would be 0.4.
+    assert 0.7 < np.mean(squares) < 1.3
+
+
 @pytest.mark.parametrize("z_m", [2, 5, 10])
 def test_shading_moves_grey_centroids_but_not_the_fit(z_m):
     radius, rng = 2133.333 * 0.05 / z_m, np.random.default_rng(6)
