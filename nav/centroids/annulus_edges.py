@@ -49,6 +49,8 @@ _SHADOW_FACTOR = 3.0
 # Mean square of a sector's summed noise that one even annulus in six exceeds. In little light noise hides most of what
 # a shadow leaves in the residuals, and none of what it does to the centre: a higher limit would overlook it.
 _EVEN_SECTOR_CHI2 = 1.35
+# Share of a pixel's light that comes from the annulus where it lies beside it.
+_BESIDE = 0.03
 _LEAST_CONTRAST_SIGMA = 4.0
 # So much of the annulus must be lit: less does not tell where its middle is.
 _LEAST_LIT_FRACTION = 0.5
@@ -134,14 +136,18 @@ def fit_annuli(
         first = _first_fit(pixels, (turns, beyond), start, thin)
     ties = tied_to_pose(start, thin)
     model = in_free_parameters(annulus_model(pixels, turns, beyond), start, ties)
-    final, weights = _weighted_fit(pixels, turns, (start, ties), model, first)
+    final, weights, edge_factor = _weighted_fit(pixels, turns, (start, ties), model, first)
     parameters = all_parameters(start, ties, final)
     between, light = shares_of(final, ties)[0], light_above(parameters, turns)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
-    spread = residual_spread(final.residuals, weights, pixels, _SECTORS, contrast, final.parameters.shape[1])
-    inflation = 1 + _SHADOW_FACTOR * np.maximum(spread.sector_chi2 - _EVEN_SECTOR_CHI2, 0)
+    uneven = _sector_chi2(final, weights, pixels, contrast)
+    if edge_factor < 1:
+        # What lies beside the annulus drowns what is on it.
+        judged = weights * (between > _BESIDE) / np.float32(edge_factor)
+        uneven = np.maximum(uneven, _sector_chi2(final, judged, pixels, contrast))
+    inflation = 1 + _SHADOW_FACTOR * np.maximum(uneven - _EVEN_SECTOR_CHI2, 0)
     # The first two free parameters are the common shift.
-    cov = beyond_linear(final.covariance()[:, :2, :2] * inflation[:, None, None])
+    cov = beyond_linear(final.covariance()[:, :2, :2] * edge_factor * inflation[:, None, None])
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
@@ -159,8 +165,8 @@ def _first_fit(pixels: PixelSet, light: tuple[Array32, Array32], start: Array, t
 
 def _weighted_fit(
     pixels: PixelSet, turns: Array32, shape: tuple[Array, Array], model: Model, first: Minimum
-) -> tuple[Minimum, Array32]:
-    """The fit of inverse variances, with the pixels' response, and the weights.
+) -> tuple[Minimum, Array32, float]:
+    """The fit of inverse variances, with the pixels' response, the weights, and the factor of `NoiseModel` in them.
 
     The noise is the annuli's own: what lies around them is lighter than a marker's face, and so noisier.
 
@@ -181,7 +187,12 @@ def _weighted_fit(
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
     noise = measure_noise(first.residuals**2 / (1 - leverages), pixels.present, between, contrast)
     weights = pixels.present / noise.variances(between, light)
-    return minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX), weights
+    final = minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
+    return final, weights, noise.edge_factor
+
+
+def _sector_chi2(fit: Minimum, weights: Array32, pixels: PixelSet, contrast: Array) -> Array:
+    return residual_spread(fit.residuals, weights, pixels, _SECTORS, contrast, fit.parameters.shape[1]).sector_chi2
 
 
 def _unevenness(parameters: Array) -> float:

@@ -46,11 +46,14 @@ class NoiseModel:
         dark_dn2: beside the markers.
         per_signal_dn: shot noise: growth with the signal above the background.
         edge_share2: further variance on an edge, in squared steps of light (render noise, unevenness of the pixels).
+        edge_factor: what edges vary over what the others say of them, at most 1: things that lie beside an outline pass
+            for noise there.
     """
 
     dark_dn2: float
     per_signal_dn: float
     edge_share2: float
+    edge_factor: float = 1.0
 
     def variances(self, inside: Array32, contrast: Array32) -> Array32:
         """Variances where the share `inside` of the light comes from `contrast` above the background. [DN^2]"""
@@ -78,8 +81,10 @@ def measure_noise(squares: Array32, present: Array32, inside: Array32, contrast:
     dark = max(dark, _LEAST_DARK_SHARE * bright, _QUANTISATION_DN2)
     bright = max(bright, dark)
     mean_shape = 0.83  # of 4 S (1 - S) over the edge's zone
-    further = max(0.0, edge - (dark + bright) / 2) / mean_shape
-    return NoiseModel(dark, (bright - dark) / max(level, 1e-6), further / max(level, 1e-6) ** 2)
+    usual_edge = (dark + bright) / 2
+    further = max(0.0, edge - usual_edge) / mean_shape
+    factor = min(edge / usual_edge, 1.0)
+    return NoiseModel(dark, (bright - dark) / max(level, 1e-6), further / max(level, 1e-6) ** 2, factor)
 
 
 @dataclass(frozen=True, eq=False)
