@@ -83,8 +83,9 @@ def measure_noise(squares: Array32, present: Array32, inside: Array32, contrast:
     mean_shape = 0.83  # of 4 S (1 - S) over the edge's zone
     usual_edge = (dark + bright) / 2
     further = max(0.0, edge - usual_edge) / mean_shape
-    factor = min(edge / usual_edge, 1.0)
-    return NoiseModel(dark, (bright - dark) / max(level, 1e-6), further / max(level, 1e-6) ** 2, factor)
+    # One pixel more, as noisy as the others tell: without an edge's pixels they are all there is.
+    factor = min((totals[1] / usual_edge + 1) / (counts[1] + 1), 1.0)
+    return NoiseModel(dark, (bright - dark) / max(level, 1e-6), further / max(level, 1e-6) ** 2, float(factor))
 
 
 @dataclass(frozen=True, eq=False)
