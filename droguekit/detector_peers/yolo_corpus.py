@@ -18,7 +18,7 @@ SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
 
 
 def check_corpus(corpus: Path, test: Path) -> None:
-    """Refuse a corpus that cannot be trained on, and a test dataset that would be scored on what was trained on.
+    """Refuse datasets without pairs to train on, to choose by or to score.
 
     Args:
         corpus: needs pairs to train on and to choose by.

@@ -32,7 +32,7 @@ from render.surfaces import (
 )
 from scenes.surroundings import Surroundings
 
-# Scenes that an engine keeps; building one takes longer than tracing a frame.
+# Scenes that an engine keeps; the one that was used longest ago goes first.
 KEPT_SCENES = 8
 _BYSTANDER_PARTS = (Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
 

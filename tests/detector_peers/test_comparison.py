@@ -225,6 +225,17 @@ def test_what_is_trained_already_is_timed_and_scored_as_benchmark_scores_it(
     assert table["detectors"]["yolov8n"]["ap50"] == 0.0 < table["detectors"]["yolov8s"]["ap50"] < 1.0
 
 
+def test_scored_are_the_pairs_of_the_test_dataset(
+    screen_dataset: Path, smoke_dataset: Path, rows_network: Callable[..., Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    for name in PEERS:
+        rows_network(out / f"{name}.onnx", np.zeros((2, 5, 2), np.float32))
+    compare_peers(order(screen_dataset, tmp_path, test=smoke_dataset), out, lambda line: None)
+    scored = json.loads((out / "scores.json").read_text())["dataset"]
+    assert scored["sha256"] == Dataset(smoke_dataset).manifest.dataset_sha256
+
+
 def test_ablations_are_scored_like_everything_and_one_view_finds_the_same_boxes(
     screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
 ) -> None:
