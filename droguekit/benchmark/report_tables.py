@@ -41,6 +41,11 @@ class Table:
     first: str = "distance"
     second: str = "method"
 
+    @property
+    def row_count(self) -> int:
+        """Lines of all groups together."""
+        return sum(len(group.rows) for group in self.groups)
+
 
 def overall_table(result: BenchmarkResult) -> Table:
     """One row a method, over all distances."""

@@ -254,3 +254,21 @@ def test_numbers_for_readers() -> None:
     assert distance_text(1.7, 2.4) == "1.7–2.4 m"
     assert percent(0.9999) == "99.9 %"
     assert percent(1.0) == "100 %"
+
+
+def test_long_tables_are_folded_under_their_titles_and_short_ones_stand_open(
+    build: SimpleNamespace, dataset: DatasetFixture, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    folder, records = dataset
+    estimates = tmp_path / "estimates.jsonl"
+    write_estimates(estimates, build.estimates(records, {f"method-{k}": 1.0 for k in range(9)}, rng))
+    result = run_benchmark(folder, estimates)
+    write_report(folder, estimates, result, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    titles = re.findall(r"<summary>(.+?) <span>(\d+) rows</span></summary>", text)
+    rows = sum(len(method.bins) for method in result.methods.values())
+    assert ("Z, depth [mm]", str(rows)) in titles
+    folded = "".join(re.findall(r"<details>.*?</details>", text, re.DOTALL))
+    assert 'id="table-z" aria-label="Z, depth [mm]"' in folded
+    assert 'id="table-overall"' in text.replace(folded, "")
+    assert 'id="table-overall"' not in folded
