@@ -17,6 +17,9 @@ TITLES = {
     "yaw": "Yaw [deg]",
 }
 
+MOST_OPEN_ROWS = 24
+"""A table with more lines is folded: some hundred lines of numbers hide what comes after them."""
+
 
 @dataclass(frozen=True)
 class Group:
@@ -45,6 +48,11 @@ class Table:
     def row_count(self) -> int:
         """Lines of all groups together."""
         return sum(len(group.rows) for group in self.groups)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it would fill a screen, and is folded under its title."""
+        return self.row_count > MOST_OPEN_ROWS
 
 
 def overall_table(result: BenchmarkResult) -> Table:

@@ -270,5 +270,5 @@ def test_long_tables_are_folded_under_their_titles_and_short_ones_stand_open(
     assert ("Z, depth [mm]", str(rows)) in titles
     folded = "".join(re.findall(r"<details>.*?</details>", text, re.DOTALL))
     assert 'id="table-z" aria-label="Z, depth [mm]"' in folded
-    assert 'id="table-overall"' in text.replace(folded, "")
+    assert 'id="table-overall"' in text
     assert 'id="table-overall"' not in folded
