@@ -29,7 +29,7 @@ class TrainingOrder:
         changes: to both the file and the defaults.
         size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
         cache: folder for images at the network's size, or None for the training's own.
-        start_from: file of weights to start from, or None for random ones.
+        start_from: shipped detector or file of weights to start from, or None for random ones.
         workers: that render, as many as the machine holds when None.
     """
 
@@ -39,7 +39,7 @@ class TrainingOrder:
     size: str | None
     final_size: str | None
     cache: Path | None
-    start_from: Path | None
+    start_from: str | None
     workers: int | None
 
 

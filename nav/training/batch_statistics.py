@@ -8,9 +8,11 @@ Source: Wu and Johnson 2021, arXiv:2105.07576, section 3 ("precise batch normali
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from nav.training.answers import to_tensor, whole_image
 from nav.training.corpus import Corpus
@@ -32,22 +34,27 @@ def measure_batch_statistics(network: nn.Module, corpus: Corpus, size_px: SizePx
     """
     layers = [module for module in network.modules() if isinstance(module, nn.BatchNorm2d)]
     momenta = [layer.momentum for layer in layers]
-    members = [(int(pair), eye) for pair in corpus.split("train") for eye in (0, 1)]
-    # Evenly over all datasets and scenes.
-    chosen = np.linspace(0, len(members) - 1, min(_MOST_IMAGES, len(members))).astype(int)
-    batches = -(-len(chosen) // _BATCH_IMAGES)
     for layer in layers:
         layer.reset_running_stats()
         layer.momentum = None  # the plain mean over all batches
         layer.train()
     try:
-        # Each batch takes images from everywhere: the variance between scenes belongs to it.
-        for first in range(batches):
-            group = [members[i] for i in chosen[first::batches]]
-            images = np.stack([whole_image(corpus, pair, eye, size_px)[0] for pair, eye in group])
+        for images in statistics_batches(corpus, size_px, computing):
             with torch.inference_mode(), computing.autocast():
-                network(to_tensor(images, computing))
+                network(images)
     finally:
         for layer, momentum in zip(layers, momenta, strict=True):
             layer.momentum = momentum
             layer.eval()
+
+
+def statistics_batches(corpus: Corpus, size_px: SizePx, computing: Computing) -> Iterator[Tensor]:
+    """(B, 3, H, W) images of the split train, evenly over all datasets and scenes."""
+    members = [(int(pair), eye) for pair in corpus.split("train") for eye in (0, 1)]
+    chosen = np.linspace(0, len(members) - 1, min(_MOST_IMAGES, len(members))).astype(int)
+    batches = -(-len(chosen) // _BATCH_IMAGES)
+    # Each batch takes images from everywhere: the variance between scenes belongs to it.
+    for first in range(batches):
+        group = [members[i] for i in chosen[first::batches]]
+        images = np.stack([whole_image(corpus, pair, eye, size_px)[0] for pair, eye in group])
+        yield to_tensor(images, computing)

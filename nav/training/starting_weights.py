@@ -10,8 +10,13 @@ from typing import Any
 import torch
 from torch import nn
 
+from nav.detector.network.config import NetworkConfig
+from nav.detector.registry import network_file
 from nav.training.checkpoint import load
+from nav.training.onnx_import import import_onnx
 from nav.training.settings import TrainingSettings
+
+_ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training's folder"
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,11 +27,18 @@ class StartingWeights:
         path: the file.
         sha256: of its bytes.
         values: name and value of every parameter and running mean.
+        network: which one they are of; None where the file does not say.
     """
 
     path: Path
     sha256: str
     values: dict[str, torch.Tensor]
+    network: NetworkConfig | None = None
+
+    @property
+    def lack_statistics(self) -> bool:
+        """Whether they are an exported file's, to be followed by `nav.training.onnx_import.normalise_anew`."""
+        return self.network is not None
 
     def put_into(self, network: nn.Module) -> None:
         """Replace all weights of a network.
@@ -37,24 +49,46 @@ class StartingWeights:
         try:
             network.load_state_dict(self.values)
         except RuntimeError as error:
+            own = "" if self.network is None else f", {', '.join(self.network.to_dict().values())}"
             raise ValueError(
-                f"{self.path}: holds weights of another network; give variant, attention and fusion as in its training"
+                f"{self.path}: holds weights of another network{own}; "
+                "give variant, attention and fusion as in its training"
             ) from error
 
 
-def read_starting_weights(path: Path) -> StartingWeights:
-    """The weights in `best.pt` of a training's folder, or the averaged ones in its `checkpoint.pt`.
+def read_starting_weights(name_or_file: str) -> StartingWeights:
+    """The weights of a shipped network, in an exported `*.onnx`, or in a training's `best.pt`.
+
+    A `checkpoint.pt` will do as well, of which the averaged ones are taken.
 
     Raises:
         ValueError: missing, truncated, or a file of something else; names it.
     """
-    advice = "give best.pt from a training's folder"
-    content: dict[str, Any] | None = load(path, advice)
+    path = network_file(name_or_file)
+    return _from_checkpoint(Path(name_or_file)) if path is None else _from_onnx(path)
+
+
+def _from_onnx(path: Path) -> StartingWeights:
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: is missing; {_ADVICE}") from error
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        network = import_onnx(content)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; {_ADVICE}") from error
+    return StartingWeights(path, hashlib.sha256(content).hexdigest(), network.state_dict(), network.config)
+
+
+def _from_checkpoint(path: Path) -> StartingWeights:
+    content: dict[str, Any] | None = load(path, _ADVICE)
     if content is None:
-        raise ValueError(f"{path}: is missing; {advice}")
+        raise ValueError(f"{path}: is missing; {_ADVICE}")
     values = content.get("average", content.get("network"))
     if not isinstance(values, dict) or not all(isinstance(value, torch.Tensor) for value in values.values()):
-        raise ValueError(f"{path}: holds no weights; {advice}")
+        raise ValueError(f"{path}: holds no weights; {_ADVICE}")
     return StartingWeights(path, hashlib.sha256(path.read_bytes()).hexdigest(), values)
 
 

@@ -131,8 +131,8 @@ def _check_same(
 
 def restore_state(
     out: Path, state: TrainingState, settings: TrainingSettings, datasets: Sequence[DatasetStamp]
-) -> None:
-    """Put the state that `save_state` wrote into a new one; nothing happens where there is none.
+) -> bool:
+    """Put the state that `save_state` wrote into a new one; whether there was any.
 
     Raises:
         ValueError: a file that is truncated or of another version, or of other settings or datasets; names it and the
@@ -141,7 +141,7 @@ def restore_state(
     path = out / CHECKPOINT_FILE
     content = load(path)
     if content is None:
-        return
+        return False
     _check_same(path, content, settings, datasets)
     try:
         state.network.load_state_dict(content["network"])
@@ -152,3 +152,4 @@ def restore_state(
         state.best = content["best"]
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: does not fit this network; delete it, or train into another folder") from error
+    return True

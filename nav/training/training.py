@@ -17,11 +17,13 @@ from nav.detector.model_metadata import ModelMetadata
 from nav.detector.network.model import DetectorNetwork
 from nav.training.answers import Answers, answer
 from nav.training.average_precision import AveragePrecision, average_precision
-from nav.training.batch_statistics import measure_batch_statistics
+from nav.training.batch_statistics import measure_batch_statistics, statistics_batches
 from nav.training.checkpoint import BEST_FILE, load, remove_leftovers
 from nav.training.corpus import Corpus, open_corpus
+from nav.training.moving_average import MovingAverage
 from nav.training.observer import Observer
 from nav.training.onnx_export import export_onnx
+from nav.training.onnx_import import normalise_anew
 from nav.training.precision import Computing, open_computing, own_threads
 from nav.training.score_threshold import best_threshold
 from nav.training.settings import TrainingSettings
@@ -87,7 +89,9 @@ def train(
         size, threads = settings.largest_size_px, settings.loader_threads
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
         state = new_state(settings, computing, start)
-        restore_state(out, state, settings, corpus.datasets)
+        goes_on = restore_state(out, state, settings, corpus.datasets)
+        if start is not None and start.lack_statistics and not goes_on:
+            _measure_start(state, corpus, settings, computing)
         _load_best(out, state)
         write_text_atomic(out / SETTINGS_FILE, json.dumps(settings.model_dump(mode="json"), indent=1) + "\n")
         observer.say(_summary(corpus, settings, computing, state))
@@ -126,6 +130,13 @@ def _locked(out: Path) -> Iterator[None]:
                 f"{out}: another training is at work in it; wait for its end, or give another folder"
             ) from error
         yield
+
+
+def _measure_start(state: TrainingState, corpus: Corpus, settings: TrainingSettings, computing: Computing) -> None:
+    """Normalisation for weights of an exported file, before the first step."""
+    exact = Computing(computing.device, bf16=False)
+    normalise_anew(state.network, statistics_batches(corpus, settings.size_at(0), exact))
+    state.average = MovingAverage(state.network, settings.ema_decay)
 
 
 def _summary(corpus: Corpus, settings: TrainingSettings, computing: Computing, state: TrainingState) -> str:

@@ -1,0 +1,162 @@
+"""A network file that droguekit exported, back to weights that can learn on.
+
+An exported file has batch normalisation folded into the convolutions (`nav.training.onnx_export`). Each gets a
+normalisation back that answers as the file does, and then one that does so for the batches of a training too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import onnx
+import torch
+from google.protobuf.message import DecodeError
+from onnx import numpy_helper
+from torch import Tensor, nn
+
+from nav.detector.maps import SIZE_STEP_PX
+from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
+from nav.detector.network.config import NetworkConfig
+from nav.detector.network.model import DetectorNetwork
+
+Convolution = nn.Conv1d | nn.Conv2d
+
+# Kaiming's draw for a fan-in n has filters of norm sqrt(n * 2/n). A step of AdamW changes a weight by the learning
+# rate, so that filters of this norm learn as quickly as new ones.
+_FILTER_NORM = 2**0.5
+
+
+def import_onnx(content: bytes) -> DetectorNetwork:
+    """The network in a file, in evaluation mode, answering what the file answers.
+
+    Its normalisation leaves what it is given but for an offset, so that it must not train before `normalise_anew`.
+
+    Raises:
+        ValueError: not a whole ONNX file, or none that droguekit exported; says what is wrong.
+    """
+    try:
+        model = onnx.load_from_string(content)
+    except DecodeError as error:
+        raise ValueError("is truncated or no ONNX file") from error
+    text = {entry.key: entry.value for entry in model.metadata_props}.get(METADATA_KEY, "{}")
+    stated = ModelMetadata.from_json(text).network
+    if not stated:
+        raise ValueError("does not say which of droguekit's networks it is")
+    network = DetectorNetwork(NetworkConfig.from_dict(stated)).eval()
+    arrays = {each.name: each for each in model.graph.initializer}
+    for node in model.graph.node:
+        # The exporter writes equal values once.
+        if node.op_type == "Identity" and node.input[0] in arrays:
+            arrays[node.output[0]] = arrays[node.input[0]]
+    nodes = [node for node in model.graph.node if node.op_type == "Conv"]
+    layers = list(_normalised_convolutions(network))
+    try:
+        # The file's order is that in which they run; strict, for another number of them is another network.
+        for node, (convolution, norm) in zip(nodes, layers, strict=True):
+            values = [torch.tensor(numpy_helper.to_array(arrays[name])) for name in node.input[1:]]
+            _put_into(convolution, norm, *values)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError("does not have the layers of the network that it says it is") from error
+    with torch.no_grad():
+        network.backbone.first_weights.div_(network.gain)
+    return network
+
+
+def normalise_anew(network: DetectorNetwork, batches: Iterable[Tensor]) -> None:
+    """Let batch normalisation work on what the convolutions give, without a change of any answer.
+
+    Means and variances become those over the images; scales and offsets undo them. Filters get the length of new ones.
+
+    Args:
+        network: of `import_onnx`; its mode is left as it is.
+        batches: (B, 3, H, W) each, as for `DetectorNetwork.forward`.
+    """
+    layers = [(convolution, norm) for convolution, norm in _normalised_convolutions(network) if norm is not None]
+    sums = {norm: torch.zeros(2, norm.num_features, dtype=torch.float64) for _, norm in layers}
+
+    def add(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        values = inputs[0].detach().double().cpu()
+        assert isinstance(norm, nn.BatchNorm2d)
+        sums[norm] += torch.stack((values.mean((0, 2, 3)), values.square().mean((0, 2, 3))))
+
+    hooks = [norm.register_forward_pre_hook(add) for _, norm in layers]
+    was_training, count = network.training, 0
+    network.eval()
+    try:
+        with torch.inference_mode():
+            for images in batches:
+                network(images)
+                count += 1
+    finally:
+        network.train(was_training)
+        for hook in hooks:
+            hook.remove()
+    for convolution, norm in layers:
+        mean, square = sums[norm] / max(count, 1)
+        _give_statistics(convolution, norm, mean, (square - mean.square()).clamp(min=0))
+
+
+@torch.no_grad()
+def _give_statistics(convolution: Convolution, norm: nn.BatchNorm2d, mean: Tensor, variance: Tensor) -> None:
+    """Of what the convolution gives; the norm's own mean is 0 and its scale undoes its variance until now."""
+    assert norm.running_mean is not None and norm.running_var is not None
+    lengths = convolution.weight.flatten(1).norm(dim=1).double().cpu() / _FILTER_NORM
+    # A filter that is zero stays so.
+    lengths[lengths == 0] = 1
+    offset = norm.bias.double().cpu() + mean
+    convolution.weight.div_(lengths.to(convolution.weight).reshape(-1, *[1] * (convolution.weight.ndim - 1)))
+    norm.running_mean.copy_(mean / lengths)
+    norm.running_var.copy_(variance / lengths**2)
+    norm.weight.copy_(lengths * (variance / lengths**2 + norm.eps).sqrt())
+    norm.bias.copy_(offset)
+
+
+@torch.no_grad()
+def _put_into(
+    convolution: Convolution, norm: nn.BatchNorm2d | None, weight: Tensor, bias: Tensor | None = None
+) -> None:
+    """A file's convolution; its bias into the normalisation where there is one, which otherwise changes nothing."""
+    _copy(convolution.weight, weight)
+    if norm is None:
+        own = convolution.bias
+        if (own is None) != (bias is None):
+            raise ValueError("one of the two has a bias")
+        if own is not None and bias is not None:
+            _copy(own, bias)
+        return
+    assert norm.running_mean is not None and norm.running_var is not None
+    if bias is None:
+        raise ValueError("normalisation is not folded")
+    _copy(norm.bias, bias)
+    norm.running_mean.zero_()
+    norm.running_var.fill_(1)
+    norm.weight.fill_((1 + norm.eps) ** 0.5)
+
+
+def _copy(to: Tensor, values: Tensor) -> None:
+    if to.shape != values.shape:
+        raise ValueError(f"must be {tuple(to.shape)}, got {tuple(values.shape)}")
+    to.copy_(values)
+
+
+def _normalised_convolutions(network: DetectorNetwork) -> Iterator[tuple[Convolution, nn.BatchNorm2d | None]]:
+    """All convolutions in the order in which they run, each with the normalisation that follows it at once, if any."""
+    run: list[nn.Module] = []
+    kinds = (nn.Conv1d, nn.Conv2d, nn.BatchNorm2d)
+    hooks = [
+        module.register_forward_pre_hook(lambda module, _: run.append(module))
+        for module in network.modules()
+        if isinstance(module, kinds)
+    ]
+    was_training = network.training
+    network.eval()
+    try:
+        with torch.inference_mode():
+            network(torch.zeros(1, 3, SIZE_STEP_PX, SIZE_STEP_PX, device=network.backbone.first_weights.device))
+    finally:
+        network.train(was_training)
+        for hook in hooks:
+            hook.remove()
+    for module, following in zip(run, [*run[1:], None], strict=True):
+        if isinstance(module, nn.Conv1d | nn.Conv2d):
+            yield module, following if isinstance(following, nn.BatchNorm2d) else None
