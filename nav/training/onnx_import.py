@@ -10,7 +10,6 @@ from collections.abc import Iterable, Iterator
 
 import onnx
 import torch
-from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 from torch import Tensor, nn
 
@@ -36,7 +35,7 @@ def import_onnx(content: bytes) -> DetectorNetwork:
     """
     try:
         model = onnx.load_from_string(content)
-    except DecodeError as error:
+    except Exception as error:  # protobuf's faults differ by its implementation
         raise ValueError("is truncated or no ONNX file") from error
     text = {entry.key: entry.value for entry in model.metadata_props}.get(METADATA_KEY, "{}")
     stated = ModelMetadata.from_json(text).network
