@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import shutil
@@ -14,6 +13,7 @@ from typing import Any, TextIO
 
 from datasets_manifest import layout
 from datasets_manifest.frame_store import FrameStore
+from datasets_manifest.locking import takes_lock
 from datasets_manifest.manifest import Manifest, build_manifest, read_manifest, write_manifest
 from datasets_manifest.packing import check_pairs_per_tar, choose_packing, mend_shards, pack_all
 from datasets_manifest.recipe import Recipe
@@ -123,11 +123,8 @@ def _refuse_foreign(out: Location) -> None:
 
 
 def _lock(events: TextIO, out: Path) -> None:
-    """The kernel frees this lock when the process ends, however it ends."""
-    try:
-        fcntl.flock(events, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise ValueError(f"{out}: another run is writing into it; wait for its end, or give another folder") from error
+    if not takes_lock(events):
+        raise ValueError(f"{out}: another run is writing into it; wait for its end, or give another folder")
 
 
 def _start(out: Location, recipe: Recipe, recipe_text: str) -> None:

@@ -6,7 +6,6 @@ data are scripts, which hand over what is in them.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,6 +18,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from datasets_manifest.atomic import PART_SUFFIX, write_text_atomic
+from datasets_manifest.locking import takes_lock
 from droguekit.browse.conditions import LIGHTS
 from droguekit.browse.drogue_rings import Ring
 from droguekit.browse.frame_entry import rings_name
@@ -57,15 +57,13 @@ def opened_page(out: Path) -> Iterator[None]:
         try:
             out.mkdir(parents=True, exist_ok=True)
             mark = stack.enter_context((out / MARK_FILE).open("a", encoding="utf-8"))
-            # The kernel frees this lock when the process ends, however it ends.
-            fcntl.flock(mark, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not takes_lock(mark):
+                raise ValueError(f"{out}: another run is writing into it; wait for its end, or name another one")
             if not mark.tell():
                 mark.write(_MARK)
                 mark.flush()
             for folder in folders:
                 folder.mkdir(exist_ok=True)
-        except BlockingIOError as error:
-            raise ValueError(f"{out}: another run is writing into it; wait for its end, or name another one") from error
         except OSError as error:
             raise OSError(error.errno, f"{out}: cannot be written: {error.strerror or error}") from error
         yield

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.blind import BlindDataset
+from datasets_manifest.locking import takes_lock
 from datasets_manifest.reader import Dataset
 from droguekit.benchmark.detection_boxes import write_detections
 from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
@@ -84,14 +86,18 @@ def compare_peers(order: PeerOrder, out: Path, say: Say) -> dict[str, Any]:
         By detector's name, its cost, times and scores.
 
     Raises:
-        ValueError: a wrong number, corpus or file, or a folder of another comparison.
+        ValueError: a wrong number, corpus or file, or a folder of another comparison or with another run at work in it.
         OSError: the peers' environment cannot be made, a training failed, or a file cannot be written.
     """
     # Whatever is wrong is said before hours of training.
     ours = _our_detectors(order)
     if order.image_passes:
         check_corpus(order.corpus, order.test)
-    _check_folder(order, out)
+    with _own_folder(order, out):
+        return _compare(order, out, ours, say)
+
+
+def _compare(order: PeerOrder, out: Path, ours: Mapping[str, Detector], say: Say) -> dict[str, Any]:
     networks = {name: _peer_network(order, out, name, say) for name in PEERS}
     detectors: dict[str, Detector] = {name: YoloDetector(file, order.threads) for name, file in networks.items()}
     detectors |= ours
@@ -178,8 +184,19 @@ def _our_detectors(order: PeerOrder) -> dict[str, Detector]:
     return detectors
 
 
+@contextmanager
+def _own_folder(order: PeerOrder, out: Path) -> Iterator[None]:
+    """Claim a new folder, or go on in the one of this comparison, if nobody else does."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / ".lock").open("a") as lock:
+        if not takes_lock(lock):
+            raise ValueError(f"{out}: another comparison is at work in it; wait for its end, or name another folder")
+        _check_folder(order, out)
+        yield
+
+
 def _check_folder(order: PeerOrder, out: Path) -> None:
-    """Refuse a folder of another comparison, and claim a new one."""
+    """Refuse a folder of another comparison, and write down what a new one is of."""
     settings = {name: str(value) for name, value in asdict(order).items() if name not in _FREE_TO_CHANGE}
     for name, dataset in (("corpus", order.corpus), ("test", order.test)):
         settings[name] = Dataset(dataset).manifest.dataset_sha256

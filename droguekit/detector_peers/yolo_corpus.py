@@ -18,14 +18,14 @@ SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
 
 
 def check_corpus(corpus: Path, test: Path) -> None:
-    """Refuse datasets without pairs to train on, to choose by or to score.
+    """Refuse datasets without pairs to train on, to choose by or to score, and two of the same scenes.
 
     Args:
         corpus: needs pairs to train on and to choose by.
         test: needs pairs to score; may be the corpus.
 
     Raises:
-        ValueError: a dataset cannot be read, or lacks a split.
+        ValueError: a dataset cannot be read or lacks a split, or two have the same seed, from which scenes follow.
     """
     needed: dict[Path, tuple[SplitName, ...]] = {corpus: ("train", "val")}
     needed[test] = (*needed.get(test, ()), "test")
@@ -33,6 +33,12 @@ def check_corpus(corpus: Path, test: Path) -> None:
         counts = Dataset(dataset).manifest.counts.by_split
         if not all(counts.get(split) for split in splits):
             raise ValueError(f"{dataset}: needs pairs in the splits {', '.join(splits)}, got {dict(counts)}")
+    seeds = {Dataset(dataset).manifest.recipe.seed for dataset in needed}
+    if len(seeds) < len(needed):
+        raise ValueError(
+            f"{test}: has scenes of {corpus}, for both have the seed {min(seeds)}; render one with another seed, "
+            "or leave --test away to score the corpus's own split"
+        )
 
 
 def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:

@@ -6,7 +6,6 @@ array that is mapped into memory, and `index.json`. Deleting it costs the time t
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -15,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.atomic import PART_SUFFIX, new_folder
 from datasets_manifest.json_types import FrozenModel
+from datasets_manifest.locking import takes_lock
 from datasets_manifest.manifest import SplitName
 from datasets_manifest.reader import Dataset
 from geometry.stereo import EYES
@@ -124,7 +124,7 @@ def _locked(folder: Path, observer: Observer, should_stop: Callable[[], bool]) -
     """Let others who want the same caches wait; the kernel frees the lock when the process ends, however it ends."""
     with (folder / _LOCK_FILE).open("a") as lock:
         said = False
-        while not _takes(lock):
+        while not takes_lock(lock):
             if not said:
                 observer.say(f"{folder}: waiting for another training that makes images there")
                 said = True
@@ -132,14 +132,6 @@ def _locked(folder: Path, observer: Observer, should_stop: Callable[[], bool]) -
                 raise KeyboardInterrupt
             time.sleep(_ASK_AGAIN_S)
         yield
-
-
-def _takes(lock: IO[str]) -> bool:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _read(place: Path, dataset: Dataset, size_px: SizePx) -> ImageCache | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.locking import takes_lock
 from datasets_manifest.manifest import SplitName
 from datasets_manifest.storage import Location
 from nav.detector.model_metadata import ModelMetadata
@@ -121,14 +121,9 @@ def _check_place(out: Path) -> None:
 
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """The kernel frees this lock when the process ends, however it ends."""
     with (out / _LOCK_FILE).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(
-                f"{out}: another training is at work in it; wait for its end, or give another folder"
-            ) from error
+        if not takes_lock(lock):
+            raise ValueError(f"{out}: another training is at work in it; wait for its end, or give another folder")
         yield
 
 

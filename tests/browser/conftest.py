@@ -7,7 +7,6 @@ the same process could start an event loop of its own.
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,8 @@ from typing import Any, Literal, NamedTuple
 
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, sync_playwright
+
+from droguekit.paper_report.print_pdf import NO_BROWSER, find_browser
 
 from .browsed_dataset import BrowsedDataset, browse_dataset
 
@@ -31,8 +32,6 @@ PATIENCE_MS = 180_000
 TEXT_CONTRAST = 4.5
 LARGE_TEXT_CONTRAST = 3.0
 LINE_CONTRAST = 3.0
-
-_CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 # Colours of everything that is read, each over what lies behind it. Backgrounds are blended from the page upwards.
 _CONTRASTS = """
@@ -225,9 +224,9 @@ def pdf_pages(path: Path) -> list[PrintedPage]:
 @pytest.fixture(scope="session")
 def chromium_path() -> str:
     """The installed browser."""
-    found = next((path for path in map(shutil.which, _CHROMIUM_NAMES) if path is not None), None)
+    found = find_browser()
     if found is None:
-        pytest.skip("no chromium on the search path: apt-get install chromium")
+        pytest.skip(NO_BROWSER)
     return found
 
 

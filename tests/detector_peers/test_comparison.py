@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -45,7 +47,7 @@ def screen_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     changed = text.replace('preset = "rgb-ideal"', 'preset = "rgb-ideal"\nencoding = "gamma"')
     changed = changed.replace("scenes = 2", "scenes = 3\nempty_fraction = 0.2").replace("train = 0.5", "train = 0.34")
     changed = changed.replace("val = 0.0", "val = 0.33").replace("test = 0.5", "test = 0.33")
-    changed = changed.replace("[render]", '[render]\nengine = "analytic"')
+    changed = changed.replace("[render]", '[render]\nengine = "analytic"').replace("seed = 1", "seed = 8")
     recipe = parse_recipe(changed)
     out = tmp_path_factory.mktemp("screen") / "dataset"
     with (out.parent / "log").open("w") as told:
@@ -120,6 +122,24 @@ def test_a_corpus_without_a_test_split_is_scored_on_another_dataset(
     with pytest.raises(ValueError, match="needs pairs in the splits train, val, got"):
         compare_peers(order(smoke_dataset, tmp_path, test=screen_dataset), tmp_path / "out", print)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_scenes_that_were_trained_on_are_not_scored(screen_dataset: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(screen_dataset, again)
+    with pytest.raises(ValueError, match=r"again: has scenes of .*, for both have the seed 8; render one of them"):
+        compare_peers(order(screen_dataset, tmp_path, test=again), tmp_path / "out", print)
+    assert list(tmp_path.iterdir()) == [again]
+
+
+def test_a_folder_in_which_another_comparison_is_at_work_is_refused(screen_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    with (out / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(ValueError, match="out: another comparison is at work in it; wait for its end"):
+            compare_peers(order(screen_dataset, tmp_path), out, print)
+    assert [file.name for file in out.iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize(
