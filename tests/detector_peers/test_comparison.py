@@ -127,7 +127,7 @@ def test_a_corpus_without_a_test_split_is_scored_on_another_dataset(
 def test_scenes_that_were_trained_on_are_not_scored(screen_dataset: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     shutil.copytree(screen_dataset, again)
-    with pytest.raises(ValueError, match=r"again: has scenes of .*, for both have the seed 8; render one of them"):
+    with pytest.raises(ValueError, match=r"again: has scenes of .*, for both have the seed 8; render one with"):
         compare_peers(order(screen_dataset, tmp_path, test=again), tmp_path / "out", print)
     assert list(tmp_path.iterdir()) == [again]
 
