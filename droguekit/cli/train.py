@@ -15,7 +15,7 @@ EXAMPLES = (
     "droguekit train detector-small --out out/detector   (renders the recipe first)",
     "droguekit train data/mine data/more --out out/mine --variant s --image-passes 20000 --size 320x416",
     "droguekit train data/mine --out out/mine --size 320x416 --final-size 480x640   (large images in the last half)",
-    "droguekit train data/mine --out out/mine --variant s --start-from mobile-s   (from the shipped weights)",
+    "droguekit train data/mine --out out/mine --start-from mobile-s --image-passes 8000   (from the shipped weights)",
     "droguekit train data/mine --out out/mine --settings mine.toml   (learning rate, batch, seed and so on)",
 )
 

@@ -78,17 +78,19 @@ def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> T
 
     sizes = {"size_px": order.size, "final_size_px": order.final_size}
     parsed = {name: parse_size(text) for name, text in sizes.items() if text is not None}
-    settings = build_settings(order.settings_file, {**order.changes, **parsed})
     missing = [name for name in _NEEDED if find_spec(name) is None]
     if missing:
         raise ValueError(f"train: {', '.join(missing)} is missing: pip install 'droguekit[train]'")
-    found = [_find(source) for source in order.sources]
     # Threads of torch that wait for each other by spinning lose most of their time where others use the cores too.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from nav.training.starting_weights import read_starting_weights
-    from nav.training.training import check_before, train
 
     start = None if order.start_from is None else read_starting_weights(order.start_from)
+    network = None if start is None or start.network is None else start.network.to_dict()
+    settings = build_settings(order.settings_file, {**order.changes, **parsed}, network)
+    found = [_find(source) for source in order.sources]
+    from nav.training.training import check_before, train
+
     # Rendering takes hours: what would stop the training afterwards is looked for first.
     if not any(not isinstance(each, _Recipe) or each.recipe.split.train > 0 for each in found):
         raise ValueError(f"{order.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -128,8 +129,15 @@ def parse_size(text: str) -> SizePx:
     return int(height), int(width)
 
 
-def build_settings(file: Path | None, changes: dict[str, Any]) -> TrainingSettings:
+def build_settings(
+    file: Path | None, changes: Mapping[str, Any], network: Mapping[str, Any] | None = None
+) -> TrainingSettings:
     """Settings from a TOML file, the defaults where it says nothing, and changes to both.
+
+    Args:
+        file: of the settings, or None.
+        changes: by the settings' names.
+        network: variant, attention and fusion where neither of the two names them.
 
     Raises:
         ValueError: no such file, not TOML, an unknown key or a wrong value; names the file.
@@ -143,7 +151,7 @@ def build_settings(file: Path | None, changes: dict[str, Any]) -> TrainingSettin
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{file}: is not TOML: {error}") from error
     try:
-        return TrainingSettings.model_validate({**table, **changes})
+        return TrainingSettings.model_validate({**(network or {}), **table, **changes})
     except ValidationError as error:
         where = f"{file}: " if file is not None else ""
         raise ValueError(f"{where}{explain(error)}") from error

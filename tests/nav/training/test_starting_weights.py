@@ -134,6 +134,13 @@ def test_a_training_starts_from_a_shipped_network(split_dataset: Path, tmp_path:
         check_before(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
 
 
+def test_settings_go_before_the_network_of_the_weights(tmp_path: Path) -> None:
+    file, shipped = tmp_path / "mine.toml", {"variant": "s", "attention": "se", "fusion": "concat"}
+    file.write_text('attention = "eca"\n')
+    settings = build_settings(file, {"fusion": "asff"}, shipped)
+    assert (settings.variant, settings.attention, settings.fusion) == ("s", "eca", "asff")
+
+
 def test_a_resumed_training_keeps_what_it_learned_and_not_its_start(split_dataset: Path, tmp_path: Path) -> None:
     start, settings = read_starting_weights("mobile-s"), build_settings(None, {**SMALL, "image_passes": 16})
     whole = train([split_dataset], tmp_path / "whole", settings, PlainProgress(io.StringIO()), start=start)

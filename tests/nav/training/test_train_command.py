@@ -68,6 +68,9 @@ def test_nothing_is_rendered_for_a_training_that_cannot_be(
         ([".", "--image-passes", "0"], "image_passes:"),
         ([".", "--settings", "none.toml"], "none.toml: cannot be read"),
         (["nav", "--start-from", "none.pt"], "none.pt: is missing"),
+        # The network is that of the weights, and what comes next is wrong.
+        (["nav", "--start-from", "mobile-s"], "manifest.json: is missing"),
+        (["nav", "--start-from", "mobile-s", "--variant", "l"], "holds weights of another network, s, eca, asff;"),
         (["nav"], "manifest.json: is missing"),
     ],
 )
