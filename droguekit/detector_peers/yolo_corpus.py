@@ -29,11 +29,12 @@ def check_corpus(corpus: Path, test: Path) -> None:
     """
     needed: dict[Path, tuple[SplitName, ...]] = {corpus: ("train", "val")}
     needed[test] = (*needed.get(test, ()), "test")
+    manifests = {dataset: Dataset(dataset).manifest for dataset in needed}
     for dataset, splits in needed.items():
-        counts = Dataset(dataset).manifest.counts.by_split
+        counts = manifests[dataset].counts.by_split
         if not all(counts.get(split) for split in splits):
             raise ValueError(f"{dataset}: needs pairs in the splits {', '.join(splits)}, got {dict(counts)}")
-    seeds = {Dataset(dataset).manifest.recipe.seed for dataset in needed}
+    seeds = {manifest.recipe.seed for manifest in manifests.values()}
     if len(seeds) < len(needed):
         raise ValueError(
             f"{test}: has scenes of {corpus}, for both have the seed {min(seeds)}; render one with another seed, "

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 import onnx
 import torch
 from onnx import numpy_helper
+from onnx.external_data_helper import uses_external_data
 from torch import Tensor, nn
 
 from nav.detector.maps import SIZE_STEP_PX
@@ -42,6 +43,9 @@ def import_onnx(content: bytes) -> DetectorNetwork:
     if not stated:
         raise ValueError("does not say which of droguekit's networks it is")
     network = DetectorNetwork(NetworkConfig.from_dict(stated)).eval()
+    # A file of droguekit has its weights inside, and no file leads this program to others.
+    if any(uses_external_data(each) for each in model.graph.initializer):
+        raise ValueError("keeps its weights in other files")
     arrays = {each.name: each for each in model.graph.initializer}
     for node in model.graph.node:
         # The exporter writes equal values once.
