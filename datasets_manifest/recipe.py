@@ -59,7 +59,10 @@ class RenderSettings(FrozenModel):
         denoise: whether light that reaches a matt drogue, and what stands around it, by way of other surfaces is
             smoothed over each surface (engine mitsuba). Paths then start from pixel centres, `samples_per_px` where the
             smoothing is wide and up to `edge_samples_per_px` where the drogue is far away; insides take
-            `open_samples_per_px` rays, and edges the fewer the more pixels are inside.
+            `open_samples_per_px` rays, and edges 16 to `edge_samples_per_px` on average, fewer the more pixels are
+            inside, and more the larger their contrast.
+        noise_over_sensor: what edges aim at if `denoise` is set: the renderer's noise on the drogue over the sensor's
+            own. They take no more rays than that needs.
     """
 
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)
@@ -69,6 +72,7 @@ class RenderSettings(FrozenModel):
     surround_samples_per_px: int = Field(default=4, ge=1, le=65536)
     max_depth: int = Field(default=4, ge=2, le=64)
     denoise: bool = True
+    noise_over_sensor: float = Field(default=0.42, gt=0, le=100, exclude_if=lambda noise: noise == 0.42)
 
 
 class Outputs(FrozenModel):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ class TracedEye:
         pixel: (P,) flat indices of the traced pixels.
         radiance_cd_m2: (P, 3) light from parts alone, already weighted by coverage. [cd/m2]
         coverage: (P,) share of the pixel that parts cover.
+        nearest_m: (H, W) planar depth of the nearest part within two pixels, inf where there is none. [m]
     """
 
     part_id: NDArray[np.uint8]
@@ -33,10 +35,16 @@ class TracedEye:
     pixel: NDArray[np.int64]
     radiance_cd_m2: NDArray[np.float32]
     coverage: NDArray[np.float32]
+    nearest_m: NDArray[np.float32] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.nearest_m = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8))
 
     def lit_by(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> TracedEye:
         """The same passes with these pixels, and their (P, 4) radiance and coverage."""
-        return replace(self, pixel=pixel, radiance_cd_m2=light[:, :3], coverage=light[:, 3])
+        lit = copy(self)
+        lit.pixel, lit.radiance_cd_m2, lit.coverage = pixel, light[:, :3], light[:, 3]
+        return lit
 
     def put_behind_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Let the air between parts and camera take its share of their light and add its own, in place.
@@ -50,12 +58,15 @@ class TracedEye:
         Returns:
             (P, 1) the share of their light that is left.
         """
-        nearest = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[self.pixel]
-        clear = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))[:, None]
-        through = self.radiance_cd_m2 * clear + self.coverage[:, None] * (1.0 - clear) * air
-        self.radiance_cd_m2 = through.astype(np.float32)
-        share: NDArray[np.float32] = clear.astype(np.float32)
-        return share
+        clear = self.clear_share(self.pixel, optical_depth_per_m)
+        self.radiance_cd_m2 = self.radiance_cd_m2 * clear + self.coverage[:, None] * (1.0 - clear) * air
+        return clear
+
+    def clear_share(self, pixel: NDArray[np.int64], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(P, 1) share that the air leaves of the light of parts in pixels; see `put_behind_air`."""
+        nearest = self.nearest_m.reshape(-1)[pixel]
+        share: NDArray[np.float32] = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))
+        return share[:, None]
 
     def pixels_over(self, behind: NDArray[np.float32]) -> NDArray[np.float32]:
         """(P, 3) radiance of the traced pixels over the surroundings `behind` (H, W, 3)."""

@@ -70,7 +70,7 @@ class MitsubaEngine:
             empty = {eye: _empty_eye(behind[eye]) for eye in EYES}
             return StereoRadiance(empty["left"], empty["right"], self.name, self.version, 0.0, stage_s)
         around = surroundings(frame.environment)
-        traced = self._tracer.trace(frame, settings, around)
+        traced = self._tracer.trace(frame, settings, around, behind)
         stage_s |= traced.stage_s
         started = time.process_time()
         for eye in EYES:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -22,8 +23,8 @@ from render.mitsuba_engine.traced import Plan
 from scenes.seeding import generator
 from scenes.surroundings import Surroundings
 
-# Lanes of one launch: bounds memory (about 300 bytes a lane) without costing speed.
-_MOST_LANES = 2_000_000
+MOST_LANES = 2_000_000
+"""Lanes of one launch: bounds memory (about 300 bytes a lane) without costing speed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +75,30 @@ class FrameRays:
         """Pixels of a kind of both eyes' plans."""
         return np.concatenate([getattr(plans[eye], kind) + index * self.size for index, eye in enumerate(EYES)])
 
+    def spread(self, pixel: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P,) means of each pixel's own value, and of that and its neighbours' among the pixels."""
+        mean = np.empty(len(pixel))
+        for index in range(len(EYES)):
+            own = pixel // self.size == index
+            if own.any():
+                mean[own] = self._spread(pixel[own], values[own])
+        return mean
+
+    def _spread(self, pixel: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        row, column = np.divmod(pixel, self.width_px)
+        place = row - row.min(), column - column.min()
+        window = np.zeros((2, place[0].max() + 1, place[1].max() + 1))
+        window[(0, *place)], window[(1, *place)] = values, 1.0
+        total, number = (
+            cv2.boxFilter(plane, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)[place] for plane in window
+        )
+        # Running sums leave roundings of what they have passed.
+        mean: NDArray[np.float64] = (values + np.maximum(total, 0.0) / np.rint(number)) / 2
+        return mean
+
     def parts(self, pixel: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
         """The same pixels in as many pieces as launches of so many samples a pixel need."""
-        return np.split(pixel, range(max(_MOST_LANES // count, 1), len(pixel), max(_MOST_LANES // count, 1)))
+        return np.split(pixel, range(max(MOST_LANES // count, 1), len(pixel), max(MOST_LANES // count, 1)))
 
     def sampler(self, lanes: int, count: int) -> Any:
         """A sampler with a seed of its own, for `count` neighbouring lanes a pixel."""
@@ -87,6 +109,10 @@ class FrameRays:
         sampler.set_samples_per_wavefront(count)
         sampler.seed(int(self._seeds.integers(2**31)), lanes)
         return sampler
+
+    def bits(self, kinds: int, pixels: int) -> NDArray[np.uint32]:
+        """(kinds, pixels) random bits."""
+        return self._seeds.integers(2**32, size=(kinds, pixels), dtype=np.uint32)
 
     def through(self, pixel: Any, place: Any, moment: Any) -> Any:
         """Rays of either eye, whichever the pixels belong to; arguments as in `CameraRays.rays`."""

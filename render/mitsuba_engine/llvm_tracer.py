@@ -14,6 +14,7 @@ from datasets_manifest.recipe import RenderSettings
 from drogue_models.parts import Part
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.center_passes import CenterPasses
+from render.mitsuba_engine.in_picture import InPicture
 from render.mitsuba_engine.launches import FrameRays, Sampled
 from render.mitsuba_engine.path_launches import trace_paths
 from render.mitsuba_engine.registry import reserve_numbers
@@ -34,8 +35,14 @@ class LlvmTracer:
         self._last_number = reserve_numbers()
         self._scenes = SceneCache()
 
-    def trace(self, frame: FrameSpec, settings: RenderSettings, around: Surroundings) -> Traced:
-        """Passes and radiance of both eyes of a frame with a drogue."""
+    def trace(
+        self,
+        frame: FrameSpec,
+        settings: RenderSettings,
+        around: Surroundings,
+        behind: dict[Eye, NDArray[np.float32]],
+    ) -> Traced:
+        """Passes and radiance of both eyes of a frame, whose (H, W, 3) surroundings are `behind`."""
         stage_s: dict[str, float] = {}
         started = time.process_time()
         scene = self._scenes.scene_of(frame, around)
@@ -51,7 +58,7 @@ class LlvmTracer:
             plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)))
             eyes[eye] = passes.traced_eye(*seen[0])
         stage_s["passes"], started = time.process_time() - started, time.process_time()
-        found = _sampled(frame, settings, (scene, around), eyes, plans)
+        found = _sampled(settings, (scene, around), InPicture(frame, eyes, behind), plans)
         size = frame.rig.camera.width_px * frame.rig.camera.height_px
         traced = Traced(
             {eye: eyes[eye].lit_by(*_of_eye(index, size, found.pixel, found.light)) for index, eye in enumerate(EYES)},
@@ -75,14 +82,13 @@ def _of_eye(
 
 
 def _sampled(
-    frame: FrameSpec,
     settings: RenderSettings,
     stage: tuple[DrogueScene, Surroundings],
-    eyes: dict[Eye, TracedEye],
+    picture: InPicture,
     plans: dict[Eye, Plan],
 ) -> Sampled:
     """What samples say, smoothed where that is asked for; light on a drogue only if all of it is matt."""
-    scene, around = stage
+    (scene, around), frame, eyes = stage, picture.frame, picture.eyes
     centers = _centers(eyes, plans)
     matt = frame.drogue is not None and frame.drogue.satin is None
     smoothed = settings.denoise and matt and any(len(pixel) > 0 for pixel in centers.values())
@@ -93,7 +99,7 @@ def _sampled(
     if smoothed:
         assert frame.left_from_drogue is not None
         px_per_m = frame.rig.camera.fx_px / float(frame.left_from_drogue.translation_m[2])
-        found = SmoothedPaths(rays, settings, px_per_m, moves_px).trace(plans, centers)
+        found = SmoothedPaths(rays, settings, px_per_m, moves_px).trace(plans, centers, picture)
     else:
         found = trace_paths(rays, plans, settings)
     pixel, met = rays.of_both(plans, "surround"), np.concatenate([eyes[eye].part_id.reshape(-1) > 0 for eye in EYES])

@@ -42,7 +42,13 @@ class ScalarTracer:
         dr.set_thread_count(1)
         self._scenes = SceneCache()
 
-    def trace(self, frame: FrameSpec, settings: RenderSettings, around: Surroundings) -> Traced:
+    def trace(
+        self,
+        frame: FrameSpec,
+        settings: RenderSettings,
+        around: Surroundings,
+        behind: dict[Eye, NDArray[np.float32]],
+    ) -> Traced:
         """Passes and radiance of both eyes of a frame with a drogue."""
         stage_s = {"scene": 0.0, "passes": 0.0, "paths": 0.0}
         started = time.process_time()

@@ -42,7 +42,7 @@ def trace_around(
         if len(center):
             light = SurfaceLight(rays, center, _EVERY_PX + moves_px, _EVERY_PX)
             chosen = np.ones(len(center), dtype=np.bool_)
-            light.trace([(chosen, grid_count(count * _EVERY_PX**2 / 2))], SURROUND_DEPTH)
+            light.trace([(chosen, grid_count(count * _EVERY_PX**2 / 4))], SURROUND_DEPTH)
             light.smooth(chosen, _EVERY_PX * MOST_SMOOTHING_STEPS)
             return looked_up(rays, light, pixel, count, at_edges=True)[:, :4]
     return mean_light(rays, pixel, count, SURROUND_DEPTH).seen()

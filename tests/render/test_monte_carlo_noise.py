@@ -12,6 +12,9 @@ from scenes.sampler import sample_frame
 
 pytestmark = pytest.mark.mitsuba
 
+UNREACHABLE = {"noise_over_sensor": 1e-3}
+"""An aim for which all samples that are allowed are taken."""
+
 
 def test_stated_noise_is_the_difference_of_two_renders(engine, make_recipe):
     recipe = make_recipe(scale=0.5, stations_m=(2.5,))
@@ -33,7 +36,8 @@ def test_more_samples_leave_less_noise(engine, make_recipe):
     frame_recipe = make_recipe(scale=0.5, stations_m=(3.0,))
     frame = sample_frame(frame_recipe, 0)
     few_samples, many_samples = (
-        frame_recipe.render.model_copy(update={"samples_per_px": n, "edge_samples_per_px": 4 * n}) for n in (16, 64)
+        frame_recipe.render.model_copy(update={"samples_per_px": n, "edge_samples_per_px": 4 * n} | UNREACHABLE)
+        for n in (16, 64)
     )
     few, many = (engine.render(frame, settings) for settings in (few_samples, many_samples))
     # Independent samples would halve it; stratified ones do better, and 0.6 leaves room for the estimate's own noise.
@@ -45,3 +49,27 @@ def test_more_samples_leave_less_noise(engine, make_recipe):
     assert engine.render(longer, few_samples).monte_carlo_over_sensor_noise == pytest.approx(
         few.monte_carlo_over_sensor_noise * np.sqrt(10), rel=0.1
     )
+
+
+def test_edges_take_no_more_rays_than_the_aim_needs(engine, make_recipe):
+    recipe = make_recipe(scale=0.5, stations_m=(3.0,))
+    frame = sample_frame(recipe, 0)
+    plenty = recipe.render.model_copy(update={"edge_samples_per_px": 2048})
+    for aim in (0.35, 0.7):
+        stated = engine.render(
+            frame, plenty.model_copy(update={"noise_over_sensor": aim})
+        ).monte_carlo_over_sensor_noise
+        # A sixteenth of the pixels states it, and counts are powers of two.
+        assert stated == pytest.approx(aim, rel=0.25)
+
+
+def test_more_light_takes_more_rays(engine, make_recipe):
+    recipe = make_recipe(scale=0.5, stations_m=(3.0,))
+    frame = sample_frame(recipe, 0)
+    plenty = recipe.render.model_copy(update={"edge_samples_per_px": 2048, "noise_over_sensor": 0.7})
+    longer = frame.model_copy(
+        update={"exposure": frame.exposure.model_copy(update={"time_s": 3 * frame.exposure.time_s})}
+    )
+    # The light's own noise falls against the light, and the renderer's must too.
+    fractions = [engine.render(seen, plenty).monte_carlo_noise_fraction for seen in (frame, longer)]
+    assert fractions[1] == pytest.approx(fractions[0] / np.sqrt(3), rel=0.3)

@@ -1,0 +1,63 @@
+"""Light of parts as the picture shows it: behind the air before them and over the surroundings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.frame import FrameSpec
+from geometry.stereo import EYES, Eye
+from render.background import air_before
+from render.mitsuba_engine.traced import OF_DROGUE
+from render.traced import TracedEye
+
+
+@dataclass(frozen=True, eq=False)
+class InPicture:
+    """Both eyes of one frame; flat indices of the right eye come after all of the left.
+
+    Attributes:
+        frame: with its air.
+        eyes: passes at mid-exposure.
+        behind: (H, W, 3) surroundings of each eye. [cd/m2]
+    """
+
+    frame: FrameSpec
+    eyes: dict[Eye, TracedEye]
+    behind: dict[Eye, NDArray[np.float32]]
+
+    def radiance(
+        self, pixel: NDArray[np.int64], light: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(P, S, 3) radiance in the picture, and (P, 1) the share that the air leaves of parts' light.
+
+        Args:
+            pixel: (P,) flat indices.
+            light: (P, S, 4) radiance and coverage of parts alone, by some samples of each pixel.
+        """
+        shown, clear = np.empty((*light.shape[:2], 3), dtype=np.float32), np.empty((len(pixel), 1), dtype=np.float32)
+        for index, eye in enumerate(EYES):
+            own, own_pixel = self._own(index, pixel)
+            air, optical_depth_per_m = air_before(self.frame, own_pixel)
+            clear[own] = self.eyes[eye].clear_share(own_pixel, optical_depth_per_m)
+            behind = self.behind[eye].reshape(-1, 3)[own_pixel]
+            # What a sample shows if it meets a part, less what it shows if it meets none.
+            of_part = (1.0 - clear[own]) * air - behind
+            shown[own] = light[own, :, :3] * clear[own, None] + light[own, :, 3:] * of_part[:, None] + behind[:, None]
+        return shown, clear
+
+    def shows_drogue(self, pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(P,) whether the pixels' centres see the drogue."""
+        shows = np.zeros(len(pixel), dtype=np.bool_)
+        for index, eye in enumerate(EYES):
+            own, own_pixel = self._own(index, pixel)
+            shows[own] = OF_DROGUE[self.eyes[eye].part_id.reshape(-1)[own_pixel]] > 0
+        return shows
+
+    def _own(self, index: int, pixel: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """Which pixels are of an eye, and their indices in it."""
+        size = self.eyes[EYES[index]].part_id.size
+        own = pixel // size == index
+        return own, pixel[own] - index * size

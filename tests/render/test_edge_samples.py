@@ -1,0 +1,102 @@
+"""Rays of pixels with edges: how many, and where they go."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scenes.seeding import generator
+
+pytestmark = pytest.mark.mitsuba
+
+
+class Bits:
+    """Random bits as `FrameRays` gives them."""
+
+    def __init__(self, seed):
+        self._seeds = generator(seed, 0, "test")
+
+    def bits(self, kinds, pixels):
+        return self._seeds.integers(2**32, size=(kinds, pixels), dtype=np.uint32)
+
+
+@pytest.fixture
+def place(engine):
+    from render.mitsuba_engine.edge_samples import PlacedSamples
+
+    return PlacedSamples
+
+
+@pytest.fixture
+def counts_of(engine):
+    from render.mitsuba_engine.edge_samples import counts_by_variance
+
+    return counts_by_variance
+
+
+def of_pixel(samples, pixel):
+    rows = np.array(samples.pixel) == pixel
+    return np.array(samples.place).T[rows], np.array(samples.moment)[rows]
+
+
+@pytest.mark.parametrize("count", [16, 64, 1024])
+def test_every_rectangle_of_a_samples_size_has_one(place, count):
+    samples = place(Bits(1), np.array([7, 30]), np.array([32, count]))
+    places, _ = of_pixel(samples, 30)
+    for power in range(count.bit_length()):
+        columns, rows = 2**power, count // 2**power
+        cell = np.floor(places * (columns, rows)).astype(int)
+        assert len(np.unique(cell @ (1, columns))) == count
+
+
+def test_moments_are_even(place):
+    _, moments = of_pixel(place(Bits(2), np.array([3]), np.array([256])), 3)
+    # The golden ratio's steps leave gaps of at most some twice the mean.
+    assert np.diff(np.sort(moments), prepend=np.max(moments) - 1).max() < 3 / 256
+
+
+def test_means_are_those_of_each_pixel(place):
+    counts = np.array([16, 64, 16, 512])
+    samples = place(Bits(3), np.array([5, 9, 2, 40]), counts)
+    means = samples.means([samples.place.x * 1.0, samples.place.y * 1.0])
+    for row, pixel in enumerate((5, 9, 2, 40)):
+        assert means[row] == pytest.approx(of_pixel(samples, pixel)[0].mean(axis=0), rel=1e-5)
+
+
+def test_error_on_an_edge_goes_with_the_count_to_the_power_of_three_quarters(place):
+    rng = np.random.default_rng(4)
+    direction = rng.uniform(0, 2 * np.pi, 2000)
+    normal, through = np.stack([np.cos(direction), np.sin(direction)], axis=1), rng.uniform(0.2, 0.8, (2000, 2))
+    errors = []
+    for count in (16, 256):
+        samples = place(Bits(5), np.arange(2000), np.full(2000, count))
+        places = np.array(samples.place).T.reshape(2000, count, 2)
+        covered = (np.einsum("pci,pi->pc", places - through[:, None], normal) > 0).mean(axis=1)
+        errors.append(covered)
+    settled = place(Bits(6), np.arange(2000), np.full(2000, 1024))
+    places = np.array(settled.place).T.reshape(2000, 1024, 2)
+    truth = (np.einsum("pci,pi->pc", places - through[:, None], normal) > 0).mean(axis=1)
+    rms = [np.sqrt(np.mean((covered - truth) ** 2)) for covered in errors]
+    # 16 times the samples: an eighth of the error, and the settled picture's own error in the second.
+    assert rms[1] / rms[0] == pytest.approx(16**-0.75, rel=0.3)
+    # No side is preferred.
+    assert np.mean(errors[0] - truth) == pytest.approx(0.0, abs=4 * rms[0] / np.sqrt(2000))
+
+
+def test_counts_bring_the_error_that_is_allowed(counts_of):
+    variance = np.random.default_rng(7).lognormal(0.0, 2.0, 5000)
+    judged = np.arange(5000) % 2 == 0
+    counts = counts_of(variance, judged, 5.0, 1e9)
+    assert set(np.log2(counts) % 1) == {0.0}
+    # By the law of errors that the counts go by; rounding to powers of two and their bounds change it a little.
+    assert np.sum(0.7 * variance[judged] * counts[judged] ** -1.5) == pytest.approx(5.0, rel=0.3)
+
+
+def test_counts_stay_within_what_may_be_taken(counts_of):
+    variance = np.random.default_rng(8).lognormal(0.0, 1.0, 5000)
+    counts = counts_of(variance, np.ones(5000, dtype=bool), 1e-9, 100.0)
+    assert np.mean(counts) == pytest.approx(100.0, rel=0.1)
+
+
+def test_even_pixels_take_the_fewest_rays(counts_of):
+    assert set(counts_of(np.zeros(9), np.ones(9, dtype=bool), 1.0, 100.0)) == {16}
