@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -142,17 +143,19 @@ def worst_part(docking: DockingData, number: int) -> dict[str, object]:
     return {"anchor": f"worst-{number}", "method": method, "frames": frames}
 
 
-def failures(docking: DockingData) -> list[tuple[str, str, int]]:
-    """Method, reason and number of the pairs without a pose."""
-    return [
-        (contender.method, reason, count)
-        for contender in docking.contenders
-        for reason, count in failure_reasons(docking, contender.method)
-    ]
+def failures(docking: DockingData) -> tuple[list[str], list[tuple[str, list[int]]]] | None:
+    """Methods, and for each reason in how many pairs each gave no pose for it; None if all gave one in every pair."""
+    methods = [contender.method for contender in docking.contenders]
+    counts = [Counter(dict(failure_reasons(docking, method))) for method in methods]
+    total = sum(counts, Counter[str]())
+    return (methods, [(reason, [of[reason] for of in counts]) for reason, _ in total.most_common()]) if total else None
 
 
 def time_rows(docking: DockingData) -> list[list[str]]:
-    """Median time by method, without waiting and by stage, and percentiles of the latency, where they are told. [ms]"""
+    """Median time by method, without waiting and by stage, and percentiles of the latency, where they are told. [ms]
+
+    The share of the pairs stands behind stages that not all of those with times had.
+    """
     rows = []
     for contender in docking.contenders:
         estimates = docking.methods[contender.method].values()
@@ -165,9 +168,16 @@ def time_rows(docking: DockingData) -> list[list[str]]:
         work = [worked_s(estimate.stage_s) for estimate in estimates]
         totals = [1e3 * work_s for work_s in work if work_s is not None]
         if totals or told:
-            listed = ", ".join(f"{stage} {_median(times)}" for stage, times in stages.items())
+            timed = sum(bool(estimate.stage_s) for estimate in estimates)
+            listed = ", ".join(
+                f"{stage} {_median(times)}{_share(len(times), timed)}" for stage, times in stages.items()
+            )
             rows.append([contender.method, _median(totals), " / ".join(told) or ABSENT, listed or ABSENT])
     return rows
+
+
+def _share(pairs: int, of_pairs: int) -> str:
+    return "" if pairs == of_pairs else f" ({pairs / of_pairs:.0%})"
 
 
 def _median(values: Sequence[float]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -66,7 +67,10 @@ def worst_frames(docking: DockingData, method: str) -> list[WorstFrame]:
 
 
 def failure_reasons(docking: DockingData, method: str) -> list[tuple[str, int]]:
-    """Why a method gave no pose of a drogue, and how often; pairs that its file leaves out count too."""
+    """Why a method gave no pose of a drogue, and how often; pairs that its file leaves out count too.
+
+    Reasons that differ only in how many regions of an image were looked at are one.
+    """
     estimates = docking.methods[method]
     reasons: Counter[str] = Counter()
     for index in docking.records:
@@ -74,7 +78,7 @@ def failure_reasons(docking: DockingData, method: str) -> list[tuple[str, int]]:
         if estimate is None:
             reasons["not in the file"] += 1
         elif isinstance(estimate, NoFix):
-            reasons[estimate.reason] += 1
+            reasons[re.sub(r"among \d+ regions", "among the regions", estimate.reason)] += 1
     return reasons.most_common()
 
 

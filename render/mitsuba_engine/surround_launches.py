@@ -1,7 +1,7 @@
 """Hose, tanker and bystanders: rays to the first surfaces, and light of other surfaces from a coarse lattice.
 
 That light changes slowly on large parts. It is wanted for a picture without speckles and not to the per cent, so one
-centre in every few rows and columns takes the paths of all the pixels around it.
+centre in every few rows and columns takes the paths of half the pixels around it.
 """
 
 from __future__ import annotations

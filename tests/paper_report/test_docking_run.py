@@ -18,7 +18,7 @@ from droguekit.benchmark.number_text import ABSENT
 from droguekit.paper_report.claims import docking_claims
 from droguekit.paper_report.docking_run import read_docking
 from droguekit.paper_report.page_tables import docking_table
-from droguekit.paper_report.sections import time_rows
+from droguekit.paper_report.sections import failures, time_rows
 from droguekit.paper_report.worst_frames import clipped, failure_reasons, outlines_px, worst_frames
 
 WriteEstimates = Callable[..., Path]
@@ -92,6 +92,19 @@ def test_times_of_a_pair_leave_out_waiting(docking: Path, estimates_of: WriteEst
     assert row == ["paper", "6.00", ABSENT, "read 512, wait 256, handover 128, track 4.00, pose 2.00"]
 
 
+def test_times_say_in_how_many_pairs_a_stage_was_at_work(docking: Path, estimates_of: WriteEstimates) -> None:
+    path = estimates_of(docking, {"paper": OFFSETS["paper"]})
+    told = list(read_estimates(path))
+    asked = [
+        estimate.model_copy(update={"stage_s": {"pose": 0.002} | ({"detect": 0.05} if index == 0 else {})})
+        for index, estimate in enumerate(told[:4])
+    ]
+    # Pairs without times are none that a stage left out.
+    write_estimates(path, [*asked, *(estimate.model_copy(update={"stage_s": {}}) for estimate in told[4:])])
+    (row,) = time_rows(read_docking(docking, path))
+    assert row == ["paper", "2.00", ABSENT, "pose 2.00, detect 50.0 (25%)"]
+
+
 def test_a_file_without_any_contender_is_refused(docking: Path, estimates_of: WriteEstimates) -> None:
     with pytest.raises(ValueError, match="holds none of the methods joint-hub, paper"):
         read_docking(docking, estimates_of(docking, {"somebody-else": (0, 0, 0)}))
@@ -111,6 +124,20 @@ def test_the_worst_frames_come_first_and_failures_are_counted(docking: Path, est
     assert frames[0].frame_index == 449 and "5.00 mm off" in frames[0].caption
     assert len(frames) == 5
     assert failure_reasons(read, "joint-hub") == [("hidden by the test", 2), ("not in the file", 1)]
+
+
+def test_failures_stand_beside_each_other_by_method(docking: Path, estimates_of: WriteEstimates) -> None:
+    path = estimates_of(docking, OFFSETS, {"joint-hub": (1, 200, 449), "paper": (5,)})
+    text = path.read_text(encoding="utf-8")
+    for regions in (0, 12):
+        text = text.replace("hidden by the test", f"no ring among {regions} regions of the left image", 1)
+    path.write_text(text, encoding="utf-8")
+    read = read_docking(docking, path)
+    methods, rows = failures(read)
+    assert methods == ["joint-hub", "paper"]
+    # However many regions there were, it is one reason.
+    assert rows == [("hidden by the test", [2, 0]), ("no ring among the regions of the left image", [1, 1])]
+    assert failures(read_docking(docking, estimates_of(docking, OFFSETS))) is None
 
 
 def test_pictures_show_both_models(docking: Path, estimates_of: WriteEstimates) -> None:
