@@ -69,7 +69,16 @@ def lamp_radiance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
 
 def missing_parts(frame: FrameSpec) -> set[int]:
     """Part ids of the markers, and maybe the hub, that have come off."""
+    return {part for part in _features(frame) if surface_condition(frame, part).missing}
+
+
+def dirty_parts(frame: FrameSpec) -> set[int]:
+    """Part ids of the markers, and maybe the hub, whose paint dirt makes uneven."""
+    return {part for part in _features(frame) if not surface_condition(frame, part).is_clean}
+
+
+def _features(frame: FrameSpec) -> list[int]:
+    """Part ids of hub and markers, of a drogue that has a condition."""
     if frame.drogue is None or frame.condition is None:
-        return set()
-    features = [int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)]
-    return {part for part in features if surface_condition(frame, part).missing}
+        return []
+    return [int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)]

@@ -14,6 +14,7 @@ from drogue_models.solids import with_creases
 from render.blender_engine.messages import FrameSetup, Light, Look, PartMesh, StageThings
 from render.surfaces import (
     SMOOTH_PARTS,
+    dirty_parts,
     even_reflectance_rgb,
     lamp_radiance_rgb,
     missing_parts,
@@ -95,11 +96,8 @@ def _fixed_meshes(frame: FrameSpec) -> _Meshes:
 def _stage_key(frame: FrameSpec, moved: _Meshes) -> str:
     """Equal for frames that can share meshes and kinds of surface."""
     drogue = "" if frame.drogue is None else frame.drogue.model_dump_json()
-    count = 0 if frame.drogue is None else frame.drogue.marker_count
-    features = (int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + count))
-    dirty = [part for part in features if not surface_condition(frame, part).is_clean]
     sizes = [(name, part, len(mesh.vertices), len(mesh.faces)) for name, (part, mesh) in moved.items()]
-    return f"{drogue} {dirty} {sorted(missing_parts(frame))} {sizes}"
+    return f"{drogue} {sorted(dirty_parts(frame))} {sorted(missing_parts(frame))} {sizes}"
 
 
 def _front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.launches import MOST_LANES, FrameRays
 
-PILOT_COUNT = 4
+PILOT_COUNT = 9
 """Rays a pixel that tell how many it takes."""
 LEAST_COUNT, _MOST_COUNT = 16, 2048
 # Mean square error of n samples of these sequences on edges: this much of one sample's variance times n^-1.5.
@@ -54,9 +54,9 @@ def counts_by_variance(
 class PlacedSamples:
     """Places and moments of samples that differ in number from pixel to pixel: one kernel serves all numbers.
 
-    The first two numbers of Sobol's sequence, with their bits flipped at random for each pixel: any power of two of
-    them is stratified in every way that a pixel can be cut into equal rectangles of that number. Moments go round by
-    the golden ratio.
+    Places are the first two numbers of Sobol's sequence and moments the third, with their bits flipped at random for
+    each pixel: any power of two of them is stratified in every way that a pixel can be cut into equal rectangles of
+    that number.
 
     Source: I. M. Sobol', USSR Computational Mathematics and Mathematical Physics 7 (1967), 86,
     doi:10.1016/0041-5553(67)90144-9.
@@ -75,9 +75,9 @@ class PlacedSamples:
         self.pixel = of_row(pixel)
         self.place = mi.Point2f(
             _unit_interval(dr.brev(index) ^ of_row(flips[0])),
-            _unit_interval(_second_of_sobol(index) ^ of_row(flips[1])),
+            _unit_interval(_sobol(index, (1,)) ^ of_row(flips[1])),
         )
-        self.moment = _unit_interval(index * mi.UInt32(0x9E3779B9) + of_row(flips[2]))
+        self.moment = _unit_interval(_sobol(index, (1, 3)) ^ of_row(flips[2]))
 
     def means(self, channels: list[mi.Float]) -> NDArray[np.float32]:
         """(P, len(channels)) means over the samples of each pixel."""
@@ -97,12 +97,24 @@ def in_parts(pixel: NDArray[np.int64], counts: NDArray[np.int64]) -> Iterator[tu
             yield pixel[part], counts[part]
 
 
-def _second_of_sobol(index: mi.UInt32) -> mi.UInt32:
-    """The second number of Sobol's sequence as 32 bits behind the point, for indices below `_MOST_COUNT`."""
-    bits, direction = mi.UInt32(0), 1 << 31
+def _sobol(index: mi.UInt32, initial: tuple[int, ...]) -> mi.UInt32:
+    """One of the numbers of Sobol's sequence as 32 bits behind the point, for indices below `_MOST_COUNT`.
+
+    Args:
+        index: places in the sequence.
+        initial: first numbers of its recurrence, as many as its polynomial of coefficients 1 has degrees.
+    """
+    numbers = list(initial)
+    bits = mi.UInt32(0)
     for place in range(_MOST_COUNT.bit_length() - 1):
+        if place >= len(initial):
+            degree = len(initial)
+            number = numbers[-degree] << degree ^ numbers[-degree]
+            for back in range(1, degree):
+                number ^= numbers[-back] << back
+            numbers.append(number)
+        direction = numbers[place] << 31 - place
         bits ^= dr.select((index & (1 << place)) != 0, mi.UInt32(direction), 0)
-        direction ^= direction >> 1
     return bits
 
 

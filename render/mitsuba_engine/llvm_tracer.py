@@ -23,6 +23,7 @@ from render.mitsuba_engine.smoothed_launches import SmoothedPaths
 from render.mitsuba_engine.surround_launches import trace_around
 from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, Traced, plan_pixels
 from render.motion import blur_px
+from render.surfaces import dirty_parts
 from render.traced import TracedEye
 from scenes.surroundings import Surroundings
 
@@ -55,7 +56,7 @@ class LlvmTracer:
             passes = CenterPasses(frame, eye, scene)
             seen = [passes.part_ids(moment) for moment in times]
             sunlit = [passes.sunlit(ids, moment) for (ids, _), moment in zip(seen, times, strict=True)]
-            plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)))
+            plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), dirty_parts(frame))
             eyes[eye] = passes.traced_eye(*seen[0])
         stage_s["passes"], started = time.process_time() - started, time.process_time()
         found = _sampled(settings, (scene, around), InPicture(frame, eyes, behind), plans)

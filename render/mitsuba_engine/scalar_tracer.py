@@ -25,6 +25,7 @@ from render.mitsuba_engine.traced import (
     slipped_through,
 )
 from render.motion import blur_px, pose_polynomial
+from render.surfaces import dirty_parts
 from render.traced import TracedEye, amodal_counts
 from scenes.seeding import generator
 from scenes.surroundings import Surroundings
@@ -64,7 +65,9 @@ class ScalarTracer:
             seen = [view.passes(scene.scene, moment) for moment in moments]
             sunlit = [view.sunlit(scene, passes, moment) for (passes, moment) in zip(seen, moments, strict=True)]
             alone = view.passes(scene.features, 0.0)
-            plan = plan_pixels([part_id for part_id, _, _ in seen], sunlit, 1 + int(np.ceil(moves_px)))
+            plan = plan_pixels(
+                [part_id for part_id, _, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), dirty_parts(frame)
+            )
             stage_s["passes"], started = stage_s["passes"] + time.process_time() - started, time.process_time()
             slices = _MOVING_SLICES if moves_px >= 0.05 else 1
             halves = [_Half(view, scene, slices, seeds).light(plan, settings) for _ in range(2)]

@@ -24,11 +24,11 @@ from render.mitsuba_engine.jit_arrays import jit_array, jit_tensor
 from render.mitsuba_engine.shapes import bystander_name, bystander_shapes, drogue_shapes, front_faces
 from render.mitsuba_engine.sky_irradiance import as_mitsuba_reads
 from render.surfaces import (
+    dirty_parts,
     even_reflectance_rgb,
     lamp_radiance_rgb,
     missing_parts,
     reflectance_map,
-    surface_condition,
 )
 from scenes.surroundings import Surroundings
 
@@ -192,11 +192,9 @@ def _scene_key(frame: FrameSpec) -> str:
     """Equal for frames that can share a scene: same drogue, same topology and kinds of surface of all that is drawn."""
     drogue = "" if frame.drogue is None else frame.drogue.model_dump_json()
     nodes = 0 if frame.hose_nodes_left_m is None else len(frame.hose_nodes_left_m)
-    count = 0 if frame.drogue is None else frame.drogue.marker_count
-    features = (int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + count))
-    dirty = [part for part in features if not surface_condition(frame, part).is_clean]
     bystanders = [(bystander.kind, bystander.shape.form) for bystander in frame.bystanders]
-    return f"{drogue} {nodes} {frame.left_from_tanker is not None} {dirty} {sorted(missing_parts(frame))} {bystanders}"
+    paints = sorted(dirty_parts(frame)), sorted(missing_parts(frame))
+    return f"{drogue} {nodes} {frame.left_from_tanker is not None} {paints} {bystanders}"
 
 
 class SceneCache:

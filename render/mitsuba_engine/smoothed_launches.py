@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe import RenderSettings
 from geometry.stereo import Eye
-from render.mitsuba_engine.edge_samples import PILOT_COUNT, PlacedSamples, counts_by_variance, in_parts
+from render.mitsuba_engine.edge_samples import PILOT_COUNT, PlacedSamples, in_parts
 from render.mitsuba_engine.in_picture import InPicture
 from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.launches import FrameRays, Sampled, and_some_again, means_by_pixel
-from render.mitsuba_engine.noise import TWICE_EVERY, SensorNoise
+from render.mitsuba_engine.noise import TWICE_EVERY
+from render.mitsuba_engine.noise_budget import NoiseBudget
 from render.mitsuba_engine.sun_sky_paths import trace_first
 from render.mitsuba_engine.surface_light import SMOOTHING_M, SurfaceLight
 from render.mitsuba_engine.traced import Plan
@@ -25,6 +26,10 @@ MOST_SMOOTHING_STEPS = 2.5
 """Largest standard deviation of the smoothing, in steps from one known centre to the next."""
 # `samples_per_px` is the count where the smoothing is this wide; narrower ones take more.
 _SMOOTHING_AT_COUNT_PX = 2.4
+# Of the squared noise that is aimed at: what the smoothed light may err by when its paths are traced once more.
+_LIGHTS_SHARE = 0.5
+# So many times the paths, or it stays as it is.
+_WORTH_IT = 1.5
 
 
 class SmoothedPaths:
@@ -45,12 +50,26 @@ class SmoothedPaths:
             picture: what the light will be seen in.
         """
         rays, settings = self._rays, self._settings
-        kinds = ("open", "sheltered", "deep")
-        inside = np.concatenate([rays.of_both(plans, kind) for kind in kinds])
-        edges = np.concatenate([rays.of_both(plans, kind) for kind in ("edges", "deep_edges")])
-        light = self._surface_light(centers)
+        inside, edges = (
+            np.concatenate([rays.of_both(plans, kind) for kind in kinds])
+            for kinds in (("open", "sheltered", "deep"), ("edges", "deep_edges"))
+        )
+        pixel = np.concatenate([centers["hidden"], centers["open"]])
+        hidden = np.arange(len(pixel)) < len(centers["hidden"])
+        light, paths = SurfaceLight(rays, pixel, 1 + self._moves_px), self._paths_of_centers()
+        self._trace_light(light, hidden, grid_count(paths))
+        counts = np.zeros(0, dtype=np.int64)
         of_inside = looked_up(rays, light, and_some_again(inside), settings.open_samples_per_px, at_edges=False)
-        counts = self._edge_counts(light, edges, (inside[::TWICE_EVERY], of_inside[len(inside) :]), picture)
+        if len(edges):
+            some_inside = inside[::TWICE_EVERY], of_inside[len(inside) :]
+            pilot = edges, pilot_rays(rays, light, edges)
+            budget = NoiseBudget(picture, pilot, some_inside, settings.noise_over_sensor)
+            more = grid_count(paths * budget.of_light / (_LIGHTS_SHARE * budget.aim))
+            if more > _WORTH_IT * grid_count(paths):
+                self._trace_light(light, hidden, more)
+                budget.of_light *= grid_count(paths) / more
+                of_inside = looked_up(rays, light, and_some_again(inside), settings.open_samples_per_px, at_edges=False)
+            counts = budget.edge_counts(rays.spread(edges, budget.variance), settings.edge_samples_per_px)
         of_edges = looked_up_often(rays, light, and_some_again(edges), and_some_again(counts))
         twice = [(inside, of_inside), (edges, of_edges)]
         again = [found[len(pixel) :] for pixel, found in twice]
@@ -62,49 +81,19 @@ class SmoothedPaths:
             np.concatenate([found[:, 4:] for found in again]),
         )
 
-    def _edge_counts(
-        self,
-        light: SurfaceLight,
-        edges: NDArray[np.int64],
-        inside: tuple[NDArray[np.int64], NDArray[np.float32]],
-        picture: InPicture,
-    ) -> NDArray[np.int64]:
-        """(P,) how many rays edges take for the noise that is aimed at; `inside` is some of the other pixels."""
-        if not len(edges):
-            return np.zeros(0, dtype=np.int64)
-        sensor, (inside_pixel, of_inside) = SensorNoise.of(picture.frame), inside
-        pilot = pilot_rays(self._rays, light, edges)
-        samples, share = picture.radiance(edges, pilot[..., :4])
-        samples_inside, share_inside = picture.radiance(inside_pixel, of_inside[:, None, :4])
-        means = np.concatenate([samples.mean(axis=1), samples_inside[:, 0]])
-        errors = np.concatenate([share * pilot[..., 4:].mean(axis=1), share_inside * of_inside[:, 4:]])
-        # As in what is stated of a frame's noise; of a drogue that no centre sees, all that may see it counts.
-        judged = picture.shows_drogue(edges)
-        judged |= not (judged.any() or len(inside_pixel))
-        weight = np.concatenate([judged.astype(float), np.full(len(inside_pixel), float(TWICE_EVERY))])
-        mean = np.average(means, axis=0, weights=weight)
-        of_light = np.average((errors @ sensor.weights) ** 2, axis=0, weights=weight).mean()
-        aim = self._settings.noise_over_sensor**2 * sensor.variance(mean[None])
-        # What the smoothed light errs by is known before, and edges may err by what it leaves.
-        allowed = max(aim - of_light, aim / 4) / sensor.left_by_lens**2 * weight.sum()
-        share_of_edges = len(edges) / (len(edges) + TWICE_EVERY * len(inside_pixel))
-        # Stratified samples err by their count to the power of 3/4: the error over all of the drogue stays the same.
-        most = self._settings.edge_samples_per_px * share_of_edges ** (2 / 3)
-        variance = self._rays.spread(edges, np.var(samples @ sensor.weights, axis=1, ddof=1).mean(axis=-1))
-        return counts_by_variance(variance, judged, allowed, most)
-
-    def _surface_light(self, centers: dict[str, NDArray[np.int64]]) -> SurfaceLight:
+    def _paths_of_centers(self) -> float:
+        """Paths from each centre in each of two estimates, where the sky is hidden."""
         settings = self._settings
-        pixel = np.concatenate([centers["hidden"], centers["open"]])
-        hidden = np.arange(len(pixel)) < len(centers["hidden"])
         most = max(settings.samples_per_px, settings.edge_samples_per_px)
         # Not the square, which would keep the error: far away most pixels are edges, and their rays err more.
-        count = min(settings.samples_per_px * (_SMOOTHING_AT_COUNT_PX / self._sigma_px) ** 1.5, most)
-        light = SurfaceLight(self._rays, pixel, 1 + self._moves_px)
-        counts = [(hidden, grid_count(count / 2)), (~hidden, grid_count(settings.open_samples_per_px / 2))]
-        light.trace(counts, settings.max_depth)
+        paths: float = settings.samples_per_px * (_SMOOTHING_AT_COUNT_PX / self._sigma_px) ** 1.5
+        return min(paths, most) / 2
+
+    def _trace_light(self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: int) -> None:
+        """All of it, with so many paths where the sky is `hidden` in each of two estimates."""
+        settings = self._settings
+        light.trace([(hidden, paths), (~hidden, grid_count(settings.open_samples_per_px / 2))], settings.max_depth)
         light.smooth(hidden, MOST_SMOOTHING_STEPS)
-        return light
 
 
 def looked_up(

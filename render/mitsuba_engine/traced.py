@@ -79,7 +79,7 @@ class Plan:
         sheltered: inside canopy and ribs, that light reaches by way of others.
         deep: inside hub and coupling, few and dark, at the bottom of the basket.
         deep_edges: elsewhere on these.
-        edges: elsewhere, where parts or their shadows may meet.
+        edges: elsewhere, where parts or their shadows or dirt may meet.
         surround: what sees no drogue, but may see other things.
     """
 
@@ -91,14 +91,18 @@ class Plan:
     surround: NDArray[np.int64]
 
 
-def plan_pixels(ids: list[NDArray[np.uint8]], sunlit: list[NDArray[np.bool_]], margin_px: int) -> Plan:
+def plan_pixels(
+    ids: list[NDArray[np.uint8]], sunlit: list[NDArray[np.bool_]], margin_px: int, uneven: Iterable[int]
+) -> Plan:
     """Which pixels to trace.
 
     Args:
         ids: (H, W) part ids of pixel centres, at one or more times of the exposure.
         sunlit: (H, W) whether the drogue's surface there sees the sun, at the same times.
         margin_px: how far beyond those a part may reach into other pixels.
+        uneven: ids of parts whose paint has edges of its own anywhere.
     """
+    even = _marked(uneven) == 0
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
     drogue = np.zeros(ids[0].shape, dtype=np.uint8)
     covered = np.zeros(ids[0].shape, dtype=np.uint8)
@@ -107,7 +111,7 @@ def plan_pixels(ids: list[NDArray[np.uint8]], sunlit: list[NDArray[np.bool_]], m
         drogue |= OF_DROGUE[part_id]
         covered |= (part_id != Part.SKY).astype(np.uint8)
         # A part's sunlit and shadowed surfaces count as two.
-        inside &= inside_one_part((2 * part_id + in_sun).astype(np.uint8), margin_px)
+        inside &= inside_one_part((2 * part_id + in_sun).astype(np.uint8), margin_px) & even[part_id]
     belongs = cv2.dilate(drogue, kernel) > 0
     of_open, of_deep = IN_OPEN[ids[0]] > 0, _DEEP[ids[0]] > 0
     return Plan(

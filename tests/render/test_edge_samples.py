@@ -49,10 +49,26 @@ def test_every_rectangle_of_a_samples_size_has_one(place, count):
         assert len(np.unique(cell @ (1, columns))) == count
 
 
-def test_moments_are_even(place):
-    _, moments = of_pixel(place(Bits(2), np.array([3]), np.array([256])), 3)
-    # The golden ratio's steps leave gaps of at most some twice the mean.
-    assert np.diff(np.sort(moments), prepend=np.max(moments) - 1).max() < 3 / 256
+def test_moments_are_even_in_every_part_of_a_pixel(place):
+    places, moments = of_pixel(place(Bits(2), np.array([3]), np.array([256])), 3)
+    assert len(np.unique(np.floor(moments * 256))) == 256
+    # The first three numbers of the sequence put two samples into each box of two samples' size.
+    box = np.floor(np.column_stack([places * (4, 4), moments * 8])).astype(int) @ (1, 4, 16)
+    assert set(np.bincount(box, minlength=128)) == {2}
+
+
+def test_numbers_are_those_of_sobol(engine):
+    import drjit as dr
+    import mitsuba as mi
+    from scipy.stats.qmc import Sobol
+
+    from render.mitsuba_engine.edge_samples import _sobol
+
+    index = dr.arange(mi.UInt32, 64)
+    ours = np.stack([np.array(dr.brev(index)), np.array(_sobol(index, (1,))), np.array(_sobol(index, (1, 3)))], axis=1)
+    # SciPy goes through the sequence in another order, by Gray's code.
+    gray = np.arange(64) ^ np.arange(64) >> 1
+    assert np.array_equal(ours[gray] / 2**32, Sobol(3, scramble=False).random(64))
 
 
 def test_means_are_those_of_each_pixel(place):

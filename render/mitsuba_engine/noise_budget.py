@@ -1,0 +1,62 @@
+"""How much a frame's edges and smoothed light may err for the noise that is aimed at, and what they err by so far."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from render.mitsuba_engine.edge_samples import counts_by_variance
+from render.mitsuba_engine.in_picture import InPicture
+from render.mitsuba_engine.noise import TWICE_EVERY, SensorNoise
+
+
+class NoiseBudget:
+    """Of what is stated as a frame's noise: means over the pixels whose centres see the drogue, in the picture.
+
+    Attributes:
+        aim: mean square error that is aimed at. [cd2/m4]
+        of_light: what of it is the smoothed light's; whoever lessens that says so here. [cd2/m4]
+    """
+
+    def __init__(
+        self,
+        picture: InPicture,
+        edges: tuple[NDArray[np.int64], NDArray[np.float32]],
+        inside: tuple[NDArray[np.int64], NDArray[np.float32]],
+        noise_over_sensor: float,
+    ) -> None:
+        """Look at rays beforehand.
+
+        Args:
+            picture: what the pixels are of.
+            edges: (P,) flat indices of those on edges, and (P, S, 7) what single rays through them find: radiance,
+                coverage and error of the smoothed light.
+            inside: (Q,) every so many of the others, as many as are rendered twice, and (Q, 7) the same of each.
+            noise_over_sensor: the renderer's noise that is aimed at over the sensor's.
+        """
+        sensor = SensorNoise.of(picture.frame)
+        samples, clear = picture.radiance(edges[0], edges[1][..., :4])
+        samples_inside, clear_inside = picture.radiance(inside[0], inside[1][:, None, :4])
+        # Of a drogue that no centre sees, all that may see it counts.
+        self._judged = picture.shows_drogue(edges[0])
+        self._judged |= not (self._judged.any() or len(inside[0]))
+        weight = np.concatenate([self._judged.astype(float), np.full(len(inside[0]), float(TWICE_EVERY))])
+        mean = np.average(np.concatenate([samples.mean(axis=1), samples_inside[:, 0]]), axis=0, weights=weight)
+        errors = np.concatenate([clear * edges[1][..., 4:].mean(axis=1), clear_inside * inside[1][:, 4:]])
+        self.aim = noise_over_sensor**2 * sensor.variance(mean[None])
+        self.of_light = float(np.average((errors @ sensor.weights) ** 2, axis=0, weights=weight).mean())
+        self.variance: NDArray[np.float64] = np.var(samples @ sensor.weights, axis=1, ddof=1).mean(axis=-1)
+        # The lens averages over neighbours, whose rays err independently.
+        self._per_pixel = sensor.left_by_lens**2 / weight.sum()
+        self._share_of_edges = len(edges[0]) / (len(edges[0]) + TWICE_EVERY * len(inside[0]))
+
+    def edge_counts(self, variance: NDArray[np.float64], most: float) -> NDArray[np.int64]:
+        """(P,) how many rays edges take.
+
+        Args:
+            variance: (P,) of one ray through each. [cd2/m4]
+            most: rays a pixel, on average, of a drogue that is all edges.
+        """
+        allowed = max(self.aim - self.of_light, self.aim / 4) / self._per_pixel
+        # Stratified rays err by their number to the power of 3/4: the error over all of the drogue stays the same.
+        return counts_by_variance(variance, self._judged, allowed, most * self._share_of_edges ** (2 / 3))
