@@ -175,9 +175,14 @@ _BENCH_STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
 _BENCH_SCENES = 8
 
 
-_BENCH_SAMPLES = {
+_BENCH_SAMPLES: dict[str, dict[str, float]] = {
     "corpus": {"samples_per_px": 16, "open_samples_per_px": 4, "edge_samples_per_px": 324},
-    "benchmark": {"samples_per_px": 64, "open_samples_per_px": 8, "edge_samples_per_px": 400},
+    "benchmark": {
+        "samples_per_px": 64,
+        "open_samples_per_px": 8,
+        "edge_samples_per_px": 400,
+        "noise_over_sensor": 0.3,
+    },
 }
 BENCH_QUALITIES = tuple(_BENCH_SAMPLES)
 
