@@ -97,6 +97,16 @@ def test_the_page_has_its_parts_and_says_what_is_missing(whole_page: str) -> Non
     assert "ours, filtered" in whole_page
 
 
+def test_brackets_are_told_where_there_are_means_with_intervals(
+    whole_page: str, bench: Path, estimates_of: WriteEstimates, tmp_path: Path
+) -> None:
+    measured = estimates_of(bench, {"joint-hub": (0, 0, 1e-4)})
+    assert run(["report", "--semi-physical", f"{bench}:{measured}", "--html", str(tmp_path / "bench.html")]) == DONE
+    told = "its 95 % confidence interval"
+    # Of the bench there is a pair of numbers in the same place, against the reading and the truth.
+    assert told in whole_page and told not in (tmp_path / "bench.html").read_text(encoding="utf-8")
+
+
 def test_everything_measured_names_its_dataset_and_engine(whole_page: str) -> None:
     """Or two engines' numbers could not be told apart."""
     claims = re.findall(r"<tr><th>([^<]*)</th><td class=\"published\"", whole_page)
