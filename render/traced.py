@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,7 +24,6 @@ class TracedEye:
         pixel: (P,) flat indices of the traced pixels.
         radiance_cd_m2: (P, 3) light from parts alone, already weighted by coverage. [cd/m2]
         coverage: (P,) share of the pixel that parts cover.
-        nearest_m: (H, W) planar depth of the nearest part within two pixels, inf where there is none. [m]
     """
 
     part_id: NDArray[np.uint8]
@@ -35,16 +33,10 @@ class TracedEye:
     pixel: NDArray[np.int64]
     radiance_cd_m2: NDArray[np.float32]
     coverage: NDArray[np.float32]
-    nearest_m: NDArray[np.float32] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.nearest_m = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8))
 
     def lit_by(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> TracedEye:
         """The same passes with these pixels, and their (P, 4) radiance and coverage."""
-        lit = copy(self)
-        lit.pixel, lit.radiance_cd_m2, lit.coverage = pixel, light[:, :3], light[:, 3]
-        return lit
+        return replace(self, pixel=pixel, radiance_cd_m2=light[:, :3], coverage=light[:, 3])
 
     def put_behind_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Let the air between parts and camera take its share of their light and add its own, in place.
@@ -64,7 +56,7 @@ class TracedEye:
 
     def clear_share(self, pixel: NDArray[np.int64], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """(P, 1) share that the air leaves of the light of parts in pixels; see `put_behind_air`."""
-        nearest = self.nearest_m.reshape(-1)[pixel]
+        nearest = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[pixel]
         share: NDArray[np.float32] = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))
         return share[:, None]
 

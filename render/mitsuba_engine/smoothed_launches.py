@@ -28,8 +28,8 @@ MOST_SMOOTHING_STEPS = 2.5
 _SMOOTHING_AT_COUNT_PX = 2.4
 # Of the squared noise that is aimed at: what the smoothed light may err by when its paths are traced once more.
 _LIGHTS_SHARE = 0.5
-# So many times the paths, or it stays as it is.
-_WORTH_IT = 1.5
+# So many times the paths, or it stays as it is; and no more than so many times.
+_WORTH_IT, _MOST_TIMES = 1.5, 16.0
 
 
 class SmoothedPaths:
@@ -64,7 +64,7 @@ class SmoothedPaths:
             some_inside = inside[::TWICE_EVERY], of_inside[len(inside) :]
             pilot = edges, pilot_rays(rays, light, edges)
             budget = NoiseBudget(picture, pilot, some_inside, settings.noise_over_sensor)
-            more = grid_count(paths * budget.of_light / (_LIGHTS_SHARE * budget.aim))
+            more = grid_count(paths * min(budget.of_light / (_LIGHTS_SHARE * budget.aim), _MOST_TIMES))
             if more > _WORTH_IT * grid_count(paths):
                 self._trace_light(light, hidden, more)
                 budget.of_light *= grid_count(paths) / more
