@@ -61,8 +61,9 @@ class RenderSettings(FrozenModel):
             smoothing is wide and up to `edge_samples_per_px` where the drogue is far away; insides take
             `open_samples_per_px` rays, and edges 16 to `edge_samples_per_px` on average, fewer the more pixels are
             inside, and more the larger their contrast.
-        noise_over_sensor: what edges aim at if `denoise` is set: the renderer's noise on the drogue over the sensor's
-            own. They take no more rays than that needs.
+        noise_over_sensor: what is aimed at if `denoise` is set: the renderer's noise on the drogue over the sensor's
+            own. Edges take no more rays than that needs, and light by way of other surfaces up to 16 times the paths
+            where it alone would take three quarters of it, squared.
     """
 
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)

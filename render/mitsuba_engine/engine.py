@@ -15,7 +15,7 @@ from geometry.stereo import EYES, Eye
 from render.background import air_before, backgrounds
 from render.engine import EyeRadiance, StereoRadiance
 from render.mitsuba_engine.noise import MonteCarloNoise, measure_noise
-from render.mitsuba_engine.traced import OF_DROGUE, Traced
+from render.mitsuba_engine.traced import OF_DROGUE, ToTrace, Traced
 from render.mitsuba_engine.variant import probe_variant
 from render.version import RENDER_VERSION
 from scenes.surroundings import surroundings
@@ -70,7 +70,7 @@ class MitsubaEngine:
             empty = {eye: _empty_eye(behind[eye]) for eye in EYES}
             return StereoRadiance(empty["left"], empty["right"], self.name, self.version, 0.0, stage_s)
         around = surroundings(frame.environment)
-        traced = self._tracer.trace(frame, settings, around, behind)
+        traced = self._tracer.trace(ToTrace(frame, settings, around, behind))
         stage_s |= traced.stage_s
         started = time.process_time()
         for eye in EYES:

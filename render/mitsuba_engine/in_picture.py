@@ -38,8 +38,7 @@ class InPicture:
             light: (P, S, 4) radiance and coverage of parts alone, by some samples of each pixel.
         """
         shown, clear = np.empty((*light.shape[:2], 3), dtype=np.float32), np.empty((len(pixel), 1), dtype=np.float32)
-        for index, eye in enumerate(EYES):
-            own, own_pixel = self._own(index, pixel)
+        for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
             air, optical_depth_per_m = air_before(self.frame, own_pixel)
             clear[own] = self.eyes[eye].clear_share(own_pixel, optical_depth_per_m)
             behind = self.behind[eye].reshape(-1, 3)[own_pixel]
@@ -51,13 +50,11 @@ class InPicture:
     def shows_drogue(self, pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
         """(P,) whether the pixels' centres see the drogue."""
         shows = np.zeros(len(pixel), dtype=np.bool_)
-        for index, eye in enumerate(EYES):
-            own, own_pixel = self._own(index, pixel)
+        for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
             shows[own] = OF_DROGUE[self.eyes[eye].part_id.reshape(-1)[own_pixel]] > 0
         return shows
 
-    def _own(self, index: int, pixel: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Which pixels are of an eye, and their indices in it."""
-        size = self.eyes[EYES[index]].part_id.size
-        own = pixel // size == index
-        return own, pixel[own] - index * size
+    def by_eye(self, pixel: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], NDArray[np.int64]]]:
+        """For each eye (P,) which pixels are its own, and their indices in it."""
+        size = self.eyes[EYES[0]].part_id.size
+        return [(pixel // size == index, pixel[pixel // size == index] - index * size) for index in range(len(EYES))]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -74,27 +73,6 @@ class FrameRays:
     def of_both(self, plans: dict[Eye, Plan], kind: str) -> NDArray[np.int64]:
         """Pixels of a kind of both eyes' plans."""
         return np.concatenate([getattr(plans[eye], kind) + index * self.size for index, eye in enumerate(EYES)])
-
-    def spread(self, pixel: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(P,) means of each pixel's own value, and of that and its neighbours' among the pixels."""
-        mean = np.empty(len(pixel))
-        for index in range(len(EYES)):
-            own = pixel // self.size == index
-            if own.any():
-                mean[own] = self._spread(pixel[own], values[own])
-        return mean
-
-    def _spread(self, pixel: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        row, column = np.divmod(pixel, self.width_px)
-        place = row - row.min(), column - column.min()
-        window = np.zeros((2, place[0].max() + 1, place[1].max() + 1))
-        window[(0, *place)], window[(1, *place)] = values, 1.0
-        total, number = (
-            cv2.boxFilter(plane, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)[place] for plane in window
-        )
-        # Running sums leave roundings of what they have passed.
-        mean: NDArray[np.float64] = (values + np.maximum(total, 0.0) / np.rint(number)) / 2
-        return mean
 
     def parts(self, pixel: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
         """The same pixels in as many pieces as launches of so many samples a pixel need."""

@@ -9,8 +9,6 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.recipe import RenderSettings
 from drogue_models.parts import Part
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.center_passes import CenterPasses
@@ -21,11 +19,10 @@ from render.mitsuba_engine.registry import reserve_numbers
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.smoothed_launches import SmoothedPaths
 from render.mitsuba_engine.surround_launches import trace_around
-from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, Traced, plan_pixels
+from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, ToTrace, Traced, plan_pixels
 from render.motion import blur_px
 from render.surfaces import dirty_parts
 from render.traced import TracedEye
-from scenes.surroundings import Surroundings
 
 
 class LlvmTracer:
@@ -36,17 +33,12 @@ class LlvmTracer:
         self._last_number = reserve_numbers()
         self._scenes = SceneCache()
 
-    def trace(
-        self,
-        frame: FrameSpec,
-        settings: RenderSettings,
-        around: Surroundings,
-        behind: dict[Eye, NDArray[np.float32]],
-    ) -> Traced:
-        """Passes and radiance of both eyes of a frame, whose (H, W, 3) surroundings are `behind`."""
+    def trace(self, wanted: ToTrace) -> Traced:
+        """Passes and radiance of both eyes."""
+        frame = wanted.frame
         stage_s: dict[str, float] = {}
         started = time.process_time()
-        scene = self._scenes.scene_of(frame, around)
+        scene = self._scenes.scene_of(frame, wanted.around)
         stage_s["scene"], started = time.process_time() - started, time.process_time()
         moves_px = blur_px(frame)
         times = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
@@ -59,7 +51,7 @@ class LlvmTracer:
             plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), dirty_parts(frame))
             eyes[eye] = passes.traced_eye(*seen[0])
         stage_s["passes"], started = time.process_time() - started, time.process_time()
-        found = _sampled(settings, (scene, around), InPicture(frame, eyes, behind), plans)
+        found = _sampled(wanted, scene, eyes, plans)
         size = frame.rig.camera.width_px * frame.rig.camera.height_px
         traced = Traced(
             {eye: eyes[eye].lit_by(*_of_eye(index, size, found.pixel, found.light)) for index, eye in enumerate(EYES)},
@@ -82,24 +74,20 @@ def _of_eye(
     return pixel[own] - index * size, light[own]
 
 
-def _sampled(
-    settings: RenderSettings,
-    stage: tuple[DrogueScene, Surroundings],
-    picture: InPicture,
-    plans: dict[Eye, Plan],
-) -> Sampled:
+def _sampled(wanted: ToTrace, scene: DrogueScene, eyes: dict[Eye, TracedEye], plans: dict[Eye, Plan]) -> Sampled:
     """What samples say, smoothed where that is asked for; light on a drogue only if all of it is matt."""
-    (scene, around), frame, eyes = stage, picture.frame, picture.eyes
+    frame, settings = wanted.frame, wanted.settings
     centers = _centers(eyes, plans)
     matt = frame.drogue is not None and frame.drogue.satin is None
     smoothed = settings.denoise and matt and any(len(pixel) > 0 for pixel in centers.values())
     in_open = IN_OPEN.copy()
     # Ribs have narrow sides that few centres see: what is smoothed had better vary little with the direction.
     in_open[Part.RIBS] = smoothed
-    rays, moves_px = FrameRays(frame, scene, around, in_open), blur_px(frame)
+    rays, moves_px = FrameRays(frame, scene, wanted.around, in_open), blur_px(frame)
     if smoothed:
         assert frame.left_from_drogue is not None
         px_per_m = frame.rig.camera.fx_px / float(frame.left_from_drogue.translation_m[2])
+        picture = InPicture(frame, eyes, wanted.behind)
         found = SmoothedPaths(rays, settings, px_per_m, moves_px).trace(plans, centers, picture)
     else:
         found = trace_paths(rays, plans, settings)

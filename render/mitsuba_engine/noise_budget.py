@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,18 +46,34 @@ class NoiseBudget:
         errors = np.concatenate([clear * edges[1][..., 4:].mean(axis=1), clear_inside * inside[1][:, 4:]])
         self.aim = noise_over_sensor**2 * sensor.variance(mean[None])
         self.of_light = float(np.average((errors @ sensor.weights) ** 2, axis=0, weights=weight).mean())
-        self.variance: NDArray[np.float64] = np.var(samples @ sensor.weights, axis=1, ddof=1).mean(axis=-1)
+        variance = np.var(samples @ sensor.weights, axis=1, ddof=1).mean(axis=-1)
+        # Few rays miss what is small, which those of the pixels around may have met.
+        around = np.empty(len(variance))
+        for own, own_pixel in picture.by_eye(edges[0]):
+            around[own] = _around(own_pixel, variance[own], picture.frame.rig.camera.width_px)
+        self._variance = (variance + around) / 2
         # The lens averages over neighbours, whose rays err independently.
         self._per_pixel = sensor.left_by_lens**2 / weight.sum()
         self._share_of_edges = len(edges[0]) / (len(edges[0]) + TWICE_EVERY * len(inside[0]))
 
-    def edge_counts(self, variance: NDArray[np.float64], most: float) -> NDArray[np.int64]:
-        """(P,) how many rays edges take.
-
-        Args:
-            variance: (P,) of one ray through each. [cd2/m4]
-            most: rays a pixel, on average, of a drogue that is all edges.
-        """
+    def edge_counts(self, most: float) -> NDArray[np.int64]:
+        """(P,) how many rays edges take, with `most` a pixel on average of a drogue that is all edges."""
         allowed = max(self.aim - self.of_light, self.aim / 4) / self._per_pixel
         # Stratified rays err by their number to the power of 3/4: the error over all of the drogue stays the same.
-        return counts_by_variance(variance, self._judged, allowed, most * self._share_of_edges ** (2 / 3))
+        return counts_by_variance(self._variance, self._judged, allowed, most * self._share_of_edges ** (2 / 3))
+
+
+def _around(pixel: NDArray[np.int64], values: NDArray[np.float64], width_px: int) -> NDArray[np.float64]:
+    """(P,) means over each pixel of one eye and those of its eight neighbours that are among the pixels."""
+    if not len(pixel):
+        return values
+    row, column = np.divmod(pixel, width_px)
+    place = row - row.min(), column - column.min()
+    window = np.zeros((2, place[0].max() + 1, place[1].max() + 1))
+    window[(0, *place)], window[(1, *place)] = values, 1.0
+    total, number = (
+        cv2.boxFilter(plane, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)[place] for plane in window
+    )
+    # Running sums leave roundings of what they have passed.
+    mean: NDArray[np.float64] = np.maximum(total, 0.0) / np.rint(number)
+    return mean

@@ -20,6 +20,7 @@ from render.mitsuba_engine.traced import (
     OF_DROGUE,
     SURROUND_DEPTH,
     Plan,
+    ToTrace,
     Traced,
     plan_pixels,
     slipped_through,
@@ -28,7 +29,6 @@ from render.motion import blur_px, pose_polynomial
 from render.surfaces import dirty_parts
 from render.traced import TracedEye, amodal_counts
 from scenes.seeding import generator
-from scenes.surroundings import Surroundings
 
 # Motion is rendered as so many still pictures.
 _MOVING_SLICES = 8
@@ -43,17 +43,12 @@ class ScalarTracer:
         dr.set_thread_count(1)
         self._scenes = SceneCache()
 
-    def trace(
-        self,
-        frame: FrameSpec,
-        settings: RenderSettings,
-        around: Surroundings,
-        behind: dict[Eye, NDArray[np.float32]],
-    ) -> Traced:
-        """Passes and radiance of both eyes of a frame with a drogue."""
+    def trace(self, wanted: ToTrace) -> Traced:
+        """Passes and radiance of both eyes."""
+        frame, settings = wanted.frame, wanted.settings
         stage_s = {"scene": 0.0, "passes": 0.0, "paths": 0.0}
         started = time.process_time()
-        scene = self._scenes.scene_of(frame, around)
+        scene = self._scenes.scene_of(frame, wanted.around)
         stage_s["scene"], started = time.process_time() - started, time.process_time()
         moves_px = blur_px(frame)
         moments = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)

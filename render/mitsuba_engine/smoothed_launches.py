@@ -69,7 +69,7 @@ class SmoothedPaths:
                 self._trace_light(light, hidden, more)
                 budget.of_light *= grid_count(paths) / more
                 of_inside = looked_up(rays, light, and_some_again(inside), settings.open_samples_per_px, at_edges=False)
-            counts = budget.edge_counts(rays.spread(edges, budget.variance), settings.edge_samples_per_px)
+            counts = budget.edge_counts(settings.edge_samples_per_px)
         of_edges = looked_up_often(rays, light, and_some_again(edges), and_some_again(counts))
         twice = [(inside, of_inside), (edges, of_edges)]
         again = [found[len(pixel) :] for pixel, found in twice]

@@ -1,4 +1,4 @@
-"""What a tracer hands back for both eyes, and which pixels it has to trace."""
+"""What a tracer is asked for and hands back for both eyes, and which pixels it has to trace."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.frame import FrameSpec
+from datasets_manifest.recipe import RenderSettings
 from drogue_models.parts import MAX_MARKERS, SURROUNDING_PARTS, Part, drogue_part_ids, marker_id
 from geometry.stereo import Eye
 from render.traced import TracedEye, inside_one_part
+from scenes.surroundings import Surroundings
 
 # Next to the centre, a little farther each time and off any one line: for rays that slip through a seam at the centre.
 ASIDE = ((0.501, 0.5007), (0.496, 0.503), (0.507, 0.489))
@@ -47,6 +50,23 @@ def slipped_through(
     inside: NDArray[np.bool_] = (normals * towards).sum(axis=-1) > 0
     on_wall = (_MARKERS[part_id] > 0) & (normals[..., 2] > -0.5)
     return (part_id > 0) & (inside | on_wall)
+
+
+@dataclass(frozen=True, eq=False)
+class ToTrace:
+    """What a tracer is asked for.
+
+    Attributes:
+        frame: with a drogue or bystanders.
+        settings: how.
+        around: what lights them.
+        behind: (H, W, 3) what each eye sees of it. [cd/m2]
+    """
+
+    frame: FrameSpec
+    settings: RenderSettings
+    around: Surroundings
+    behind: dict[Eye, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,6 +70,7 @@ def test_more_light_takes_more_rays(engine, make_recipe):
     longer = frame.model_copy(
         update={"exposure": frame.exposure.model_copy(update={"time_s": 3 * frame.exposure.time_s})}
     )
-    # The light's own noise falls against the light, and the renderer's must too.
+    # The light's own noise falls against the light, and the renderer's must too. Of two such statements each is good to
+    # a quarter at most.
     fractions = [engine.render(seen, plenty).monte_carlo_noise_fraction for seen in (frame, longer)]
     assert fractions[1] == pytest.approx(fractions[0] / np.sqrt(3), rel=0.3)

@@ -35,5 +35,5 @@ def test_a_dirty_marker_has_little_noise(engine, make_recipe):
     per_cd_m2 = frame.sensor.electrons_per_cd_m2(frame.exposure)
     red = [per_cd_m2 * seen.left.radiance_cd_m2[inside][:, 0] for seen in (first, second)]
     noise_e = np.sqrt(np.mean((red[0] - red[1]) ** 2) / 2)
-    # Before the lens, which leaves two thirds of it.
-    assert noise_e < 0.6 * np.sqrt(red[0].mean() + frame.sensor.read_noise_e**2)
+    # The aim of 0.42 is behind the lens, which leaves 0.64 of it. Four rays in each of these pixels had 1.14.
+    assert noise_e < 0.66 * np.sqrt(red[0].mean() + frame.sensor.read_noise_e**2)
