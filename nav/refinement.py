@@ -19,8 +19,9 @@ from nav.centroids.disc_rejection import LARGEST_SCALE
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.ellipses import Ellipses, outline_shapes, shape_radii
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
-from nav.centroids.patches import OUTER_DIFFERENCE_PX, WHOLE_RADIUS_PX
-from nav.centroids.surroundings import Surroundings
+from nav.centroids.motion_blur import Travel
+from nav.centroids.patches import WHOLE_RADIUS_PX
+from nav.centroids.surroundings import SEEN_BESIDE_PX, Surroundings
 from nav.channels import PLAIN, balancing_weight
 from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation, Solution
 from nav.pose.joint import joint
@@ -33,8 +34,6 @@ _LEAST_WEIGHT = 0.01
 _LEAST_STEP_PX = 0.5
 # Fewer fitted markers than a pose needs with one to spare: then all of them stay as they were found.
 _LEAST_MARKERS = 4
-# What begins this near a disc may be seen in its window, which lies about the rough place, and through the blur. [px]
-_SEEN_PX = OUTER_DIFFERENCE_PX + 2.0
 # Markers so small that no part of their edge is clear of the rim's: the other colours are weighted so that it has none.
 _BALANCED_BELOW_PX = 8.0
 
@@ -71,7 +70,8 @@ def refine(
     likely = [rough.modes[0], *(mode for mode in rough.modes[1:] if mode.weight >= _LEAST_WEIGHT)]
     hubs = [hub for mode in likely for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
     around = _surroundings(layout, index, radius_px / layout.radius_m)
-    if around is not None and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
+    narrow = around is not None and around.margin_px <= SEEN_BESIDE_PX
+    if narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
         middles_px = np.stack([rig.image(rough.left_from_drogue.translation_m, eye) for eye in EYES])
         # An eye that shows no markers has no say: far outside of the image there is nothing to weigh.
         middles_px[~observation.seen.any(axis=1)] = -1e6
@@ -92,18 +92,18 @@ def refine(
     for side, eye in enumerate(EYES):
         pixels[side], cov[side] = ideal_places(rig, eye, pixels[side], shapes[side], cov[side])
     refined = replace(observation, pixels_px=pixels, cov_px2=cov)
-    return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise)
+    return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.travel)
 
 
 def _surroundings(layout: MarkerLayout, index: NDArray[np.int64], scale_px_per_m: float) -> Surroundings | None:
-    """The face, where it is so narrow around the markers that their windows reach beyond it."""
+    """The face around the markers, where the drogue has one."""
     places_m = layout.centers_m[:, :2]
     edges_m = layout.face_inner_radius_m, layout.face_outer_radius_m
+    if edges_m[1] == 0:
+        return None
     out_m = np.hypot(places_m[:, 0], places_m[:, 1])
     margin_m = min((edges_m[1] - out_m).min(), (out_m - edges_m[0]).min()) - layout.radius_m
-    if edges_m[1] == 0 or margin_m * scale_px_per_m > _SEEN_PX:
-        return None
-    return Surroundings(places_m[index], edges_m)
+    return Surroundings(places_m[index], edges_m, float(margin_m * scale_px_per_m))
 
 
 def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> Array:
@@ -152,7 +152,12 @@ def _together(groups: list[Ellipses]) -> Ellipses:
     )
 
 
-def _with_hub(observation: Observation, signals: tuple[MarkerSignal, MarkerSignal], noise: NoiseModel) -> Observation:
+def _with_hub(
+    observation: Observation,
+    signals: tuple[MarkerSignal, MarkerSignal],
+    noise: NoiseModel,
+    travel: Travel | None,
+) -> Observation:
     """The hub's outer edge, looked for where the markers' pose shows it, and where its mirror image would."""
     solution = joint(observation)
     if isinstance(solution, NoFixReason):
@@ -161,7 +166,7 @@ def _with_hub(observation: Observation, signals: tuple[MarkerSignal, MarkerSigna
     found: list[tuple[AnnulusFits, Array]] = []
     for edges in _hub_places(observation, solution):
         outer, inner = edges[OUTER_EDGE], edges[INNER_EDGE]
-        found.append((fit_annuli(signals, outer, inner, noise, collar_factor), outer.shapes_px))
+        found.append((fit_annuli(signals, outer, inner, noise, collar_factor, travel), outer.shapes_px))
         if found[-1][0].certain:
             break
     best = max(found, key=lambda each: each[0].evidence_per_px2, default=None)

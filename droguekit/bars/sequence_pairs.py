@@ -11,6 +11,7 @@ import numpy as np
 from datasets_manifest.estimates import Estimate, PoseEstimate, read_estimates
 from datasets_manifest.reader import Dataset
 from droguekit.bars.image_rows import BEST
+from droguekit.benchmark.bounds import component_deviations
 from droguekit.benchmark.centroid_errors import centroid_errors
 from droguekit.benchmark.frame_truth import DrogueTruth, drogue_truth
 from droguekit.benchmark.pose_errors import by_method, pose_error
@@ -59,7 +60,8 @@ class ScoredPair:
         pair: the truth.
         error: (5,) X, Y, Z [m], pitch and yaw [deg], estimate minus truth; None without a pose.
         sd_m: root of the trace of the position's reported covariance; None without one. [m]
-        over_bound: (5,) error over its bound at the centroid noise measured in its family; None without either.
+        over_bound: (5,) error over its bound at the noise that markers and hubs of its family were measured with, each by
+            itself; None without either.
         reason: why there is no pose; empty where there is one, or no word at all.
         work_s: of all stages but those in which the pair waits, where they are told. [s]
     """
@@ -116,7 +118,7 @@ def _true_pair(data: Dataset, index: int) -> TruePair | None:
 
 
 def _bounds(pairs: Sequence[TruePair], methods: Mapping[str, Mapping[int, Estimate]]) -> dict[int, Array | None]:
-    """(5,) bound of every pair, the same for all methods, by the noise of the best centroids of its family."""
+    """(5,) bound of every pair, the same for all methods, by the noise of its family's best markers and hubs."""
     bounds: dict[int, Array | None] = {}
     for family in sorted({pair.family for pair in pairs}):
         truths = {pair.frame_index: pair.truth for pair in pairs if pair.family == family}
@@ -127,7 +129,9 @@ def _bounds(pairs: Sequence[TruePair], methods: Mapping[str, Mapping[int, Estima
             }
             for name, answers in methods.items()
         }
-        bounds |= build_reference(truths, centroids).bounds
+        for index, covariance in build_reference(truths, centroids).covariances.items():
+            pose = truths[index].left_from_drogue
+            bounds[index] = None if covariance is None else component_deviations(pose, covariance)
     return bounds
 
 

@@ -29,8 +29,8 @@ from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.least_squares import Minimum, Model, evaluate, minimise
 from nav.centroids.marker_signal import Array32, MarkerSignal
+from nav.centroids.motion_blur import Travel, moving, share_outside_along
 from nav.centroids.patches import PixelSet, annulus_pixels
-from nav.centroids.surroundings import share_outside
 
 # Azimuthal order of the light on the annulus; a thin one has too few pixels to tell high orders from its outline.
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5
@@ -106,6 +106,7 @@ def fit_annuli(
     inner: Ellipses,
     noise: NoiseModel,
     collar_factor: float = 0.0,
+    travel: Travel | None = None,
 ) -> AnnulusFits:
     """Fit every annulus of both eyes.
 
@@ -119,24 +120,27 @@ def fit_annuli(
         noise: of the frame's pixels, from `fit_discs`; what stands out against it is contrast.
         collar_factor: radius of the dark collar around the annulus over that of its outer edge, 0 where unknown. What
             lies beyond is left out, and its blur fitted.
+        travel: how the drogue moves on the images while the shutter is open, None where it stands still.
     """
     if len(outer) == 0:
         nothing = np.zeros(0)
         return AnnulusFits(np.zeros((0, 2)), np.zeros((0, 2, 2)), nothing, nothing, nothing, ())
     width_px = float((outer.radii_px - inner.radii_px).min())
     thin = width_px < _THIN_PX
-    pixels, beyond = _within_collar(annulus_pixels(signals, outer, inner), outer, collar_factor)
+    ways = None if travel is None else travel.of(outer)
+    gathered = annulus_pixels(signals, outer, inner, 0.0 if travel is None else travel.spread_px(outer))
+    pixels, beyond = _within_collar(gathered, outer, collar_factor, ways)
     turns = azimuth_basis(pixels, _ORDER_THIN if thin else _ORDER)
     start = annulus_start(pixels, outer, inner, turns.shape[1])
-    first = _first_fit(pixels, (turns, beyond), start, thin)
+    first = _first_fit(pixels, (turns, beyond), start, thin, ways)
     rough = all_parameters(start, tied_to_pose(start, thin), first)
     if not thin and _unevenness(rough) > _UNEVEN_SHARE:
         turns = np.concatenate([turns, radial_slopes(pixels, turns, outer, inner)], axis=1)
         start = np.pad(rough, ((0, 0), (0, SLOPE_TURNS)))
-        first = _first_fit(pixels, (turns, beyond), start, thin)
+        first = _first_fit(pixels, (turns, beyond), start, thin, ways)
     ties = tied_to_pose(start, thin)
-    model = in_free_parameters(annulus_model(pixels, turns, beyond), start, ties)
-    final, weights, edge_factor = _weighted_fit(pixels, turns, (start, ties), model, first)
+    model = in_free_parameters(_drawn(pixels, (turns, beyond), ways), start, ties)
+    final, weights, edge_factor = _weighted_fit(pixels, turns, (start, ties), model, first, ways is None)
     parameters = all_parameters(start, ties, final)
     between, light = shares_of(final, ties)[0], light_above(parameters, turns)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
@@ -155,16 +159,23 @@ def fit_annuli(
     return AnnulusFits(centers, cov, contrast, lit, inflation, reasons)
 
 
-def _first_fit(pixels: PixelSet, light: tuple[Array32, Array32], start: Array, thin: bool) -> Minimum:
+def _drawn(pixels: PixelSet, light: tuple[Array32, Array32], ways: Array | None) -> Model:
+    still = annulus_model(pixels, *light)
+    return still if ways is None else moving(still, ways, (OUTER.start, INNER.start))
+
+
+def _first_fit(
+    pixels: PixelSet, light: tuple[Array32, Array32], start: Array, thin: bool, ways: Array | None
+) -> Minimum:
     """The fit of equal weights, for the noise by what each pixel sees; `light` is that on the annulus and beyond."""
     ties = tied_to_pose(start, thin)
-    model = in_free_parameters(annulus_model(pixels, *light), start, ties)
+    model = in_free_parameters(_drawn(pixels, light, ways), start, ties)
     begin = evaluate(model, pixels.values, pixels.present, np.zeros((len(start), ties.shape[2])))
     return minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
 
 
 def _weighted_fit(
-    pixels: PixelSet, turns: Array32, shape: tuple[Array, Array], model: Model, first: Minimum
+    pixels: PixelSet, turns: Array32, shape: tuple[Array, Array], model: Model, first: Minimum, is_still: bool
 ) -> tuple[Minimum, Array32, float]:
     """The fit of inverse variances, with the pixels' response, the weights, and the factor of `NoiseModel` in them.
 
@@ -175,13 +186,15 @@ def _weighted_fit(
         shape: start and ties, see `all_parameters`.
         model: in the free parameters.
         first: fit of equal weights.
+        is_still: whether edges are so sharp that the pixels' response shows.
     """
     parameters, ties = all_parameters(*shape, first), shape[1]
-    pictures = response_pictures(pixels, parameters, shares_of(first, ties), light_above(parameters, turns))
-    model = with_pictures(model, pictures)
-    begin = starting_with_pictures(first, pictures)
-    first = minimise(model, pixels.values, pixels.present, begin, _RESPONSE_STEPS, FIRST_SMALL_STEP_PX)
-    parameters = all_parameters(*shape, first)
+    if is_still:
+        pictures = response_pictures(pixels, parameters, shares_of(first, ties), light_above(parameters, turns))
+        model = with_pictures(model, pictures)
+        begin = starting_with_pictures(first, pictures)
+        first = minimise(model, pixels.values, pixels.present, begin, _RESPONSE_STEPS, FIRST_SMALL_STEP_PX)
+        parameters = all_parameters(*shape, first)
     between, light = shares_of(first, ties)[0], light_above(parameters, turns)
     leverages = np.minimum(first.leverages(first.covariance(), pixels.present), _MOST_LEVERAGE)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
@@ -202,11 +215,13 @@ def _unevenness(parameters: Array) -> float:
     return float((np.sqrt((turns[:, 1:] ** 2).sum(axis=1) / 2) / mean).max())
 
 
-def _within_collar(pixels: PixelSet, outer: Ellipses, collar_factor: float) -> tuple[PixelSet, Array32]:
+def _within_collar(
+    pixels: PixelSet, outer: Ellipses, collar_factor: float, ways: Array | None
+) -> tuple[PixelSet, Array32]:
     """The pixels without those beyond the collar, and the share of what lies beyond it in each."""
     if collar_factor == 0:
         return pixels, np.zeros_like(pixels.x_px)
-    beyond = share_outside(collar_factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX)
+    beyond = share_outside_along(collar_factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX, ways)
     return pixels.only(beyond < _MOST_BEYOND), beyond
 
 

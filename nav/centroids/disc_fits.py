@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from geometry.se3 import Array
 from nav.centroids.centroid_quality import NoiseModel
 from nav.centroids.ellipses import Ellipses
+from nav.centroids.motion_blur import Travel
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +26,7 @@ class DiscFits:
         inflation: (M,) factor in `cov_px2` for residuals that hang together.
         reasons: why a disc was rejected, or None.
         noise: of the frame's pixels, None without any disc.
+        travel: how the discs moved while the shutter was open, None where they stood still.
     """
 
     ellipses: Ellipses
@@ -36,6 +38,7 @@ class DiscFits:
     inflation: Array
     reasons: tuple[str | None, ...]
     noise: NoiseModel | None
+    travel: Travel | None = None
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
@@ -73,4 +76,5 @@ def merged(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscFits
         put(fits.inflation, part.inflation),
         tuple(reasons),
         part.noise,
+        part.travel,
     )

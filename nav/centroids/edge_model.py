@@ -24,10 +24,11 @@ from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.least_squares import Minimum, Model, evaluate, minimise
 from nav.centroids.marker_signal import Array32, MarkerSignal
+from nav.centroids.motion_blur import Travel, fit_travel, moving, seen_travel
 from nav.centroids.patches import PixelSet, disc_pixels
 from nav.centroids.pixel_response import without_pixel_response
 from nav.centroids.single_color import with_even_others
-from nav.centroids.surroundings import MOST_BEYOND, Surroundings, shares_beyond
+from nav.centroids.surroundings import MOST_BEYOND, SEEN_BESIDE_PX, Surroundings, shares_beyond
 from nav.centroids.working_memory import keep_freed_memory
 
 # Shading of a smaller disc can hardly be told from a shift of it: fitting it adds 30 % of noise here, 100 % at 4 px.
@@ -72,25 +73,18 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
     """Fit discs that are all modelled alike."""
     plain = not signals[0].is_difference
     start = located(signals, discs)
-    pixels = disc_pixels(signals, start)
-    further = None if around is None else shares_beyond(around, start, pixels, START_WIDTH_PX)
-    if further is not None:
-        pixels = pixels.only((further < MOST_BEYOND).all(axis=1))
-    sloped = plain or (shaded and bool(discs.radii_px.min() >= _LEAST_RADIUS_FOR_SLOPE_BESIDE_PX))
-    model = disc_model(pixels, sloped, shaded, further)
-    count = 2 * sloped + 2 * shaded + (0 if further is None else further.shape[1])
-    begin = evaluate(model, pixels.values, pixels.present, disc_start(pixels, start.shapes_px, count))
-    first = minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
-    if around is not None and further is not None and not shaded:
-        # The markers' own places now show the face to hundredths of a pixel; around larger discs it is so wide that
-        # tenths do.
-        found = _fitted(start, pixels, first, (None,) * len(start))
-        width_px = float(np.median(first.parameters[:, WIDTH]))
-        model = disc_model(pixels, sloped, shaded, shares_beyond(around, found, pixels, width_px))
-        first = evaluate(model, pixels.values, pixels.present, first.parameters)
+    pixels, model, first = _first_fit(signals, start, shaded, around, None)
+    travel = None if plain else seen_travel(first, pixels, start)
+    if travel is not None:
+        # What the first fit made of moving discs may lie pixels beside them: all begins anew.
+        moved, still, fit = _first_fit(signals, start, shaded, around, travel)
+        travel = fit_travel(still, moved, fit.parameters, travel, start)
+    if travel is not None:
+        pixels, still, first = _first_fit(signals, start, shaded, around, travel)
+        model = moving(still, travel.of(start), (0,))
     # The derivative by the disc's level is the share of light from within.
     inside = np.ascontiguousarray(first.jacobian[:, LEVEL])
-    if not plain:
+    if not plain and travel is None:
         first, beyond_gaussian = without_pixel_response(first, pixels, inside, contrasts(first))
         pixels = replace(pixels, values=pixels.values - beyond_gaussian)
     # What the linear steps so far change are places and residuals, not leverages.
@@ -118,7 +112,36 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
         spread.inflation,
         reasons,
         lead_noise,
+        travel,
     )
+
+
+def _first_fit(
+    signals: Sequence[MarkerSignal], start: Ellipses, shaded: bool, around: Surroundings | None, travel: Travel | None
+) -> tuple[PixelSet, Model, Minimum]:
+    """The pixels of discs, the model of still ones, and the fit of equal weights, of moving ones where they move."""
+    plain, ways = not signals[0].is_difference, None if travel is None else travel.of(start)
+    spread_px = 0.0 if travel is None else travel.spread_px(start)
+    pixels, further = disc_pixels(signals, start, blur_px=spread_px), None
+    if around is not None and around.margin_px <= SEEN_BESIDE_PX + spread_px:
+        further = shares_beyond(around, start, pixels, START_WIDTH_PX, ways)
+    if further is not None:
+        pixels = pixels.only((further < MOST_BEYOND).all(axis=1))
+    sloped = plain or (shaded and bool(start.radii_px.min() >= _LEAST_RADIUS_FOR_SLOPE_BESIDE_PX))
+    still = disc_model(pixels, sloped, shaded, further)
+    model = still if ways is None else moving(still, ways, (0,))
+    count = 2 * sloped + 2 * shaded + (0 if further is None else further.shape[1])
+    begin = evaluate(model, pixels.values, pixels.present, disc_start(pixels, start.shapes_px, count))
+    first = minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
+    if around is None or further is None or shaded:
+        return pixels, still, first
+    # The markers' own places now show the face to hundredths of a pixel; around larger discs it is so wide that tenths
+    # do.
+    found = _fitted(start, pixels, first, (None,) * len(start))
+    width_px = float(np.median(first.parameters[:, WIDTH]))
+    still = disc_model(pixels, sloped, shaded, shares_beyond(around, found, pixels, width_px, ways))
+    model = still if ways is None else moving(still, ways, (0,))
+    return pixels, still, evaluate(model, pixels.values, pixels.present, first.parameters)
 
 
 def _noise(fit: Minimum, leverages: Array32, pixels: PixelSet, inside: Array32) -> NoiseModel:

@@ -15,8 +15,9 @@ from nav.channels import PLAIN, marker_channel, signed_lead
 
 Array32 = NDArray[np.float32]
 
-# Room around an outline: the widest window about it, and what an initial centre may be off. [px]
-_MARGIN_PX = 10
+# Room around an outline: the widest window about it, of one that moves by 30 px while the shutter is open, and what an
+# initial centre may be off. [px]
+_MARGIN_PX = 20
 # First site of each colour in an RGGB cell, as row and column.
 _FIRST_SITE = ((0, 0), (0, 1), (1, 1))
 _GREEN = 1

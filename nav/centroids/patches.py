@@ -75,10 +75,15 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
     return distances
 
 
-def disc_pixels(signals: Sequence[MarkerSignal], discs: Ellipses, everything: bool = False) -> PixelSet:
-    """Pixels in and around discs; with `everything`, those far from the edge of large discs too."""
+def disc_pixels(
+    signals: Sequence[MarkerSignal], discs: Ellipses, everything: bool = False, blur_px: float = 0.0
+) -> PixelSet:
+    """Pixels in and around discs whose edges a motion spreads by `blur_px` to either side.
+
+    With `everything`, those far from the edge of large discs too.
+    """
     whole = everything or bool(discs.radii_px.max() <= WHOLE_RADIUS_PX)
-    return _gather(signals, discs, thin=1 if whole else _THIN)
+    return _gather(signals, discs, thin=1 if whole else _THIN, blur_px=blur_px)
 
 
 def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
@@ -86,13 +91,18 @@ def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
     return _gather(signals, discs, every=_THIN)
 
 
-def annulus_pixels(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses) -> PixelSet:
-    """Pixels on and around annuli; of the hole only what lies near its edge."""
-    return _gather(signals, outer, thin=_THIN, holes=inner)
+def annulus_pixels(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses, blur_px: float = 0.0) -> PixelSet:
+    """Pixels on and around annuli, `blur_px` as above; of the hole only what lies near its edge."""
+    return _gather(signals, outer, thin=_THIN, holes=inner, blur_px=blur_px)
 
 
 def _gather(
-    signals: Sequence[MarkerSignal], outlines: Ellipses, every: int = 1, thin: int = 1, holes: Ellipses | None = None
+    signals: Sequence[MarkerSignal],
+    outlines: Ellipses,
+    every: int = 1,
+    thin: int = 1,
+    holes: Ellipses | None = None,
+    blur_px: float = 0.0,
 ) -> PixelSet:
     """Pixels in and around outlines, not in their holes.
 
@@ -102,9 +112,10 @@ def _gather(
         every: pixels between the rows, and the columns, that are looked at.
         thin: far from edges, one in so many by so many of those is taken.
         holes: within the outlines.
+        blur_px: how far beyond a still one's an edge may be seen.
     """
     pitch = signals[0].pitch_px
-    reach_px = OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX
+    reach_px = blur_px + (OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
     extents = np.sqrt(np.einsum("mij,mij->mi", outlines.shapes_px, outlines.shapes_px)) + reach_px
     half = -(-(int(np.ceil(extents.max() / pitch)) + 1) // every) * every
     size = 2 * (half // every) + 1
@@ -119,7 +130,7 @@ def _gather(
     inside = np.zeros((0, 2), np.float32), np.zeros((0, 2, 2), np.float32), np.zeros(0, np.float32)
     if holes is not None:
         inside = (holes.centers_px - outlines.centers_px).astype(np.float32), *_inverses_and_radii(holes)
-    limits = np.float32(reach_px), np.float32(_BAND_PX)
+    limits = np.float32(reach_px), np.float32(_BAND_PX + blur_px)
     cells = np.empty((len(outlines), size * size), np.int32)
     outline = _inverses_and_radii(outlines)
     counts, truncated = choose_cells(offsets, starts, outline, inside, limits, thin, frames, cells)

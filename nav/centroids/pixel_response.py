@@ -14,11 +14,10 @@ from nav.centroids.disc_places import ELLIPSE_PARAMETERS
 from nav.centroids.edge_pictures import add_box_pictures
 from nav.centroids.least_squares import Minimum
 from nav.centroids.marker_signal import Array32
-from nav.centroids.matrix_loops import add_rows, couplings, normal_equations
+from nav.centroids.matrix_loops import add_rows
 from nav.centroids.patches import PixelSet
+from nav.centroids.shared_parameters import least_of_all, reduced_equations
 
-# Of a normal matrix with unit diagonal: shapes that light too dim cannot tell apart are shared out between them.
-_RIDGE = 1e-3
 # The pixel's own box, those beside it, and those across its corners.
 BOX_PICTURES = 3
 
@@ -45,23 +44,8 @@ def without_pixel_response(fit: Minimum, pixels: PixelSet, inside: Array32, cont
     steps = np.repeat(contrast.astype(np.float32)[:, None], weights.shape[1], axis=1)
     ellipses = fit.parameters[:, :ELLIPSE_PARAMETERS].astype(np.float32)
     add_box_pictures(ellipses, pixels.x_px, pixels.y_px, weights, inside, steps, shapes)
-    count = fit.parameters.shape[1]
-    coupled, slopes = np.empty((len(weights), count, BOX_PICTURES)), np.empty((len(weights), count, 1))
-    couplings(fit.jacobian, shapes, weights, coupled)
-    couplings(fit.jacobian, fit.residuals[:, None], weights, slopes)
-    own, own_slopes = np.empty((len(weights), BOX_PICTURES, BOX_PICTURES)), np.empty((len(weights), BOX_PICTURES))
-    normal_equations(shapes, fit.residuals, weights, own, own_slopes)
-    taken = np.matmul(fit.covariance(), coupled)
-    along = own_slopes.sum(axis=0) - np.einsum("nps,np->s", taken, slopes[..., 0])
-    own -= np.matmul(coupled.transpose(0, 2, 1), taken)
-    shares = _solved(own.sum(axis=0), along)
+    normal, gradient = reduced_equations(fit, shapes, weights)
+    shares = least_of_all(normal.sum(axis=0), gradient.sum(axis=0))
     beyond = np.zeros_like(weights)
     add_rows(shapes, np.tile(shares.astype(np.float32), (len(weights), 1)), beyond)
     return fit.given(fit.residuals - beyond, weights), beyond
-
-
-def _solved(normal: Array, gradient: Array) -> Array:
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float32).tiny))
-    unit = normal * scale[:, None] * scale + _RIDGE * np.eye(len(scale))
-    shares: Array = scale * np.linalg.solve(unit, gradient * scale)
-    return shares

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.edge_profile import blurred_step
 from nav.centroids.ellipses import Ellipses, plane_shapes
 from nav.centroids.marker_signal import Array32
-from nav.centroids.patches import PixelSet, edge_distances
+from nav.centroids.motion_blur import share_outside_along
+from nav.centroids.patches import OUTER_DIFFERENCE_PX, PixelSet
 
 # Fewer markers than this do not tell an affine map.
 _LEAST_MARKERS = 3
 # Pixels that see more of what lies beyond are left out: ribs, hose, hub and sky are not even. What the lens spreads
 # from there over the others is fitted as if it were.
 MOST_BEYOND = 0.5
+# What begins this near a disc may be seen in its window, which lies about the rough place, and through the blur. [px]
+SEEN_BESIDE_PX = OUTER_DIFFERENCE_PX + 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,17 +28,21 @@ class Surroundings:
     Attributes:
         places_m: (M, 2) of the markers in the rim plane, in the order of the discs. [m]
         edges_m: radii about the origin of the rim plane within which the face begins and ends. [m]
+        margin_px: width of the face beside the discs.
     """
 
     places_m: Array
     edges_m: tuple[float, float]
+    margin_px: float = 0.0
 
     def take(self, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Surroundings:
         """Those of some discs."""
-        return Surroundings(self.places_m[index], self.edges_m)
+        return replace(self, places_m=self.places_m[index])
 
 
-def shares_beyond(around: Surroundings, discs: Ellipses, pixels: PixelSet, width_px: float) -> Array32 | None:
+def shares_beyond(
+    around: Surroundings, discs: Ellipses, pixels: PixelSet, width_px: float, ways: Array | None
+) -> Array32 | None:
     """How much of each pixel's light comes from within the face's opening, and from beyond the rim.
 
     The face is where an affine map of the eye's own markers shows it, shifted so that the disc itself lies where it was
@@ -47,6 +53,7 @@ def shares_beyond(around: Surroundings, discs: Ellipses, pixels: PixelSet, width
         discs: the markers, placed to a tenth of a pixel or so.
         pixels: of the discs.
         width_px: Gaussian width of edges.
+        ways: (N, 3) of the discs while the shutter is open, None of still ones.
 
     Returns:
         (N, 2, K), or None where an eye has too few markers to tell.
@@ -65,13 +72,7 @@ def shares_beyond(around: Surroundings, discs: Ellipses, pixels: PixelSet, width
         shapes[:, mine] = np.multiply.outer(around.edges_m, plane_shapes(affine[None, :, :2])[0])[:, None]
     x = pixels.x_px - middles[:, :1].astype(np.float32)
     y = pixels.y_px - middles[:, 1:].astype(np.float32)
-    beyond_rim = share_outside(shapes[1], x, y, width_px)
-    in_opening = 1 - share_outside(shapes[0], x, y, width_px)
+    in_opening = 1 - share_outside_along(shapes[0], x, y, width_px, ways)
+    beyond_rim = share_outside_along(shapes[1], x, y, width_px, ways)
     shares: Array32 = np.stack([in_opening, beyond_rim], axis=1)
     return shares
-
-
-def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float) -> Array32:
-    """(N, K) how much of the light at places (N, K) comes from outside ellipses (N, 2, 2) about the origin."""
-    distance = edge_distances(shapes_px, x_px, y_px)
-    return blurred_step(distance * np.float32(-np.sqrt(0.5) / width_px))[0]

@@ -1,0 +1,196 @@
+"""Outlines that move while the shutter is open: how far, and the picture of them.
+
+A moving outline shows the mean of its pictures along its way. The way is straight and even within an exposure, so both
+ends of it are alike: what is measured is where the outline was at mid-exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geometry.se3 import Array
+from nav.centroids.disc_places import ELLIPSE_PARAMETERS, WIDTH
+from nav.centroids.edge_profile import edge_widths, share_outside
+from nav.centroids.ellipses import Ellipses
+from nav.centroids.least_squares import Minimum, Model, NormalEquations
+from nav.centroids.marker_signal import Array32
+from nav.centroids.matrix_loops import add_rows
+from nav.centroids.patches import PixelSet
+from nav.centroids.shared_parameters import least_of_all, reduced_equations
+
+# Shorter ways leave an edge that the fit of a still one follows, and cannot be told from its noise. [px]
+_LEAST_TRAVEL_PX = 1.0
+_LEAST_SIGMA = 5.0
+# Pictures along a way lie this far apart at most: Gaussian edges of a pixel's box and a lens are even then. [px]
+_STEP_PX = 1.0
+# A longer way is another thing's. [px]
+_MOST_TRAVEL_PX = 40.0
+# A side of an even box of unit length has this variance.
+_BOX_VARIANCE = 1 / 12
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Travel:
+    """How outlines move on the images while the shutter is open, forwards or backwards alike.
+
+    Each eye's outlines move as one, and may turn and grow about their middle meanwhile.
+
+    Attributes:
+        middles_px: (2, 2) of the eyes' outlines. [px]
+        means_px: (2, 2) way of the middles. [px]
+        turns: (2, 2) growth over the exposure, and turn. [1, rad]
+    """
+
+    middles_px: Array
+    means_px: Array
+    turns: Array
+
+    def of(self, outlines: Ellipses) -> Array:
+        """(N, 3) ways of outlines, along x and y [px], and by how much of themselves they grow on them."""
+        x, y = (outlines.centers_px - self.middles_px[outlines.eyes]).T
+        growth, turn = self.turns[outlines.eyes].T
+        along_x, along_y = self.means_px[outlines.eyes].T
+        ways: Array = np.stack([along_x + growth * x - turn * y, along_y + turn * x + growth * y, growth], axis=1)
+        return ways
+
+    def spread_px(self, outlines: Ellipses) -> float:
+        """How far to either side the edge of outlines is spread at most. [px]"""
+        return float(np.hypot(*self.of(outlines)[:, :2].T).max(initial=0.0)) / 2
+
+
+def steps_along(ways: Array) -> tuple[Array, Array]:
+    """(T, N, 3) parts of ways (N, 3), from their middles, and (T,) shares of them."""
+    longest_px = float(np.hypot(*ways[:, :2].T).max(initial=0.0))
+    count = max(1, int(np.ceil(longest_px / _STEP_PX)))
+    shares = (np.arange(count) + 0.5) / count - 0.5
+    return np.multiply.outer(shares, ways), shares
+
+
+def share_outside_along(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float, ways: Array | None) -> Array32:
+    """As `share_outside`, of ellipses that move by (N, 3), or stand still."""
+    if ways is None:
+        return share_outside(shapes_px, x_px, y_px, width_px)
+    steps = steps_along(ways)[0].astype(np.float32)[..., None]
+    total = np.zeros_like(x_px)
+    for along_x, along_y, growth in steps.transpose(0, 2, 1, 3):
+        scale = 1 - growth
+        total += share_outside(shapes_px, scale * (x_px - along_x), scale * (y_px - along_y), width_px)
+    return total / np.float32(len(steps))
+
+
+def moving(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Model:
+    """A model of still outlines, of moving ones.
+
+    Args:
+        model: of outlines.
+        ways: (N, 3).
+        ellipses: where the parameters of each outline's ellipses begin.
+    """
+    steps = steps_along(ways)[0]
+
+    def moved(parameters: Array) -> tuple[Array32, Array32]:
+        total, slopes = model(_further_on(parameters, steps[0], ellipses))
+        for step in steps[1:]:
+            picture, jacobian = model(_further_on(parameters, step, ellipses))
+            total += picture
+            slopes += jacobian
+        scale = np.float32(1 / len(steps))
+        return total * scale, slopes * scale
+
+    return moved
+
+
+def _further_on(parameters: Array, step: Array, ellipses: tuple[int, ...]) -> Array:
+    """Parameters (N, P) of outlines a step (N, 3) further on."""
+    there = parameters.copy()
+    for first in ellipses:
+        there[:, first : first + 2] += step[:, :2]
+        # Elements of the inverse shape.
+        there[:, first + 2 : first + ELLIPSE_PARAMETERS] *= 1 - step[:, 2:]
+    return there
+
+
+def seen_travel(fit: Minimum, pixels: PixelSet, discs: Ellipses) -> Travel | None:
+    """How outlines moved, roughly, from what the fit of still ones with even blur left; None where they stood still.
+
+    Along its way an outline is blurred, across it is not: what is left changes with twice the azimuth. To first order
+    that tells way and direction, of long ways three quarters.
+
+    Args:
+        fit: of the discs.
+        pixels: of them.
+        discs: where they are, roughly.
+    """
+    x, y = pixels.x_px - fit.parameters[:, :1], pixels.y_px - fit.parameters[:, 1:2]
+    azimuth = np.arctan2(y, x)
+    by_variance = fit.jacobian[:, WIDTH] / (2 * edge_widths(fit.parameters[:, WIDTH])[:, None])
+    shapes = np.stack([by_variance * np.cos(2 * azimuth), by_variance * np.sin(2 * azimuth)], axis=1)
+    normal, gradient = reduced_equations(fit, shapes.astype(np.float32), pixels.present)
+    freedom = np.maximum(pixels.present.sum() - fit.parameters.size, 1)
+    noise_dn2 = float((fit.residuals**2 * pixels.present).sum() / freedom)
+    all_normal = normal.sum(axis=0)
+    across, along = least_of_all(all_normal, gradient.sum(axis=0))
+    variance, direction = np.hypot(across, along), np.arctan2(along, across) / 2
+    length_px = np.sqrt(variance / _BOX_VARIANCE)
+    sigma = np.sqrt(noise_dn2 / np.maximum(np.diag(all_normal).min(), np.finfo(np.float32).tiny))
+    if not (_LEAST_TRAVEL_PX < length_px < _MOST_TRAVEL_PX and variance > _LEAST_SIGMA * sigma):
+        return None
+    middles = np.zeros((2, 2))
+    for eye in np.unique(discs.eyes):
+        middles[eye] = discs.centers_px[discs.eyes == eye].mean(axis=0)
+    # Both eyes see the same way, but for what the distance changes.
+    way = length_px * np.array([np.cos(direction), np.sin(direction)])
+    return Travel(middles, np.tile(way, (2, 1)), np.zeros((2, 2)))
+
+
+def fit_travel(model: Model, pixels: PixelSet, start: Array, travel: Travel, discs: Ellipses) -> Travel | None:
+    """The ways of moving discs, in Gauss-Newton steps of them and of the discs at once; None where that leads astray.
+
+    Args:
+        model: of still discs.
+        pixels: of them.
+        start: (N, P) parameters.
+        travel: roughly.
+        discs: where they are, roughly.
+    """
+    arms_px = discs.centers_px - travel.middles_px[discs.eyes]
+    size_px = max(float(np.abs(arms_px).max()), 1.0)
+    x, y = (arms_px / size_px).astype(np.float32).T[:, :, None]
+    parameters = start
+    for _ in range(_ROUNDS):
+        fit, by_travel = _evaluate_moving(model, pixels, parameters, travel.of(discs))
+        by_x, by_y = by_travel[:, 0], by_travel[:, 1]
+        shared = np.stack([by_x, by_y, x * by_x + y * by_y, x * by_y - y * by_x], axis=1)
+        normal, gradient = reduced_equations(fit, shared, pixels.present)
+        steps = np.zeros((2, 4))
+        for eye in np.unique(discs.eyes):
+            mine = discs.eyes == eye
+            steps[eye] = least_of_all(normal[mine].sum(axis=0), gradient[mine].sum(axis=0))
+        left = fit.residuals.copy()
+        add_rows(np.ascontiguousarray(shared), (-steps[discs.eyes]).astype(np.float32), left)
+        parameters = fit.given(left, pixels.present).parameters
+        travel = Travel(travel.middles_px, travel.means_px + steps[:, :2], travel.turns + steps[:, 2:] / size_px)
+        # Not a number is not within.
+        if not np.hypot(*travel.of(discs)[:, :2].T).max() < _MOST_TRAVEL_PX:
+            return None
+    return travel
+
+
+def _evaluate_moving(model: Model, pixels: PixelSet, parameters: Array, ways: Array) -> tuple[Minimum, Array32]:
+    """The picture of moving discs, and (N, 2, K) its derivatives by their ways along x and y."""
+    values, jacobian = np.zeros_like(pixels.values), None
+    by_way = np.zeros((len(parameters), 2, pixels.values.shape[1]), np.float32)
+    for step, share in zip(*steps_along(ways), strict=True):
+        picture, slopes = model(_further_on(parameters, step, (0,)))
+        values += picture
+        by_way += np.float32(share) * slopes[:, :2]
+        jacobian = slopes if jacobian is None else jacobian + slopes
+    assert jacobian is not None
+    scale = np.float32(1 / len(steps_along(ways)[1]))
+    jacobian *= scale
+    residuals = pixels.values - scale * values
+    normal = NormalEquations(jacobian, residuals, pixels.present)
+    return Minimum(parameters, residuals, jacobian, normal), scale * by_way
