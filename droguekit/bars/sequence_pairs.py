@@ -60,8 +60,7 @@ class ScoredPair:
         pair: the truth.
         error: (5,) X, Y, Z [m], pitch and yaw [deg], estimate minus truth; None without a pose.
         sd_m: root of the trace of the position's reported covariance; None without one. [m]
-        over_bound: (5,) error over its bound at the noise that markers and hubs of its family were measured with, each by
-            itself; None without either.
+        over_bound: (5,) error over its bound at the noise measured in its family, of markers and of hubs; None without.
         reason: why there is no pose; empty where there is one, or no word at all.
         work_s: of all stages but those in which the pair waits, where they are told. [s]
     """

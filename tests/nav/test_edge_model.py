@@ -212,7 +212,7 @@ def test_shares_beyond_the_face_follow_the_markers():
     rng = np.random.default_rng(14)
     signals, truth, around, _ = draw_face(rng, 0.0, noisy=False)
     pixels = disc_pixels(signals, truth)
-    shares = shares_beyond(around, truth, pixels, START_WIDTH_PX)
+    shares = shares_beyond(around, truth, pixels, START_WIDTH_PX, None)
     assert shares is not None
     places = np.stack([pixels.x_px, pixels.y_px], axis=-1) + pixels.origins_px[:, None]
     for eye in range(2):
@@ -224,7 +224,7 @@ def test_shares_beyond_the_face_follow_the_markers():
         for share, edge, sign in zip(np.moveaxis(shares[mine], 1, 0), around.edges_m, (-1, 1), strict=True):
             np.testing.assert_array_equal((share > 0.5), sign * (out_px - edge * ring_px) > 0)
     few = truth.take(np.array([0, 1, 8, 9]))
-    assert shares_beyond(around.take(np.array([0, 1, 8, 9])), few, disc_pixels(signals, few), 0.5) is None
+    assert shares_beyond(around.take(np.array([0, 1, 8, 9])), few, disc_pixels(signals, few), 0.5, None) is None
 
 
 @pytest.mark.parametrize("color", [0, 2])

@@ -14,24 +14,27 @@ from nav.centroids.motion_blur import moving
 from nav.centroids.patches import disc_pixels
 from tests.nav.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, rough_start
 
-PARTS = 40
+PARTS = 32
 
 
 def draw_moving(radius_px, light, rng, way, growth=0.0):
     """Signals of a ring of COUNT discs in each eye that moves by `way`, grows about its middle, and their places."""
-    ring_px = 2.5 * radius_px + 6 + np.hypot(*way)
-    cell = int(2 * (ring_px + radius_px + np.hypot(*way) + 12))
-    grid = np.arange(cell, dtype=np.float64)
+    reach_px = np.hypot(*way)
+    ring_px = 3 * (radius_px + reach_px + 8)
+    size = int(2 * (ring_px + radius_px + reach_px + 12))
+    window = np.arange(int(2 * (radius_px + reach_px + 8)), dtype=np.float64)
     angles = 2 * np.pi * np.arange(COUNT) / COUNT
     shape, signals, centers = radius_px * np.diag([1.0, 0.97]), [], []
     for _ in range(2):
-        middle = cell / 2 + rng.uniform(-0.5, 0.5, 2)
+        middle = size / 2 + rng.uniform(-0.5, 0.5, 2)
         arms = ring_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        mean_e = np.full((cell, cell), float(light.background_e))
-        for part in (np.arange(PARTS) + 0.5) / PARTS - 0.5:
-            for arm in arms:
-                at = middle + part * np.array(way) + (1 + growth * part) * arm
-                mean_e += light.contrast_e / PARTS * coverage((1 + growth * part) * shape, at, grid)
+        mean_e = np.full((size, size), float(light.background_e))
+        for arm in arms:
+            left, top = np.rint(middle + arm - len(window) / 2).astype(int)
+            lit = mean_e[top : top + len(window), left : left + len(window)]
+            for part in (np.arange(PARTS) + 0.5) / PARTS - 0.5:
+                at = middle + part * np.array(way) + (1 + growth * part) * arm - (left, top)
+                lit += light.contrast_e / PARTS * coverage((1 + growth * part) * shape, at, window)
         values = expose(light, mean_e, rng)
         signals.append(MarkerSignal(values, values >= 1e4, (0.0, 0.0), 1, True))
         centers.append(middle + arms)
@@ -44,7 +47,7 @@ def draw_moving(radius_px, light, rng, way, growth=0.0):
 )
 def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, radius_px, way, growth):
     rng, normalized, errors, unaware = np.random.default_rng([3, int(radius_px)]), [], [], []
-    for _ in range(4):
+    for _ in range(2):
         signals, truth = draw_moving(radius_px, DAY, rng, way, growth)
         start = rough_start(truth, rng)
         fits = fit_discs(signals, start)
@@ -59,22 +62,21 @@ def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, rad
         with monkeypatch.context() as context:
             context.setattr(edge_model, "seen_travel", lambda *_: None)
             unaware.append(fit_discs(signals, start).ellipses.centers_px - truth.centers_px)
-    # 128 squared errors: standard deviation 0.13.
-    assert 0.6 < np.mean(normalized) < 1.5
-    assert np.sqrt(np.mean(np.square(errors))) < np.sqrt(np.mean(np.square(unaware)))
+    # 64 squared errors: standard deviation 0.18.
+    assert 0.5 < np.mean(normalized) < 1.6
+    # Shorter ways move the fit of still discs by less than the noise.
+    assert np.hypot(*way) < 3 or np.mean(np.square(errors)) < np.mean(np.square(unaware)) / 2
     # Four standard errors: neither end of the way has more weight than the other.
-    assert np.abs(np.mean(errors, axis=(0, 1))).max() < 4 * np.std(errors) / np.sqrt(64)
+    assert np.abs(np.mean(errors, axis=(0, 1))).max() < 4 * np.std(errors) / np.sqrt(32)
 
 
 @pytest.mark.parametrize("light", [DAY, DUSK])
 @pytest.mark.parametrize("radius_px", [30.0, 8.0, 3.0])
 def test_still_discs_are_not_said_to_move(radius_px, light):
     rng = np.random.default_rng([5, int(radius_px)])
-    assert all(fit_discs(signals, rough_start(truth, rng)).travel is None for signals, truth in _still(radius_px, light, rng))
-
-
-def _still(radius_px, light, rng):
-    return [draw_discs(radius_px, light, rng) for _ in range(6)]
+    for _ in range(6):
+        signals, truth = draw_discs(radius_px, light, rng)
+        assert fit_discs(signals, rough_start(truth, rng)).travel is None
 
 
 def test_what_has_no_edges_does_not_move():
