@@ -142,7 +142,7 @@ def fit_annuli(
     model = in_free_parameters(_drawn(pixels, (turns, beyond), ways), start, ties)
     final, weights, edge_factor = _weighted_fit(pixels, turns, (start, ties), model, first, ways is None)
     parameters = all_parameters(start, ties, final)
-    (between, in_hole), light = shares_of(final, ties), light_above(parameters, turns)
+    between, light = shares_of(final, ties)[0], light_above(parameters, turns)
     contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
     uneven = _sector_chi2(final, weights, pixels, contrast)
     if edge_factor < 1:
@@ -151,8 +151,7 @@ def fit_annuli(
         uneven = np.maximum(uneven, _sector_chi2(final, judged, pixels, contrast))
     inflation = 1 + _SHADOW_FACTOR * np.maximum(uneven - _EVEN_SECTOR_CHI2, 0)
     # The first two free parameters are the common shift.
-    spread = final.covariance_with(_noise_factors(final, weights, (between, in_hole), edge_factor))
-    cov = beyond_linear(spread[:, :2, :2] * inflation[:, None, None])
+    cov = beyond_linear(final.covariance()[:, :2, :2] * edge_factor * inflation[:, None, None])
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
@@ -203,21 +202,6 @@ def _weighted_fit(
     weights = pixels.present / noise.variances(between, light)
     final = minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
     return final, weights, noise.edge_factor
-
-
-def _noise_factors(fit: Minimum, weights: Array32, shares: tuple[Array32, Array32], edge_factor: float) -> Array32:
-    """(N, K) by how much the pixels' variances differ from what the weights say.
-
-    Edges vary by less where things beside the annulus pass for noise; the light in the hole, whose slope takes a share
-    of what is known of the centre, may vary by more than that outside.
-    """
-    between, in_hole = shares
-    deep = weights * (in_hole > 1 - _BESIDE)
-    count = np.maximum((deep > 0).sum(axis=1), 1)
-    own = np.maximum((deep * fit.residuals**2).sum(axis=1) / count, 1)
-    beside = np.where(deep > 0, own[:, None], np.float32(1))
-    on_edge = (between > _BESIDE) & (between < 1 - _BESIDE)
-    return np.where(on_edge, np.float32(edge_factor), beside).astype(np.float32)
 
 
 def _sector_chi2(fit: Minimum, weights: Array32, pixels: PixelSet, contrast: Array) -> Array:

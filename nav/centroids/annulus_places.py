@@ -12,7 +12,5 @@ CENTERS = np.array([0, 1, ELLIPSE_PARAMETERS, ELLIPSE_PARAMETERS + 1])
 WIDTH, BACKGROUND, HOLE = (2 * ELLIPSE_PARAMETERS + i for i in range(3))
 # What lies beyond is lighter towards one side than towards another: a constant and the first two orders of the azimuth.
 BEYOND, BEYOND_TURNS = HOLE + 1, 5
-# The wall of the mouth is lit from one side: what the hole's light changes by, the first order of the azimuth.
-HOLE_TURN, HOLE_TURNS = BEYOND + BEYOND_TURNS, 2
 # Light on the annulus by the azimuth, the constant first.
-AMPLITUDE = HOLE_TURN + HOLE_TURNS
+AMPLITUDE = BEYOND + BEYOND_TURNS

@@ -76,5 +76,5 @@ def merged(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscFits
         put(fits.inflation, part.inflation),
         tuple(reasons),
         part.noise,
-        part.travel,
+        fits.travel if part.travel is None else part.travel,
     )

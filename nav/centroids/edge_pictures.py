@@ -223,19 +223,17 @@ def draw_annuli(
         picture: (N, K).
         jacobian: (N, P, K).
     """
-    by_q, by_gradient, light, hole = np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0])
+    by_q, by_gradient, light = np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0])
     to_outer, to_inner, up, down = (np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0]))
     for n in range(len(x)):
         own, rows, xs, ys, width = parameters[n], jacobian[n], x[n], y[n], widths[n]
         outside, in_hole = rows[annulus_places.BACKGROUND], rows[annulus_places.HOLE]
         between = rows[annulus_places.AMPLITUDE]
-        background = own[annulus_places.BACKGROUND]
+        background, hole = own[annulus_places.BACKGROUND], own[annulus_places.HOLE]
         outer, inner = (own[0], own[1], own[2], own[3], own[4]), (own[5], own[6], own[7], own[8], own[9])
-        light[:], hole[:] = _F(0), own[annulus_places.HOLE]
+        light[:] = _F(0)
         for turn in range(turns.shape[1]):
             add_row(turns[n, turn], own[annulus_places.AMPLITUDE + turn], light)
-        for turn in range(annulus_places.HOLE_TURNS):
-            add_row(turns[n, 1 + turn], own[annulus_places.HOLE_TURN + turn], hole)
         # The slopes need what `_place` leaves, so one edge is done before the other; `between` is the outer share till
         # the inner one is known.
         _place(xs, ys, outer, to_outer, by_q, by_gradient)
@@ -248,7 +246,7 @@ def draw_annuli(
         _place(xs, ys, inner, to_inner, by_q, by_gradient)
         blurred_steps(to_inner, _F(_SQRT_HALF) / width, in_hole, down)
         for k in range(len(xs)):
-            down[k] *= peak * (hole[k] - light[k])
+            down[k] *= peak * (hole - light[k])
         _slopes_by_center(xs, ys, inner, by_q, by_gradient, down, rows[disc_places.ELLIPSE_PARAMETERS :])
         _slopes_by_shape(xs, ys, inner, by_q, by_gradient, down, rows[disc_places.ELLIPSE_PARAMETERS :])
         by_width = rows[annulus_places.WIDTH]
@@ -258,13 +256,11 @@ def draw_annuli(
             outside[k] = _ONE - between[k]
             between[k] -= in_hole[k]
         for k in range(len(xs)):
-            picture[n, k] = background * outside[k] + light[k] * between[k] + hole[k] * in_hole[k]
+            picture[n, k] = background * outside[k] + light[k] * between[k] + hole * in_hole[k]
         for turn in range(annulus_places.BEYOND_TURNS):
             place = annulus_places.BEYOND + turn
             multiply_rows(turns[n, turn], beyond[n], _ONE, rows[place])
             add_row(rows[place], own[place], picture[n])
-        for turn in range(annulus_places.HOLE_TURNS):
-            multiply_rows(turns[n, 1 + turn], in_hole, _ONE, rows[annulus_places.HOLE_TURN + turn])
         # The first function is one, so its row is `between` itself, from which the others follow.
         for turn in range(1, turns.shape[1]):
             multiply_rows(turns[n, turn], between, _ONE, rows[annulus_places.AMPLITUDE + turn])

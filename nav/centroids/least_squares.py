@@ -94,15 +94,6 @@ class Minimum:
         """(N, P, P) inverse of the normal matrices."""
         return self.normal.inverse
 
-    def covariance_with(self, factors: Array32) -> Array:
-        """(N, P, P) covariance where the variances of the data are the weights' inverses times factors (N, K)."""
-        count, size, _ = self.jacobian.shape
-        spread, unused = np.empty((count, size, size)), np.empty((count, size))
-        normal_equations(self.jacobian, self.residuals, self.normal.weights * factors, spread, unused)
-        inverse = self.normal.inverse
-        covariance: Array = inverse @ spread @ inverse
-        return covariance
-
     def given(self, residuals: Array32, weights: Array32) -> Minimum:
         """Where one undamped step ends from here if the residuals were these; (N, K) each."""
         gradient = np.empty((*self.parameters.shape, 1))

@@ -27,7 +27,7 @@ _LEAST_SIGMA = 5.0
 _STEP_PX = 1.0
 # A longer way is another thing's. [px]
 _MOST_TRAVEL_PX = 40.0
-# A side of an even box of unit length has this variance.
+# Of places spread evenly over a unit of length.
 _BOX_VARIANCE = 1 / 12
 _ROUNDS = 4
 
