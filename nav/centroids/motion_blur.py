@@ -25,8 +25,8 @@ _LEAST_TRAVEL_PX = 1.0
 _LEAST_SIGMA = 5.0
 # Pictures along a way lie this far apart at most: Gaussian edges of a pixel's box and a lens are even then. [px]
 _STEP_PX = 1.0
-# A longer way is another thing's. [px]
-_MOST_TRAVEL_PX = 40.0
+# There the room around outlines ends (`nav.centroids.marker_signal`). [px]
+_MOST_TRAVEL_PX = 30.0
 # Of places spread evenly over a unit of length.
 _BOX_VARIANCE = 1 / 12
 _ROUNDS = 4
@@ -125,10 +125,12 @@ def seen_travel(fit: Minimum, pixels: PixelSet, discs: Ellipses) -> Travel | Non
         discs: where they are, roughly.
     """
     x, y = pixels.x_px - fit.parameters[:, :1], pixels.y_px - fit.parameters[:, 1:2]
-    azimuth = np.arctan2(y, x)
-    by_variance = fit.jacobian[:, WIDTH] / (2 * edge_widths(fit.parameters[:, WIDTH])[:, None])
-    shapes = np.stack([by_variance * np.cos(2 * azimuth), by_variance * np.sin(2 * azimuth)], axis=1)
-    normal, gradient = reduced_equations(fit, shapes.astype(np.float32), pixels.present)
+    x, y = x.astype(np.float32), y.astype(np.float32)
+    # Cosine and sine of twice the azimuth, without the angle itself.
+    square = x * x + y * y + np.finfo(np.float32).tiny
+    by_variance = fit.jacobian[:, WIDTH] / (2 * edge_widths(fit.parameters[:, WIDTH])[:, None] * square)
+    shapes = np.stack([by_variance * (x * x - y * y), by_variance * (2 * x * y)], axis=1)
+    normal, gradient = reduced_equations(fit, shapes, pixels.present)
     freedom = np.maximum(pixels.present.sum() - fit.parameters.size, 1)
     noise_dn2 = float((fit.residuals**2 * pixels.present).sum() / freedom)
     all_normal = normal.sum(axis=0)

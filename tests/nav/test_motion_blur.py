@@ -54,7 +54,7 @@ def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, rad
         assert fits.accepted.all(), fits.reasons
         assert fits.travel is not None
         sense = np.sign(fits.travel.means_px[0] @ np.array(way))
-        # To a tenth of a pixel at the smallest, whose edges are hardly wider than still ones.
+        # The shortest ways, which widen edges least, are told worst: to 0.1 px or so.
         np.testing.assert_allclose(sense * fits.travel.means_px, [way, way], atol=0.25)
         error = fits.ellipses.centers_px - truth.centers_px
         errors.append(error)
