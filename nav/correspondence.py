@@ -2,7 +2,8 @@
 
 In each image the drogue's ring is found among the regions (`nav.ring_match`), which orders the markers up to the
 layout's symmetry and leaves gaps where one is missing; an image that shows too few of them for a ring by itself is
-looked at where the other one's ring must be. Then every turn of the right image's order against the left's is
+looked at where the other one's ring must be, and where the images' edges cut the ring, what they leave of it is enough
+where both images show the same. Then every turn of the right image's order against the left's is
 tried, and the one with the smallest epipolar and disparity cost is taken.
 """
 
@@ -18,10 +19,22 @@ from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
 from nav.centroids.binary_chain import Centroids
 from nav.pose.interface import NoFixReason, Observation
-from nav.ring_match import RingMatch, match_ring, match_ring_near, symmetry_permutations
+from nav.ring_match import (
+    FEW,
+    RingMatch,
+    least_markers,
+    match_cut_ring,
+    match_ring,
+    match_ring_near,
+    symmetry_permutations,
+)
 
 # The best turn must explain the pairs within this share of the gap between neighbours; a wrong turn misses by a gap.
 _LARGEST_COST_FRACTION = 0.35
+# Where both images show a part of the ring only, the pairs must fit better (drawn tilts of 20 degrees: 0.03 of the gap at most).
+_LARGEST_COST_FRACTION_OF_PARTS = 0.05
+# Markers in the other image of four that the image's edge leaves: six coordinates, and the row and size of each.
+_FEWEST_BESIDE_A_CUT_RING = 3
 # A pair whose rows differ by more than this is not one marker: room for the rig's calibration, and six deviations.
 _ROW_TOLERANCE_PX = 1.0
 _ROW_TOLERANCE_SIGMA = 6.0
@@ -72,7 +85,8 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
     costs = _costs_px(first.centers_px, second.centers_px[permutations], disparity_px)
     best = int(np.argmin(costs))
     gap_px = _smallest_gap_m(layout) * rings[0].scale_px_per_m
-    if costs[best] > _LARGEST_COST_FRACTION * gap_px:
+    is_part = max(rings[0].count, rings[1].count) < least_markers(layout)
+    if costs[best] > (_LARGEST_COST_FRACTION_OF_PARTS if is_part else _LARGEST_COST_FRACTION) * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
     return Observation(rig, layout, *_without_bad_pairs(first, second.turned(permutations[best])))
 
@@ -80,12 +94,31 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
 def _rings(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayout) -> list[RingMatch | None]:
     """The ring in each image; where only one shows it by itself, the other is looked at where it must be."""
     rings = [centroids.ring or match_ring(centroids.blobs, layout) for centroids in (left, right)]
-    for eye, blobs, toward_px in ((0, left.blobs, 1.0), (1, right.blobs, -1.0)):
+    if rings[0] is None and rings[1] is None:
+        return _cut_rings(left, right, rig, layout)
+    return _seen_by_other_eye(rings, (left, right), rig, layout, FEW)
+
+
+def _cut_rings(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayout) -> list[RingMatch | None]:
+    """The part of the ring that the images' edges leave, in both images or in none."""
+    size_px = rig.camera.width_px, rig.camera.height_px
+    parts = [match_cut_ring(centroids.blobs, layout, size_px) for centroids in (left, right)]
+    parts = _seen_by_other_eye(parts, (left, right), rig, layout, _FEWEST_BESIDE_A_CUT_RING)
+    return [None, None] if parts[0] is None or parts[1] is None else parts
+
+
+def _seen_by_other_eye(
+    rings: list[RingMatch | None], seen: tuple[Centroids, Centroids], rig: StereoRig, layout: MarkerLayout, least: int
+) -> list[RingMatch | None]:
+    """The same, where one image shows a ring, with what the other shows of at least so many markers where it must be."""
+    found = list(rings)
+    for eye, toward_px in ((0, 1.0), (1, -1.0)):
         other = rings[1 - eye]
         if rings[eye] is None and other is not None:
             disparity_px = rig.baseline_m * other.scale_px_per_m
-            rings[eye] = match_ring_near(blobs, layout, other.moved((toward_px * disparity_px, 0.0)).affine)
-    return rings
+            expected = other.moved((toward_px * disparity_px, 0.0)).affine
+            found[eye] = match_ring_near(seen[eye].blobs, layout, expected, least)
+    return found
 
 
 def no_ring(centroids: Centroids, eye: Eye) -> str:

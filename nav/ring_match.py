@@ -26,7 +26,12 @@ _FIT_TOLERANCE = 0.4
 _ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
-_LEAST_NEAR = 4  # markers where the ring is known to be
+FEW = 4  # markers, where the ring is known to be or another image shows the same
+# Part of a ring: at most 37 degrees of tilt, and discs of the size that goes with their gaps within a quarter. Three
+# markers and the hub would pass for four markers of a ring of twice their size, tilted by 60 degrees.
+_PART_TILT_COSINE = 0.8
+_PART_SIZE_FACTOR = 1.25
+_PART_REACH = 1.4
 # A marker that was not found lies this many times as far off the map as the others at most.
 _MOST_OFF = 3.0
 # A complete ring this near its map needs no second guess.
@@ -97,7 +102,38 @@ def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
         blobs: of one image.
         layout: the drogue's markers.
     """
-    if len(blobs) < least_markers(layout):
+    return _best_match(blobs, layout, least_markers(layout))
+
+
+def match_cut_ring(blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int]) -> RingMatch | None:
+    """Four markers or more of a ring whose others the picture's edge cuts off, or None.
+
+    Not enough to take it for the drogue, unless the other eye shows the same.
+
+    Args:
+        blobs: of one image.
+        layout: the drogue's markers.
+        size_px: width and height of the image.
+    """
+    match = _best_match(blobs, layout, FEW)
+    if match is None:
+        return None
+    largest, smallest = _stretches(match.affine)
+    places_px = layout.centers_m[:, :2] @ match.affine[:, :2].T + match.affine[:, 2]
+    # A disc is dropped whose picture touches the edge, and the map may be off by a third of a radius.
+    reach_px = _PART_REACH * layout.radius_m * largest
+    whole = ((places_px > reach_px) & (places_px < np.array(size_px) - 1 - reach_px)).all(axis=1)
+    if (whole & (match.blob_of_marker < 0)).any():
+        return None
+    expected_px = layout.radius_m * np.sqrt(largest * smallest)
+    radii_px = blobs.radii_px[match.blob_of_marker[match.blob_of_marker >= 0]]
+    alike = np.abs(np.log(radii_px / expected_px)) < np.log(_PART_SIZE_FACTOR)
+    return match if smallest > _PART_TILT_COSINE * largest and alike.all() else None
+
+
+def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
+    """The set of at least so many markers that has most of them, and fits best, or None."""
+    if len(blobs) < least:
         return None
     best: RingMatch | None = None
     permutations = symmetry_permutations(layout)
@@ -110,7 +146,7 @@ def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
         if key in tried:
             continue
         tried.add(key)
-        match = _fit(blob_of_marker, blobs, layout, least_markers(layout))
+        match = _fit(blob_of_marker, blobs, layout, least)
         if match is not None and (best is None or _rank(match) > _rank(best)):
             best = match
         if best is not None and best.count == layout.count and best.rms_fraction < _GOOD_RMS_FRACTION:
@@ -118,19 +154,20 @@ def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
     return best
 
 
-def match_ring_near(blobs: Blobs, layout: MarkerLayout, affine: Array) -> RingMatch | None:
+def match_ring_near(blobs: Blobs, layout: MarkerLayout, affine: Array, least: int = FEW) -> RingMatch | None:
     """The markers among blobs where a ring is known to be, or None.
 
-    Four are enough then, where a ring that may be anywhere needs more to be told from other things.
+    Few are enough then, where a ring that may be anywhere needs more to be told from other things.
 
     Args:
         blobs: of one image.
         layout: the drogue's markers.
         affine: (2, 3) map from the rim plane [m] to pixels, right to some tenths of a marker's radius.
+        least: so many must be there, three at least.
     """
-    if len(blobs) < _LEAST_NEAR:
+    if len(blobs) < least:
         return None
-    return _fit(_nearest_blobs(affine, blobs, layout, _GUESS_TOLERANCE), blobs, layout, _LEAST_NEAR)
+    return _fit(_nearest_blobs(affine, blobs, layout, _GUESS_TOLERANCE), blobs, layout, least)
 
 
 def _rank(match: RingMatch) -> tuple[int, float]:

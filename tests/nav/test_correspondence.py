@@ -8,6 +8,7 @@ import pytest
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import disc_area_px2, project_disc_centers
+from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
 from nav.blobs import Blobs
 from nav.centroids.binary_chain import Centroids, quantisation_variance_px2
@@ -243,3 +244,63 @@ def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leave
         told["cut"] += int(clearly.sum())
     # Both happen.
     assert min(told.values()) > 100
+
+
+def partly_beside(make_pose, rng, layout, whole_left, whole_right):
+    """A place near by where the edges of the images leave so many markers whole."""
+    size_px = np.array([RIG.camera.width_px, RIG.camera.height_px])
+    while True:
+        x_m, y_m = rng.uniform(-0.5, 0.6), rng.choice([-1, 1]) * rng.uniform(0.2, 0.6)
+        place = make_pose(x_m, y_m, rng.uniform(1.5, 1.8), *rng.uniform(-20, 20, 2), rng.uniform(-180, 180))
+        cut, unclear = [], False
+        for eye in EYES:
+            centers = project_disc_centers(RIG, place, layout.centers_m, layout.radius_m, eye)
+            areas = [disc_area_px2(RIG, place, center, layout.radius_m, eye) for center in layout.centers_m]
+            # A disc tilted by 30 degrees reaches further than its mean radius by 7 %.
+            reach = 1.1 * np.sqrt(np.array(areas) / np.pi)[:, None] + 1
+            depth = np.minimum(centers, size_px - centers).min(axis=1) / reach[:, 0]
+            cut.append(np.flatnonzero(depth < 1))
+            unclear |= bool(((depth > 0.5) & (depth < 1)).any())
+        if not unclear and [layout.count - len(one) for one in cut] == [whole_left, whole_right]:
+            return place, dict(zip(EYES, cut, strict=True))
+
+
+@pytest.mark.parametrize("whole", [(4, 4), (4, 3), (3, 4)])
+def test_what_the_edges_of_both_images_leave_of_a_ring_is_enough(make_pose, whole):
+    layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(whole)
+    for _ in range(40):
+        place, cut = partly_beside(make_pose, rng, layout, *whole)
+        shown = [centroids(layout, place, eye, rng, cut[eye]) for eye in EYES]
+        assert all(match_ring(one.blobs, layout) is None for one in shown)
+        observation = correspond(*shown, RIG, layout)
+        assert not isinstance(observation, NoFixReason), observation.reason
+        assert observation.seen.sum(axis=1).tolist() == list(whole)
+        # Six deviations of centroids of black and white pixels with a radius of 55 px.
+        assert worst_match_px(observation, layout, place) < 6 * 0.0203
+
+
+def test_four_markers_are_not_enough_where_the_images_show_the_places_of_the_others(make_pose):
+    layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(12)
+    place = make_pose(0.06, 0, 1.8)
+    shown = [centroids(layout, place, eye, rng, hidden=range(4)) for eye in EYES]
+    assert isinstance(correspond(*shown, RIG, layout), NoFixReason)
+
+
+def test_parts_of_a_ring_at_other_distances_do_not_belong_together(make_pose):
+    layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(13)
+    for _ in range(20):
+        place, cut = partly_beside(make_pose, rng, layout, 4, 4)
+        left = centroids(layout, place, "left", rng, cut["left"])
+        # As far off as a ring a fifth nearer.
+        x_m, y_m, z_m = place.translation_m
+        off = RigidTransform(place.rotation, (x_m + 0.2 * RIG.baseline_m, y_m, z_m))
+        answer = correspond(left, centroids(layout, off, "right", rng, cut["right"]), RIG, layout)
+        assert isinstance(answer, NoFixReason)
+
+
+def test_three_markers_and_the_hub_are_no_four_markers(make_pose):
+    layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(14)
+    for _ in range(60):
+        place, cut = partly_beside(make_pose, rng, layout, 3, 3)
+        shown = [centroids(layout, place, eye, rng, cut[eye]) for eye in EYES]
+        assert isinstance(correspond(*shown, RIG, layout), NoFixReason)
