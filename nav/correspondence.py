@@ -31,7 +31,8 @@ from nav.ring_match import (
 
 # The best turn must explain the pairs within this share of the gap between neighbours; a wrong turn misses by a gap.
 _LARGEST_COST_FRACTION = 0.35
-# Where both images show a part of the ring only, the pairs must fit better (drawn tilts of 20 degrees: 0.03 of the gap at most).
+# Where both images show a part of the ring only, the pairs must fit better. Drawn ones, tilted by up to 20 degrees,
+# have 0.03 of the gap at most.
 _LARGEST_COST_FRACTION_OF_PARTS = 0.05
 # Markers in the other image of four that the image's edge leaves: six coordinates, and the row and size of each.
 _FEWEST_BESIDE_A_CUT_RING = 3
@@ -110,7 +111,7 @@ def _cut_rings(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
 def _seen_by_other_eye(
     rings: list[RingMatch | None], seen: tuple[Centroids, Centroids], rig: StereoRig, layout: MarkerLayout, least: int
 ) -> list[RingMatch | None]:
-    """The same, where one image shows a ring, with what the other shows of at least so many markers where it must be."""
+    """The same; where only one shows a ring, with at least so many markers of the other where it says that they are."""
     found = list(rings)
     for eye, toward_px in ((0, 1.0), (1, -1.0)):
         other = rings[1 - eye]

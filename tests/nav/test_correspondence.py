@@ -251,7 +251,7 @@ def partly_beside(make_pose, rng, layout, whole_left, whole_right):
     size_px = np.array([RIG.camera.width_px, RIG.camera.height_px])
     while True:
         x_m, y_m = rng.uniform(-0.5, 0.6), rng.choice([-1, 1]) * rng.uniform(0.2, 0.6)
-        place = make_pose(x_m, y_m, rng.uniform(1.5, 1.8), *rng.uniform(-20, 20, 2), rng.uniform(-180, 180))
+        place = make_pose(x_m, y_m, rng.uniform(1.5, 1.8), *rng.uniform(-10, 10, 2), rng.uniform(-180, 180))
         cut, unclear = [], False
         for eye in EYES:
             centers = project_disc_centers(RIG, place, layout.centers_m, layout.radius_m, eye)
