@@ -32,7 +32,7 @@ from nav.ring_match import (
 # The best turn must explain the pairs within this share of the gap between neighbours; a wrong turn misses by a gap.
 _LARGEST_COST_FRACTION = 0.35
 # Where both images show a part of the ring only, the pairs must fit better. Drawn ones, tilted by up to 20 degrees,
-# have 0.03 of the gap at most.
+# have 0.033 of the gap at most.
 _LARGEST_COST_FRACTION_OF_PARTS = 0.05
 # Markers in the other image of four that the image's edge leaves: six coordinates, and the row and size of each.
 _FEWEST_BESIDE_A_CUT_RING = 3

@@ -27,11 +27,8 @@ _ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
 FEW = 4  # markers, where the ring is known to be or another image shows the same
-# Part of a ring: at most 37 degrees of tilt, and discs of the size that goes with their gaps within a quarter. Three
-# markers and the hub would pass for four markers of a ring of twice their size, tilted by 60 degrees.
-_PART_TILT_COSINE = 0.8
-_PART_SIZE_FACTOR = 1.25
-_PART_REACH = 1.4
+# A disc that touches the picture's edge is dropped, and perspective puts it off the map by up to a third of its radius.
+_REACH = 1.4
 # A marker that was not found lies this many times as far off the map as the others at most.
 _MOST_OFF = 3.0
 # A complete ring this near its map needs no second guess.
@@ -64,13 +61,22 @@ class RingMatch:
         return _stretches(self.affine)[0]
 
     def cut(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-        """(N,) markers whose images do not lie wholly within a picture of (width, height)."""
-        places_px = layout.centers_m[:, :2] @ self.affine[:, :2].T + self.affine[:, 2]
+        """(N,) markers whose images surely do not lie wholly within a picture of (width, height)."""
         # As far as a disc reaches to all sides, less what the map may be off.
-        sure_px = layout.radius_m * _stretches(self.affine)[1] * (1 - _MOST_OFF * self.rms_fraction)
-        inside = (places_px > sure_px) & (places_px < np.array(size_px) - 1 - sure_px)
-        cut: NDArray[np.bool_] = ~inside.all(axis=1)
-        return cut
+        return ~self._inside(layout, size_px, _stretches(self.affine)[1] * (1 - _MOST_OFF * self.rms_fraction))
+
+    def clear(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+        """(N,) markers whose images surely lie wholly within a picture of (width, height)."""
+        return self._inside(layout, size_px, _stretches(self.affine)[0] * _REACH)
+
+    def _inside(self, layout: MarkerLayout, size_px: tuple[int, int], reach_px_per_m: float) -> NDArray[np.bool_]:
+        """(N,) markers whose places are further from the picture's edge than their radius times a stretch."""
+        places_px = layout.centers_m[:, :2] @ self.affine[:, :2].T + self.affine[:, 2]
+        reach_px = layout.radius_m * reach_px_per_m
+        inside: NDArray[np.bool_] = ((places_px > reach_px) & (places_px < np.array(size_px) - 1 - reach_px)).all(
+            axis=1
+        )
+        return inside
 
     def moved(self, shift_px: tuple[float, float]) -> RingMatch:
         """The same where all blobs lie further right and down by x and y. [px]"""
@@ -116,19 +122,9 @@ def match_cut_ring(blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int])
         size_px: width and height of the image.
     """
     match = _best_match(blobs, layout, FEW)
-    if match is None:
+    if match is None or (match.clear(layout, size_px) & (match.blob_of_marker < 0)).any():
         return None
-    largest, smallest = _stretches(match.affine)
-    places_px = layout.centers_m[:, :2] @ match.affine[:, :2].T + match.affine[:, 2]
-    # A disc is dropped whose picture touches the edge, and the map may be off by a third of a radius.
-    reach_px = _PART_REACH * layout.radius_m * largest
-    whole = ((places_px > reach_px) & (places_px < np.array(size_px) - 1 - reach_px)).all(axis=1)
-    if (whole & (match.blob_of_marker < 0)).any():
-        return None
-    expected_px = layout.radius_m * np.sqrt(largest * smallest)
-    radii_px = blobs.radii_px[match.blob_of_marker[match.blob_of_marker >= 0]]
-    alike = np.abs(np.log(radii_px / expected_px)) < np.log(_PART_SIZE_FACTOR)
-    return match if smallest > _PART_TILT_COSINE * largest and alike.all() else None
+    return match
 
 
 def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
