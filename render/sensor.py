@@ -1,7 +1,7 @@
 """The sensor: illuminance becomes electrons, noise, numbers.
 
-Electrons = responsivity x illuminance x time; gain of each pixel; shot and read noise; full well; converter. In low
-light shot noise is a true Poisson draw; above a few dozen electrons it is a normal one of the same variance.
+Electrons = responsivity x illuminance x time; gain of each pixel; shot and read noise, full well and converter
+(`render/read_out.py`); mosaic and encoding.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from datasets_manifest.images import Pixels, StereoImages
 from geometry.stereo import EYES, Eye
 from render.engine import StereoRadiance
 from render.optics import light_on_sensor
+from render.read_out import ReadOut
 from scenes.seeding import bulk_generator
 
-# A Poisson variate of this mean has skewness 0.14 and its quantiles are within 0.2 electrons of a normal one's.
-_POISSON_BELOW_E = 50.0
 # Response of bare silicon behind a daylight scene to the three bands of Rec. 709 (our assumption).
 MONO_WEIGHTS = np.array([[0.36, 0.37, 0.27]], dtype=np.float32)
 # Sites of the RGGB mosaic: channel, first row, first column.
@@ -42,12 +41,20 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
     sensor = frame.sensor
     images: dict[Eye, Pixels] = {}
     mosaics: dict[Eye, Pixels | None] = {}
+    read_out = ReadOut(
+        sensor.electrons_per_cd_m2(frame.exposure),
+        sensor.read_noise_e,
+        sensor.full_well_e,
+        dn_per_electron(sensor, frame.exposure.gain),
+        sensor.black_level_dn,
+        sensor.adc_bits,
+    )
     for index, eye in enumerate(EYES):
         seen = light_on_sensor(frame, radiance.left if eye == "left" else radiance.right, eye)
-        mean_e = _sample_sites(seen, sensor) * np.float32(sensor.electrons_per_cd_m2(frame.exposure))
-        mean_e *= _pixel_gains(frame.seed, index, mean_e.shape, sensor.prnu_fraction)
+        light = _sample_sites(seen, sensor)
+        gains = _pixel_gains(frame.seed, index, light.shape, sensor.prnu_fraction)
         rng = bulk_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
-        numbers = _convert(_add_noise(mean_e, sensor.read_noise_e, rng), sensor, frame.exposure.gain)
+        numbers = read_out.numbers(light, gains, rng)
         mosaics[eye] = _store(numbers, sensor, "linear") if sensor.color == "bayer" else None
         if sensor.color == "bayer":
             numbers = cv2.cvtColor(numbers, cv2.COLOR_BayerRGGB2RGB)
@@ -86,30 +93,6 @@ def _pixel_gains(seed: int, eye_index: int, shape: tuple[int, ...], spread: floa
     gains *= np.float32(spread)
     gains += np.float32(1.0)
     return gains
-
-
-def _add_noise(mean_e: NDArray[np.float32], read_noise_e: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Shot and read noise on mean electrons."""
-    dim = mean_e < _POISSON_BELOW_E if mean_e.min(initial=_POISSON_BELOW_E) < _POISSON_BELOW_E else None
-    noise = rng.standard_normal(mean_e.shape, dtype=np.float32)
-    variance = mean_e + np.float32(read_noise_e**2)
-    if dim is not None:
-        variance[dim] = np.float32(read_noise_e**2)
-    noise *= np.sqrt(variance, out=variance)
-    if dim is not None:
-        noise[dim] += rng.poisson(mean_e[dim]).astype(np.float32) - mean_e[dim]
-    noise += mean_e
-    return noise
-
-
-def _convert(electrons: NDArray[np.float32], sensor: Sensor, gain: float) -> NDArray[np.uint16]:
-    """Full well and converter: numbers of `adc_bits`."""
-    electrons *= np.float32(dn_per_electron(sensor, gain))
-    full = np.float32(sensor.full_well_e * dn_per_electron(sensor, gain))
-    np.minimum(electrons, full, out=electrons)
-    electrons += np.float32(sensor.black_level_dn + 0.5)
-    np.clip(electrons, 0, 2**sensor.adc_bits - 1, out=electrons)
-    return electrons.astype(np.uint16)
 
 
 def _store(numbers: NDArray[np.uint16], sensor: Sensor, encoding: str) -> Pixels:

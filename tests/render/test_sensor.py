@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from datasets_manifest.frame import Exposure
 from datasets_manifest.rigs import SENSORS
 from render.engine import EyeRadiance, StereoRadiance
+from render.read_out import normal_quantiles
 from render.sensor import MONO_WEIGHTS, dn_per_electron, expose
 from scenes.sampler import sample_frame
 
@@ -42,6 +44,27 @@ def test_white_marker_at_50_klux_fills_7000_electrons_in_0_13_ms():
     luminance = 50_000 * 0.8 / np.pi
     electrons = luminance * sensor.electrons_per_cd_m2(Exposure(time_s=0.13e-3, f_number=2.8))
     assert electrons == pytest.approx(7000, rel=0.01)
+
+
+def test_noise_is_normal_far_into_its_tails():
+    """All sums of two quantiles together, so that nothing but the table is tested."""
+    quantiles = np.sort(normal_quantiles().astype(np.float64))
+    places = np.linspace(-4.5, 4.5, 91)
+    got = np.array([np.searchsorted(quantiles, place - quantiles, side="right").mean() for place in places])
+    got /= len(quantiles)
+    # Half a step of one table: 1 / 2^17.
+    np.testing.assert_allclose(got, ndtr(places), atol=8e-6)
+    # What is left of the tails, relative: 6 % are missing beyond 4.5 deviations.
+    np.testing.assert_allclose(got[places <= -3.0], ndtr(places[places <= -3.0]), rtol=0.07)
+
+
+def test_noise_differs_from_site_to_site_and_does_not_hang_together(frame):
+    """Each site has bits of its own: neighbours, and the halves of one draw of the generator, are uncorrelated."""
+    frame = with_sensor(frame, prnu_fraction=0.0)
+    numbers = expose(frame, flat_pair(level_for(frame, 2000))).left.astype(float).ravel()
+    for step in (1, 2, 3, 128 * 3):
+        correlation = np.corrcoef(numbers[:-step], numbers[step:])[0, 1]
+        assert abs(correlation) < 4 / np.sqrt(numbers.size)  # four standard errors
 
 
 @pytest.mark.parametrize("electrons", [3.0, 20.0, 200.0, 2000.0, 8000.0])
