@@ -54,10 +54,10 @@ def _real_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
 
 
 def _grid_px(size_px: int, step_px: int) -> NDArray[np.float64]:
-    """Coordinates of all pixels, or of every so many of them with one more step before and two behind. [px]"""
+    """Coordinates of all pixels, or of the middles of squares of so many, one before the first and one behind. [px]"""
     if step_px == 1:
         return np.arange(size_px, dtype=float)
-    return (np.arange(size_px // step_px + 4) - 1.0) * step_px
+    return (np.arange(-(-size_px // step_px) + 2) - 0.5) * step_px - 0.5
 
 
 def _sharp_background(
@@ -71,13 +71,10 @@ def _sharp_background(
         u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))
         return _directions(camera, rotation, u, v)
 
-    coarse = through(step)
-    # Full pixel u lies at coarse coordinate u / step + 1.
-    to_coarse = np.array([[1 / step, 0.0, 1.0], [0.0, 1 / step, 1.0]])
-    size = (camera.width_px, camera.height_px)
+    window = slice(step, step + camera.height_px), slice(step, step + camera.width_px)
     sky, horizon = (
-        np.maximum(cv2.warpAffine(image, to_coarse, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP), 0.0)
-        for image in around.clear_radiance(coarse)
+        np.maximum(cv2.resize(image, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[window], 0.0)
+        for image in around.clear_radiance(through(step))
     )
     if around.environment.sun_elevation_deg < _STARS_BELOW_DEG:
         add_stars(sky, rig, eye, rotation)

@@ -163,17 +163,15 @@ class Ground:
 
     def _smooth_fields(self, directions: NDArray[np.float32], every: int, angle_rad: float) -> tuple[Field, Field]:
         """(H, W, 4) regions; (H, W, 3) by how much places are moved, and the share of the beam that the slope takes."""
-        view = self._view(directions[::every, ::every], every * angle_rad)
+        view = self._view(directions if every == 1 else _between(directions, every), every * angle_rad)
         x_m, y_m = view.x_m + self._shift_m[0], view.y_m + self._shift_m[1]
         fields = [tile.sample(x_m, y_m, np.sqrt(view.across_m * view.along_m)) for tile in (_regions(), _shapes())]
         fields[1] = np.concatenate([fields[1][..., :2], self._facing(fields[1][..., 2:])[..., None]], axis=-1)
         if every == 1:
             return fields[0], fields[1]
-        size = (directions.shape[1], directions.shape[0])
-        scale = np.array([[1 / every, 0.0, 0.0], [0.0, 1 / every, 0.0]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        full = [cv2.warpAffine(field, scale, size, flags=flags, borderMode=cv2.BORDER_REPLICATE) for field in fields]
-        return full[0], full[1]
+        height, width = directions.shape[:2]
+        full = [cv2.resize(field, None, fx=every, fy=every, interpolation=cv2.INTER_LINEAR) for field in fields]
+        return full[0][:height, :width], full[1][:height, :width]
 
     def _block(self, view: GroundView, regions: Field, shapes: Field) -> Radiance:
         gusts = np.clip(1.0 + np.float32(0.26) * regions[..., 3] + np.float32(0.08) * shapes[..., 0], 0.4, 1.9)
@@ -262,3 +260,13 @@ class Ground:
         """0 by day, 1 by night."""
         daylight_lux = float(self._light.level_lux.mean())
         return np.float32(np.clip(2.0 * (1.0 - daylight_lux / _LAMPS_ON_LUX), 0.0, 1.0))
+
+
+def _between(directions: NDArray[np.float32], every: int) -> NDArray[np.float32]:
+    """(H / every, W / every, 3) directions in the middles of squares of rays, rounded up; an even number to a side."""
+    for axis in (0, 1):
+        last = directions.shape[axis] - 1
+        first = np.arange(every // 2 - 1, last + every // 2, every)
+        before, behind = (directions.take(np.minimum(place, last), axis=axis) for place in (first, first + 1))
+        directions = (before + behind) / 2
+    return directions

@@ -162,8 +162,15 @@ class Surroundings:
         altitude_m = np.float32(self.environment.altitude_m)
         distance_m = altitude_m / np.maximum(-directions[..., 2], altitude_m / np.float32(FARTHEST_M))
         clear = np.exp(-distance_m * np.float32(self.environment.extinction_per_m))[..., None]
-        seen = horizon + (self.ground.radiance(directions, uncovered) - horizon) * clear
-        np.copyto(total, seen, where=(directions[..., 2] < 0)[..., None])
+        seen = self.ground.radiance(directions, uncovered)
+        seen -= horizon
+        seen *= clear
+        seen += horizon
+        below = directions[..., 2] < 0
+        whole = below.all(axis=1)
+        # Rows at once, where they can be: choosing each number takes as long as all before.
+        total[whole] = seen[whole]
+        np.copyto(total, seen, where=(below & ~whole[:, None])[..., None])
 
     def _cloud(self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance) -> Radiance:
         """(H, W, 4) light of a cloud layer, itself behind haze, times its opacity, and its opacity."""

@@ -15,7 +15,7 @@ from render.mitsuba_engine.camera_rays import CameraRays
 from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.launches import rows_of
 from render.mitsuba_engine.scene import DrogueScene, by_shape
-from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, slipped_through
+from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, parts_in, slipped_through
 from render.traced import TracedEye, amodal_counts
 
 CENTER = (0.5, 0.5)
@@ -42,7 +42,7 @@ class CenterPasses:
     def sunlit(self, part_id: NDArray[np.uint8], s: float) -> NDArray[np.bool_]:
         """(H, W) where the rays of `part_ids` at time s meet surfaces of the drogue that see the sun."""
         sunlit = np.zeros(self._shape, dtype=np.bool_)
-        pixel = np.flatnonzero(OF_DROGUE[part_id])
+        pixel = np.flatnonzero(parts_in(part_id, OF_DROGUE))
         if len(pixel):
             to_sun, _ = self._scene.sun
             ray = self._center_rays(jit_array(mi.UInt32, pixel), (s + 1) / 2)
@@ -64,7 +64,7 @@ class CenterPasses:
         """The passes at mid-exposure, without radiance yet."""
         depth = np.full(self._shape, np.inf, dtype=np.float32)
         normal = np.zeros((*self._shape, 3), dtype=np.float32)
-        covered = np.flatnonzero(part_id)
+        covered = np.flatnonzero(part_id > 0)
         if len(covered):
             pose = self._rays.pose_at_middle
             points, normals = self._surface(covered, CENTER)
@@ -81,8 +81,8 @@ class CenterPasses:
                 part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
                 leaked[again] = slipped_through(ids, normals[again], points[again] - pose[:, 3])
             met = part_id.reshape(-1)[covered] > 0
-            depth.reshape(-1)[covered[met]] = np.einsum("pi,i->p", points[met] - pose[:, 3], pose[:, 2])
-            normal.reshape(-1, 3)[covered[met]] = np.einsum("pi,ij->pj", normals[met], pose[:, :3])
+            depth.reshape(-1)[covered[met]] = (points[met] - pose[:, 3]) @ pose[:, 2]
+            normal.reshape(-1, 3)[covered[met]] = normals[met] @ pose[:, :3]
         return TracedEye(
             part_id,
             depth,

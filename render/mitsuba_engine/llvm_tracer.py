@@ -19,7 +19,7 @@ from render.mitsuba_engine.registry import reserve_numbers
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.smoothed_launches import SmoothedPaths
 from render.mitsuba_engine.surround_launches import trace_around
-from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, ToTrace, Traced, plan_pixels
+from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, ToTrace, Traced, parts_in, plan_pixels
 from render.motion import blur_px
 from render.surfaces import dirty_parts
 from render.traced import TracedEye
@@ -104,8 +104,9 @@ def _centers(eyes: dict[Eye, TracedEye], plans: dict[Eye, Plan]) -> dict[str, ND
         for kind in ("edges", "deep_edges"):
             near.reshape(-1)[getattr(plans[eye], kind)] = 1
         # A ray looks for its light at the centres of the nine nearest pixels.
-        near = cv2.dilate(near, np.ones((3, 3), dtype=np.uint8)) | OF_DROGUE[part_id]
-        met, in_open = (near > 0) & (part_id > 0), IN_OPEN[part_id] > 0
+        near = cv2.dilate(near, np.ones((3, 3), dtype=np.uint8))
+        met = ((near > 0) & (part_id > 0)) | parts_in(part_id, OF_DROGUE)
+        in_open = parts_in(part_id, IN_OPEN)
         found["open"].append(np.flatnonzero(met & in_open) + index * part_id.size)
         found["hidden"].append(np.flatnonzero(met & ~in_open) + index * part_id.size)
     return {kind: np.concatenate(pixels) for kind, pixels in found.items()}

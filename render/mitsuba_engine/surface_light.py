@@ -97,9 +97,9 @@ class SurfaceLight:
 
     def _by_part(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """(256, 4) means by part id, 0 where no centre sees a part."""
-        total = np.zeros((256, 4), dtype=np.float64)
-        np.add.at(total, self._part_of_row, light)
-        mean: NDArray[np.float32] = total / np.maximum(np.bincount(self._part_of_row, minlength=256), 1)[:, None]
+        rows = self._part_of_row
+        total = np.stack([np.bincount(rows, weights=channel, minlength=256) for channel in light.T], axis=-1)
+        mean: NDArray[np.float32] = total / np.maximum(np.bincount(rows, minlength=256), 1)[:, None]
         return mean.astype(np.float32)
 
     def _traced(self, pixel: NDArray[np.int64], count: int, max_depth: int) -> NDArray[np.float32]:

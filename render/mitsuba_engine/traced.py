@@ -34,6 +34,13 @@ _DEEP = _marked(_DEEP_PARTS)
 IN_OPEN = _marked({*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS})
 
 
+def parts_in(part_id: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W) where an image of part ids shows those that a table marks."""
+    # Two to three times as quick as indexing, and so are searches for what is true in place of what is not 0.
+    marked: NDArray[np.bool_] = cv2.LUT(part_id, table) > 0
+    return marked
+
+
 def slipped_through(
     part_id: NDArray[np.uint8], normals: NDArray[np.float32], towards: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
@@ -122,23 +129,23 @@ def plan_pixels(
         margin_px: how far beyond those a part may reach into other pixels.
         uneven: ids of parts whose paint has edges of its own anywhere.
     """
-    even = _marked(uneven) == 0
+    even = (_marked(uneven) == 0).astype(np.uint8)
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
-    drogue = np.zeros(ids[0].shape, dtype=np.uint8)
-    covered = np.zeros(ids[0].shape, dtype=np.uint8)
+    drogue, covered = (np.zeros(ids[0].shape, dtype=np.bool_) for _ in range(2))
     inside = np.ones(ids[0].shape, dtype=np.bool_)
     for part_id, in_sun in zip(ids, sunlit, strict=True):
-        drogue |= OF_DROGUE[part_id]
-        covered |= (part_id != Part.SKY).astype(np.uint8)
+        drogue |= parts_in(part_id, OF_DROGUE)
+        covered |= part_id != Part.SKY
         # A part's sunlit and shadowed surfaces count as two.
-        inside &= inside_one_part((2 * part_id + in_sun).astype(np.uint8), margin_px) & even[part_id]
-    belongs = cv2.dilate(drogue, kernel) > 0
-    of_open, of_deep = IN_OPEN[ids[0]] > 0, _DEEP[ids[0]] > 0
+        inside &= inside_one_part((2 * part_id + in_sun).astype(np.uint8), margin_px) & parts_in(part_id, even)
+    belongs, reached = (cv2.dilate(seen.view(np.uint8), kernel) > 0 for seen in (drogue, covered))
+    of_open, of_deep = (parts_in(ids[0], table) for table in (IN_OPEN, _DEEP))
+    within, edges = belongs & inside, belongs & ~inside
     return Plan(
-        open=np.flatnonzero(belongs & inside & of_open),
-        sheltered=np.flatnonzero(belongs & inside & ~of_open & ~of_deep),
-        deep=np.flatnonzero(belongs & inside & of_deep),
-        deep_edges=np.flatnonzero(belongs & ~inside & of_deep),
-        edges=np.flatnonzero(belongs & ~inside & ~of_deep),
-        surround=np.flatnonzero((cv2.dilate(covered, kernel) > 0) & ~belongs),
+        open=np.flatnonzero(within & of_open),
+        sheltered=np.flatnonzero(within & ~of_open & ~of_deep),
+        deep=np.flatnonzero(within & of_deep),
+        deep_edges=np.flatnonzero(edges & of_deep),
+        edges=np.flatnonzero(edges & ~of_deep),
+        surround=np.flatnonzero(reached & ~belongs),
     )
