@@ -1,8 +1,8 @@
 """Hose, tanker and bystanders: rays to the first surfaces, and light of other surfaces from a coarse lattice.
 
 That light changes slowly on large parts. It is wanted for a picture without speckles and not to the per cent, so one
-centre in every few rows and columns takes the paths of a quarter of the pixels around it. One ray through each pixel shows
-where edges and shadows are, and only these take more.
+centre in every few rows and columns takes the paths of a quarter of the pixels around it. One ray through each pixel
+shows where edges and shadows are, and only these take more.
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ def test_smoothing_leaves_no_speckles_on_the_tanker(engine, below_the_wing):
         seen = engine.render(frame, recipe.render.model_copy(update={"denoise": denoise}))
         errors.append(on_the_tanker(seen.left) - settled)
     smoothed, alone = (np.sqrt(np.mean(error**2)) for error in errors)
-    # Some thirty-five neighbours' paths, nine for each, against a pixel's own four would leave a tenth; the rest is blur
-    # on narrow parts, of which this small picture has many.
+    # Some thirty-five neighbours' paths, nine for each, against a pixel's own four would leave a tenth; the rest is
+    # blur on narrow parts, of which this small picture has many.
     assert smoothed < 0.5 * alone
     assert np.mean(errors[0]) == pytest.approx(0.0, abs=0.01 * settled.mean())
