@@ -14,9 +14,6 @@ from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
 from nav.centroids.marker_signal import Array32, MarkerSignal
 from nav.centroids.window_cells import choose_cells, take_cells
 
-# Pixels this far outside the edge are seen; a plain picture needs more of them to know its background. [px]
-OUTER_DIFFERENCE_PX = 2.5
-OUTER_PLAIN_PX = 5.0
 # Discs up to this radius are taken whole. Of larger ones the pixels within the band of the edge are, and of the rest,
 # which tells only level and shading, one in four by four: 8 % more noise where shading is fitted, half the time. Of a
 # mosaic's sites, which lie two pixels apart, that is one in two by two.
@@ -121,7 +118,7 @@ def _gather(
         blur_px: how far beyond a still one's an edge may be seen.
     """
     pitch = signals[0].pitch_px
-    reach_px = blur_px + (OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
+    reach_px = blur_px + signals[0].outer_px
     extents = np.sqrt(np.einsum("mij,mij->mi", outlines.shapes_px, outlines.shapes_px)) + reach_px
     half = -(-(int(np.ceil(extents.max() / pitch)) + 1) // every) * every
     size = 2 * (half // every) + 1
