@@ -28,6 +28,7 @@ _WEIGHTS = (0.0, 1.6)
 
 # Where the first site of each colour lies in an RGGB cell; the mean of both greens lies between them. [px]
 _SITE_OFFSET_PX = (0.0, 0.5, 1.0)
+_RED, _GREEN = 0, 1
 
 
 def marker_color(drogue: DrogueParameters) -> int | None:
@@ -150,15 +151,45 @@ def _srgb_to_linear(
 
 
 def _from_mosaic(mosaic: Pixels, color: int, others_weight: float) -> Pixels:
-    """Difference of the sites of one RGGB cell, brought bilinearly to the full grid at the colour's own place."""
+    """Difference of the sites of one RGGB cell, brought bilinearly to the full grid at the colour's own place.
+
+    Where other sites beside one of red or blue are as bright as it is, it does not lead: before a bright sky the rim
+    would else lead over the others of its cell by more than the markers do, wherever the colour comes first.
+    """
     height, width = mosaic.shape
     even = mosaic[: height // 2 * 2, : width // 2 * 2]
-    green = cv2.addWeighted(even[0::2, 1::2], 0.5, even[1::2, 0::2], 0.5, 0)
+    first_green, second_green = np.ascontiguousarray(even[0::2, 1::2]), np.ascontiguousarray(even[1::2, 0::2])
+    green = cv2.addWeighted(first_green, 0.5, second_green, 0.5, 0)
     planes = (np.ascontiguousarray(even[0::2, 0::2]), green, np.ascontiguousarray(even[1::2, 1::2]))
     first, second = (planes[index] for index in range(3) if index != color)
     difference = _lead(planes[color], cv2.max(first, second), others_weight)
+    if color != _GREEN:
+        beside = _brightest_beside((planes[0], first_green, second_green, planes[2]), color)
+        difference = np.where(_lead(planes[color], beside, others_weight) > 0, difference, difference.dtype.type(0))
     shift = -_SITE_OFFSET_PX[color] / 2
     full_to_site = np.array([[0.5, 0.0, shift], [0.0, 0.5, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     upsampled = cv2.warpAffine(difference, full_to_site, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(upsampled)
+
+
+def _brightest_beside(planes: tuple[Pixels, Pixels, Pixels, Pixels], color: int) -> Pixels:
+    """The most that the four squares of 2 x 2 sites around each of red or blue show of another colour.
+
+    One of them lies on the brighter side of any edge.
+
+    Args:
+        planes: red, green beside red, green beside blue, and blue sites, of all cells.
+        color: 0 red, 2 blue.
+    """
+    red, in_reds_row, in_blues_row, blue = planes
+    across, left_right, up_down = (
+        (blue, in_reds_row, in_blues_row) if color == _RED else (red, in_blues_row, in_reds_row)
+    )
+    # A red site's other neighbours lie in the cells before it, a blue one's in those behind.
+    anchor = 1 if color == _RED else 0
+    row, column, square = (np.ones(shape, np.uint8) for shape in ((1, 2), (2, 1), (2, 2)))
+    green = cv2.addWeighted(
+        cv2.dilate(left_right, row, anchor=(anchor, 0)), 0.5, cv2.dilate(up_down, column, anchor=(0, anchor)), 0.5, 0
+    )
+    return np.asarray(cv2.max(green, cv2.dilate(across, square, anchor=(anchor, anchor))))

@@ -102,7 +102,8 @@ class Navigator:
         if fault is not None or not regions:
             return Sighting(fault or NOT_DETECTED, {})
         best = self._matched(images, regions, PLAIN)
-        for weight in OTHERS_WEIGHTS[1:]:
+        has_others = self._color is not None and images.left.ndim == 3
+        for weight in OTHERS_WEIGHTS[1:] if has_others else ():
             if best.markers[0] == self._layout.count:
                 break
             again = self._matched(images, regions, weight)

@@ -27,10 +27,11 @@ from nav.centroids.centroid_quality import NoiseModel, beyond_linear, measure_no
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
+from nav.centroids.glare import without_glare
 from nav.centroids.least_squares import Minimum, Model, evaluate, minimise
 from nav.centroids.marker_signal import Array32, MarkerSignal
 from nav.centroids.motion_blur import Travel, moving, share_outside_along
-from nav.centroids.patches import PixelSet, annulus_pixels
+from nav.centroids.patches import PixelSet, annulus_pixels, edge_distances
 
 # Azimuthal order of the light on the annulus; a thin one has too few pixels to tell high orders from its outline.
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5
@@ -129,7 +130,7 @@ def fit_annuli(
     thin = width_px < _THIN_PX
     ways = None if travel is None else travel.of(outer)
     gathered = annulus_pixels(signals, outer, inner, 0.0 if travel is None else travel.spread_px(outer))
-    pixels, beyond = _within_collar(gathered, outer, collar_factor, ways)
+    pixels, beyond = _within_collar(gathered, signals[0], (outer, inner), collar_factor, ways)
     turns = azimuth_basis(pixels, _ORDER_THIN if thin else _ORDER)
     start = annulus_start(pixels, outer, inner, turns.shape[1])
     first = _first_fit(pixels, (turns, beyond), start, thin, ways)
@@ -216,13 +217,25 @@ def _unevenness(parameters: Array) -> float:
 
 
 def _within_collar(
-    pixels: PixelSet, outer: Ellipses, collar_factor: float, ways: Array | None
+    pixels: PixelSet, signal: MarkerSignal, edges: tuple[Ellipses, Ellipses], collar_factor: float, ways: Array | None
 ) -> tuple[PixelSet, Array32]:
     """The pixels without those beyond the collar, and the share of what lies beyond it in each."""
     if collar_factor == 0:
         return pixels, np.zeros_like(pixels.x_px)
-    beyond = share_outside_along(collar_factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX, ways)
-    return pixels.only(beyond < _MOST_BEYOND), beyond
+    outer, inner = edges
+
+    def beyond(nearer_px: float) -> Array32:
+        factor = np.maximum(collar_factor - nearer_px / outer.radii_px, 0.5)[:, None, None]
+        return share_outside_along(factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX, ways)
+
+    shares = beyond(0.0)
+    if not signal.shows_glare:
+        return pixels.only(shares < _MOST_BEYOND), shares
+    to_outer = edge_distances(outer.shapes_px, pixels.x_px, pixels.y_px)
+    # Into the annulus from either edge; the hole is as dark as the collar.
+    inwards = np.minimum(to_outer, (outer.radii_px - inner.radii_px).astype(np.float32)[:, None] - to_outer)
+    clear = without_glare(pixels, signal, inwards, beyond)
+    return pixels.only(shares < _MOST_BEYOND if clear is None else clear), shares
 
 
 def _reasons(

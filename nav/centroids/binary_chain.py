@@ -20,6 +20,10 @@ from nav.ring_match import RingMatch, match_ring
 _BOX_MARGIN_FRACTION = 0.06
 _LEAST_AREA_PX2 = 7.0
 _LEAST_SIDE_PX = 3
+# From the whole picture's range to what lies below a marker's tenth of it, each threshold leaving a half or less.
+_MOST_DARKER = 5
+# Below this there is only noise.
+_LEAST_RANGE_DN = 4
 # A drogue has some ten discs; more regions than this in its box are noise.
 _MOST_BLOBS = 60
 # Below this diameter the 3x3 median and opening eat the disc's outline (0.2 px instead of 0.09 px at 5 px), and the
@@ -27,6 +31,8 @@ _MOST_BLOBS = 60
 _LEAST_DIAMETER_FOR_MORPHOLOGY_PX = 14.0
 # Median and opening flip two or three outline pixels of a disc at random (measured); each moves its centre by 1/(pi r).
 _FLIPPED_PIXELS = 2.4
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +72,8 @@ def window_centroids(channel: Pixels, corner_px: tuple[int, int], layout: Marker
 
     Where that does not show all markers that the part's edge leaves whole, Otsu's thresholds of its brighter
     class (white markers that run together with a bright sky) and of its darker class (markers in shade beside sunlit
-    ones) are tried. Median and opening are left out where the discs are smaller than they can stand. Regions that touch
+    ones) are tried; where none of them shows a ring, that of what is darker still, again and again (grey markers before
+    a bright sky). Median and opening are left out where the discs are smaller than they can stand. Regions that touch
     the edge of the part or of the image are dropped: their centre of mass is not the marker's.
 
     Args:
@@ -92,14 +99,17 @@ def _otsu(levels: Pixels) -> float:
 
 
 def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool, RingMatch | None]:
-    """Regions by the first of three thresholds that shows most of the ring of markers, and that ring.
+    """Regions by the first of several thresholds that shows most of the ring of markers, and that ring.
 
-    Where all markers that the part's edge does not cut are found, no other threshold is tried.
+    Where all markers that the part's edge does not cut are found, no other threshold is tried, and none in the dark
+    where any ring is.
     """
     best, most = (Blobs(np.zeros((0, 2)), np.zeros(0)), False), -1
     shown: RingMatch | None = None
-    for level in _thresholds(roi):
-        regions = _regions(roi, level)
+    for level, dark in _thresholds(roi):
+        if dark is not None and shown is not None:
+            break
+        regions = _regions(roi, level, dark)
         ring = match_ring(regions[0], layout)
         count = 0 if ring is None else ring.count
         if count > most:
@@ -109,18 +119,30 @@ def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool, RingM
     return *best, shown
 
 
-def _thresholds(roi: Pixels) -> Iterator[float]:
-    """Otsu's threshold, then those of its brighter and its darker class."""
+def _thresholds(roi: Pixels) -> Iterator[tuple[float, Mask | None]]:
+    """Otsu's threshold, then those of its brighter and its darker class; then of what is dark, with where that is.
+
+    A pixel at the rim of the dark has a share of the light beside it, which may be as bright as a marker and would join
+    a marker near the rim to the sky: what is dark is what lies a pixel within.
+    """
     level = _otsu(roi.ravel())
-    yield level
+    yield level, None
     for part in (roi[roi > level], roi[roi <= level]):
         if part.size:
-            yield _otsu(part)
+            yield _otsu(part), None
+    for _ in range(_MOST_DARKER):
+        dark: Mask = cv2.erode((roi <= level).view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
+        levels = roi[dark]
+        if levels.size == 0 or np.ptp(levels) < _LEAST_RANGE_DN:
+            return
+        level = _otsu(levels)
+        yield level, dark
 
 
-def _regions(roi: Pixels, level: float) -> tuple[Blobs, bool]:
-    """Disc-like regions above a level, and whether they went through median and opening."""
-    mask: NDArray[np.uint8] = (roi > level).view(np.uint8)
+def _regions(roi: Pixels, level: float, dark: Mask | None) -> tuple[Blobs, bool]:
+    """Disc-like regions above a level, or of what is dark, and whether they went through median and opening."""
+    inside = roi > level if dark is None else (roi > level) & dark
+    mask: NDArray[np.uint8] = inside.view(np.uint8)
     blobs = disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS)
     if len(blobs) == 0 or 2 * np.median(blobs.radii_px) < _LEAST_DIAMETER_FOR_MORPHOLOGY_PX:
         return blobs, False

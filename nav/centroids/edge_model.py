@@ -28,7 +28,7 @@ from nav.centroids.motion_blur import Travel, fit_travel, moving, seen_travel
 from nav.centroids.patches import PixelSet, disc_pixels
 from nav.centroids.pixel_response import without_pixel_response
 from nav.centroids.single_color import with_even_others
-from nav.centroids.surroundings import MOST_BEYOND, SEEN_BESIDE_PX, Surroundings, shares_beyond
+from nav.centroids.surroundings import Surroundings, on_the_face, seen_beside_px, shares_beyond
 from nav.centroids.working_memory import keep_freed_memory
 
 # Shading of a smaller disc can hardly be told from a shift of it: fitting it adds 30 % of noise here, 100 % at 4 px.
@@ -123,10 +123,10 @@ def _first_fit(
     plain, ways = not signals[0].is_difference, None if travel is None else travel.of(start)
     spread_px = 0.0 if travel is None else travel.spread_px(start)
     pixels, further = disc_pixels(signals, start, blur_px=spread_px), None
-    if around is not None and around.margin_px <= SEEN_BESIDE_PX + spread_px:
+    if around is not None and around.margin_px <= seen_beside_px(signals[0]) + spread_px:
         further = shares_beyond(around, start, pixels, START_WIDTH_PX, ways)
-    if further is not None:
-        pixels = pixels.only((further < MOST_BEYOND).all(axis=1))
+        if further is not None:
+            pixels = on_the_face(around, start, pixels, further, ways, signals[0])
     sloped = plain or (shaded and bool(start.radii_px.min() >= _LEAST_RADIUS_FOR_SLOPE_BESIDE_PX))
     still = disc_model(pixels, sloped, shaded, further)
     model = still if ways is None else moving(still, ways, (0,))

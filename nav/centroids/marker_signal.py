@@ -18,6 +18,8 @@ Array32 = NDArray[np.float32]
 # Room around an outline: the widest window about it, of one that moves by 30 px while the shutter is open, and what an
 # initial centre may be off. [px]
 _MARGIN_PX = 20
+# Pixels this far outside the edge are seen; a plain picture needs more of them to know its background. [px]
+OUTER_DIFFERENCE_PX, _OUTER_PLAIN_PX = 2.5, 5.0
 # First site of each colour in an RGGB cell, as row and column.
 _FIRST_SITE = ((0, 0), (0, 1), (1, 1))
 _GREEN = 1
@@ -47,6 +49,25 @@ class MarkerSignal:
     pitch_px: int
     is_difference: bool
     own: Pixels | None = None
+
+    @property
+    def outer_px(self) -> float:
+        """How far outside an edge pixels are seen. [px]"""
+        return OUTER_DIFFERENCE_PX if self.is_difference else _OUTER_PLAIN_PX
+
+    @property
+    def beside_px(self) -> float:
+        """How far beside a site some of the light in its value fell: a mosaic has the other colours there. [px]"""
+        return float(self.pitch_px - 1)
+
+    @property
+    def shows_glare(self) -> bool:
+        """Whether light of a bright sky stays in it where the lens, or the sites beside, spread it over a dark face.
+
+        A difference of colours of the same place takes it off, all but its colour. A plain picture shows it whole; of a
+        mosaic's difference, whose colours lie side by side, sites along the rim get it with either sign.
+        """
+        return not self.is_difference or self.beside_px > 0
 
 
 def marker_signals(

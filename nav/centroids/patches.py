@@ -14,14 +14,12 @@ from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
 from nav.centroids.marker_signal import Array32, MarkerSignal
 from nav.centroids.window_cells import choose_cells, take_cells
 
-# Pixels this far outside the edge are seen; a plain picture needs more of them to know its background. [px]
-OUTER_DIFFERENCE_PX = 2.5
-OUTER_PLAIN_PX = 5.0
 # Discs up to this radius are taken whole. Of larger ones the pixels within the band of the edge are, and of the rest,
-# which tells only level and shading, one in four by four: 8 % more noise where shading is fitted, half the time.
+# which tells only level and shading, one in four by four: 8 % more noise where shading is fitted, half the time. Of a
+# mosaic's sites, which lie two pixels apart, that is one in two by two.
 WHOLE_RADIUS_PX = 24.0
 _BAND_PX = 2.5
-_THIN = 4
+_THIN_PX = 4
 
 _Picture = Array32 | Pixels | NDArray[np.bool_]
 
@@ -83,17 +81,22 @@ def disc_pixels(
     With `everything`, those far from the edge of large discs too.
     """
     whole = everything or bool(discs.radii_px.max() <= WHOLE_RADIUS_PX)
-    return _gather(signals, discs, thin=1 if whole else _THIN, blur_px=blur_px)
+    return _gather(signals, discs, thin=1 if whole else _thin_cells(signals), blur_px=blur_px)
 
 
 def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
     """One in four by four of the pixels in and around discs."""
-    return _gather(signals, discs, every=_THIN)
+    return _gather(signals, discs, every=_thin_cells(signals))
 
 
 def annulus_pixels(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses, blur_px: float = 0.0) -> PixelSet:
     """Pixels on and around annuli, `blur_px` as above; of the hole only what lies near its edge."""
-    return _gather(signals, outer, thin=_THIN, holes=inner, blur_px=blur_px)
+    return _gather(signals, outer, thin=_thin_cells(signals), holes=inner, blur_px=blur_px)
+
+
+def _thin_cells(signals: Sequence[MarkerSignal]) -> int:
+    """Sites from one to the next where they are thinned."""
+    return _THIN_PX // signals[0].pitch_px
 
 
 def _gather(
@@ -115,7 +118,7 @@ def _gather(
         blur_px: how far beyond a still one's an edge may be seen.
     """
     pitch = signals[0].pitch_px
-    reach_px = blur_px + (OUTER_DIFFERENCE_PX if signals[0].is_difference else OUTER_PLAIN_PX)
+    reach_px = blur_px + signals[0].outer_px
     extents = np.sqrt(np.einsum("mij,mij->mi", outlines.shapes_px, outlines.shapes_px)) + reach_px
     half = -(-(int(np.ceil(extents.max() / pitch)) + 1) // every) * every
     size = 2 * (half // every) + 1

@@ -69,3 +69,15 @@ def test_part_of_the_channel_is_that_part_of_the_whole(window, color, kind):
     assert part.shape == (bottom - top, right - left)
     assert (part == whole[top:bottom, left:right]).all()
     assert whole.any()
+
+
+@pytest.mark.parametrize("turn", range(8))
+@pytest.mark.parametrize("color", [0, 2])
+def test_the_edge_of_a_bright_sky_leads_nowhere_in_a_mosaic(color, turn):
+    v, u = np.mgrid[:60, :80].astype(np.float64)
+    away_px = (u - 40) * np.cos(turn * np.pi / 4) + (v - 30) * np.sin(turn * np.pi / 4)
+    mosaic = np.round(8 + 190 / (1 + np.exp(-2 * away_px))).astype(np.uint8)
+    blank = np.zeros((60, 80, 3), np.uint8)
+    images = StereoImages(blank, blank, 0.0, 1e-3, left_mosaic=mosaic, right_mosaic=mosaic)
+    # Sites of one cell differ by up to 40 numbers there.
+    assert marker_channel(images, "left", color).max() == 0

@@ -228,9 +228,10 @@ def test_shares_beyond_the_face_follow_the_markers():
 
 
 @pytest.mark.parametrize("color", [0, 2])
-def test_mosaic_sites_keep_their_places(color):
+@pytest.mark.parametrize("radius_px", [10.0, 39.0])
+def test_mosaic_sites_keep_their_places(color, radius_px):
     rng = np.random.default_rng(11)
-    signals, truth = draw_discs(10.0, DAY, rng)
+    signals, truth = draw_discs(radius_px, DAY, rng)
     mosaics = []
     for signal in signals:
         even = signal.values[: signal.values.shape[0] // 2 * 2]
@@ -243,7 +244,7 @@ def test_mosaic_sites_keep_their_places(color):
     fits = fit_discs(marker_signals(images, color, truth), rough_start(truth, rng))
     error = fits.ellipses.centers_px - truth.centers_px
     # A quarter of the pixels doubles the noise; 32 errors know their rms to 13 %.
-    assert np.sqrt(np.mean(error**2)) < 2 * 1.6 * center_bound_px(10.0, DAY)
+    assert np.sqrt(np.mean(error**2)) < 2 * 1.6 * center_bound_px(radius_px, DAY)
     assert fits.accepted.all()
 
 
