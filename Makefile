@@ -18,11 +18,12 @@ demo: ## render a small dataset, navigate on it blind, and report how accurate t
 	@$(BIN)/droguekit demo --out out/demo
 	@echo "demo: the report is $(CURDIR)/out/demo/report.html"
 
+# Three for two cores: tests of commands and pages wait for other processes much of their time.
 # A process that crashes ends the tests, with the name of the test that it ran: replaced, it may leave them waiting for
 # ever (pytest-xdist 3.8).
 test: setup lint ## linters, types and the fast tests
 	@echo "test: pytest, the fast tests"
-	@$(BIN)/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --max-worker-restart 0
+	@$(BIN)/python -m pytest -m "not slow" --numprocesses 3 --dist loadfile --max-worker-restart 0
 
 test-slow: setup ## the tests that render for longer
 	@echo "test-slow: pytest, the slow tests"
