@@ -11,13 +11,10 @@ from geometry.distortion import Lens
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import Eye, StereoRig
 from render.blender_engine.messages import CameraPath, RealEye, Window
+from render.windows import NEAREST_M, window_of
 
 _SHARP_BELOW_PX = 0.05
 _MOMENTS = 5
-# Beyond what the corners reach: their own rounding, and the pixel that holds them.
-_MARGIN_PX = 2
-# Nearer than this a corner's projection means nothing and the whole image is taken.
-_NEAREST_M = 0.05
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
@@ -43,7 +40,7 @@ class EyePath:
     def _moves(self, poses: list[RigidTransform], corners_m: NDArray[np.float32]) -> bool:
         """Whether any corner's image is elsewhere when the shutter opens or closes than in the middle."""
         seen = [poses[index].inverse().apply(corners_m) for index in (0, _MOMENTS // 2, -1)]
-        front = np.min([points[:, 2] for points in seen], axis=0) > _NEAREST_M
+        front = np.min([points[:, 2] for points in seen], axis=0) > NEAREST_M
         opened, middle, closed = (self._camera.project(points[front]) for points in seen)
         return bool(max(np.abs(end - middle).max(initial=0.0) for end in (opened, closed)) >= _SHARP_BELOW_PX)
 
@@ -53,25 +50,8 @@ class EyePath:
         Args:
             corners_m: (V, 3) in the stage's axes. [m]
         """
-        camera = self._camera
-        low, high = np.full(2, np.inf), np.full(2, -np.inf)
-        for pose in self._poses:
-            points = pose.inverse().apply(corners_m)
-            if not len(points) or points[:, 2].max() < _NEAREST_M:
-                continue
-            if points[:, 2].min() < _NEAREST_M:
-                low, high = np.zeros(2), np.array([camera.width_px, camera.height_px], dtype=np.float64)
-                break
-            seen = camera.project(points)
-            low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
-        size = np.array([camera.width_px, camera.height_px])
-        # Where a lens moves what stands in the ideal image.
-        margin = _MARGIN_PX + np.ceil(self._rig.largest_shift_px())
-        first = np.clip(np.floor(low) - margin, 0, size)
-        end = np.clip(np.ceil(high) + margin + 1, 0, size)
-        if (first >= end).any():
-            return None
-        return _window(self._rig, self._eye, first.astype(int), end.astype(int))
+        window = window_of(self._rig, self._poses, corners_m)
+        return None if window is None else _window(self._rig, self._eye, *window)
 
 
 def holds(outer: Window | None, inner: Window) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from datasets_manifest.frame import FrameSpec
 from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
+from geometry.se3 import RigidTransform
 from geometry.stereo import Eye
 from render.mitsuba_engine.jit_arrays import jit_array
 from render.motion import pose_polynomial
@@ -30,6 +31,11 @@ class CameraRays:
         self._opaque_pose = [
             [[dr.opaque(mi.Float, float(value)) for value in row] for row in coefficient] for coefficient in self._pose
         ]
+
+    def stage_from_eye(self, s: float) -> RigidTransform:
+        """Pose at mid-exposure (s = 0) or at one of its ends (-1, 1), where the polynomial is exact."""
+        matrix = np.vstack([self._pose[0] + s * (self._pose[1] + s * self._pose[2]), [0.0, 0.0, 0.0, 1.0]])
+        return RigidTransform.from_matrix(matrix)
 
     def rays(self, pixel: Any, place: Any, moment: Any) -> Any:
         """Rays through pixels.

@@ -17,6 +17,7 @@ from render.mitsuba_engine.launches import rows_of
 from render.mitsuba_engine.scene import DrogueScene, by_shape
 from render.mitsuba_engine.traced import ASIDE, OF_DROGUE, parts_in, slipped_through
 from render.traced import TracedEye, amodal_counts
+from render.windows import window_of
 
 CENTER = (0.5, 0.5)
 
@@ -29,15 +30,31 @@ class CenterPasses:
         self._scene = scene
         camera = frame.rig.camera
         self._shape = (camera.height_px, camera.width_px)
+        self._rig = frame.rig
 
     def _center_rays(self, pixel: Any, moment: float = 0.5, place: tuple[float, float] = CENTER) -> Any:
         return self._rays.rays(pixel, mi.Point2f(*place), dr.opaque(mi.Float, moment))
 
     def part_ids(self, s: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """(H, W) part ids and distances [m] at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""
-        pixel = dr.arange(mi.UInt32, self._shape[0] * self._shape[1])
-        ids, distance = self._hits(self._scene.scene, self._center_rays(pixel, (s + 1) / 2))
-        return ids.reshape(self._shape), distance.reshape(self._shape)
+        ids, distance_m = np.zeros(self._shape, dtype=np.uint8), np.full(self._shape, np.inf, dtype=np.float32)
+        # Most rays meet nothing, and where the image has nothing need not be sent.
+        pixel = self._pixels_of(self._scene.things_m, s)
+        if len(pixel):
+            rays = self._center_rays(jit_array(mi.UInt32, pixel), (s + 1) / 2)
+            ids.reshape(-1)[pixel], distance_m.reshape(-1)[pixel] = self._hits(self._scene.scene, rays)
+        return ids, distance_m
+
+    def _pixels_of(self, things_m: list[NDArray[np.float64]], s: float) -> NDArray[np.int64]:
+        """(P,) flat indices of pixels that may show one of some things, by points that have them between them."""
+        held = np.zeros(self._shape, dtype=np.bool_)
+        pose = self._rays.stage_from_eye(s)
+        for corners_m in things_m:
+            window = window_of(self._rig, [pose], corners_m)
+            if window is not None:
+                (left, top), (right, bottom) = window
+                held[top:bottom, left:right] = True
+        return np.flatnonzero(held)
 
     def sunlit(self, part_id: NDArray[np.uint8], s: float) -> NDArray[np.bool_]:
         """(H, W) where the rays of `part_ids` at time s meet surfaces of the drogue that see the sun."""
@@ -99,16 +116,15 @@ class CenterPasses:
         """(P, 3) points and normals in the drogue frame."""
         ray = self._center_rays(jit_array(mi.UInt32, pixel), place=place)
         hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-        dr.eval(hit.p, hit.n)
-        return rows_of(hit.p), rows_of(hit.n)
+        # Robust rays know how far they go to the last digit, but their place on a narrow triangle to a millimetre.
+        point = ray(hit.t)
+        dr.eval(point, hit.n)
+        return rows_of(point), rows_of(hit.n)
 
     def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
         """Pixel centres that each marker and the hub would cover alone, on the image's grid."""
-        rows, columns = np.flatnonzero(part_id.any(axis=1)), np.flatnonzero(part_id.any(axis=0))
-        if not len(rows) or not self._scene.features.shapes():
+        pixel = self._pixels_of([self._scene.features_m], 0.0)
+        if not len(pixel):
             return {}
-        # Where a hidden feature would be, something else is seen: what is covered bounds the features too.
-        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        pixel = np.arange(part_id.size, dtype=np.uint32).reshape(self._shape)[window].ravel()
         alone_id, alone_m = self._hits(self._scene.features, self._center_rays(jit_array(mi.UInt32, pixel)))
-        return amodal_counts(part_id[window].ravel(), distance_m[window].ravel(), alone_id, alone_m)
+        return amodal_counts(part_id.reshape(-1)[pixel], distance_m.reshape(-1)[pixel], alone_id, alone_m)

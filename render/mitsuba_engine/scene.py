@@ -7,6 +7,7 @@ ever rebuilt. Without a drogue the stage is the left camera's own frame.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from typing import Any
 
 import drjit as dr
@@ -47,10 +48,13 @@ class DrogueScene:
     Attributes:
         scene: everything.
         features: markers and hub alone, for their amodal pixels.
+        features_m: (V, 3) points in the stage's axes that have all of `features` between them. [m]
+        things_m: such points for each thing in the frame. [m]
         sun: direction towards the sun in the stage's axes, and its illuminance of a facing plane [lux].
     """
 
     def __init__(self, frame: FrameSpec) -> None:
+        self.features_m = self._drogue_m = np.zeros((0, 3))
         self._has_surround = frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None
         self._tanker = with_creases(tanker_mesh())
         shapes, features = bystander_shapes(frame), {}
@@ -62,14 +66,17 @@ class DrogueScene:
                 for part, mesh in meshes.items()
                 if part == int(Part.HUB) or part >= FIRST_MARKER_ID
             }
+            self.features_m, self._drogue_m = _corners_m(fronts.values()), _corners_m(meshes.values())
             if self._has_surround:
                 meshes[int(Part.HOSE)] = hose_mesh(self._hose_nodes(frame), frame.drogue.hose_radius_m)
                 meshes[int(Part.TANKER)] = self._tanker
             shapes |= drogue_shapes(frame, meshes)
             features = drogue_shapes(frame, fronts)
-        # Merging meshes would lose the parts' identity.
-        self.scene = mi.load_dict({"type": "scene", **shapes, **_lights()}, optimize=False)
-        self.features = mi.load_dict({"type": "scene", **features}, optimize=False)
+        # Merging meshes would lose the parts' identity. Embree's quick mode lets one ray in 10,000 through a marker,
+        # between its triangles.
+        watertight = {"type": "scene", "embree_use_robust_intersections": True}
+        self.scene = mi.load_dict({**watertight, **shapes, **_lights()}, optimize=False)
+        self.features = mi.load_dict({**watertight, **features}, optimize=False)
         self._parameters = mi.traverse(self.scene)
         self._aged = False
 
@@ -82,10 +89,12 @@ class DrogueScene:
     def set_frame(self, frame: FrameSpec, around: Surroundings) -> None:
         """Put hose, tanker, bystanders, paints, lamps, sky and sun where and how this frame has them."""
         stage_from_left = frame.left_from_stage_at(0.0).inverse()
+        self.things_m = [self._drogue_m]
         if self._has_surround:
             assert frame.left_from_tanker is not None and frame.drogue is not None
             hose = hose_mesh(self._hose_nodes(frame), frame.drogue.hose_radius_m)
             self._set_vertices(f"part_{int(Part.HOSE)}", np.asarray(hose.vertices), np.asarray(hose.vertex_normals))
+            self.things_m.append(np.asarray(hose.vertices))
             self._set_moved(f"part_{int(Part.TANKER)}", stage_from_left @ frame.left_from_tanker, self._tanker)
         self._set_bystanders(frame, stage_from_left)
         self._set_looks(frame)
@@ -131,6 +140,7 @@ class DrogueScene:
         self._parameters["sun.irradiance.value"] = mi.Color3f(around.beam_illuminance_lux.tolist())
 
     def _set_moved(self, name: str, stage_from_mesh: RigidTransform, mesh: trimesh.Trimesh) -> None:
+        self.things_m.append(stage_from_mesh.apply(_corners_m([mesh])))
         vertices_m, normals = stage_from_mesh.apply(mesh.vertices), stage_from_mesh.rotate(mesh.vertex_normals)
         self._set_vertices(name, vertices_m, normals)
 
@@ -151,6 +161,11 @@ def by_shape(scene: Any, of_part: NDArray[Any]) -> NDArray[Any]:
     for number, shape in zip(numbers, scene.shapes(), strict=True):
         table[number] = of_part[int(shape.id().split("_")[1])]
     return table
+
+
+def _corners_m(meshes: Iterable[trimesh.Trimesh]) -> NDArray[np.float64]:
+    """(8 N, 3) corners of the boxes that hold each of N meshes. [m]"""
+    return np.concatenate([np.zeros((0, 3)), *(trimesh.bounds.corners(mesh.bounds) for mesh in meshes)])
 
 
 def _opaque(kind: Any, values: NDArray[np.float64]) -> Any:

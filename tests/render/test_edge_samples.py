@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drogue_models.parts import Part
+from geometry.stereo import EYES
+from scenes.sampler import sample_frame
 from scenes.seeding import generator
 
 pytestmark = pytest.mark.mitsuba
@@ -116,3 +119,30 @@ def test_counts_stay_within_what_may_be_taken(counts_of):
 
 def test_even_pixels_take_the_fewest_rays(counts_of):
     assert set(counts_of(np.zeros(9), np.ones(9, dtype=bool), 1.0, 100.0)) == {16}
+
+
+def test_rays_that_agree_do_not_prove_a_pixel_even(engine, make_recipe):
+    """Nine rays miss what fills a twentieth of a pixel three times in five."""
+    from render.mitsuba_engine.in_picture import InPicture
+    from render.mitsuba_engine.noise_budget import NoiseBudget
+    from render.traced import TracedEye
+
+    frame = sample_frame(make_recipe(scale=0.1), 0)
+    shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)
+    nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32)
+    face = np.full(shape, int(Part.FACE), dtype=np.uint8)
+    seen = TracedEye(face, np.full(shape, 30.0, dtype=np.float32), np.zeros((*shape, 3)), {}, *nothing)
+    bright = np.full((*shape, 3), 10_000.0, dtype=np.float32)
+    picture = InPicture(frame, dict.fromkeys(EYES, seen), dict.fromkeys(EYES, bright))
+    # Every third pixel of some rows: none is another's neighbour.
+    pixel = np.concatenate([np.arange(0, shape[1], 3) + row * shape[1] for row in (0, 5, 10, 15)])
+    found = np.zeros((len(pixel), 9, 7), dtype=np.float32)
+    found[..., :3], found[..., 3] = 200.0, 1.0
+    found[::2, ::2, :4] = 0.0
+    inside = pixel[:4], np.repeat(found[1:2, 0], 4, axis=0)
+    counts = NoiseBudget(picture, (pixel, found), inside, 0.1).edge_counts(512)
+    torn, agreeing = counts[::2], counts[1::2]
+    assert len(np.unique(torn)) == len(np.unique(agreeing)) == 1
+    # A hundredth of the mean variance, and to the power of 0.4: an eighth of the rays, which are powers of two.
+    assert torn[0] // 16 <= agreeing[0] <= torn[0] // 4
+    assert agreeing[0] > 16

@@ -1,0 +1,114 @@
+"""What the pixels' centres see, against rays through all of them, and rays against closed surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe import parse_recipe
+from drogue_models.parts import FIRST_MARKER_ID, Part
+from geometry.stereo import EYES
+from scenes.sampler import sample_frame
+from scenes.surroundings import surroundings
+
+pytestmark = pytest.mark.mitsuba
+
+
+@pytest.fixture(scope="module")
+def scene_of(engine):
+    from render.mitsuba_engine.scene import SceneCache
+
+    scenes = SceneCache()
+    return lambda frame: scenes.scene_of(frame, surroundings(frame.environment))
+
+
+RECIPE = """
+name = "passes"
+seed = 3
+rig = { preset = "rgb-ideal", probe_tip_body_m = [2.6, 0.5, 0.35]%s }
+[frames]
+count = 3
+[distance]
+law = "stations"
+stations_m = [2.0, 9.0, 33.0]
+%s
+"""
+REAL_LENSES = ", eyes = { k1 = { low = -0.1, high = -0.05 }, principal_point_px = 8.0, right_rotation_deg = 0.5 }"
+MOVING = "[pose]\nspeed_m_s = 40.0\nrate_deg_s = 300.0"
+BYSTANDERS = "[target]\nprobe = true\nobstacle_frame_fraction = 1\ndistractor_frame_fraction = 1"
+
+
+@pytest.mark.parametrize(
+    ("rig", "more"),
+    [("", ""), (REAL_LENSES, ""), ("", MOVING), ("", BYSTANDERS)],
+    ids=["ideal", "real lenses", "moving", "bystanders"],
+)
+def test_nothing_is_seen_where_no_ray_is_sent(scene_of, rig, more, monkeypatch):
+    from render.mitsuba_engine.center_passes import CenterPasses
+
+    recipe = parse_recipe(RECIPE % (rig, more))
+    for frame in (sample_frame(recipe, index) for index in range(recipe.frames.count)):
+        scene = scene_of(frame)
+        for eye in EYES:
+            passes, everywhere = (CenterPasses(frame, eye, scene) for _ in range(2))
+            size = frame.rig.camera.width_px * frame.rig.camera.height_px
+            monkeypatch.setattr(everywhere, "_pixels_of", lambda *_, size=size: np.arange(size))
+            for s in (-1.0, 0.0, 1.0):
+                (ids, distance_m), (all_ids, all_m) = passes.part_ids(s), everywhere.part_ids(s)
+                assert ids.any() and set(np.unique(all_ids)) == set(np.unique(ids))
+                # What a ray that grazes an edge meets may depend on the rays that travel with it.
+                other = np.flatnonzero(ids != all_ids)
+                sent = np.isin(other, passes._pixels_of(scene.things_m, s))
+                assert sent.all() and len(other) <= 3
+                assert np.count_nonzero(distance_m != all_m) <= 3
+
+
+def test_depths_are_those_of_the_plane_that_is_seen(engine, make_recipe):
+    recipe = make_recipe(stations_m=(3.0, 11.0, 36.0))
+    for frame in (sample_frame(recipe, index) for index in range(3)):
+        seen = engine.render(frame, recipe.render).left
+        axis, center_m = frame.left_from_drogue.rotation[:, 2], frame.left_from_drogue.translation_m
+        # The front of the face lies in the drogue's plane z = 0.
+        rows, columns = np.nonzero((seen.part_id == Part.FACE) & (seen.normal @ axis < -0.9))
+        rays = frame.rig.camera.rays(np.column_stack([columns, rows]).astype(np.float64))
+        depth_m = axis @ center_m / (rays @ axis)
+        assert len(rows) > 100
+        # Sums of three float32 products.
+        assert np.abs(seen.depth_m[rows, columns] - depth_m).max() < 4 * np.finfo(np.float32).eps * depth_m.max()
+
+
+def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of, make_recipe):
+    """Seen from inside, a marker is black: one such ray of four takes a quarter of a pixel's light away."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from render.mitsuba_engine.camera_rays import CameraRays
+    from render.mitsuba_engine.jit_arrays import jit_array
+    from render.mitsuba_engine.scene import by_shape
+
+    rays = 1_000_000
+    rng = np.random.default_rng(4)
+    recipe = make_recipe(stations_m=(24.0,))
+    for frame in (sample_frame(recipe, index) for index in range(2)):
+        scene = scene_of(frame)
+        camera = CameraRays(frame, "left")
+        for marker in range(frame.drogue.marker_count):
+            center_m = np.array([*frame.drogue.marker_positions_m[marker], 0.0])
+            center_px = frame.rig.camera.project(frame.left_from_drogue.apply(center_m))
+            # A square inside the disc, however it is turned.
+            half_px = (
+                0.3 * frame.drogue.marker_radius_m * frame.rig.camera.fx_px / frame.left_from_drogue.translation_m[2]
+            )
+            at_px = center_px + rng.uniform(-half_px, half_px, (rays // frame.drogue.marker_count, 2))
+            pixel = np.rint(at_px)
+            place = (at_px - pixel + 0.5).astype(np.float32)
+            flat = pixel[:, 1] * frame.rig.camera.width_px + pixel[:, 0]
+            sent = camera.rays(
+                jit_array(mi.UInt32, flat),
+                mi.Point2f(jit_array(mi.Float, place[:, 0]), jit_array(mi.Float, place[:, 1])),
+                mi.Float(0.5),
+            )
+            surface = scene.scene.ray_intersect(sent)
+            parts = by_shape(scene.scene, np.arange(256))[np.array(dr.reinterpret_array(mi.UInt32, surface.shape))]
+            assert set(parts) == {FIRST_MARKER_ID + marker}
+            assert np.array(surface.wi.z).min() > 0
