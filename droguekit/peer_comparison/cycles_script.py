@@ -16,7 +16,7 @@ import bpy
 
 from droguekit.peer_comparison.cycles_orders import CyclesOrder, DenoisedPicture
 from droguekit.peer_comparison.noise_search import cpu_seconds
-from render.blender_engine.blender_scene import BlenderScene
+from render.blender_engine.blender_scene import BlenderScene, set_threads
 from render.blender_engine.messages import LIGHT
 
 _SENSOR_WIDTH_MM = 36.0
@@ -55,7 +55,7 @@ def _take(scene: Any, camera: Any, picture: DenoisedPicture) -> None:
     render.engine, cycles.device = "CYCLES", "CPU"
     render.resolution_x, render.resolution_y, render.resolution_percentage = window.width_px, window.height_px, 100
     render.use_persistent_data = True
-    render.threads_mode, render.threads = "FIXED", 1
+    set_threads(scene)
     render.use_compositing = render.use_sequencer = False
     render.image_settings.media_type = "MULTI_LAYER_IMAGE"
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"

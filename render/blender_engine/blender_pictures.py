@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 
 from render.blender_engine.blender_lens import set_real_eye
-from render.blender_engine.blender_scene import BlenderScene
+from render.blender_engine.blender_scene import BlenderScene, set_threads
 from render.blender_engine.messages import LIGHT, CameraPath, Picture
 
 # Only the lens's ratio to the sensor's width counts, and Blender has no narrow sensors but lenses of any length.
@@ -70,7 +70,7 @@ def _set_output(scene: Any, order: Picture) -> None:
     render.resolution_percentage = 100
     render.film_transparent = True
     render.use_persistent_data = True
-    render.threads_mode, render.threads = "FIXED", 1
+    set_threads(scene)
     render.motion_blur_position, render.motion_blur_shutter = "CENTER", 1.0
     render.use_compositing = render.use_sequencer = False
     settings = render.image_settings

@@ -117,7 +117,7 @@ class CenterPasses:
         ray = self._center_rays(jit_array(mi.UInt32, pixel), place=place)
         hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
         # Robust rays know how far they go to the last digit, but their place on a narrow triangle to a millimetre.
-        point = ray(hit.t)
+        point = ray(dr.select(hit.is_valid(), hit.t, 0.0))
         dr.eval(point, hit.n)
         return rows_of(point), rows_of(hit.n)
 

@@ -47,14 +47,15 @@ def slipped_through(
     """Which rays met what no ray can see, having passed exactly between two triangles.
 
     All parts are closed, so a surface that looks away from the camera is seen from inside. A marker fills its pocket
-    up to the front, so its wall is seen from within the face.
+    up to the front, so its wall is seen from within the face. A ray that grazes an edge may have met the part in other
+    company, but nothing alone: its normal is 0.
 
     Args:
         part_id: (...,) part that each ray met.
         normals: (..., 3) outward normal there, in the drogue frame.
         towards: (..., 3) direction of the ray, of any length, in the drogue frame.
     """
-    inside: NDArray[np.bool_] = (normals * towards).sum(axis=-1) > 0
+    inside: NDArray[np.bool_] = (normals * towards).sum(axis=-1) >= 0
     on_wall = (_MARKERS[part_id] > 0) & (normals[..., 2] > -0.5)
     return (part_id > 0) & (inside | on_wall)
 

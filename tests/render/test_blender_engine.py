@@ -285,3 +285,18 @@ def test_a_killed_blender_costs_one_try(blender, make_recipe):
     os.kill(blender._process._process.pid, signal.SIGKILL)
     after = blender.render(frame, recipe.render)
     assert np.array_equal(before.left.radiance_cd_m2, after.left.radiance_cd_m2)
+
+
+def test_blender_rests_when_it_has_nothing_to_draw(blender, make_recipe):
+    """With one thread Cycles leaves one of TBB's awake, which takes a core for as long as the process lives."""
+    recipe = make_recipe(scale=0.125, stations_m=(5.0,), samples=2)
+    blender.render(sample_frame(recipe, 0), recipe.render)
+    tasks = [*Path(f"/proc/{blender._process._process.pid}/task").iterdir()]
+    assert len(tasks) > 1
+
+    def awake():
+        # State after the name, which stands in brackets and may hold anything.
+        return any((task / "stat").read_text().rpartition(")")[2].split()[0] == "R" for task in tasks)
+
+    # Threads that have just had work look around for more, for much less time than so many looks at them take.
+    assert any(not awake() for _ in range(200_000))
