@@ -59,7 +59,7 @@ bench-detectors: ## detectors OURS=FILE.onnx beside YOLOv8n and YOLOv8s, trained
 	@scripts/setup all
 	@$(BIN)/python -m droguekit.detector_peers --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
 
-bench: ## CPU seconds per stereo pair by distance and stage
+bench: ## CPU seconds per stereo pair by distance and stage, and pairs a second of all workers
 	@scripts/setup mitsuba
 	@$(BIN)/droguekit bench
 

@@ -13,6 +13,8 @@ from render.engine import EyeRadiance
 
 # Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
 _SEAM_DEPTH_FRACTION = 1e-5
+# How far from an edge the depth is looked for of what reaches over it.
+_NEAREST_PX = 2
 
 
 @dataclass(eq=False)
@@ -56,7 +58,12 @@ class TracedEye:
 
     def clear_share(self, pixel: NDArray[np.int64], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """(P, 1) share that the air leaves of the light of parts in pixels; see `put_behind_air`."""
-        nearest = cv2.erode(self.depth_m, np.ones((5, 5), dtype=np.uint8)).reshape(-1)[pixel]
+        if not len(pixel):
+            return np.zeros((0, 1), dtype=np.float32)
+        width = self.depth_m.shape[1]
+        first, end = max(int(pixel.min()) // width - _NEAREST_PX, 0), int(pixel.max()) // width + _NEAREST_PX + 1
+        around = np.ones((2 * _NEAREST_PX + 1, 2 * _NEAREST_PX + 1), dtype=np.uint8)
+        nearest = cv2.erode(self.depth_m[first:end], around).reshape(-1)[pixel - first * width]
         share: NDArray[np.float32] = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))
         return share[:, None]
 

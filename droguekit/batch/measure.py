@@ -1,9 +1,11 @@
-"""What frames of a recipe cost, measured in one warm worker process and thrown away."""
+"""What frames of a recipe cost, made by warm worker processes and thrown away."""
 
 from __future__ import annotations
 
 import os
 import tempfile
+import time
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +14,10 @@ from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.reader import read_record_table
 from datasets_manifest.recipe import Recipe
 from droguekit.batch.frame_task import FrameReport, FrameTask
-from droguekit.batch.workers import run_alone
+from droguekit.batch.workers import run_alone, run_tasks
+
+# A worker's first frames compile kernels.
+_WARM_UP_FRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,38 @@ def _measure(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ..
         task = FrameTask(recipe, Path(folder))
         task(frames[0])
         return tuple(_measured(task, frame_index) for frame_index in frames)
+
+
+def frames_per_second(recipe: Recipe, workers: int) -> float:
+    """How many frames come to be in a second of the clock when all of a recipe are made, in a temporary folder.
+
+    What starting costs does not count, and what it costs that fewer and fewer workers have work at the end does.
+
+    Args:
+        recipe: what to make; its first frames, `warm_up(workers)` of them, do not count.
+        workers: how many processes.
+
+    Raises:
+        ValueError: too few frames, the engine cannot be used, or a frame cannot be made.
+        OSError: a process died again and again, or the temporary folder cannot be written.
+    """
+    uncounted = warm_up(workers)
+    if recipe.frames.count <= uncounted:
+        raise ValueError(f"frames: {recipe.frames.count} are too few for {workers} workers; {uncounted} do not count")
+    ended_s = []
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        frames = range(recipe.frames.count)
+        with closing(run_tasks(FrameTask(recipe, Path(folder)), frames, workers)) as attempts:
+            for attempt in attempts:
+                if attempt.final and attempt.error is not None:
+                    raise attempt.error
+                ended_s += [time.monotonic()] * attempt.final
+    return (len(ended_s) - uncounted) / (ended_s[-1] - ended_s[uncounted - 1])
+
+
+def warm_up(workers: int) -> int:
+    """Frames of `frames_per_second` that do not count."""
+    return _WARM_UP_FRAMES * workers
 
 
 def _measured(task: FrameTask, frame_index: int) -> MeasuredFrame:

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from droguekit.cli.arguments import EngineOption
+from droguekit.cli.arguments import EngineOption, WorkersOption
 from droguekit.cli.pipelines import BENCH_QUALITIES, open_bench_recipe, open_uniform_bench_recipe
 
 if TYPE_CHECKING:
     from droguekit.batch.frame_task import FrameReport
     from droguekit.batch.measure import MeasuredFrame
 
-EXAMPLES = ("droguekit bench", "droguekit bench --repeat 5", "droguekit bench --pairs 500")
+EXAMPLES = ("droguekit bench", "droguekit bench --repeat 5 --workers 8", "droguekit bench --pairs 500")
 
 
 def bench(
     repeat: Annotated[int, typer.Option("--repeat", help="Pairs at each distance.")] = 2,
     pairs: Annotated[int, typer.Option("--pairs", help="Pairs over the uniform law, for each quality.")] = 40,
+    workers: WorkersOption = None,
     engine: EngineOption = None,
 ) -> None:
     """Measure the CPU time of a full-size pair by distance and stage, everything included.
@@ -28,10 +29,14 @@ def bench(
     One process with one thread, 16 samples a pixel, after one pair that is not counted. Then the mean over distances
     uniform from 2 to 40 m in eight scenes, with 16 and with 64 samples, the renderer's noise on the drogue against the
     sensor's (root mean square over pairs), and how much more memory the process holds after the last pair than after
-    the first fifth.
+    the first fifth. Last, how many pairs a second all workers make of these, by the clock.
     """
-    from droguekit.batch.measure import measure_closely, measure_frames
+    from droguekit.batch.machine import default_workers
+    from droguekit.batch.measure import frames_per_second, measure_closely, measure_frames, warm_up
 
+    workers = default_workers() if workers is None else workers
+    if workers < 1:
+        raise ValueError(f"--workers: must be at least 1, got {workers}")
     recipe = open_bench_recipe(repeat, engine)
     stations = recipe.distance.stations_m or ()
     # The farthest first: the pair that is not counted is the cheapest.
@@ -49,6 +54,10 @@ def bench(
     for quality in BENCH_QUALITIES:
         uniform = open_uniform_bench_recipe(pairs, quality, engine)
         typer.echo(_mean_row(quality, measure_closely(uniform, tuple(range(pairs)))))
+    typer.echo(f"\n{'2 to 40 m':>9} {'pairs/s by the clock':>20} {'workers':>8}")
+    for quality in BENCH_QUALITIES:
+        uniform = open_uniform_bench_recipe(pairs + warm_up(workers), quality, engine)
+        typer.echo(f"{quality:>9} {frames_per_second(uniform, workers):20.2f} {workers:8d}")
 
 
 def _is_at(distance_m: float, station_m: float) -> bool:

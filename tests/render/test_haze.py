@@ -11,6 +11,7 @@ from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
 from render.engine import load_engine
+from render.traced import TracedEye
 from scenes.light import luminance
 from scenes.sampler import sample_frame
 
@@ -72,3 +73,20 @@ def test_airlight_is_the_background_where_nothing_can_be_seen(make_recipe):
         around = Surroundings(environment)
         # 1e-4 rad down is endlessly far.
         np.testing.assert_allclose(around.radiance(rays), around.airlight(rays), rtol=0.02)
+
+
+def test_a_pixel_is_as_hazy_alone_as_among_others():
+    rng = np.random.default_rng(8)
+    depth_m = np.where(rng.random((12, 9)) < 0.6, np.inf, rng.uniform(5, 40, (12, 9))).astype(np.float32)
+    nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32)
+    seen = TracedEye(depth_m > 0, depth_m, np.zeros((12, 9, 3)), {}, *nothing)
+    per_m = rng.uniform(0.01, 0.05, depth_m.size).astype(np.float32)
+    all_of_them = seen.clear_share(np.arange(depth_m.size), per_m)
+    # By the definition: the nearest depth of the 25 pixels around, and clear air where none has one.
+    padded = np.pad(depth_m, 2, constant_values=np.inf)
+    nearest_m = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).min(axis=(2, 3)).ravel()
+    expected = np.exp(-per_m * np.where(np.isfinite(nearest_m), nearest_m, 0.0))
+    np.testing.assert_allclose(all_of_them[:, 0], expected, rtol=1e-6)
+    for pixel in range(depth_m.size):
+        assert seen.clear_share(np.array([pixel]), per_m[[pixel]])[0, 0] == all_of_them[pixel, 0]
+    assert seen.clear_share(np.zeros(0, dtype=np.int64), per_m[:0]).shape == (0, 1)

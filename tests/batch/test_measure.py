@@ -1,0 +1,35 @@
+"""Measuring what frames cost."""
+
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+
+import pytest
+
+from datasets_manifest.recipe import parse_recipe
+from droguekit.batch import measure
+from droguekit.batch.measure import frames_per_second, warm_up
+
+
+def of_frames(recipe_text, count):
+    recipe = parse_recipe(recipe_text)
+    return recipe.model_copy(update={"frames": recipe.frames.model_copy(update={"count": count})})
+
+
+def test_the_rate_is_of_the_frames_after_the_first_ones(analytic_recipe, monkeypatch):
+    # By a clock that goes on by half a second with every frame, and had stood before them for an hour.
+    told_s = itertools.chain([0.0], itertools.count(3600.0, 0.5))
+    monkeypatch.setattr(measure, "time", SimpleNamespace(monotonic=lambda: next(told_s)))
+    assert frames_per_second(of_frames(analytic_recipe, warm_up(2) + 3), workers=2) == 2.0
+
+
+def test_a_recipe_of_first_frames_alone_has_no_rate(analytic_recipe):
+    with pytest.raises(ValueError, match="8 are too few for 2 workers; 8 do not count"):
+        frames_per_second(of_frames(analytic_recipe, warm_up(2)), workers=2)
+
+
+def test_an_engine_that_is_missing_ends_the_measurement(analytic_recipe):
+    recipe = of_frames(analytic_recipe.replace('engine = "analytic"', 'engine = "no-such-engine"'), warm_up(1) + 1)
+    with pytest.raises(ValueError, match="no-such-engine"):
+        frames_per_second(recipe, workers=1)
