@@ -63,7 +63,9 @@ class TracedEye:
         width = self.depth_m.shape[1]
         first, end = max(int(pixel.min()) // width - _NEAREST_PX, 0), int(pixel.max()) // width + _NEAREST_PX + 1
         around = np.ones((2 * _NEAREST_PX + 1, 2 * _NEAREST_PX + 1), dtype=np.uint8)
-        nearest = cv2.erode(self.depth_m[first:end], around).reshape(-1)[pixel - first * width]
+        # What OpenCV takes to be beyond the image is finite otherwise.
+        eroded = cv2.erode(self.depth_m[first:end], around, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
+        nearest = eroded.reshape(-1)[pixel - first * width]
         share: NDArray[np.float32] = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))
         return share[:, None]
 
