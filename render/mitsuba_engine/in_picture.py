@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from datasets_manifest.frame import FrameSpec
 from geometry.stereo import EYES, Eye
 from render.background import air_before
-from render.mitsuba_engine.traced import OF_DROGUE
 from render.traced import TracedEye
 
 
@@ -47,11 +46,11 @@ class InPicture:
             shown[own] = light[own, :, :3] * clear[own, None] + light[own, :, 3:] * of_part[:, None] + behind[:, None]
         return shown, clear
 
-    def shows_drogue(self, pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(P,) whether the pixels' centres see the drogue."""
+    def shows(self, parts: NDArray[np.uint8], pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(P,) whether the pixels' centres see one of the parts that a table by part id marks."""
         shows = np.zeros(len(pixel), dtype=np.bool_)
         for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
-            shows[own] = OF_DROGUE[self.eyes[eye].part_id.reshape(-1)[own_pixel]] > 0
+            shows[own] = parts[self.eyes[eye].part_id.reshape(-1)[own_pixel]] > 0
         return shows
 
     def by_eye(self, pixel: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], NDArray[np.int64]]]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from render.mitsuba_engine.edge_samples import counts_by_variance
 from render.mitsuba_engine.in_picture import InPicture
 from render.mitsuba_engine.noise import TWICE_EVERY, SensorNoise
+from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE
 
 # Share of the edges' mean variance that pixels have beyond what their rays show. At 37 m one of 2,000 had a twentieth
 # of bright sky that its nine rays and those around all missed, took 16 rays and was three fifths of the squared error.
@@ -20,7 +21,8 @@ class NoiseBudget:
 
     Attributes:
         aim: mean square error that is aimed at. [cd2/m4]
-        of_light: what of it is the smoothed light's; whoever lessens that says so here. [cd2/m4]
+        of_light: (2,) what of it is the smoothed light's where the sky is hidden, and in the open (`IN_OPEN`); whoever
+            lessens that says so here. [cd2/m4]
     """
 
     def __init__(
@@ -43,13 +45,15 @@ class NoiseBudget:
         samples, clear = picture.radiance(edges[0], edges[1][..., :4])
         samples_inside, clear_inside = picture.radiance(inside[0], inside[1][:, None, :4])
         # Of a drogue that no centre sees, all that may see it counts.
-        self._judged = picture.shows_drogue(edges[0])
+        self._judged = picture.shows(OF_DROGUE, edges[0])
         self._judged |= not (self._judged.any() or len(inside[0]))
         weight = np.concatenate([self._judged.astype(float), np.full(len(inside[0]), float(TWICE_EVERY))])
         mean = np.average(np.concatenate([samples.mean(axis=1), samples_inside[:, 0]]), axis=0, weights=weight)
         errors = np.concatenate([clear * edges[1][..., 4:].mean(axis=1), clear_inside * inside[1][:, 4:]])
         self.aim = noise_over_sensor**2 * sensor.variance(mean[None])
-        self.of_light = float(np.average((errors @ sensor.weights) ** 2, axis=0, weights=weight).mean())
+        squared = np.mean((errors @ sensor.weights) ** 2, axis=-1) * weight / weight.sum()
+        in_open = np.concatenate([picture.shows(IN_OPEN, edges[0]), picture.shows(IN_OPEN, inside[0])])
+        self.of_light: NDArray[np.float64] = np.bincount(in_open, weights=squared, minlength=2).astype(np.float64)
         variance = np.var(samples @ sensor.weights, axis=1, ddof=1).mean(axis=-1)
         # Few rays miss what is small, which those of the pixels around may have met.
         around = np.empty(len(variance))
@@ -65,7 +69,7 @@ class NoiseBudget:
 
     def edge_counts(self, most: float) -> NDArray[np.int64]:
         """(P,) how many rays edges take, with `most` a pixel on average of a drogue that is all edges."""
-        allowed = max(self.aim - self.of_light, self.aim / 4) / self._per_pixel
+        allowed = max(self.aim - self.of_light.sum(), self.aim / 4) / self._per_pixel
         # Stratified rays err by their number to the power of 3/4: the error over all of the drogue stays the same.
         return counts_by_variance(self._variance, self._judged, allowed, most * self._share_of_edges ** (2 / 3))
 

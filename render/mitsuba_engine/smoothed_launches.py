@@ -30,6 +30,8 @@ _SMOOTHING_AT_COUNT_PX = 2.4
 _LIGHTS_SHARE = 0.5
 # So many times the paths, or it stays as it is; and no more than so many times.
 _WORTH_IT, _MOST_TIMES = 1.5, 16.0
+# Where it is less than this share of the light's squared error, more paths would not show.
+_COUNTS_FROM = 0.1
 
 
 class SmoothedPaths:
@@ -56,19 +58,27 @@ class SmoothedPaths:
         )
         pixel = np.concatenate([centers["hidden"], centers["open"]])
         hidden = np.arange(len(pixel)) < len(centers["hidden"])
-        light, paths = SurfaceLight(rays, pixel, 1 + self._moves_px), self._paths_of_centers()
-        self._trace_light(light, hidden, grid_count(paths))
+        light = SurfaceLight(rays, pixel, 1 + self._moves_px)
+        # In each of two estimates, where the sky is hidden and in the open.
+        paths = np.array([self._paths_of_centers(), settings.open_samples_per_px]) / 2
+        traced = self._trace_light(light, hidden, paths)
+        light.smooth(hidden, MOST_SMOOTHING_STEPS)
         counts = np.zeros(0, dtype=np.int64)
-        of_inside = looked_up(rays, light, and_some_again(inside), settings.open_samples_per_px, at_edges=False)
+        of_inside = self._looked_up_inside(light, inside)
         if len(edges):
-            some_inside = inside[::TWICE_EVERY], of_inside[len(inside) :]
-            pilot = edges, pilot_rays(rays, light, edges)
-            budget = NoiseBudget(picture, pilot, some_inside, settings.noise_over_sensor)
-            more = grid_count(paths * min(budget.of_light / (_LIGHTS_SHARE * budget.aim), _MOST_TIMES))
-            if more > _WORTH_IT * grid_count(paths):
-                self._trace_light(light, hidden, more)
-                budget.of_light *= grid_count(paths) / more
-                of_inside = looked_up(rays, light, and_some_again(inside), settings.open_samples_per_px, at_edges=False)
+            budget = self._budget(light, picture, edges, inside, of_inside)
+            if budget.of_light.sum() > _WORTH_IT * _LIGHTS_SHARE * budget.aim:
+                # What is in the open otherwise has something close by before it.
+                light.smooth(~hidden, MOST_SMOOTHING_STEPS)
+                of_inside = self._looked_up_inside(light, inside)
+                budget = self._budget(light, picture, edges, inside, of_inside)
+                times = min(budget.of_light.sum() / (_LIGHTS_SHARE * budget.aim), _MOST_TIMES)
+                if times > _WORTH_IT:
+                    counts_there = budget.of_light > _COUNTS_FROM * budget.of_light.sum()
+                    more = self._trace_light(light, hidden, paths * np.where(counts_there, times, 1.0))
+                    light.smooth(np.ones(len(pixel), dtype=np.bool_), MOST_SMOOTHING_STEPS)
+                    budget.of_light *= traced / more
+                    of_inside = self._looked_up_inside(light, inside)
             counts = budget.edge_counts(settings.edge_samples_per_px)
         of_edges = looked_up_often(rays, light, and_some_again(edges), and_some_again(counts))
         twice = [(inside, of_inside), (edges, of_edges)]
@@ -82,18 +92,40 @@ class SmoothedPaths:
         )
 
     def _paths_of_centers(self) -> float:
-        """Paths from each centre in each of two estimates, where the sky is hidden."""
+        """Paths from each centre where the sky is hidden."""
         settings = self._settings
         most = max(settings.samples_per_px, settings.edge_samples_per_px)
         # Not the square, which would keep the error: far away most pixels are edges, and their rays err more.
         paths: float = settings.samples_per_px * (_SMOOTHING_AT_COUNT_PX / self._sigma_px) ** 1.5
-        return min(paths, most) / 2
+        return min(paths, most)
 
-    def _trace_light(self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: int) -> None:
-        """All of it, with so many paths where the sky is `hidden` in each of two estimates."""
-        settings = self._settings
-        light.trace([(hidden, paths), (~hidden, grid_count(settings.open_samples_per_px / 2))], settings.max_depth)
-        light.smooth(hidden, MOST_SMOOTHING_STEPS)
+    def _trace_light(
+        self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """All of it, with some so many paths where the sky is `hidden` and in the open in each of two estimates.
+
+        Returns:
+            (2,) how many they were.
+        """
+        counts = np.array([grid_count(count) for count in paths])
+        light.trace([(hidden, int(counts[0])), (~hidden, int(counts[1]))], self._settings.max_depth)
+        return counts
+
+    def _looked_up_inside(self, light: SurfaceLight, inside: NDArray[np.int64]) -> NDArray[np.float32]:
+        return looked_up(self._rays, light, and_some_again(inside), self._settings.open_samples_per_px, at_edges=False)
+
+    def _budget(
+        self,
+        light: SurfaceLight,
+        picture: InPicture,
+        edges: NDArray[np.int64],
+        inside: NDArray[np.int64],
+        of_inside: NDArray[np.float32],
+    ) -> NoiseBudget:
+        """By rays beforehand through pixels on edges, and what is found inside."""
+        pilot = edges, pilot_rays(self._rays, light, edges)
+        some_inside = inside[::TWICE_EVERY], of_inside[len(inside) :]
+        return NoiseBudget(picture, pilot, some_inside, self._settings.noise_over_sensor)
 
 
 def looked_up(

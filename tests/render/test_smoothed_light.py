@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe import parse_recipe
 from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids
 from geometry.stereo import EYES
 from render.optics import blur
@@ -132,3 +133,29 @@ def test_smoothing_leaves_no_speckles_on_the_tanker(engine, below_the_wing):
     # blur on narrow parts, of which this small picture has many.
     assert smoothed < 0.5 * alone
     assert np.mean(errors[0]) == pytest.approx(0.0, abs=0.01 * settled.mean())
+
+
+PROBE_BESIDE = """
+name = "probe"
+seed = 3
+rig = { preset = "rgb-ideal", width_px = 427, height_px = 320, focal_px = 711.0, probe_tip_body_m = [2.6, 0.5, 0.35] }
+[frames]
+count = 2
+[distance]
+law = "stations"
+stations_m = [2.2, 2.6]
+[target]
+probe = true
+"""
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_probe_beside_the_drogue_brings_no_noise(engine, index):
+    """It stands close before markers and face, whose light from others is next to nothing elsewhere."""
+    recipe = parse_recipe(PROBE_BESIDE)
+    frame = sample_frame(recipe, index)
+    first, second = (engine.render(reseeded(frame, seed), recipe.render) for seed in (1, 2))
+    # Two pictures differ by both their noises. With two paths from each pixel it was two to three times the sensor's.
+    measured = over_sensor(frame, first, second) / np.sqrt(2)
+    assert measured < 0.5
+    assert first.monte_carlo_over_sensor_noise == pytest.approx(measured, rel=0.25)
