@@ -18,11 +18,11 @@ from droguekit.peer_comparison.cycles_orders import CyclesOrder, DenoisedPicture
 from droguekit.peer_comparison.noise_search import Cost, NoiseAt, noise_of, reach_noise
 from droguekit.peer_comparison.views import View
 from geometry.stereo import EYES, Eye
+from render.blender_engine.eye_path import EyePath
 from render.blender_engine.messages import FrameSetup, Window
 from render.blender_engine.pixels import read_light
 from render.blender_engine.process import bpy_version
 from render.blender_engine.stage import Stage
-from render.blender_engine.windows import EyePath
 from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import surroundings
 

@@ -99,7 +99,7 @@ class BlenderScene:
 def set_threads(scene: Any) -> None:
     """Let Cycles take two threads: if it may take but one, TBB keeps another awake that does nothing, at work or idle.
 
-    Who renders in several processes has more threads than cores then, which costs nothing; pixels stay the same.
+    Both on one core take no more CPU time than one alone; pixels stay the same.
     """
     scene.render.threads_mode, scene.render.threads = "FIXED", 2
 

@@ -13,11 +13,11 @@ from datasets_manifest.recipe import RenderSettings
 from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from geometry.stereo import EYES, Eye
 from render.background import air_before, backgrounds
+from render.blender_engine.eye_path import EyePath, holds
 from render.blender_engine.messages import CENTER_SAMPLE, FEATURES, FIRST_RANDOM_SAMPLE, LIGHT, PASSES, Picture, Window
 from render.blender_engine.pixels import CenterPixels, place, read_light, read_passes
 from render.blender_engine.process import BlenderEndedError, BlenderProcess, bpy_version
 from render.blender_engine.stage import Stage
-from render.blender_engine.windows import EyePath, holds
 from render.engine import EyeRadiance, StereoRadiance
 from render.traced import TracedEye, amodal_counts
 from render.version import RENDER_VERSION

@@ -61,10 +61,9 @@ class SmoothedPaths:
         light = SurfaceLight(rays, pixel, 1 + self._moves_px)
         # In each of two estimates, where the sky is hidden and in the open.
         paths = np.array([self._paths_of_centers(), settings.open_samples_per_px]) / 2
-        traced = self._trace_light(light, hidden, paths)
+        self._trace_light(light, hidden, paths)
         light.smooth(hidden, MOST_SMOOTHING_STEPS)
-        counts = np.zeros(0, dtype=np.int64)
-        of_inside = self._looked_up_inside(light, inside)
+        of_inside, counts = self._looked_up_inside(light, inside), np.zeros(0, dtype=np.int64)
         if len(edges):
             budget = self._budget(light, picture, edges, inside, of_inside)
             if budget.of_light.sum() > _WORTH_IT * _LIGHTS_SHARE * budget.aim:
@@ -72,12 +71,7 @@ class SmoothedPaths:
                 light.smooth(~hidden, MOST_SMOOTHING_STEPS)
                 of_inside = self._looked_up_inside(light, inside)
                 budget = self._budget(light, picture, edges, inside, of_inside)
-                times = min(budget.of_light.sum() / (_LIGHTS_SHARE * budget.aim), _MOST_TIMES)
-                if times > _WORTH_IT:
-                    counts_there = budget.of_light > _COUNTS_FROM * budget.of_light.sum()
-                    more = self._trace_light(light, hidden, paths * np.where(counts_there, times, 1.0))
-                    light.smooth(np.ones(len(pixel), dtype=np.bool_), MOST_SMOOTHING_STEPS)
-                    budget.of_light *= traced / more
+                if self._traced_more(light, hidden, paths, budget):
                     of_inside = self._looked_up_inside(light, inside)
             counts = budget.edge_counts(settings.edge_samples_per_px)
         of_edges = looked_up_often(rays, light, and_some_again(edges), and_some_again(counts))
@@ -99,17 +93,27 @@ class SmoothedPaths:
         paths: float = settings.samples_per_px * (_SMOOTHING_AT_COUNT_PX / self._sigma_px) ** 1.5
         return min(paths, most)
 
-    def _trace_light(
-        self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
-        """All of it, with some so many paths where the sky is `hidden` and in the open in each of two estimates.
+    def _trace_light(self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64]) -> None:
+        """All of it, with some so many paths where the sky is `hidden` and in the open in each of two estimates."""
+        of_hidden, of_open = (grid_count(count) for count in paths)
+        light.trace([(hidden, of_hidden), (~hidden, of_open)], self._settings.max_depth)
+
+    def _traced_more(
+        self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64], budget: NoiseBudget
+    ) -> bool:
+        """Trace and smooth all light once more, with more paths where it errs, if it errs by too much; tell the budget.
 
         Returns:
-            (2,) how many they were.
+            Whether it was.
         """
-        counts = np.array([grid_count(count) for count in paths])
-        light.trace([(hidden, int(counts[0])), (~hidden, int(counts[1]))], self._settings.max_depth)
-        return counts
+        times = min(budget.of_light.sum() / (_LIGHTS_SHARE * budget.aim), _MOST_TIMES)
+        if times <= _WORTH_IT:
+            return False
+        more = paths * np.where(budget.of_light > _COUNTS_FROM * budget.of_light.sum(), times, 1.0)
+        self._trace_light(light, hidden, more)
+        light.smooth(np.ones(len(hidden), dtype=np.bool_), MOST_SMOOTHING_STEPS)
+        budget.of_light *= [grid_count(before) / grid_count(now) for before, now in zip(paths, more, strict=True)]
+        return True
 
     def _looked_up_inside(self, light: SurfaceLight, inside: NDArray[np.int64]) -> NDArray[np.float32]:
         return looked_up(self._rays, light, and_some_again(inside), self._settings.open_samples_per_px, at_edges=False)
