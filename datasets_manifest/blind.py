@@ -11,11 +11,12 @@ from pydantic import Field, ValidationError
 from datasets_manifest.frame import Sensor
 from datasets_manifest.frame_store import FrameStore
 from datasets_manifest.images import StereoImages
-from datasets_manifest.json_types import FrozenModel, Rig
+from datasets_manifest.json_types import Rig
 from datasets_manifest.layout import BLIND_FILE
 from datasets_manifest.manifest import read_manifest
 from datasets_manifest.reader import read_images, read_shutter, read_sought
 from datasets_manifest.storage import Location, open_storage
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain
 from geometry.stereo import StereoRig

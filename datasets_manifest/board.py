@@ -7,7 +7,8 @@ from typing import Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from datasets_manifest.json_types import FrozenModel, Transform
+from datasets_manifest.json_types import Transform
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import Reflectance
 from geometry.se3 import Array
 

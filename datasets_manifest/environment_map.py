@@ -8,8 +8,8 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.ranges import Range
+from drogue_models.frozen_model import FrozenModel
 
 MAP_SUFFIXES = (".exr", ".hdr")
 

@@ -8,9 +8,9 @@ from pydantic import Field, field_validator, model_validator
 
 from datasets_manifest.environment_map import MapRanges
 from datasets_manifest.ground import GroundKind
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.ranges import Range
 from datasets_manifest.weather_ranges import Clouds, MistRanges, MoonRanges
+from drogue_models.frozen_model import FrozenModel
 
 
 class EnvironmentRanges(FrozenModel):

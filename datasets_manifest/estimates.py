@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from datasets_manifest.atomic import open_text_atomic
-from datasets_manifest.json_types import FrozenModel, Matrix6, Transform
+from datasets_manifest.json_types import Matrix6, Transform
+from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import Eye
 
 TANGENT = "left: t' = t + dt, R' = exp([w]x) R; order dt [m], w [rad]"

@@ -6,8 +6,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.ranges import Range
+from drogue_models.frozen_model import FrozenModel
 
 
 class ExposureLaw(FrozenModel):

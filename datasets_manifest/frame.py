@@ -10,10 +10,11 @@ from pydantic import Field, model_validator
 from datasets_manifest.board import PlacedBoard
 from datasets_manifest.environment_map import EnvironmentMap
 from datasets_manifest.ground import GroundKind
-from datasets_manifest.json_types import FrozenModel, Points3, Rig, Transform, Vector6
+from datasets_manifest.json_types import Points3, Rig, Transform, Vector6
 from datasets_manifest.loss import Loss
 from datasets_manifest.target import Bystander, DrogueCondition
 from datasets_manifest.weather import CloudLayer, Mist, Moon
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters, ReflectanceRgb
 from geometry.se3 import RigidTransform, exp_twist
 

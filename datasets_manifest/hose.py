@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from datasets_manifest.json_types import FrozenModel
+from drogue_models.frozen_model import FrozenModel
 
 
 class HoseParameters(FrozenModel):

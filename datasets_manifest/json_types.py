@@ -6,18 +6,12 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, InstanceOf, PlainSerializer
+from pydantic import BeforeValidator, InstanceOf, PlainSerializer
 
 from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, read_only
 from geometry.stereo import StereoRig
-
-
-class FrozenModel(BaseModel):
-    """A value that is checked when it is made, refuses unknown keys and never changes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def _array_type(shape: tuple[int, ...]) -> Any:

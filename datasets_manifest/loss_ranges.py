@@ -8,10 +8,10 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from datasets_manifest.environment_ranges import EnvironmentRanges
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.loss import Loss
 from datasets_manifest.pose_ranges import Pose
 from datasets_manifest.ranges import Range
+from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import StereoRig
 
 LossOrNone = Loss | Literal["none"]

@@ -5,18 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from datasets_manifest.frame_store import FrameStore
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.layout import BLIND_FILE, MANIFEST_FILE, RECORD_FILE
 from datasets_manifest.provenance import CONVENTIONS, cpu_features, software_versions
 from datasets_manifest.recipe import Recipe
 from datasets_manifest.storage import Location, in_order, open_storage
 from datasets_manifest.writer import canonical_json
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 
 SplitName = Literal["train", "val", "test"]
@@ -112,7 +112,7 @@ def build_manifest(
     dataset: Location,
     recipe: Recipe,
     render_version: str,
-    split_of_scene: Callable[[int], SplitName],
+    split_of_scene: Mapping[int, SplitName],
     drops: Sequence[Drop] = (),
 ) -> Manifest:
     """Describe the frames that lie in a dataset.
@@ -121,7 +121,7 @@ def build_manifest(
         dataset: where it lies.
         recipe: that it was made from.
         render_version: `render.version.RENDER_VERSION`.
-        split_of_scene: the split of a scene's id.
+        split_of_scene: the split of every scene, by its id.
         drops: frames that were given up.
 
     Raises:
@@ -212,9 +212,7 @@ def _content_sha256(table: dict[str, Any]) -> str:
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()
 
 
-def _read_entry(
-    store: FrameStore, frame_index: int, split_of_scene: Callable[[int], SplitName]
-) -> tuple[FrameEntry, str]:
+def _read_entry(store: FrameStore, frame_index: int, split_of_scene: Mapping[int, SplitName]) -> tuple[FrameEntry, str]:
     """What the manifest holds of one record, and its engine; the record's other contents are not checked here."""
     path = store.where(frame_index, RECORD_FILE)
     try:
@@ -223,7 +221,7 @@ def _read_entry(
         entry = FrameEntry(
             frame_index=table["frame_index"],
             scene_id=table["scene_id"],
-            split=split_of_scene(table["scene_id"]),
+            split=split_of_scene[table["scene_id"]],
             empty=table["left_from_drogue"] is None,
             record_sha256=hashlib.sha256(data).hexdigest(),
         )

@@ -11,13 +11,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError
 
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.manifest import Manifest
 from datasets_manifest.provenance import differing_builds
 from datasets_manifest.reader import Dataset
 from datasets_manifest.records import FeatureView, HubView, PairRecord, ViewRecord
 from datasets_manifest.storage import Location
 from datasets_manifest.writer import canonical_json
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 
 _DECIMALS = 9

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from datasets_manifest.json_types import FrozenModel
+from drogue_models.frozen_model import FrozenModel
 
 
 class Rangefinder(FrozenModel):

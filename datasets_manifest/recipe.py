@@ -15,13 +15,14 @@ from datasets_manifest.environment_ranges import EnvironmentRanges
 from datasets_manifest.exposure_law import ExposureLaw
 from datasets_manifest.families import fill_families
 from datasets_manifest.frame import Sensor
-from datasets_manifest.json_types import FrozenModel, Rig
+from datasets_manifest.json_types import Rig
 from datasets_manifest.pose_ranges import DistanceLaw, Pose
 from datasets_manifest.rangefinder import Rangefinder
 from datasets_manifest.ranges import Fraction
 from datasets_manifest.rigs import resolve_rig
 from datasets_manifest.sequence_ranges import SequenceRanges, check_singles, fill_distance
 from datasets_manifest.target_ranges import DrogueVariant, TargetRanges
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 

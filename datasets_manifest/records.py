@@ -7,7 +7,8 @@ from typing import Literal
 from pydantic import Field
 
 from datasets_manifest.frame import FrameSpec
-from datasets_manifest.json_types import FrozenModel, Transform
+from datasets_manifest.json_types import Transform
+from drogue_models.frozen_model import FrozenModel
 
 PixelPoint = tuple[float, float]
 PixelBox = tuple[float, float, float, float]

@@ -8,8 +8,9 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from datasets_manifest.frame import Optics, Sensor
-from datasets_manifest.json_types import FrozenModel
+from datasets_manifest.random_streams import seeded_generator
 from datasets_manifest.ranges import Range
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
@@ -137,7 +138,7 @@ def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:
 def _draw_lenses(eyes: Eyes, camera: PinholeCamera, seed: int) -> tuple[Lens, Lens]:
     """The left and the right eye; the left one's axes are the rig's."""
     # Apart from all streams of frames and scenes, whose keys are longer.
-    rng = np.random.Generator(np.random.Philox(np.random.SeedSequence((seed & 0xFFFFFFFF, seed >> 32))))
+    rng = seeded_generator(seed)
     lenses = []
     for is_right in (False, True):
         shape = [rng.uniform(limits.low, limits.high) for limits in (eyes.k1, eyes.k2, eyes.p1, eyes.p2, eyes.k3)]

@@ -8,12 +8,12 @@ from typing import Any, Literal, Self
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from datasets_manifest.hose import Hose
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.loss_ranges import LossRanges
 from datasets_manifest.pose_ranges import Pose
 from datasets_manifest.ranges import Range
 from datasets_manifest.target_ranges import TargetRanges
 from datasets_manifest.turbulence import SLOWEST_M_S, Turbulence
+from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import StereoRig
 
 Manoeuvre = Literal["docking", "station", "missed-approach"]

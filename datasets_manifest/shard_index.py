@@ -9,7 +9,6 @@ from typing import IO, Annotated, Any, BinaryIO, Literal, NamedTuple, Self, cast
 
 from pydantic import Field, ValidationError, model_validator
 
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.layout import (
     RECORD_FILE,
     SHARDS_FILE,
@@ -19,6 +18,7 @@ from datasets_manifest.layout import (
     shard_index_file,
 )
 from datasets_manifest.storage import Storage
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 
 MAX_PAIRS_PER_TAR = 100_000

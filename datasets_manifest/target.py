@@ -6,8 +6,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from datasets_manifest.json_types import FrozenModel, Transform
+from datasets_manifest.json_types import Transform
 from drogue_models.bystanders import BystanderShape
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import ReflectanceRgb
 
 

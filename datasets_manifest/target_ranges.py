@@ -6,8 +6,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.ranges import Fraction, Range
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 
 CONSTANT_ONE = Range(low=1, high=1)

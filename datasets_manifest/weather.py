@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from datasets_manifest.json_types import FrozenModel
+from drogue_models.frozen_model import FrozenModel
 
 CloudKind = Literal["cumulus", "stratus", "cirrus"]
 

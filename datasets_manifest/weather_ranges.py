@@ -6,9 +6,9 @@ from typing import Self
 
 from pydantic import model_validator
 
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.ranges import Fraction, Range
 from datasets_manifest.weather import CloudKind
+from drogue_models.frozen_model import FrozenModel
 
 
 class Clouds(FrozenModel):

@@ -7,7 +7,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from drogue_models.parameters import FrozenModel, Metres
+from drogue_models.frozen_model import FrozenModel
+from drogue_models.parameters import Metres
 from geometry.se3 import Array
 
 SECTIONS = 64

@@ -9,7 +9,9 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from drogue_models.frozen_model import FrozenModel
 
 Metres = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
 Reflectance = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
@@ -22,12 +24,6 @@ PlanePoint = tuple[
 RED_PAINT: ReflectanceRgb = (0.55, 0.03, 0.03)  # our choice: a saturated signal red
 WHITE_PAINT: ReflectanceRgb = (0.80, 0.80, 0.80)  # fresh white paint reflects 0.8 in the visible
 MATT_BLACK: ReflectanceRgb = (0.03, 0.03, 0.03)
-
-
-class FrozenModel(BaseModel):
-    """A value that is checked when it is made, refuses unknown keys and never changes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class HubParameters(FrozenModel):

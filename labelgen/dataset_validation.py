@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame_store import FrameStore
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.layout import RECORD_FILE, parts_file
 from datasets_manifest.manifest import FrameEntry, Manifest, count_pairs
 from datasets_manifest.png import png_fault
@@ -18,6 +17,7 @@ from datasets_manifest.reader import Dataset
 from datasets_manifest.records import PairRecord
 from datasets_manifest.storage import Location, open_storage
 from datasets_manifest.writer import leftovers
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES, Eye

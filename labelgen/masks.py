@@ -11,10 +11,7 @@ from geometry.stereo import Eye
 from labelgen.part_meshes import part_triangles
 from labelgen.part_pixels import is_one_of
 from labelgen.silhouettes import silhouette
-from render.analytic_engine.flat_parts import FlatDrogue, flat_drogue
-from render.analytic_engine.outlines import EyeView
-from render.analytic_engine.passes import pixel_passes
-from render.surfaces import missing_parts
+from render.analytic_engine.part_masks import flat_part_masks
 
 Mask = NDArray[np.bool_]
 
@@ -62,7 +59,7 @@ def amodal_masks(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> di
     Raises:
         ValueError: a user's body mesh that is missing or was changed.
     """
-    alone = _flat_masks(record, eye) if record.engine == "analytic" else _mesh_masks(record, eye)
+    alone = flat_part_masks(record.frame, eye) if record.engine == "analytic" else _mesh_masks(record, eye)
     for part in np.flatnonzero(np.bincount(part_id.ravel(), minlength=256)[: FIRST_MARKER_ID + MAX_MARKERS]):
         if part != Part.SKY:
             seen = part_id == part
@@ -82,16 +79,3 @@ def joined(masks: dict[int, Mask], parts: tuple[int, ...], shape: tuple[int, ...
 def _mesh_masks(record: PairRecord, eye: Eye) -> dict[int, Mask]:
     frame = record.frame
     return {part: silhouette(corners, frame.rig, eye) for part, corners in part_triangles(frame, eye).items()}
-
-
-def _flat_masks(record: PairRecord, eye: Eye) -> dict[int, Mask]:
-    """The rings of the analytic engine, each alone."""
-    frame = record.frame
-    if frame.drogue is None or frame.left_from_drogue is None:
-        return {}
-    view = EyeView(frame.rig, eye, frame.left_from_drogue)
-    masks: dict[int, Mask] = {}
-    for ring in flat_drogue(frame.drogue, missing_parts(frame)).back_to_front:
-        alone = pixel_passes(FlatDrogue((), (ring,), ()), view).part_id == ring.part
-        masks[ring.part] = masks[ring.part] | alone if ring.part in masks else alone
-    return masks

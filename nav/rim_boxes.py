@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from geometry.boxes import intersection_area
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
 from geometry.stereo import Eye, StereoRig
@@ -14,8 +15,6 @@ _OUTLINE_POINTS = 32
 _LEAST_SHARE_IN_IMAGE = 0.5
 # A box smaller than this on an image is none.
 _LEAST_SIDE_PX = 3.0
-
-Box = tuple[float, float, float, float]
 
 
 def rim_boxes(rig: StereoRig, rim_radius_m: float, left_from_drogue: RigidTransform) -> StereoDetection:
@@ -33,21 +32,7 @@ def _detection(
     (left, top), (right, bottom) = points_px.min(axis=0).tolist(), points_px.max(axis=0).tolist()
     box = (left, top, right - left, bottom - top)
     size_px = (rig.camera.width_px, rig.camera.height_px)
-    inside = overlap_px2(box, (-0.5, -0.5, *size_px))
+    inside = intersection_area(box, (-0.5, -0.5, *size_px))
     # Far outside a lens's view its polynomial may end in no number, of which neither holds.
     is_seen = min(box[2:]) >= _LEAST_SIDE_PX and inside >= _LEAST_SHARE_IN_IMAGE * box[2] * box[3]
     return Detection(box, 1.0) if is_seen else None
-
-
-def overlap_px2(one: Box, other: Box) -> float:
-    """Area that two boxes share. [px^2]"""
-    width = min(one[0] + one[2], other[0] + other[2]) - max(one[0], other[0])
-    height = min(one[1] + one[3], other[1] + other[3]) - max(one[1], other[1])
-    return max(width, 0.0) * max(height, 0.0)
-
-
-def overlap_fraction(one: Box, other: Box) -> float:
-    """Intersection over union of two boxes."""
-    shared = overlap_px2(one, other)
-    union = one[2] * one[3] + other[2] * other[3] - shared
-    return shared / union if union > 0 else 0.0

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec, Sensor
 from datasets_manifest.images import Pixels, StereoImages
+from datasets_manifest.random_streams import bulk_frame_generator
 from geometry.stereo import EYES, Eye
 from render.engine import StereoRadiance
 from render.optics import light_on_sensor
 from render.read_out import ReadOut
-from scenes.seeding import bulk_generator
 
 # Response of bare silicon behind a daylight scene to the three bands of Rec. 709 (our assumption).
 MONO_WEIGHTS = np.array([[0.36, 0.37, 0.27]], dtype=np.float32)
@@ -53,7 +53,7 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
         seen = light_on_sensor(frame, radiance.left if eye == "left" else radiance.right, eye)
         light = _sample_sites(seen, sensor)
         gains = _pixel_gains(frame.seed, index, light.shape, sensor.prnu_fraction)
-        rng = bulk_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
+        rng = bulk_frame_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
         numbers = read_out.numbers(light, gains, rng)
         mosaics[eye] = _store(numbers, sensor, "linear") if sensor.color == "bayer" else None
         if sensor.color == "bayer":
@@ -88,7 +88,7 @@ def _sample_sites(seen: NDArray[np.float32], sensor: Sensor) -> NDArray[np.float
 @lru_cache(maxsize=2)
 def _pixel_gains(seed: int, eye_index: int, shape: tuple[int, ...], spread: float) -> NDArray[np.float32]:
     """Fixed gain of every site of one sensor, mean 1."""
-    rng = bulk_generator(seed, eye_index, "pixel gains")
+    rng = bulk_frame_generator(seed, eye_index, "pixel gains")
     gains = rng.standard_normal(shape, dtype=np.float32)
     gains *= np.float32(spread)
     gains += np.float32(1.0)

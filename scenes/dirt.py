@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from scenes.seeding import generator
+from datasets_manifest.random_streams import frame_generator
 
 DIRT_MAP_PX = 64
 # Soot, hydraulic fluid and road dust: dark and nearly grey (our choice).
@@ -25,7 +25,7 @@ def dirt_map(seed: int, dirt_fraction: float) -> NDArray[np.float32]:
     Returns:
         (64, 64) share of each texel under dirt, 0 to 1; row 0 is the low y end of the square.
     """
-    noise = generator(seed, 0, "dirt").standard_normal((DIRT_MAP_PX, DIRT_MAP_PX))
+    noise = frame_generator(seed, 0, "dirt").standard_normal((DIRT_MAP_PX, DIRT_MAP_PX))
     smooth = gaussian_filter(noise, _BLOTCH_PX, mode="wrap")
     covered = (smooth >= np.quantile(smooth, 1.0 - dirt_fraction)).astype(np.float64)
     if dirt_fraction <= 0:

@@ -8,13 +8,13 @@ from datasets_manifest.environment_map import EnvironmentMap, MapRanges
 from datasets_manifest.environment_ranges import EnvironmentRanges
 from datasets_manifest.frame import Environment
 from datasets_manifest.ground import GroundKind
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.ranges import Range
 from datasets_manifest.weather import CloudLayer, Mist, Moon
 from datasets_manifest.weather_ranges import Clouds, MistRanges, MoonRanges
 from drogue_models.parameters import ReflectanceRgb
 from scenes.environment_map import load_map
 from scenes.ground import MEAN_REFLECTANCE
-from scenes.seeding import generator
 
 # How much brighter or darker, and how much redder or bluer, the ground of a scene is than its kind's mean.
 _GROUND_SPREAD, _GROUND_TINT = 0.25, 0.06
@@ -30,7 +30,7 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
 
     The streams are named apart, so that a scene keeps its sky when a layer, mist or a moon is added to the recipe.
     """
-    rng = generator(seed, scene_id, "environment")
+    rng = frame_generator(seed, scene_id, "environment")
     sky = {
         "sun_elevation_deg": draw(rng, ranges.sun_elevation_deg),
         "sun_azimuth_deg": draw(rng, ranges.sun_azimuth_deg),
@@ -40,11 +40,13 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
     }
     ground = ranges.ground[int(rng.integers(len(ranges.ground)))]
     ground_texture_seed = int(rng.integers(2**31))
-    ground_rng = generator(seed, scene_id, "ground")
+    ground_rng = frame_generator(seed, scene_id, "ground")
     # The first layer is drawn from the scene's main stream, each other one from its own.
-    of_layer = [rng] + [generator(seed, scene_id, f"cloud layer {index}") for index in range(1, len(ranges.clouds))]
+    of_layer = [rng] + [
+        frame_generator(seed, scene_id, f"cloud layer {index}") for index in range(1, len(ranges.clouds))
+    ]
     layers = [
-        sample_cloud(stream, generator(seed, scene_id, f"cloud shape {index}"), clouds)
+        sample_cloud(stream, frame_generator(seed, scene_id, f"cloud shape {index}"), clouds)
         for index, (stream, clouds) in enumerate(zip(of_layer, ranges.clouds, strict=False))
     ]
     environment = Environment(
@@ -54,10 +56,12 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
         ground_texture_seed=ground_texture_seed,
         wind_speed_m_s=draw(ground_rng, ranges.wind_speed_m_s),
         clouds=tuple(layer for layer in layers if layer is not None),
-        mist=sample_mist(generator(seed, scene_id, "mist"), ranges.mist),
-        moon=sample_moon(generator(seed, scene_id, "moon"), ranges.moon),
+        mist=sample_mist(frame_generator(seed, scene_id, "mist"), ranges.mist),
+        moon=sample_moon(frame_generator(seed, scene_id, "moon"), ranges.moon),
     )
-    return environment if ranges.map is None else _mapped(environment, ranges.map, generator(seed, scene_id, "map"))
+    return (
+        environment if ranges.map is None else _mapped(environment, ranges.map, frame_generator(seed, scene_id, "map"))
+    )
 
 
 def _mapped(environment: Environment, ranges: MapRanges, rng: np.random.Generator) -> Environment:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe import Family, Recipe
-from scenes.seeding import generator
 
 
 def family_of_scene(recipe: Recipe, scene_id: int) -> Family | None:
@@ -19,7 +19,7 @@ def family_of_scene(recipe: Recipe, scene_id: int) -> Family | None:
     if recipe.frames.in_turn:
         return recipe.families[scene_id % len(recipe.families)]
     scenes = recipe.frames.scenes
-    place = int(np.flatnonzero(generator(recipe.seed, 0, "families").permutation(scenes) == scene_id)[0])
+    place = int(np.flatnonzero(frame_generator(recipe.seed, 0, "families").permutation(scenes) == scene_id)[0])
     ends = np.cumsum(scenes_per_family(recipe))
     return recipe.families[int(np.searchsorted(ends, place, side="right"))]
 

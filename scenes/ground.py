@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.frame import Environment
 from datasets_manifest.ground import GroundKind
+from datasets_manifest.random_streams import frame_generator
 from drogue_models.parameters import ReflectanceRgb
 from scenes.cloud_march import enlarge
 from scenes.coast import Coast
@@ -19,7 +20,6 @@ from scenes.land_tiles import LandKind, land_tile
 from scenes.light import Radiance
 from scenes.mip_tile import Field, MipTile, power_noise, smooth_noise
 from scenes.sea import GroundLight, Sea
-from scenes.seeding import generator
 from scenes.ships import put_ships, sample_ships
 
 __all__ = ["MEAN_REFLECTANCE", "Ground", "GroundLight"]
@@ -98,7 +98,7 @@ class Ground:
         self._environment = environment
         self._light = light
         self._kind = environment.ground
-        rng = generator(environment.ground_texture_seed, 0, "ground")
+        rng = frame_generator(environment.ground_texture_seed, 0, "ground")
         self._shift_m = rng.uniform(0, 1e5, 2).astype(np.float32)
         angles = rng.uniform(0, 2 * np.pi, 8)
         self._turns = np.stack([np.cos(angles), np.sin(angles), *rng.uniform(0, 1e5, (2, 8))]).astype(np.float32)

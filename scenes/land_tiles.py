@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.random_streams import frame_generator
 from scenes.mip_tile import Field, MipTile, power_noise, smooth_noise
-from scenes.seeding import generator
 
 LandKind = Literal["fields", "forest", "dry", "town"]
 Rgb = tuple[float, float, float]
@@ -56,7 +56,7 @@ _ROOFS: tuple[Rgb, ...] = (
 def land_tile(kind: LandKind) -> MipTile:
     """The picture of a kind of land: reflectance, and as the fourth channel how many lamps burn there at night."""
     paint = {"fields": _paint_fields, "forest": _paint_forest, "dry": _paint_dry, "town": _paint_town}[kind]
-    rng = generator(_SEED, 0, f"paint {kind}")
+    rng = frame_generator(_SEED, 0, f"paint {kind}")
     canvas = np.clip(paint(rng), 0.0, 1.0)
     return MipTile(canvas, _TOWN_TEXEL_M if kind == "town" else _TEXEL_M, coded=True)
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.seeding import generator
+from datasets_manifest.random_streams import frame_generator
 
 Field = NDArray[np.float32]
 
@@ -43,7 +43,7 @@ def _frequencies(size_px: int) -> NDArray[np.float64]:
 
 def _noise_of_spectrum(seed: int, stream: str, amplitude: NDArray[np.float64]) -> Field:
     size_px = amplitude.shape[0]
-    white = generator(seed, 0, stream).standard_normal((size_px, size_px))
+    white = frame_generator(seed, 0, stream).standard_normal((size_px, size_px))
     noise = np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=(size_px, size_px))
     result: Field = (noise / noise.std()).astype(np.float32)
     return result

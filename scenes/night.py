@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.weather import Moon
 from scenes.light import Radiance
-from scenes.seeding import generator
 
 # Dark sites: 21.9 mag/arcsec2 at the zenith, 1.9e-4 cd/m2 (Leinert et al. 1998, doi:10.1051/aas:1998105), with the
 # brighter stars, which no telescope counts into the background, 2.6e-4.
@@ -70,7 +70,7 @@ def star_catalogue() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
     Stars fainter than that are part of `night_radiance`.
     """
-    rng = generator(_STAR_SEED, 0, "stars")
+    rng = frame_generator(_STAR_SEED, 0, "stars")
     count = round(10 ** (0.5 * _FAINTEST_MAGNITUDE + 0.70))
     directions = rng.standard_normal((count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -8,6 +8,7 @@ import numpy as np
 
 from datasets_manifest.board import PlacedBoard
 from datasets_manifest.frame import Environment, FrameSpec
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
@@ -19,7 +20,6 @@ from scenes.metering import meter
 from scenes.moment import Moment
 from scenes.rangefinder import sample_reading_m
 from scenes.receiver import sample_attitude
-from scenes.seeding import generator
 from scenes.sequence import moment_of_sequence
 from scenes.suspension import sample_suspension
 from scenes.target import condition_of_scene, drogue_of_scene, sample_bystanders
@@ -40,17 +40,20 @@ def scene_of_frame(recipe: Recipe, frame_index: int) -> int:
         unit = frame_index // recipe.sequence.frames_per_sequence
     if recipe.frames.in_turn:
         return unit % scenes
-    order = generator(recipe.seed, unit // scenes, "scene order").permutation(scenes)
+    order = frame_generator(recipe.seed, unit // scenes, "scene order").permutation(scenes)
     return int(order[unit % scenes])
 
 
-def split_of_scene(recipe: Recipe, scene_id: int) -> SplitName:
-    """Which split a scene belongs to: shares of the scenes in a drawn order, rounded to whole scenes."""
+def split_of_scenes(recipe: Recipe) -> dict[int, SplitName]:
+    """The split of every scene: shares of the scenes in a drawn order, rounded to whole scenes."""
     scenes = recipe.frames.scenes
-    place = int(np.flatnonzero(generator(recipe.seed, 0, "split").permutation(scenes) == scene_id)[0])
+    order = frame_generator(recipe.seed, 0, "split").permutation(scenes).tolist()
     train_end = round(recipe.split.train * scenes)
     val_end = round((recipe.split.train + recipe.split.val) * scenes)
-    return "train" if place < train_end else "val" if place < val_end else "test"
+    return {
+        scene_id: "train" if place < train_end else "val" if place < val_end else "test"
+        for place, scene_id in enumerate(order)
+    }
 
 
 def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
@@ -76,7 +79,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         environment = _where_it_flies(environment, moment)
     # What stands beside a sequence stays there all along.
     stands = frame_index if moment.sequence_id is None else moment.sequence_id
-    bystanders = sample_bystanders(generator(seed, stands, "bystanders"), recipe, pose)
+    bystanders = sample_bystanders(frame_generator(seed, stands, "bystanders"), recipe, pose)
     return FrameSpec(
         seed=seed,
         frame_index=frame_index,
@@ -131,15 +134,15 @@ def _moment_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int)
     if recipe.sequence is not None:
         return moment_of_sequence(recipe, recipe.sequence, drogue, frame_index)
     seed = recipe.seed
-    rotation = sample_attitude(generator(seed, frame_index, "receiver"), recipe.pose)
+    rotation = sample_attitude(frame_generator(seed, frame_index, "receiver"), recipe.pose)
     world_from_left = RigidTransform(rotation, np.zeros(3))
     left_from_drogue = _pose_of_frame(recipe, drogue, frame_index)
     left_from_tanker, nodes = None, None
     if left_from_drogue is not None:
         left_from_tanker, nodes = sample_suspension(
-            generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
+            frame_generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
         )
-    left_twist, drogue_twist = _sample_motion(generator(seed, frame_index, "motion"), recipe)
+    left_twist, drogue_twist = _sample_motion(frame_generator(seed, frame_index, "motion"), recipe)
     return Moment(
         sequence_id=None,
         time_s=frame_index * FRAME_PERIOD_S,
@@ -154,18 +157,18 @@ def _moment_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int)
 
 def _pose_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> RigidTransform | None:
     """`left_from_drogue`, or None without a drogue; the recipe is that of the scene."""
-    if generator(recipe.seed, frame_index, "empty").random() < recipe.frames.empty_fraction:
+    if frame_generator(recipe.seed, frame_index, "empty").random() < recipe.frames.empty_fraction:
         return None
-    distance_m = sample_distance_m(generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
-    return sample_pose(generator(recipe.seed, frame_index, "pose"), recipe, outline(drogue), distance_m)
+    distance_m = sample_distance_m(frame_generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
+    return sample_pose(frame_generator(recipe.seed, frame_index, "pose"), recipe, outline(drogue), distance_m)
 
 
 def _place_board(recipe: Recipe, frame_index: int) -> PlacedBoard | None:
     """The calibration board of a frame, or None in a recipe without one."""
     if recipe.board is None:
         return None
-    distance_m = sample_distance_m(generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
-    pose = sample_pose(generator(recipe.seed, frame_index, "pose"), recipe, recipe.board.outline_m(), distance_m)
+    distance_m = sample_distance_m(frame_generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
+    pose = sample_pose(frame_generator(recipe.seed, frame_index, "pose"), recipe, recipe.board.outline_m(), distance_m)
     return PlacedBoard(shape=recipe.board, left_from_board=pose)
 
 

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.random_streams import frame_generator
 from scenes.ground_view import GroundView
 from scenes.light import Radiance
 from scenes.mip_tile import Field, MipTile, power_noise
-from scenes.seeding import generator
 
 _WATER_INDEX = 1.34
 _SEED = 5
@@ -90,7 +90,7 @@ def hidden_share(sine: NDArray[np.floating[Any]], variance: float) -> NDArray[np
 @lru_cache(maxsize=1)
 def _wave_tile() -> MipTile:
     """Slopes along and across the wind (together of unit variance), and patches of foam (mean `_FOAM_PATCHES`)."""
-    rng = generator(_SEED, 0, "waves")
+    rng = frame_generator(_SEED, 0, "waves")
     k1, k2 = np.meshgrid(
         np.fft.fftfreq(_TILE_PX, _TILE_TEXEL_M), np.fft.rfftfreq(_TILE_PX, _TILE_TEXEL_M), indexing="ij"
     )

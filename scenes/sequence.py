@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from datasets_manifest.pose_ranges import Pose
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe import Recipe
 from datasets_manifest.sequence_ranges import SequenceRanges
 from drogue_models.parameters import DrogueParameters
@@ -22,7 +23,6 @@ from scenes.loss import HidingBar, flown_m, hiding_bar, sample_loss, sun_beside
 from scenes.moment import Moment
 from scenes.oscillation import sample_oscillation
 from scenes.receiver import sample_attitude, wanted_places
-from scenes.seeding import generator
 from scenes.suspension import HOSE_OVERLAP_M, WORLD_FROM_TANKER
 from scenes.trajectory import SETTLING_S, Surroundings, Trajectory, simulate
 from scenes.turbulence import GUST_PERIOD_S, dryden, sample_gusts
@@ -92,16 +92,16 @@ class Flight:
         receiver = sequence.receiver
         tail_m = drogue.hub_depth_m + drogue.coupling_length_m - HOSE_OVERLAP_M
         self._drogue_from_tail_m = np.array([0.0, 0.0, tail_m])
-        self._roll_rad = float(np.radians(draw(generator(seed, sequence_id, "drogue roll"), pose.roll_deg)))
-        world_from_left = sample_attitude(generator(seed, sequence_id, "receiver"), pose)
+        self._roll_rad = float(np.radians(draw(frame_generator(seed, sequence_id, "drogue roll"), pose.roll_deg)))
+        world_from_left = sample_attitude(frame_generator(seed, sequence_id, "receiver"), pose)
         self._tanker_from_left = WORLD_FROM_TANKER.T @ world_from_left
-        shaking = generator(seed, sequence_id, "receiver shake")
+        shaking = frame_generator(seed, sequence_id, "receiver shake")
         attitude_rad, vibration_rad = np.radians([receiver.attitude_sd_deg, receiver.vibration_deg])
         self._attitude = sample_oscillation(shaking, [attitude_rad] * 3, *_ATTITUDE_HZ)
         vibration = [receiver.vibration_m] * 3 + [vibration_rad] * 3
         self._vibration = sample_oscillation(shaking, vibration, *_VIBRATION_HZ)
         self._baseline_m = baseline_m
-        self._loss = sample_loss(generator(seed, sequence_id, "loss"), sequence.losses, sequence_id)
+        self._loss = sample_loss(frame_generator(seed, sequence_id, "loss"), sequence.losses, sequence_id)
         around, settling_s = self._surroundings(seed, baseline_m, tail_m)
         release_m = None if sequence.release_m is None else np.array(sequence.release_m)
         self._trajectory = Trajectory(simulate(sequence.hose, around, release_m), settling_s)
@@ -115,10 +115,10 @@ class Flight:
         samples = int(np.ceil(span_s / GUST_PERIOD_S)) + _SPARE_SAMPLES
         severity = sequence.turbulence[sequence_id % len(sequence.turbulence)]
         air = dryden(severity, hose.turbulence_altitude_m)
-        gusts = sample_gusts(generator(seed, sequence_id, "gusts"), air, hose.airspeed_m_s, (samples, 1))
-        tanker = generator(seed, sequence_id, "tanker motion")
+        gusts = sample_gusts(frame_generator(seed, sequence_id, "gusts"), air, hose.airspeed_m_s, (samples, 1))
+        tanker = frame_generator(seed, sequence_id, "tanker motion")
         pod = sample_oscillation(tanker, [sequence.tanker_motion_m] * 3, *_TANKER_HZ)
-        offsets = generator(seed, sequence_id, "receiver offset")
+        offsets = frame_generator(seed, sequence_id, "receiver offset")
         offset_m = draw(offsets, receiver.offset_right_m), draw(offsets, receiver.offset_down_m)
         manoeuvre = receiver.manoeuvres[sequence_id % len(receiver.manoeuvres)]
         times = GUST_PERIOD_S * np.arange(samples) - settling_s

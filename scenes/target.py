@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe import Recipe
 from datasets_manifest.target import Bystander, DrogueCondition, SurfaceCondition
 from datasets_manifest.target_ranges import TargetRanges
@@ -12,7 +13,6 @@ from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters, R
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
 from scenes.environment import draw
-from scenes.seeding import generator
 
 # Fewer cannot be told from anything else, and three fix a pose.
 _FEWEST_MARKERS = 3
@@ -32,13 +32,13 @@ def drogue_of_scene(recipe: Recipe, scene_id: int) -> DrogueParameters:
     if recipe.frames.in_turn:
         return variants[scene_id // max(len(recipe.families), 1) % len(variants)].drogue
     shares = np.cumsum([variant.weight for variant in variants])
-    place = generator(recipe.seed, scene_id, "drogue variant").random() * shares[-1]
+    place = frame_generator(recipe.seed, scene_id, "drogue variant").random() * shares[-1]
     return variants[int(np.searchsorted(shares, place, side="right"))].drogue
 
 
 def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) -> DrogueCondition | None:
     """The state of a scene's drogue, or None when it is as new."""
-    rng, ranges = generator(recipe.seed, scene_id, "drogue condition"), recipe.target
+    rng, ranges = frame_generator(recipe.seed, scene_id, "drogue condition"), recipe.target
     missing = rng.random(drogue.marker_count) < ranges.missing_marker_fraction
     spared = rng.permutation(drogue.marker_count)[:_FEWEST_MARKERS]
     missing[spared] = False

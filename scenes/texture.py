@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.seeding import generator
+from datasets_manifest.random_streams import frame_generator
 
 _SIZE_PX = 1024
 # Periods of the texture held by one repeat: the largest blobs are 1/8 of it, so repeats are not seen at once.
@@ -24,7 +24,7 @@ _SMOOTH_SLOPE = 2.5
 @lru_cache(maxsize=24)
 def _tile(seed: int, slope: float) -> NDArray[np.float32]:
     """(1024, 1024) periodic Gaussian texture of unit variance whose spectrum falls with `slope` above its peak."""
-    rng = generator(seed, 0, "texture")
+    rng = frame_generator(seed, 0, "texture")
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(_SIZE_PX), np.fft.rfftfreq(_SIZE_PX), indexing="ij")) * _SIZE_PX
     amplitude = np.where(frequency > 0, (frequency**2 + _LARGEST_PER_REPEAT**2) ** (-slope / 2), 0.0)
     noise = np.fft.rfft2(rng.standard_normal((_SIZE_PX, _SIZE_PX)))

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t
 
+from datasets_manifest.random_streams import named_generator
 from droguekit.bars.confidence import Limited, mean_limit, percentile_limit, share_limit
-from droguekit.benchmark.statistics import CONFIDENCE, RESAMPLES, keyed_generator
+from droguekit.benchmark.statistics import CONFIDENCE, RESAMPLES
 from geometry.se3 import Array
 
 
@@ -69,7 +70,7 @@ def block_percentile_limit(values: ArrayLike, blocks: Sequence[int], percent: fl
         return value, limit
     of_block = np.asarray(blocks)
     parts = [sizes[of_block == name] for name in names]
-    rng = keyed_generator(key)
+    rng = named_generator(key)
     drawn = [
         np.percentile(np.concatenate([parts[k] for k in rng.integers(0, len(parts), len(parts))]), percent)
         for _ in range(RESAMPLES)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,18 +40,6 @@ class RightEyeErrors:
 
     yaw_rad: Array
     cx_px: Array
-
-
-def cell_generator(seed: int, cell: str, stream: str) -> np.random.Generator:
-    """The random stream of one kind of draw in one cell.
-
-    Raises:
-        ValueError: a negative seed.
-    """
-    if seed < 0:
-        raise ValueError(f"seed: must not be negative, got {seed}")
-    key = (seed & 0xFFFFFFFF, seed >> 32, zlib.crc32(cell.encode()), zlib.crc32(stream.encode()))
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
 
 
 def draw_poses(

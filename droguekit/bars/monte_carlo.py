@@ -8,16 +8,17 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 from scipy.stats import norm
 
+from datasets_manifest.random_streams import seeded_generator
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import load_drogue
 from droguekit.bars.batch_scores import bound_deviations, flipped, pose_errors, sight_tilts, squared_errors
 from droguekit.bars.corruption import CLEAN, Corruption, draw_shifts
-from droguekit.bars.drawn_poses import Poses, cell_generator, draw_poses, ellipse_centers_px
-from droguekit.bars.one_thread import one_thread
+from droguekit.bars.drawn_poses import Poses, draw_poses, ellipse_centers_px
 from droguekit.bars.solvers import Measured, Solved, solve
 from droguekit.bars.tolerances import AS_BUILT, Tolerances, draw_features
 from droguekit.benchmark.bounds import feature_points
 from droguekit.benchmark.closed_forms import FacingRing
+from droguekit.numerical_threads import one_thread
 from geometry.se3 import Array
 from geometry.stereo import paper_rig
 from nav.pose.tolerances import EXACT, StatedTolerances
@@ -128,7 +129,7 @@ def _result(cell: Cell) -> CellResult:
     rig, drogue = paper_rig(), load_drogue(f"red-{cell.markers}")
     layout = marker_layout(drogue)
     poses = draw_poses(
-        cell_generator(cell.seed, cell.stream, "poses"), rig, drogue.rim_radius_m, cell.distance_m, cell.draws
+        seeded_generator(cell.seed, cell.stream, "poses"), rig, drogue.rim_radius_m, cell.distance_m, cell.draws
     )
     measured = _measure(cell, layout, poses)
     solved = solve(cell.method, measured)
@@ -168,15 +169,15 @@ def _result(cell: Cell) -> CellResult:
 
 def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> Measured:
     key = f"{cell.stream}, {cell.markers} markers, {cell.sigma_px:g} px, {cell.corruption}, {cell.tolerances}"
-    true = draw_features(cell_generator(cell.seed, key, "features"), layout, cell.tolerances, cell.draws)
+    true = draw_features(seeded_generator(cell.seed, key, "features"), layout, cell.tolerances, cell.draws)
     _, radii = feature_points(layout)
     exact = ellipse_centers_px(paper_rig(), poses, true.centers_m, radii, true.right)
     # The same noise with and without bad markers, so that their effect stands out.
     noise_key = f"{cell.stream}, {cell.markers} markers, {cell.sigma_px:g} px"
-    noise = cell_generator(cell.seed, noise_key, "noise").standard_normal(exact.shape)
+    noise = seeded_generator(cell.seed, noise_key, "noise").standard_normal(exact.shape)
     hub_sigma_px = HUB_NOISE_FACTOR * cell.sigma_px
     count = layout.count
-    shifts = draw_shifts(cell_generator(cell.seed, key, "shifts"), cell.corruption, cell.draws, count)
+    shifts = draw_shifts(seeded_generator(cell.seed, key, "shifts"), cell.corruption, cell.draws, count)
     return Measured(
         rig=paper_rig(),
         layout=layout,

@@ -10,17 +10,18 @@ import numpy as np
 
 from datasets_manifest.blind import BlindDataset
 from datasets_manifest.images import StereoImages
+from datasets_manifest.random_streams import seeded_generator
 from datasets_manifest.reader import Dataset
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
 from droguekit.bars.corruption import Corruption, draw_shifts
-from droguekit.bars.drawn_poses import cell_generator, draw_poses, ellipse_centers_px
-from droguekit.bars.one_thread import one_thread
+from droguekit.bars.drawn_poses import draw_poses, ellipse_centers_px
 from droguekit.bars.protocol import DOCKING_RANGE_M
 from droguekit.bars.reporter import Reporter
 from droguekit.bars.solvers import Measured, observations, solve
 from droguekit.bars.table import BarRow, at_most
 from droguekit.benchmark.bounds import feature_points
+from droguekit.numerical_threads import one_thread
 from geometry.stereo import paper_rig
 from nav.navigator import Navigator
 from nav.pose.interface import Observation, Solution
@@ -117,9 +118,9 @@ def _single_ms(method: str, measured: Measured, count: int) -> list[float]:
 def _measured(seed: int, count: int, corruption: Corruption) -> Measured:
     rig, drogue = paper_rig(), load_drogue("red-8")
     layout = marker_layout(drogue)
-    poses = draw_poses(cell_generator(seed, "speed", "poses"), rig, drogue.rim_radius_m, DOCKING_RANGE_M, count)
+    poses = draw_poses(seeded_generator(seed, "speed", "poses"), rig, drogue.rim_radius_m, DOCKING_RANGE_M, count)
     pixels = ellipse_centers_px(rig, poses, *feature_points(layout))
-    pixels = pixels + _SIGMA_PX * cell_generator(seed, "speed", "noise").standard_normal(pixels.shape)
-    shifts = draw_shifts(cell_generator(seed, "speed", "shifts"), corruption, count, layout.count)
+    pixels = pixels + _SIGMA_PX * seeded_generator(seed, "speed", "noise").standard_normal(pixels.shape)
+    shifts = draw_shifts(seeded_generator(seed, "speed", "shifts"), corruption, count, layout.count)
     markers = pixels[:, :, : layout.count] + shifts
     return Measured(rig, layout, markers, pixels[:, :, layout.count], _SIGMA_PX, _SIGMA_PX)

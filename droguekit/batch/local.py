@@ -20,7 +20,7 @@ from droguekit.batch.progress import ProgressReport
 from droguekit.batch.resume import finish_frames, open_dataset, sort_frames
 from labelgen.export.coco import write_annotations
 from render.version import RENDER_VERSION
-from scenes.sampler import split_of_scene
+from scenes.sampler import split_of_scenes
 
 # For so many, a step that takes milliseconds a pair is long enough to be announced.
 _MANY_PAIRS = 1000
@@ -109,9 +109,7 @@ def describe_dataset(recipe: Recipe, out: Location, drops: Sequence[Drop], made_
         OSError: they cannot be written.
     """
     finish_frames(out)
-    manifest = build_manifest(
-        out, recipe, RENDER_VERSION, lambda scene_id: split_of_scene(recipe, scene_id), tuple(drops)
-    )
+    manifest = build_manifest(out, recipe, RENDER_VERSION, split_of_scenes(recipe), tuple(drops))
     if made_by is not None:
         manifest = made_with(manifest, made_by.software, made_by.cpu_features)
     write_manifest(out, manifest)

@@ -15,7 +15,7 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from labelgen.boxes import full_box
 from scenes.families import family_of_scene, recipe_of_scene
-from scenes.sampler import sample_left_from_drogue, scene_of_frame, split_of_scene
+from scenes.sampler import sample_left_from_drogue, scene_of_frame, split_of_scenes
 from scenes.target import drogue_of_scene
 
 # A worker may have to load its engine and compile kernels within its first frame.
@@ -88,10 +88,10 @@ def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> Plan:
     Raises:
         ValueError: none of the first ones can be made.
     """
-    by_scene = _pairs_by_scene(recipe)
+    by_scene, splits = _pairs_by_scene(recipe), split_of_scenes(recipe)
     by_split: Counter[str] = Counter()
     for scene_id, pairs in by_scene.items():
-        by_split[split_of_scene(recipe, scene_id)] += pairs
+        by_split[splits[scene_id]] += pairs
     by_family = {family.name: (0, 0) for family in recipe.families}
     for scene_id, pairs in by_scene.items():
         family = family_of_scene(recipe, scene_id)

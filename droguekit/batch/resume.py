@@ -22,7 +22,7 @@ from datasets_manifest.shard_index import shard_numbers
 from datasets_manifest.storage import Location, in_order, open_storage
 from datasets_manifest.writer import remove_leftovers
 from render.version import RENDER_VERSION
-from scenes.sampler import split_of_scene
+from scenes.sampler import split_of_scenes
 
 _OURS = {
     layout.RECIPE_FILE,
@@ -148,7 +148,7 @@ def _start(out: Location, recipe: Recipe, recipe_text: str) -> None:
         storage.delete(layout.shard_index_file(number))
         storage.delete(layout.shard_file(number))
     storage.write(layout.RECIPE_FILE, recipe_text.encode())
-    write_manifest(out, build_manifest(out, recipe, RENDER_VERSION, lambda scene_id: split_of_scene(recipe, scene_id)))
+    write_manifest(out, build_manifest(out, recipe, RENDER_VERSION, split_of_scenes(recipe)))
 
 
 def differing_keys(first: Any, second: Any, where: str = "") -> list[str]:

@@ -9,16 +9,16 @@ import pickle
 import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any
 
 from droguekit.batch.machine import resident_gib
+from droguekit.numerical_threads import one_thread_in_new_processes
 
 READY, UNTIMED = "ready", "untimed"
 _CONTEXT = multiprocessing.get_context("spawn")
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -56,7 +56,7 @@ class Worker:
         self._process = _CONTEXT.Process(
             target=_serve, args=(there, function, then, os.getpid()), name="droguekit-worker"
         )
-        with _one_thread():
+        with one_thread_in_new_processes():
             self._process.start()
         there.close()
         self.index: int | None = None
@@ -102,21 +102,6 @@ class Worker:
         """Let it end by itself; it holds no task."""
         self.connection.close()
         self._process.join()
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let a process that starts meanwhile use one thread; libraries read these variables when they load."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 def _serve(

@@ -22,6 +22,7 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from droguekit.benchmark.pose_errors import by_method
 from droguekit.benchmark.result_parts import ResultModel
+from geometry.boxes import intersection_over_union
 from geometry.circles import disc_image_centers, disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
@@ -144,7 +145,9 @@ def _row(estimates: Mapping[int, Estimate], scenes: Mapping[int, BlindScene]) ->
         residual_rms_px=float(np.sqrt(np.mean(np.square(residuals)))) if residuals else None,
         boxes=len(views),
         middle_in_box_fraction=float(np.mean(inside)) if views else None,
-        rim_box_iou_median=float(np.median([_overlap(given, rim) for given, rim in views])) if views else None,
+        rim_box_iou_median=float(np.median([intersection_over_union(given, rim) for given, rim in views]))
+        if views
+        else None,
     )
 
 
@@ -166,13 +169,6 @@ def _residuals_px(estimate: PoseEstimate, scene: BlindScene) -> Iterator[float]:
 def _holds(box: PixelBox, rim: PixelBox) -> bool:
     x, y = rim[0] + rim[2] / 2, rim[1] + rim[3] / 2
     return box[0] <= x <= box[0] + box[2] and box[1] <= y <= box[1] + box[3]
-
-
-def _overlap(one: PixelBox, other: PixelBox) -> float:
-    """Intersection over union."""
-    sides = [min(one[k] + one[k + 2], other[k] + other[k + 2]) - max(one[k], other[k]) for k in (0, 1)]
-    common = max(sides[0], 0.0) * max(sides[1], 0.0)
-    return common / (one[2] * one[3] + other[2] * other[3] - common)
 
 
 def _read_boxes(dataset: Location) -> dict[int, PixelBox]:

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from datasets_manifest.random_streams import named_generator
 from droguekit.benchmark.detection_matching import RECALLS, Matches
-from droguekit.benchmark.statistics import CONFIDENCE, RESAMPLES, Interval, keyed_generator
+from droguekit.benchmark.statistics import CONFIDENCE, RESAMPLES, Interval
 from geometry.se3 import Array
 
 Counts = NDArray[np.signedinteger[Any]]
@@ -35,7 +36,7 @@ def average_precision_interval(matches: Matches, overlaps: tuple[int, ...], key:
     scene_ids, _, drogues = _scenes(matches)
     if np.count_nonzero(drogues) < 2:
         return None
-    rng = keyed_generator(key)
+    rng = named_generator(key)
     times = rng.multinomial(len(scene_ids), np.full(len(scene_ids), 1 / len(scene_ids)), RESAMPLES)
     # A resample without any drogue has no precision.
     drawn = times[times @ drogues > 0]

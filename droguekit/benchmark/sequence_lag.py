@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from datasets_manifest.estimates import PoseEstimate
+from datasets_manifest.random_streams import named_generator
 from droguekit.benchmark.pose_errors import COMPONENTS
 from droguekit.benchmark.sequence_motion import smoothing_spline
 from droguekit.benchmark.sequence_result import Lag
 from droguekit.benchmark.sequence_truth import Moment, TrueSequence
-from droguekit.benchmark.statistics import CONFIDENCE, RESAMPLES, keyed_generator
+from droguekit.benchmark.statistics import CONFIDENCE, RESAMPLES
 from geometry.se3 import Array, RigidTransform, angles_from_axis
 
 MOST_LAG_S = 0.5
@@ -46,7 +47,7 @@ def lags(sequences: Sequence[TrueSequence], estimates: Mapping[int, PoseEstimate
     if sum(counts) < _FEWEST:
         return None
     sums = np.array(tables)
-    rng = keyed_generator(key)
+    rng = named_generator(key)
     times = rng.multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
     return {name: _lag(sums[:, c], times) for c, name in enumerate(COMPONENTS)}
 

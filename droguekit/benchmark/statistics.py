@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.stats import chi2, norm
 
+from datasets_manifest.random_streams import named_generator
 from geometry.se3 import Array
 
 CONFIDENCE = 0.95
@@ -71,11 +71,6 @@ def fraction_interval(hits: int, count: int) -> Interval:
     return (float(middle - half) if hits else 0.0), (float(middle + half) if hits < count else 1.0)
 
 
-def keyed_generator(key: str) -> np.random.Generator:
-    """A random stream of its own for every key, the same on every machine."""
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(zlib.crc32(key.encode()))))
-
-
 def bootstrap_intervals(columns: Array, percentiles: tuple[float, ...], key: str) -> tuple[Array, Array]:
     """Percentile-bootstrap intervals of means and percentiles, all from the same resampled frames.
 
@@ -93,7 +88,7 @@ def bootstrap_intervals(columns: Array, percentiles: tuple[float, ...], key: str
     """
     ordered = columns[np.lexsort(columns.T)]
     size = len(ordered)
-    rng = keyed_generator(key)
+    rng = named_generator(key)
     means, ranks = [], []
     step = max(1, _DRAWS_AT_ONCE // (size * columns.shape[1]))
     for start in range(0, RESAMPLES, step):
@@ -126,7 +121,7 @@ def ratio_intervals(numerators: Array, denominators: Array, blocks: Sequence[int
         return [None] * columns
     sums = np.zeros((count, 2 * columns))
     np.add.at(sums, place, np.hstack([numerators, denominators]))
-    rng = keyed_generator(key)
+    rng = named_generator(key)
     totals = []
     step = max(1, _DRAWS_AT_ONCE // sums.size)
     for start in range(0, RATIO_RESAMPLES, step):

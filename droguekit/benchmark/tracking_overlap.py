@@ -22,26 +22,8 @@ PRECISION_AT_PX = 20.0
 NO_BOX = (np.nan, np.nan, np.nan, np.nan)
 
 
-def overlaps(found: Array, truth: Array) -> Array:
-    """Intersection over union of boxes with the true ones.
-
-    Args:
-        found, truth: (n, 4) x, y of the low corner, width, height; `NO_BOX` where nothing was found. [px]
-
-    Returns:
-        (n,) 0 without a box.
-    """
-    low = np.maximum(found[:, :2], truth[:, :2])
-    high = np.minimum(found[:, :2] + found[:, 2:], truth[:, :2] + truth[:, 2:])
-    common = np.prod(np.maximum(high - low, 0.0), axis=1)
-    union = np.prod(found[:, 2:], axis=1) + np.prod(truth[:, 2:], axis=1) - common
-    # Rounding takes equal boxes beyond 1, and so over the last threshold.
-    shares: Array = np.minimum(np.nan_to_num(common / union, nan=0.0), 1.0)
-    return shares
-
-
 def center_errors_px(found: Array, truth: Array) -> Array:
-    """(n,) distances of the centres; infinite without a box. Arguments as those of `overlaps`. [px]"""
+    """(n,) distances of the centres of (n, 4) boxes; infinite where a box is `NO_BOX`. [px]"""
     return _lengths(_center_offsets(found, truth))
 
 

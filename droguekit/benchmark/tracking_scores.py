@@ -20,11 +20,11 @@ from droguekit.benchmark.tracking_overlap import (
     PRECISION_AT_PX,
     center_errors_px,
     normalized_center_errors,
-    overlaps,
     precision_curve,
     success_curve,
 )
 from droguekit.benchmark.tracking_result import EyeTracking, Losses, OverlapRow, Reacquisition
+from geometry.boxes import intersection_over_union
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 
@@ -72,7 +72,7 @@ class EyeTrack:
     @property
     def overlap(self) -> Array:
         """(n,) intersection over union; 0 without a box."""
-        return overlaps(self.found, self.truth)
+        return intersection_over_union(self.found, self.truth)
 
 
 def eye_tracks(
@@ -119,7 +119,7 @@ def overlap_row(
     if not len(found):
         return None
     blocks = np.repeat([track.sequence_id for track in tracks], [int(pick.sum()) for pick in picks]).tolist()
-    overlap, errors = overlaps(found, truth), center_errors_px(found, truth)
+    overlap, errors = intersection_over_union(found, truth), center_errors_px(found, truth)
     success = success_curve(overlap)
     normalized = precision_curve(normalized_center_errors(found, truth), NORMALIZED_ERRORS)
     near, known = errors <= PRECISION_AT_PX, np.isfinite(errors)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from droguekit.benchmark.detection_boxes import FoundBox
     from droguekit.benchmark.detection_result import DetectionResult, PairTimes
     from droguekit.benchmark.detection_run import DetectorPass
-    from droguekit.detector_peers.onnx_cost import NetworkCost
+    from nav.detector.onnx_cost import NetworkCost
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _network_cost(name_or_file: str, sizes_px: tuple[tuple[int, int], ...]) -> N
     file = network_file(name_or_file)
     if file is None or not sizes_px or find_spec("onnx") is None:
         return None
-    from droguekit.detector_peers.onnx_cost import NetworkCost, network_cost
+    from nav.detector.onnx_cost import NetworkCost, network_cost
 
     try:
         costs = [network_cost(file, size_px) for size_px in sizes_px]

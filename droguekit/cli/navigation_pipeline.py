@@ -99,8 +99,8 @@ def navigate_dataset(
     from datasets_manifest.atomic import write_text_atomic
     from datasets_manifest.blind import BlindDataset
     from datasets_manifest.estimates import write_estimates
-    from droguekit.bars.one_thread import one_thread
     from droguekit.cli.latency import LatencyTally
+    from droguekit.numerical_threads import one_thread
     from nav.runner import with_smoothed
 
     order = NavigationOrder() if order is None else order

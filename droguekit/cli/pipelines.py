@@ -108,9 +108,9 @@ def benchmark_dataset(
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.bars.one_thread import one_thread
     from droguekit.benchmark.benchmark import run_benchmark
     from droguekit.benchmark.report import write_report
+    from droguekit.numerical_threads import one_thread
 
     with one_thread():
         result = run_benchmark(dataset, estimates)
@@ -129,9 +129,9 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.bars.one_thread import one_thread
     from droguekit.benchmark.blind_check import check_blind
     from droguekit.benchmark.blind_report import write_blind_report
+    from droguekit.numerical_threads import one_thread
 
     with one_thread():
         check = check_blind(dataset, estimates)

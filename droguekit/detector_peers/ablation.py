@@ -19,8 +19,8 @@ from droguekit.benchmark.detection_tables import share
 from droguekit.benchmark.detection_truth import ImageTruth, read_detection_truth
 from droguekit.detector_peers.latency import measure_latency
 from droguekit.detector_peers.one_view import OneViewDetector
-from droguekit.detector_peers.onnx_cost import network_cost
 from nav.detector.interface import Detector
+from nav.detector.onnx_cost import network_cost
 from nav.detector.onnx_detector import OnnxDetector
 
 ONE_VIEW = "one-view"

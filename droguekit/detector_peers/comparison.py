@@ -19,10 +19,10 @@ from droguekit.benchmark.detection_boxes import write_detections
 from droguekit.benchmark.detection_run import LEAST_SCORE, DetectorPass
 from droguekit.detector_peers.environment import peer_python, peer_variables
 from droguekit.detector_peers.latency import measure_latency
-from droguekit.detector_peers.onnx_cost import network_cost
 from droguekit.detector_peers.yolo_corpus import check_corpus, export_corpus, images_to_train_on
 from droguekit.detector_peers.yolo_detector import YoloDetector
 from nav.detector.interface import Detector
+from nav.detector.onnx_cost import network_cost
 from nav.detector.onnx_detector import OnnxDetector
 
 PEERS = ("yolov8s", "yolov8n")

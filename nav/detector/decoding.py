@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geometry.boxes import intersection_area
 from geometry.se3 import Array
 from nav.detector.maps import LOG_DISTANCE_RANGE, STRIDES
 
@@ -46,13 +47,12 @@ def _decode_one(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, m
     finite = np.isfinite(all_boxes).all(axis=1)
     all_scores, all_boxes = all_scores[finite], all_boxes[finite]
     order = np.argsort(-all_scores, kind="stable")[:_MOST_CELLS]
-    kept = without_overlaps(all_boxes[order], most)
+    kept = non_maximum_suppression(all_boxes[order], most)
     return all_boxes[order][kept], all_scores[order][kept]
 
 
-def without_overlaps(boxes: Array, most: int) -> list[int]:
+def non_maximum_suppression(boxes: Array, most: int) -> list[int]:
     """Indices of the boxes, best first, that overlap no better one (non-maximum suppression)."""
-    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
     area = boxes[:, 2] * boxes[:, 3]
     open_ = np.ones(len(boxes), dtype=bool)
     kept: list[int] = []
@@ -62,8 +62,7 @@ def without_overlaps(boxes: Array, most: int) -> list[int]:
         kept.append(index)
         if len(kept) == most:
             break
-        sides = np.maximum(np.minimum(high[index], high) - np.maximum(low[index], low), 0)
-        shared = sides[:, 0] * sides[:, 1]
+        shared = intersection_area(boxes[index], boxes)
         open_ &= shared <= _MOST_OVERLAP * (area[index] + area - shared)
     return kept
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.detector.decoding import decode, without_overlaps
+from nav.detector.decoding import decode, non_maximum_suppression
 from nav.detector.input_image import Letterbox, fit_picture
 from nav.detector.maps import SIZE_STEP_PX
 
@@ -81,7 +81,7 @@ def joined(full: Found, half: Found, large_from_px: float, most: int) -> Found:
     boxes, scores, is_large = boxes[order], scores[order], is_large[order]
     whole = ~_is_part(boxes, is_large)
     boxes, scores = boxes[whole], scores[whole]
-    kept = without_overlaps(boxes, most)
+    kept = non_maximum_suppression(boxes, most)
     return boxes[kept], scores[kept]
 
 

@@ -7,8 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from geometry.se3 import Array, RigidTransform
-from nav.filtering.so3 import exp_rotation, left_jacobian, log_rotation
+from geometry.se3 import Array, RigidTransform, exp_rotation, left_jacobian, log_rotation
 
 # Where what lies in an error: the drogue's place and turn without the camera's shaking, their rates, and the shaking.
 PLACE, TURN, VELOCITY, RATE, SHIFT, SHAKE = (slice(3 * part, 3 * part + 3) for part in range(6))

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets_manifest.estimates import TANGENT, PoseEstimate
-from geometry.se3 import Array, RigidTransform
+from geometry.se3 import Array, RigidTransform, exp_rotation, log_rotation
 from nav.filtering.error_state import symmetric
-from nav.filtering.so3 import exp_rotation, log_rotation
 from nav.pose.interface import NoFixReason
 
 # Places and deviations beyond these are no drogue's, and squares of much larger ones overflow.

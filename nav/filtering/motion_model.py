@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geometry.se3 import Array, skew
+from geometry.se3 import Array, exp_rotation, left_jacobian, skew
 from nav.filtering.error_state import (
     PLACE,
     RATE,
@@ -25,7 +25,6 @@ from nav.filtering.error_state import (
     symmetric,
 )
 from nav.filtering.settings import FilterSettings
-from nav.filtering.so3 import exp_rotation, left_jacobian
 
 _VIBRATION = slice(12, 18)
 _AXES = np.eye(3)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from nav.rim_boxes import Box, overlap_fraction
+from geometry.boxes import intersection_over_union
+
+PixelBox = tuple[float, float, float, float]
 
 # A longer time between two pairs parts two sequences. [s]
 _LONGEST_GAP_S = 1.0
@@ -22,6 +24,6 @@ def begins_sequence(last_s: float | None, now_s: float) -> bool:
     return last_s is None or not 0 < now_s - last_s <= _LONGEST_GAP_S
 
 
-def is_same_place(one: Box, other: Box) -> bool:
+def is_same_place(one: PixelBox, other: PixelBox) -> bool:
     """Whether two boxes of one image show the same thing."""
-    return overlap_fraction(one, other) >= _SAME_PLACE
+    return bool(intersection_over_union(one, other) >= _SAME_PLACE)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
 from nav.training.corpus import Corpus, EyeIndex
 from nav.training.image_views import (
@@ -28,7 +29,6 @@ from nav.training.mosaic import TILES, sample_mosaic
 from nav.training.ordered_work import in_order
 from nav.training.painted_shapes import distract, occlude
 from nav.training.photometry import vary_light
-from nav.training.seeding import generator
 from nav.training.settings import SizePx, TrainingSettings
 
 _MOSAIC_FRACTION = 0.8  # of the images while mosaic is on
@@ -83,8 +83,8 @@ class BatchMaker:
     def _sample(self, step: int, epoch: int, position: int) -> Iterator[tuple[Image, Boxes]]:
         """Images and boxes of one eye, or of both."""
         settings = self._settings
-        order = generator(settings.seed, epoch, 0, "order").permutation(self._samples_per_epoch)
-        rng = generator(settings.seed, epoch, position, "geometry")
+        order = sample_generator(settings.seed, epoch, 0, "order").permutation(self._samples_per_epoch)
+        rng = sample_generator(settings.seed, epoch, position, "geometry")
         first = int(order[position])
         is_mosaic = settings.mosaic_at(step) and rng.random() < _MOSAIC_FRACTION
         samples = [first, *rng.integers(self._samples_per_epoch, size=TILES - 1)] if is_mosaic else [first]
@@ -95,7 +95,7 @@ class BatchMaker:
         views = self._sample_views(rng, members, size, is_mosaic)
         for eye_number, of_eye in enumerate(zip(*members, strict=True)):
             # The eyes see one scene, but each in light and with noise, occluders and distractors of its own.
-            light = generator(settings.seed, epoch, position, f"light {eye_number}")
+            light = sample_generator(settings.seed, epoch, position, f"light {eye_number}")
             yield self._paint(light, list(of_eye), views, size)
 
     def _members(self, sample: int) -> list[tuple[int, EyeIndex]]:

@@ -21,10 +21,10 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from datasets_manifest.atomic import PART_SUFFIX, new_folder
-from datasets_manifest.json_types import FrozenModel
 from datasets_manifest.locking import takes_lock
 from datasets_manifest.manifest import SplitName
 from datasets_manifest.reader import Dataset
+from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.training.observer import Observer

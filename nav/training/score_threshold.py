@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from geometry.boxes import intersection_over_union
 from nav.training.image_views import Boxes
 
 _LEAST_OVERLAP = 0.5
@@ -27,7 +28,7 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
         Midway between the highest and the lowest of those.
     """
     best = [
-        (float(scores[0]), len(own) > 0, len(own) > 0 and _overlap(own[0], boxes[0]) >= _LEAST_OVERLAP)
+        (float(scores[0]), len(own) > 0, len(own) > 0 and intersection_over_union(own[0], boxes[0]) >= _LEAST_OVERLAP)
         for own, (boxes, scores) in zip(truth, found, strict=True)
         if len(scores)
     ]
@@ -45,10 +46,3 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
     first, last = int(good[0]), int(good[-1])
     below = best[last + 1][0] if last + 1 < len(best) else 0.0
     return (best[first][0] + below) / 2
-
-
-def _overlap(first: Boxes, second: Boxes) -> float:
-    """Intersection over union of two boxes."""
-    low, high = np.maximum(first[:2], second[:2]), np.minimum(first[:2] + first[2:], second[:2] + second[2:])
-    shared = float(np.prod(np.maximum(high - low, 0)))
-    return shared / float(first[2] * first[3] + second[2] * second[3] - shared)

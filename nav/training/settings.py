@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from datasets_manifest.json_types import FrozenModel
+from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe import RenderSettings
 from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from geometry.stereo import EYES, Eye
@@ -21,7 +22,6 @@ from render.blender_engine.stage import Stage
 from render.engine import EyeRadiance, StereoRadiance
 from render.traced import TracedEye, amodal_counts
 from render.version import RENDER_VERSION
-from scenes.seeding import generator
 from scenes.sky import REC709_LUMINANCE
 from scenes.surroundings import Surroundings, surroundings
 
@@ -123,7 +123,7 @@ class BlenderEngine:
         started = time.process_time()
         setup = self._stage.set_frame(frame, around)
         self._stage_s["scene"] += time.process_time() - started + self._process.ask(setup)
-        seeds = generator(frame.seed, frame.frame_index, "blender samples")
+        seeds = frame_generator(frame.seed, frame.frame_index, "blender samples")
         eyes, scatter = {}, {}
         for eye in EYES:
             eyes[eye], scatter[eye] = self._eye(_Job(frame, settings, eye, setup.light.unit_cd_m2, seeds))

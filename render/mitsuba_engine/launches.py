@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
+from datasets_manifest.random_streams import frame_generator
 from geometry.stereo import EYES, Eye
 from render.mitsuba_engine.camera_rays import CameraRays
 from render.mitsuba_engine.jit_arrays import jit_array
@@ -19,7 +20,6 @@ from render.mitsuba_engine.scene import DrogueScene, by_shape
 from render.mitsuba_engine.sky_irradiance import SkyIrradiance, as_mitsuba_reads
 from render.mitsuba_engine.sun_sky_paths import Lights
 from render.mitsuba_engine.traced import Plan
-from scenes.seeding import generator
 from scenes.surroundings import Surroundings
 
 MOST_LANES = 2_000_000
@@ -59,7 +59,7 @@ class FrameRays:
         self.size = self.width_px * frame.rig.camera.height_px
         self.focal_px = frame.rig.camera.fx_px
         self._cameras = [CameraRays(frame, eye) for eye in EYES]
-        self._seeds = generator(frame.seed, frame.frame_index, "mitsuba samples")
+        self._seeds = frame_generator(frame.seed, frame.frame_index, "mitsuba samples")
         to_sun, sun_lux = scene.sun
         world_from_stage = frame.world_from_left @ frame.left_from_stage_at(0.0)
         self.lights = Lights(

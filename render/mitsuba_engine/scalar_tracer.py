@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.frame import FrameSpec
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe import RenderSettings
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
@@ -28,7 +29,6 @@ from render.mitsuba_engine.traced import (
 from render.motion import blur_px, pose_polynomial
 from render.surfaces import dirty_parts
 from render.traced import TracedEye, amodal_counts
-from scenes.seeding import generator
 
 # Motion is rendered as so many still pictures.
 _MOVING_SLICES = 8
@@ -52,7 +52,7 @@ class ScalarTracer:
         stage_s["scene"], started = time.process_time() - started, time.process_time()
         moves_px = blur_px(frame)
         moments = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
-        seeds = generator(frame.seed, frame.frame_index, "mitsuba samples")
+        seeds = frame_generator(frame.seed, frame.frame_index, "mitsuba samples")
         eyes: dict[Eye, TracedEye] = {}
         again: dict[Eye, TracedEye] = {}
         for eye in EYES:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datasets_manifest.random_streams import seeded_generator
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
 from droguekit.bars.batch_scores import bound_deviations, component_slopes, flipped, pose_errors, sight_tilts
 from droguekit.bars.corruption import Corruption, draw_shifts
-from droguekit.bars.drawn_poses import Poses, cell_generator, draw_poses, ellipse_centers_px
+from droguekit.bars.drawn_poses import Poses, draw_poses, ellipse_centers_px
 from droguekit.bars.tolerances import AS_BUILT, TOLERANCED, Tolerances, draw_features
 from droguekit.benchmark.bounds import FeatureNoise, angles_jacobian, feature_points, features_seen, pose_bound
 from droguekit.benchmark.pose_errors import pose_error
@@ -24,7 +25,7 @@ CENTERS, RADII = feature_points(LAYOUT)
 
 
 def drawn(count: int = 40, distance_m: tuple[float, float] = (1.7, 40.0)) -> Poses:
-    return draw_poses(cell_generator(1, "test", "poses"), RIG, DROGUE.rim_radius_m, distance_m, count)
+    return draw_poses(seeded_generator(1, "test", "poses"), RIG, DROGUE.rim_radius_m, distance_m, count)
 
 
 def transforms(poses: Poses) -> list[RigidTransform]:
@@ -45,10 +46,10 @@ def test_drawn_poses_keep_to_the_protocol() -> None:
 
 def test_draws_depend_on_seed_cell_and_stream_only() -> None:
     key = (1, "cell", "stream")
-    first = cell_generator(*key).random(4)
-    assert (first == cell_generator(*key).random(4)).all()
+    first = seeded_generator(*key).random(4)
+    assert (first == seeded_generator(*key).random(4)).all()
     for other in ((2, "cell", "stream"), (1, "other", "stream"), (1, "cell", "other")):
-        assert (first != cell_generator(*other).random(4)).all()
+        assert (first != seeded_generator(*other).random(4)).all()
 
 
 def test_a_drogue_too_near_is_refused() -> None:
@@ -100,14 +101,14 @@ def test_a_mirrored_tilt_is_a_flip_and_the_true_one_is_none() -> None:
 
 
 def test_a_drogue_as_built_is_the_nominal_one() -> None:
-    true = draw_features(cell_generator(1, "test", "features"), LAYOUT, AS_BUILT, 3)
+    true = draw_features(seeded_generator(1, "test", "features"), LAYOUT, AS_BUILT, 3)
     np.testing.assert_array_equal(true.centers_m, np.broadcast_to(CENTERS, (3, *CENTERS.shape)))
     assert not true.right.yaw_rad.any()
     assert not true.right.cx_px.any()
 
 
 def test_tolerances_have_the_spread_that_they_name() -> None:
-    true = draw_features(cell_generator(1, "test", "features"), LAYOUT, TOLERANCED, 20_000)
+    true = draw_features(seeded_generator(1, "test", "features"), LAYOUT, TOLERANCED, 20_000)
     ring = np.linalg.norm(true.centers_m[:, :8, :2], axis=-1).mean(axis=1)
     expected = np.hypot(0.5e-3, 0.3e-3 / np.sqrt(8))
     # Standard error of a spread from 20 000 draws: 0.5 %; four of them.
@@ -119,7 +120,7 @@ def test_tolerances_have_the_spread_that_they_name() -> None:
 
 
 def test_an_ellipse_has_the_axes_that_it_names() -> None:
-    true = draw_features(cell_generator(1, "test", "features"), LAYOUT, Tolerances(ellipticity=0.01), 500)
+    true = draw_features(seeded_generator(1, "test", "features"), LAYOUT, Tolerances(ellipticity=0.01), 500)
     mapped = np.linalg.lstsq(LAYOUT.centers_m[:, :2], np.moveaxis(true.centers_m[:, :8, :2], 0, 1).reshape(8, -1), None)
     axes = np.linalg.svd(np.moveaxis(mapped[0].reshape(2, 500, 2), 1, 0), compute_uv=False)
     # Exact but for rounding: 1 + e/2 and 1 - e/2.
@@ -129,7 +130,7 @@ def test_an_ellipse_has_the_axes_that_it_names() -> None:
 @pytest.mark.parametrize("bad", [0, 1, 2])
 @pytest.mark.parametrize("where", ["one eye", "both eyes", "u only"])
 def test_shifts_are_of_as_many_markers_as_asked(bad: int, where: str) -> None:
-    shifts = draw_shifts(cell_generator(1, "test", where), Corruption(bad, where), 300, 8)  # type: ignore[arg-type]
+    shifts = draw_shifts(seeded_generator(1, "test", where), Corruption(bad, where), 300, 8)  # type: ignore[arg-type]
     size = np.linalg.norm(shifts, axis=-1)
     assert ((size > 0).any(axis=1).sum(axis=1) == bad).all()
     eyes = (size > 0).any(axis=2).sum(axis=1)
@@ -142,4 +143,4 @@ def test_shifts_are_of_as_many_markers_as_asked(bad: int, where: str) -> None:
 
 def test_more_bad_markers_than_there_are_is_an_error() -> None:
     with pytest.raises(ValueError, match="at most 5 markers"):
-        draw_shifts(cell_generator(1, "test", "shifts"), Corruption(6), 1, 5)
+        draw_shifts(seeded_generator(1, "test", "shifts"), Corruption(6), 1, 5)

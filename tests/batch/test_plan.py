@@ -12,7 +12,7 @@ from droguekit.batch.plan import draw_frames, plan_recipe
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 from labelgen.boxes import full_box
-from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scene
+from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
 RECIPE = """
 name = "planned"
@@ -43,7 +43,7 @@ def test_counts_are_those_of_the_frames() -> None:
     plan = plan_recipe(recipe)
     scenes = [scene_of_frame(recipe, index) for index in range(23)]
     assert plan.by_scene == Counter(scenes)
-    assert plan.by_split == Counter(split_of_scene(recipe, scene) for scene in scenes)
+    assert plan.by_split == Counter(split_of_scenes(recipe)[scene] for scene in scenes)
     assert plan.drawn.indices == tuple(range(23))
     assert plan.drawn.scenes.tolist() == scenes
 

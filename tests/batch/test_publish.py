@@ -32,7 +32,7 @@ from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.stereo import EYES
 from labelgen.boxes import full_box
 from render.version import RENDER_VERSION
-from scenes.sampler import sample_left_from_drogue, split_of_scene
+from scenes.sampler import sample_left_from_drogue, split_of_scenes
 
 OTHER_FEATURES = ("SSE", "SSE2")
 
@@ -59,7 +59,7 @@ def relit(dataset: Path, out: Path, features: tuple[str, ...] | None = None) -> 
     conditions = record.conditions.model_copy(update={"background_luminance_cd_m2": brighter})
     path.write_bytes(encode_record(record.model_copy(update={"conditions": conditions})))
     old = read_manifest(dataset)
-    manifest = build_manifest(out, old.recipe, old.render_version, lambda scene: split_of_scene(old.recipe, scene))
+    manifest = build_manifest(out, old.recipe, old.render_version, split_of_scenes(old.recipe))
     write_manifest(out, manifest if features is None else made_with(manifest, manifest.software, features))
     return out
 

@@ -207,7 +207,7 @@ def make_dataset(folder: Path, records: Sequence[PairRecord], alike: bool = Fals
         f'name = "bench-test"\ndescription = "Flat pictures of a drogue."\nframes = {{count = {len(records)}}}\n'
         'distance = {law = "uniform", low_m = 1.7, high_m = 40}'
     )
-    write_manifest(folder, build_manifest(folder, recipe, "test", lambda _: "train"))
+    write_manifest(folder, build_manifest(folder, recipe, "test", dict.fromkeys(range(recipe.frames.scenes), "train")))
     return folder
 
 

@@ -4,11 +4,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
+from datasets_manifest.random_streams import named_generator
 from droguekit.benchmark.statistics import (
     CONFIDENCE,
     bootstrap_intervals,
     fraction_interval,
-    keyed_generator,
     rms_interval,
     root_mean_square,
 )
@@ -103,5 +103,5 @@ def test_bootstrap_in_pieces_has_the_right_spread(rng: np.random.Generator) -> N
 
 
 def test_streams_differ_by_key_and_repeat() -> None:
-    assert keyed_generator("a").integers(2**60) == keyed_generator("a").integers(2**60)
-    assert keyed_generator("a").integers(2**60) != keyed_generator("b").integers(2**60)
+    assert named_generator("a").integers(2**60) == named_generator("a").integers(2**60)
+    assert named_generator("a").integers(2**60) != named_generator("b").integers(2**60)

@@ -126,8 +126,7 @@ def add_frame(dataset: Path, recipe: Recipe, frame_index: int, empty: bool = Fal
     return write_frame(dataset, make_record(recipe, frame_index, empty), files)
 
 
-def split_of_scene(scene_id: int) -> str:
-    return ("train", "test")[scene_id % 2]
+SPLIT_OF_SCENE = {scene_id: ("train", "test")[scene_id % 2] for scene_id in range(4)}
 
 
 @pytest.fixture
@@ -142,5 +141,5 @@ def tiny(tmp_path: Path) -> Path:
     recipe, dataset = make_recipe(), tmp_path / "tiny"
     for frame_index in (0, 1, 3):
         add_frame(dataset, recipe, frame_index, empty=frame_index == 3)
-    write_manifest(dataset, build_manifest(dataset, recipe, "1", split_of_scene))
+    write_manifest(dataset, build_manifest(dataset, recipe, "1", SPLIT_OF_SCENE))
     return dataset

@@ -131,7 +131,7 @@ def test_croissant_is_valid_for_its_makers_reader(described: Path) -> None:
 
 def test_a_dataset_without_pairs_is_described_too(tmp_path: Path) -> None:
     recipe, _ = load_recipe("smoke")
-    write_manifest(tmp_path, build_manifest(tmp_path, recipe, "0", lambda _: "train"))
+    write_manifest(tmp_path, build_manifest(tmp_path, recipe, "0", dict.fromkeys(range(recipe.frames.scenes), "train")))
     manifest = read_manifest(tmp_path)
     assert "* 0 stereo pairs" in card_text(manifest)
     assert len(describe_croissant(tmp_path, manifest)["distribution"]) == 6

@@ -8,9 +8,7 @@ from datasets_manifest.layout import frame_folder
 from datasets_manifest.manifest import Drop, build_manifest, dataset_sha256, read_manifest, write_manifest
 from datasets_manifest.provenance import cpu_features, software_versions
 
-
-def split_of_scene(scene_id):
-    return ("train", "test")[scene_id % 2]
+SPLIT_OF_SCENE = {scene_id: ("train", "test")[scene_id % 2] for scene_id in range(4)}
 
 
 def test_counts_splits_and_engines(tiny):
@@ -38,8 +36,8 @@ def test_the_dataset_hash_ignores_order_and_place(maker, tmp_path):
     for name, order in (("a", [0, 1, 2, 3]), ("b", [3, 1, 0, 2])):
         for index in order:
             add_frame(tmp_path / name, recipe, index)
-        digests.add(build_manifest(tmp_path / name, recipe, "1", split_of_scene).dataset_sha256)
-    hashes = [entry.record_sha256 for entry in build_manifest(tmp_path / "a", recipe, "1", split_of_scene).frames]
+        digests.add(build_manifest(tmp_path / name, recipe, "1", SPLIT_OF_SCENE).dataset_sha256)
+    hashes = [entry.record_sha256 for entry in build_manifest(tmp_path / "a", recipe, "1", SPLIT_OF_SCENE).frames]
     random.Random(1).shuffle(hashes)
     digests.add(dataset_sha256(recipe, hashes))
     assert len(digests) == 1
@@ -61,7 +59,7 @@ def test_the_dataset_hash_follows_records_and_recipe(tiny):
 def test_drops_are_kept_with_their_reasons(tiny, maker):
     make_recipe, *_ = maker
     drops = [Drop(frame_index=2, reason="the engine stopped"), Drop(frame_index=1, reason="no room")]
-    write_manifest(tiny, build_manifest(tiny, make_recipe(), "1", split_of_scene, drops))
+    write_manifest(tiny, build_manifest(tiny, make_recipe(), "1", SPLIT_OF_SCENE, drops))
     assert [drop.frame_index for drop in read_manifest(tiny).drops] == [1, 2]
 
 
@@ -112,14 +110,14 @@ def test_a_damaged_record_cannot_be_described(tiny, maker, contents):
     path = frame_folder(tiny, 1) / "record.json"
     path.write_text(contents)
     with pytest.raises(ValueError, match=r"000001/record\.json: is not a whole record"):
-        build_manifest(tiny, make_recipe(), "1", split_of_scene)
+        build_manifest(tiny, make_recipe(), "1", SPLIT_OF_SCENE)
 
 
 def test_a_record_in_the_wrong_folder_cannot_be_described(tiny, maker):
     make_recipe, *_ = maker
     frame_folder(tiny, 1).rename(frame_folder(tiny, 2))
     with pytest.raises(ValueError, match=r"000002/record\.json: belongs to frame 1"):
-        build_manifest(tiny, make_recipe(), "1", split_of_scene)
+        build_manifest(tiny, make_recipe(), "1", SPLIT_OF_SCENE)
 
 
 def test_processors_of_two_makers_are_two(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ def test_images_and_parts_come_back(maker, tmp_path, preset, bits):
     make_recipe, make_images, make_parts, _, add_frame = maker
     recipe = make_recipe(preset, bits)
     add_frame(tmp_path, recipe, 1)
-    write_manifest(tmp_path, build_manifest(tmp_path, recipe, "1", lambda _: "train"))
+    write_manifest(tmp_path, build_manifest(tmp_path, recipe, "1", dict.fromkeys(range(recipe.frames.scenes), "train")))
     dataset, wanted = Dataset(tmp_path), make_images(recipe, 1)
     for images in (dataset.images(1), BlindDataset(tmp_path).pair(1).images):
         for name in ("left", "right", "left_mosaic", "right_mosaic"):

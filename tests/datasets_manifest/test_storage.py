@@ -118,7 +118,7 @@ def test_a_dataset_reads_the_same_from_both(place, maker):
         write_frame(
             place, make_record(recipe, index), encode_files(make_images(recipe, index), make_parts(recipe, index))
         )
-    write_manifest(place, build_manifest(place, recipe, "1", lambda _: "train"))
+    write_manifest(place, build_manifest(place, recipe, "1", dict.fromkeys(range(recipe.frames.scenes), "train")))
     dataset = pickle.loads(pickle.dumps(Dataset(place)))  # data loaders send it to other processes
     assert dataset.frame_indices == (0, 2)
     assert (dataset.images(2).right == make_images(recipe, 2).right).all()
@@ -136,7 +136,7 @@ def test_a_frame_is_handed_on_as_it_is_on_record_or_not_at_all(place, maker):
     recipe = make_recipe()
     files = encode_files(make_images(recipe, 0), make_parts(recipe, 0))
     record = write_frame(place, make_record(recipe, 0), files)
-    write_manifest(place, build_manifest(place, recipe, "1", lambda _: "train"))
+    write_manifest(place, build_manifest(place, recipe, "1", dict.fromkeys(range(recipe.frames.scenes), "train")))
     found, data = Dataset(place).whole_frame(0)
     assert (encode_record(found), data) == (encode_record(record), files)
     storage = open_storage(place)

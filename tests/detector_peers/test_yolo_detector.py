@@ -14,10 +14,10 @@ from onnx import TensorProto, helper
 
 from datasets_manifest.images import StereoImages
 from droguekit.detector_peers.latency import _latency, measure_latency
-from droguekit.detector_peers.onnx_cost import network_cost
 from droguekit.detector_peers.yolo_detector import YoloDetector, decode_rows
 from geometry.stereo import Eye
 from nav.detector.interface import Detection, StereoDetection
+from nav.detector.onnx_cost import network_cost
 
 
 def images(width_px: int = 128, height_px: int = 96) -> StereoImages:

@@ -45,7 +45,8 @@ def write_whole_dataset(folder: Path) -> None:
     for index in range(recipe.frames.count):
         record, files, _ = make_frame(recipe, index, engine)
         write_frame(folder, record, files)
-    write_manifest(folder, build_manifest(folder, recipe, "1", lambda scene_id: ("train", "test")[scene_id % 2]))
+    splits = {scene_id: ("train", "test")[scene_id % 2] for scene_id in range(recipe.frames.scenes)}
+    write_manifest(folder, build_manifest(folder, recipe, "1", splits))
     write_calibration(folder, recipe.rig)
     write_annotations(folder, folder / "annotations")
     (folder / "recipe.toml").write_text(RECIPE)

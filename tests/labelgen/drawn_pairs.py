@@ -114,7 +114,8 @@ def write_drawn_dataset(folder: Path, recipe: Recipe, pairs: Iterable[Pair]) -> 
         parts = {"left": pair.radiance.left.part_id, "right": pair.radiance.right.part_id}
         write_frame(folder, pair.record, encode_files(pair.images, parts))
     splits = ("train", "val", "test")
-    write_manifest(folder, build_manifest(folder, recipe, "1", lambda scene_id: splits[scene_id % 3]))
+    split_of_scene = {scene_id: splits[scene_id % 3] for scene_id in range(recipe.frames.scenes)}
+    write_manifest(folder, build_manifest(folder, recipe, "1", split_of_scene))
     write_calibration(folder, recipe.rig)
     write_annotations(folder, folder / "annotations")
     return folder

@@ -29,7 +29,12 @@ def deep_dataset(tmp_path_factory, small_recipe, pairs):
         seen = {eye: getattr(pair.radiance, eye) for eye in EYES}
         files = encode_files(pair.images, {eye: passes.part_id for eye, passes in seen.items()})
         write_frame(folder, pair.record, files | {f"{eye}.exr": encode_passes(passes) for eye, passes in seen.items()})
-    write_manifest(folder, build_manifest(folder, recipe, "1", lambda scene_id: SPLITS[scene_id % 3]))
+    write_manifest(
+        folder,
+        build_manifest(
+            folder, recipe, "1", {scene_id: SPLITS[scene_id % 3] for scene_id in range(recipe.frames.scenes)}
+        ),
+    )
     return folder
 
 
@@ -148,7 +153,10 @@ def test_what_leaves_the_image_counts_for_the_whole(full_pairs, small_recipe, tm
     files = encode_files(pair.images, {eye: getattr(pair.radiance, eye).part_id for eye in EYES})
     write_frame(tmp_path / "dataset", pair.record, files)
     write_manifest(
-        tmp_path / "dataset", build_manifest(tmp_path / "dataset", small_recipe, "1", lambda scene_id: "val")
+        tmp_path / "dataset",
+        build_manifest(
+            tmp_path / "dataset", small_recipe, "1", dict.fromkeys(range(small_recipe.frames.scenes), "val")
+        ),
     )
     write_bop(tmp_path / "dataset", tmp_path / "bop", ExportLog())
     (info,) = json.loads(next((tmp_path / "bop").rglob("scene_gt_info_left.json")).read_text())[str(cut.frame_index)]
@@ -229,7 +237,10 @@ def test_real_lenses_are_refused(tmp_path):
     recipe = parse_recipe(
         'name = "real"\nrig = "paper-real"\nframes = { count = 1 }\n[distance]\nlaw = "stations"\nstations_m = [5.0]'
     )
-    write_manifest(tmp_path / "real", build_manifest(tmp_path / "real", recipe, "1", lambda _: "train"))
+    write_manifest(
+        tmp_path / "real",
+        build_manifest(tmp_path / "real", recipe, "1", dict.fromkeys(range(recipe.frames.scenes), "train")),
+    )
     with pytest.raises(ValueError, match="BOP holds pinhole images only"):
         write_bop(tmp_path / "real", tmp_path / "out", ExportLog())
     assert not (tmp_path / "out").exists()

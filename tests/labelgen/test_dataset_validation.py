@@ -29,7 +29,7 @@ def edit_record(dataset, pair, edit):
     path.write_text(canonical_json(table) + "\n")
     manifest = read_manifest(dataset)
     splits = {entry.scene_id: entry.split for entry in manifest.frames}
-    write_manifest(dataset, build_manifest(dataset, manifest.recipe, "1", splits.__getitem__))
+    write_manifest(dataset, build_manifest(dataset, manifest.recipe, "1", splits))
 
 
 def test_a_whole_dataset_passes(small_dataset, pairs, capfd):
@@ -132,8 +132,12 @@ def test_a_wrong_box_is_a_fault(small_dataset, full_pairs):
 
 
 def test_a_scene_in_two_splits_is_a_fault(small_dataset, small_recipe):
-    calls = iter(range(100))
-    leaky = build_manifest(small_dataset, small_recipe, "1", lambda _: "train" if next(calls) % 2 else "test")
+    manifest = read_manifest(small_dataset)
+    entries = [
+        entry.model_copy(update={"split": ("train", "test")[place >= len(manifest.frames) // 2]})
+        for place, entry in enumerate(manifest.frames)
+    ]
+    leaky = manifest.model_copy(update={"frames": tuple(entries)})
     write_manifest(small_dataset, leaky)
     assert any("is in more than one split" in fault for fault in faults_of(small_dataset))
 

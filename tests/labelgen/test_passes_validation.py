@@ -36,7 +36,7 @@ def with_passes(small_dataset, full_pairs):
 def describe(dataset, drops=()):
     manifest = read_manifest(dataset)
     splits = {entry.scene_id: entry.split for entry in manifest.frames}
-    write_manifest(dataset, build_manifest(dataset, manifest.recipe, "1", splits.__getitem__, drops))
+    write_manifest(dataset, build_manifest(dataset, manifest.recipe, "1", splits, drops))
 
 
 def changed(passes, **planes):

@@ -10,7 +10,7 @@ import pytest
 from geometry.distortion import BrownConrady, Lens
 from geometry.se3 import RigidTransform
 from geometry.stereo import paper_rig
-from nav.rim_boxes import overlap_fraction, rim_boxes
+from nav.rim_boxes import rim_boxes
 
 RIG = paper_rig()
 CAMERA = RIG.camera
@@ -57,18 +57,3 @@ def test_a_rim_where_the_lens_has_no_number_has_no_box():
     with np.errstate(over="ignore", invalid="ignore"):
         found = rim_boxes(rig, RIM_RADIUS_M, facing(1e60, 1.0))
     assert (found.left, found.right) == (None, None)
-
-
-@pytest.mark.parametrize(
-    ("other", "want"),
-    [
-        ((0.0, 0.0, 4.0, 2.0), 1.0),
-        ((2.0, 0.0, 4.0, 2.0), 1 / 3),
-        ((4.0, 0.0, 4.0, 2.0), 0.0),
-        ((1.0, 0.5, 2.0, 1.0), 1 / 4),
-        ((9.0, 9.0, 0.0, 0.0), 0.0),
-    ],
-)
-def test_what_two_boxes_share(other, want):
-    assert overlap_fraction((0.0, 0.0, 4.0, 2.0), other) == pytest.approx(want)
-    assert overlap_fraction(other, (0.0, 0.0, 4.0, 2.0)) == pytest.approx(want)

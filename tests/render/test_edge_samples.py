@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datasets_manifest.random_streams import frame_generator
 from drogue_models.parts import Part
 from geometry.stereo import EYES
 from scenes.sampler import sample_frame
-from scenes.seeding import generator
 
 pytestmark = pytest.mark.mitsuba
 
@@ -17,7 +17,7 @@ class Bits:
     """Random bits as `FrameRays` gives them."""
 
     def __init__(self, seed):
-        self._seeds = generator(seed, 0, "test")
+        self._seeds = frame_generator(seed, 0, "test")
 
     def bits(self, kinds, pixels):
         return self._seeds.integers(2**32, size=(kinds, pixels), dtype=np.uint32)

@@ -9,7 +9,7 @@ import pytest
 from datasets_manifest.recipe import load_recipe, parse_recipe
 from droguekit.batch.plan import plan_recipe
 from scenes.families import family_of_scene, recipe_of_scene, scenes_per_family
-from scenes.sampler import sample_frame, split_of_scene
+from scenes.sampler import sample_frame, split_of_scenes
 
 BASE = """
 name = "families-test"
@@ -70,7 +70,7 @@ def test_a_family_changes_what_it_names_and_no_more():
 def test_splits_and_poses_stay_as_without_families():
     with_families, without = recipe(), recipe("")
     for index in range(10):
-        assert split_of_scene(with_families, index) == split_of_scene(without, index)
+        assert split_of_scenes(with_families)[index] == split_of_scenes(without)[index]
         one, other = sample_frame(with_families, index), sample_frame(without, index)
         assert one.left_from_drogue.as_matrix().tolist() == other.left_from_drogue.as_matrix().tolist()
         assert other.family == "own"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.loss_ranges import LossRanges
+from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe import load_recipe, parse_recipe
 from drogue_models.parts import Part
 from geometry.se3 import log_twist
@@ -14,7 +15,6 @@ from labelgen.boxes import drogue_hull_m
 from scenes.light import direction_from_angles
 from scenes.loss import LossEvent, flown_m, sample_loss
 from scenes.sampler import sample_frame
-from scenes.seeding import generator
 
 FRAMES = 40
 BASE = """
@@ -48,7 +48,7 @@ def recipe(kind, seed=2, start_m=6.0, rig="", more=""):
 
 
 def event(drawn):
-    return sample_loss(generator(drawn.seed, 0, "loss"), drawn.sequence.losses, 0)
+    return sample_loss(frame_generator(drawn.seed, 0, "loss"), drawn.sequence.losses, 0)
 
 
 def lost(drawn):
@@ -138,7 +138,7 @@ def test_the_turn_is_in_the_twists():
         .replace("time_s = 0.002", "time_s = 0.0005")
         .replace("= 40", "= 2000")
     )
-    happens = sample_loss(generator(2, 0, "loss"), drawn.sequence.losses, 0)
+    happens = sample_loss(frame_generator(2, 0, "loss"), drawn.sequence.losses, 0)
     middle = round(1000 * (happens.begin_s - happens.onset_s / 2))
     earlier, frame, later = (sample_frame(drawn, middle + step) for step in (-1, 0, 1))
     relative = log_twist(earlier.left_from_drogue.inverse() @ later.left_from_drogue) / 0.002
@@ -203,9 +203,9 @@ def test_it_comes_lasts_and_goes_smoothly():
 
 def test_kinds_come_in_turn_and_draws_do_not_depend_on_them():
     ranges = LossRanges(kinds=("occlusion", "none", "glare"))
-    drawn = [sample_loss(generator(1, k, "loss"), ranges, k) for k in range(6)]
+    drawn = [sample_loss(frame_generator(1, k, "loss"), ranges, k) for k in range(6)]
     assert [None if one is None else one.kind for one in drawn] == ["occlusion", None, "glare"] * 2
-    other = sample_loss(generator(1, 0, "loss"), LossRanges(kinds=("glare",)), 0)
+    other = sample_loss(frame_generator(1, 0, "loss"), LossRanges(kinds=("glare",)), 0)
     assert (other.tilt_rad, other.side) == (drawn[0].tilt_rad, drawn[0].side)
 
 

@@ -3,13 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datasets_manifest.random_streams import bulk_frame_generator, frame_generator
 from datasets_manifest.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES
 from scenes.distance import sample_distance_m
-from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scene
-from scenes.seeding import bulk_generator, generator
+from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
 BASE = """
 name = "sampler-test"
@@ -46,7 +46,7 @@ def test_seed_zero_is_a_seed():
     )
 
 
-@pytest.mark.parametrize("make", [generator, bulk_generator])
+@pytest.mark.parametrize("make", [frame_generator, bulk_frame_generator])
 def test_streams_are_independent_of_each_other(make):
     draws = {
         key: make(*key).standard_normal(2000)
@@ -61,7 +61,7 @@ def test_streams_are_independent_of_each_other(make):
 
 def test_negative_seed_is_refused():
     with pytest.raises(ValueError, match="must not be negative"):
-        generator(-1, 0, "a")
+        frame_generator(-1, 0, "a")
 
 
 @pytest.mark.parametrize("distance_m", [1.7, 3.0, 10.0, 40.0])
@@ -125,7 +125,7 @@ def test_scenes_are_visited_evenly_and_split_whole():
     drawn = recipe()
     scenes = [scene_of_frame(drawn, index) for index in range(400)]
     assert np.bincount(scenes).tolist() == [40] * 10
-    splits = [split_of_scene(drawn, scene) for scene in range(10)]
+    splits = list(split_of_scenes(drawn).values())
     assert sorted(splits) == ["test"] + ["train"] * 7 + ["val"] * 2
 
 

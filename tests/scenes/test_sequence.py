@@ -10,7 +10,7 @@ from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.se3 import exp_twist, log_twist
 from geometry.stereo import EYES
-from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scene
+from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 from scenes.sequence import _flight
 from scenes.suspension import WORLD_FROM_TANKER
 
@@ -39,7 +39,7 @@ def test_sequences_scenes_and_times():
     assert [frame.sequence_id for frame in frames] == [index // 20 for index in range(60)]
     assert all(frame.scene_id == scene_of_frame(drawn, 20 * (index // 20)) for index, frame in enumerate(frames))
     assert {scene_of_frame(drawn, 0), scene_of_frame(drawn, 20)} == {0, 1}
-    assert len({split_of_scene(drawn, frame.scene_id) for frame in frames[:20]}) == 1
+    assert len({split_of_scenes(drawn)[frame.scene_id] for frame in frames[:20]}) == 1
     times = np.array([frame.time_s for frame in frames])
     # Mid-exposures are a fiftieth of a second apart, and sequences clearly more.
     np.testing.assert_allclose(np.diff(times)[:19], 0.02, rtol=1e-12)

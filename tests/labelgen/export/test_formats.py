@@ -141,7 +141,9 @@ def test_a_missing_package_is_named_with_its_extra(mixed_dataset, tmp_path, monk
 def test_a_dataset_that_is_still_being_rendered_is_refused(name, small_recipe, tmp_path):
     dataset = tmp_path / "dataset"
     dataset.mkdir()
-    write_manifest(dataset, build_manifest(dataset, small_recipe, "1", lambda scene_id: "train"))
+    write_manifest(
+        dataset, build_manifest(dataset, small_recipe, "1", dict.fromkeys(range(small_recipe.frames.scenes), "train"))
+    )
     with pytest.raises(ValueError, match="lists no pairs yet"):
         write_export(name, dataset, tmp_path / "out", ExportLog())
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.estimates import PoseEstimate
-from geometry.se3 import Array, RigidTransform
-from nav.filtering.so3 import exp_rotation
+from geometry.se3 import Array, RigidTransform, exp_rotation
 
 Measure = Callable[..., PoseEstimate]
 

@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.random_streams import sample_generator
 from nav.training.batches import BatchMaker
 from nav.training.corpus import Corpus
 from nav.training.painted_shapes import distract, occlude, paint_ring
 from nav.training.photometry import vary_light
-from nav.training.seeding import generator
 from nav.training.settings import build_settings
 
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])
@@ -138,9 +138,9 @@ def test_light_varies_and_the_image_given_stays() -> None:
 
 def test_streams_differ_by_every_part_of_their_key() -> None:
     keys = [(0, 0, 0, "a"), (1, 0, 0, "a"), (2**40, 0, 0, "a"), (0, 1, 0, "a"), (0, 0, 1, "a"), (0, 0, 0, "b")]
-    assert len({generator(*key).integers(2**62) for key in keys}) == len(keys)
+    assert len({sample_generator(*key).integers(2**62) for key in keys}) == len(keys)
     with pytest.raises(ValueError, match="must not be negative"):
-        generator(0, -1, 0, "a")
+        sample_generator(0, -1, 0, "a")
 
 
 @pytest.mark.parametrize("views", ["one", "both"])
