@@ -44,20 +44,20 @@ lint: setup ## formatting, style, types, walls between the packages
 
 bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (an hour; installs Blender; goes on where it stopped)
 	@scripts/setup all
-	@$(BIN)/python -m droguekit.engine_agreement --out out/engine-agreement
+	@$(BIN)/python -m studies.engine_agreement --out out/engine-agreement
 
 bench-peers: ## CPU seconds per pair of our path, plain Cycles and plain Mitsuba at equal noise (hours; installs Blender; goes on where it stopped)
 	@scripts/setup all
-	@$(BIN)/python -m droguekit.peer_comparison --out out/peer-comparison
+	@$(BIN)/python -m studies.render_cost --out out/peer-comparison
 
 bench-scaling: ## two workers against one on 200 pairs, and what a frame costs besides its work (minutes; on a machine that does nothing else; goes on where it stopped)
 	@scripts/setup all
-	@$(BIN)/python -m droguekit.batch.scaling --out out/scaling
+	@$(BIN)/python -m studies.scaling.scaling --out out/scaling
 
 CORPUS ?= out/detector/datasets/detector-small
 bench-detectors: ## detectors OURS=FILE.onnx beside YOLOv8n and YOLOv8s, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; goes on where it stopped)
 	@scripts/setup all
-	@$(BIN)/python -m droguekit.detector_peers --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
+	@$(BIN)/python -m studies.detector_comparison --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
 
 bench: ## CPU seconds per stereo pair by distance and stage, and pairs a second of all workers
 	@scripts/setup mitsuba
@@ -65,36 +65,36 @@ bench: ## CPU seconds per stereo pair by distance and stage, and pairs a second 
 
 bars-nav-a: ## accuracy bars, tier A: analytic images, day and dusk, 400 pairs a distance (hours; goes on where it stopped)
 	@scripts/setup mitsuba
-	@$(BIN)/droguekit bars a --out out/bars/a
+	@$(BIN)/python -m studies.acceptance a --out out/bars/a
 
 bars-nav-b: ## accuracy bars, tier B: path-traced images, day and dusk, 64 pairs a distance (hours; goes on where it stopped)
 	@scripts/setup mitsuba
-	@$(BIN)/droguekit bars b --out out/bars/b
+	@$(BIN)/python -m studies.acceptance b --out out/bars/b
 
 bars-nav-b-blender: ## accuracy bars, tier B by the engine Blender (hours; installs Blender; goes on where it stopped)
 	@scripts/setup all
-	@$(BIN)/droguekit bars b --out out/bars/b-blender --engine blender
+	@$(BIN)/python -m studies.acceptance b --out out/bars/b-blender --engine blender
 
 bars-nav-c: ## accuracy bars, tier C: noise, flips, covariances and tolerances at the level of centroids (minutes)
 	@scripts/setup mitsuba
-	@$(BIN)/droguekit bars c --out out/bars/c
+	@$(BIN)/python -m studies.acceptance c --out out/bars/c
 
 bars-nav-d: ## accuracy bars, tier D: markers measured wrongly, at the level of centroids (minutes)
 	@scripts/setup mitsuba
-	@$(BIN)/droguekit bars d --out out/bars/d
+	@$(BIN)/python -m studies.acceptance d --out out/bars/d
 
 bars-nav-e: ## accuracy bars, tier E: sequences behind a swinging drogue, with tracker and filter (hours; goes on where it stopped)
 	@scripts/setup mitsuba
-	@$(BIN)/droguekit bars e --out out/bars/e
+	@$(BIN)/python -m studies.acceptance e --out out/bars/e
 
 bars-nav-docking: ## accuracy bars of whole docking runs, by both engines and beside by two other sensors (days; goes on where it stopped)
 	@scripts/setup all
-	@$(BIN)/droguekit bars docking --out out/bars/docking --engine mitsuba --engine blender --rig rgb-ideal --rig paper-colour --rig mono
+	@$(BIN)/python -m studies.acceptance docking --out out/bars/docking --engine mitsuba --engine blender --rig rgb-ideal --rig paper-colour --rig mono
 
 publish: ## make the published manifests of the small recipes anew (minutes); after a change of pixels or recipes
 	@scripts/setup mitsuba
 	@rm -rf out/publish
-	@$(BIN)/python -m droguekit.batch.publish --work out/publish --out datasets_manifest/published
+	@$(BIN)/python -m studies.publish.publish --work out/publish --out datasets_manifest/published
 
 clean: ## remove the environment, caches and build results; out/ stays
 	rm -rf .venv .bootstrap build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

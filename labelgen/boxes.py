@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from datasets_manifest.records import PixelBox
+from datasets_manifest.types.records import PixelBox
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import drogue_part_ids

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.images import StereoImages
-from datasets_manifest.records import Conditions, PairRecord, PixelPoint, StereoViews, ViewRecord
+from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import Conditions, PairRecord, PixelPoint, StereoViews, ViewRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform, angles_from_rotation
@@ -15,7 +15,7 @@ from geometry.stereo import Eye
 from labelgen.boxes import full_box, leaves_image, visible_box, visible_mask
 from labelgen.marker_labels import hub_view, marker_views
 from render.engine import EyeRadiance, StereoRadiance
-from scenes.sky import REC709_LUMINANCE
+from scenes.sky.clear_sky import REC709_LUMINANCE
 
 
 def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages) -> PairRecord:

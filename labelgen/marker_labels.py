@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.records import FeatureView, HubView
+from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.records import FeatureView, HubView
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, SURROUNDING_PARTS, Part
 from geometry.circles import disc_image_centers
@@ -14,8 +14,8 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye
 from labelgen.boxes import leaves_image
 from labelgen.discs import DiscInEye, hub_discs, marker_discs, window_around
+from render.camera.sensor import MONO_WEIGHTS
 from render.engine import EyeRadiance
-from render.sensor import MONO_WEIGHTS
 
 # The surroundings that a feature stands out against reach from its edge to this multiple of its radius.
 _SURROUNDINGS_REACH = 1.8
@@ -58,7 +58,7 @@ def hub_view(
 def visible_fraction(part: int, seen: EyeRadiance) -> float:
     """Visible over amodal pixel centres of a feature; 0 where it covers none.
 
-    `labelgen.validation` faults passes in which a feature has more visible pixels than amodal ones.
+    `labelgen.validation.label_checks` faults passes in which a feature has more visible pixels than amodal ones.
     """
     amodal = seen.amodal_px.get(part, 0)
     return min(1.0, int(np.count_nonzero(seen.part_id == part)) / amodal) if amodal else 0.0

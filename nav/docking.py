@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.estimates import Docking, PoseEstimate
+from datasets_manifest.types.estimates import Docking, PoseEstimate
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig

@@ -13,23 +13,23 @@ from typing import Literal
 
 import numpy as np
 
-from datasets_manifest.estimates import Estimate, Region
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.estimates import Estimate, Region
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.both_eyes import for_each_eye
 from nav.centroids.binary_chain import NOTHING, Centroids, box_window, window_centroids
-from nav.channels import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
-from nav.correspondence import correspond, no_ring
 from nav.detector.color_blob import ColorBlobDetector
-from nav.detector.interface import Detector
-from nav.pose.interface import NoFixReason, Observation, Solution
-from nav.pose.tolerances import EXACT, StatedTolerances
-from nav.real_eyes import ideal_centroids
+from nav.detector.detector import Detector
+from nav.lens_correction import ideal_centroids
+from nav.map_views import for_each_eye
+from nav.matching.marker_channel import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
+from nav.pair_measurement import Sighting, estimate_pose, regions_of
+from nav.pose.pose_method import NoFixReason, Observation, Solution
+from nav.pose.stated_tolerances import EXACT, StatedTolerances
 from nav.refinement import refine
-from nav.rim_boxes import rim_boxes
-from nav.sighting import Sighting, estimate_pose, regions_of
+from nav.stereo_correspondence import correspond, no_ring
+from nav.tracking.rim_boxes import rim_boxes
 
 # Sources of regions that no tracker has followed: the detector, or the other eye where that alone had found the drogue.
 DETECTOR, OTHER_EYE = "detector", "other eye"

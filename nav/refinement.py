@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout
 from geometry.circles import disc_image_centers, disc_outline
 from geometry.se3 import Array, RigidTransform
@@ -18,15 +18,15 @@ from nav.centroids.centroid_quality import NoiseModel
 from nav.centroids.disc_rejection import LARGEST_SCALE
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.ellipses import Ellipses, outline_shapes, shape_radii
+from nav.centroids.face_background import SEEN_BESIDE_PX, Surroundings
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.motion_blur import Travel
 from nav.centroids.patches import WHOLE_RADIUS_PX
-from nav.centroids.surroundings import SEEN_BESIDE_PX, Surroundings
-from nav.channels import PLAIN, balancing_weight
-from nav.pose.interface import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation, Solution
+from nav.lens_correction import ideal_places, real_places
+from nav.matching.marker_channel import PLAIN, balancing_weight
 from nav.pose.joint import joint
 from nav.pose.mono import mono_lm
-from nav.real_eyes import ideal_places, real_places
+from nav.pose.pose_method import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation, Solution
 
 _OUTLINE_POINTS = 24
 # A second pose is followed to its hub when it is this likely, and shows the hub this far from the first one's.
@@ -50,10 +50,10 @@ def refine(
 
     Args:
         images: the pair.
-        color: see `nav.channels.marker_color`.
+        color: see `nav.matching.marker_channel.marker_color`.
         observation: matched markers, placed to half a pixel or so.
         rough: their pose, see `rough_pose`.
-        others_weight: see `nav.channels.marker_channel`.
+        others_weight: see `nav.matching.marker_channel.marker_channel`.
 
     Returns:
         Edge-fitted markers; those that the fit rejects (clipped, cut, shadowed, occluded) are left out. Where too few

@@ -10,21 +10,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 
-from datasets_manifest.blind import BlindPair
-from datasets_manifest.estimates import Estimate, NoFix
+from datasets_manifest.storage.blind import BlindPair
+from datasets_manifest.types.estimates import Estimate, NoFix
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import StereoRig
-from nav.detector.interface import Detector
+from nav.detector.detector import Detector
 from nav.docking import docking_of
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
-from nav.filtering.settings import FilterSettings
 from nav.filtering.smoother import SMOOTHER_SUFFIX
 from nav.navigator import CentroidChoice, Navigator
-from nav.sighting import Sighting
+from nav.pair_measurement import Sighting
 from nav.tracked_observer import TrackedObserver
 from nav.tracking.continuity import REDETECT_EVERY, begins_sequence
-from nav.tracking.registry import open_tracker
+from nav.tracking.trackers import open_tracker
 
 
 @dataclass(frozen=True)

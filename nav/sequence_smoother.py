@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datasets_manifest.estimates import Estimate, NoFix
+from datasets_manifest.types.estimates import Estimate, NoFix
 from drogue_models.marker_layout import marker_layout
 from nav.docking import docking_of
 from nav.filtering.smoother import SMOOTHER_SUFFIX, smooth

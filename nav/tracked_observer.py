@@ -5,20 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from time import perf_counter
 
-from datasets_manifest.estimates import Mode, PoseEstimate, Region
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.estimates import Mode, PoseEstimate, Region
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.detector.interface import StereoDetection
+from nav.detector.detector import StereoDetection
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.settings import FilterSettings
 from nav.navigator import DETECTOR, Navigator
-from nav.pose.interface import Solution
-from nav.rim_boxes import rim_boxes
-from nav.sighting import Sighting, regions_of
+from nav.pair_measurement import Sighting, regions_of
+from nav.pose.pose_method import Solution
 from nav.tracking.continuity import is_same_place
-from nav.tracking.interface import Tracker
+from nav.tracking.rim_boxes import rim_boxes
+from nav.tracking.tracker import Tracker
 
 _NOWHERE = StereoDetection(None, None)
 

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec
 from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye, StereoRig
 from render.stars import add_stars
-from scenes.surroundings import Surroundings, surroundings
+from scenes.environment_radiance import Surroundings, surroundings
 
 # The clear sky varies over many degrees; the paper's camera has 37 px a degree.
 _COARSE_STEP_PX = 8

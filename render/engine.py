@@ -9,8 +9,8 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.recipe import RenderSettings
+from datasets_manifest.recipe.recipe import RenderSettings
+from datasets_manifest.types.frame import FrameSpec
 
 ENTRY_POINT_GROUP = "droguekit.engines"
 """Where other packages name their engines: classes that are made without arguments."""

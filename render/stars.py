@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.stereo import Eye, StereoRig
-from scenes.night import EXTINCTION_MAG, star_catalogue
+from scenes.sky.night import EXTINCTION_MAG, star_catalogue
 
 _FAR_M = 1e9
 # Towards the horizon the air takes the rest.

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.target import AS_NEW, SurfaceCondition
+from datasets_manifest.types.appearance import AS_NEW, SurfaceCondition
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.materials import part_reflectance_rgb
 from drogue_models.parts import FIRST_MARKER_ID, SURROUNDING_PARTS, Part
-from scenes.dirt import DIRT_RGB, dirt_map
-from scenes.sky import REC709_LUMINANCE
+from render.dirt import DIRT_RGB, dirt_map
+from scenes.sky.clear_sky import REC709_LUMINANCE
 
 SMOOTH_PARTS = (Part.RIM, Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
 """Parts with interpolated normals, which those with edges too must have creases for; others have flat faces."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.pose_ranges import DistanceLaw
+from datasets_manifest.recipe.pose_ranges import DistanceLaw
 
 
 def sample_distance_m(rng: np.random.Generator, law: DistanceLaw, frame_index: int) -> float:

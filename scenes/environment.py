@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.environment_map import EnvironmentMap, MapRanges
-from datasets_manifest.environment_ranges import EnvironmentRanges
-from datasets_manifest.frame import Environment
-from datasets_manifest.ground import GroundKind
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.ranges import Range
-from datasets_manifest.weather import CloudLayer, Mist, Moon
-from datasets_manifest.weather_ranges import Clouds, MistRanges, MoonRanges
+from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
+from datasets_manifest.recipe.weather_ranges import Clouds, MistRanges, MoonRanges
+from datasets_manifest.types.environment_map import EnvironmentMap, MapRanges
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.ground import GroundKind
+from datasets_manifest.types.ranges import Range
+from datasets_manifest.types.weather import CloudLayer, Mist, Moon
 from drogue_models.parameters import ReflectanceRgb
-from scenes.environment_map import load_map
-from scenes.ground import MEAN_REFLECTANCE
+from scenes.ground.ground_radiance import MEAN_REFLECTANCE
+from scenes.sky.equirectangular_sky import load_map
 
 # How much brighter or darker, and how much redder or bluer, the ground of a scene is than its kind's mean.
 _GROUND_SPREAD, _GROUND_TINT = 0.25, 0.06

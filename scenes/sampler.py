@@ -6,23 +6,23 @@ from typing import Literal
 
 import numpy as np
 
-from datasets_manifest.board import PlacedBoard
-from datasets_manifest.frame import Environment, FrameSpec
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe import Recipe
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.types.calibration_board import PlacedBoard
+from datasets_manifest.types.frame import Environment, FrameSpec
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
+from scenes.auto_exposure import meter
 from scenes.distance import sample_distance_m
+from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_bystanders
 from scenes.environment import environment_of_scene
-from scenes.families import recipe_of_scene
+from scenes.flight.frame_kinematics import Moment
+from scenes.flight.receiver import sample_attitude
+from scenes.flight.sequence import moment_of_sequence
+from scenes.flight.suspension import sample_suspension
 from scenes.framing import outline, sample_pose
-from scenes.metering import meter
-from scenes.moment import Moment
-from scenes.rangefinder import sample_reading_m
-from scenes.receiver import sample_attitude
-from scenes.sequence import moment_of_sequence
-from scenes.suspension import sample_suspension
-from scenes.target import condition_of_scene, drogue_of_scene, sample_bystanders
+from scenes.rangefinder_reading import sample_reading_m
+from scenes.scene_family import recipe_of_scene
 
 SplitName = Literal["train", "val", "test"]
 SPLITS: tuple[SplitName, ...] = ("train", "val", "test")

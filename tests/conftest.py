@@ -34,9 +34,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shipped recipe `smoke`, rendered once by the real engine; to be read only (copy it to change it)."""
-    from datasets_manifest.recipe import load_recipe
-    from droguekit.batch.local import render_dataset
+    from datasets_manifest.recipe.recipe import load_recipe
     from droguekit.batch.progress import PlainProgress
+    from droguekit.batch.render_dataset import render_dataset
 
     recipe, text = load_recipe("smoke")
     out = tmp_path_factory.mktemp("smoke") / "dataset"

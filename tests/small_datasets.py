@@ -9,9 +9,9 @@ import io
 from collections.abc import Iterable
 from pathlib import Path
 
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import render_dataset
+from datasets_manifest.recipe.recipe import parse_recipe
 from droguekit.batch.progress import PlainProgress
+from droguekit.batch.render_dataset import render_dataset
 
 # The ideal eyes with an eighth and a quarter of their pixels a side, at the same field of view.
 RIG_160_PX = """[rig]

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from datasets_manifest.importers.image_folder import image_key
-from datasets_manifest.records import PixelBox
+from datasets_manifest.types.records import PixelBox
 
 
 def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:

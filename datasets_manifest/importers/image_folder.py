@@ -9,8 +9,8 @@ from pathlib import Path, PurePath
 import cv2
 import numpy as np
 
-from datasets_manifest.images import Pixels
-from datasets_manifest.importers.source import SourcePair
+from datasets_manifest.importers.pair_source import SourcePair
+from datasets_manifest.types.images import Pixels
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 # Two folders of equal names, in the order in which they are looked for.

@@ -15,12 +15,12 @@ from functools import cache, lru_cache, partial
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
-from datasets_manifest.layout import EVENTS_FILE
-from datasets_manifest.provenance import cpu_features, software_versions
-from datasets_manifest.storage import absolute, open_storage
+from datasets_manifest.storage.layout import EVENTS_FILE
+from datasets_manifest.storage.provenance import cpu_features, software_versions
+from datasets_manifest.storage.storage import absolute, open_storage
 from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
 from droguekit.batch.machine import resident_gib
-from droguekit.batch.stop import StopRequest
+from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.workers import MAX_ATTEMPTS, Attempt, run_alone
 from render.engine import load_engine
 

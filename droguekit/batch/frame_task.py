@@ -12,18 +12,18 @@ from functools import cache
 
 import cv2
 
-from datasets_manifest.layout import passes_file
-from datasets_manifest.packing import Packing, pack_if_complete
-from datasets_manifest.recipe import Recipe
-from datasets_manifest.records import PairRecord
-from datasets_manifest.storage import Location
-from datasets_manifest.writer import encode_files, write_frame
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.storage.layout import passes_file
+from datasets_manifest.storage.packing import Packing, pack_if_complete
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.storage.writer import encode_files, write_frame
+from datasets_manifest.types.records import PairRecord
 from geometry.stereo import EYES, Eye
 from labelgen.frame_labels import label_frame
-from labelgen.validation import check_against_passes
+from labelgen.validation.label_checks import check_against_passes
+from render.camera.sensor import expose
 from render.engine import EyeRadiance, RenderEngine, StereoRadiance, load_engine
-from render.exr import encode_passes
-from render.sensor import expose
+from render.exr_writer import encode_passes
 from scenes.sampler import sample_frame
 
 

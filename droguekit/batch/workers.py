@@ -10,7 +10,7 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, Generic, TypeVar, cast
 
-from droguekit.batch.stop import StopRequest
+from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.worker_process import READY, UNTIMED, TaskTimeoutError, Worker, WorkerDiedError
 
 T = TypeVar("T")

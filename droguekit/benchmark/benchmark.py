@@ -6,23 +6,29 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from datasets_manifest.estimates import Estimate, PoseEstimate, read_estimates
-from datasets_manifest.reader import Dataset
-from datasets_manifest.storage import Location
-from droguekit.benchmark.centroid_errors import CentroidErrors, centroid_errors
-from droguekit.benchmark.comparisons import PairGroups, compare
-from droguekit.benchmark.distance_bins import DistanceBin
-from droguekit.benchmark.frame_scores import frame_scores
-from droguekit.benchmark.frame_truth import DrogueTruth, drogue_truth
-from droguekit.benchmark.pose_errors import by_method
-from droguekit.benchmark.ranking import PAPER_METHOD, best_method
-from droguekit.benchmark.reference import Reference, build_reference
-from droguekit.benchmark.result import BenchmarkResult, BinRow, DatasetFacts, EmptyFrames, MethodResult
-from droguekit.benchmark.result_parts import Comparison
-from droguekit.benchmark.sequence_scores import score_sequences
-from droguekit.benchmark.sequence_truth import TrueSequence, moment, true_sequences
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
+from droguekit.benchmark.poses.centroid_errors import CentroidErrors, centroid_errors
+from droguekit.benchmark.poses.comparisons import PairGroups, compare
+from droguekit.benchmark.poses.distance_bins import DistanceBin
+from droguekit.benchmark.poses.frame_scores import frame_scores
+from droguekit.benchmark.poses.frame_truth import DrogueTruth, drogue_truth
+from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.poses.ranking import PAPER_METHOD, best_method
+from droguekit.benchmark.poses.reference import Reference, build_reference
+from droguekit.benchmark.poses.summary import FrameScore, summarize
+from droguekit.benchmark.results.benchmark_result import (
+    BenchmarkResult,
+    BinRow,
+    DatasetFacts,
+    EmptyFrames,
+    MethodResult,
+)
+from droguekit.benchmark.results.result_parts import Comparison
+from droguekit.benchmark.sequences.sequence_scores import score_sequences
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
 from droguekit.benchmark.statistics import CONFIDENCE, fraction_interval
-from droguekit.benchmark.summary import FrameScore, summarize
 
 __all__ = ["BenchmarkResult", "run_benchmark", "score"]
 

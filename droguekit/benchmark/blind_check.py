@@ -11,17 +11,17 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from datasets_manifest.blind import BlindIndex, read_blind_index
-from datasets_manifest.estimates import Estimate, PoseEstimate, read_estimates
-from datasets_manifest.frame_store import FrameStore
-from datasets_manifest.layout import ANNOTATIONS_FOLDER
-from datasets_manifest.reader import read_sought
-from datasets_manifest.records import PixelBox
-from datasets_manifest.storage import Location, open_storage
+from datasets_manifest.storage.blind import BlindIndex, read_blind_index
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
+from datasets_manifest.storage.reader import read_sought
+from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
+from datasets_manifest.types.records import PixelBox
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
-from droguekit.benchmark.pose_errors import by_method
-from droguekit.benchmark.result_parts import ResultModel
+from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.results.result_parts import ResultModel
 from geometry.boxes import intersection_over_union
 from geometry.circles import disc_image_centers, disc_outline
 from geometry.se3 import Array, RigidTransform

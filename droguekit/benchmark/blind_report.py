@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from datasets_manifest.atomic import write_text_atomic
-from datasets_manifest.blind import BlindDataset, read_blind_index
-from datasets_manifest.estimates import PoseEstimate, read_estimates
-from datasets_manifest.storage import Location
+from datasets_manifest.storage.blind import BlindDataset, read_blind_index
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.estimates import PoseEstimate, read_estimates
 from droguekit.benchmark.blind_check import BlindCheck, blind_scenes, marker_images_px, rim_box_px
-from droguekit.benchmark.contact_sheet import Tile, label_picture, spread, tile_of
-from droguekit.benchmark.label_drawing import display_picture
-from droguekit.benchmark.number_text import percent, plain_number, three_digits
-from droguekit.benchmark.report import page_template
+from droguekit.benchmark.report.label_drawing import display_picture
+from droguekit.benchmark.report.label_thumbnails import Tile, label_picture, spread, tile_of
+from droguekit.benchmark.report.number_text import percent, plain_number, three_digits
+from droguekit.benchmark.report.report import page_template
 
 COLUMNS = ("pose found", "residual [px]", "views with a box", "middle in box", "overlap")
 _MOST_TILES = 12

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from datasets_manifest.storage import Location, as_location
+from datasets_manifest.storage.storage import Location, as_location
 
 if TYPE_CHECKING:
     Place = Location

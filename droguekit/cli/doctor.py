@@ -53,7 +53,7 @@ def doctor() -> None:
 
 
 def _show_machine() -> None:
-    from datasets_manifest.provenance import cpu_features
+    from datasets_manifest.storage.provenance import cpu_features
     from droguekit.batch.machine import available_cores, available_memory_gib, default_workers
 
     typer.echo(f"python     {platform.python_version()}, {sys.executable}")
@@ -85,7 +85,7 @@ def _show_viewer() -> None:
 
 def _show_browser() -> None:
     """Look for a browser, which is optional: nothing but the PDF of `report` needs it."""
-    from droguekit.paper_report.print_pdf import NO_BROWSER, find_browser
+    from droguekit.visualization.print_pdf import NO_BROWSER, find_browser
 
     found = find_browser()
     if found is None:

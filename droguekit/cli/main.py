@@ -7,36 +7,57 @@ import importlib
 import keyword
 import os
 import sys
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer.core import TyperGroup
 
 DONE, FAULT, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
-# Every command lives in the module and the function of its name, imported only when it is asked for.
+
+class Command(NamedTuple):
+    """One command.
+
+    Attributes:
+        module: that holds the function of the command's name; imported only when the command is asked for.
+        summary: one line for the list of commands.
+    """
+
+    module: str
+    summary: str
+
+
 COMMANDS = {
-    "plan": "Show what a recipe will make, how long it takes and how large it gets.",
-    "render": "Make a dataset from a recipe; goes on where it stopped.",
-    "merge": "Join shards of a dataset that were made apart.",
-    "import": "Make a dataset from real stereo images, without truth.",
-    "validate": "Check a dataset: files, hashes, labels against part ids.",
-    "reproduce": "Make one frame of a dataset again and compare.",
-    "export": "Write a dataset's labels in another format.",
-    "preview": "Draw a contact sheet of a dataset with its labels.",
-    "browse": "Write a page to look through a dataset in a browser.",
-    "view": "Show a dataset in the rerun viewer: images, labels, 3-D, errors.",
-    "detect": "Find the drogue in every image, without the truth.",
-    "train": "Train a detector on datasets, evaluate and export it.",
-    "navigate": "Estimate the drogue's pose in every pair, without the truth.",
-    "benchmark": "Compare estimates with the truth: numbers and a report.",
-    "report": "Put our numbers beside the seed paper's: its tables and figures, as page and PDF.",
-    "model": "Write the drogue as a mesh.",
-    "demo": "Render a small dataset, navigate on it, and report.",
-    "bars": "Measure the accuracy bars of a tier: reached or not.",
-    "bench": "Measure the CPU time of a pair by distance and stage.",
-    "doctor": "Show what is installed and which engines work.",
+    "plan": Command(
+        "droguekit.cli.dataset.plan", "Show what a recipe will make, how long it takes and how large it gets."
+    ),
+    "render": Command("droguekit.cli.dataset.render", "Make a dataset from a recipe; goes on where it stopped."),
+    "merge": Command("droguekit.cli.dataset.merge", "Join shards of a dataset that were made apart."),
+    "import": Command("droguekit.cli.dataset.import_", "Make a dataset from real stereo images, without truth."),
+    "validate": Command("droguekit.cli.dataset.validate", "Check a dataset: files, hashes, labels against part ids."),
+    "reproduce": Command("droguekit.cli.dataset.reproduce", "Make one frame of a dataset again and compare."),
+    "export": Command("droguekit.cli.dataset.export", "Write a dataset's labels in another format."),
+    "preview": Command("droguekit.cli.viewing.preview", "Draw a contact sheet of a dataset with its labels."),
+    "browse": Command("droguekit.cli.viewing.browse", "Write a page to look through a dataset in a browser."),
+    "view": Command("droguekit.cli.viewing.view", "Show a dataset in the rerun viewer: images, labels, 3-D, errors."),
+    "detect": Command("droguekit.cli.navigation.detect", "Find the drogue in every image, without the truth."),
+    "train": Command("droguekit.cli.navigation.train", "Train a detector on datasets, evaluate and export it."),
+    "navigate": Command(
+        "droguekit.cli.navigation.navigate", "Estimate the drogue's pose in every pair, without the truth."
+    ),
+    "benchmark": Command(
+        "droguekit.cli.navigation.benchmark", "Compare estimates with the truth: numbers and a report."
+    ),
+    "report": Command(
+        "studies.paper.command", "Put our numbers beside the seed paper's: its tables and figures, as page and PDF."
+    ),
+    "model": Command("droguekit.cli.viewing.model", "Write the drogue as a mesh."),
+    "demo": Command("droguekit.cli.demo", "Render a small dataset, navigate on it, and report."),
+    "bench": Command("droguekit.cli.bench", "Measure the CPU time of a pair by distance and stage."),
+    "doctor": Command("droguekit.cli.doctor", "Show what is installed and which engines work."),
 }
+# Commands whose module is in the repository and not in the wheel.
+_STUDIES = "studies."
 
 HELP = """Synthetic stereo pairs of a refuelling drogue with ground truth, and navigation measured against it.
 
@@ -50,16 +71,20 @@ def load_command(name: str) -> Any:
     """The command `name`, its module imported now; None where there is none."""
     if name not in COMMANDS:
         return None
+    chosen = COMMANDS[name]
+    try:
+        module = importlib.import_module(chosen.module)
+    except ModuleNotFoundError as error:
+        if not (error.name and f"{error.name}.".startswith(_STUDIES)):
+            raise
+        raise ValueError(f"{name}: is no part of the installed package; run it in a clone of the repository") from error
     # Python keeps some words for itself, such as `import`.
-    name_in_code = f"{name}_" if keyword.iskeyword(name) else name
-    module = importlib.import_module(f"droguekit.cli.{name_in_code}")
+    function = getattr(module, f"{name}_" if keyword.iskeyword(name) else name)
     examples: tuple[str, ...] = getattr(module, "EXAMPLES", ())
     # The backspace keeps the help's line breaks.
     epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in examples)]) if examples else None
     app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command(name=name, epilog=epilog, short_help=COMMANDS[name], no_args_is_help=False)(
-        getattr(module, name_in_code)
-    )
+    app.command(name=name, epilog=epilog, short_help=chosen.summary, no_args_is_help=False)(function)
     return typer.main.get_command(app)
 
 
@@ -77,7 +102,7 @@ class LazyGroup(TyperGroup):
     def format_commands(self, ctx: typer.Context, formatter: Any) -> None:  # type: ignore[override]
         """List the commands for `--help` without importing them."""
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([(name, command.summary) for name, command in COMMANDS.items()])
 
 
 app = typer.Typer(

@@ -15,22 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.layout import passes_file
-from datasets_manifest.manifest import SplitName
-from datasets_manifest.passes import read_passes
-from datasets_manifest.png import encode_png
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
-from datasets_manifest.storage import Location
-from datasets_manifest.writer import canonical_json
+from datasets_manifest.storage.exr_passes import read_passes
+from datasets_manifest.storage.layout import passes_file
+from datasets_manifest.storage.manifest import SplitName
+from datasets_manifest.storage.png import encode_png
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.storage.writer import canonical_json
+from datasets_manifest.types.records import PairRecord
 from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import EYES, Eye
 from labelgen.export.bop_models import MM_PER_M, object_id, write_models
+from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import place_image
-from labelgen.export.log import ExportLog
-from labelgen.masks import Mask, amodal_masks, joined, visible_mask_of
+from labelgen.part_masks import Mask, amodal_masks, joined, visible_mask_of
 
 SPLIT_FOLDERS: dict[SplitName, str] = {"train": "train_pbr", "val": "val", "test": "test"}
 TARGETS_FILE = "test_targets_bop19.json"

@@ -10,9 +10,9 @@ import trimesh
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
-from datasets_manifest.recipe import Recipe
-from datasets_manifest.records import PairRecord
-from datasets_manifest.writer import canonical_json
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.storage.writer import canonical_json
+from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters

@@ -10,15 +10,15 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.layout import parts_file
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
-from datasets_manifest.storage import Location, Storage, join, open_storage
-from datasets_manifest.writer import canonical_json
+from datasets_manifest.storage.layout import parts_file
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location, Storage, join, open_storage
+from datasets_manifest.storage.writer import canonical_json
+from datasets_manifest.types.records import PairRecord
 from geometry.stereo import EYES, Eye
 from labelgen.export.coco_entries import coco_annotation, coco_features, coco_header, coco_image
+from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import count_absent_keypoints, count_cuts, keypoint_count, view_keypoints, view_of
-from labelgen.export.log import ExportLog
 
 
 def write_annotations(dataset: Location, out: Location) -> list[Location]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.layout import FRAMES_FOLDER, image_file, parts_file
-from datasets_manifest.manifest import Manifest
-from datasets_manifest.records import FeatureView, PairRecord, PixelBox, PixelPoint
+from datasets_manifest.storage.layout import FRAMES_FOLDER, image_file, parts_file
+from datasets_manifest.storage.manifest import Manifest
+from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, PixelPoint
 from drogue_models.parts import Part, marker_id
 from geometry.stereo import EYES, Eye
 from labelgen.export.keypoints import (

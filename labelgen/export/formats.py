@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from datasets_manifest.storage import Location, open_storage
-from labelgen.export.log import ExportLog
+from datasets_manifest.storage.storage import Location, open_storage
+from labelgen.export.export_log import ExportLog
 
 Writer = Callable[[Location, Path, ExportLog], list[Path]]
 
@@ -47,7 +47,7 @@ FORMATS: dict[str, ExportFormat] = {
     "yolo-detect": ExportFormat(
         "ultralytics boxes of drogue, markers and hub", "labelgen.export.yolo:write_yolo_detect"
     ),
-    "speed": ExportFormat("SPEED+ pose lists and camera, a folder an eye", "labelgen.export.speed:write_speed"),
+    "speed": ExportFormat("SPEED+ pose lists and camera, a folder an eye", "labelgen.export.speed_plus:write_speed"),
     "kitti": ExportFormat("KITTI calibration, boxes and images", "labelgen.export.kitti:write_kitti"),
     "webdataset": ExportFormat(
         "tar shards of images, part ids and records", "labelgen.export.tar_shards:write_webdataset"
@@ -60,13 +60,13 @@ FORMATS: dict[str, ExportFormat] = {
     "bop": ExportFormat(
         "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.bop:write_bop"
     ),
-    "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.masks:write_masks"),
-    "opencv": ExportFormat("the rig as OpenCV's stereo YAML", "labelgen.export.calibration:write_opencv"),
-    "kalibr": ExportFormat("the rig as Kalibr's camera chain", "labelgen.export.calibration:write_kalibr"),
+    "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.mask_images:write_masks"),
+    "opencv": ExportFormat("the rig as OpenCV's stereo YAML", "labelgen.export.calibration_export:write_opencv"),
+    "kalibr": ExportFormat("the rig as Kalibr's camera chain", "labelgen.export.calibration_export:write_kalibr"),
     "ros-camera-info": ExportFormat(
-        "the rig as ROS camera_info, a file an eye", "labelgen.export.calibration:write_camera_info"
+        "the rig as ROS camera_info, a file an eye", "labelgen.export.calibration_export:write_camera_info"
     ),
-    "blind": ExportFormat("images, rig and drogue without any truth", "labelgen.export.blind:write_blind"),
+    "blind": ExportFormat("images, rig and drogue without any truth", "labelgen.export.blind_export:write_blind"),
 }
 
 
@@ -101,7 +101,7 @@ def write_export(name: str, dataset: Location, out: Path, log: ExportLog) -> lis
     if folder is not None and out.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"--out: must lie outside the dataset's folder, got {out}")
     # Imported here, as the list of formats is also the command's help, which loads nothing that reads a dataset.
-    from datasets_manifest.manifest import read_manifest
+    from datasets_manifest.storage.manifest import read_manifest
 
     if not read_manifest(dataset).frames:
         raise ValueError(f"{dataset}: its manifest lists no pairs yet; let `render` finish first")

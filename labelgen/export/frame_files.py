@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets_manifest.layout import image_file
-from datasets_manifest.png import decode_png, encode_png
-from datasets_manifest.reader import Dataset
+from datasets_manifest.storage.layout import image_file
+from datasets_manifest.storage.png import decode_png, encode_png
+from datasets_manifest.storage.reader import Dataset
 from geometry.stereo import Eye
-from labelgen.export.log import ExportLog
+from labelgen.export.export_log import ExportLog
 
 
 def place_file(source: Dataset, frame_index: int, name: str, target: Path) -> None:

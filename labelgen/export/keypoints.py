@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from datasets_manifest.manifest import Manifest
-from datasets_manifest.records import PairRecord, ViewRecord
+from datasets_manifest.storage.manifest import Manifest
+from datasets_manifest.types.records import PairRecord, ViewRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye
-from labelgen.export.log import ExportLog
+from labelgen.export.export_log import ExportLog
 
 # A marker counts as visible from half of its pixels on.
 _VISIBLE_FROM_FRACTION = 0.5

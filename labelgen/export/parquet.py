@@ -14,16 +14,16 @@ import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from datasets_manifest.atomic import part_path, sync_folder
-from datasets_manifest.layout import FRAMES_FOLDER, image_file
-from datasets_manifest.manifest import Manifest
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import FeatureView, PairRecord, PixelBox
-from datasets_manifest.storage import Location
-from datasets_manifest.writer import canonical_json
+from datasets_manifest.storage.layout import FRAMES_FOLDER, image_file
+from datasets_manifest.storage.manifest import Manifest
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.storage.writer import canonical_json
+from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox
 from geometry.stereo import EYES, Eye
 from labelgen.export.coco_entries import coco_image_id
+from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import view_of
-from labelgen.export.log import ExportLog
 
 TABLE_FILE = "views.parquet"
 _ROWS_AT_ONCE = 2048

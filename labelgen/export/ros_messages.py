@@ -14,8 +14,8 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.calibration import opencv_stereo_matrices
-from datasets_manifest.images import StereoImages
+from datasets_manifest.calibration.calibration import opencv_stereo_matrices
+from datasets_manifest.types.images import StereoImages
 from geometry.body_axes import FLU_FROM_FRD
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig

@@ -11,12 +11,12 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
-from datasets_manifest.storage import Location
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.records import PairRecord
 from geometry.stereo import EYES, StereoRig
 from labelgen.export import ros_messages as ros
-from labelgen.export.log import ExportLog
+from labelgen.export.export_log import ExportLog
 from labelgen.export.sequences import SequenceOrder, sequence_name
 
 POSE_TOPIC = "/drogue/pose"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
-from datasets_manifest.records import PixelBox
+from datasets_manifest.types.records import PixelBox
 from labelgen.boxes import visible_mask
 from labelgen.part_pixels import FeaturePixels
 

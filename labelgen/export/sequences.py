@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datasets_manifest.records import PairRecord
+from datasets_manifest.types.records import PairRecord
 
 _LATEST_S = 2.0**31
 

@@ -11,11 +11,11 @@ import tarfile
 from pathlib import Path
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
-from datasets_manifest.storage import Location
-from datasets_manifest.writer import canonical_json
-from labelgen.export.log import ExportLog
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.storage.writer import canonical_json
+from datasets_manifest.types.records import PairRecord
+from labelgen.export.export_log import ExportLog
 
 SHARD_BYTES = 500_000_000
 """A shard ends before it would grow beyond this, unless one sample is larger."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
-from datasets_manifest.storage import Location
-from labelgen.export.log import ExportLog
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.records import PairRecord
+from labelgen.export.export_log import ExportLog
 from labelgen.export.sequences import SequenceOrder, sequence_name
 
 _HEADER = (

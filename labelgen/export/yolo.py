@@ -10,15 +10,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.manifest import Manifest
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
-from datasets_manifest.storage import Location
+from datasets_manifest.storage.manifest import Manifest
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
 from labelgen.export.coco import read_part_ids
 from labelgen.export.coco_entries import HUB, MARKER, coco_annotation, coco_features
+from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import place_image
 from labelgen.export.keypoints import (
     ABSENT,
@@ -29,7 +30,6 @@ from labelgen.export.keypoints import (
     view_keypoints,
     view_of,
 )
-from labelgen.export.log import ExportLog
 
 _CLASSES = ("drogue", "marker", "hub")
 _CLASS_OF_CATEGORY = {MARKER: 1, HUB: 2}

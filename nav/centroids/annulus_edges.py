@@ -23,15 +23,16 @@ from nav.centroids.annulus_model import (
 )
 from nav.centroids.annulus_places import AMPLITUDE, BACKGROUND, INNER, OUTER
 from nav.centroids.annulus_response import response_pictures, starting_with_pictures, with_pictures
+from nav.centroids.background_glare import without_glare
 from nav.centroids.centroid_quality import NoiseModel, beyond_linear, measure_noise, residual_spread
 from nav.centroids.edge_model import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.glare import without_glare
-from nav.centroids.least_squares import Minimum, Model, evaluate, minimise
-from nav.centroids.marker_signal import Array32, MarkerSignal
+from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import Travel, moving, share_outside_along
 from nav.centroids.patches import PixelSet, annulus_pixels, edge_distances
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model, evaluate, minimise
 
 # Azimuthal order of the light on the annulus; a thin one has too few pixels to tell high orders from its outline.
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5

@@ -9,10 +9,10 @@ from nav.centroids.annulus_places import AMPLITUDE, BACKGROUND, CENTERS, HOLE, I
 from nav.centroids.edge_pictures import draw_annuli
 from nav.centroids.edge_profile import START_WIDTH_PX, edge_widths, ellipse_parameters
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.least_squares import Minimum, Model
-from nav.centroids.marker_signal import Array32
-from nav.centroids.matrix_loops import tie_rows
 from nav.centroids.patches import PixelSet, edge_distances
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model
+from nav.numerics.matrix_loops import tie_rows
 
 SLOPE_TURNS = 5
 

@@ -7,10 +7,10 @@ import numpy as np
 from geometry.se3 import Array
 from nav.centroids.annulus_places import BACKGROUND, HOLE, INNER, OUTER
 from nav.centroids.edge_pictures import add_box_pictures
-from nav.centroids.least_squares import Minimum, Model, NormalEquations
-from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet
 from nav.centroids.pixel_response import BOX_PICTURES
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations
 
 
 def response_pictures(pixels: PixelSet, parameters: Array, shares: tuple[Array32, Array32], light: Array32) -> Array32:

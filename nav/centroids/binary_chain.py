@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.images import Pixels
+from datasets_manifest.types.images import Pixels
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
-from nav.blobs import Blobs, disc_like_blobs
-from nav.channels import Window
-from nav.ring_match import RingMatch, match_ring
+from nav.matching.blobs import Blobs, disc_like_blobs
+from nav.matching.marker_channel import Window
+from nav.matching.ring_matching import RingMatch, match_ring
 
 # Share of the box added on every side, so that a box that is a little too small cuts no marker.
 _BOX_MARGIN_FRACTION = 0.06

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.centroids.least_squares import Minimum
-from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet
 from nav.centroids.pixel_sums import piece_sums, sector_sums, zone_sums
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum
 
 # Rounding to integers. [DN^2]
 _QUANTISATION_DN2 = 1 / 12

@@ -8,9 +8,9 @@ from geometry.se3 import Array
 from nav.centroids.disc_places import BACKGROUND, ELLIPSE_PARAMETERS, LEVEL, REST, WIDTH
 from nav.centroids.edge_pictures import draw_discs
 from nav.centroids.edge_profile import START_WIDTH_PX, edge_widths, ellipse_parameters
-from nav.centroids.least_squares import Minimum, Model
-from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet, edge_distances
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model
 
 # An initial outline may be this far off; pixels this far from it show one side only. [px]
 _CLEAR_PX = 1.0

@@ -9,9 +9,9 @@ from nav.centroids.centroid_quality import NoiseModel, ResidualSpread
 from nav.centroids.disc_model import contrasts
 from nav.centroids.edge_profile import parameter_shapes
 from nav.centroids.ellipses import Ellipses, are_positive, shape_radii
-from nav.centroids.least_squares import Minimum
-from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import PixelSet
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum
 
 # Of a pixel's noise: fainter discs start from noise and end anywhere. Small ones are told by so few pixels that their
 # centre's own deviation [px] says when they are too faint.

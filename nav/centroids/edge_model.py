@@ -22,14 +22,15 @@ from nav.centroids.disc_places import BACKGROUND, LEVEL, WIDTH
 from nav.centroids.disc_rejection import rejection_reasons
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.least_squares import Minimum, Model, evaluate, minimise
-from nav.centroids.marker_signal import Array32, MarkerSignal
+from nav.centroids.face_background import Surroundings, on_the_face, seen_beside_px, shares_beyond
+from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import Travel, fit_travel, moving, seen_travel
 from nav.centroids.patches import PixelSet, disc_pixels
 from nav.centroids.pixel_response import without_pixel_response
 from nav.centroids.single_color import with_even_others
-from nav.centroids.surroundings import Surroundings, on_the_face, seen_beside_px, shares_beyond
 from nav.centroids.working_memory import keep_freed_memory
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model, evaluate, minimise
 
 # Shading of a smaller disc can hardly be told from a shift of it: fitting it adds 30 % of noise here, 100 % at 4 px.
 _LEAST_RADIUS_FOR_SHADING_PX = 7.5

@@ -11,9 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from nav.centroids import annulus_places, disc_places
-from nav.centroids.marker_signal import Array32
-from nav.centroids.rows import add_row, multiply_rows
-from nav.compiled import compiled, float_of_bits
+from nav.numerics.compiled import Array32, compiled, float_of_bits
+from nav.numerics.rows import add_row, multiply_rows
 
 _F = np.float32
 _ONE, _HALF = _F(1), _F(0.5)

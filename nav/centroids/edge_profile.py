@@ -7,8 +7,8 @@ import numpy as np
 from geometry.se3 import Array
 from nav.centroids.edge_pictures import blurred_steps
 from nav.centroids.ellipses import shape_inverses
-from nav.centroids.marker_signal import Array32
 from nav.centroids.patches import edge_distances
+from nav.numerics.compiled import Array32
 
 # Blur of the pixel's box (1/12 px^2) and of a lens and sensor with a Gaussian of 0.5 px: where the fit starts. [px]
 START_WIDTH_PX = float(np.sqrt(0.25 + 1 / 12))

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.images import Pixels, StereoImages
+from datasets_manifest.types.images import Pixels, StereoImages
 from geometry.stereo import EYES, Eye
 from nav.centroids.ellipses import Ellipses
-from nav.channels import PLAIN, marker_channel, signed_lead
-
-Array32 = NDArray[np.float32]
+from nav.matching.marker_channel import PLAIN, marker_channel, signed_lead
+from nav.numerics.compiled import Array32
 
 # Room around an outline: the widest window about it, of one that moves by 30 px while the shutter is open, and what an
 # initial centre may be off. [px]
@@ -80,9 +79,9 @@ def marker_signals(
 
     Args:
         images: the pair.
-        color: see `nav.channels.marker_color`.
+        color: see `nav.matching.marker_channel.marker_color`.
         ellipses: where to look; outlines over the image's edge are allowed.
-        others_weight: see `nav.channels.marker_channel`.
+        others_weight: see `nav.matching.marker_channel.marker_channel`.
     """
     signals = []
     for index, eye in enumerate(EYES):

@@ -14,11 +14,11 @@ from geometry.se3 import Array
 from nav.centroids.disc_places import ELLIPSE_PARAMETERS, WIDTH
 from nav.centroids.edge_profile import edge_widths, share_outside
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.least_squares import Minimum, Model, NormalEquations
-from nav.centroids.marker_signal import Array32
-from nav.centroids.matrix_loops import add_rows
 from nav.centroids.patches import PixelSet
 from nav.centroids.shared_parameters import least_of_all, reduced_equations
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations
+from nav.numerics.matrix_loops import add_rows
 
 # Shorter ways leave an edge that the fit of a still one follows, and cannot be told from its noise. [px]
 _LEAST_TRAVEL_PX = 1.0

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.images import Pixels
+from datasets_manifest.types.images import Pixels
 from geometry.se3 import Array
 from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
-from nav.centroids.marker_signal import Array32, MarkerSignal
+from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.window_cells import choose_cells, take_cells
+from nav.numerics.compiled import Array32
 
 # Discs up to this radius are taken whole. Of larger ones the pixels within the band of the edge are, and of the rest,
 # which tells only level and shading, one in four by four: 8 % more noise where shading is fitted, half the time. Of a

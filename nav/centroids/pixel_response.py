@@ -12,11 +12,11 @@ import numpy as np
 from geometry.se3 import Array
 from nav.centroids.disc_places import ELLIPSE_PARAMETERS
 from nav.centroids.edge_pictures import add_box_pictures
-from nav.centroids.least_squares import Minimum
-from nav.centroids.marker_signal import Array32
-from nav.centroids.matrix_loops import add_rows
 from nav.centroids.patches import PixelSet
 from nav.centroids.shared_parameters import least_of_all, reduced_equations
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum
+from nav.numerics.matrix_loops import add_rows
 
 # The pixel's own box, those beside it, and those across its corners.
 BOX_PICTURES = 3

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.marker_signal import Array32
-from nav.compiled import compiled
+from nav.numerics.compiled import Array32, compiled
 
 _F = np.float32
 _ONE, _HALF, _QUARTER = _F(1), _F(0.5), _F(0.25)

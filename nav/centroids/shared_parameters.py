@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.least_squares import Minimum
-from nav.centroids.marker_signal import Array32
-from nav.centroids.matrix_loops import couplings, normal_equations
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum
+from nav.numerics.matrix_loops import couplings, normal_equations
 
 # Of a normal matrix with unit diagonal: what light too dim cannot tell apart is shared out.
 _RIDGE = 1e-3

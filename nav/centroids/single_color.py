@@ -8,8 +8,8 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.centroids.centroid_quality import NoiseModel
-from nav.centroids.least_squares import Minimum
 from nav.centroids.patches import PixelSet
+from nav.numerics.levenberg_marquardt import Minimum
 
 # Square of a centre's move over its variance, of two coordinates: even light exceeds it once in a hundred discs.
 _MOST_MOVED = 9.2

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nav.centroids.marker_signal import Array32
-from nav.compiled import compiled
+from nav.numerics.compiled import Array32, compiled
 
 # Of whole numbers, or a picture's.
 Cells = NDArray[Any]

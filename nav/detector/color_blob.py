@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.images import Pixels, StereoImages
+from datasets_manifest.types.images import Pixels, StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
-from nav.blobs import disc_like_blobs
-from nav.channels import OTHERS_WEIGHTS, marker_channel, marker_color
-from nav.detector.interface import Detection, StereoDetection
-from nav.ring_match import RingMatch, match_ring
+from nav.detector.detector import Detection, StereoDetection
+from nav.matching.blobs import disc_like_blobs
+from nav.matching.marker_channel import OTHERS_WEIGHTS, marker_channel, marker_color
+from nav.matching.ring_matching import RingMatch, match_ring
 
 # A marker of 5 px diameter covers about 20 pixels; half of them stay above half its contrast after blurring.
 _LEAST_AREA_PX2 = 7.0

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.images import Pixels, StereoImages
+from datasets_manifest.types.images import Pixels, StereoImages
 from geometry.se3 import Array
 from geometry.stereo import Eye
 from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX

@@ -11,13 +11,13 @@ import onnxruntime
 from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as faults
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES, Eye
+from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import input_image, letterbox, network_input
-from nav.detector.interface import Detection, StereoDetection
 from nav.detector.maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.two_scales import Found, find_at_scales, half_size_px
+from nav.detector.multiscale_inference import Found, find_at_scales, half_size_px
 
 _FAULTS = (
     faults.EPFail, faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf,

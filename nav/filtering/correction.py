@@ -8,9 +8,9 @@ import numpy as np
 
 from geometry.se3 import Array, RigidTransform
 from nav.filtering.error_state import SIZE, MotionState, orthonormal, symmetric
-from nav.filtering.fixes import pose_difference
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.motion_model import seen_from_turning, vibration_covariance
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import pose_difference
 
 _POSE = 6
 _VIBRATION = slice(12, 18)
@@ -21,7 +21,7 @@ class Innovation:
     """What a measured pose says beyond the prediction.
 
     Attributes:
-        error: (6,) from the predicted to the measured pose, in the tangent of `datasets_manifest.estimates`.
+        error: (6,) from the predicted to the measured pose, in the tangent of `datasets_manifest.types.estimates`.
         jacobian: (6, 18) of the predicted pose by the error of the state.
         whitener: (6, 6) inverse of the lower Cholesky factor of its covariance.
         white: (6,) `whitener @ error`.

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.estimates import Estimate, Mode, Motion, PoseEstimate
+from datasets_manifest.types.estimates import Estimate, Mode, Motion, PoseEstimate
 from geometry.se3 import Array, RigidTransform, read_only
-from nav.filtering.fixes import pose_difference
 from nav.filtering.hypotheses import Bank, Hypothesis, bank_covariance
+from nav.filtering.pose_measurement import pose_difference
 
 _POSE = 6
 # Chi-square below which two poses are one fix of the same mode; six degrees of freedom, beyond it one of a million.
@@ -27,8 +27,8 @@ class FilterState:
         left_from_drogue: pose as the camera sees it; of the equivalent rolls one that goes on from fix to fix.
         velocity_m_s: (3,) of the drogue's origin in the left camera's axes, without its vibration. [m/s]
         rate_rad_s: (3,) of its attitude, `R' = [rate]x R`, without its vibration. [rad/s]
-        covariance: (12, 12) of pose, velocity and rate in this order, in the tangent of `datasets_manifest.estimates`.
-            [m, rad, m/s, rad/s]
+        covariance: (12, 12) of pose, velocity and rate in this order, in the tangent of
+            `datasets_manifest.types.estimates`. [m, rad, m/s, rad/s]
         modes: the poses of all explanations that live, the best first.
         coasted_s: since the last fix. [s]
     """

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.special import chdtri
 
 from geometry.se3 import Array
-from nav.filtering.agitation import Agitation
 from nav.filtering.correction import Innovation, correct, first_state, innovation_of
 from nav.filtering.error_state import MotionState, symmetric
-from nav.filtering.fixes import Fix, nearest_roll, pose_difference
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.motion_model import Step, advance
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import Fix, nearest_roll, pose_difference
+from nav.filtering.process_noise_scale import Agitation
 
 _POSE_DEGREES = 6
 # Hypotheses whose poses are nearer than this in their deviations say the same. (One deviation, all axes together.)

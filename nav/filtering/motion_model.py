@@ -24,7 +24,7 @@ from nav.filtering.error_state import (
     orthonormal,
     symmetric,
 )
-from nav.filtering.settings import FilterSettings
+from nav.filtering.filter_settings import FilterSettings
 
 _VIBRATION = slice(12, 18)
 _AXES = np.eye(3)

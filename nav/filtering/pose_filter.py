@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.estimates import PoseEstimate
+from datasets_manifest.types.estimates import PoseEstimate
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.filter_state import FilterState
-from nav.filtering.fixes import Fix, fix_of
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import Fix, fix_of
 from nav.filtering.track import Memory, Taken, take, told
-from nav.pose.interface import NoFixReason
+from nav.pose.pose_method import NoFixReason
 
 FILTER_SUFFIX = "+filter"
 

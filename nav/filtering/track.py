@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.filter_state import FilterState, state_of
-from nav.filtering.fixes import Fix
 from nav.filtering.hypotheses import Bank, advance_bank, correct_bank, first_bank
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import Fix
 
 
 @dataclass(frozen=True, eq=False)

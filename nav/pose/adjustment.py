@@ -22,7 +22,7 @@ class Adjusted:
         translations_m: (S, 3).
         departures: (S, G) from the nominal drogue and rig, see `State`.
         costs: (S,) half the sum of squared whitened residuals, with priors.
-        information: (S, K, K) in the tangent of `datasets_manifest.estimates`, and the departures.
+        information: (S, K, K) in the tangent of `datasets_manifest.types.estimates`, and the departures.
     """
 
     rotations: Array

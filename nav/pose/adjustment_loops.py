@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.compiled import compiled
-from nav.damped_steps import solve_damped
+from nav.numerics.compiled import compiled
+from nav.numerics.damped_steps import solve_damped
 from nav.pose.reprojection_loops import Shared, linearise_frame
 
 _ITERATIONS = 20

@@ -18,7 +18,7 @@ from geometry.stereo import StereoRig
 from nav.pose.adjustment import Adjusted, adjust, information_at, inverse_information
 from nav.pose.features import Features, stack_features
 from nav.pose.reprojection import SQUARES, Loss
-from nav.pose.tolerances import EXACT, StatedTolerances
+from nav.pose.stated_tolerances import EXACT, StatedTolerances
 from nav.pose.two_fold_start import cross, sight_rotations, two_fold_start
 
 # Standard deviation of pitch and of yaw, of drogues that swing within 10 degrees uniformly: 5.8 degrees.
@@ -36,7 +36,7 @@ class JointBatch:
     Attributes:
         rotations: (B, 3, 3) `left_from_drogue`.
         translations_m: (B, 3).
-        covariances: (B, 6, 6) in the tangent of `datasets_manifest.estimates`.
+        covariances: (B, 6, 6) in the tangent of `datasets_manifest.types.estimates`.
         sound: (B,) whether there is a pose in front of the cameras that the measurements determine; nothing else of a
             frame means anything where not.
         tilt_sign_reliable: (B,) whether the tilt is large enough for its sign to be told.

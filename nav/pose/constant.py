@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from nav.pose.faults import fault
-from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.mean_plane import pose_about_mean
+from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.prediction import triangulate_pairs, used_pairs
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.se3 import Array
 from geometry.stereo import EYES
-from nav.pose.interface import NoFixReason, Observation
+from nav.pose.pose_method import NoFixReason, Observation
 
 # Three points fix a plane.
 _LEAST_PAIRS = 3

@@ -11,8 +11,8 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import EYES, StereoRig
-from nav.pose.interface import Observation
-from nav.pose.tolerances import EXACT, StatedTolerances
+from nav.pose.pose_method import Observation
+from nav.pose.stated_tolerances import EXACT, StatedTolerances
 from nav.pose.whitening import whiten, whiten_displaced
 
 

@@ -9,7 +9,7 @@ from geometry.se3 import Array, RigidTransform
 from nav.pose.batched import JointBatch, solve_features
 from nav.pose.faults import fault, hub_fault
 from nav.pose.features import Features, observed_features
-from nav.pose.interface import NoFixReason, Observation, PoseMode, Solution
+from nav.pose.pose_method import NoFixReason, Observation, PoseMode, Solution
 from nav.pose.reprojection import predicted_px
 
 # Matched features miss their places by this share of a marker's own radius only when they are not the drogue's.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from geometry.se3 import Array, RigidTransform
 from nav.pose.faults import fault
-from nav.pose.interface import NoFixReason, Observation, Solution
+from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.prediction import plane_normal, rotations_with_axis, triangulate_pairs, used_pairs, with_best_roll
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from nav.pose.features import left_features
-from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.joint import solve_one
 from nav.pose.mono_eye import solve_with_one_eye
+from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.prediction import used_left
 
 # Three image points have up to four poses.

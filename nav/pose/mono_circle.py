@@ -14,9 +14,9 @@ from nav.pose.adjustment import Adjusted, adjust, inverse_information
 from nav.pose.circle_pose import circle_poses, conic_through
 from nav.pose.faults import hub_fault
 from nav.pose.features import Features, left_features, stack_features
-from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.joint import misfit
 from nav.pose.mono_eye import solve_with_one_eye
+from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.prediction import predict_px, rotations_with_axis, used_left, with_best_roll
 from nav.pose.reprojection import State, linearise
 

@@ -13,7 +13,7 @@ import numpy as np
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES
 from nav.pose.faults import eye_fault
-from nav.pose.interface import NoFixReason, Observation, PoseMethod, Solution
+from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
 
 _LEFT, _RIGHT = range(2)
 

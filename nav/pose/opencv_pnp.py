@@ -16,10 +16,10 @@ import numpy as np
 from geometry.se3 import Array, RigidTransform
 from nav.pose.adjustment import information_at, inverse_information
 from nav.pose.features import left_features
-from nav.pose.interface import NoFixReason, Observation, PoseMode, Solution
 from nav.pose.joint import misfit
 from nav.pose.mono import LEAST_MARKERS
 from nav.pose.mono_eye import solve_with_one_eye
+from nav.pose.pose_method import NoFixReason, Observation, PoseMode, Solution
 from nav.pose.prediction import predict_px, used_left
 from nav.pose.reprojection import State, linearise
 

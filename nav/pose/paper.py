@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
 from nav.pose.faults import fault
-from nav.pose.interface import NoFixReason, Observation, Solution
+from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.prediction import (
     eye_points,
     plane_normal,

@@ -15,8 +15,8 @@ import numpy as np
 from geometry.se3 import Array
 from geometry.stereo import EYES
 from nav.pose.faults import fault
-from nav.pose.interface import NoFixReason, Observation, PoseMethod, Solution
 from nav.pose.paper import Candidates, reprojection_scores, three_sphere_candidates
+from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
 from nav.pose.prediction import used_pairs
 
 # What the score of a candidate compares:

@@ -9,7 +9,7 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.circles import ellipse_center_points
 from geometry.se3 import Array, angles_from_axis
 from geometry.stereo import EYES, StereoRig
-from nav.pose.interface import Observation
+from nav.pose.pose_method import Observation
 
 
 def eye_points(rig: StereoRig, centers_m: Array, rotations: Array, translations_m: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from geometry.se3 import Array
-from nav.compiled import compiled
+from nav.numerics.compiled import compiled
 
 
 class Shared(NamedTuple):

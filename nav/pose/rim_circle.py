@@ -10,7 +10,7 @@ import numpy as np
 
 from geometry.se3 import Array, RigidTransform
 from nav.pose.faults import fault
-from nav.pose.interface import NoFixReason, Observation, Solution
+from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.prediction import plane_normal, rotations_with_axis, triangulate_pairs, used_pairs, with_best_roll
 
 # Three points lie on a circle whatever their error.

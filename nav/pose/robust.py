@@ -13,8 +13,8 @@ from nav.pose.adjustment import Adjusted, adjust
 from nav.pose.batched import solve_from
 from nav.pose.faults import fault, hub_fault
 from nav.pose.features import Features, observed_features
-from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.joint import hub_note, solve_one
+from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.reprojection import Loss, State, linearise
 from nav.pose.two_fold_start import two_fold_start
 

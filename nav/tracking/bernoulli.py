@@ -1,8 +1,8 @@
 """Follows the drogue by N learned comparisons of pixel pairs about a Kalman filter's prediction.
 
-In the spirit of the N-fold Bernoulli tracker, see `nav.tracking.pair_tests`. Ours: the tests are chosen from more at
-the start, across colours too; `nav.tracking.template_alignment` brings the winner to a fraction of a percent, and
-the tests have the last word on both.
+In the spirit of the N-fold Bernoulli tracker, see `nav.tracking.pixel_comparison_features`. Ours: the tests are chosen
+from more at the start, across colours too; `nav.tracking.template_alignment` brings the winner to a fraction of a
+percent, and the tests have the last word on both.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.se3 import Array
-from nav.detector.interface import Detection
+from nav.detector.detector import Detection
 from nav.tracking.box_motion import BoxMotion, ExpectedBox
-from nav.tracking.pair_tests import PairTests
+from nav.tracking.pixel_comparison_features import PairTests
 from nav.tracking.region import (
     Box,
     EyeImage,

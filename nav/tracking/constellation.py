@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.blobs import Blobs, disc_like_blobs
+from nav.matching.blobs import Blobs, disc_like_blobs
 from nav.tracking.region import Box, EyeImage, ImageRegion, box_center, box_size, grown, image_region, moved
 
 # The box is looked at with so many pixels across it, not enlarged: in colour, and in grey, where only the narrow dark
@@ -22,7 +22,7 @@ _SIZE_FACTOR = 1.6
 _LEAST_SPOTS = 4
 # They lie far apart in the box, unlike what noise makes of one lamp: largest distance from the middle, in box sides.
 _LEAST_SPREAD, _MOST_SPREAD = 0.25, 0.55
-# The same share of a drogue's markers as the ring search asks for, see `nav.ring_match`.
+# The same share of a drogue's markers as the ring search asks for, see `nav.matching.ring_matching`.
 _LEAST_SHARE = 0.6
 # A spot lies where it is expected within this many of its radii, and the box's size has changed by no more.
 _NEAR_RADII = 1.0

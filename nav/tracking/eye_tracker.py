@@ -8,9 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES, Eye
-from nav.detector.interface import Detection, StereoDetection
+from nav.detector.detector import Detection, StereoDetection
 from nav.tracking.region import Box, EyeImage, box_center, box_size, eye_image, moved
 
 # Boxes of one drogue have the same height on both images and the same size; what may be off, in box sides (and pixels)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.detector.interface import Detection
+from nav.detector.detector import Detection
+from nav.tracking.appearance_model import ALIKE, Likeness
 from nav.tracking.box_motion import BoxMotion
-from nav.tracking.likeness import ALIKE, Likeness
 from nav.tracking.region import Box, EyeImage, box_center, box_size, grown, image_region, moved
 
 # The box is looked at with so many pixels across it, not enlarged.

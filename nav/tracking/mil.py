@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from geometry.se3 import Array
-from nav.detector.interface import Detection
-from nav.tracking.likeness import ALIKE, Likeness
+from nav.detector.detector import Detection
+from nav.tracking.appearance_model import ALIKE, Likeness
 from nav.tracking.region import Box, EyeImage, ImageRegion, box_around, box_center, box_size, image_region
 
 # Any will do. With each of them MIL loses at once one in ten of the boxes that reach over an image's edge; which ones
@@ -31,7 +31,7 @@ _SAME_PLACE = 2.0
 
 
 class MilEyeTracker:
-    """One eye of the tracker `mil`; what tells whether the drogue is still there is `nav.tracking.likeness`."""
+    """One eye of the tracker `mil`; what tells whether the drogue is still there is `nav.tracking.appearance_model`."""
 
     _box: Box
     _step_px: float

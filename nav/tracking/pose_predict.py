@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nav.detector.interface import Detection
+from nav.detector.detector import Detection
 from nav.tracking.box_motion import BoxMotion
 from nav.tracking.constellation import Constellation, learn_constellation
 from nav.tracking.region import Box, EyeImage, box_size

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nav.training.answers import to_tensor, whole_image
 from nav.training.corpus import Corpus
 from nav.training.precision import Computing
-from nav.training.settings import SizePx
+from nav.training.predictions import to_tensor, whole_image
+from nav.training.training_settings import SizePx
 
 _MOST_IMAGES = 192  # a mean over as many is known to a twentieth of what images differ by
 _BATCH_IMAGES = 16

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
+from nav.training.color_jitter import vary_light
 from nav.training.corpus import Corpus, EyeIndex
 from nav.training.image_views import (
     Boxes,
@@ -26,10 +27,9 @@ from nav.training.image_views import (
     whole_view,
 )
 from nav.training.mosaic import TILES, sample_mosaic
-from nav.training.ordered_work import in_order
 from nav.training.painted_shapes import distract, occlude
-from nav.training.photometry import vary_light
-from nav.training.settings import SizePx, TrainingSettings
+from nav.training.prefetch_map import in_order
+from nav.training.training_settings import SizePx, TrainingSettings
 
 _MOSAIC_FRACTION = 0.8  # of the images while mosaic is on
 _WHOLE_FRACTION = 0.25  # of the others: as they are when the detector is used

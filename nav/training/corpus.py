@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.manifest import SplitName
-from datasets_manifest.reader import Dataset
-from datasets_manifest.storage import Location
+from datasets_manifest.storage.manifest import SplitName
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
 from nav.training.image_cache import CachedPair, ImageCache, open_cache
 from nav.training.image_views import Boxes, Image
-from nav.training.observer import Observer
-from nav.training.settings import SizePx, size_text
+from nav.training.training_observer import Observer
+from nav.training.training_settings import SizePx, size_text
 
 EyeIndex = int
 """0 the left eye, 1 the right."""

@@ -21,15 +21,15 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from datasets_manifest.atomic import PART_SUFFIX, new_folder
-from datasets_manifest.locking import takes_lock
-from datasets_manifest.manifest import SplitName
-from datasets_manifest.reader import Dataset
+from datasets_manifest.storage.locking import takes_lock
+from datasets_manifest.storage.manifest import SplitName
+from datasets_manifest.storage.reader import Dataset
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
-from nav.training.observer import Observer
-from nav.training.ordered_work import in_order
-from nav.training.settings import SizePx, size_text
+from nav.training.prefetch_map import in_order
+from nav.training.training_observer import Observer
+from nav.training.training_settings import SizePx, size_text
 
 _VERSION = 1  # grows with every change of what stands in a cache
 _IMAGES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "index.json", ".lock"

@@ -7,7 +7,7 @@ import copy
 import torch
 from torch import Tensor
 
-from nav.detector.network.model import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork
 
 _RAMP_STEPS = 10  # the average of the first n steps forgets about n/10 of them at a time
 

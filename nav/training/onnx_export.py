@@ -13,7 +13,7 @@ import torch
 from datasets_manifest.atomic import open_bytes_atomic
 from nav.detector.maps import SIZE_STEP_PX, STRIDES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.network.model import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork
 
 INPUT_NAME = "images"
 OUTPUT_NAMES = tuple(f"maps_{stride}" for stride in STRIDES)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from nav.detector.maps import SIZE_STEP_PX
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.config import NetworkConfig
-from nav.detector.network.model import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork
 
 Convolution = nn.Conv1d | nn.Conv2d
 

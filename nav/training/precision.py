@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import torch
 
-from nav.training.settings import TrainingSettings
+from nav.training.training_settings import TrainingSettings
 
 
 @dataclass(frozen=True)

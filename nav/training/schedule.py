@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import cos, pi
 
-from nav.training.settings import TrainingSettings
+from nav.training.training_settings import TrainingSettings
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:

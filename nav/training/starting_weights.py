@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import nn
 
+from nav.detector.detectors import network_file
 from nav.detector.network.config import NetworkConfig
-from nav.detector.registry import network_file
 from nav.training.checkpoint import load
 from nav.training.onnx_import import import_onnx
-from nav.training.settings import TrainingSettings
+from nav.training.training_settings import TrainingSettings
 
 _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training's folder"
 

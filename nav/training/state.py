@@ -12,14 +12,14 @@ import torch
 from torch import nn
 
 from nav.detector.network.config import NetworkConfig
-from nav.detector.network.model import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork
 from nav.training.checkpoint import CHECKPOINT_FILE, load, save
 from nav.training.corpus import DatasetStamp
 from nav.training.history import EpochRow
 from nav.training.moving_average import MovingAverage
 from nav.training.precision import Computing
-from nav.training.settings import TrainingSettings, differing_settings
 from nav.training.starting_weights import StartingWeights
+from nav.training.training_settings import TrainingSettings, differing_settings
 
 _VERSION = 1  # grows with every change of what stands in a checkpoint
 

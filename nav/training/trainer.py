@@ -11,19 +11,19 @@ from pathlib import Path
 
 import torch
 
-from nav.detector.network.loss import DetectionLoss, detection_loss
-from nav.training.answers import answer, to_tensor
+from nav.detector.network.detection_loss import DetectionLoss, detection_loss
 from nav.training.average_precision import AveragePrecision, average_precision
 from nav.training.batch_statistics import measure_batch_statistics
 from nav.training.batches import Batch, BatchMaker
 from nav.training.checkpoint import BEST_FILE, save
 from nav.training.corpus import Corpus
 from nav.training.history import VALIDATED, Curves, EpochRow, write_tables
-from nav.training.observer import Observer
 from nav.training.precision import Computing
+from nav.training.predictions import answer, to_tensor
 from nav.training.schedule import learning_rate
-from nav.training.settings import SizePx, TrainingSettings
 from nav.training.state import TrainingState, save_state
+from nav.training.training_observer import Observer
+from nav.training.training_settings import SizePx, TrainingSettings
 
 _CURVE_EVERY_STEPS = 10
 _VALIDATED_EPOCHS = 3  # every so many, before the last input size: the best weights are chosen among those after it

@@ -10,20 +10,20 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.recipe import RenderSettings
+from datasets_manifest.recipe.recipe import RenderSettings
+from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import EYES, Eye
-from render.analytic_engine.board import board_eye
+from render.analytic_engine.board_drawing import board_eye
 from render.analytic_engine.flat_parts import flat_drogue, ring_radiance
 from render.analytic_engine.outlines import EyeView, seen_areas
 from render.analytic_engine.painting import paint
-from render.analytic_engine.passes import empty_passes, pixel_passes
+from render.analytic_engine.ring_passes import empty_passes, pixel_passes
 from render.background import backgrounds
+from render.camera.exposure_motion import blur_px
 from render.engine import EyeRadiance, StereoRadiance
-from render.motion import blur_px
 from render.surfaces import missing_parts
 from render.version import RENDER_VERSION
-from scenes.surroundings import surroundings
+from scenes.environment_radiance import surroundings
 
 _SHARP_BELOW_PX = 0.05
 # A streak is the mean of sharp images this far apart at most, unless it is very long.

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.meshes import FACE_THICKNESS_M
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part, marker_id
 from geometry.se3 import Array, RigidTransform
 from render.surfaces import lamp_radiance_rgb, mean_reflectance_rgb
-from scenes.surroundings import Surroundings
+from scenes.environment_radiance import Surroundings
 
 
 @dataclass(frozen=True)

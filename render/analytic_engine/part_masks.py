@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import Eye
 from render.analytic_engine.flat_parts import FlatDrogue, flat_drogue
 from render.analytic_engine.outlines import EyeView
-from render.analytic_engine.passes import pixel_passes
+from render.analytic_engine.ring_passes import pixel_passes
 from render.surfaces import missing_parts
 
 

@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe import RenderSettings
+from datasets_manifest.recipe.recipe import RenderSettings
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from geometry.stereo import EYES, Eye
 from render.background import air_before, backgrounds
-from render.blender_engine.eye_path import EyePath, holds
+from render.blender_engine.camera_path import EyePath, holds
 from render.blender_engine.messages import CENTER_SAMPLE, FEATURES, FIRST_RANDOM_SAMPLE, LIGHT, PASSES, Picture, Window
-from render.blender_engine.pixels import CenterPixels, place, read_light, read_passes
+from render.blender_engine.picture_arrays import CenterPixels, place, read_light, read_passes
 from render.blender_engine.process import BlenderEndedError, BlenderProcess, bpy_version
 from render.blender_engine.stage import Stage
+from render.compositing import TracedEye, amodal_counts
 from render.engine import EyeRadiance, StereoRadiance
-from render.traced import TracedEye, amodal_counts
 from render.version import RENDER_VERSION
-from scenes.sky import REC709_LUMINANCE
-from scenes.surroundings import Surroundings, surroundings
+from scenes.environment_radiance import Surroundings, surroundings
+from scenes.sky.clear_sky import REC709_LUMINANCE
 
 # Hose, tanker and bystanders are convex enough for light straight from sky, sun and ground.
 _AROUND_DEPTH = 2

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.materials import part_satin
 from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name
@@ -21,7 +21,7 @@ from render.surfaces import (
     reflectance_map,
     surface_condition,
 )
-from scenes.surroundings import Surroundings
+from scenes.environment_radiance import Surroundings
 
 
 class Stage:

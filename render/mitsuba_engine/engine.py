@@ -9,16 +9,16 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.recipe import RenderSettings
+from datasets_manifest.recipe.recipe import RenderSettings
+from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import EYES, Eye
 from render.background import air_before, backgrounds
 from render.engine import EyeRadiance, StereoRadiance
-from render.mitsuba_engine.noise import MonteCarloNoise, measure_noise
-from render.mitsuba_engine.traced import OF_DROGUE, ToTrace, Traced
+from render.mitsuba_engine.render_noise import MonteCarloNoise, measure_noise
+from render.mitsuba_engine.trace_request import OF_DROGUE, ToTrace, Traced
 from render.mitsuba_engine.variant import probe_variant
 from render.version import RENDER_VERSION
-from scenes.surroundings import surroundings
+from scenes.environment_radiance import surroundings
 
 
 class MitsubaEngine:

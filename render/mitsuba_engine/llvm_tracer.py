@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 from drogue_models.parts import Part
 from geometry.stereo import EYES, Eye
-from render.mitsuba_engine.center_passes import CenterPasses
-from render.mitsuba_engine.in_picture import InPicture
-from render.mitsuba_engine.launches import FrameRays, Sampled
-from render.mitsuba_engine.path_launches import trace_paths
-from render.mitsuba_engine.registry import reserve_numbers
+from render.camera.exposure_motion import blur_px
+from render.compositing import TracedEye
+from render.mitsuba_engine.jit_registry import reserve_numbers
+from render.mitsuba_engine.paths.center_passes import CenterPasses
+from render.mitsuba_engine.paths.compositor import InPicture
+from render.mitsuba_engine.paths.context_paths import trace_around
+from render.mitsuba_engine.paths.denoised_paths import SmoothedPaths
+from render.mitsuba_engine.paths.drogue_paths import trace_paths
+from render.mitsuba_engine.paths.rays import FrameRays, Sampled
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
-from render.mitsuba_engine.smoothed_launches import SmoothedPaths
-from render.mitsuba_engine.surround_launches import trace_around
-from render.mitsuba_engine.traced import IN_OPEN, OF_DROGUE, Plan, ToTrace, Traced, parts_in, plan_pixels
-from render.motion import blur_px
+from render.mitsuba_engine.trace_request import IN_OPEN, OF_DROGUE, Plan, ToTrace, Traced, parts_in, plan_pixels
 from render.surfaces import dirty_parts
-from render.traced import TracedEye
 
 
 class LlvmTracer:

@@ -10,13 +10,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe import RenderSettings
+from datasets_manifest.recipe.recipe import RenderSettings
+from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
+from render.camera.exposure_motion import blur_px, pose_polynomial
+from render.compositing import TracedEye, amodal_counts
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
-from render.mitsuba_engine.traced import (
+from render.mitsuba_engine.trace_request import (
     ASIDE,
     OF_DROGUE,
     SURROUND_DEPTH,
@@ -26,9 +28,7 @@ from render.mitsuba_engine.traced import (
     plan_pixels,
     slipped_through,
 )
-from render.motion import blur_px, pose_polynomial
 from render.surfaces import dirty_parts
-from render.traced import TracedEye, amodal_counts
 
 # Motion is rendered as so many still pictures.
 _MOVING_SLICES = 8

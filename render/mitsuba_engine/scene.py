@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.solids import with_creases
@@ -31,7 +31,7 @@ from render.surfaces import (
     missing_parts,
     reflectance_map,
 )
-from scenes.surroundings import Surroundings
+from scenes.environment_radiance import Surroundings
 
 # Scenes that an engine keeps; the one that was used longest ago goes first.
 KEPT_SCENES = 8

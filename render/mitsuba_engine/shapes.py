@@ -11,14 +11,14 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from datasets_manifest.frame import FrameSpec
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.materials import part_satin
 from drogue_models.meshes import bystander_mesh
 from drogue_models.parameters import SatinPaint
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.solids import with_creases
+from render.dirt import DIRT_MAP_PX
 from render.surfaces import SMOOTH_PARTS, even_reflectance_rgb, lamp_radiance_rgb, surface_condition
-from scenes.dirt import DIRT_MAP_PX
 
 
 def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any]) -> Any:

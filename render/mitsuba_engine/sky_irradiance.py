@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from geometry.se3 import Array
 from render.mitsuba_engine.jit_arrays import jit_tensor
-from scenes.light import Radiance
+from scenes.sky.light import Radiance
 
 # Light by direction of the plate is so smooth that linear interpolation between 3.75 degrees errs by 5e-4 at most.
 _ROWS = 48

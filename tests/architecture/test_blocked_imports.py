@@ -54,14 +54,16 @@ def test_the_block_holds(package: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["nav.runner", "droguekit.benchmark.benchmark", "droguekit.benchmark.report", "droguekit.cli.main"]
+    "module", ["nav.runner", "droguekit.benchmark.benchmark", "droguekit.benchmark.report.report", "droguekit.cli.main"]
 )
 def test_modules_import_without_renderer_meshes_and_torch(module: str, tmp_path: Path) -> None:
     result = run_blocked(f"import {module}", [], tmp_path)
     assert result.returncode == 0, result.stderr
 
 
-@pytest.mark.parametrize("module", ["labelgen.frame_labels", "labelgen.dataset_validation", "labelgen.export.coco"])
+@pytest.mark.parametrize(
+    "module", ["labelgen.frame_labels", "labelgen.validation.dataset_checks", "labelgen.export.coco"]
+)
 def test_labels_import_without_renderer(module: str, tmp_path: Path) -> None:
     result = run_blocked(f"import {module}", [], tmp_path, RENDERERS)
     assert result.returncode == 0, result.stderr

@@ -20,16 +20,18 @@ PACKAGES = SETTINGS["root_packages"]
 TRESPASSES = [
     ("rooms", "geometry/trespass.py", "import drogue_models.parameters"),
     ("rooms", "scenes/trespass.py", "import render.engine"),
-    ("rooms", "datasets_manifest/trespass.py", "import scenes.seeding"),
+    ("rooms", "datasets_manifest/trespass.py", "import scenes.sampler"),
     ("rooms", "labelgen/trespass.py", "import nav.runner"),
+    ("rooms", "droguekit/trespass.py", "import studies.acceptance.table"),
+    ("application", "droguekit/workflows/trespass.py", "import droguekit.cli.main"),
     ("application", "droguekit/benchmark/trespass.py", "import droguekit.batch.workers"),
     ("application", "droguekit/batch/trespass.py", "import droguekit.benchmark.benchmark"),
     ("application", "droguekit/batch/trespass.py", "import droguekit.cli.main"),
-    ("blind", "nav/trespass.py", "import datasets_manifest.records"),
-    ("blind", "nav/pose/trespass.py", "from datasets_manifest import reader"),
+    ("blind", "nav/trespass.py", "import datasets_manifest.types.records"),
+    ("blind", "nav/pose/trespass.py", "from datasets_manifest.storage import reader"),
     ("blind", "nav/trespass.py", "import datasets_manifest"),
     ("training", "nav/pose/trespass.py", "import nav.training"),
-    ("no-generator", "nav/trespass.py", "def f():\n    import scenes.seeding"),
+    ("no-generator", "nav/trespass.py", "def f():\n    import scenes.sampler"),
     ("no-generator", "droguekit/benchmark/trespass.py", "import labelgen.frame_labels"),
     ("light", "nav/trespass.py", "import drogue_models.meshes"),
     ("light", "droguekit/benchmark/trespass.py", "import trimesh"),
@@ -41,7 +43,7 @@ TRESPASSES = [
     ("torch", "nav/pose/trespass.py", "import torch"),
     ("torch", "droguekit/benchmark/trespass.py", "import torch"),
     ("geometry", "geometry/trespass.py", "import cv2"),
-    ("cycles", "datasets_manifest/layout.py", "import datasets_manifest.reader"),
+    ("cycles", "datasets_manifest/storage/layout.py", "import datasets_manifest.storage.reader"),
 ]
 
 

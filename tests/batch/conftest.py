@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.layout import EVENTS_FILE
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import RunSummary, Spread, render_dataset
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage.layout import EVENTS_FILE
 from droguekit.batch.progress import PlainProgress
+from droguekit.batch.render_dataset import RunSummary, Spread, render_dataset
 
 from ..small_datasets import RIG_160_PX, RIG_320_PX
 

@@ -16,10 +16,10 @@ from typing import IO
 
 import pytest
 
-from datasets_manifest import layout
-from datasets_manifest.manifest import read_manifest
-from datasets_manifest.writer import leftovers
-from droguekit.batch.local import RunSummary, Spread
+from datasets_manifest.storage import layout
+from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.writer import leftovers
+from droguekit.batch.render_dataset import RunSummary, Spread
 from droguekit.cli.main import INTERRUPTED
 
 Make = Callable[..., RunSummary]

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest import layout
+from datasets_manifest.storage import layout
 from droguekit.batch import cluster
 from droguekit.batch.cluster import Build, ClusterTask, build_here
 from droguekit.batch.frame_task import FrameTask, OtherBuildError
-from droguekit.batch.local import RunSummary, Spread
+from droguekit.batch.render_dataset import RunSummary, Spread
 from droguekit.cli.main import WRONG_INPUT, run
 
 distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
@@ -88,8 +88,8 @@ class OnFrame:
 def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
     start: Start, scheduler: str, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
 ) -> None:
-    from datasets_manifest.recipe import parse_recipe
-    from droguekit.batch.local import render_dataset
+    from datasets_manifest.recipe.recipe import parse_recipe
+    from droguekit.batch.render_dataset import render_dataset
 
     text = analytic_recipe.replace("count = 8", "count = 24")
     make(tmp_path / "calm", text=text)
@@ -113,8 +113,8 @@ def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
 def test_a_request_to_stop_finishes_the_frames_in_hand(
     start: Start, scheduler: str, analytic_recipe: str, tmp_path: Path
 ) -> None:
-    from datasets_manifest.recipe import parse_recipe
-    from droguekit.batch.local import render_dataset
+    from datasets_manifest.recipe.recipe import parse_recipe
+    from droguekit.batch.render_dataset import render_dataset
 
     text = analytic_recipe.replace("count = 8", "count = 24")
     worker(start, scheduler)
@@ -221,7 +221,7 @@ def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
 def test_workers_of_another_build_are_refused(
     start: Start, scheduler: str, analytic_recipe: str, tmp_path: Path
 ) -> None:
-    from datasets_manifest.recipe import parse_recipe
+    from datasets_manifest.recipe.recipe import parse_recipe
 
     worker(start, scheduler)
     here = build_here()

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest import layout
-from datasets_manifest.manifest import read_manifest
-from datasets_manifest.writer import leftovers
-from droguekit.batch.local import RunSummary
-from labelgen.dataset_validation import validate_dataset
+from datasets_manifest.storage import layout
+from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.writer import leftovers
+from droguekit.batch.render_dataset import RunSummary
+from labelgen.validation.dataset_checks import validate_dataset
 
 Make = Callable[..., RunSummary]
 Hashes = Callable[[Path], dict[str, str]]

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest import layout
-from datasets_manifest.manifest import read_manifest
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.writer import leftovers
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage import layout
+from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.writer import leftovers
 from droguekit.batch.frame_task import FrameTask
-from droguekit.batch.local import RunSummary
+from droguekit.batch.render_dataset import RunSummary
 from droguekit.batch.workers import run_alone
 
 Make = Callable[..., RunSummary]
@@ -89,8 +89,8 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
     # Tells of each finished frame on a line, which is when the test kills it.
     script.write_text(
         "from pathlib import Path\n"
-        "from datasets_manifest.recipe import parse_recipe\n"
-        "from droguekit.batch.local import render_dataset\n"
+        "from datasets_manifest.recipe.recipe import parse_recipe\n"
+        "from droguekit.batch.render_dataset import render_dataset\n"
         "class Tell:\n"
         "    def begin(self, what, total): pass\n"
         "    def advance(self): print('frame', flush=True)\n"

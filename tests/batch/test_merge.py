@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest import layout
-from datasets_manifest.manifest import made_with, read_manifest, write_manifest
-from droguekit.batch.local import RunSummary
+from datasets_manifest.storage import layout
+from datasets_manifest.storage.manifest import made_with, read_manifest, write_manifest
+from droguekit.batch.render_dataset import RunSummary
 from droguekit.cli.main import DONE, WRONG_INPUT, run
-from labelgen.dataset_validation import validate_dataset
+from labelgen.validation.dataset_checks import validate_dataset
 
 Make = Callable[..., RunSummary]
 Hashes = Callable[[Path], dict[str, str]]
@@ -123,7 +123,7 @@ def test_two_frames_of_one_index_are_refused(
     shards: tuple[Path, ...], made_shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = read_manifest(shards[0]).model_dump(mode="json")
-    from datasets_manifest.manifest import Manifest, dataset_sha256
+    from datasets_manifest.storage.manifest import Manifest, dataset_sha256
 
     table["frames"][0]["record_sha256"] = "0" * 64
     manifest = Manifest.model_construct(**read_manifest(shards[0]).__dict__)

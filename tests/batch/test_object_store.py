@@ -17,17 +17,16 @@ import pytest
 from moto.server import ThreadedMotoServer
 from s3fs import S3FileSystem
 
-from datasets_manifest import layout
-from datasets_manifest.frame_store import FrameStore, frames_there
-from datasets_manifest.manifest import read_manifest
-from datasets_manifest.reader import Dataset
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.storage import open_storage
-from datasets_manifest.writer import encode_record, leftovers
-from droguekit.batch.local import RunSummary, render_dataset
-from droguekit.batch.making import Spread
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage import layout, open_storage
+from datasets_manifest.storage.frame_store import FrameStore, frames_there
+from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import encode_record, leftovers
+from droguekit.batch.execution import Spread
+from droguekit.batch.render_dataset import RunSummary, render_dataset
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
-from labelgen.dataset_validation import validate_dataset
+from labelgen.validation.dataset_checks import validate_dataset
 
 Make = Callable[..., RunSummary]
 Hashes = Callable[[Path], dict[str, str]]

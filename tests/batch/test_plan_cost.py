@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.manifest import Drop
-from datasets_manifest.recipe import Recipe, parse_recipe
-from droguekit.batch.drop_rule import drop_of
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.storage.manifest import Drop
+from droguekit.batch.failure_policy import drop_of
 from droguekit.batch.frame_task import FrameReport
-from droguekit.batch.plan import Plan, plan_recipe
-from droguekit.batch.plan_cost import Cost, fit_over_distance, probe_cost, reckon
-from droguekit.batch.plan_probe import Probe, choose_frames, make_in_turn
+from droguekit.batch.planning.plan_cost import Cost, fit_over_distance, probe_cost, reckon
+from droguekit.batch.planning.plan_probe import Probe, choose_frames, make_in_turn
+from droguekit.batch.planning.recipe_plan import Plan, plan_recipe
 from droguekit.batch.workers import Limits
-from droguekit.cli.plan import _cost
+from droguekit.cli.dataset.plan import _cost
 
 RECIPE = """
 name = "spread"

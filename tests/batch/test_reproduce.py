@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from datasets_manifest.layout import RECORD_FILE, frame_folder
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
-from datasets_manifest.writer import write_frame
-from droguekit.batch.local import describe_dataset
-from droguekit.batch.reproduce import reproduce_frame
+from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import write_frame
+from datasets_manifest.types.records import PairRecord
+from droguekit.batch.render_dataset import describe_dataset
+from droguekit.batch.reproduce_frame import reproduce_frame
 
 Change = Callable[[dict[str, Any]], None]
 

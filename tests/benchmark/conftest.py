@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import Estimate, Feature, NoFix, PoseEstimate
-from datasets_manifest.frame import Environment, Exposure, FrameSpec
-from datasets_manifest.images import StereoImages
-from datasets_manifest.manifest import build_manifest, write_manifest
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.records import Conditions, FeatureView, HubView, PairRecord, StereoViews, ViewRecord
-from datasets_manifest.rigs import SENSORS
-from datasets_manifest.writer import encode_files, write_frame
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.rigs import SENSORS
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.writer import encode_files, write_frame
+from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate
+from datasets_manifest.types.frame import Environment, Exposure, FrameSpec
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import Conditions, FeatureView, HubView, PairRecord, StereoViews, ViewRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters, HubParameters, even_ring
 from geometry.circles import disc_outline, project_disc_centers

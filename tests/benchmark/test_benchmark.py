@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import NoFix, PoseEstimate, write_estimates
-from datasets_manifest.records import PairRecord
+from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
+from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.benchmark import run_benchmark, score
-from droguekit.benchmark.centroid_errors import centroid_errors
-from droguekit.benchmark.frame_truth import drogue_truth
-from droguekit.benchmark.pose_errors import by_method
-from droguekit.benchmark.result import BenchmarkResult, DatasetFacts
+from droguekit.benchmark.poses.centroid_errors import centroid_errors
+from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform, exp_twist
 
 DatasetFixture = tuple[Path, list[PairRecord]]
@@ -293,7 +293,7 @@ class Wall:
 
 sys.meta_path.insert(0, Wall())
 from droguekit.benchmark.benchmark import run_benchmark
-from droguekit.benchmark.report import write_report
+from droguekit.benchmark.report.report import write_report
 folder, estimates, page = map(Path, sys.argv[1:])
 write_report(folder, estimates, run_benchmark(folder, estimates), page)
 """

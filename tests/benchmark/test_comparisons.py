@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from droguekit.benchmark.comparisons import PairGroups, compare
-from droguekit.benchmark.distance_bins import DistanceBin
-from droguekit.benchmark.pose_errors import PoseError
+from droguekit.benchmark.poses.comparisons import PairGroups, compare
+from droguekit.benchmark.poses.distance_bins import DistanceBin
+from droguekit.benchmark.poses.pose_errors import PoseError
 from droguekit.benchmark.statistics import ratio_intervals
 
 

@@ -4,10 +4,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import PoseEstimate
-from droguekit.benchmark.bounds import component_covariance
-from droguekit.benchmark.consistency import nees, normalized_errors, squared_errors
-from droguekit.benchmark.pose_errors import PoseError, pose_error
+from datasets_manifest.types.estimates import PoseEstimate
+from droguekit.benchmark.poses.bounds import component_covariance
+from droguekit.benchmark.poses.consistency import nees, normalized_errors, squared_errors
+from droguekit.benchmark.poses.pose_errors import PoseError, pose_error
 from droguekit.benchmark.statistics import mean_square_region, rms_upper_limit
 from geometry.se3 import RigidTransform, exp_twist
 

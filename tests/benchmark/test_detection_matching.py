@@ -13,12 +13,12 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from datasets_manifest.records import PixelBox
-from droguekit.benchmark.detection_boxes import FoundBox
-from droguekit.benchmark.detection_curve import best_f1, operating_point, precision_recall
-from droguekit.benchmark.detection_intervals import average_precision_interval, resampled_precision
-from droguekit.benchmark.detection_matching import AT_50, RECALLS, Evaluation, Matches
-from droguekit.benchmark.detection_truth import ImageTruth
+from datasets_manifest.types.records import PixelBox
+from droguekit.benchmark.detection.detection_curve import best_f1, operating_point, precision_recall
+from droguekit.benchmark.detection.detection_intervals import average_precision_interval, resampled_precision
+from droguekit.benchmark.detection.detection_matching import AT_50, RECALLS, Evaluation, Matches
+from droguekit.benchmark.detection.detection_truth import ImageTruth
+from droguekit.benchmark.results.detection_boxes import FoundBox
 from geometry.stereo import EYES
 from nav.training.score_threshold import best_threshold
 

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
-from datasets_manifest.records import PairRecord, ViewRecord
-from datasets_manifest.storage import open_storage
-from droguekit.benchmark.detection_boxes import (
+from datasets_manifest.storage.storage import open_storage
+from datasets_manifest.types.records import PairRecord, ViewRecord
+from droguekit.benchmark.detection.detection_truth import image_truth, read_detection_truth
+from droguekit.benchmark.poses.visibility import LEAST_SEEN_FRACTION, seen_fraction
+from droguekit.benchmark.results.detection_boxes import (
     FoundBox,
     center_box,
     clipped_box,
@@ -23,8 +25,6 @@ from droguekit.benchmark.detection_boxes import (
     read_detections,
     write_detections,
 )
-from droguekit.benchmark.detection_truth import image_truth, read_detection_truth
-from droguekit.benchmark.visibility import LEAST_SEEN_FRACTION, seen_fraction
 
 SIZE_PX = (1280, 960)
 

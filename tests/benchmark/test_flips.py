@@ -3,10 +3,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from droguekit.benchmark.centroid_errors import centroid_errors
-from droguekit.benchmark.closed_forms import FacingRing, flip_probability
-from droguekit.benchmark.flips import FlipTrial, flip_row, flip_trials, ring_tilt_scale
-from droguekit.benchmark.frame_truth import DrogueTruth, drogue_truth
+from droguekit.benchmark.poses.centroid_errors import centroid_errors
+from droguekit.benchmark.poses.closed_forms import FacingRing, flip_probability
+from droguekit.benchmark.poses.flips import FlipTrial, flip_row, flip_trials, ring_tilt_scale
+from droguekit.benchmark.poses.frame_truth import DrogueTruth, drogue_truth
 from geometry.se3 import RigidTransform
 
 MIDDLE_M = 0.06

@@ -3,8 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import NoFix
-from droguekit.benchmark.pose_errors import by_method, pose_error
+from datasets_manifest.types.estimates import NoFix
+from droguekit.benchmark.poses.pose_errors import by_method, pose_error
 from geometry.se3 import RigidTransform
 
 

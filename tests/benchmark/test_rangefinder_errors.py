@@ -6,16 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import write_estimates
-from datasets_manifest.recipe import load_recipe
-from datasets_manifest.records import PairRecord
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.types.estimates import write_estimates
+from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.benchmark import run_benchmark, score
-from droguekit.benchmark.frame_truth import drogue_truth
-from droguekit.benchmark.pose_errors import by_method
-from droguekit.benchmark.report import write_report
-from droguekit.benchmark.result import BenchmarkResult, DatasetFacts
+from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.report.report import write_report
+from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform
-from scenes.rangefinder import sample_reading_m
+from scenes.rangefinder_reading import sample_reading_m
 
 
 def read(record: PairRecord, reading_m: float) -> PairRecord:

@@ -8,17 +8,17 @@ import matplotlib
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import NoFix, write_estimates
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import NoFix, write_estimates
+from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.benchmark import run_benchmark
-from droguekit.benchmark.contact_sheet import contact_tiles, label_picture
-from droguekit.benchmark.figures import QUANTITIES, error_panel, method_styles
-from droguekit.benchmark.narrative import result_sentences
-from droguekit.benchmark.number_text import distance_text, percent, plain_number, three_digits
-from droguekit.benchmark.ranking import best_method
-from droguekit.benchmark.report import stage_times_ms, write_report
-from droguekit.benchmark.result import BenchmarkResult
+from droguekit.benchmark.poses.ranking import best_method
+from droguekit.benchmark.report.figures import QUANTITIES, error_panel, method_styles
+from droguekit.benchmark.report.label_thumbnails import contact_tiles, label_picture
+from droguekit.benchmark.report.narrative import result_sentences
+from droguekit.benchmark.report.number_text import distance_text, percent, plain_number, three_digits
+from droguekit.benchmark.report.report import stage_times_ms, write_report
+from droguekit.benchmark.results.benchmark_result import BenchmarkResult
 
 DatasetFixture = tuple[Path, list[PairRecord]]
 METHODS = {"joint": 1.0, "paper": 6.0, "circle-fit": 4.0}

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from datasets_manifest.estimates import Docking, Motion, PoseEstimate
-from datasets_manifest.records import PairRecord
-from droguekit.benchmark.docking_result import Captures
-from droguekit.benchmark.docking_scores import calibration, docking_errors
-from droguekit.benchmark.frame_truth import drogue_truth
-from droguekit.benchmark.sequence_docking import (
+from datasets_manifest.types.estimates import Docking, Motion, PoseEstimate
+from datasets_manifest.types.records import PairRecord
+from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.results.docking_result import Captures
+from droguekit.benchmark.sequences.docking_scores import calibration, docking_errors
+from droguekit.benchmark.sequences.sequence_docking import (
     Arrival,
     arrivals_in_the_end,
     predicted_arrival,
     tip_in_left_m,
     true_dockings,
 )
-from droguekit.benchmark.sequence_filtering import SequenceData
-from droguekit.benchmark.sequence_scores import sequence_data
-from droguekit.benchmark.sequence_truth import TrueSequence, moment, true_sequences
+from droguekit.benchmark.sequences.sequence_filtering import SequenceData
+from droguekit.benchmark.sequences.sequence_scores import sequence_data
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
 from nav.docking import capture_radius_m, docking_of
 
 TIP_LEFT_M = np.array([0.45, 0.35, 1.0])

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import PoseEstimate
-from droguekit.benchmark.pose_errors import COMPONENTS
-from droguekit.benchmark.sequence_lag import MOST_LAG_S, lags
-from droguekit.benchmark.sequence_truth import TrueSequence, moment, true_sequences
+from datasets_manifest.types.estimates import PoseEstimate
+from droguekit.benchmark.poses.pose_errors import COMPONENTS
+from droguekit.benchmark.sequences.sequence_lag import MOST_LAG_S, lags
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
 from geometry.se3 import RigidTransform
 
 COUNT = 75

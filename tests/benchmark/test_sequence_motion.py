@@ -9,22 +9,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from datasets_manifest.estimates import Motion, PoseEstimate
-from datasets_manifest.recipe import Recipe, load_recipe
-from droguekit.benchmark.consistency import normalized_squares
-from droguekit.benchmark.frame_truth import drogue_truth
-from droguekit.benchmark.sequence_filtering import filtering
-from droguekit.benchmark.sequence_motion import (
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
+from datasets_manifest.types.estimates import Motion, PoseEstimate
+from droguekit.benchmark.poses.consistency import normalized_squares
+from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.sequences.sequence_filtering import filtering
+from droguekit.benchmark.sequences.sequence_motion import (
     MOTION_PARTS,
     motion_errors,
     pairs_per_knot,
     smoothing_spline,
     true_motions,
 )
-from droguekit.benchmark.sequence_scores import sequence_data
-from droguekit.benchmark.sequence_truth import Moment, TrueSequence, moment, true_sequences
+from droguekit.benchmark.sequences.sequence_scores import sequence_data
+from droguekit.benchmark.sequences.sequence_truth import Moment, TrueSequence, moment, true_sequences
 from geometry.se3 import RigidTransform
-from scenes.sequence import moment_of_sequence
+from scenes.flight.sequence import moment_of_sequence
 
 PERIOD_S = 1 / 25
 MARGIN = 4

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from datasets_manifest.estimates import Estimate, NoFix, Region
-from datasets_manifest.records import PairRecord
-from droguekit.benchmark.detection_boxes import FoundBox, corner_box, image_id_of
-from droguekit.benchmark.frame_truth import drogue_truth
-from droguekit.benchmark.sequence_report import sequence_sentences
-from droguekit.benchmark.sequence_scores import score_sequences
-from droguekit.benchmark.sequence_truth import TrueSequence, moment, true_sequences
+from datasets_manifest.types.estimates import Estimate, NoFix, Region
+from datasets_manifest.types.records import PairRecord
+from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.report.sequence_report import sequence_sentences
+from droguekit.benchmark.results.detection_boxes import FoundBox, corner_box, image_id_of
+from droguekit.benchmark.sequences.sequence_scores import score_sequences
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
+from droguekit.benchmark.sequences.tracking import track_found_boxes, track_regions
+from droguekit.benchmark.sequences.tracking_scores import reacquisition
 from droguekit.benchmark.statistics import rate_interval
-from droguekit.benchmark.tracking import track_found_boxes, track_regions
-from droguekit.benchmark.tracking_scores import reacquisition
 from geometry.stereo import EYES
 
 SEEN, HIDDEN, PARTLY, DAZZLED = "seen", "hidden", "partly", "dazzled"

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from datasets_manifest.estimates import Estimate, Feature, NoFix, PoseEstimate, write_estimates
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate, write_estimates
+from datasets_manifest.types.records import PairRecord
 from droguekit.batch.progress import PlainProgress
-from droguekit.browse.browse import write_browse
+from droguekit.visualization.browse.browse import write_browse
 from geometry.se3 import RigidTransform
 
 from ..small_datasets import rendered

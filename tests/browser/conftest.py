@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, sync_playwright
 
-from droguekit.paper_report.print_pdf import NO_BROWSER, find_browser
+from droguekit.visualization.print_pdf import NO_BROWSER, find_browser
 
 from .browsed_dataset import BrowsedDataset, browse_dataset
 

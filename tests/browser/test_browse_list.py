@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 
-from datasets_manifest.estimates import PoseEstimate
+from datasets_manifest.types.estimates import PoseEstimate
 
 from .browsed_dataset import HOSTILE, OTHER, PAIRS, BrowsedDataset, show, shown_frames
 

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import PoseEstimate
-from datasets_manifest.records import PairRecord
+from datasets_manifest.types.estimates import PoseEstimate
+from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from droguekit.batch.progress import PlainProgress
-from droguekit.browse.browse import write_browse
 from droguekit.cli.main import DONE, run
+from droguekit.visualization.browse.browse import write_browse
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import Estimate, Feature, NoFix, PoseEstimate, Region, write_estimates
-from datasets_manifest.reader import Dataset
-from droguekit.batch.local import render_dataset
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate, Region, write_estimates
 from droguekit.batch.progress import PlainProgress
-from droguekit.benchmark.detection_published import PUBLISHED_DETECTORS
-from droguekit.benchmark.detection_speed import published_name, speed_panel
+from droguekit.batch.render_dataset import render_dataset
+from droguekit.benchmark.detection.detection_published import PUBLISHED_DETECTORS
+from droguekit.benchmark.detection.detection_speed import published_name, speed_panel
 from droguekit.cli.main import DONE, run
-from droguekit.cli.pipelines import open_recipe
-from droguekit.paper_report.contenders import CONTENDERS
-from droguekit.paper_report.page import read_detection
+from droguekit.workflows.datasets import open_recipe
 from geometry.se3 import RigidTransform
+from studies.paper.contenders import CONTENDERS
+from studies.paper.page import read_detection
 
 OpenPage = Callable[..., Any]
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import PoseEstimate, write_estimates
-from datasets_manifest.reader import Dataset
-from droguekit.batch.local import render_dataset
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import PoseEstimate, write_estimates
 from droguekit.batch.progress import PlainProgress
-from droguekit.benchmark.report_tables import MOST_OPEN_ROWS
+from droguekit.batch.render_dataset import render_dataset
+from droguekit.benchmark.report.report_tables import MOST_OPEN_ROWS
 from droguekit.cli.main import DONE, run
-from droguekit.cli.pipelines import open_recipe
+from droguekit.workflows.datasets import open_recipe
 from geometry.se3 import RigidTransform
 
 OpenPage = Callable[..., Any]

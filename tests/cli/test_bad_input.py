@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest import layout
+from datasets_manifest.storage import layout
 from droguekit.cli.main import FAULT, WRONG_INPUT, run
 
 RECIPE = """

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest import layout
-from datasets_manifest.estimates import read_estimates
-from datasets_manifest.manifest import read_manifest
+from datasets_manifest.storage import layout
+from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.types.estimates import read_estimates
 from droguekit.cli.main import DONE, run
 from nav.runner import method_names
 

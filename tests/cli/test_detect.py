@@ -12,10 +12,10 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from datasets_manifest.estimates import PoseEstimate, read_estimates
-from datasets_manifest.layout import ANNOTATIONS_FOLDER
-from datasets_manifest.storage import open_storage
-from droguekit.benchmark.detection_truth import read_detection_truth
+from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
+from datasets_manifest.storage.storage import open_storage
+from datasets_manifest.types.estimates import PoseEstimate, read_estimates
+from droguekit.benchmark.detection.detection_truth import read_detection_truth
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
-from datasets_manifest.blind import BlindDataset
-from datasets_manifest.estimates import PoseEstimate, read_estimates
-from datasets_manifest.reader import Dataset
-from datasets_manifest.writer import leftovers
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import leftovers
+from datasets_manifest.types.estimates import PoseEstimate, read_estimates
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
-from labelgen.export.log import ExportLog
 
 
 def poses(dataset: Path, out: Path) -> dict[int, np.ndarray]:

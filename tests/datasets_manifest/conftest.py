@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.images import StereoImages
-from datasets_manifest.manifest import build_manifest, write_manifest
-from datasets_manifest.recipe import Recipe, parse_recipe
-from datasets_manifest.records import Conditions, PairRecord, StereoViews, ViewRecord
-from datasets_manifest.writer import encode_files, write_frame
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.writer import encode_files, write_frame
+from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import Conditions, PairRecord, StereoViews, ViewRecord
 from geometry.se3 import RigidTransform, exp_twist
 
 RECIPE = """

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import yaml
 
-from datasets_manifest.calibration import calibration_files, write_calibration
-from datasets_manifest.calibration_kalibr import kalibr_camchain
-from datasets_manifest.calibration_ros import camera_info
-from datasets_manifest.rigs import resolve_rig
-from datasets_manifest.yaml_text import yaml_number
+from datasets_manifest.calibration.calibration import calibration_files, write_calibration
+from datasets_manifest.calibration.kalibr import kalibr_camchain
+from datasets_manifest.calibration.ros import camera_info
+from datasets_manifest.calibration.yaml_text import yaml_number
+from datasets_manifest.recipe.rigs import resolve_rig
 from geometry.stereo import EYES, paper_rig
 
 RIGS = [paper_rig(), resolve_rig("paper-real", 6)[0]]

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 import yaml
 
-from datasets_manifest.card import card_text, citation, write_card
-from datasets_manifest.croissant import describe_croissant, write_croissant
-from datasets_manifest.layout import ANNOTATIONS_FOLDER, RECORD_FILE, frame_folder
-from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
-from datasets_manifest.recipe import load_recipe
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.release.card import card_text, citation, write_card
+from datasets_manifest.release.croissant import describe_croissant, write_croissant
+from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, RECORD_FILE, frame_folder
+from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
 
 # https://huggingface.co/docs/hub/datasets-cards and the lists that it names.
 HUB_SIZES = {"n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "n>1M"}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.estimates import NoFix, read_estimates, write_estimates
+from datasets_manifest.types.estimates import NoFix, read_estimates, write_estimates
 
 
 def dark(method: str, count: int) -> list[NoFix]:

@@ -3,10 +3,10 @@ import random
 
 import pytest
 
-from datasets_manifest import provenance
-from datasets_manifest.layout import frame_folder
-from datasets_manifest.manifest import Drop, build_manifest, dataset_sha256, read_manifest, write_manifest
-from datasets_manifest.provenance import cpu_features, software_versions
+from datasets_manifest.storage import provenance
+from datasets_manifest.storage.layout import frame_folder
+from datasets_manifest.storage.manifest import Drop, build_manifest, dataset_sha256, read_manifest, write_manifest
+from datasets_manifest.storage.provenance import cpu_features, software_versions
 
 SPLIT_OF_SCENE = {scene_id: ("train", "test")[scene_id % 2] for scene_id in range(4)}
 

@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 import webdataset
 
-from datasets_manifest.blind import BlindDataset
-from datasets_manifest.frame_store import FrameStore, frames_there
-from datasets_manifest.layout import frame_folder
-from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
-from datasets_manifest.packing import Packing, choose_packing, mend_shards, pack_all, pack_if_complete
-from datasets_manifest.reader import Dataset
-from datasets_manifest.storage import open_storage
-from datasets_manifest.writer import leftovers, remove_frame, remove_leftovers
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.frame_store import FrameStore, frames_there
+from datasets_manifest.storage.layout import frame_folder
+from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
+from datasets_manifest.storage.packing import Packing, choose_packing, mend_shards, pack_all, pack_if_complete
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import open_storage
+from datasets_manifest.storage.writer import leftovers, remove_frame, remove_leftovers
 
 FRAMES = (0, 1, 2, 3, 4, 6)
 
@@ -285,7 +285,7 @@ def test_a_list_is_made_again_from_its_archive(staged):
 def test_threads_read_one_store_while_lists_come_and_go(staged, monkeypatch):
     wanted = contents(staged)
     pack_all(staged)
-    monkeypatch.setattr("datasets_manifest.frame_store._LISTS_KEPT", 1)
+    monkeypatch.setattr("datasets_manifest.storage.frame_store._LISTS_KEPT", 1)
     store = FrameStore(staged)
     places = [*wanted] * 20
     with ThreadPoolExecutor(16) as threads:

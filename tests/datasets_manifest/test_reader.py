@@ -3,10 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.blind import BlindDataset, BlindPair
-from datasets_manifest.layout import frame_folder
-from datasets_manifest.manifest import build_manifest, write_manifest
-from datasets_manifest.reader import Dataset
+from datasets_manifest.storage.blind import BlindDataset, BlindPair
+from datasets_manifest.storage.layout import frame_folder
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.reader import Dataset
 
 
 @pytest.mark.parametrize("preset", ["rgb-ideal", "paper-colour", "mono"])

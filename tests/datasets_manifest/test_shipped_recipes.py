@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe import load_recipe, recipe_names
-from droguekit.batch.plan import draw_frames, plan_recipe
+from datasets_manifest.recipe.recipe import load_recipe, recipe_names
+from droguekit.batch.planning.recipe_plan import draw_frames, plan_recipe
+from scenes.drogue_appearance import sample_bystanders
 from scenes.sampler import sample_left_from_drogue
-from scenes.target import sample_bystanders
 
 
 @pytest.mark.parametrize("name", recipe_names())

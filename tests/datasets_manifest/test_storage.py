@@ -7,11 +7,18 @@ import uuid
 
 import pytest
 
-from datasets_manifest.frame_store import FrameStore
-from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
-from datasets_manifest.reader import Dataset
-from datasets_manifest.storage import absolute, as_location, in_order, join, open_storage
-from datasets_manifest.writer import encode_files, encode_record, leftovers, remove_frame, remove_leftovers, write_frame
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import absolute, as_location, in_order, join, open_storage
+from datasets_manifest.storage.writer import (
+    encode_files,
+    encode_record,
+    leftovers,
+    remove_frame,
+    remove_leftovers,
+    write_frame,
+)
 
 
 @pytest.fixture(params=["folder", "memory"])

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from datasets_manifest.atomic import open_text_atomic, write_text_atomic
-from datasets_manifest.layout import frame_folder, frame_indices
-from datasets_manifest.reader import Dataset
-from datasets_manifest.writer import encode_files, encode_record, leftovers, remove_leftovers, write_frame
+from datasets_manifest.storage.layout import frame_folder, frame_indices
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import encode_files, encode_record, leftovers, remove_leftovers, write_frame
 
 
 def entries(folder):
@@ -197,7 +197,7 @@ def test_an_unwritable_folder_is_one_clear_line(tmp_path):
 KILLED = """
 import os, signal
 from pathlib import Path
-from datasets_manifest import writer
+from datasets_manifest.storage.storage import writer
 
 def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from labelgen.dataset_validation import validate_dataset
+from labelgen.validation.dataset_checks import validate_dataset
 
 from .whole_dataset import write_whole_dataset
 

@@ -12,15 +12,15 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datasets_manifest.blind import BlindDataset
-from datasets_manifest.layout import RECORD_FILE, frame_folder
-from datasets_manifest.passes import read_passes
-from datasets_manifest.reader import Dataset
-from datasets_manifest.writer import canonical_json
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.exr_passes import read_passes
+from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import canonical_json
 from geometry.stereo import EYES
-from labelgen.dataset_validation import validate_dataset
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
-from labelgen.export.log import ExportLog
+from labelgen.validation.dataset_checks import validate_dataset
 
 from .strategies import byte_edits, fuzz, json_edits, quietly
 

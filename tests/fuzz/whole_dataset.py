@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datasets_manifest.calibration import write_calibration
-from datasets_manifest.manifest import build_manifest, write_manifest
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.writer import write_frame
+from datasets_manifest.calibration.calibration import write_calibration
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.writer import write_frame
 from droguekit.batch.frame_task import make_frame
 from labelgen.export.coco import write_annotations
 from render.engine import load_engine

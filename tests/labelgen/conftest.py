@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from scenes.sampler import sample_frame
 
 from ..small_datasets import RIG_160_PX

@@ -8,21 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets_manifest.calibration import write_calibration
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.images import StereoImages
-from datasets_manifest.manifest import build_manifest, write_manifest
-from datasets_manifest.recipe import Recipe
-from datasets_manifest.records import PairRecord
-from datasets_manifest.writer import encode_files, write_frame
+from datasets_manifest.calibration.calibration import write_calibration
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.writer import encode_files, write_frame
+from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import PairRecord
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import Eye
 from labelgen.export.coco import write_annotations
 from labelgen.frame_labels import label_frame
+from render.camera.sensor import expose
 from render.engine import EyeRadiance, StereoRadiance
-from render.sensor import expose
 
 # Luminance of each kind of part [cd/m2]: bright features, dark structure, a sky between.
 SKY, FEATURE, STRUCTURE = 2000.0, 6000.0, 150.0

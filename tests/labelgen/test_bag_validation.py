@@ -2,9 +2,9 @@ import shutil
 
 import pytest
 
-from labelgen.dataset_validation import validate_dataset
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
-from labelgen.export.log import ExportLog
+from labelgen.validation.dataset_checks import validate_dataset
 
 
 @pytest.fixture

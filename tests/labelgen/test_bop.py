@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets_manifest.manifest import build_manifest, write_manifest
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.writer import encode_files, write_frame
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES
 from labelgen.export.bop import depth_numbers, write_bop
-from labelgen.export.log import ExportLog
-from render.exr import encode_passes
+from labelgen.export.export_log import ExportLog
+from render.exr_writer import encode_passes
 
 SPLITS = ("train", "val", "test")
 FOLDERS = {"train": "train_pbr", "val": "val", "test": "test"}

@@ -5,8 +5,8 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from datasets_manifest.manifest import read_manifest
-from datasets_manifest.writer import leftovers
+from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.writer import leftovers
 from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
 from geometry.stereo import EYES
 from labelgen.export.coco import write_annotations

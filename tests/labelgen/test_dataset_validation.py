@@ -3,11 +3,11 @@ import shutil
 
 import pytest
 
-from datasets_manifest.layout import frame_folder
-from datasets_manifest.manifest import build_manifest, read_manifest, write_manifest
-from datasets_manifest.reader import Dataset
-from datasets_manifest.writer import canonical_json
-from labelgen.dataset_validation import validate_dataset
+from datasets_manifest.storage.layout import frame_folder
+from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import canonical_json
+from labelgen.validation.dataset_checks import validate_dataset
 
 
 def folder_of(dataset, pair):
@@ -133,11 +133,9 @@ def test_a_wrong_box_is_a_fault(small_dataset, full_pairs):
 
 def test_a_scene_in_two_splits_is_a_fault(small_dataset, small_recipe):
     manifest = read_manifest(small_dataset)
-    entries = [
-        entry.model_copy(update={"split": ("train", "test")[place >= len(manifest.frames) // 2]})
-        for place, entry in enumerate(manifest.frames)
-    ]
-    leaky = manifest.model_copy(update={"frames": tuple(entries)})
+    first = manifest.frames[0]
+    moved = first.model_copy(update={"split": "val" if first.split == "train" else "train"})
+    leaky = manifest.model_copy(update={"frames": (moved, *manifest.frames[1:])})
     write_manifest(small_dataset, leaky)
     assert any("is in more than one split" in fault for fault in faults_of(small_dataset))
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parts import drogue_part_ids

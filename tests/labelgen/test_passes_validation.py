@@ -4,14 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.layout import frame_folder
-from datasets_manifest.manifest import Drop, build_manifest, read_manifest, write_manifest
-from datasets_manifest.passes import read_passes
-from datasets_manifest.writer import encode_files, write_frame
+from datasets_manifest.storage.exr_passes import read_passes
+from datasets_manifest.storage.layout import frame_folder
+from datasets_manifest.storage.manifest import Drop, build_manifest, read_manifest, write_manifest
+from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
-from labelgen.dataset_validation import validate_dataset
-from render.exr import encode_passes
+from labelgen.validation.dataset_checks import validate_dataset
+from render.exr_writer import encode_passes
 
 SPLITS = ("train", "val", "test")
 

@@ -6,16 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
-from labelgen.dataset_validation import validate_dataset
 from labelgen.frame_labels import label_frame
-from labelgen.validation import check_against_passes
+from labelgen.validation.dataset_checks import validate_dataset
+from labelgen.validation.label_checks import check_against_passes
+from render.camera.optics import light_on_sensor
+from render.camera.sensor import expose
 from render.engine import load_engine
-from render.optics import light_on_sensor
-from render.sensor import expose
 from scenes.sampler import sample_frame
 
 from ..small_datasets import rendered

@@ -1,5 +1,5 @@
-from datasets_manifest.reader import Dataset
-from labelgen.dataset_validation import validate_dataset
+from datasets_manifest.storage.reader import Dataset
+from labelgen.validation.dataset_checks import validate_dataset
 
 
 def test_a_rendered_dataset_passes(smoke_dataset):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from labelgen.validation import LATTICE_RMS, check_against_passes
+from labelgen.validation.label_checks import LATTICE_RMS, check_against_passes
 
 
 def centroid_errors(longer_px, shorter_px, count):

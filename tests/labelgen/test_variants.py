@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from pycocotools.coco import COCO
 
-from datasets_manifest.blind import BlindDataset
-from datasets_manifest.reader import Dataset
-from labelgen.dataset_validation import validate_dataset
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.reader import Dataset
+from labelgen.validation.dataset_checks import validate_dataset
 
 from ..small_datasets import RIG_320_PX, rendered
 

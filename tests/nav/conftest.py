@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from datasets_manifest.blind import BlindPair
-from datasets_manifest.images import StereoImages
+from datasets_manifest.storage.blind import BlindPair
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parameters import DrogueParameters, even_ring
 from drogue_models.presets import PRESETS
@@ -17,7 +17,7 @@ from geometry.circles import project_disc_centers
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, angles_from_axis, exp_twist, log_twist, rotation_from_angles
 from geometry.stereo import EYES, StereoRig, paper_rig
-from nav.pose.interface import Observation
+from nav.pose.pose_method import Observation
 
 SAMPLES = 8
 READ_NOISE_DN = 1.0

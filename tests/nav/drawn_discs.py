@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from droguekit.benchmark.centroid_bounds import PixelLight, outline_coverage
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
+from studies.acceptance.rendered.centroid_bounds import PixelLight, outline_coverage
 
 DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
 DUSK = PixelLight(60, 240, 4.8, 11_700 / 255 / 16, 0.5, 0.01)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import shapely
 
-from droguekit.benchmark.centroid_bounds import PixelLight, outline_coverage
 from nav.centroids.annulus_edges import AnnulusFits, fit_annuli
 from nav.centroids.annulus_model import annulus_model, annulus_start, azimuth_basis
 from nav.centroids.centroid_quality import NoiseModel
@@ -15,7 +14,8 @@ from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import Travel
 from nav.centroids.patches import annulus_pixels
 from render.analytic_engine.pixel_coverage import pixel_coverage
-from render.optics import blur
+from render.camera.optics import blur
+from studies.acceptance.rendered.centroid_bounds import PixelLight, outline_coverage
 
 DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
 STEP_PX = np.array([0.03, -0.02])

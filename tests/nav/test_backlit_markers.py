@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import PoseEstimate
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.estimates import PoseEstimate
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
 from nav.centroids.binary_chain import window_centroids
 from nav.navigator import DETECTOR, Navigator
-from nav.pose.interface import OUTER_EDGE, NoFixReason
-from nav.rim_boxes import rim_boxes
-from nav.sighting import regions_of
+from nav.pair_measurement import regions_of
+from nav.pose.pose_method import OUTER_EDGE, NoFixReason
+from nav.tracking.rim_boxes import rim_boxes
 
 from .conftest import FACE_RGB, background, expose, paint_disc
 

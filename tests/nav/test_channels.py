@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
-from nav.channels import PLAIN, balancing_weight, marker_channel
+from datasets_manifest.types.images import StereoImages
+from nav.matching.marker_channel import PLAIN, balancing_weight, marker_channel
 
 MIDDLES_PX = np.array([[60.0, 50.0], [58.0, 50.0]])
 RIM_PX = 12.0

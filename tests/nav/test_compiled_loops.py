@@ -8,12 +8,12 @@ import sys
 import numpy as np
 import pytest
 
-from nav import damped_steps
-from nav.centroids import edge_pictures, matrix_loops, pixel_sums, window_cells
+from nav.centroids import edge_pictures, pixel_sums, window_cells
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.patches import annulus_pixels, disc_pixels
 from nav.centroids.pixel_sums import sector_sums, zone_sums
+from nav.numerics import damped_steps, matrix_loops
 from nav.pose import adjustment_loops, reprojection_loops
 
 
@@ -165,15 +165,16 @@ def test_an_outline_over_the_edge_of_the_image_is_cut():
 
 def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile():
     code = """
-from datasets_manifest.recipe import load_recipe
-from nav import damped_steps
-from nav import damped_steps
-from nav.centroids import edge_pictures, matrix_loops, pixel_sums, window_cells
-from nav.first_fits import fit_once
+from datasets_manifest.recipe.recipe import load_recipe
+from nav.numerics import damped_steps
+from nav.numerics import damped_steps
+from nav.centroids import edge_pictures, pixel_sums, window_cells
+from nav.numerics import matrix_loops
+from nav.realtime.warm_up import fit_once
 from nav.navigator import Navigator
 from nav.pose import adjustment_loops, reprojection_loops
 from render.engine import load_engine
-from render.sensor import expose
+from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.estimates import PoseEstimate
+from datasets_manifest.types.estimates import PoseEstimate
 from drogue_models.presets import load_drogue
 from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera

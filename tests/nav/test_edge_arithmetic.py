@@ -8,7 +8,7 @@ from scipy.special import erf
 
 from nav.centroids.edge_profile import blurred_step
 from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
-from nav.centroids.least_squares import evaluate, minimise
+from nav.numerics.levenberg_marquardt import evaluate, minimise
 
 
 def test_a_blurred_step_is_the_error_function():

@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
-from droguekit.benchmark.centroid_bounds import center_bound_px
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
 from nav.centroids.disc_model import disc_model
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.edge_profile import START_WIDTH_PX, ellipse_parameters
 from nav.centroids.ellipses import circles
+from nav.centroids.face_background import Surroundings, shares_beyond
 from nav.centroids.grey_centroid import grey_centroids
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.patches import disc_pixels
-from nav.centroids.surroundings import Surroundings, shares_beyond
+from studies.acceptance.rendered.centroid_bounds import center_bound_px
 
 from .drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
 

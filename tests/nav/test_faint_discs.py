@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from droguekit.benchmark.centroid_bounds import center_bound_px
 from nav.centroids.centroid_quality import SECTORS, NoiseModel, residual_spread
 from nav.centroids.disc_model import contrasts, disc_model, disc_start
 from nav.centroids.disc_places import LEVEL
 from nav.centroids.disc_rejection import rejection_reasons
 from nav.centroids.edge_model import fit_discs
-from nav.centroids.least_squares import evaluate
 from nav.centroids.patches import disc_pixels
+from nav.numerics.levenberg_marquardt import evaluate
+from studies.acceptance.rendered.centroid_bounds import center_bound_px
 
 from .drawn_discs import DAY, DUSK, draw_discs, fit_many, rough_start
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.recipe import load_recipe
+from datasets_manifest.recipe.recipe import load_recipe
 from nav.navigator import Navigator
+from render.camera.sensor import expose
 from render.engine import load_engine
-from render.sensor import expose
 from scenes.sampler import sample_frame
 
 

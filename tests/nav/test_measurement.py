@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, StereoRig, paper_rig
 from nav.centroids.binary_chain import binary_centroids, quantisation_variance_px2
-from nav.channels import marker_channel, marker_color
 from nav.detector.color_blob import ColorBlobDetector
+from nav.matching.marker_channel import marker_channel, marker_color
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]

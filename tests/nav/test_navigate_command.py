@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from datasets_manifest.estimates import NoFix, PoseEstimate, read_estimates
-from datasets_manifest.importers.dataset import ImportSettings, write_imported
-from datasets_manifest.importers.source import SourcePair
+from datasets_manifest.importers.imported_dataset import ImportSettings, write_imported
+from datasets_manifest.importers.pair_source import SourcePair
+from datasets_manifest.types.estimates import NoFix, PoseEstimate, read_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, WRONG_INPUT, run
-from droguekit.cli.navigation_pipeline import NavigationOrder, navigate_dataset
+from droguekit.workflows.navigation import NavigationOrder, navigate_dataset
 from geometry.se3 import RigidTransform, rotation_from_angles
 
 PAIRS = 6

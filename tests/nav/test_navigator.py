@@ -10,22 +10,22 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.blind import BlindDataset
-from datasets_manifest.estimates import PoseEstimate, Region, read_estimates, write_estimates
-from datasets_manifest.recipe import load_recipe
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.types.estimates import PoseEstimate, Region, read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.se3 import angles_from_rotation
 from geometry.stereo import EYES, paper_rig
-from nav.detector.interface import Detection
+from nav.detector.detector import Detection
 from nav.navigator import CENTROID_CHOICES, Navigator
-from nav.pose.interface import NoFixReason
-from nav.pose.tolerances import EXACT, StatedTolerances
+from nav.pose.pose_method import NoFixReason
+from nav.pose.stated_tolerances import EXACT, StatedTolerances
 from nav.refinement import marker_shapes
 from nav.runner import method_names, navigate
+from render.camera.sensor import expose
 from render.engine import load_engine
-from render.sensor import expose
 from scenes.sampler import sample_frame
 
 RIG = paper_rig()
@@ -205,7 +205,7 @@ for name in ("mitsuba", "drjit", "bpy", "torch", "trimesh", "matplotlib", "scene
     sys.modules[name] = None
 import numpy as np
 import nav.runner
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from drogue_models.presets import PRESETS
 from geometry.stereo import paper_rig
 from nav.navigator import CENTROID_CHOICES, Navigator

@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import NoFix, PoseEstimate
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.estimates import NoFix, PoseEstimate
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
 from nav.navigator import Navigator
-from nav.pose.interface import NoFixReason, Observation
-from nav.pose.registry import METHODS, pose_method
-from nav.sighting import Sighting, estimate_pose
+from nav.pair_measurement import Sighting, estimate_pose
+from nav.pose.pose_method import NoFixReason, Observation
+from nav.pose.pose_methods import METHODS, pose_method
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]

@@ -11,8 +11,8 @@ import pytest
 from drogue_models.parameters import even_ring
 from geometry.se3 import rotation_from_angles
 from geometry.stereo import EYES, paper_rig
-from nav.pose.interface import Solution
 from nav.pose.paper import paper, paper_with_step, triple_circles
+from nav.pose.pose_method import Solution
 
 RIG = paper_rig()
 # The ring for which the reference figures were worked out.

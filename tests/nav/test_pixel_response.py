@@ -12,7 +12,7 @@ from nav.centroids.edge_model import fit_discs
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
 from render.analytic_engine.pixel_coverage import pixel_coverage
-from render.optics import blur
+from render.camera.optics import blur
 
 COUNT, BACKGROUND_DN, CONTRAST_DN = 8, 6.0, 100.0
 

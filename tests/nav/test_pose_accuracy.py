@@ -14,11 +14,11 @@ from geometry.se3 import angles_from_axis, log_twist
 from geometry.stereo import EYES, paper_rig
 from nav.pose.adjustment import adjust
 from nav.pose.features import observed_features
-from nav.pose.interface import NoFixReason, Observation, Solution
 from nav.pose.joint import joint
 from nav.pose.mean_plane import mean_plane
 from nav.pose.paper import paper, triple_circles
-from nav.pose.registry import METHODS
+from nav.pose.pose_method import NoFixReason, Observation, Solution
+from nav.pose.pose_methods import METHODS
 
 RIG = paper_rig()
 # The published bounds were worked out for this ring, not for the shipped one of 0.27 m.

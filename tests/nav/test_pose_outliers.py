@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nav.pose.interface import NoFixReason, Solution
 from nav.pose.joint import joint
 from nav.pose.mean_plane import mean_plane
 from nav.pose.paper import paper, three_sphere_candidates
 from nav.pose.paper_literal import _row_difference, paper_literal, paper_reading
+from nav.pose.pose_method import NoFixReason, Solution
 from nav.pose.robust import joint_robust
-from nav.pose.tolerances import StatedTolerances
+from nav.pose.stated_tolerances import StatedTolerances
 
 
 def corrupt(rng, draws, count: int, eyes: str = "one") -> np.ndarray:

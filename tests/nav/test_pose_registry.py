@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nav.pose.interface import NoFixReason
-from nav.pose.registry import METHODS, method_names, pose_method
+from nav.pose.pose_method import NoFixReason
+from nav.pose.pose_methods import METHODS, method_names, pose_method
 from nav.runner import method_names as names_of_runner
 
 NAMES = (
@@ -19,7 +19,7 @@ NAMES = (
 )
 
 MODULE = """
-from nav.pose.interface import NoFixReason
+from nav.pose.pose_method import NoFixReason
 
 def never(observation):
     return NoFixReason("never sure")

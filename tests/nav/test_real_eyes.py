@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import PoseEstimate
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.rigs import resolve_rig
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.rigs import resolve_rig
+from datasets_manifest.types.estimates import PoseEstimate
 from geometry.circles import disc_image_centers, disc_outline, project_disc_centers
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, paper_rig
 from labelgen.frame_labels import label_frame
 from nav.centroids.ellipses import outline_shapes
+from nav.lens_correction import ideal_places, real_places
 from nav.navigator import Navigator
-from nav.real_eyes import ideal_places, real_places
+from render.camera.sensor import expose
 from render.engine import load_engine
-from render.sensor import expose
 from scenes.sampler import sample_frame
 
 TABLE = """

@@ -11,7 +11,7 @@ import pytest
 from nav.pose.adjustment import adjust
 from nav.pose.features import stack_features
 from nav.pose.reprojection import Loss, State, linearise, predicted_px
-from nav.pose.tolerances import StatedTolerances
+from nav.pose.stated_tolerances import StatedTolerances
 
 SIGMA_PX = 0.1
 STATED = StatedTolerances(

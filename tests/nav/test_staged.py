@@ -7,14 +7,14 @@ import threading
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import NoFix, PoseEstimate
+from datasets_manifest.types.estimates import NoFix, PoseEstimate
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from nav.detector.color_blob import ColorBlobDetector
-from nav.handover import Handover, NewestFirst
+from nav.realtime.pipeline import MonotonicClock, play
+from nav.realtime.queues import Handover, NewestFirst
 from nav.runner import LATE, open_navigator, with_smoothed
 from nav.sequence_navigator import LatePair, SequenceNavigator, SequenceSettings
-from nav.staged import MonotonicClock, play
 
 RATE_HZ = 25.0
 PATIENCE_S = 60.0

@@ -10,10 +10,10 @@ import pytest
 from nav.pose.batched import solve_joint_batch
 from nav.pose.features import stack_features
 from nav.pose.joint import joint_hub
-from nav.pose.registry import METHODS
+from nav.pose.pose_methods import METHODS
 from nav.pose.reprojection import State, linearise
 from nav.pose.robust import joint_robust
-from nav.pose.tolerances import EXACT, StatedTolerances
+from nav.pose.stated_tolerances import EXACT, StatedTolerances
 from nav.pose.whitening import whiten, whiten_displaced
 
 STATED = StatedTolerances(

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import read_estimates
-from datasets_manifest.recipe import load_recipe
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.types.estimates import read_estimates
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from droguekit.cli.main import COMMANDS, load_command
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
 from nav.navigator import BINARY_METHODS
-from nav.pose.interface import Observation, Solution
-from nav.pose.registry import ENTRY_POINT_GROUP
+from nav.pose.pose_method import Observation, Solution
+from nav.pose.pose_methods import ENTRY_POINT_GROUP
 from nav.runner import method_names
 
 REPOSITORY = Path(__file__).resolve().parents[2]

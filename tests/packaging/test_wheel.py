@@ -103,7 +103,7 @@ def test_every_data_folder_is_packaged() -> None:
 
 def test_installed_clean_it_lists_and_reads_its_recipes(installed: Path) -> None:
     code = """
-import datasets_manifest.recipe as recipe
+import datasets_manifest.recipe.recipe as recipe
 print(recipe.__file__)
 for name in recipe.recipe_names():
     print(recipe.load_recipe(name)[0].name)

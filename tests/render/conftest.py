@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from render.engine import RenderEngine, load_engine
 
 TABLE = """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datasets_manifest.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 
 GOLDEN = Path(__file__).parent / "golden_render.npz"
 _RECIPE = """

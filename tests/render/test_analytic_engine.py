@@ -11,25 +11,25 @@ import pytest
 import shapely
 from scipy.special import j1
 
-from datasets_manifest.ranges import Range
-from datasets_manifest.recipe import load_recipe
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.types.ranges import Range
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from droguekit.batch.local import render_dataset
 from droguekit.batch.progress import PlainProgress
+from droguekit.batch.render_dataset import render_dataset
 from geometry.circles import disc_area_px2
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from labelgen.dataset_validation import validate_dataset
 from labelgen.discs import hub_discs, marker_discs
 from labelgen.frame_labels import label_frame
-from labelgen.validation import check_against_passes
+from labelgen.validation.dataset_checks import validate_dataset
+from labelgen.validation.label_checks import check_against_passes
 from render.analytic_engine.pixel_coverage import pixel_coverage
+from render.camera.sensor import expose
 from render.engine import load_engine
-from render.sensor import expose
+from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
-from scenes.sky import REC709_LUMINANCE
-from scenes.surroundings import surroundings
+from scenes.sky.clear_sky import REC709_LUMINANCE
 
 LAMP_CD_M2 = 1e6
 STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)

@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.weather import CloudLayer
+from datasets_manifest.types.weather import CloudLayer
 from geometry.se3 import RigidTransform
 from render.background import background
 from render.stars import add_stars
-from scenes.light import luminance
-from scenes.night import star_catalogue
+from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
-from scenes.surroundings import surroundings
+from scenes.sky.light import luminance
+from scenes.sky.night import star_catalogue
 
 
 def exact_rays(frame):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.target import Bystander
+from datasets_manifest.types.appearance import Bystander
 from drogue_models.bystanders import BystanderShape
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import SatinPaint
@@ -22,10 +22,10 @@ from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
-from labelgen.validation import check_against_passes
-from render.sensor import expose
+from labelgen.validation.label_checks import check_against_passes
+from render.camera.sensor import expose
 from scenes.sampler import sample_frame
-from scenes.sky import REC709_LUMINANCE
+from scenes.sky.clear_sky import REC709_LUMINANCE
 
 pytestmark = [
     pytest.mark.blender,

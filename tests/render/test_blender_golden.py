@@ -9,8 +9,8 @@ import pytest
 
 from drogue_models.parts import Part
 from geometry.stereo import EYES
-from scenes.light import REC709_LUMINANCE
 from scenes.sampler import sample_frame
+from scenes.sky.light import REC709_LUMINANCE
 
 from .golden_frame import GOLDEN, golden_recipe
 

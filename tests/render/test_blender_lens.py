@@ -7,13 +7,13 @@ import importlib.util
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
-from labelgen.validation import check_against_passes
-from render.sensor import expose
+from labelgen.validation.label_checks import check_against_passes
+from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 pytestmark = [

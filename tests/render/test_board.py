@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.board import CalibrationBoard
-from datasets_manifest.calibration import opencv_stereo_matrices
-from datasets_manifest.png import encode_png
-from datasets_manifest.recipe import load_recipe, parse_recipe
+from datasets_manifest.calibration.calibration import opencv_stereo_matrices
+from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.storage.png import encode_png
+from datasets_manifest.types.calibration_board import CalibrationBoard
 from drogue_models.parts import Part
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
+from render.camera.sensor import expose
 from render.engine import load_engine
-from render.sensor import expose
 from scenes.sampler import sample_frame
 
 DOC = Path(__file__).resolve().parents[2] / "docs" / "calibration.md"

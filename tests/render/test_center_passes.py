@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import EYES
+from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
-from scenes.surroundings import surroundings
 
 pytestmark = pytest.mark.mitsuba
 
@@ -44,7 +44,7 @@ BYSTANDERS = "[target]\nprobe = true\nobstacle_frame_fraction = 1\ndistractor_fr
     ids=["ideal", "real lenses", "moving", "bystanders"],
 )
 def test_nothing_is_seen_where_no_ray_is_sent(scene_of, rig, more, monkeypatch):
-    from render.mitsuba_engine.center_passes import CenterPasses
+    from render.mitsuba_engine.paths.center_passes import CenterPasses
 
     recipe = parse_recipe(RECIPE % (rig, more))
     for frame in (sample_frame(recipe, index) for index in range(recipe.frames.count)):
@@ -82,8 +82,8 @@ def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of, make_recipe):
     import drjit as dr
     import mitsuba as mi
 
-    from render.mitsuba_engine.camera_rays import CameraRays
     from render.mitsuba_engine.jit_arrays import jit_array
+    from render.mitsuba_engine.paths.camera_rays import CameraRays
     from render.mitsuba_engine.scene import by_shape
 
     rays = 1_000_000

@@ -3,13 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.weather import CloudLayer
+from datasets_manifest.types.weather import CloudLayer
+from render.camera.lens_glare import glare_spread_per_sr, sun_glare
 from render.engine import EyeRadiance
-from render.glare import glare_spread_per_sr, sun_glare
-from scenes.clouds import opacity_towards
-from scenes.light import luminance
+from scenes.clouds.cloud_layers import opacity_towards
+from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
-from scenes.surroundings import surroundings
+from scenes.sky.light import luminance
 
 
 def with_sun(make_recipe, elevation_deg, azimuth_deg):

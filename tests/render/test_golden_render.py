@@ -13,8 +13,8 @@ import pytest
 
 from geometry.stereo import EYES
 from render.engine import load_engine
-from scenes.light import REC709_LUMINANCE
 from scenes.sampler import sample_frame
+from scenes.sky.light import REC709_LUMINANCE
 
 from .golden_frame import GOLDEN, golden_recipe
 

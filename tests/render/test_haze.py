@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Environment
-from datasets_manifest.weather import Mist
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.weather import Mist
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
+from render.compositing import TracedEye
 from render.engine import load_engine
-from render.traced import TracedEye
-from scenes.light import luminance
 from scenes.sampler import sample_frame
+from scenes.sky.light import luminance
 
 BLACK = (0.0, 0.0, 0.0)
 VISIBILITY_M = 60.0
@@ -64,7 +64,7 @@ def test_contrast_falls_as_koschmieder_says_in_mitsuba(make_recipe, engine):
 
 def test_airlight_is_the_background_where_nothing_can_be_seen(make_recipe):
     """Endless air in front of things and the background behind them are one, in clear air and in mist."""
-    from scenes.surroundings import Surroundings
+    from scenes.environment_radiance import Surroundings
 
     _, frame = black_frame(make_recipe, 10.0)
     azimuth = np.linspace(0, 2 * np.pi, 90, endpoint=False)

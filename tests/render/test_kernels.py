@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.target import DrogueCondition, SurfaceCondition
+from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from geometry.se3 import RigidTransform
 from scenes.sampler import sample_frame
 

@@ -9,9 +9,9 @@ import pytest
 from drogue_models.parameters import DrogueParameters, HubParameters
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
-from scenes.light import luminance
+from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
-from scenes.surroundings import surroundings
+from scenes.sky.light import luminance
 
 pytestmark = pytest.mark.mitsuba
 

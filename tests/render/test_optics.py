@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Exposure, Optics
-from datasets_manifest.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.types.frame import Exposure, Optics
 from geometry.pinhole import PinholeCamera
+from render.camera.optics import blur_circle_px, disc_kernel, light_on_sensor, transmission
+from render.camera.sensor import expose
 from render.engine import load_engine
-from render.optics import blur_circle_px, disc_kernel, light_on_sensor, transmission
-from render.sensor import expose
 from scenes.sampler import sample_frame
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)

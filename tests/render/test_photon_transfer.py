@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Exposure, FrameSpec
+from datasets_manifest.types.frame import Exposure, FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID
 from drogue_models.presets import load_drogue
+from render.camera.sensor import dn_per_electron, expose
 from render.engine import EyeRadiance, StereoRadiance, load_engine
-from render.sensor import dn_per_electron, expose
 from scenes.sampler import sample_frame
-from scenes.sky import REC709_LUMINANCE
+from scenes.sky.clear_sky import REC709_LUMINANCE
 
 SHAPE = (96, 128)
 # 36864 samples an image give the variance within 0.74 % (one sigma); eight images within 0.26 %.
@@ -75,7 +75,7 @@ def lit_electrons(frame, power=1.0, engine="analytic"):
         update={"marker_luminance_cd_m2": 2000.0 * power, "marker_emission_rgb": (1.0, 1.0, 1.0)}
     )
     dark = frame.drogue.model_copy(update={"marker_luminance_cd_m2": 0.0})
-    from datasets_manifest.recipe import RenderSettings
+    from datasets_manifest.recipe.recipe import RenderSettings
 
     means = []
     for shown in (drogue, dark):
@@ -140,7 +140,7 @@ def expected_electrons(frame, power, distance_m):
 
 def test_light_of_a_whole_marker_falls_with_the_square_of_its_distance(make_recipe):
     """Electrons summed over a marker and its blur, against its image's area."""
-    from datasets_manifest.recipe import RenderSettings
+    from datasets_manifest.recipe.recipe import RenderSettings
 
     sums = []
     for distance_m in (5.0, 10.0, 20.0):

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.target import DrogueCondition, SurfaceCondition
+from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from scenes.sampler import sample_frame
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.mitsuba
 
 
 def test_dirt_on_a_marker_is_an_edge_everywhere(engine):
-    from render.mitsuba_engine.traced import plan_pixels
+    from render.mitsuba_engine.trace_request import plan_pixels
 
     ids = np.full((20, 30), int(Part.FACE), dtype=np.uint8)
     ids[5:15, 5:12], ids[5:15, 18:25] = FIRST_MARKER_ID, FIRST_MARKER_ID + 1

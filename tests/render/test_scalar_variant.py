@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from geometry.stereo import EYES
-from render.traced import inside_one_part
+from render.compositing import inside_one_part
 
 pytestmark = pytest.mark.mitsuba
 
 SCRIPT = """
 import pickle, sys
 from render.mitsuba_engine.engine import MitsubaEngine
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from scenes.sampler import sample_frame
 recipe = parse_recipe(open(sys.argv[1]).read())
 frames = []
@@ -52,7 +52,7 @@ import sys
 import mitsuba as mi
 import numpy as np
 mi.set_variant("scalar_rgb")
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from render.mitsuba_engine.scalar_tracer import _MITSUBA_FROM_OPENCV, _View
 from scenes.sampler import sample_frame
 recipe = parse_recipe(open(sys.argv[1]).read())

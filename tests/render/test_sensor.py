@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from datasets_manifest.frame import Exposure
-from datasets_manifest.rigs import SENSORS
+from datasets_manifest.recipe.rigs import SENSORS
+from datasets_manifest.types.frame import Exposure
+from render.camera.readout import normal_quantiles
+from render.camera.sensor import MONO_WEIGHTS, dn_per_electron, expose
 from render.engine import EyeRadiance, StereoRadiance
-from render.read_out import normal_quantiles
-from render.sensor import MONO_WEIGHTS, dn_per_electron, expose
 from scenes.sampler import sample_frame
 
 SHAPE = (96, 128)
@@ -162,7 +162,7 @@ def test_same_frame_same_image(frame):
 
 def test_blur_keeps_light_and_place(frame):
     """A point of light keeps its sum and centroid and spreads by the stated variance."""
-    from render.optics import blur
+    from render.camera.optics import blur
 
     image = np.zeros((41, 41, 1), dtype=np.float32)
     image[20, 17] = 1.0

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids
 from geometry.stereo import EYES
-from render.optics import blur
+from render.camera.optics import blur
 from scenes.sampler import sample_frame
 
 pytestmark = pytest.mark.mitsuba

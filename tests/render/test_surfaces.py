@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.target import Bystander, DrogueCondition, SurfaceCondition
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.types.appearance import Bystander, DrogueCondition, SurfaceCondition
 from drogue_models.bystanders import BystanderShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datasets_manifest.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 
 BASE = """
 name = "sequence-test"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.sequence_ranges import Follower, Receiver, SequenceRanges
-from scenes.bow_wave import bow_wave
-from scenes.trajectory import Surroundings, simulate
-from scenes.turbulence import GUST_PERIOD_S
+from datasets_manifest.recipe.sequence_ranges import Follower, Receiver, SequenceRanges
+from scenes.flight.bow_wave import bow_wave
+from scenes.flight.trajectory import Surroundings, simulate
+from scenes.flight.turbulence_field import GUST_PERIOD_S
 
 
 def test_bow_wave_of_a_half_body():

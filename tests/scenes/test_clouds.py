@@ -3,15 +3,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Environment
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.weather import CloudLayer, Mist
-from scenes.cloud_density import CloudDensity
-from scenes.clouds import CloudLight, diffuse_transmission, opacity_towards, see_cloud
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.weather import CloudLayer, Mist
+from scenes.clouds.cloud_density import CloudDensity
+from scenes.clouds.cloud_layers import CloudLight, diffuse_transmission, opacity_towards, see_cloud
 from scenes.environment import environment_of_scene
-from scenes.light import luminance
-from scenes.sky import direction_from_angles
-from scenes.surroundings import Surroundings
+from scenes.environment_radiance import Surroundings
+from scenes.sky.clear_sky import direction_from_angles
+from scenes.sky.light import luminance
 
 RECIPE = """
 name = "weather-test"

@@ -10,12 +10,12 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.recipe import load_recipe
-from scenes.environment_map import load_map
-from scenes.light import SUN_SOLID_ANGLE_SR, luminance
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.types.frame import FrameSpec
+from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
-from scenes.surroundings import surroundings
+from scenes.sky.equirectangular_sky import load_map
+from scenes.sky.light import SUN_SOLID_ANGLE_SR, luminance
 
 HEIGHT = 128
 RECIPE = """
@@ -130,8 +130,8 @@ def test_a_frame_works_in_another_process(tmp_path):
     (tmp_path / "frame.json").write_text(frame.model_dump_json(), encoding="utf-8")
     code = (
         "from pathlib import Path; import numpy as np\n"
-        "from datasets_manifest.frame import FrameSpec\n"
-        "from scenes.surroundings import surroundings\n"
+        "from datasets_manifest.types.frame import FrameSpec\n"
+        "from scenes.environment_radiance import surroundings\n"
         "frame = FrameSpec.model_validate_json(Path('frame.json').read_text())\n"
         "print(surroundings(frame.environment).light_map.mean(dtype=np.float64))"
     )

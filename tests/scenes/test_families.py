@@ -6,10 +6,10 @@ from collections import Counter
 
 import pytest
 
-from datasets_manifest.recipe import load_recipe, parse_recipe
-from droguekit.batch.plan import plan_recipe
-from scenes.families import family_of_scene, recipe_of_scene, scenes_per_family
+from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from droguekit.batch.planning.recipe_plan import plan_recipe
 from scenes.sampler import sample_frame, split_of_scenes
+from scenes.scene_family import family_of_scene, recipe_of_scene, scenes_per_family
 
 BASE = """
 name = "families-test"

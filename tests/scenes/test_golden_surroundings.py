@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Environment
-from datasets_manifest.weather import CloudLayer
-from scenes.clouds import CloudLight, opacity_towards, see_cloud
-from scenes.ground import MEAN_REFLECTANCE, Ground
-from scenes.sea import GroundLight
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.weather import CloudLayer
+from scenes.clouds.cloud_layers import CloudLight, opacity_towards, see_cloud
+from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
+from scenes.ground.sea import GroundLight
 
 GOLDEN = Path(__file__).parent / "golden_surroundings.npz"
 FOCAL_PX, WIDTH_PX, HEIGHT_PX = 30.0, 24, 16

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Environment
-from datasets_manifest.ground import GROUND_KINDS
-from scenes.ground import MEAN_REFLECTANCE, Ground, GroundLight
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.ground import GROUND_KINDS
+from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
+from scenes.ground.land_tiles import land_tile
+from scenes.ground.sea import Sea, fresnel, slope_variances
 from scenes.ground_view import FARTHEST_M, ground_view, pixel_angle_rad
-from scenes.land_tiles import land_tile
-from scenes.light import luminance
 from scenes.mip_tile import MipTile, power_noise
-from scenes.sea import Sea, fresnel, slope_variances
+from scenes.sky.light import luminance
 
 
 def environment(kind, **changes):

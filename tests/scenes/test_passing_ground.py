@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Environment
-from datasets_manifest.recipe import parse_recipe
-from datasets_manifest.weather import CloudLayer
-from scenes.clouds import CloudLight, see_cloud
-from scenes.ground import MEAN_REFLECTANCE, Ground, GroundLight
-from scenes.light import luminance
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.weather import CloudLayer
+from scenes.clouds.cloud_layers import CloudLight, see_cloud
+from scenes.environment_radiance import surroundings
+from scenes.flight.suspension import WORLD_FROM_TANKER
+from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
 from scenes.sampler import sample_frame
-from scenes.surroundings import surroundings
-from scenes.suspension import WORLD_FROM_TANKER
+from scenes.sky.light import luminance
 
 FOCAL_PX, SIZE_PX = 400.0, 192
 RECIPE = """

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.rangefinder import Rangefinder
-from datasets_manifest.recipe import parse_recipe
-from scenes.rangefinder import sample_reading_m
+from datasets_manifest.recipe.rangefinder import Rangefinder
+from datasets_manifest.recipe.recipe import parse_recipe
+from scenes.rangefinder_reading import sample_reading_m
 from scenes.sampler import sample_frame
 
 RECIPE = """

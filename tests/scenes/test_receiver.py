@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.sequence_ranges import CLOSURE_ACCELERATION_M_S2, Follower, Receiver
-from scenes.receiver import Guidance, run_m, wanted_places
+from datasets_manifest.recipe.sequence_ranges import CLOSURE_ACCELERATION_M_S2, Follower, Receiver
+from scenes.flight.receiver import Guidance, run_m, wanted_places
 
 
 def test_a_run_keeps_speed_and_acceleration():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import bulk_frame_generator, frame_generator
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.se3 import exp_twist, log_twist
 from geometry.stereo import EYES
+from scenes.flight.sequence import _flight
+from scenes.flight.suspension import WORLD_FROM_TANKER
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
-from scenes.sequence import _flight
-from scenes.suspension import WORLD_FROM_TANKER
 
 from .sequence_recipe import BASE, recipe
 

@@ -3,13 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import Environment
-from datasets_manifest.weather import CloudLayer, Moon
-from scenes.light import REC709_FROM_XYZ, hemisphere, luminance
-from scenes.night import moon_illuminance_lux, star_catalogue
-from scenes.sky import ClearSky, direction_from_angles
-from scenes.surroundings import Surroundings
-from scenes.texture import sample_texture
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.weather import CloudLayer, Moon
+from scenes.clouds.noise_texture import sample_texture
+from scenes.environment_radiance import Surroundings
+from scenes.sky.clear_sky import ClearSky, direction_from_angles
+from scenes.sky.light import REC709_FROM_XYZ, hemisphere, luminance
+from scenes.sky.night import moon_illuminance_lux, star_catalogue
 
 
 def environment(**changes):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import parse_recipe
 from scenes.sampler import sample_frame
 
 from .sequence_recipe import BASE, recipe

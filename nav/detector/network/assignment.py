@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nav.detector.network.overlap import intersection_over_union
+from nav.detector.network.iou import intersection_over_union
 
 # A cell's claim to a box is score^a IoU^b; so many of the cells with the best claims answer for it.
 _SCORE_POWER, _OVERLAP_POWER = 0.5, 6.0

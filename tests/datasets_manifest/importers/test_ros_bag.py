@@ -13,8 +13,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from datasets_manifest.calibration.stereo_calibration import rig_of_calibration
 from datasets_manifest.importers.ros_bag import RosBag
-from datasets_manifest.importers.stereo_calibration import rig_of_calibration
 
 HUMBLE, NOETIC = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
 IMAGE, INFO, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"

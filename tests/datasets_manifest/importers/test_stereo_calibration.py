@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration import calibration_files
-from datasets_manifest.importers.stereo_calibration import StereoCalibration, read_opencv_stereo, rig_of_calibration
-from datasets_manifest.rigs import resolve_rig
+from datasets_manifest.calibration.calibration import calibration_files
+from datasets_manifest.calibration.stereo_calibration import StereoCalibration, read_opencv_stereo, rig_of_calibration
+from datasets_manifest.recipe.rigs import resolve_rig
 from geometry.stereo import EYES, StereoRig
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.frame import FrameSpec
-from datasets_manifest.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform
 from scenes.sampler import sample_frame

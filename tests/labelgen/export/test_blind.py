@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets_manifest.blind import BlindDataset
-from datasets_manifest.estimates import read_estimates
-from datasets_manifest.reader import Dataset
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import read_estimates
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
-from labelgen.export.log import ExportLog
 
 NUMBER = re.compile(r"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 # What the rig, the drogue and the shutter are called; everything else that a dataset names is truth.

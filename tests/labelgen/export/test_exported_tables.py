@@ -11,11 +11,11 @@ import pyarrow.parquet as pq
 import pytest
 import webdataset
 
-from datasets_manifest.reader import Dataset
+from datasets_manifest.storage.reader import Dataset
 from geometry.stereo import EYES
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
-from labelgen.export.log import ExportLog
 from labelgen.export.tar_shards import write_webdataset
 
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import yaml
 
-from datasets_manifest.reader import Dataset
+from datasets_manifest.storage.reader import Dataset
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import EYES
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
-from labelgen.export.log import ExportLog
 
 ULTRALYTICS = "DROGUEKIT_ULTRALYTICS_PYTHON"
 NAMES = ("yolo", "yolo-image-order", "yolo-detect")

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.manifest import build_manifest, write_manifest
-from datasets_manifest.png import encode_png
+from datasets_manifest.storage.manifest import build_manifest, write_manifest
+from datasets_manifest.storage.png import encode_png
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
-from labelgen.export.log import ExportLog
 
 NAMES = ("coco", "yolo", "yolo-image-order", "yolo-detect", "speed", "kitti", "webdataset", "parquet", "blind")
 # Those that fill a folder of their own; the others replace single files.

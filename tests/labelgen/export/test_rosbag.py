@@ -14,11 +14,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.reader import Dataset
-from datasets_manifest.writer import leftovers
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.writer import leftovers
 from geometry.se3 import RigidTransform
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
-from labelgen.export.log import ExportLog
 from labelgen.export.rosbag import POSE_TOPIC, camera_info_topic, image_topic
 
 Messages = dict[str, list[tuple[int, Any]]]

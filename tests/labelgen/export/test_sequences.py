@@ -8,10 +8,10 @@ import pytest
 from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.reader import Dataset
-from datasets_manifest.records import PairRecord
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.records import PairRecord
+from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
-from labelgen.export.log import ExportLog
 from labelgen.export.sequences import SequenceOrder
 
 

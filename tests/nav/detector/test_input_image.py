@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import PADDING_DN, input_image, letterbox, network_input
 
 SIZES = [((1280, 960), (640, 480)), ((1280, 960), (416, 320)), ((1000, 400), (416, 320)), ((333, 777), (640, 480))]

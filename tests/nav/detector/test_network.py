@@ -21,8 +21,8 @@ from nav.detector.network.backbone import BLOCKS, MobileNetV3
 from nav.detector.network.complexity import complexity
 from nav.detector.network.config import NetworkConfig
 from nav.detector.network.convolution import DepthwiseConv
-from nav.detector.network.model import DetectorNetwork
 from nav.detector.network.neck import AdaptiveFusion, LevelResize
+from nav.detector.network.network import DetectorNetwork
 
 CONFIGS = [NetworkConfig(*each) for each in product(("l", "s"), ("eca", "se"), ("asff", "concat"))]
 MOST_WEIGHTS_BYTES = 12e6

@@ -10,7 +10,7 @@ import pytest
 import torch
 from onnx import TensorProto, helper
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.config import NetworkConfig

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
-from datasets_manifest.recipe import load_recipe
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.types.images import StereoImages
 from droguekit.cli.main import DONE, run
+from nav.detector.detectors import COLOR_BLOB, DEFAULT_DETECTOR, detector_names, network_file
 from nav.detector.onnx_detector import OnnxDetector
-from nav.detector.registry import COLOR_BLOB, DEFAULT_DETECTOR, detector_names, network_file
 
 NETWORKS = [name for name in detector_names() if name != COLOR_BLOB]
 CARD = Path(__file__).parents[3] / "docs" / "detector.md"

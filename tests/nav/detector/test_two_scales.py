@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import letterbox
 from nav.detector.model_metadata import ModelMetadata
+from nav.detector.multiscale_inference import at_full_size, half_size_px, joined
 from nav.detector.onnx_detector import OnnxDetector
-from nav.detector.two_scales import at_full_size, half_size_px, joined
 
 LARGE_PX = 160.0
 NONE = (np.zeros((0, 4)), np.zeros(0))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from datasets_manifest.estimates import PoseEstimate
+from datasets_manifest.types.estimates import PoseEstimate
 from geometry.se3 import Array, RigidTransform, exp_rotation
 
 Measure = Callable[..., PoseEstimate]

@@ -8,12 +8,12 @@ from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from datasets_manifest.estimates import PoseEstimate
+from datasets_manifest.types.estimates import PoseEstimate
 from geometry.se3 import Array, RigidTransform
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.filter_state import FilterState
-from nav.filtering.fixes import pose_difference
 from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import pose_difference
 
 Measure = Callable[..., PoseEstimate]
 PERIOD_S = 0.04

@@ -4,12 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from datasets_manifest.estimates import PoseEstimate
-from datasets_manifest.recipe import load_recipe
+from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.types.estimates import PoseEstimate
 from geometry.se3 import Array
-from nav.filtering.fixes import pose_difference
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import pose_difference
 from scenes.sampler import sample_left_from_drogue
 
 Measure = Callable[..., PoseEstimate]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.estimates import Mode, NoFix, PoseEstimate
+from datasets_manifest.types.estimates import Mode, NoFix, PoseEstimate
 from geometry.se3 import Array, RigidTransform
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.filter_state import FilterState
-from nav.filtering.fixes import Fix, fix_of, pose_difference
 from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import Fix, fix_of, pose_difference
 
 Measure = Callable[..., PoseEstimate]
 PERIOD_S = 0.04

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.estimates import Estimate, PoseEstimate
+from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from geometry.se3 import Array, RigidTransform
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.pose_filter import FilterUpdate, PoseFilter
-from nav.filtering.settings import FilterSettings
 from nav.filtering.smoother import smooth
 
 Measure = Callable[..., PoseEstimate]

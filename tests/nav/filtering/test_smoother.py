@@ -8,11 +8,11 @@ from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
-from datasets_manifest.estimates import Estimate, Mode, NoFix, PoseEstimate
+from datasets_manifest.types.estimates import Estimate, Mode, NoFix, PoseEstimate
 from geometry.se3 import Array, RigidTransform
-from nav.filtering.fixes import pose_difference
+from nav.filtering.filter_settings import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.settings import FilterSettings
+from nav.filtering.pose_measurement import pose_difference
 from nav.filtering.smoother import smooth
 
 Measure = Callable[..., PoseEstimate]

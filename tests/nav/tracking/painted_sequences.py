@@ -9,7 +9,7 @@ from functools import cache, lru_cache
 import cv2
 import numpy as np
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES
 
 WIDTH, HEIGHT = 640, 480

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from nav.detector.interface import Detection, StereoDetection
-from nav.tracking.registry import open_tracker
+from nav.detector.detector import Detection, StereoDetection
+from nav.tracking.trackers import open_tracker
 
 from .painted_sequences import Place, film, overlap
 

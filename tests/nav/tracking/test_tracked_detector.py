@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from drogue_models.presets import load_drogue
 from geometry.stereo import EYES
 from nav.detector.color_blob import ColorBlobDetector
-from nav.detector.interface import Detection, StereoDetection
+from nav.detector.detector import Detection, StereoDetection
 from nav.tracking.continuity import REDETECT_EVERY, begins_sequence
-from nav.tracking.registry import open_tracker
 from nav.tracking.tracked_detector import TrackedDetector, tracked_detector_factory
+from nav.tracking.trackers import open_tracker
 
 from .painted_sequences import RATE_HZ, Look, Place, film, overlap
 

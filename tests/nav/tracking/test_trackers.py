@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES
-from nav.detector.interface import Detection, StereoDetection
-from nav.tracking.interface import Tracker
-from nav.tracking.registry import open_tracker, tracker_names
+from nav.detector.detector import Detection, StereoDetection
+from nav.tracking.tracker import Tracker
+from nav.tracking.trackers import open_tracker, tracker_names
 
 from .painted_sequences import Look, Place, film, growing, overlap, swing
 

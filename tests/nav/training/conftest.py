@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe import parse_recipe
-from droguekit.batch.local import render_dataset
+from datasets_manifest.recipe.recipe import parse_recipe
 from droguekit.batch.progress import PlainProgress
+from droguekit.batch.render_dataset import render_dataset
 from nav.training.corpus import Corpus
 from nav.training.image_cache import CachedPair, ImageCache
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.reader import Dataset
+from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image

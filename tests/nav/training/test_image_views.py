@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from datasets_manifest.images import StereoImages
+from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import PADDING_DN, input_image, network_input
-from nav.training.answers import to_tensor, whole_image
 from nav.training.corpus import Corpus
 from nav.training.image_cache import CachedPair, ImageCache
 from nav.training.image_views import (
@@ -24,6 +23,7 @@ from nav.training.image_views import (
 )
 from nav.training.mosaic import sample_windows
 from nav.training.precision import Computing
+from nav.training.predictions import to_tensor, whole_image
 
 SOURCE_WH = (160, 120)
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])

@@ -1,0 +1,1 @@
+"""The rig's calibration in the files of other programs."""

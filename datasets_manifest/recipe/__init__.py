@@ -1,0 +1,1 @@
+"""What dataset to make: the sections of a recipe's TOML, checked."""

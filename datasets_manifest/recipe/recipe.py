@@ -1,0 +1,320 @@
+"""A recipe: what dataset to make. Read from TOML; every wrong key is named."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from datasets_manifest.recipe.appearance_ranges import DrogueVariant, TargetRanges
+from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
+from datasets_manifest.recipe.exposure_law import ExposureLaw
+from datasets_manifest.recipe.families import fill_families
+from datasets_manifest.recipe.pose_ranges import DistanceLaw, Pose
+from datasets_manifest.recipe.rangefinder import Rangefinder
+from datasets_manifest.recipe.rigs import resolve_rig
+from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_singles, fill_distance
+from datasets_manifest.types.calibration_board import CalibrationBoard
+from datasets_manifest.types.environment_map import pin_map
+from datasets_manifest.types.frame import Sensor
+from datasets_manifest.types.json_types import Rig
+from datasets_manifest.types.ranges import Fraction
+from drogue_models.frozen_model import FrozenModel
+from drogue_models.parameters import DrogueParameters
+from drogue_models.presets import explain, load_drogue
+
+MAX_SEED = 2**63 - 1
+_ENGINES_WITH_LENSES = ("analytic", "mitsuba", "blender")
+
+
+class FrameCounts(FrozenModel):
+    """How many pairs, over how many scenes, how many without a drogue.
+
+    Attributes:
+        in_turn: scenes, families and drogue variants follow each other in the order in which they are given, the family
+            changing from scene to scene and the variant when all families had a scene; else in a drawn order. So a
+            few sequences have every combination.
+    """
+
+    count: int = Field(ge=1, le=10_000_000)
+    scenes: int = Field(default=1, ge=1, le=1_000_000)
+    empty_fraction: Fraction = 0.0
+    # Left out where it says nothing, so that the hashes of other recipes do not know of it.
+    in_turn: bool = Field(default=False, exclude_if=lambda in_turn: not in_turn)
+
+
+class RenderSettings(FrozenModel):
+    """How the engine works.
+
+    Attributes:
+        engine: its name.
+        samples_per_px: paths through each pixel of the drogue, but for those of the next two.
+        open_samples_per_px: the same inside markers, face and rim, where hardly anything hides the sky.
+        edge_samples_per_px: rays to the surfaces in each pixel where parts or shadows meet, and paths through each
+            pixel on hub and coupling; `samples_per_px` if that is more.
+        surround_samples_per_px: the same for hose and tanker.
+        max_depth: longest path, counted in segments.
+        denoise: whether light that reaches a matt drogue, and what stands around it, by way of other surfaces is
+            smoothed over each surface (engine mitsuba). Paths then start from pixel centres, `samples_per_px` where the
+            smoothing is wide and up to `edge_samples_per_px` where the drogue is far away; insides take
+            `open_samples_per_px` rays, and edges 16 to `edge_samples_per_px` on average, fewer the more pixels are
+            inside, and more the larger their contrast.
+        noise_over_sensor: what is aimed at if `denoise` is set: the renderer's noise on the drogue over the sensor's
+            own. Edges take no more rays than that needs, and light by way of other surfaces up to 16 times the paths
+            where it alone would take three quarters of it, squared.
+    """
+
+    engine: str = Field(default="mitsuba", min_length=1, max_length=40)
+    samples_per_px: int = Field(default=16, ge=1, le=65536)
+    open_samples_per_px: int = Field(default=4, ge=1, le=65536)
+    edge_samples_per_px: int = Field(default=324, ge=1, le=65536)
+    surround_samples_per_px: int = Field(default=4, ge=1, le=65536)
+    max_depth: int = Field(default=4, ge=2, le=64)
+    denoise: bool = True
+    noise_over_sensor: float = Field(default=0.42, gt=0, le=100, exclude_if=lambda noise: noise == 0.42)
+
+
+class Outputs(FrozenModel):
+    """What is stored besides images, part ids and records."""
+
+    exr: bool = False
+
+
+class Split(FrozenModel):
+    """Shares of the scenes in each split."""
+
+    train: Fraction = 1.0
+    val: Fraction = 0.0
+    test: Fraction = 0.0
+
+    @model_validator(mode="after")
+    def _sum(self) -> Self:
+        total = self.train + self.val + self.test
+        if abs(total - 1) > 1e-9:
+            raise ValueError(f"train, val, test: must add up to 1, got {total:g}")
+        return self
+
+
+class Family(FrozenModel):
+    """Conditions of a share of a recipe's scenes.
+
+    Attributes:
+        name: written into the scenes' frames.
+        weight: its share of the scenes, against the other families' weights.
+        pose, target, environment, exposure: as in `Recipe`; in TOML only the keys that differ from the recipe's.
+    """
+
+    name: str = Field(min_length=1, max_length=40, pattern=r"^[a-z0-9][a-z0-9-]*$")
+    weight: float = Field(default=1.0, gt=0, le=1e6)
+    pose: Pose = Pose()
+    target: TargetRanges = TargetRanges()
+    environment: EnvironmentRanges = EnvironmentRanges()
+    exposure: ExposureLaw = ExposureLaw()
+
+
+class Recipe(FrozenModel):
+    """What dataset to make, with every reference to presets and files replaced by its contents.
+
+    Attributes:
+        name: of the dataset.
+        family: what kind of conditions, for tables; of recipes without `families`.
+        seed: of everything random.
+        drogue, rig, sensor: in TOML names of presets (`drogue` also a TOML file).
+        board: a calibration board that every frame shows instead of a drogue, or none; `distance` and `pose` are then
+            those of its middle.
+        rangefinder: whose readings the records hold, or none.
+        families: over which the scenes are spread, each with its own conditions; or none.
+        sequence: how pairs follow each other in time; without it each stands alone.
+    """
+
+    name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
+    description: str = Field(default="", max_length=2000)
+    family: str = Field(default="clear", min_length=1, max_length=40)
+    seed: int = Field(default=1, ge=0, le=MAX_SEED)
+    frames: FrameCounts
+    drogue: DrogueParameters
+    rig: Rig
+    sensor: Sensor
+    distance: DistanceLaw
+    pose: Pose = Pose()
+    target: TargetRanges = TargetRanges()
+    environment: EnvironmentRanges = EnvironmentRanges()
+    exposure: ExposureLaw = ExposureLaw()
+    render: RenderSettings = RenderSettings()
+    outputs: Outputs = Outputs()
+    split: Split = Split()
+    board: CalibrationBoard | None = Field(default=None, exclude_if=lambda board: board is None)
+    rangefinder: Rangefinder | None = Field(default=None, exclude_if=lambda rangefinder: rangefinder is None)
+    families: tuple[Family, ...] = Field(default=(), max_length=100)
+    sequence: SequenceRanges | None = Field(default=None, exclude_if=lambda sequence: sequence is None)
+
+    @property
+    def variants(self) -> tuple[DrogueVariant, ...]:
+        """All drogues of all families that scenes may have instead of the recipe's own."""
+        targets = [family.target for family in self.families] or [self.target]
+        return tuple(variant for target in targets for variant in target.variants)
+
+    @model_validator(mode="after")
+    def _families_differ(self) -> Self:
+        names = [family.name for family in self.families]
+        if len(set(names)) < len(names):
+            raise ValueError(f"families: each needs a name of its own, got {', '.join(names)}")
+        if self.frames.in_turn and len({family.weight for family in self.families}) > 1:
+            raise ValueError("families: have equal weights where frames.in_turn is true; leave weight out")
+        for part in self.families or (self,):
+            if self.frames.in_turn and len({variant.weight for variant in part.target.variants}) > 1:
+                raise ValueError("target.variants: have equal weights where frames.in_turn is true; leave weight out")
+        return self
+
+    @model_validator(mode="after")
+    def _engine_knows_lenses(self) -> Self:
+        if self.rig.lenses is not None and self.render.engine not in _ENGINES_WITH_LENSES:
+            raise ValueError(
+                f"render.engine: {self.render.engine} draws ideal eyes only, and the rig has real lenses; use "
+                f"{' or '.join(_ENGINES_WITH_LENSES)}, or a rig without eyes"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _board_can_be_drawn(self) -> Self:
+        if self.board is None:
+            return self
+        if self.render.engine != "analytic":
+            raise ValueError(f"board: is drawn by the engine analytic only, got render.engine {self.render.engine!r}")
+        if self.frames.empty_fraction != 1 or self.families:
+            raise ValueError("board: takes the drogue's place; set frames.empty_fraction to 1, and give no families")
+        if self.pose.speed_m_s != 0 or self.pose.rate_deg_s != 0:
+            raise ValueError("board: stands still; set pose.speed_m_s and pose.rate_deg_s to 0")
+        return self
+
+    @model_validator(mode="after")
+    def _sequences_move_by_themselves(self) -> Self:
+        if self.sequence is None:
+            return self
+        if self.frames.empty_fraction > 0:
+            raise ValueError("frames.empty_fraction: must be 0 with [sequence], where every pair has the drogue")
+        losses = self.sequence.losses
+        if losses is not None and "occlusion" in losses.kinds and self.render.engine == "analytic":
+            raise ValueError(
+                "render.engine: analytic draws no obstacles, and sequence.losses has occlusion; use mitsuba"
+            )
+        for part in self.families or (self,):
+            check_singles(part.pose, part.target)
+            if losses is not None:
+                losses.check_sun(part.pose, part.environment)
+            longest_s = part.exposure.auto_time_s.high if part.exposure.time_s is None else part.exposure.time_s
+            period_s = 1 / self.sequence.frame_rate_hz
+            if longest_s > period_s:
+                raise ValueError(
+                    f"exposure: up to {longest_s:g} s are longer than the {period_s:g} s between pairs of the "
+                    "sequence; lower time_s or auto_time_s, or frame_rate_hz"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _nearest_distance_is_visible(self) -> Self:
+        nearest = self.distance.nearest_m
+        if self.board is not None:
+            limit = self.rig.nearest_plate_view_m(*self.board.size_m)
+            if nearest < limit:
+                raise ValueError(
+                    f"distance: {nearest:g} m is nearer than {limit:.2f} m, where both views hold the board"
+                )
+            return self
+        drogues = [variant.drogue for variant in self.variants] or [self.drogue]
+        if self.sequence is not None:
+            self.sequence.check_view(self.rig, max(drogue.rim_radius_m for drogue in drogues))
+            return self
+        limit = max(self.rig.nearest_full_view_m(drogue.rim_radius_m) for drogue in drogues)
+        if nearest < limit:
+            raise ValueError(
+                f"distance: {nearest:g} m is nearer than {limit:.2f} m, where the whole drogue fits both views"
+            )
+        return self
+
+
+def recipe_names() -> list[str]:
+    """Names of the recipes that ship."""
+    folder = files("datasets_manifest") / "recipes"
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_recipe(name_or_path: str, seed: int | None = None) -> tuple[Recipe, str]:
+    """A recipe by the name of a shipped one, or from a TOML file.
+
+    Args:
+        name_or_path: name, or path of a `.toml` file.
+        seed: replaces the recipe's own.
+
+    Returns:
+        The recipe with all references resolved, and its text as given.
+
+    Raises:
+        ValueError: there is no such recipe, or keys are wrong; names each key.
+    """
+    if name_or_path in recipe_names():
+        text = (files("datasets_manifest") / "recipes" / f"{name_or_path}.toml").read_text(encoding="utf-8")
+        base = Path()
+    else:
+        path = Path(name_or_path)
+        if path.suffix != ".toml":
+            raise ValueError(
+                f"recipe: no {name_or_path!r} ships; there are {', '.join(recipe_names())}, or give a .toml file"
+            )
+        base = path.parent
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}: cannot be read: {error}") from error
+    try:
+        return parse_recipe(text, base, seed), text
+    except ValueError as error:
+        raise ValueError(f"recipe {name_or_path}: {error}") from error
+
+
+def parse_recipe(text: str, base: Path | None = None, seed: int | None = None) -> Recipe:
+    """A recipe from TOML text; relative paths in it are read against `base`.
+
+    Raises:
+        ValueError: not TOML, or keys are wrong; names each key.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"not valid TOML: {error}") from error
+    if seed is not None:
+        table["seed"] = seed
+    drogue = table.get("drogue", "red-8")
+    if not isinstance(drogue, str):
+        raise ValueError("drogue: must be the name of a preset or a .toml file")
+    table["drogue"] = load_drogue(drogue, base)
+    fill_families(table)
+    fill_distance(table)
+    for part in (table, *table.get("families", ())):
+        _load_variants(part.get("target"), base)
+        if isinstance(part.get("environment"), dict):
+            pin_map(part["environment"], base or Path())
+    if "sensor" in table:
+        raise ValueError("sensor: unknown key; it belongs to rig")
+    table["rig"], table["sensor"] = resolve_rig(table.get("rig", "rgb-ideal"), _seed(table))
+    try:
+        return Recipe.model_validate(table)
+    except ValidationError as error:
+        raise ValueError(explain(error)) from error
+
+
+def _load_variants(target: object, base: Path | None) -> None:
+    """Replace the names of drogues in `target.variants` by their contents; other types are left to the schema."""
+    variants = target.get("variants") if isinstance(target, dict) else None
+    for variant in variants if isinstance(variants, list) else ():
+        if isinstance(variant, dict) and isinstance(variant.get("drogue"), str):
+            variant["drogue"] = load_drogue(variant["drogue"], base)
+
+
+def _seed(table: dict[str, Any]) -> int:
+    """The seed of a recipe's table; a wrong one, which the schema will name, counts as none."""
+    seed = table.get("seed", Recipe.model_fields["seed"].default)
+    return seed if type(seed) is int and 0 <= seed <= MAX_SEED else 0

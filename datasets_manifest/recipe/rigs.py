@@ -1,0 +1,158 @@
+"""The rigs that ship: the paper's geometry with three sensors, ideal or real eyes, and the table that adapts one."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from datasets_manifest.random_streams import seeded_generator
+from datasets_manifest.types.frame import Optics, Sensor
+from datasets_manifest.types.ranges import Range
+from drogue_models.frozen_model import FrozenModel
+from drogue_models.presets import explain
+from geometry.distortion import BrownConrady, Lens
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import exp_twist
+from geometry.stereo import StereoRig, paper_rig
+
+# onsemi AR0135AT product brief: 42 ke-/(lux s), 40.7 dB maximum signal to noise, 67.7 dB dynamic range; full well
+# 10^(40.7/10) = 11.7 ke- and read noise 11.7 ke-/10^(67.7/20) = 4.8 e- follow. PRNU is our assumption.
+_AR0135 = {
+    "full_well_e": 11_700.0,
+    "read_noise_e": 4.8,
+    "responsivity_e_per_lux_s": 42_000.0,
+    "prnu_fraction": 0.01,
+    "psf_sigma_px": 0.5,
+    "black_level_dn": 64,
+}
+
+SENSORS: dict[str, Sensor] = {
+    "rgb-ideal": Sensor(name="rgb-ideal", color="rgb", **_AR0135),
+    "paper-colour": Sensor(name="paper-colour", color="bayer", **_AR0135),
+    "mono": Sensor(name="mono", color="mono", **_AR0135),
+}
+SENSORS["paper-real"] = SENSORS["rgb-ideal"].model_copy(
+    update={
+        "name": "paper-real",
+        "optics": Optics(natural_vignetting=True, mechanical_falloff_fraction=0.15, focus_distance_m=15.0),
+    }
+)
+
+
+class Eyes(FrozenModel):
+    """How far the eyes of a rig are from ideal; ranges are drawn once for the whole dataset, for each eye anew.
+
+    Attributes:
+        k1, k2, p1, p2, k3: Brown-Conrady coefficients of both lenses.
+        principal_point_px: largest shift of the principal points along either axis, either way. [px]
+        focal_fraction: largest difference of either focal length from the ideal one, as a share of it.
+        right_rotation_deg: largest turn of the right eye about each of its axes, either way. [deg]
+    """
+
+    k1: Range = Range(low=0, high=0)
+    k2: Range = Range(low=0, high=0)
+    p1: Range = Range(low=0, high=0)
+    p2: Range = Range(low=0, high=0)
+    k3: Range = Range(low=0, high=0)
+    principal_point_px: float = Field(default=0.0, ge=0, le=500)
+    focal_fraction: float = Field(default=0.0, ge=0, le=0.2)
+    right_rotation_deg: float = Field(default=0.0, ge=0, le=5)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        for name in ("k1", "k2", "p1", "p2", "k3"):
+            getattr(self, name).within(-2, 2, name)
+        return self
+
+
+# A good 8 mm lens of a machine vision camera, and a mount adjusted by hand (our assumption).
+_REAL_EYES = Eyes(
+    k1=Range(low=-0.08, high=-0.04),
+    k2=Range(low=0.0, high=0.05),
+    p1=Range(low=-2e-4, high=2e-4),
+    p2=Range(low=-2e-4, high=2e-4),
+    principal_point_px=8.0,
+    focal_fraction=0.003,
+    right_rotation_deg=0.25,
+)
+
+
+class _RigTable(FrozenModel):
+    """A shipped rig with changes."""
+
+    preset: str
+    width_px: int | None = Field(default=None, ge=16, le=16384)
+    height_px: int | None = Field(default=None, ge=16, le=16384)
+    focal_px: float | None = Field(default=None, gt=0, le=1e6)
+    baseline_m: float | None = Field(default=None, gt=0, le=100)
+    probe_tip_body_m: tuple[float, float, float] | None = None
+    output_bits: int | None = None
+    encoding: str | None = None
+    optics: Optics | None = None
+    eyes: Eyes | None = None
+
+
+def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:
+    """Rig and sensor from a preset's name, or from a table that changes one.
+
+    A changed image size keeps the principal point in the middle.
+
+    Args:
+        value: name or table.
+        seed: of the dataset, for what is drawn.
+
+    Raises:
+        ValueError: unknown preset or key.
+    """
+    try:
+        table = _RigTable.model_validate({"preset": value} if isinstance(value, str) else value)
+        if table.preset not in SENSORS:
+            raise ValueError(f"preset: no rig named {table.preset!r}; there are {', '.join(SENSORS)}")
+        rig, sensor = paper_rig(), SENSORS[table.preset]
+        width_px = table.width_px or rig.camera.width_px
+        height_px = table.height_px or rig.camera.height_px
+        focal_px = table.focal_px or rig.camera.fx_px
+        camera = PinholeCamera(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
+        changes = {
+            key: change
+            for key, change in (
+                ("output_bits", table.output_bits),
+                ("encoding", table.encoding),
+                ("optics", table.optics),
+            )
+            if change is not None
+        }
+        sensor = Sensor.model_validate({**sensor.model_dump(), **changes})
+        tip_m = rig.probe_tip_body_m if table.probe_tip_body_m is None else np.array(table.probe_tip_body_m)
+        eyes = table.eyes or (_REAL_EYES if table.preset == "paper-real" else None)
+        lenses = None if eyes is None else _draw_lenses(eyes, camera, seed)
+        return StereoRig(camera, table.baseline_m or rig.baseline_m, rig.body_from_left, tip_m, lenses), sensor
+    except ValidationError as error:
+        raise ValueError(f"rig: {explain(error)}") from error
+    except ValueError as error:
+        raise ValueError(f"rig: {error}") from error
+
+
+def _draw_lenses(eyes: Eyes, camera: PinholeCamera, seed: int) -> tuple[Lens, Lens]:
+    """The left and the right eye; the left one's axes are the rig's."""
+    # Apart from all streams of frames and scenes, whose keys are longer.
+    rng = seeded_generator(seed)
+    lenses = []
+    for is_right in (False, True):
+        shape = [rng.uniform(limits.low, limits.high) for limits in (eyes.k1, eyes.k2, eyes.p1, eyes.p2, eyes.k3)]
+        du, dv = rng.uniform(-1.0, 1.0, 2) * eyes.principal_point_px
+        scale_x, scale_y = 1.0 + rng.uniform(-1.0, 1.0, 2) * eyes.focal_fraction
+        turn = rng.uniform(-1.0, 1.0, 3) * np.radians(eyes.right_rotation_deg) * is_right
+        real = PinholeCamera(
+            camera.width_px,
+            camera.height_px,
+            camera.fx_px * float(scale_x),
+            camera.fy_px * float(scale_y),
+            camera.cx_px + float(du),
+            camera.cy_px + float(dv),
+        )
+        rotation = exp_twist(np.concatenate([np.zeros(3), turn])).rotation
+        lenses.append(Lens(real, BrownConrady(*map(float, shape)), rotation))
+    return lenses[0], lenses[1]

@@ -1,0 +1,223 @@
+"""The `[sequence]` section of a recipe: pairs that follow each other in time, moved by hose, air and receiver."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, Self
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from datasets_manifest.recipe.appearance_ranges import TargetRanges
+from datasets_manifest.recipe.dropout_ranges import LossRanges
+from datasets_manifest.recipe.hose import Hose
+from datasets_manifest.recipe.pose_ranges import Pose
+from datasets_manifest.types.ranges import Range
+from datasets_manifest.types.turbulence import SLOWEST_M_S, Turbulence
+from drogue_models.frozen_model import FrozenModel
+from geometry.stereo import StereoRig
+
+Manoeuvre = Literal["docking", "station", "missed-approach"]
+
+# How a receiver gets to its closure speed and out of it. [m/s2]
+CLOSURE_ACCELERATION_M_S2 = 0.5
+_NOTHING = Range(low=0, high=0)
+# What moves a sequence takes the place of these keys of `[pose]`.
+_POSE_OF_SINGLES = ("pitch_deg", "yaw_deg", "on_axis", "speed_m_s", "rate_deg_s")
+
+
+class Follower(FrozenModel):
+    """Guidance that keeps the drogue near the axis of the rig, as a law of second order.
+
+    Attributes:
+        bandwidth_hz: natural frequency; 0 flies to where the drogue hangs in still air, whatever it does. [Hz]
+        delay_s: age of what it knows of the drogue, whose place it carries on over this time by the velocity. [s]
+        acceleration_limit_m_s2: of the receiver against the tanker. [m/s2]
+    """
+
+    bandwidth_hz: float = Field(default=0.8, ge=0, le=5)
+    delay_s: float = Field(default=0.1, ge=0, le=2)
+    acceleration_limit_m_s2: float = Field(default=6.0, gt=0, le=100)
+
+
+class Receiver(FrozenModel):
+    """What the receiver does and how it shakes; distances are those of the rim's centre along the optical axis.
+
+    Attributes:
+        manoeuvres: sequence by sequence in turn. `docking` closes from `start_m` to `end_m` and stays there; `station`
+            stays at `start_m`; `missed-approach` closes to `abort_m` and backs off to `start_m` again.
+        start_m, end_m, abort_m: [m]
+        closure_m_s: [m/s]
+        hold_s: at `start_m` before it closes. [s]
+        offset_right_m, offset_down_m: of the drogue from the rig's axis; drawn by sequence. Docking takes them out in
+            proportion to the distance still to go. [m]
+        follower: its guidance.
+        body_radius_m: of its nose, far behind the tip, for the bow wave; 0 for none. [m]
+        nose_body_m: the tip of its nose from the left eye: forward, right, down. [m]
+        attitude_sd_deg: standard deviation of each angle about its mean, slowly (0.05 to 0.6 Hz). [deg]
+        vibration_deg, vibration_m: the same of each axis, fast (8 to 40 Hz). [deg, m]
+    """
+
+    manoeuvres: tuple[Manoeuvre, ...] = Field(default=("docking",), min_length=1, max_length=40)
+    start_m: float = Field(default=10.0, gt=0, le=200)
+    end_m: float = Field(default=1.7, gt=0, le=200)
+    abort_m: float = Field(default=3.0, gt=0, le=200)
+    closure_m_s: float = Field(default=0.6, gt=0, le=20)
+    hold_s: float = Field(default=1.0, ge=0, le=600)
+    offset_right_m: Range = _NOTHING
+    offset_down_m: Range = _NOTHING
+    follower: Follower = Follower()
+    body_radius_m: float = Field(default=0.5, ge=0, le=5)
+    nose_body_m: tuple[float, float, float] = (0.0, 0.06, 0.6)
+    attitude_sd_deg: float = Field(default=0.3, ge=0, le=10)
+    vibration_deg: float = Field(default=0.01, ge=0, le=2)
+    vibration_m: float = Field(default=0.0002, ge=0, le=0.05)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        for name, kind in (("end_m", "docking"), ("abort_m", "missed-approach")):
+            near = getattr(self, name)
+            if kind in self.manoeuvres and near >= self.start_m:
+                raise ValueError(f"{name}: must be below start_m, {self.start_m:g} m, got {near:g}")
+        return self
+
+    def nearest_m(self, manoeuvre: Manoeuvre) -> float:
+        """Smallest distance of a manoeuvre. [m]"""
+        return {"docking": self.end_m, "station": self.start_m, "missed-approach": self.abort_m}[manoeuvre]
+
+    def duration_s(self, manoeuvre: Manoeuvre) -> float:
+        """How long a manoeuvre takes; 0 for one that has no end. [s]"""
+        if manoeuvre == "station":
+            return 0.0
+        leg_s = run_time_s(self.start_m - self.nearest_m(manoeuvre), self.closure_m_s)
+        return self.hold_s + leg_s * (2 if manoeuvre == "missed-approach" else 1)
+
+
+def run_time_s(length_m: float, speed_m_s: float) -> float:
+    """How long a run over a length takes, from rest to rest. [s]"""
+    peak_m_s = min(speed_m_s, math.sqrt(length_m * CLOSURE_ACCELERATION_M_S2))
+    return length_m / peak_m_s + peak_m_s / CLOSURE_ACCELERATION_M_S2
+
+
+class SequenceRanges(FrozenModel):
+    """How the sequences of a recipe move; each has a scene, a hose, and air that is its own.
+
+    Attributes:
+        frames_per_sequence: pairs in each; frame k is number k modulo this of sequence k over this.
+        frame_rate_hz: the middles of the exposures are evenly spaced. [Hz]
+        hose: preset, table or all parameters.
+        turbulence: severities, sequence by sequence in turn; in TOML also a single name.
+        tanker_motion_m: standard deviation of the pod about its mean place, along each axis (0.05 to 0.2 Hz). [m]
+        release_m: where the drogue's coupling is let go at the beginning, at rest: aft, right, up of the pod; without
+            it the hose has moved with the air for a while. [m]
+        receiver: what it does.
+        losses: stretches over which the cameras lose the drogue, or none.
+    """
+
+    frames_per_sequence: int = Field(ge=1, le=100_000)
+    frame_rate_hz: float = Field(default=25.0, gt=0, le=1000)
+    hose: Hose = Field(default="full-size", validate_default=True)
+    turbulence: tuple[Turbulence, ...] = Field(default=("light",), min_length=1, max_length=40)
+    tanker_motion_m: float = Field(default=0.05, ge=0, le=5)
+    release_m: tuple[float, float, float] | None = None
+    receiver: Receiver = Receiver()
+    # Left out where there is none, so that the hashes of other recipes do not know of it.
+    losses: LossRanges | None = Field(default=None, exclude_if=lambda losses: losses is None)
+
+    @field_validator("turbulence", mode="before")
+    @classmethod
+    def _one_severity(cls, value: object) -> object:
+        return (value,) if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.release_m is not None:
+            away_m = sum(part**2 for part in self.release_m) ** 0.5
+            if away_m >= self.hose.length_m:
+                raise ValueError(
+                    f"hose.length_m: a hose of {self.hose.length_m:g} m is shorter than the {away_m:.3g} m from the "
+                    "pod to release_m; lengthen it or release the drogue nearer to the pod"
+                )
+        if self.hose.airspeed_m_s < SLOWEST_M_S and set(self.turbulence) != {"none"}:
+            raise ValueError(
+                f"turbulence: needs an airspeed of at least {SLOWEST_M_S:g} m/s, got {self.hose.airspeed_m_s:g}; "
+                "use 'none'"
+            )
+        span_s = (self.frames_per_sequence - 1) / self.frame_rate_hz
+        for manoeuvre in self.receiver.manoeuvres:
+            needed_s = self.receiver.duration_s(manoeuvre)
+            if span_s < needed_s:
+                raise ValueError(
+                    f"frames_per_sequence: {manoeuvre} takes {needed_s:.4g} s, which is "
+                    f"{int(needed_s * self.frame_rate_hz) + 2} frames, got {self.frames_per_sequence}"
+                )
+        if self.losses is not None and span_s < self.losses.end_s:
+            raise ValueError(
+                f"frames_per_sequence: losses last until {self.losses.end_s:.4g} s, which is "
+                f"{int(self.losses.end_s * self.frame_rate_hz) + 2} frames, got {self.frames_per_sequence}"
+            )
+        return self
+
+    @property
+    def nearest_m(self) -> float:
+        """Smallest distance that is flown to. [m]"""
+        return min(self.receiver.nearest_m(manoeuvre) for manoeuvre in self.receiver.manoeuvres)
+
+    def check_view(self, rig: StereoRig, rim_radius_m: float) -> None:
+        """Check that both eyes see the whole drogue along the intended path, but for what `losses` asks for.
+
+        Raises:
+            ValueError: they do not, or a turn that is to lose the drogue does not.
+        """
+        receiver = self.receiver
+        for manoeuvre in receiver.manoeuvres:
+            near_m = receiver.nearest_m(manoeuvre)
+            ends = [(receiver.start_m, 1.0), (near_m, 0.0 if manoeuvre == "docking" else 1.0)]
+            for depth_m, share in ends:
+                field = rig.common_field_m(depth_m, rim_radius_m)
+                across, down = receiver.offset_right_m, receiver.offset_down_m
+                if self.losses is not None:
+                    self.losses.check_turn(rig, rim_radius_m, depth_m, share * max(-across.low, across.high))
+                right = [rig.baseline_m / 2 + share * end for end in (across.low, across.high)]
+                below = [share * end for end in (down.low, down.high)]
+                seen = field is not None and (
+                    field[0] <= right[0] and right[1] <= field[1] and field[2] <= below[0] and below[1] <= field[3]
+                )
+                if not seen:
+                    raise ValueError(
+                        f"sequence.receiver: {manoeuvre} leaves the visible volume at {depth_m:g} m, where both eyes "
+                        f"must see the whole drogue; keep beyond {rig.nearest_full_view_m(rim_radius_m):.2f} m and "
+                        "make offset_right_m and offset_down_m smaller"
+                    )
+
+
+def check_singles(pose: Pose, target: TargetRanges) -> None:
+    """Check that nothing is asked for that only single frames have.
+
+    Raises:
+        ValueError: something is.
+    """
+    plain = Pose()
+    for name in _POSE_OF_SINGLES:
+        if getattr(pose, name) != getattr(plain, name):
+            raise ValueError(f"pose.{name}: in a recipe with [sequence] the motion decides; leave it out")
+    if target.distractor_frame_fraction > 0:
+        raise ValueError("target.distractor_frame_fraction: is drawn by frame, and [sequence] needs it to be 0")
+
+
+def fill_distance(table: dict[str, Any]) -> None:
+    """Give a recipe's table with a `[sequence]` the `[distance]` that follows from it, in place.
+
+    Raises:
+        ValueError: it has one of its own.
+    """
+    given = table.get("sequence")
+    if given is None:
+        return
+    if "distance" in table:
+        raise ValueError("distance: in a recipe with [sequence] the receiver decides; leave it out")
+    try:
+        sequence = SequenceRanges.model_validate(given)
+        ends = (sequence.nearest_m, sequence.receiver.start_m)
+    except ValidationError:
+        ends = (1.0, 1.0)  # the schema will name what is wrong
+    table["distance"] = {"law": "uniform", "low_m": ends[0], "high_m": ends[1]}

@@ -1,0 +1,1 @@
+"""A dataset's descriptions for others: card, Croissant, provenance, published manifests."""

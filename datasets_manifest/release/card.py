@@ -1,0 +1,134 @@
+"""The dataset's card: what it is, how it was made, what it is good for, in words, with Hugging Face's metadata."""
+
+from __future__ import annotations
+
+import json
+
+from datasets_manifest.recipe.pose_ranges import DistanceLaw
+from datasets_manifest.storage.layout import CARD_FILE
+from datasets_manifest.storage.manifest import Manifest
+from datasets_manifest.storage.storage import Location, join, open_storage
+
+# https://github.com/huggingface/hub-docs/blob/main/datasetcard.md: steps of the tag `size_categories`, by images.
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+_LARGEST = "n>1M"
+_TAGS = ("aerial-refuelling", "drogue", "stereo", "6d-pose", "synthetic")
+_LIMITS = """\
+* Every image is computed. What the model leaves out, such as rain, ice, heat haze of engines and cloth that flutters,
+  is not there, and results on these images are no proof of results on a real camera.
+* Dimensions that the seed paper does not give (marker circle, hub, canopy, hose, tanker) are the makers' choice; the
+  manifest holds all of them.
+* Equal, evenly spaced markers leave the roll open up to one marker's turn: no method can tell more than the roll modulo
+  that.
+* Scenes, not frames, are split: frames of one scene share sky, sun and ground, and are not independent draws."""
+
+
+def card_text(manifest: Manifest) -> str:
+    """The whole card as Markdown, with YAML metadata at its head; a function of the manifest alone."""
+    return f"{_metadata(manifest)}\n{_body(manifest)}"
+
+
+def write_card(dataset: Location, manifest: Manifest) -> Location:
+    """Write the card into the dataset.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    open_storage(dataset).write(CARD_FILE, card_text(manifest).encode())
+    return join(dataset, CARD_FILE)
+
+
+def citation(manifest: Manifest) -> str:
+    """A BibTeX entry; the hash says which data are meant."""
+    version = manifest.software.get("droguekit", "")
+    return "\n".join(
+        [
+            f"@misc{{{manifest.name},",
+            f"  title = {{{manifest.name}: synthetic stereo images of an aerial-refuelling drogue}},",
+            "  author = {{The droguekit project}},",
+            f"  howpublished = {{Made with droguekit {version}}},",
+            f"  note = {{dataset sha256 {manifest.dataset_sha256}}}",
+            "}",
+        ]
+    )
+
+
+def _metadata(manifest: Manifest) -> str:
+    """Front matter; JSON's strings and lists are YAML's."""
+    images = 2 * manifest.counts.pairs
+    size = next((name for limit, name in _SIZES if images < limit), _LARGEST)
+    values = {
+        "pretty_name": manifest.name,
+        "license": manifest.data_licence.lower(),
+        "annotations_creators": ["machine-generated"],
+        "source_datasets": ["original"],
+        "task_categories": ["object-detection", "keypoint-detection"],
+        "tags": list(_TAGS),
+        "size_categories": [size],
+        # The files are pairs with their truth beside them, not rows of a table.
+        "viewer": False,
+    }
+    lines = [f"{key}: {json.dumps(value)}" for key, value in values.items()]
+    return "\n".join(["---", *lines, "---", ""])
+
+
+def _body(manifest: Manifest) -> str:
+    recipe, camera = manifest.recipe, manifest.recipe.rig.camera
+    counts = manifest.counts
+    splits = ", ".join(f"{name} {counts.by_split[name]}" for name in ("train", "val", "test"))
+    missing = recipe.frames.count - counts.pairs
+    gaps = f" {missing} of the recipe's {recipe.frames.count} pairs are not in it." if missing else ""
+    software = ", ".join(f"{name} {version}" for name, version in sorted(manifest.software.items()))
+    engines = ", ".join(f"{pairs} pairs by {engine}" for engine, pairs in sorted(manifest.engines.items()))
+    rangefinder = (
+        "\n* `frame.rangefinder_reading_m` in the records is what a laser rangefinder beside the camera reads, with "
+        "the errors that the recipe states. It is a reference with errors of its own, not the truth."
+        if recipe.rangefinder is not None
+        else ""
+    )
+    return f"""# {manifest.name}
+
+{recipe.description or "Synthetic stereo images of an aerial-refuelling drogue."}
+
+## What is in it
+* {counts.pairs} stereo pairs ({2 * counts.pairs} images of {camera.width_px} x {camera.height_px}) of \
+{len(counts.by_scene)} scenes, {counts.empty} of them without a drogue.{gaps}
+* Pairs by split: {splits}.
+* Distance of the drogue: {_distance(recipe.distance)}.
+* Cameras: baseline {recipe.rig.baseline_m:g} m, focal length {camera.fx_px:g} px, sensor `{recipe.sensor.name}`.
+* For every pair the images, the part that each pixel sees, and `record.json`: pose at the middle and the ends of the
+  exposure, every marker's centre and visibility in both eyes, boxes, light, exposure, and all that the frame was made
+  from.{rangefinder}
+* `annotations/` has boxes, masks and keypoints as COCO, `calibration/` the rig, `croissant.json` this in
+  machine-readable form.
+
+`manifest.json` states axes, units and pixel conventions under `conventions`, and the hash of every record.
+
+## How it was made
+By `droguekit` from `recipe.toml` with seed {recipe.seed}: {engines or "no pair yet"}.
+Software: {software}. Dataset sha256: `{manifest.dataset_sha256}`.
+
+`droguekit render recipe.toml --out DIR` makes it again, `droguekit validate DIR` checks every file and label, and
+`droguekit reproduce DIR --frame N` makes one pair again and says whether it is the same bit for bit.
+
+## What it is for
+Training and testing detectors of the drogue, and measuring the errors of pose estimators against exact truth.
+
+## Limits
+{_LIMITS}
+
+## Licence
+The data are under {manifest.data_licence}: use them for anything, and name where they come from. The program that
+made them has a licence of its own. No image shows a person, a place or somebody else's work.
+
+## How to cite
+```
+{citation(manifest)}
+```
+"""
+
+
+def _distance(law: DistanceLaw) -> str:
+    if law.stations_m is not None:
+        return "stations at " + ", ".join(f"{station:g}" for station in law.stations_m) + " m, frame by frame in turn"
+    return f"{law.low_m:g} to {law.high_m:g} m, {law.law}"

@@ -1,0 +1,1 @@
+"""The disk: where files lie, how they appear whole, how they are read."""

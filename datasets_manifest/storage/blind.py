@@ -1,0 +1,116 @@
+"""A dataset as navigation may see it: images, time stamps, rig and the drogue, nothing else."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import BLIND_FILE
+from datasets_manifest.storage.manifest import read_manifest
+from datasets_manifest.storage.reader import read_images, read_shutter, read_sought
+from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.types.frame import Sensor
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.json_types import Rig
+from drogue_models.frozen_model import FrozenModel
+from drogue_models.parameters import DrogueParameters
+from drogue_models.presets import explain
+from geometry.stereo import StereoRig
+
+
+@dataclass(frozen=True, eq=False)
+class BlindPair:
+    """One stereo pair.
+
+    Attributes:
+        frame_index: place in the dataset.
+        images: what the cameras saw, with time stamp and exposure.
+        rig: the cameras.
+        drogue: what to look for; whether it is there is for the images to tell.
+    """
+
+    frame_index: int
+    images: StereoImages
+    rig: StereoRig
+    drogue: DrogueParameters
+
+
+class BlindIndex(FrozenModel):
+    """What stands for a dataset without its truth: `blind.json` of a blind export, or what a manifest says of it.
+
+    Attributes:
+        name: of the dataset.
+        rig, sensor: the cameras.
+        drogue: what to look for.
+        drogues_differ: each pair names its own drogue instead.
+        frames: indices of the pairs, ascending.
+    """
+
+    schema_version: Literal[1] = 1
+    name: str
+    rig: Rig
+    sensor: Sensor
+    drogue: DrogueParameters
+    drogues_differ: bool
+    frames: tuple[Annotated[int, Field(ge=0)], ...]
+
+
+def read_blind_index(dataset: Location) -> BlindIndex:
+    """What may be known of a dataset, blind or not.
+
+    Raises:
+        ValueError: no such folder, or neither a manifest nor an index that can be trusted; names the file.
+    """
+    storage = open_storage(dataset)
+    path = storage.where(BLIND_FILE)
+    if not storage.exists(BLIND_FILE):
+        manifest = read_manifest(dataset)
+        return BlindIndex(
+            name=manifest.name,
+            rig=manifest.recipe.rig,
+            sensor=manifest.recipe.sensor,
+            drogue=manifest.recipe.drogue,
+            drogues_differ=bool(manifest.recipe.variants),
+            frames=tuple(sorted(entry.frame_index for entry in manifest.frames)),
+        )
+    try:
+        return BlindIndex.model_validate(json.loads(storage.read(BLIND_FILE)))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise ValueError(f"{path}: {explain(error)}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
+
+
+class BlindDataset:
+    """Stereo pairs without their truth; images are read when they are asked for."""
+
+    def __init__(self, path: Location) -> None:
+        """Open the dataset in a folder, or at a URL such as `s3://bucket/name`.
+
+        Raises:
+            ValueError: no such place, or nothing in it that can be trusted.
+        """
+        index = read_blind_index(path)
+        self._frames = FrameStore(path)
+        self._rig: StereoRig = index.rig
+        self._drogue = index.drogue
+        self._has_variants = index.drogues_differ
+        self._sensor = index.sensor
+        self.frame_indices: tuple[int, ...] = index.frames
+
+    def pair(self, frame_index: int) -> BlindPair:
+        """One stereo pair.
+
+        Raises:
+            ValueError: it is missing, truncated or of another size or depth than the rig's; names the file.
+        """
+        shutter = read_shutter(self._frames, frame_index)
+        images = read_images(self._frames, frame_index, self._rig.camera, self._sensor, shutter)
+        drogue = read_sought(self._frames, frame_index, self._drogue) if self._has_variants else self._drogue
+        return BlindPair(frame_index, images, self._rig, drogue)

@@ -1,0 +1,286 @@
+"""Finished frames into tar files, so that no instant at which a run may be killed costs a frame.
+
+A frame is first written into a folder of its own. Once all frames of a tar file are there, the archive is written and
+appears whole; then the list beside it; and only then the folders go. An archive without a list is listed anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tarfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import BinaryIO
+
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import (
+    FRAMES_FOLDER,
+    RECORD_FILE,
+    SHARDS_FILE,
+    SHARDS_FOLDER,
+    frame_name,
+    is_plain_name,
+    shard_file,
+    shard_index_file,
+)
+from datasets_manifest.storage.shard_index import (
+    MAX_PAIRS_PER_TAR,
+    PackedFile,
+    ShardIndex,
+    ShardLayout,
+    index_of_archive,
+    index_text,
+    member_name,
+    read_pairs_per_tar,
+    read_shard_index,
+    sha256_of,
+    shard_numbers,
+)
+from datasets_manifest.storage.storage import Location, Storage, in_order, open_storage
+
+Contents = list[tuple[str, bytes]]
+Packed = Mapping[str, PackedFile]
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Which frames come together.
+
+    Attributes:
+        pairs_per_tar: frame i belongs to the tar file i // pairs_per_tar.
+        frames: that are made; a tar file is complete with those of them that belong to it.
+    """
+
+    pairs_per_tar: int
+    frames: range
+
+    def members(self, number: int) -> set[int]:
+        """Frames of one tar file."""
+        first = number * self.pairs_per_tar
+        return {index for index in range(first, first + self.pairs_per_tar) if index in self.frames}
+
+
+def choose_packing(dataset: Location, pairs_per_tar: int | None) -> None:
+    """Let a dataset keep its frames in tar files from now on; those that it has are packed when a run ends.
+
+    Args:
+        dataset: where it lies.
+        pairs_per_tar: how many in each; None leaves it as it is.
+
+    Raises:
+        ValueError: it has tar files of another number already.
+        OSError: it cannot be written.
+    """
+    if pairs_per_tar is None:
+        return
+    check_pairs_per_tar(pairs_per_tar)
+    storage = open_storage(dataset)
+    there = read_pairs_per_tar(storage)
+    if there is None:
+        text = ShardLayout(pairs_per_tar=pairs_per_tar).model_dump_json() + "\n"
+        storage.write(SHARDS_FILE, text.encode())
+    elif there != pairs_per_tar:
+        raise ValueError(
+            f"--tar: {storage.where()} has tar files of {there} pairs, got {pairs_per_tar}; leave it out, or render "
+            "into a new folder"
+        )
+
+
+def check_pairs_per_tar(pairs_per_tar: int | None) -> None:
+    """See that a number of pairs can be chosen; None leaves a dataset as it is.
+
+    Raises:
+        ValueError: it is out of range.
+    """
+    if pairs_per_tar is not None and not 1 <= pairs_per_tar <= MAX_PAIRS_PER_TAR:
+        raise ValueError(f"--tar: must be from 1 to {MAX_PAIRS_PER_TAR} pairs, got {pairs_per_tar}")
+
+
+def packing_of(dataset: Location, frames: range) -> Packing | None:
+    """How a dataset packs frames that are made, or None where each keeps its folder.
+
+    Raises:
+        ValueError: the file that says so is damaged.
+    """
+    pairs_per_tar = read_pairs_per_tar(open_storage(dataset))
+    return None if pairs_per_tar is None else Packing(pairs_per_tar, frames)
+
+
+class _NotWholeError(Exception):
+    """Frames' folders are damaged, or another process has packed them and removes them."""
+
+
+def pack_if_complete(dataset: Location, frame_index: int, packing: Packing) -> None:
+    """Pack the tar file that a frame belongs to, if that frame was the last one missing.
+
+    Several processes may come here at once: they write the same bytes. What cannot be packed is left to `pack_all`.
+
+    Raises:
+        OSError: it cannot be read or written.
+    """
+    storage = open_storage(dataset)
+    number = frame_index // packing.pairs_per_tar
+    wanted = packing.members(number)
+    # What is begun has a name too, so that the second look is seldom taken.
+    if not wanted <= _indices(storage.names(FRAMES_FOLDER)):
+        return
+    staged = _indices(storage.folders_with(FRAMES_FOLDER, RECORD_FILE))
+    if not wanted <= staged or storage.exists(shard_file(number)):
+        return
+    try:
+        _pack(storage, number, _all_staged(storage, sorted(wanted)))
+    except _NotWholeError:
+        return
+    _remove_folders(storage, wanted)
+
+
+def pack_all(dataset: Location) -> None:
+    """Pack all frames that still have folders, those of incomplete tar files too; only while nobody else writes.
+
+    Damaged ones keep their folders.
+
+    Raises:
+        ValueError: a list of a tar file is missing or damaged; names it.
+        OSError: it cannot be read or written.
+    """
+    store = FrameStore(dataset)
+    if store.pairs_per_tar is None:
+        return
+    by_number: dict[int, list[int]] = {}
+    for frame_index in sorted(store.staged):
+        by_number.setdefault(frame_index // store.pairs_per_tar, []).append(frame_index)
+    there = set(shard_numbers(store.storage))
+    for number, staged in by_number.items():
+        packed = read_shard_index(store.storage, number).frames if number in there else {}
+        _pack_again(store.storage, number, staged, packed)
+
+
+def mend_shards(dataset: Location) -> None:
+    """List anew what killed runs have left without its list; only while nobody else writes into the dataset.
+
+    Raises:
+        ValueError: a tar file that cannot be read as one; names it.
+        OSError: it cannot be read or written.
+    """
+    storage = open_storage(dataset)
+    if read_pairs_per_tar(storage) is None:
+        return
+    names = set(storage.names(SHARDS_FOLDER))
+    for number in shard_numbers(storage):
+        if f"{number:06d}.json" in names:
+            continue
+        try:
+            with storage.open(shard_file(number)) as stream:
+                index = index_of_archive(stream)
+        except ValueError as error:
+            where = storage.where(shard_file(number))
+            raise ValueError(f"{where}: {error}; delete it, and the same command makes its frames again") from error
+        storage.write(shard_index_file(number), index_text(index).encode())
+
+
+def _indices(names: list[str]) -> set[int]:
+    return {int(name) for name in names if name.isdecimal()}
+
+
+def _pack_again(storage: Storage, number: int, staged: list[int], packed: Mapping[int, Packed]) -> None:
+    """Pack the whole ones of the frames that have folders, with those that their tar file holds already."""
+    if all(index in packed for index in staged) and all(
+        in_order(partial(_is_known, storage, number, packed), staged, storage)
+    ):
+        _remove_folders(storage, staged)
+        return
+    waiting, whole = set(staged), list[int]()
+
+    def files_of(index: int) -> tuple[Contents | None, Contents | None]:
+        files = _staged_files(storage, index) if index in waiting else None
+        # What is damaged in the tar file and was not made again is none of the dataset's frames any more.
+        return files, _packed_files(storage, number, packed[index]) if files is None and index in packed else None
+
+    def contents() -> Iterator[tuple[int, Contents]]:
+        indices = sorted({*packed, *waiting})
+        for index, (mine, before) in zip(indices, in_order(files_of, indices, storage), strict=True):
+            if mine is not None:
+                whole.append(index)
+            files = mine or before
+            if files is not None:
+                yield index, files
+        if not whole:
+            raise _NotWholeError
+
+    with suppress(_NotWholeError):
+        _pack(storage, number, contents())
+        _remove_folders(storage, whole)
+
+
+def _is_known(storage: Storage, number: int, packed: Mapping[int, Packed], frame_index: int) -> bool:
+    """Whether a frame's folder is whole, and its tar file holds the same."""
+    files = _staged_files(storage, frame_index)
+    return files is not None and files == _packed_files(storage, number, packed[frame_index])
+
+
+def _all_staged(storage: Storage, indices: Sequence[int]) -> Iterator[tuple[int, Contents]]:
+    """Frames that have folders, with their files, of which only a few are in memory at a time.
+
+    Raises:
+        _NotWholeError: one is damaged.
+    """
+    contents = in_order(partial(_staged_files, storage), indices, storage)
+    for index, files in zip(indices, contents, strict=True):
+        if files is None:
+            raise _NotWholeError
+        yield index, files
+
+
+def _staged_files(storage: Storage, frame_index: int) -> Contents | None:
+    """The files in a frame's folder, sorted, or None where they are not those of its record."""
+    folder = frame_name(frame_index)
+    try:
+        record = storage.read(f"{folder}/{RECORD_FILE}")
+        hashes: dict[str, str] = json.loads(record)["file_sha256"]
+        files = {name: storage.read(f"{folder}/{name}") for name in hashes if is_plain_name(name)}
+    except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    if {name: hashlib.sha256(data).hexdigest() for name, data in files.items()} != hashes:
+        return None
+    return sorted({**files, RECORD_FILE: record}.items())
+
+
+def _packed_files(storage: Storage, number: int, files: Packed) -> Contents | None:
+    """The files of a frame in a tar file, sorted, or None where they are not those of its list."""
+    found = [(name, storage.read(shard_file(number), file.offset, file.size)) for name, file in sorted(files.items())]
+    same = all(hashlib.sha256(data).hexdigest() == files[name].sha256 for name, data in found)
+    return found if same else None
+
+
+def _pack(storage: Storage, number: int, frames: Iterable[tuple[int, Contents]]) -> None:
+    with storage.write_large(shard_file(number)) as stream:
+        index = _write_archive(frames, stream)
+        # A list never stands beside an archive that it is not of.
+        storage.delete(shard_index_file(number))
+    storage.write(shard_index_file(number), index_text(index).encode())
+
+
+def _write_archive(frames: Iterable[tuple[int, Contents]], stream: BinaryIO) -> ShardIndex:
+    """Write a tar file, which is a function of its frames alone: nobody's files, of no time."""
+    lists: dict[int, dict[str, PackedFile]] = {}
+    with tarfile.TarFile(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as archive:
+        for frame_index, contents in frames:
+            lists[frame_index] = {}
+            for name, data in contents:
+                header = tarfile.TarInfo(member_name(frame_index, name))
+                header.size, header.mode = len(data), 0o644
+                place = PackedFile(archive.offset + tarfile.BLOCKSIZE, len(data), hashlib.sha256(data).hexdigest())
+                archive.addfile(header, io.BytesIO(data))
+                lists[frame_index][name] = place
+    size = stream.tell()
+    stream.seek(0)
+    return ShardIndex(size=size, sha256=sha256_of(stream), frames=lists)
+
+
+def _remove_folders(storage: Storage, indices: Iterable[int]) -> None:
+    for _ in in_order(lambda index: storage.delete_folder(frame_name(index), RECORD_FILE), indices, storage):
+        pass

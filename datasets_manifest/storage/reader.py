@@ -1,0 +1,253 @@
+"""A dataset, read as it is asked for, wherever and however its frames lie."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cached_property
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import RECORD_FILE, image_file, is_plain_name, mosaic_file, parts_file
+from datasets_manifest.storage.manifest import Manifest, read_manifest
+from datasets_manifest.storage.png import decode_png
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.frame import Sensor
+from datasets_manifest.types.images import Pixels, StereoImages
+from datasets_manifest.types.json_types import write_rig
+from datasets_manifest.types.records import PairRecord
+from drogue_models.parameters import DrogueParameters
+from drogue_models.presets import explain
+from geometry.pinhole import PinholeCamera
+from geometry.stereo import EYES, Eye
+
+
+class Shutter(NamedTuple):
+    """What a pair's record says of its images besides the truth."""
+
+    time_s: float
+    exposure_s: float
+    black_level_dn: float
+
+
+class Dataset:
+    """Stereo pairs with their truth; nothing but the manifest is read before it is asked for."""
+
+    def __init__(self, path: Location) -> None:
+        """Open the dataset in a folder, or at a URL such as `s3://bucket/name`.
+
+        Raises:
+            ValueError: no such place, or no manifest that can be trusted.
+        """
+        self.path = path
+        self.frames = FrameStore(path)
+        self.manifest: Manifest = read_manifest(path)
+
+    @cached_property
+    def frame_indices(self) -> tuple[int, ...]:
+        """Indices of the pairs, ascending."""
+        return tuple(sorted(entry.frame_index for entry in self.manifest.frames))
+
+    @cached_property
+    def _record_hashes(self) -> dict[int, str]:
+        return {entry.frame_index: entry.record_sha256 for entry in self.manifest.frames}
+
+    @cached_property
+    def _rig_table(self) -> dict[str, Any]:
+        return write_rig(self.manifest.recipe.rig)
+
+    def record(self, frame_index: int) -> PairRecord:
+        """The truth of one pair.
+
+        Raises:
+            ValueError: the pair is missing, or its record is truncated or wrong; names the file.
+        """
+        return self._parse_record(frame_index, self.frames.read(frame_index, RECORD_FILE))
+
+    def drogue_sought(self, record: PairRecord) -> DrogueParameters:
+        """What navigation looks for in a pair, whether it is there or not."""
+        return record.frame.drogue or record.frame.sought or self.manifest.recipe.drogue
+
+    def _parse_record(self, frame_index: int, data: bytes) -> PairRecord:
+        path = self.frames.where(frame_index, RECORD_FILE)
+        table = _parse_table(data, path)
+        try:
+            record = PairRecord.model_validate(table)
+        except ValidationError as error:
+            raise ValueError(f"{path}: {explain(error)}") from error
+        if record.frame_index != frame_index:
+            raise ValueError(f"{path}: frame_index: must be {frame_index}, got {record.frame_index}")
+        if write_rig(record.frame.rig) != self._rig_table:
+            raise ValueError(f"{path}: frame.rig: differs from that of the dataset's recipe")
+        for name in record.file_sha256:
+            if not is_plain_name(name):
+                raise ValueError(f"{path}: file_sha256: must name files of the frame's own folder, got {name!r}")
+        return record
+
+    def whole_frame(self, frame_index: int) -> tuple[PairRecord, dict[str, bytes]]:
+        """The record and the other files by name of a pair of the manifest, each read once and hashed.
+
+        Raises:
+            ValueError: a file is missing, or is not the one on record; names it.
+        """
+        data = self.frames.read(frame_index, RECORD_FILE)
+        self._check_hash(frame_index, RECORD_FILE, data, self._record_hashes[frame_index])
+        record = self._parse_record(frame_index, data)
+        files: dict[str, bytes] = {}
+        for name, expected in record.file_sha256.items():
+            files[name] = self.frames.read(frame_index, name)
+            self._check_hash(frame_index, name, files[name], expected)
+        return record, files
+
+    def _check_hash(self, frame_index: int, name: str, data: bytes, expected: str) -> None:
+        if hashlib.sha256(data).hexdigest() != expected:
+            raise ValueError(f"{self.frames.where(frame_index, name)}: was changed, its hash is not the one on record")
+
+    def images(self, frame_index: int) -> StereoImages:
+        """What the cameras saw.
+
+        Raises:
+            ValueError: a file is missing, truncated or of another size or depth than the rig's; names the file.
+        """
+        recipe = self.manifest.recipe
+        shutter = read_shutter(self.frames, frame_index)
+        return read_images(self.frames, frame_index, recipe.rig.camera, recipe.sensor, shutter)
+
+    def part_ids(self, frame_index: int, eye: Eye) -> NDArray[np.uint8]:
+        """(H, W) part id of every pixel centre.
+
+        Raises:
+            ValueError: the file is missing, truncated or of another size than the rig's; names the file.
+        """
+        camera = self.manifest.recipe.rig.camera
+        return cast(NDArray[np.uint8], _read_gray(self.frames, frame_index, parts_file(eye), camera, np.uint8))
+
+    def verify(self, frame_index: int) -> list[str]:
+        """Hash a pair's files again.
+
+        Returns:
+            What is wrong, one line for each file; empty if nothing is.
+        """
+        expected = self._record_hashes.get(frame_index)
+        if expected is None:
+            return [f"{self.frames.where(frame_index)}: is not in the manifest"]
+        faults = self._hash_faults(frame_index, RECORD_FILE, expected)
+        try:
+            hashes = self.record(frame_index).file_sha256
+        except ValueError as error:
+            return [*faults, str(error)]
+        for name, want in hashes.items():
+            faults += self._hash_faults(frame_index, name, want)
+        return faults
+
+    def _hash_faults(self, frame_index: int, name: str, expected: str) -> list[str]:
+        try:
+            self._check_hash(frame_index, name, self.frames.read(frame_index, name), expected)
+        except ValueError as error:
+            return [str(error)]
+        return []
+
+
+def read_record_table(frames: FrameStore, frame_index: int) -> dict[str, Any]:
+    """The JSON object in a pair's record, unchecked.
+
+    Raises:
+        ValueError: it is missing, truncated or no JSON object; names the file.
+    """
+    return _parse_table(frames.read(frame_index, RECORD_FILE), frames.where(frame_index, RECORD_FILE))
+
+
+def _parse_table(data: bytes, path: str) -> dict[str, Any]:
+    try:
+        table = json.loads(data)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
+    if not isinstance(table, dict):
+        raise ValueError(f"{path}: must hold a JSON object")
+    return table
+
+
+def read_shutter(frames: FrameStore, frame_index: int) -> Shutter:
+    """Time stamp, exposure and black level of a pair's images; no truth is looked at.
+
+    Raises:
+        ValueError: the record is missing or truncated, or lacks them; names the file.
+    """
+    table = read_record_table(frames, frame_index)
+    try:
+        values = table["time_s"], table["frame"]["exposure"]["time_s"], table.get("image_black_level_dn", 0.0)
+        return Shutter(*(float(value) for value in values))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{frames.where(frame_index, RECORD_FILE)}: no valid time_s or exposure") from error
+
+
+def read_sought(frames: FrameStore, frame_index: int, usual: DrogueParameters) -> DrogueParameters:
+    """The drogue that a receiver would look for in a pair; whether it is there is not told.
+
+    Args:
+        frames: of the dataset.
+        frame_index: which pair.
+        usual: the recipe's drogue, for datasets with one.
+
+    Raises:
+        ValueError: the record is missing, truncated or wrong; names the file.
+    """
+    frame = read_record_table(frames, frame_index).get("frame")
+    given = (frame.get("drogue") or frame.get("sought")) if isinstance(frame, dict) else None
+    if given is None:
+        return usual
+    try:
+        return DrogueParameters.model_validate(given)
+    except ValidationError as error:
+        raise ValueError(f"{frames.where(frame_index, RECORD_FILE)}: drogue: {explain(error)}") from error
+
+
+def read_images(
+    frames: FrameStore, frame_index: int, camera: PinholeCamera, sensor: Sensor, shutter: Shutter
+) -> StereoImages:
+    """A pair's images.
+
+    Raises:
+        ValueError: a file is missing, truncated or of another size or depth than camera and sensor give.
+    """
+    dtype = np.uint8 if sensor.output_bits == 8 else np.uint16
+    pixels: dict[Eye, Pixels] = {}
+    mosaics: dict[Eye, Pixels | None] = {"left": None, "right": None}
+    for eye in EYES:
+        if sensor.color == "mono":
+            pixels[eye] = _read_gray(frames, frame_index, image_file(eye), camera, dtype)
+        else:
+            pixels[eye] = _read(frames, frame_index, image_file(eye), (camera.height_px, camera.width_px, 3), dtype)
+        if sensor.color == "bayer":
+            mosaics[eye] = _read_gray(frames, frame_index, mosaic_file(eye), camera, dtype)
+    return StereoImages(
+        left=pixels["left"],
+        right=pixels["right"],
+        time_s=shutter.time_s,
+        exposure_s=shutter.exposure_s,
+        bits=sensor.output_bits,
+        encoding=sensor.encoding,
+        black_level_dn=shutter.black_level_dn,
+        left_mosaic=mosaics["left"],
+        right_mosaic=mosaics["right"],
+    )
+
+
+def _read_gray(
+    frames: FrameStore, frame_index: int, name: str, camera: PinholeCamera, dtype: type[np.unsignedinteger[Any]]
+) -> Pixels:
+    return _read(frames, frame_index, name, (camera.height_px, camera.width_px), dtype)
+
+
+def _read(
+    frames: FrameStore, frame_index: int, name: str, shape: tuple[int, ...], dtype: type[np.unsignedinteger[Any]]
+) -> Pixels:
+    where = frames.where(frame_index, name)
+    image = decode_png(frames.read(frame_index, name), where)
+    if image.shape != shape or image.dtype != dtype:
+        raise ValueError(f"{where}: must be {shape} of {np.dtype(dtype).name}, got {image.shape} of {image.dtype}")
+    return image

@@ -1,0 +1,124 @@
+"""A user's own picture of sky and ground all around, instead of drawn ones."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import Field, model_validator
+
+from datasets_manifest.types.ranges import Range
+from drogue_models.frozen_model import FrozenModel
+
+MAP_SUFFIXES = (".exr", ".hdr")
+
+
+class _MapFile(FrozenModel):
+    """A file that is pinned by its contents, and the level of its light; one of the two levels must be given.
+
+    Attributes:
+        path: of an equirectangular picture, `.exr` or Radiance `.hdr`, as the user wrote it; relative to `folder`
+            unless absolute.
+        sha256: of the file.
+        folder: where the recipe lies. It is not stored with a dataset, which must not depend on where it was made; a
+            frame that is read back looks in the working directory.
+        cd_m2_per_unit: luminance of the picture's value 1. [cd/m2]
+        horizontal_illuminance_lux: what the picture's upper half gives level ground, sun included. [lux]
+    """
+
+    path: str = Field(min_length=1, max_length=1000)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    folder: Path = Field(default=Path(), exclude=True)
+    cd_m2_per_unit: float | None = Field(default=None, gt=0, le=1e9)
+    horizontal_illuminance_lux: float | None = Field(default=None, gt=0, le=1e6)
+
+    @model_validator(mode="after")
+    def _one_level(self) -> Self:
+        if (self.cd_m2_per_unit is None) == (self.horizontal_illuminance_lux is None):
+            raise ValueError("cd_m2_per_unit, horizontal_illuminance_lux: give one of the two")
+        return self
+
+    @property
+    def file(self) -> Path:
+        """Where the picture lies."""
+        return self.folder / self.path
+
+
+class EnvironmentMap(_MapFile):
+    """The map of one scene.
+
+    Attributes:
+        rotation_deg: azimuth, from east towards north, of the middle of the picture; what stands right of it in the
+            picture stands right of it in the world. [deg]
+    """
+
+    rotation_deg: float = Field(default=0.0, ge=-360, le=360)
+
+
+class MapRanges(_MapFile):
+    """From what the map of a scene is drawn.
+
+    Attributes:
+        rotation_deg: see `EnvironmentMap`.
+    """
+
+    rotation_deg: Range = Range(low=0, high=0)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        self.rotation_deg.within(-360, 360, "rotation_deg")
+        return self
+
+
+def pin_map(table: dict[str, Any], folder: Path) -> None:
+    """Replace the name of the map's file in an `[environment]` table, if it has one, by path, hash and folder.
+
+    Raises:
+        ValueError: not a name, or a file that cannot be read.
+    """
+    given = table.get("map")
+    if isinstance(given, str):
+        given = {"file": given, "cd_m2_per_unit": 1.0}
+    if not isinstance(given, dict) or "file" not in given:
+        if given is not None:
+            raise ValueError("environment.map: must be the path of a file, or a table with the key file")
+        return
+    rest = {key: value for key, value in given.items() if key != "file"}
+    path = given["file"]
+    if not isinstance(path, str) or not path.lower().endswith(MAP_SUFFIXES):
+        raise ValueError(f"environment.map: must be the path of an .exr or .hdr file, got {path!r}")
+    for key in ("path", "sha256", "folder"):
+        if key in rest:
+            raise ValueError(f"environment.map.{key}: unknown key")
+    table["map"] = {"path": path, "sha256": _sha256(folder / path), "folder": folder, **rest}
+
+
+def read_map_file(environment_map: _MapFile) -> bytes:
+    """The contents of a map's file.
+
+    Raises:
+        ValueError: it is missing, or is not the file that it was when the recipe was read.
+    """
+    data = _read(environment_map.file)
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 != environment_map.sha256:
+        raise ValueError(
+            f"environment.map: {environment_map.file} has changed since the recipe was read; restore the file with "
+            f"sha256 {environment_map.sha256}, got {sha256}"
+        )
+    return data
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(_read(file)).hexdigest()
+
+
+def _read(file: Path) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise ValueError(
+            f"environment.map: {file} cannot be read: {error.strerror}; a frame from a dataset looks for its map in "
+            "the working directory"
+        ) from error

@@ -1,0 +1,181 @@
+"""What a pose estimator says about one frame, and the JSON-lines file that holds many."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from datasets_manifest.atomic import open_text_atomic
+from datasets_manifest.types.json_types import Matrix6, Transform
+from drogue_models.frozen_model import FrozenModel
+from geometry.stereo import Eye
+
+TANGENT = "left: t' = t + dt, R' = exp([w]x) R; order dt [m], w [rad]"
+
+
+class Feature(FrozenModel):
+    """One measured image point.
+
+    Attributes:
+        eye: which image.
+        index: of the marker in the drogue's order; `hub` for the hub.
+        center_px: measured centre.
+        cov_px2: (2, 2) covariance of the centre, row-major. [px^2]
+        used: whether the pose rests on it.
+    """
+
+    eye: Eye
+    index: int | Literal["hub"]
+    center_px: tuple[float, float]
+    cov_px2: tuple[tuple[float, float], tuple[float, float]]
+    used: bool
+
+
+class Mode(FrozenModel):
+    """One of several poses that explain the images."""
+
+    left_from_drogue: Transform
+    weight: float = Field(ge=0, le=1)
+
+
+class Region(FrozenModel):
+    """Where in one image the drogue was looked for.
+
+    Attributes:
+        eye: which image.
+        box_xywh_px: x, y of the low corner, width, height in pixel-centre coordinates; may reach over the image's edge.
+        source: `detector`, the name of the tracker that followed it, or `other eye` where that one alone had found it.
+        score: 0 to 1.
+    """
+
+    eye: Eye
+    box_xywh_px: tuple[float, float, float, float]
+    source: str = Field(min_length=1, max_length=80)
+    score: float = Field(ge=0, le=1)
+
+
+class Motion(FrozenModel):
+    """How the drogue moves against the left camera, at the time of the images.
+
+    Attributes:
+        velocity_m_s: of the drogue's origin, in the left camera's axes. [m/s]
+        rate_rad_s: of its attitude, `R' = [w]x R`, in the left camera's axes. [rad/s]
+        covariance: (6, 6) of both in this order.
+    """
+
+    velocity_m_s: tuple[float, float, float]
+    rate_rad_s: tuple[float, float, float]
+    covariance: Matrix6
+
+
+class Docking(FrozenModel):
+    """The drogue as the probe sees it, in the receiver's body axes: forward, right, down.
+
+    Attributes:
+        mouth_from_tip_m: (3,) centre of the drogue's rim from the probe's tip. [m]
+        mouth_sd_m: (3,) standard deviations of that. [m]
+        closure_m_s: how fast the forward part shrinks; null where the motion is not known. [m/s]
+        miss_m: distance of the tip from the drogue's axis when it comes to the plane of the rim, if both go on as they
+            move now; null unless they close. [m]
+        miss_sd_m: standard deviation of that. [m]
+        contact_s: until then; null unless they close. [s]
+        captured: whether `miss_m` lies within the capture radius; null where there is no `miss_m`.
+        capture_radius_m: that radius; null for the drogue's own. [m]
+    """
+
+    mouth_from_tip_m: tuple[float, float, float]
+    mouth_sd_m: tuple[float, float, float]
+    closure_m_s: float | None = None
+    miss_m: float | None = Field(default=None, ge=0)
+    miss_sd_m: float | None = Field(default=None, ge=0)
+    contact_s: float | None = Field(default=None, ge=0)
+    captured: bool | None = None
+    capture_radius_m: float | None = Field(default=None, gt=0)
+
+
+class PoseEstimate(FrozenModel):
+    """A pose of the drogue.
+
+    Attributes:
+        left_from_drogue: modulo the markers' symmetry.
+        covariance: (6, 6) in the tangent that `tangent` names; None where a method knows none.
+        modes: every pose that explains the images, the best first; weights sum to 1.
+        features: what was measured.
+        stage_s: seconds by stage. [s]
+        regions: where the drogue was looked for, at most one an eye.
+        motion: where a filter knows it.
+        docking: where it was asked for.
+        latency_s: from the arrival of the images to this answer, where they came at a rate. [s]
+    """
+
+    status: Literal["fix"] = "fix"
+    frame_index: int = Field(ge=0)
+    method: str = Field(min_length=1, max_length=80)
+    left_from_drogue: Transform
+    covariance: Matrix6 | None = None
+    tangent: str = TANGENT
+    modes: tuple[Mode, ...] = ()
+    features: tuple[Feature, ...] = ()
+    stage_s: dict[str, float] = Field(default_factory=dict)
+    regions: tuple[Region, ...] = ()
+    motion: Motion | None = None
+    docking: Docking | None = None
+    latency_s: float | None = Field(default=None, ge=0)
+
+
+class NoFix(FrozenModel):
+    """No pose, and why."""
+
+    status: Literal["no_fix"] = "no_fix"
+    frame_index: int = Field(ge=0)
+    method: str = Field(min_length=1, max_length=80)
+    reason: str = Field(min_length=1)
+    features: tuple[Feature, ...] = ()
+    stage_s: dict[str, float] = Field(default_factory=dict)
+    regions: tuple[Region, ...] = ()
+    latency_s: float | None = Field(default=None, ge=0)
+
+
+Estimate = PoseEstimate | NoFix
+_ADAPTER: TypeAdapter[Estimate] = TypeAdapter(Annotated[Estimate, Field(discriminator="status")])
+
+
+def write_estimates(path: Path, estimates: Iterable[Estimate]) -> int:
+    """Write one JSON object a line, replacing `path` only once all are written.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        OSError: the file cannot be written; names it. What was there stays.
+    """
+    count = 0
+    with open_text_atomic(path) as stream:
+        for estimate in estimates:
+            stream.write(estimate.model_dump_json() + "\n")
+            count += 1
+    return count
+
+
+def read_estimates(path: Path) -> Iterator[Estimate]:
+    """Estimates of a JSON-lines file, ours or anybody's.
+
+    Raises:
+        ValueError: the file cannot be read, or a line is not an estimate; names file and line.
+    """
+    try:
+        with path.open(encoding="utf-8") as stream:
+            for number, line in enumerate(stream, start=1):
+                if not line.strip():
+                    continue
+                try:
+                    yield _ADAPTER.validate_python(json.loads(line))
+                except (ValidationError, ValueError, RecursionError) as error:
+                    first = str(error).splitlines()[0]
+                    raise ValueError(f"{path}, line {number}: not a pose estimate: {first}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: cannot be read: {error}") from error

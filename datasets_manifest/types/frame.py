@@ -1,0 +1,235 @@
+"""One frame to be rendered, complete: everything that the picture and its truth depend on."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from datasets_manifest.types.appearance import Bystander, DrogueCondition
+from datasets_manifest.types.calibration_board import PlacedBoard
+from datasets_manifest.types.dropout import Loss
+from datasets_manifest.types.environment_map import EnvironmentMap
+from datasets_manifest.types.ground import GroundKind
+from datasets_manifest.types.json_types import Points3, Rig, Transform, Vector6
+from datasets_manifest.types.weather import CloudLayer, Mist, Moon
+from drogue_models.frozen_model import FrozenModel
+from drogue_models.parameters import DrogueParameters, ReflectanceRgb
+from geometry.se3 import RigidTransform, exp_twist
+
+Elevation = Annotated[float, Field(ge=-90, le=90)]
+
+
+class Environment(FrozenModel):
+    """Sky, sun, air and ground of one scene, in world axes (x east, y north, z up).
+
+    Attributes:
+        sun_elevation_deg, sun_azimuth_deg: direction to the sun; azimuth from east towards north. Below the horizon
+            there is twilight, then night. [deg]
+        turbidity: Linke-like turbidity of Preetham's model, 2 very clear to 6 hazy.
+        visibility_m: meteorological range (2 % contrast), which sets the extinction of the air. [m]
+        altitude_m: of the camera above ground. [m]
+        camera_offset_m: east and north of the place about which ground and clouds are laid out; only a sequence flies
+            away from it. [m]
+        ground: what lies below; `town` runs out into fields.
+        ground_reflectance_rgb: mean diffuse reflectance of the ground, of a coast's land, or of the water under the
+            surface of the sea.
+        ground_texture_seed: of its pattern, shoreline and ships.
+        wind_speed_m_s: over the sea, which sets waves, glint and foam. [m/s]
+        clouds: cloud layers, in any order.
+        mist: thin cloud around the camera, or none.
+        moon: or none.
+        map: a picture of sky and ground that takes the place of all the others but the visibility, or none.
+    """
+
+    sun_elevation_deg: float = Field(ge=-90, le=90)
+    sun_azimuth_deg: float = Field(ge=-360, le=360)
+    turbidity: float = Field(ge=1.9, le=10)
+    visibility_m: float = Field(ge=500, le=400_000)
+    altitude_m: float = Field(ge=10, le=20_000)
+    # Left out where it says nothing, so that the hashes of single pairs do not know of it.
+    camera_offset_m: tuple[float, float] = Field(default=(0.0, 0.0), exclude_if=lambda offset_m: offset_m == (0.0, 0.0))
+    ground: GroundKind = "fields"
+    ground_reflectance_rgb: ReflectanceRgb
+    ground_texture_seed: int = Field(ge=0)
+    wind_speed_m_s: float = Field(default=7.0, ge=0, le=40)
+    clouds: tuple[CloudLayer, ...] = Field(default=(), max_length=6)
+    mist: Mist | None = None
+    moon: Moon | None = None
+    map: EnvironmentMap | None = None
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of the clear air, without mist (Koschmieder, contrast 2 %). [1/m]"""
+        return 3.912 / self.visibility_m
+
+
+class Exposure(FrozenModel):
+    """Shutter, aperture and amplification of both eyes.
+
+    Attributes:
+        time_s: how long the shutter is open. [s]
+        f_number: focal length over aperture.
+        gain: of the amplifier before the converter; at 1 a full well is the highest number.
+    """
+
+    time_s: float = Field(gt=0, le=1)
+    f_number: float = Field(ge=0.5, le=64)
+    gain: float = Field(default=1.0, ge=0.1, le=64)
+
+    @property
+    def lux_per_cd_m2(self) -> float:
+        """Illuminance of the sensor per luminance of the scene, for a lens without loss, focused far away. [lux m2/cd]
+
+        Source: camera equation E = pi L / (4 N^2), EMVA Standard 1288.
+        """
+        return math.pi / (4.0 * self.f_number**2)
+
+
+class Optics(FrozenModel):
+    """What the lens does besides its point spread; as given here it does nothing.
+
+    Attributes:
+        natural_vignetting: light falls off with the fourth power of the cosine of the angle from the axis.
+        mechanical_falloff_fraction: of the light that the lens barrel takes besides in the corners of the image; it
+            grows with the fourth power of the distance from the principal point.
+        focus_distance_m: planar depth that is sharp; without it everything is. [m]
+        pixel_pitch_um: with the focal length in pixels it gives the one in metres, and so the aperture. [um]
+        scattered_fraction: of the light of sun or moon on the lens, spread over the picture as glare; 0.01 is
+            a clean lens, a fogged one may have a tenth (our choice).
+    """
+
+    natural_vignetting: bool = False
+    mechanical_falloff_fraction: float = Field(default=0.0, ge=0, lt=1)
+    focus_distance_m: float | None = Field(default=None, gt=0.05, le=1e6)
+    pixel_pitch_um: float = Field(default=3.75, ge=0.5, le=100)
+    # Left out where the lens is clean, so that the hashes of other datasets do not know of it.
+    scattered_fraction: float = Field(default=0.01, ge=0, le=0.5, exclude_if=lambda fraction: fraction == 0.01)
+
+
+class Sensor(FrozenModel):
+    """What turns radiance into numbers, with the lens before it.
+
+    Attributes:
+        name: the preset's name.
+        color: `rgb` three samples a pixel, `bayer` one (RGGB mosaic), `mono` none.
+        full_well_e, read_noise_e: [electrons]
+        responsivity_e_per_lux_s: electrons per pixel for white light. [e-/(lux s)]
+        prnu_fraction: standard deviation of the pixels' gains.
+        psf_sigma_px: Gaussian blur of lens and pixel crosstalk, after the pixel's box. [px]
+        adc_bits, output_bits: of the converter and of the stored image.
+        black_level_dn: added before the converter clips. [DN of adc_bits]
+        encoding: `linear`, or `gamma` (the sRGB curve).
+        optics: vignetting and focus.
+    """
+
+    name: str = Field(min_length=1, max_length=80)
+    color: Literal["rgb", "bayer", "mono"]
+    full_well_e: float = Field(gt=0, le=1e7)
+    read_noise_e: float = Field(ge=0, le=1e4)
+    responsivity_e_per_lux_s: float = Field(gt=0, le=1e7)
+    prnu_fraction: float = Field(ge=0, le=0.2)
+    psf_sigma_px: float = Field(ge=0, le=10)
+    adc_bits: Literal[12] = 12
+    output_bits: Literal[8, 12] = 8
+    black_level_dn: int = Field(ge=0, le=1000)
+    encoding: Literal["linear", "gamma"] = "linear"
+    optics: Optics = Optics()
+
+    def electrons_per_cd_m2(self, exposure: Exposure) -> float:
+        """Electrons of one pixel per luminance of the scene. [e- m2/cd]"""
+        return self.responsivity_e_per_lux_s * exposure.lux_per_cd_m2 * exposure.time_s
+
+
+class FrameSpec(FrozenModel):
+    """One stereo pair to make. Truth in all that it holds; navigation never sees it.
+
+    Attributes:
+        seed: of the dataset; with `frame_index` it keys every random stream.
+        frame_index: place in the dataset.
+        family: the recipe's name for these conditions, for tables.
+        scene_id: which drawn environment; splits are by scene.
+        sequence_id: which sequence, or None for single frames.
+        time_s: mid-exposure. [s]
+        drogue: what hangs there, or None for an empty frame.
+        sought: in an empty frame of a dataset with several drogues, the one that navigation is told to look for.
+        condition: state of the drogue's surfaces, or None when it is as new.
+        bystanders: what else stands in the picture.
+        board: a calibration board instead of a drogue, or none.
+        left_from_drogue: pose at mid-exposure, or None for an empty frame.
+        world_from_left: world axes are x east, y north, z up; origin at the left eye.
+        left_twist_per_s, drogue_twist_per_s: (6,) body twists over the exposure, each in its own frame, relative to
+            axes that fly along with the tanker: velocity [m/s], then angular velocity [rad/s].
+        left_from_tanker: tanker frame x aft, y right wing, z up at the pod's hose exit, or None.
+        hose_nodes_left_m: (K, 3) centre line from coupling to pod in the left camera at mid-exposure, or None. [m]
+        rig, sensor, exposure, environment: as named.
+        rangefinder_reading_m: of the distance of the rim centre along the optical axis, or None without one. [m]
+        loss: what is coming to keep the cameras from seeing the drogue, keeps them, or is going; or None.
+    """
+
+    seed: int = Field(ge=0)
+    frame_index: int = Field(ge=0)
+    family: str = "clear"
+    scene_id: int = Field(ge=0)
+    sequence_id: int | None = Field(default=None, ge=0)
+    time_s: float
+    drogue: DrogueParameters | None
+    sought: DrogueParameters | None = None
+    condition: DrogueCondition | None = None
+    bystanders: tuple[Bystander, ...] = ()
+    # Left out where there is none, so that the hashes of other datasets do not know of boards.
+    board: PlacedBoard | None = Field(default=None, exclude_if=lambda board: board is None)
+    left_from_drogue: Transform | None
+    world_from_left: Transform
+    left_twist_per_s: Vector6
+    drogue_twist_per_s: Vector6
+    left_from_tanker: Transform | None
+    hose_nodes_left_m: Points3 | None
+    rig: Rig
+    sensor: Sensor
+    exposure: Exposure
+    environment: Environment
+    rangefinder_reading_m: float | None = Field(default=None, exclude_if=lambda reading_m: reading_m is None)
+    loss: Loss | None = Field(default=None, exclude_if=lambda loss: loss is None)
+
+    @model_validator(mode="after")
+    def _drogue_has_a_pose(self) -> Self:
+        if (self.drogue is None) != (self.left_from_drogue is None):
+            raise ValueError("left_from_drogue: must be given exactly when there is a drogue")
+        if self.drogue is not None and self.board is not None:
+            raise ValueError("board: stands only in frames without a drogue")
+        states = self.condition.markers if self.condition is not None else ()
+        if self.condition is not None and self.drogue is None:
+            raise ValueError("condition: an empty frame has none")
+        if self.drogue is not None and states and len(states) != self.drogue.marker_count:
+            raise ValueError(f"condition.markers: must be {self.drogue.marker_count} or none, got {len(states)}")
+        return self
+
+    def left_from_drogue_at(self, offset_s: float) -> RigidTransform:
+        """Pose of the drogue in the left camera, `offset_s` after mid-exposure.
+
+        Raises:
+            ValueError: the frame has no drogue.
+        """
+        if self.left_from_drogue is None:
+            raise ValueError("left_from_drogue_at: the frame has no drogue")
+        camera_moved = exp_twist(-offset_s * self.left_twist_per_s)
+        drogue_moved = exp_twist(offset_s * self.drogue_twist_per_s)
+        pose: RigidTransform = camera_moved @ self.left_from_drogue @ drogue_moved
+        return pose
+
+    def left_from_stage_at(self, offset_s: float) -> RigidTransform:
+        """Pose of the axes in which everything that is drawn stands still, `offset_s` after mid-exposure.
+
+        They are the drogue's; without one the left camera's own at mid-exposure, flying along with the tanker.
+        """
+        if self.left_from_drogue is not None:
+            return self.left_from_drogue_at(offset_s)
+        moved: RigidTransform = exp_twist(-offset_s * self.left_twist_per_s)
+        return moved
+
+    def world_from_left_at(self, offset_s: float) -> RigidTransform:
+        """Pose of the left camera in the world, `offset_s` after mid-exposure."""
+        pose: RigidTransform = self.world_from_left @ exp_twist(offset_s * self.left_twist_per_s)
+        return pose

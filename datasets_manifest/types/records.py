@@ -1,0 +1,121 @@
+"""The truth of one stereo pair as it stands on disk: a function of the recipe and the frame, nothing else."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.json_types import Transform
+from drogue_models.frozen_model import FrozenModel
+
+PixelPoint = tuple[float, float]
+PixelBox = tuple[float, float, float, float]
+"""x, y of the low corner, width, height, in pixel-centre coordinates: a full frame is (-0.5, -0.5, W, H)."""
+
+
+class FeatureView(FrozenModel):
+    """How one marker, or one more thing with a centre, stands in one image.
+
+    Attributes:
+        center_proj_px: image of the 3-D centre.
+        center_ellipse_px: centre of the image ellipse; what a centroid is compared with.
+        visible_fraction: visible over amodal pixel centres on the image's grid; 1 unoccluded, 0 when outside.
+        in_image: whether the whole feature lies on the image.
+        signal_to_noise: contrast against its surroundings over the sensor's noise at one pixel.
+    """
+
+    center_proj_px: PixelPoint
+    center_ellipse_px: PixelPoint
+    visible_fraction: float = Field(ge=0, le=1)
+    in_image: bool
+    signal_to_noise: float
+
+
+class HubView(FeatureView):
+    """The hub annulus: `center_ellipse_px` belongs to its outer edge."""
+
+    center_ellipse_inner_px: PixelPoint
+
+
+class ViewRecord(FrozenModel):
+    """Truth of one eye.
+
+    Attributes:
+        markers: in the drogue's order.
+        hub: None when the drogue has none.
+        box_full_xywh_px: of the whole drogue, neither clipped nor occluded; None in an empty frame.
+        box_visible_xywh_px: around its visible pixels; None when no pixel is visible.
+        visible_drogue_px: number of pixel centres that see the drogue.
+        truncated: the full box leaves the image.
+        board_corners_px: images of a calibration board's inner corners, row by row; only in frames with a board.
+    """
+
+    markers: tuple[FeatureView, ...]
+    hub: HubView | None
+    box_full_xywh_px: PixelBox | None
+    box_visible_xywh_px: PixelBox | None
+    visible_drogue_px: int = Field(ge=0)
+    truncated: bool
+    board_corners_px: tuple[PixelPoint, ...] = Field(default=(), exclude_if=lambda corners: not corners)
+
+
+class StereoViews(FrozenModel):
+    """Both eyes."""
+
+    left: ViewRecord
+    right: ViewRecord
+
+
+class Conditions(FrozenModel):
+    """What the frame is sorted by in reports.
+
+    Attributes:
+        markers_in_view, hub_in_view: of a sequence's pair, by eye: how many markers lie wholly on the image, and
+            whether the hub does; occlusion does not count.
+    """
+
+    family: str
+    distance_m: float | None
+    sun_elevation_deg: float
+    background_luminance_cd_m2: float
+    monte_carlo_noise_fraction: float
+    monte_carlo_over_sensor_noise: float | None = None
+    markers_in_view: tuple[int, int] | None = Field(default=None, exclude_if=lambda count: count is None)
+    hub_in_view: tuple[bool, bool] | None = Field(default=None, exclude_if=lambda seen: seen is None)
+
+
+class PairRecord(FrozenModel):
+    """Everything known of one stereo pair.
+
+    Attributes:
+        left_from_drogue: at mid-exposure; None in an empty frame.
+        left_from_drogue_open, left_from_drogue_close: when the shutter opens and closes.
+        pitch_deg, yaw_deg, roll_deg: of `left_from_drogue`.
+        roll_modulo_deg: roll modulo the markers' symmetry, in [0, 360/order).
+        file_sha256: of every other file of the frame, by name.
+        engine, engine_version: what made the radiance.
+        image_black_level_dn: number in the stored images that no light gives. [DN]
+        frame: the specification that it was made from.
+    """
+
+    schema_version: Literal[1] = 1
+    frame_index: int = Field(ge=0)
+    scene_id: int = Field(ge=0)
+    sequence_id: int | None
+    time_s: float
+    left_from_drogue: Transform | None
+    left_from_drogue_open: Transform | None
+    left_from_drogue_close: Transform | None
+    pitch_deg: float | None
+    yaw_deg: float | None
+    roll_deg: float | None
+    roll_modulo_deg: float | None
+    views: StereoViews
+    conditions: Conditions
+    engine: str
+    engine_version: str
+    image_black_level_dn: float = Field(default=0.0, ge=0)
+    file_sha256: dict[str, str]
+    frame: FrameSpec

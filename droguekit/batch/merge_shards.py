@@ -1,0 +1,147 @@
+"""Parts of a dataset that were made apart, joined to one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from datasets_manifest.storage.layout import RECIPE_FILE
+from datasets_manifest.storage.manifest import Manifest, read_manifest
+from datasets_manifest.storage.packing import pack_if_complete, packing_of
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.storage.writer import write_frame
+from droguekit.batch.execution import Events, Totals
+from droguekit.batch.progress import ProgressReport
+from droguekit.batch.render_dataset import RunSummary, describe_dataset, still_missing
+from droguekit.batch.resume import differing_keys, open_dataset, sort_frames
+from render.version import RENDER_VERSION
+
+_SHOWN = 20
+
+
+def merge_shards(
+    out: Location, shards: Sequence[Location], report: ProgressReport, pairs_per_tar: int | None = None
+) -> RunSummary:
+    """Join shards of one recipe to a dataset, the same that one run would have made.
+
+    Frames that are in `out` already and whole stay, so a merge that was stopped goes on by the same call.
+
+    Args:
+        out: where the dataset is to lie; a folder is made if missing.
+        shards: places of datasets that hold a part of the frames each; a frame may be in several.
+        report: hears how it goes.
+        pairs_per_tar: how many frames come into a tar file; None leaves that as it is, folders at first.
+
+    Raises:
+        ValueError: the shards do not belong together, lack frames, or hold a damaged one; nothing is joined then.
+        OSError: the folder cannot be written; finished frames stay.
+    """
+    if not shards:
+        raise ValueError("shards: at least one must be given")
+    manifests = {shard: read_manifest(shard) for shard in shards}
+    first, manifest = next(iter(manifests.items()))
+    for shard, other in manifests.items():
+        _belongs(first, manifest, shard, other)
+    sources = _sources(manifests)
+    drops = [drop for other in manifests.values() for drop in other.drops if drop.frame_index not in sources]
+    _complete(manifest.recipe.frames.count, {*sources, *(drop.frame_index for drop in drops)})
+    datasets = {shard: Dataset(shard) for shard in shards}
+    recipe_text = open_storage(first).read(RECIPE_FILE).decode()
+    with open_dataset(out, manifest.recipe, recipe_text, pairs_per_tar) as stream:
+        events = Events(stream)
+        whole = sort_frames(out, read_manifest(out)).whole
+        events.write("merge", shards=[str(shard) for shard in shards], kept=len(whole))
+        totals, packing = Totals(), packing_of(out, range(manifest.recipe.frames.count))
+        report.begin("pairs", len(sources) - len(whole))
+        try:
+            for frame_index in sorted(set(sources) - whole):
+                totals.size_bytes += _copy(datasets[sources[frame_index]], frame_index, out)
+                totals.made.append(frame_index)
+                if packing is not None:
+                    pack_if_complete(out, frame_index, packing)
+                report.advance()
+        finally:
+            report.end()
+        missing = still_missing(drops, out)
+        result = describe_dataset(manifest.recipe, out, missing, made_by=manifest)
+        events.write("end", pairs=result.counts.pairs, dataset_sha256=result.dataset_sha256)
+    planned = manifest.recipe.frames.count
+    return RunSummary(totals, len(whole), missing, result.counts.pairs, planned, result.dataset_sha256)
+
+
+def _belongs(first: Location, manifest: Manifest, shard: Location, other: Manifest) -> None:
+    """See that two shards are parts of one dataset.
+
+    Raises:
+        ValueError: they are not; names what differs.
+    """
+    differing = differing_keys(manifest.recipe.model_dump(mode="json"), other.recipe.model_dump(mode="json"))
+    if differing:
+        raise ValueError(f"{shard}: is of another recipe than {first}, which differs in {', '.join(differing[:8])}")
+    for what, there, here in _builds(manifest, other):
+        if there != here:
+            raise ValueError(
+                f"{shard}: was made with {what} {here}, but {first} with {there}; their pixels or last digits differ: "
+                "make all shards with the same packages on processors of one kind"
+            )
+    if other.render_version != RENDER_VERSION:
+        raise ValueError(f"{shard}: is of render version {other.render_version}, this is {RENDER_VERSION}; use that")
+
+
+def _builds(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str, str]]:
+    """What two shards were made with, by the kind of thing."""
+    yield "render version", manifest.render_version, other.render_version
+    if manifest.engines and other.engines:
+        yield "engine", " and ".join(sorted(manifest.engines)), " and ".join(sorted(other.engines))
+    for name in sorted({*manifest.software, *other.software}):
+        yield name, manifest.software.get(name, "missing"), other.software.get(name, "missing")
+    mine, theirs = set(manifest.cpu_features), set(other.cpu_features)
+    yield (
+        "processor features",
+        " ".join(sorted(mine - theirs)) or "none more",
+        " ".join(sorted(theirs - mine)) or ("none more"),
+    )
+
+
+def _sources(manifests: dict[Location, Manifest]) -> dict[int, Location]:
+    """Where each frame lies.
+
+    Raises:
+        ValueError: two shards hold different frames of one index.
+    """
+    found: dict[int, tuple[Location, str]] = {}
+    for shard, manifest in manifests.items():
+        for entry in manifest.frames:
+            known, sha256 = found.setdefault(entry.frame_index, (shard, entry.record_sha256))
+            if sha256 != entry.record_sha256:
+                raise ValueError(f"{shard}: its frame {entry.frame_index} is not the one of {known}; make both again")
+    return {frame_index: shard for frame_index, (shard, _) in found.items()}
+
+
+def _complete(count: int, there: set[int]) -> None:
+    missing = [frame_index for frame_index in range(count) if frame_index not in there]
+    if missing:
+        shown = ", ".join(map(str, missing[:_SHOWN])) + (
+            f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
+        )
+        raise ValueError(
+            f"shards: {len(missing)} of {count} frames are in none of them: {shown}; start the commands of their "
+            "shards again, then merge"
+        )
+
+
+def _copy(source: Dataset, frame_index: int, out: Location) -> int:
+    """Copy a frame, hashing it on the way.
+
+    Returns:
+        The size of its files without the record. [bytes]
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    try:
+        record, files = source.whole_frame(frame_index)
+    except ValueError as error:
+        raise ValueError(f"{error}; start the command of that shard again, which mends it, then merge") from error
+    write_frame(out, record, files)
+    return sum(len(content) for content in files.values())

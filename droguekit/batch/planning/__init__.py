@@ -1,0 +1,1 @@
+"""What a recipe will make, and what it will cost."""

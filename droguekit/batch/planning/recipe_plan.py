@@ -1,0 +1,186 @@
+"""What a recipe will make: counts, distances, boxes and places, without rendering."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.storage.manifest import Drop
+from drogue_models.parameters import DrogueParameters
+from droguekit.batch.failure_policy import FIRST_FRAMES, drop_of
+from geometry.se3 import Array, RigidTransform
+from geometry.stereo import EYES, StereoRig
+from labelgen.boxes import full_box
+from scenes.drogue_appearance import drogue_of_scene
+from scenes.sampler import sample_left_from_drogue, scene_of_frame, split_of_scenes
+from scenes.scene_family import family_of_scene, recipe_of_scene
+
+# A worker may have to load its engine and compile kernels within its first frame.
+_START_S = 300.0
+# Our choice, far above what an engine takes for one sample of one pixel.
+_S_PER_SAMPLE = 20e-6
+# Shares to within 1 %, and every frame of the corpora that ship; ten seconds.
+_MOST_SAMPLED = 10_000
+# Distance, middle and side of the box, room of its middle.
+_COLUMNS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFrames:
+    """Frames of a recipe as they were drawn; NaN where a frame has no drogue.
+
+    Attributes:
+        indices: (N,) of the frames, ascending, without those that cannot be made.
+        scenes: (N,) which scene each belongs to.
+        families: (N,) place of its family in the recipe, 0 without families.
+        distances_m: (N,) of the rim centre along the optical axis. [m]
+        centers_px: (N, 2) middle of the drogue's full box in the left image. [px]
+        sides_px: (N,) side of the square with that box's area. [px]
+        rooms_px: (N, 4) lowest and highest u, lowest and highest v, between which the middle of the box may lie so that
+            both views hold all of the drogue; NaN also where the place is not drawn. [px]
+        drops: frames that were asked for and cannot be made, and why.
+    """
+
+    indices: tuple[int, ...]
+    scenes: Array
+    families: Array
+    distances_m: Array
+    centers_px: Array
+    sides_px: Array
+    rooms_px: Array
+    drops: tuple[Drop, ...] = ()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a recipe will make.
+
+    Attributes:
+        by_split: pairs in each split, with those that turn out to be impossible to make.
+        by_scene: pairs in each scene, likewise.
+        by_family: scenes and pairs of each family, in the recipe's order; empty without families.
+        drawn: the frames that were drawn.
+    """
+
+    by_split: dict[str, int]
+    by_scene: dict[int, int]
+    by_family: dict[str, tuple[int, int]]
+    drawn: DrawnFrames
+
+    @property
+    def empty_fraction(self) -> float:
+        """Share of the drawn frames without a drogue."""
+        return float(np.isnan(self.drawn.distances_m).mean())
+
+    @property
+    def dropped_fraction(self) -> float:
+        """Share of the frames that were to be drawn that cannot be made."""
+        drops = len(self.drawn.drops)
+        return drops / (drops + len(self.drawn.indices))
+
+
+def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> Plan:
+    """Count the pairs of a recipe, and draw its frames or, of a larger one, so many of them evenly spread.
+
+    Raises:
+        ValueError: none of the first ones can be made.
+    """
+    by_scene, splits = _pairs_by_scene(recipe), split_of_scenes(recipe)
+    by_split: Counter[str] = Counter()
+    for scene_id, pairs in by_scene.items():
+        by_split[splits[scene_id]] += pairs
+    by_family = {family.name: (0, 0) for family in recipe.families}
+    for scene_id, pairs in by_scene.items():
+        family = family_of_scene(recipe, scene_id)
+        if family is not None:
+            scenes, total = by_family[family.name]
+            by_family[family.name] = scenes + 1, total + pairs
+    sampled = tuple(
+        sorted(
+            {int(index) for index in np.linspace(0, recipe.frames.count - 1, min(recipe.frames.count, most_sampled))}
+        )
+    )
+    return Plan(dict(by_split), dict(by_scene), by_family, draw_frames(recipe, sampled))
+
+
+def frame_timeout_s(recipe: Recipe) -> float:
+    """How long a frame may take before it counts as hung: far more than any engine needs here. [s]"""
+    camera = recipe.rig.camera
+    samples = 2 * camera.width_px * camera.height_px * recipe.render.samples_per_px
+    return _START_S + float(round(_S_PER_SAMPLE * samples))
+
+
+def _pairs_by_scene(recipe: Recipe) -> Counter[int]:
+    count, scenes = recipe.frames.count, recipe.frames.scenes
+    length = 1 if recipe.sequence is None else recipe.sequence.frames_per_sequence
+    # Every run of as many frames, or sequences, as there are scenes visits each scene once.
+    rounds = count // (scenes * length)
+    by_scene = Counter(dict.fromkeys(range(scenes), rounds * length))
+    by_scene.update(scene_of_frame(recipe, frame_index) for frame_index in range(rounds * scenes * length, count))
+    return by_scene
+
+
+def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
+    """Distances, boxes and places of frames.
+
+    Raises:
+        ValueError: none of the first ones can be made.
+    """
+    places = {family.name: place for place, family in enumerate(recipe.families)}
+    known: dict[int, tuple[int, DrogueParameters, bool]] = {}
+    drawn, scenes, rows, drops = list[int](), list[int](), list[Array](), list[Drop]()
+    for frame_index in indices:
+        scene_id = scene_of_frame(recipe, frame_index)
+        try:
+            if scene_id not in known:
+                own = recipe_of_scene(recipe, scene_id)
+                is_placed = not own.pose.on_axis and recipe.sequence is None
+                known[scene_id] = places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
+            row = _row(recipe, frame_index, *known[scene_id][1:])
+        except ValueError as error:
+            drops.append(drop_of(frame_index, error))
+            if not drawn and len(drops) >= min(FIRST_FRAMES, len(indices)):
+                raise
+            continue
+        drawn.append(frame_index)
+        scenes.append(scene_id)
+        rows.append(row)
+    values = np.array(rows).reshape(-1, _COLUMNS)
+    return DrawnFrames(
+        indices=tuple(drawn),
+        scenes=np.array(scenes, dtype=np.int64),
+        families=np.array([known[scene_id][0] for scene_id in scenes], dtype=np.int64),
+        distances_m=values[:, 0],
+        centers_px=values[:, 1:3],
+        sides_px=values[:, 3],
+        rooms_px=values[:, 4:],
+        drops=tuple(drops),
+    )
+
+
+def _row(recipe: Recipe, frame_index: int, drogue: DrogueParameters, is_placed: bool) -> Array:
+    """(_COLUMNS,) distance [m], middle and side of the box, and room of its middle [px].
+
+    Raises:
+        ValueError: a pose that cannot be framed.
+    """
+    pose = sample_left_from_drogue(recipe, frame_index)
+    if pose is None:
+        return np.full(_COLUMNS, np.nan)
+    center_px, side_px, room_px = _box(drogue, recipe.rig, pose)
+    return np.array([pose.translation_m[2], *center_px, side_px, *(room_px if is_placed else np.full(4, np.nan))])
+
+
+def _box(drogue: DrogueParameters, rig: StereoRig, pose: RigidTransform) -> tuple[Array, float, Array]:
+    """Middle of the left image's full box [px], side of its square [px], and (4,) room of its middle [px]."""
+    boxes = np.array([full_box(drogue, rig, pose, eye) for eye in EYES])
+    low, size = boxes[:, :2], boxes[:, 2:]
+    center = low[0] + size[0] / 2
+    # A box moves in both images alike, as far as neither leaves its image; lenses may move it further out.
+    edge = rig.largest_shift_px() - 0.5
+    limit = np.array([rig.camera.width_px, rig.camera.height_px]) - 1 - edge
+    lowest, highest = center - (low.min(axis=0) - edge), center + (limit - (low + size).max(axis=0))
+    return center, float(np.sqrt(size[0].prod())), np.stack([lowest, highest], axis=1).ravel()

@@ -1,0 +1,118 @@
+"""One frame of a dataset made again, and what its sameness proves."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
+from datasets_manifest.storage.provenance import cpu_features, differing_builds, software_versions
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from droguekit.batch.frame_task import FrameTask
+from droguekit.batch.workers import run_alone
+
+# Numbers that do not come from noisy paths agree this well on any machine: numpy's exp, log, tan, arctan2 and matmul
+# differ in their last bits between instruction sets.
+_RELATIVE_TOLERANCE = 1e-9
+# What follows from the pixels, which are the same only for the same engine, packages and processor features.
+_FROM_PIXELS = {
+    "file_sha256",
+    "monte_carlo_noise_fraction",
+    "monte_carlo_over_sensor_noise",
+    "signal_to_noise",
+    "background_luminance_cd_m2",
+}
+_FROM_HERE = {"engine", "engine_version"}
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What making a frame again showed.
+
+    Attributes:
+        verdict: `identical`, bit for bit; `equivalent`, made with other versions or on another processor, with equal
+            draws and numbers that agree; or `different`.
+        differences: where the records differ beyond what is promised.
+        elsewhere: versions and processor features that are not those of the dataset.
+    """
+
+    verdict: Literal["identical", "equivalent", "different"]
+    differences: tuple[str, ...]
+    elsewhere: tuple[str, ...]
+
+
+def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
+    """Make a frame of a dataset again, from the manifest alone, and compare record and files.
+
+    Raises:
+        ValueError: no such dataset or frame, or its engine cannot be used here.
+        OSError: the temporary folder cannot be written.
+    """
+    source = Dataset(dataset)
+    if frame_index not in source.frame_indices:
+        raise ValueError(f"frame: {dataset} has no frame {frame_index}")
+    faults = source.verify(frame_index)
+    if faults:
+        return Reproduction("different", tuple(faults), ())
+    old = json.loads(source.frames.read(frame_index, RECORD_FILE))
+    new, record_sha256 = run_alone(partial(_make_again, source.manifest.recipe, frame_index))
+    expected = next(entry.record_sha256 for entry in source.manifest.frames if entry.frame_index == frame_index)
+    # The record holds the hashes of all other files.
+    if record_sha256 == expected:
+        return Reproduction("identical", (), ())
+    elsewhere = _elsewhere(source, old, new)
+    differences = _differences(old, new, pixels_too=not elsewhere)
+    return Reproduction("equivalent" if elsewhere and not differences else "different", differences, elsewhere)
+
+
+def _make_again(recipe: Recipe, frame_index: int) -> tuple[dict[str, Any], str]:
+    """The record that a fresh folder gets, and the hash of its file."""
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        FrameTask(recipe, Path(folder))(frame_index)
+        data = (frame_folder(Path(folder), frame_index) / RECORD_FILE).read_bytes()
+    return json.loads(data), hashlib.sha256(data).hexdigest()
+
+
+def _elsewhere(source: Dataset, old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
+    """How this machine differs from the one that the manifest describes, as far as pixels depend on it."""
+    manifest = source.manifest
+    found = differing_builds(manifest.software, manifest.cpu_features, software_versions(), cpu_features())
+    if old["engine_version"] != new["engine_version"]:
+        found.append(f"{old['engine_version']} there, {new['engine_version']} here")
+    return tuple(found)
+
+
+def _differences(old: Any, new: Any, pixels_too: bool, where: str = "") -> tuple[str, ...]:
+    """Dotted keys at which two JSON values differ beyond the tolerance, with both values."""
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        skip = set() if pixels_too else _FROM_PIXELS | _FROM_HERE
+        return tuple(
+            found
+            for key in sorted({*old, *new} - skip)
+            for found in _differences(old.get(key), new.get(key), pixels_too, f"{where}.{key}" if where else key)
+        )
+    if isinstance(old, Sequence) and isinstance(new, Sequence) and not isinstance(old, str) and len(old) == len(new):
+        return tuple(
+            found
+            for index, pair in enumerate(zip(old, new, strict=True))
+            for found in _differences(*pair, pixels_too, f"{where}[{index}]")
+        )
+    if isinstance(old, float) and isinstance(new, float) and not pixels_too:
+        same = math.isclose(old, new, rel_tol=_RELATIVE_TOLERANCE, abs_tol=_RELATIVE_TOLERANCE)
+    else:
+        same = old == new
+    return () if same else (f"{where}: {_short(old)} there, {_short(new)} here",)
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else text[:37] + "..."

@@ -1,0 +1,137 @@
+"""The tables of the detection report, as text ready to print."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from droguekit.benchmark.detection.detection_published import PUBLISHED_DETECTORS
+from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
+from droguekit.benchmark.results.detection_result import DetectionResult, DetectionRow, DetectorResult, Ends
+
+SUMMARY_COLUMNS = ("precision", "recall", "AP50", "95 % interval", "AP", "95 % interval", "AP75")
+SUMMARY_COLUMNS_MORE = (
+    *("parameters [10⁶]", "GFLOPs", "time of an image [ms]"),
+    *("false alarms in 600 empty frames", "of 600, frames with any", "95 % interval"),
+)
+CELL_COLUMNS = ("scenes", "boxes", "AP50", "95 % interval", "AP", "recall", "95 % interval", "precision", "")
+
+
+class CellGroup(NamedTuple):
+    """Rows of all detectors in one cell."""
+
+    label: str
+    rows: list[list[str]]
+
+
+class CellTable(NamedTuple):
+    """Cells of one kind."""
+
+    anchor: str
+    title: str
+    first: str
+    groups: list[CellGroup]
+
+
+def summary_rows(result: DetectionResult) -> list[list[str]]:
+    """A row for each detector, in the columns of the paper's table and more."""
+    return [[name, *_summary_cells(detector)] for name, detector in result.detectors.items()]
+
+
+def published_rows() -> list[list[str]]:
+    """The paper's rows in the same columns."""
+    return [
+        [
+            row.name,
+            *map(share, (row.precision, row.recall, row.ap50)),
+            *[ABSENT] * 5,
+            f"{row.gflops:g}",
+            f"{1e3 * row.image_s:.1f}",
+            *[ABSENT] * 3,
+        ]
+        for row in PUBLISHED_DETECTORS
+    ]
+
+
+def cell_tables(result: DetectionResult) -> list[CellTable]:
+    """By distance, family, eye and split."""
+    kinds = [
+        ("distances", "By distance", "distance", _distance_cells),
+        ("families", "By family", "family", lambda detector: list(detector.families.items())),
+        ("eyes", "By eye", "eye", lambda detector: list(detector.eyes.items())),
+        ("splits", "By split, each over its own images", "split", lambda detector: list(detector.splits.items())),
+    ]
+    tables = []
+    for anchor, title, first, cells in kinds:
+        groups: dict[str, list[list[str]]] = {}
+        for name, detector in result.detectors.items():
+            for label, row in cells(detector):
+                groups.setdefault(label, []).append([name, *_cells(row)])
+        if groups:
+            tables.append(CellTable(anchor, title, first, [CellGroup(*group) for group in groups.items()]))
+    return tables
+
+
+def detector_lines(result: DetectionResult) -> Iterator[str]:
+    """The summary as plain lines, for a terminal."""
+    yield f"{'detector':<16} {'AP50':>8} {'AP':>8} {'recall':>8} {'precision':>9} {'at score':>9}  false alarms"
+    for name, detector in result.detectors.items():
+        row, alarms = detector.overall, detector.false_alarms
+        told = "no empty frames" if alarms is None else f"{alarms.boxes} in {alarms.frames} empty frames"
+        yield (
+            f"{name:<16} {share(row.ap50):>8} {share(row.ap):>8} {share(row.recall):>8} {share(row.precision):>9} "
+            f"{detector.operating_threshold:9.3f}  {told}"
+        )
+
+
+def share(fraction: float | None) -> str:
+    """A fraction in percent with two decimals, as the paper gives it; never all where one is missing."""
+    if fraction is None:
+        return ABSENT
+    shown = math.floor(1e4 * fraction + 0.5) / 100
+    shown = min(shown, 99.99) if fraction < 1 else shown
+    return f"{shown:.2f} %"
+
+
+def shares(ends: Ends | None) -> str:
+    """An interval of fractions."""
+    return ABSENT if ends is None else f"{100 * ends[0]:.2f} to {100 * ends[1]:.2f}"
+
+
+def _summary_cells(detector: DetectorResult) -> list[str]:
+    row, alarms, times = detector.overall, detector.false_alarms, detector.times
+    return [
+        *map(share, (row.precision, row.recall, row.ap50)),
+        shares(row.ap50_interval),
+        share(row.ap),
+        shares(row.ap_interval),
+        share(row.ap75),
+        ABSENT if detector.parameters is None else three_digits(1e-6 * detector.parameters),
+        ABSENT if detector.gflops_per_image is None else three_digits(detector.gflops_per_image),
+        ABSENT if times is None else three_digits(times.wall_ms / 2),
+        ABSENT if alarms is None else plain_number(alarms.boxes_per_600_frames),
+        ABSENT if alarms is None else plain_number(alarms.frames_with_any_per_600),
+        ABSENT if alarms is None else " to ".join(map(plain_number, alarms.interval_per_600_frames)),
+    ]
+
+
+def _distance_cells(detector: DetectorResult) -> list[tuple[str, DetectionRow]]:
+    return [
+        (f"{row.low_m:g}–{row.high_m:g} m" if row.high_m is not None else f"{row.low_m:g} m and more", row)
+        for row in detector.distances
+    ]
+
+
+def _cells(row: DetectionRow) -> list[str]:
+    return [
+        str(row.scenes),
+        str(row.boxes),
+        share(row.ap50),
+        shares(row.ap50_interval),
+        share(row.ap),
+        share(row.recall),
+        shares(row.recall_interval),
+        share(row.precision),
+        row.note or "",
+    ]

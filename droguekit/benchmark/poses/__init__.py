@@ -1,0 +1,1 @@
+"""Errors of poses in single pairs, beside bounds and covariances."""

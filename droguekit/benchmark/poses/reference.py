@@ -1,0 +1,129 @@
+"""What all methods of a file are measured against: bins of distance, centroid noise, bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from droguekit.benchmark.poses.bounds import FeatureNoise, component_deviations, pose_covariance
+from droguekit.benchmark.poses.centroid_errors import CentroidErrors, centroid_statistics
+from droguekit.benchmark.poses.distance_bins import DistanceBin, distance_bins
+from droguekit.benchmark.poses.frame_truth import DrogueTruth
+from droguekit.benchmark.poses.summary import mean_bound
+from droguekit.benchmark.results.benchmark_result import ReferenceBin
+from droguekit.benchmark.results.result_parts import Centroids
+from geometry.se3 import Array, angles_from_axis
+
+# A method whose centroids are the best of the file, but which shows only the easy ones, sets no standard.
+_FEWEST_OF_MOST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What all methods of a file are measured against.
+
+    Attributes:
+        bins: with their noise and bound.
+        bin_of_frame: for pairs that show a drogue.
+        bounds: (5,) by frame, every feature at the markers' noise of its bin; None where there is none.
+        covariances: (6, 6) by frame, markers and hub each at its own noise; None where there is none.
+        truth_spread: (5,) standard deviations of the true X, Y, Z [m], pitch and yaw [deg] of the dataset.
+    """
+
+    bins: list[ReferenceBin]
+    bin_of_frame: dict[int, int]
+    bounds: dict[int, Array | None]
+    covariances: dict[int, Array | None]
+    truth_spread: Array
+
+
+def build_reference(
+    drogues: Mapping[int, DrogueTruth], centroids: Mapping[str, Mapping[int, CentroidErrors]]
+) -> Reference:
+    """Noise and bounds of a dataset's pairs.
+
+    Args:
+        drogues: by frame, at least one.
+        centroids: by method and frame.
+    """
+    places, labels = distance_bins([truth.distance_m for truth in drogues.values()])
+    bin_of_frame = dict(zip(drogues, labels, strict=True))
+    rows: list[ReferenceBin] = []
+    bounds: dict[int, Array | None] = {}
+    covariances: dict[int, Array | None] = {}
+    for k, place in enumerate(places):
+        frames = [index for index in drogues if bin_of_frame[index] == k]
+        found = {name: centroid_statistics([errors[i] for i in frames]) for name, errors in centroids.items()}
+        row = _reference_bin(place, len(frames), found)
+        marker_px = row.centroid_sigma_px
+        for i in frames:
+            alike = bound_covariance(drogues[i], drogues[i].visible, feature_noise(marker_px, None))
+            bounds[i] = None if alike is None else component_deviations(drogues[i].left_from_drogue, alike)
+            own_noise = feature_noise(marker_px, row.hub_sigma_px)
+            covariances[i] = bound_covariance(drogues[i], drogues[i].visible, own_noise)
+        rows.append(row.model_copy(update={"bound": mean_bound([bounds[i] for i in frames])}))
+    return Reference(rows, bin_of_frame, bounds, covariances, _truth_spread(list(drogues.values())))
+
+
+def bound_covariance(truth: DrogueTruth, seen: NDArray[np.bool_], noise: FeatureNoise | None) -> Array | None:
+    """(6, 6) Cramer-Rao bound of a pose, or None where the noise is unknown or the pose open.
+
+    Args:
+        truth: of the pair.
+        seen: (2, M) which features are measured.
+        noise: of their centroids.
+    """
+    if noise is None:
+        return None
+    whitened = truth.jacobian / noise.by_feature(truth.layout)[:, None, None]
+    return pose_covariance(whitened[seen])
+
+
+def feature_noise(marker_px: float | None, hub_px: float | None) -> FeatureNoise | None:
+    """Measured noise; a hub that nobody measured counts as good as a marker.
+
+    Centroids without any error, such as those of another program's truth, set no limit: None.
+    """
+    if not marker_px or hub_px == 0:
+        return None
+    return FeatureNoise(marker_px, marker_px if hub_px is None else hub_px)
+
+
+def _reference_bin(place: DistanceBin, count: int, found: Mapping[str, Centroids]) -> ReferenceBin:
+    method, sigma = _best(found, lambda s: (s.count, s.sigma_px))
+    hub_method, hub_sigma = _best(found, lambda s: (s.hub_count, s.hub_sigma_px))
+    return ReferenceBin(
+        low_m=place.low_m,
+        high_m=place.high_m,
+        n=count,
+        centroid_sigma_px=sigma,
+        centroid_method=method,
+        hub_sigma_px=hub_sigma,
+        hub_method=hub_method,
+        bound=None,
+    )
+
+
+def _best(
+    found: Mapping[str, Centroids], kind: Callable[[Centroids], tuple[int, float | None]]
+) -> tuple[str | None, float | None]:
+    """The method with the least noise among those that measured enough features of a kind, and that noise. [px]"""
+    kinds = {name: kind(statistics) for name, statistics in found.items()}
+    most = max(count for count, _ in kinds.values())
+    sigmas = {
+        name: sigma for name, (count, sigma) in kinds.items() if sigma is not None and count >= _FEWEST_OF_MOST * most
+    }
+    if not sigmas:
+        return None, None
+    best = min(sigmas, key=lambda name: sigmas[name])
+    return best, sigmas[best]
+
+
+def _truth_spread(truths: Sequence[DrogueTruth]) -> Array:
+    places = np.array([truth.left_from_drogue.translation_m for truth in truths])
+    angles = angles_from_axis(np.array([truth.left_from_drogue.rotation[:, 2] for truth in truths]))
+    spread: Array = np.concatenate([places.std(axis=0), np.rad2deg(np.std(angles, axis=1))])
+    return spread

@@ -1,0 +1,181 @@
+"""One row of the result from the frames that belong to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from droguekit.benchmark.poses.centroid_errors import CentroidErrors, centroid_statistics
+from droguekit.benchmark.poses.consistency import nees, normalized_errors
+from droguekit.benchmark.poses.flips import FlipTrials, flip_row
+from droguekit.benchmark.poses.pose_errors import COMPONENTS, PoseError
+from droguekit.benchmark.poses.rangefinder_errors import Depth, rangefinder_errors
+from droguekit.benchmark.results.benchmark_result import Row
+from droguekit.benchmark.results.result_parts import Bound, ComponentErrors, ComponentRatios
+from droguekit.benchmark.statistics import (
+    Interval,
+    bootstrap_intervals,
+    fraction_interval,
+    rms_interval,
+    root_mean_square,
+)
+from geometry.se3 import Array
+
+UNITS = {"x": "m", "y": "m", "z": "m", "pitch": "deg", "yaw": "deg"}
+_PERCENTILES = (95.0, 99.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseScore:
+    """One pose.
+
+    Attributes:
+        error: estimate minus truth.
+        common_bound: (5,) bound of all visible features, markers and hub each at its own noise, or None. [m, deg]
+        own_bound: (5,) bound of the features that the method used, at its own noise, or None. [m, deg]
+        has_covariance: whether the estimate carries one.
+        squared_errors: (3,) see `consistency.squared_errors`.
+        flips: None where no bound is known.
+        depth: beside the rangefinder's reading, or None without one.
+    """
+
+    error: PoseError
+    common_bound: Array | None
+    own_bound: Array | None
+    has_covariance: bool
+    squared_errors: Array | None
+    flips: FlipTrials | None
+    depth: Depth | None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameScore:
+    """One method in one pair that shows a drogue.
+
+    Attributes:
+        pose: how good its pose is, or None without one.
+        bound: (5,) Cramer-Rao bound at the noise of the pair's bin [m, deg], or None where there is none.
+        centroids: errors of its features.
+        from_centroids_m: (3,) position error that its centroids alone would make, or None. [m]
+    """
+
+    pose: PoseScore | None
+    bound: Array | None
+    centroids: CentroidErrors
+    from_centroids_m: Array | None
+
+
+def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Row:
+    """The row of some pairs, of which there is at least one.
+
+    Args:
+        scores: one for each pair; their order does not matter.
+        truth_spread: (5,) what a pair without a pose counts with in `rmse_with_failures`. [m, deg]
+        key: of the bootstrap's random stream.
+    """
+    fixed = [score for score in scores if score.pose is not None]
+    poses = [score.pose for score in scores if score.pose is not None]
+    numbers: dict[str, float] = {}
+    intervals: dict[str, Interval] = {"fix_fraction": fraction_interval(len(fixed), len(scores))}
+    bound = mean_bound([score.bound for score in fixed])
+    bounded = [score.pose.error for score in fixed if score.pose is not None and score.bound is not None]
+    if poses:
+        numbers, error_intervals = _error_numbers([pose.error for pose in poses], key)
+        intervals |= error_intervals
+    return Row.model_validate(
+        {
+            "n": len(scores),
+            "fixes": len(fixed),
+            "fix_fraction": len(fixed) / len(scores),
+            **numbers,
+            "intervals": intervals,
+            "bound": bound,
+            "bound_ratio": _ratios(bounded, bound),
+            "centroids": centroid_statistics([score.centroids for score in scores]),
+            **_centroid_share(fixed),
+            **_checks(poses),
+            "failures": len(scores) - len(poses),
+            "rmse_with_failures": _with_failures(poses, len(scores), truth_spread),
+            "rangefinder": rangefinder_errors([pose.depth for pose in poses if pose.depth is not None]),
+        }
+    )
+
+
+def mean_bound(bounds: Sequence[Array | None]) -> Bound | None:
+    """Root mean square of the bounds of the frames that have one, or None where none has."""
+    known = [bound for bound in bounds if bound is not None]
+    if not known:
+        return None
+    squares = np.mean(np.square(known), axis=0)
+    x, y, z, pitch, yaw = np.sqrt(squares).tolist()
+    position = float(np.sqrt(squares[:3].sum()))
+    return Bound(position_m=position, x_m=x, y_m=y, z_m=z, pitch_deg=pitch, yaw_deg=yaw)
+
+
+def _error_numbers(errors: Sequence[PoseError], key: str) -> tuple[dict[str, float], dict[str, Interval]]:
+    position = np.array([error.position_m for error in errors])
+    columns = np.column_stack([position, np.stack([error.components for error in errors])])
+    names = [("position", "m"), *UNITS.items()]
+    mean_ends, rank_ends = bootstrap_intervals(columns, _PERCENTILES, key)
+    numbers: dict[str, float] = {}
+    intervals: dict[str, Interval] = {}
+    for k, (name, unit) in enumerate(names):
+        column = columns[:, k]
+        average = f"{name}_mean_{unit}" if name == "position" else f"{name}_bias_{unit}"
+        numbers[average] = float(column.mean())
+        intervals[average] = tuple(mean_ends[k].tolist())
+        numbers[f"{name}_rmse_{unit}"] = root_mean_square(column)
+        intervals[f"{name}_rmse_{unit}"] = rms_interval(column)
+        for p, percent in enumerate(_PERCENTILES):
+            rank = f"{name}_p{percent:.0f}_{unit}"
+            numbers[rank] = float(np.percentile(np.abs(column), percent))
+            intervals[rank] = tuple(rank_ends[k, p].tolist())
+        numbers[f"{name}_max_{unit}"] = float(np.abs(column).max())
+    transverse = np.array([error.transverse_m for error in errors])
+    numbers["transverse_rmse_m"] = root_mean_square(transverse)
+    intervals["transverse_rmse_m"] = rms_interval(transverse)
+    return numbers, intervals
+
+
+def _ratios(errors: Sequence[PoseError], bound: Bound | None) -> ComponentRatios | None:
+    if bound is None:
+        return None
+    limits = np.array([getattr(bound, f"{name}_{UNITS[name]}") for name in COMPONENTS])
+    rms = np.sqrt(np.mean(np.square([error.components for error in errors]), axis=0))
+    return ComponentRatios(**dict(zip(COMPONENTS, (rms / limits).tolist(), strict=True)))
+
+
+def _checks(poses: Sequence[PoseScore]) -> dict[str, object]:
+    """Errors against bounds and covariances, pose by pose, and mirrored tilts."""
+    optical = [pose.flips.optical for pose in poses if pose.flips is not None]
+    sight = [pose.flips.sight for pose in poses if pose.flips is not None]
+    return {
+        "normalized": normalized_errors([(p.error, p.common_bound) for p in poses if p.common_bound is not None]),
+        "normalized_own": normalized_errors([(p.error, p.own_bound) for p in poses if p.own_bound is not None]),
+        "nees": nees([pose.squared_errors for pose in poses if pose.has_covariance]),
+        "flips": flip_row([trial for trial in optical if trial is not None]),
+        "sight_flips": flip_row([trial for trial in sight if trial is not None]),
+    }
+
+
+def _with_failures(poses: Sequence[PoseScore], count: int, truth_spread: Array) -> ComponentErrors:
+    squares = (count - len(poses)) * truth_spread**2
+    for pose in poses:
+        squares = squares + pose.error.components**2
+    x, y, z, pitch, yaw = np.sqrt(squares / count).tolist()
+    return ComponentErrors(x_m=x, y_m=y, z_m=z, pitch_deg=pitch, yaw_deg=yaw)
+
+
+def _centroid_share(fixed: Sequence[FrameScore]) -> dict[str, float | None]:
+    """What the centroids explain, over the frames where they determine a pose."""
+    pairs = [(s.pose.error.components[:3], s.from_centroids_m) for s in fixed if s.pose is not None]
+    known = [(error, predicted) for error, predicted in pairs if predicted is not None]
+    if not known:
+        return {"position_from_centroids_rmse_m": None, "centroid_share": None}
+    errors, predicted = np.array([k[0] for k in known]), np.array([k[1] for k in known])
+    total, rest = float(np.square(errors).sum()), float(np.square(errors - predicted).sum())
+    share = None if total == 0 else max(0.0, 1 - rest / total)
+    from_centroids = float(np.sqrt(np.square(predicted).sum(axis=1).mean()))
+    return {"position_from_centroids_rmse_m": from_centroids, "centroid_share": share}

@@ -1,0 +1,1 @@
+"""The types of benchmark.json and of the detector benchmark's file."""

@@ -1,0 +1,1 @@
+"""What is only defined over sequences: motion, docking, latency, tracking."""

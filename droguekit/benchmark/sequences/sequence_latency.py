@@ -1,0 +1,69 @@
+"""How long answers took over sequences, and how many pairs were too late to be worked on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from datasets_manifest.types.estimates import Estimate, NoFix
+from droguekit.benchmark.results.sequence_result import Latency, LatencyBin, Percentiles
+from droguekit.benchmark.sequences.sequence_filtering import SequenceData
+
+LATE = "late:"
+"""How the reason begins of a pair that was not worked on, because newer ones had come."""
+# Stages in which a pair waits, or is only on its way, and nobody works on it.
+_WAITING = frozenset({"read", "wait", "handover"})
+
+
+def worked_s(stage_s: Mapping[str, float]) -> float | None:
+    """Time that was worked on a pair; None where no such stage is told. [s]
+
+    Args:
+        stage_s: seconds by stage, of an estimate.
+    """
+    work = [seconds for stage, seconds in stage_s.items() if stage not in _WAITING]
+    return sum(work) if work else None
+
+
+def latency(data: SequenceData, estimates: Mapping[int, Estimate]) -> Latency | None:
+    """Percentiles of a method; None where no answer tells how long it took, and no pair was late.
+
+    Args:
+        data: the truth.
+        estimates: of the method, by frame.
+    """
+    frames = [moment.frame_index for sequence in data.sequences for moment in sequence.moments]
+    answers = {index: estimates[index] for index in sorted(frames) if index in estimates}
+    in_time = {index: answer for index, answer in answers.items() if not _is_late(answer)}
+    late = len(answers) - len(in_time)
+    took_ms = {index: 1e3 * a.latency_s for index, a in in_time.items() if a.latency_s is not None}
+    if not took_ms and not late:
+        return None
+    stages: dict[str, list[float]] = {}
+    for answer in in_time.values():
+        for stage, seconds in answer.stage_s.items():
+            stages.setdefault(stage, []).append(1e3 * seconds)
+    bins = []
+    for k, place in enumerate(data.groups.bins):
+        inside = [ms for index, ms in took_ms.items() if data.groups.bin_of_frame.get(index) == k]
+        if inside:
+            bins.append(LatencyBin(**dict(percentiles(inside)), low_m=place.low_m, high_m=place.high_m))
+    return Latency(
+        overall=percentiles(list(took_ms.values())) if took_ms else None,
+        bins=tuple(bins),
+        stages={stage: percentiles(times) for stage, times in stages.items()},
+        answers=len(answers),
+        late=late,
+        late_fraction=late / len(answers),
+    )
+
+
+def _is_late(answer: Estimate) -> bool:
+    return isinstance(answer, NoFix) and answer.reason.startswith(LATE)
+
+
+def percentiles(times_ms: Sequence[float]) -> Percentiles:
+    """Of at least one time. [ms]"""
+    p50, p95, p99 = np.percentile(times_ms, (50, 95, 99)).tolist()
+    return Percentiles(n=len(times_ms), p50_ms=p50, p95_ms=p95, p99_ms=p99, max_ms=max(times_ms))

@@ -1,0 +1,226 @@
+"""Boxes that follow the drogue through sequences, against the true ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.records import PixelBox
+from droguekit.benchmark.results.detection_boxes import center_box, clipped_box, corner_box
+from droguekit.benchmark.results.tracking_result import EyeTracking, Losses, OverlapRow, Reacquisition
+from droguekit.benchmark.sequences.sequence_truth import Sight, TrueSequence
+from droguekit.benchmark.sequences.tracking_overlap import (
+    CENTER_ERRORS_PX,
+    NO_BOX,
+    NORMALIZED_ERRORS,
+    OVERLAPS,
+    PRECISION_AT_PX,
+    center_errors_px,
+    normalized_center_errors,
+    precision_curve,
+    success_curve,
+)
+from droguekit.benchmark.statistics import mean_interval, rate_interval, root_mean_square
+from geometry.boxes import intersection_over_union
+from geometry.se3 import Array
+from geometry.stereo import EYES, Eye
+
+LEAST_FOLLOWED_OVERLAP = 0.1
+"""A box that overlaps the true one by less has lost the drogue (our choice)."""
+LEAST_FOUND_OVERLAP = 0.5
+"""From which overlap on a box has the drogue again, as a detector's."""
+SOON_FRAMES = 3
+"""Within which a drogue should be found again."""
+
+
+@dataclass(frozen=True)
+class SourcedBox:
+    """A box in pixel-centre coordinates, and who gave it, or an empty name."""
+
+    box_px: PixelBox
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class EyeTrack:
+    """The images of one eye through one sequence.
+
+    Attributes:
+        sequence_id, period_s: of the sequence.
+        frame_index: (n,) of the pairs.
+        sights: of the drogue in each image.
+        found, truth: (n, 4) boxes, nan where there is none. [px]
+        sources: of each found box; None without one.
+    """
+
+    sequence_id: int
+    period_s: float
+    frame_index: tuple[int, ...]
+    sights: tuple[Sight, ...]
+    found: Array
+    truth: Array
+    sources: tuple[str | None, ...]
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(n,) whether the drogue is to be found."""
+        return np.array([sight == "seen" for sight in self.sights])
+
+    @property
+    def overlap(self) -> Array:
+        """(n,) intersection over union; 0 without a box."""
+        return intersection_over_union(self.found, self.truth)
+
+
+def eye_tracks(
+    sequences: Iterable[TrueSequence], boxes: Mapping[tuple[int, Eye], SourcedBox]
+) -> dict[Eye, list[EyeTrack]]:
+    """The images of every sequence, with the boxes found in them by frame and eye."""
+    return {eye: [_eye_track(sequence, eye, boxes) for sequence in sequences] for eye in EYES}
+
+
+def eye_tracking(tracks: Sequence[EyeTrack], key: str) -> EyeTracking:
+    """The scores of one eye's images; `key` is that of the bootstrap's random stream."""
+    return _tracking(tracks, _losses(tracks), key)
+
+
+def both_eyes_tracking(by_eye: Mapping[Eye, Sequence[EyeTrack]]) -> EyeTracking:
+    """The scores of both eyes' images; losses are those of the eye that has more."""
+    losses = [found for found in map(_losses, by_eye.values()) if found is not None]
+    worse = max(losses, key=lambda found: (found.count, found.per_minute), default=None)
+    return _tracking([track for eye in EYES for track in by_eye[eye]], worse, "both eyes")
+
+
+def _tracking(tracks: Sequence[EyeTrack], losses: Losses | None, key: str) -> EyeTracking:
+    boxed = [box is not None for track in tracks for box in track.sources]
+    hidden = [sight == "hidden" for track in tracks for sight in track.sights]
+    found = [(track.overlap >= LEAST_FOUND_OVERLAP).tolist() for track in tracks]
+    return EyeTracking(
+        overlap=overlap_row(tracks, lambda track: track.seen, key),
+        losses=losses,
+        reacquisition=reacquisition((track.sights, hits) for track, hits in zip(tracks, found, strict=True)),
+        hidden=sum(hidden),
+        hidden_with_box=sum(h and b for h, b in zip(hidden, boxed, strict=True)),
+    )
+
+
+def overlap_row(
+    tracks: Sequence[EyeTrack], chosen: Callable[[EyeTrack], NDArray[np.bool_]], key: str
+) -> OverlapRow | None:
+    """The OTB scores of the chosen images of each track; None where there are none."""
+    picks = [chosen(track) for track in tracks]
+    found, truth = (
+        np.concatenate([getattr(track, name)[pick] for track, pick in zip(tracks, picks, strict=True)])
+        for name in ("found", "truth")
+    )
+    if not len(found):
+        return None
+    blocks = np.repeat([track.sequence_id for track in tracks], [int(pick.sum()) for pick in picks]).tolist()
+    overlap, errors = intersection_over_union(found, truth), center_errors_px(found, truth)
+    success = success_curve(overlap)
+    normalized = precision_curve(normalized_center_errors(found, truth), NORMALIZED_ERRORS)
+    near, known = errors <= PRECISION_AT_PX, np.isfinite(errors)
+    # The area under the plot is a mean over images too: of the share of thresholds that each passes.
+    areas = np.mean(overlap[:, None] > OVERLAPS, axis=1)
+    return OverlapRow(
+        n=len(found),
+        auc=float(success.mean()),
+        auc_interval=mean_interval(areas, blocks, f"{key}, auc"),
+        mean_overlap=float(overlap.mean()),
+        precision=float(near.mean()),
+        precision_interval=mean_interval(near.astype(np.float64), blocks, f"{key}, precision"),
+        normalized_precision=float(normalized.mean()),
+        center_rms_px=root_mean_square(errors[known]) if known.any() else None,
+        success=tuple(success.tolist()),
+        precisions=tuple(precision_curve(errors, CENTER_ERRORS_PX).tolist()),
+        normalized=tuple(normalized.tolist()),
+    )
+
+
+def reacquisition(courses: Iterable[tuple[Sequence[Sight], Sequence[bool]]]) -> Reacquisition:
+    """How soon answers come after the drogue was hidden, or had no answer beside the sun.
+
+    Args:
+        courses: for each sequence what was to be seen frame by frame, and whether there was an answer.
+    """
+    delays = [delay for sights, answers in courses for delay in _delays(sights, answers)]
+    came = [delay for delay in delays if delay is not None]
+    return Reacquisition(
+        n=len(delays),
+        found=len(came),
+        within_3=sum(delay <= SOON_FRAMES for delay in came),
+        median_frames=float(np.median(came)) if came else None,
+        max_frames=max(came, default=None),
+    )
+
+
+def _delays(sights: Sequence[Sight], answers: Sequence[bool]) -> Iterator[int | None]:
+    """Of each re-appearance, the frames until an answer, or None where none came before the drogue hid again."""
+    hidden, since = False, None
+    for k, (sight, answer) in enumerate(zip(sights, answers, strict=True)):
+        if sight == "seen" and hidden:
+            hidden, since = False, k
+        elif sight == "hidden" or (sight == "dazzled" and not answer):
+            if since is not None:
+                yield None
+            hidden, since = True, None
+        if since is not None and answer:
+            yield k - since
+            since = None
+    if since is not None:
+        yield None
+
+
+def _losses(tracks: Sequence[EyeTrack]) -> Losses | None:
+    seen_s = sum(float(track.seen.sum()) * track.period_s for track in tracks)
+    if not seen_s:
+        return None
+    count = sum(_losses_of(track) for track in tracks)
+    lost = np.concatenate([track.overlap[track.seen] < LEAST_FOLLOWED_OVERLAP for track in tracks])
+    return Losses(
+        minutes=seen_s / 60,
+        count=count,
+        per_minute=60 * count / seen_s,
+        per_minute_interval=rate_interval(count, seen_s / 60),
+        lost_fraction=float(lost.mean()),
+    )
+
+
+def _losses_of(track: EyeTrack) -> int:
+    count, followed = 0, False
+    for sight, overlap in zip(track.sights, track.overlap, strict=True):
+        if sight in ("hidden", "dazzled"):
+            followed = False
+        elif sight == "seen":
+            held = bool(overlap >= LEAST_FOLLOWED_OVERLAP)
+            count += followed and not held
+            followed = held
+    return count
+
+
+def _eye_track(sequence: TrueSequence, eye: Eye, boxes: Mapping[tuple[int, Eye], SourcedBox]) -> EyeTrack:
+    moments = sequence.moments
+    camera = moments[0].rig.camera
+    size_px = (camera.width_px, camera.height_px)
+    on_image = [_on_image(boxes.get((moment.frame_index, eye)), size_px) for moment in moments]
+    truths = [moment.eyes[eye].box_px for moment in moments]
+    return EyeTrack(
+        sequence_id=sequence.sequence_id,
+        period_s=sequence.period_s,
+        frame_index=tuple(moment.frame_index for moment in moments),
+        sights=tuple(moment.eyes[eye].sight for moment in moments),
+        found=np.array([NO_BOX if box is None else box.box_px for box in on_image], dtype=np.float64),
+        truth=np.array([NO_BOX if box is None else box for box in truths], dtype=np.float64),
+        sources=tuple(None if box is None else box.source for box in on_image),
+    )
+
+
+def _on_image(box: SourcedBox | None, size_px: tuple[int, int]) -> SourcedBox | None:
+    """The part of a box that lies on the image, for the true one goes around pixels; None without any."""
+    if box is None:
+        return None
+    clipped = clipped_box(corner_box(box.box_px), size_px)
+    return None if clipped is None else SourcedBox(center_box(clipped), box.source)

@@ -1,0 +1,91 @@
+"""`droguekit render`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from datasets_manifest.storage.storage import as_location
+from droguekit.batch.progress import duration, progress_report
+from droguekit.cli.arguments import (
+    EngineOption,
+    Place,
+    RecipeArgument,
+    SeedOption,
+    TarOption,
+    WorkersOption,
+    human_size,
+    parse_frames,
+    parse_shard,
+)
+from droguekit.cli.main import FAULT
+from droguekit.workflows.datasets import RenderOrder, open_recipe, render_frames
+
+EXAMPLES = (
+    "droguekit render demo --out data/demo",
+    "droguekit render my-recipe.toml --out data/mine --seed 7 --workers 4",
+    "droguekit render demo --out data/demo --frames 0:10   (a part now, the rest later)",
+    "droguekit render my-recipe.toml --out s3://bucket/mine --tar 1000   (an object store, tar files of 1000 pairs)",
+    "droguekit render demo --out data/demo-0 --shard 0/4   (a fourth here, the others elsewhere; see `merge`)",
+)
+
+
+def render(
+    recipe: RecipeArgument,
+    out: Annotated[
+        Place,
+        typer.Option(
+            "--out",
+            metavar="DIR",
+            parser=str,
+            callback=as_location,
+            help="The dataset's folder, made if missing, or a URL such as s3://BUCKET/NAME.",
+        ),
+    ],
+    seed: SeedOption = None,
+    frames: Annotated[
+        str | None, typer.Option("--frames", metavar="A:B", help="Only frames A up to but without B.")
+    ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option("--shard", metavar="I/N", help="Only every N-th of the frames, from the I-th on, I from 0."),
+    ] = None,
+    tar: TarOption = None,
+    workers: WorkersOption = None,
+    timeout: Annotated[
+        float | None,
+        typer.Option("--timeout", metavar="S", help="Seconds for one frame; by default what `droguekit plan` tells."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://HOST:8786, to work on."),
+    ] = None,
+    engine: EngineOption = None,
+) -> None:
+    """Make a dataset from a recipe.
+
+    The same command again goes on where the last one stopped: pairs that are whole stay, damaged ones are made again,
+    and the result is the same as that of one undisturbed run. Ctrl-C finishes the pairs in hand and stops; twice stops
+    at once.
+    """
+    chosen, text = open_recipe(recipe, seed, engine)
+    wanted = parse_shard(shard, parse_frames(frames, chosen.frames.count))
+    order = RenderOrder(workers, timeout, scheduler, tar)
+    summary = render_frames(chosen, text, out, wanted, order, progress_report())
+    totals = summary.totals
+    cpu_s, retries = sum(totals.stage_s.values()), f", {totals.retries} attempts repeated" if totals.retries else ""
+    typer.echo(
+        f"{out}: made {len(totals.made)} pairs ({duration(cpu_s)} of CPU time, {human_size(totals.size_bytes)}"
+        f"{retries}), kept {summary.kept}"
+    )
+    if totals.made:
+        stages = ", ".join(f"{stage} {duration(seconds)}" for stage, seconds in totals.stage_s.most_common())
+        typer.echo(f"CPU time by stage: {stages}")
+    if totals.peak_gib:
+        typer.echo(f"workers held up to {totals.peak_gib:.1f} GiB together")
+    typer.echo(f"{summary.pairs} of {summary.planned} pairs are there; dataset sha256 {summary.dataset_sha256}")
+    for drop in summary.drops:
+        typer.echo(f"frame {drop.frame_index} is missing: {drop.reason}", err=True)
+    if summary.drops:
+        raise typer.Exit(FAULT)

@@ -1,0 +1,39 @@
+"""`droguekit reproduce`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from droguekit.cli.arguments import DatasetArgument
+from droguekit.cli.main import FAULT
+
+EXAMPLES = ("droguekit reproduce data/demo --frame 12",)
+
+
+def reproduce(
+    dataset: DatasetArgument,
+    frame: Annotated[int, typer.Option("--frame", metavar="N", help="Index of the frame.")],
+) -> None:
+    """Make one frame of a dataset again, from its manifest alone, and compare record and images.
+
+    On the same processor with the same packages both must be the same bit for bit. Elsewhere the draws must be equal
+    and the labels agree within 1e-9; the command says which of the two it proved, and exits with 1 when neither holds.
+    """
+    from droguekit.batch.reproduce_frame import reproduce_frame
+
+    result = reproduce_frame(dataset, frame)
+    for difference in result.elsewhere:
+        typer.echo(f"not the same machine: {difference}")
+    for difference in result.differences:
+        typer.echo(difference)
+    if result.verdict == "different":
+        typer.echo(f"frame {frame}: is not reproduced")
+        raise typer.Exit(FAULT)
+    proof = (
+        "record and images are the same bit for bit"
+        if result.verdict == "identical"
+        else "made elsewhere: the draws are equal and the labels agree within 1e-9; pixels were not compared"
+    )
+    typer.echo(f"frame {frame}: {proof}")

@@ -1,0 +1,1 @@
+"""Commands that find the drogue and score what was found."""

@@ -1,0 +1,47 @@
+"""`droguekit detect`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from droguekit.batch.progress import progress_report
+from droguekit.cli.arguments import DatasetArgument, DetectorOption, output_option
+from droguekit.workflows.detection import detect_dataset
+
+EXAMPLES = (
+    "droguekit detect data/demo --out detections.json",
+    "droguekit detect data/demo --detector color-blob --out color-blob.json",
+    "droguekit detect data/flight --detector my-network.onnx --out detections.json",
+    "droguekit detect data/docking-10m --tracker bernoulli --out tracked.json",
+)
+
+
+def detect(
+    dataset: DatasetArgument,
+    out: Annotated[Path, output_option("--out", "FILE.json", "Gets the boxes, as COCO results.")],
+    detector: DetectorOption = None,
+    least_score: Annotated[float, typer.Option("--least-score", help="Boxes that score less are left out.")] = 0.001,
+    tracker: Annotated[
+        str | None,
+        typer.Option(
+            "--tracker",
+            metavar="NAME",
+            help="Follow the drogue from pair to pair with bernoulli, flow, mil or pose-predict; the detector looks "
+            "where it is lost, and at every 25th pair. docs/tracking.md.",
+        ),
+    ] = None,
+) -> None:
+    """Find the drogue in every image of a dataset, from images, rig and drogue alone.
+
+    Image ids are those of the dataset's annotations/all.json, also where there is no such file: twice the pair's index,
+    and 1 for the left or 2 for the right image.
+    """
+    counts = detect_dataset(dataset, detector, out, least_score, progress_report(), tracker)
+    typer.echo(
+        f"{counts.detector}: {counts.boxes} boxes in {counts.images_with_boxes} of {2 * counts.pairs} images, "
+        f"median {counts.times.wall_ms:.1f} ms a pair ({counts.times.cpu_ms:.1f} ms CPU)"
+    )
+    typer.echo(f"wrote {out}")

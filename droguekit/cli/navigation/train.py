@@ -1,0 +1,100 @@
+"""`droguekit train`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from droguekit.batch.progress import progress_report
+from droguekit.cli.arguments import WorkersOption, output_option
+from droguekit.workflows.training import TrainingOrder, train_detector
+
+EXAMPLES = (
+    "droguekit train detector-small --out out/detector   (renders the recipe first)",
+    "droguekit train data/mine data/more --out out/mine --variant s --image-passes 20000 --size 320x416",
+    "droguekit train data/mine --out out/mine --size 320x416 --final-size 480x640   (large images in the last half)",
+    "droguekit train data/mine --out out/mine --start-from mobile-s --image-passes 8000   (from the shipped weights)",
+    "droguekit train data/mine --out out/mine --settings mine.toml   (learning rate, batch, seed and so on)",
+)
+
+
+def train(
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE",
+            help="Datasets' folders or URLs, and recipes, shipped or .toml, which are rendered into OUT/datasets.",
+        ),
+    ],
+    out: Annotated[Path, output_option("--out", "DIR", "The training's folder; made if missing.")],
+    variant: Annotated[Literal["l", "s"] | None, typer.Option("--variant", help="Large or small network.")] = None,
+    attention: Annotated[
+        Literal["eca", "se"] | None, typer.Option("--attention", help="Attention to channels.")
+    ] = None,
+    fusion: Annotated[
+        Literal["asff", "concat"] | None, typer.Option("--fusion", help="Fusion of the three scales.")
+    ] = None,
+    mosaic: Annotated[
+        bool | None, typer.Option("--mosaic/--no-mosaic", help="Put four images together; on by default.")
+    ] = None,
+    views: Annotated[
+        Literal["one", "both"] | None,
+        typer.Option("--views", help="Both eyes of a pair in one batch (the default), or single eyes."),
+    ] = None,
+    image_passes: Annotated[
+        int | None, typer.Option("--image-passes", help="Images that go through the network in all; 40,000.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="HxW", help="The network's input, multiples of 32; 480x640.")
+    ] = None,
+    final_size: Annotated[
+        str | None, typer.Option("--final-size", metavar="HxW", help="The same in the last half of the training.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of weights and augmentation; 0.")] = None,
+    device: Annotated[Literal["cpu", "cuda"] | None, typer.Option("--device", help="Where to compute; cpu.")] = None,
+    threads: Annotated[int | None, typer.Option("--threads", help="That compute; as many as cores.")] = None,
+    settings: Annotated[
+        Path | None,
+        typer.Option("--settings", metavar="FILE", help="TOML with any of the settings; options here go before it."),
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option("--cache", metavar="DIR", help="For images at the network's size; OUT/cache.")
+    ] = None,
+    start_from: Annotated[
+        str | None,
+        typer.Option(
+            "--start-from",
+            metavar="NAME|FILE",
+            help="Weights to begin with: mobile-s, mobile-l, an .onnx of droguekit, or best.pt of a training.",
+        ),
+    ] = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Train a detector on datasets, evaluate it on their test splits, and export it as ONNX.
+
+    The same command again goes on where the last one stopped. Ctrl-C saves and stops; twice stops at once.
+    """
+    given = {
+        "variant": variant,
+        "attention": attention,
+        "fusion": fusion,
+        "mosaic": mosaic,
+        "views": views,
+        "image_passes": image_passes,
+        "seed": seed,
+        "device": device,
+        "threads": threads,
+    }
+    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    order = TrainingOrder(tuple(sources), settings, changes, size, final_size, cache, start_from, workers)
+    result = train_detector(order, out, progress_report())
+    for split, reached in (("val", result.validation), ("test", result.test)):
+        if reached is not None:
+            ap50, ap75, ap, recall50 = (
+                f"{100 * value:.2f} %" for value in (reached.ap50, reached.ap75, reached.ap, reached.recall50)
+            )
+            typer.echo(f"{split}: AP50 {ap50}, AP75 {ap75}, AP {ap}, recall at an overlap of 0.5 {recall50}")
+    threshold = f"{result.score_threshold:.3f}"
+    typer.echo(f"{result.file}: the weights after {result.best_step} steps, score threshold {threshold}")

@@ -1,0 +1,1 @@
+"""Pictures of datasets and results for people to look at."""

@@ -1,0 +1,176 @@
+"""The page on disk: pictures, labels and the catalogue beside a page that reads them without a server.
+
+A browser lets a page from the file system load pictures and scripts of its own folder, but read no other file. So all
+data are scripts, which hand over what is in them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from datasets_manifest.atomic import PART_SUFFIX, write_text_atomic
+from datasets_manifest.storage.locking import takes_lock
+from droguekit.visualization.browse.conditions import LIGHTS
+from droguekit.visualization.browse.drogue_rings import Ring
+from droguekit.visualization.browse.frame_entry import rings_name
+from droguekit.visualization.browse.source import DatasetFacts
+from geometry.stereo import StereoRig
+
+MARK_FILE = ".droguekit-browse"
+_MARK = "Written by `droguekit browse`, which may replace or remove anything in this folder.\n"
+SITE_FOLDER, DATA_FOLDER, PICTURES_FOLDER = "site", "data", "pictures"
+_SCRIPTS = ("projection.js", "overlay.js", "catalogue.js", "single.js", "page.js")
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A pair that is not on the page, and why."""
+
+    frame_index: int
+    reason: str
+
+
+@contextmanager
+def opened_page(out: Path) -> Iterator[None]:
+    """Make the page's folders, or go on with those of an earlier run, and keep other runs out of them.
+
+    Raises:
+        ValueError: a folder with other things in it, or that another run is writing into.
+        OSError: it cannot be written.
+    """
+    if out.exists() and not _is_ours(out):
+        raise ValueError(f"{out}: is there already and is no page of this command; name a new folder")
+    folders = [out / name for name in (SITE_FOLDER, DATA_FOLDER, PICTURES_FOLDER)]
+    for path in (out / MARK_FILE, *folders):
+        if path.is_symlink():
+            raise ValueError(f"{path}: leads elsewhere, where nothing is written or removed; name a new folder")
+    with ExitStack() as stack:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            mark = stack.enter_context((out / MARK_FILE).open("a", encoding="utf-8"))
+            if not takes_lock(mark):
+                raise ValueError(f"{out}: another run is writing into it; wait for its end, or name another one")
+            if not mark.tell():
+                mark.write(_MARK)
+                mark.flush()
+            for folder in folders:
+                folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OSError(error.errno, f"{out}: cannot be written: {error.strerror or error}") from error
+        yield
+
+
+def _is_ours(out: Path) -> bool:
+    """Whether a place is a page, a part of one that was never begun, or empty."""
+    if not out.is_dir():
+        return False
+    others = [path for path in out.iterdir() if not path.name.endswith(PART_SUFFIX)]
+    return not others or (out / MARK_FILE).is_file()
+
+
+def write_labels(out: Path, frame_index: int, labels: dict[str, Any]) -> str:
+    """Write what the page loads when it shows a pair large.
+
+    Returns:
+        The file's name without its suffix. It holds the contents' hash: until the catalogue is written anew, the page
+        goes on with the files that the old one names.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    text = _json(labels)
+    name = f"{frame_index:06d}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    write_text_atomic(_labels_file(out, name), f'droguekit.receive("{name}", {text});\n')
+    return name
+
+
+def write_page(
+    out: Path, facts: DatasetFacts, rows: Sequence[dict[str, Any]], drogues: Iterable[tuple[Ring, ...]],
+    methods: Sequence[str], skipped: Sequence[Skipped],
+) -> None:  # fmt: skip
+    """Write the catalogue and the page itself, and remove what earlier runs left of other pairs.
+
+    Args:
+        out: the page's folder.
+        facts: of the dataset.
+        rows: of the catalogue, by frame.
+        drogues: rings of every drogue that is shown or looked for, in any order.
+        methods: whose estimates there are.
+        skipped: pairs that could not be read.
+
+    Raises:
+        OSError: something cannot be written.
+    """
+    camera = facts.rig.camera
+    catalogue = {
+        "is_blind": facts.is_blind,
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "rig": _rig_table(facts.rig),
+        "drogues": {rings_name(rings): [ring._asdict() for ring in rings] for rings in sorted(drogues)},
+        "lights": LIGHTS,
+        "methods": list(methods),
+        "rows": list(rows),
+    }
+    write_text_atomic(out / DATA_FOLDER / "catalogue.js", f"droguekit.catalogue = {_json(catalogue)};\n")
+    _write_site(out, facts, skipped)
+    _remove_others(out, rows)
+
+
+def _write_site(out: Path, facts: DatasetFacts, skipped: Sequence[Skipped]) -> None:
+    folder = files(__package__) / SITE_FOLDER
+    for name in ("browse.css", *_SCRIPTS):
+        write_text_atomic(out / SITE_FOLDER / name, (folder / name).read_text(encoding="utf-8"))
+    environment = Environment(
+        loader=PackageLoader(__package__, SITE_FOLDER),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("index.html.j2").render(facts=facts, skipped=skipped, scripts=_SCRIPTS)
+    write_text_atomic(out / "index.html", page)
+
+
+def _remove_others(out: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Remove pictures and labels of pairs that are not in the catalogue any more, or have other pixels now."""
+    kept = {str(row["picture"]) for row in rows}
+    for path in (out / PICTURES_FOLDER).iterdir():
+        if path.name.rpartition("-")[0] not in kept:
+            path.unlink()
+    labels = {_labels_file(out, row["labels"]).name for row in rows} | {"catalogue.js"}
+    for path in (out / DATA_FOLDER).iterdir():
+        if path.name not in labels:
+            path.unlink()
+
+
+def _labels_file(out: Path, name: str) -> Path:
+    return out / DATA_FOLDER / f"{name}.js"
+
+
+def _rig_table(rig: StereoRig) -> dict[str, Any]:
+    def intrinsics(camera: Any) -> dict[str, float]:
+        return {name: getattr(camera, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+
+    lenses = [
+        {
+            "camera": intrinsics(lens.camera),
+            "distortion": lens.distortion.coefficients().tolist(),
+            "real_from_ideal": lens.ideal_from_real.T.ravel().tolist(),
+        }
+        for lens in rig.lenses or ()
+    ]
+    return {"camera": intrinsics(rig.camera), "baseline_m": rig.baseline_m, "lenses": lenses or None}
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))

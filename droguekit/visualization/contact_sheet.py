@@ -1,0 +1,140 @@
+"""A contact sheet: left images side by side with their labels drawn in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from datasets_manifest.storage.blind import BlindDataset, BlindPair
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import PairRecord
+from droguekit.benchmark.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
+
+_HUB_RGB = (255, 120, 220)
+_TEXT_RGB = (255, 255, 255)
+_PAPER = 24
+_GAP_PX = 4
+_CAPTION_PX = 22
+
+
+def draw_contact_sheet(dataset: Dataset, frames: Sequence[int], columns: int, tile_width_px: int) -> Picture:
+    """Tiles of left images with box, marker and hub centres, and a caption with index and distance.
+
+    Args:
+        dataset: where they come from.
+        frames: indices, in reading order; at least one.
+        columns: tiles in a row.
+        tile_width_px: width of a tile; its height follows the images.
+
+    Returns:
+        (H, W, 3) in the order red, green, blue.
+
+    Raises:
+        ValueError: an image or a record cannot be read.
+    """
+    return _grid([_draw_tile(dataset.images(index), dataset.record(index), tile_width_px) for index in frames], columns)
+
+
+def draw_blind_sheet(dataset: BlindDataset, frames: Sequence[int], columns: int, tile_width_px: int) -> Picture:
+    """Tiles of left images without labels, and a caption with index and time; arguments as `draw_contact_sheet`.
+
+    Raises:
+        ValueError: an image cannot be read.
+    """
+    return _grid([_draw_blind_tile(dataset.pair(index), tile_width_px) for index in frames], columns)
+
+
+def _grid(tiles: Sequence[Picture], columns: int) -> Picture:
+    """Equal tiles in rows."""
+    height_px, width_px = tiles[0].shape[:2]
+    rows = math.ceil(len(tiles) / columns)
+    shape = (rows * (height_px + _GAP_PX) + _GAP_PX, columns * (width_px + _GAP_PX) + _GAP_PX, 3)
+    sheet = np.full(shape, _PAPER, dtype=np.uint8)
+    for place, tile in enumerate(tiles):
+        row, column = divmod(place, columns)
+        top, left = _GAP_PX + row * (height_px + _GAP_PX), _GAP_PX + column * (width_px + _GAP_PX)
+        sheet[top : top + height_px, left : left + width_px] = tile
+    return sheet
+
+
+def draw_family_sheet(dataset: Dataset, count: int, columns: int, tile_width_px: int) -> tuple[Picture, int]:
+    """Left images without labels, a row for each family of conditions, with the distance of the drogue in a corner.
+
+    Args:
+        dataset: where they come from.
+        count: tiles in all, at most; every family gets as many as the others as long as it has pairs.
+        columns: families side by side.
+        tile_width_px: width of a tile; its height follows the images.
+
+    Returns:
+        (H, W, 3) in the order red, green, blue, and how many pairs it shows.
+
+    Raises:
+        ValueError: an image or a record cannot be read.
+    """
+    families: dict[str, list[int]] = {}
+    for index in dataset.frame_indices:
+        families.setdefault(dataset.record(index).conditions.family, []).append(index)
+    per_row = max(1, count // len(families))
+    blocks = [
+        _family_row(dataset, name, indices[:per_row], per_row, tile_width_px) for name, indices in families.items()
+    ]
+    height_px, width_px = blocks[0].shape[:2]
+    rows = math.ceil(len(blocks) / columns)
+    sheet = np.full((rows * (height_px + _GAP_PX), columns * (width_px + _GAP_PX), 3), _PAPER, dtype=np.uint8)
+    for place, block in enumerate(blocks):
+        column, row = divmod(place, rows)
+        top, left = row * (height_px + _GAP_PX), column * (width_px + _GAP_PX)
+        sheet[top : top + height_px, left : left + width_px] = block
+    return sheet, sum(min(per_row, len(indices)) for indices in families.values())
+
+
+def _family_row(dataset: Dataset, name: str, frames: Sequence[int], length: int, width_px: int) -> Picture:
+    """A caption with the family's name over its tiles, from left to right."""
+    tiles = [_plain_tile(dataset.images(index), dataset.record(index), width_px) for index in frames]
+    height_px = tiles[0].shape[0]
+    row = np.full((_CAPTION_PX + height_px, length * (width_px + _GAP_PX), 3), _PAPER, dtype=np.uint8)
+    cv2.putText(row, name, (4, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
+    for place, tile in enumerate(tiles):
+        left = place * (width_px + _GAP_PX)
+        row[_CAPTION_PX:, left : left + width_px] = tile
+    return row
+
+
+def _plain_tile(images: StereoImages, record: PairRecord, width_px: int) -> Picture:
+    picture, _ = resized(display_picture(images), width_px)
+    distance_m = record.conditions.distance_m
+    text = "no drogue" if distance_m is None else f"{distance_m:.1f} m"
+    foot = (6, picture.shape[0] - 7)
+    for color, thickness in (((0, 0, 0), 3), (_TEXT_RGB, 1)):
+        cv2.putText(picture, text, foot, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, thickness, cv2.LINE_AA)
+    return picture
+
+
+def _draw_tile(images: StereoImages, record: PairRecord, width_px: int) -> Picture:
+    picture, scale = resized(display_picture(images), width_px)
+    view = record.views.left
+    if view.box_full_xywh_px is not None:
+        draw_box(picture, view.box_full_xywh_px, scale)
+    draw_crosses(picture, [marker.center_ellipse_px for marker in view.markers], scale)
+    if view.hub is not None and view.hub.visible_fraction > 0:
+        draw_crosses(picture, [view.hub.center_ellipse_px], scale, color=_HUB_RGB)
+    distance_m = record.conditions.distance_m
+    what = "no drogue" if distance_m is None else f"{distance_m:.2f} m"
+    return _with_caption(picture, f"{record.frame_index}: {what}")
+
+
+def _draw_blind_tile(pair: BlindPair, width_px: int) -> Picture:
+    picture, _ = resized(display_picture(pair.images), width_px)
+    return _with_caption(picture, f"{pair.frame_index}: {pair.images.time_s:.2f} s")
+
+
+def _with_caption(picture: Picture, text: str) -> Picture:
+    caption = np.zeros((_CAPTION_PX, picture.shape[1], 3), dtype=np.uint8)
+    cv2.putText(caption, text, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT_RGB, 1, cv2.LINE_AA)
+    tile: Picture = np.concatenate([picture, caption])
+    return tile

@@ -1,0 +1,231 @@
+"""A video of a dataset's left images with labels, a method's estimates and their errors drawn in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, read_estimates
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
+from drogue_models.parameters import DrogueParameters
+from droguekit.benchmark.poses.pose_errors import by_method, pose_error
+from droguekit.benchmark.report.label_drawing import (
+    Picture,
+    Rgb,
+    display_picture,
+    draw_box,
+    draw_crosses,
+    resized,
+)
+from droguekit.visualization.animation import evenly, period_s, write_movie
+from droguekit.visualization.browse.drogue_rings import drogue_rings, ring_images
+from geometry.se3 import Array, RigidTransform
+
+TRUE_RGB: Rgb = (80, 255, 100)
+ESTIMATE_RGB: Rgb = (255, 138, 31)
+CENTROID_RGB: Rgb = (255, 255, 255)
+_TEXT_RGB: Rgb = (235, 238, 242)
+_SOFT_RGB: Rgb = (150, 158, 168)
+_PAPER = 24
+_WHOLE_WIDTH_PX, _BAR_PX = 800, 64
+# The close-up shows the drogue and this much more of its surroundings.
+_MARGIN = 1.35
+_SMALLEST_PX = 32.0
+# What lies farther out, in widths of the image, is not drawn.
+_FARTHEST_WIDTHS = 8.0
+# Coordinates are handed to OpenCV in 1/16 px.
+_SHIFT = 4
+
+
+def read_method(path: Path, dataset: Dataset, method: str | None) -> tuple[str, Mapping[int, Estimate]]:
+    """One method's estimates by frame.
+
+    Args:
+        path: the file of estimates.
+        dataset: that it belongs to.
+        method: its name, or None where the file holds but one.
+
+    Raises:
+        ValueError: the file cannot be used, has no such method, or several where none was named.
+    """
+    methods = by_method(read_estimates(path), dataset.frame_indices, str(path))
+    if method is None and len(methods) > 1:
+        raise ValueError(f"--method: {path} holds several; name one of {', '.join(methods)}")
+    name = next(iter(methods)) if method is None else method
+    if name not in methods:
+        raise ValueError(f"--method: {path} holds {', '.join(methods)}, got {name}")
+    return name, methods[name]
+
+
+def write_overlay_video(
+    dataset: Dataset, path: Path, count: int, sequence_id: int | None, estimates: tuple[str, Mapping[int, Estimate]]
+) -> tuple[int, float]:
+    """Draw pairs of a dataset, spread evenly, and write them as they follow each other in time.
+
+    Args:
+        dataset: where they come from.
+        path: ends in .mp4 or .gif; takes its name when it is whole.
+        count: pairs at most.
+        sequence_id: only pairs of this sequence, or None for all.
+        estimates: a method's name and its estimates by frame; no name for the truth alone.
+
+    Returns:
+        How many pairs it shows, and how long it lasts. [s]
+
+    Raises:
+        ValueError: no such pairs, or one that cannot be read.
+        OSError: it cannot be written.
+    """
+    fitting = [
+        index
+        for index in dataset.frame_indices
+        if sequence_id is None or dataset.record(index).sequence_id == sequence_id
+    ]
+    if not fitting:
+        which = "" if sequence_id is None else f" of sequence {sequence_id}"
+        raise ValueError(f"{dataset.path}: holds no pairs{which} to show")
+    records = [dataset.record(index) for index in evenly(fitting, count)]
+    method, answers = estimates
+
+    def draw(record: PairRecord) -> Picture:
+        drogue = dataset.drogue_sought(record)
+        index = record.frame_index
+        return draw_overlay(record, dataset.images(index), drogue, method, answers.get(index))
+
+    length_s = period_s(records)
+    write_movie(path, map(draw, records), length_s)
+    return len(records), len(records) * length_s
+
+
+class _Lines(NamedTuple):
+    """What is drawn over the left image. [px]"""
+
+    box: PixelBox | None
+    true: list[Array]
+    estimated: list[Array]
+    centers: list[PixelPoint]
+
+
+def draw_overlay(
+    record: PairRecord, images: StereoImages, drogue: DrogueParameters, method: str, estimate: Estimate | None
+) -> Picture:
+    """(H, W, 3) the left image, beside it the drogue enlarged, and a line of numbers above.
+
+    Boxes are yellow, the true outline is green; an estimate's outline is orange, its measured centres white.
+
+    Args:
+        record: the pair's truth.
+        images: its images.
+        drogue: that is there or looked for.
+        method: whose estimate is drawn, empty for the truth alone.
+        estimate: what it says of the pair, or None for nothing.
+    """
+    lines = _lines(record, drogue, estimate)
+    picture = display_picture(images)
+    whole, scale = resized(picture, _WHOLE_WIDTH_PX)
+    # Codecs want even sizes.
+    height = whole.shape[0] // 2 * 2
+    whole = whole[:height]
+    _draw(whole, lines, scale, (-0.5, -0.5))
+    close = np.full((height, height, 3), _PAPER, dtype=np.uint8)
+    around = _around(record, lines)
+    if around is not None:
+        close, larger, corner = _close_up(picture, around, height)
+        _draw(close, lines, larger, corner)
+    bar = _bar(record, method, estimate, whole.shape[1] + height)
+    return np.concatenate([bar, np.concatenate([whole, close], axis=1)])
+
+
+def _lines(record: PairRecord, drogue: DrogueParameters, estimate: Estimate | None) -> _Lines:
+    rig, rings = record.frame.rig, drogue_rings(drogue)
+    # An estimate may be anywhere: far beyond the picture OpenCV's fixed point overflows.
+    most_px = _FARTHEST_WIDTHS * rig.camera.width_px
+
+    def outlines(pose: RigidTransform | None) -> list[Array]:
+        images = [] if pose is None else ring_images(rings, pose, rig, "left")
+        return [image for image in images if np.abs(image).max() < most_px]
+
+    found = [f.center_px for f in estimate.features if f.eye == "left"] if estimate is not None else []
+    return _Lines(
+        record.views.left.box_visible_xywh_px,
+        outlines(record.left_from_drogue),
+        outlines(estimate.left_from_drogue if isinstance(estimate, PoseEstimate) else None),
+        [center for center in found if max(map(abs, center)) < most_px],
+    )
+
+
+def _draw(tile: Picture, lines: _Lines, scale: float, corner: PixelPoint) -> None:
+    """Draw them into a copy of the left image, or a part of it that begins at `corner`."""
+    if lines.box is not None:
+        draw_box(tile, lines.box, scale, corner)
+    for outlines, color in ((lines.true, TRUE_RGB), (lines.estimated, ESTIMATE_RGB)):
+        fixed = [np.rint(((outline - corner) * scale - 0.5) * 2**_SHIFT).astype(np.int32) for outline in outlines]
+        cv2.polylines(tile, fixed, True, color, 1, cv2.LINE_AA, _SHIFT)
+    draw_crosses(tile, lines.centers, scale, corner, CENTROID_RGB)
+
+
+def _around(record: PairRecord, lines: _Lines) -> PixelBox | None:
+    """What the close-up shows: the drogue, or where an estimate puts it; None where there is neither."""
+    box = lines.box or record.views.left.box_full_xywh_px
+    if box is None and lines.estimated:
+        low, high = lines.estimated[0].min(axis=0), lines.estimated[0].max(axis=0)
+        box = (float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1]))
+    return box
+
+
+def _close_up(picture: Picture, box: PixelBox, side: int) -> tuple[Picture, float, PixelPoint]:
+    """A square around a box, its size over that of what it shows, and the low corner of what it shows. [px]"""
+    reach = max(_SMALLEST_PX, _MARGIN * max(box[2], box[3]))
+    scale = side / reach
+    corner = (box[0] + box[2] / 2 - reach / 2, box[1] + box[3] / 2 - reach / 2)
+    # OpenCV's warp takes single pixels out of a larger picture: it is made smaller first.
+    source = picture if scale >= 1 else resized(picture, max(1, round(scale * picture.shape[1])))[0]
+    step = [got / had / scale for got, had in zip(source.shape[1::-1], picture.shape[1::-1], strict=True)]
+    warp = np.array([[step[0], 0, 0.0], [0, step[1], 0.0]])
+    # From pixel centres of the close-up to those of the source, whose corner lies half a pixel before its first centre.
+    warp[:, 2] = [(low + 0.5) * scale * each + 0.5 * each - 0.5 for low, each in zip(corner, step, strict=True)]
+    flags = cv2.INTER_NEAREST if scale > 1 else cv2.INTER_LINEAR
+    part = cv2.warpAffine(source, warp, (side, side), flags=flags | cv2.WARP_INVERSE_MAP)
+    return np.asarray(part, dtype=np.uint8), scale, corner
+
+
+def _bar(record: PairRecord, method: str, estimate: Estimate | None, width: int) -> Picture:
+    bar = np.full((_BAR_PX, width, 3), _PAPER, dtype=np.uint8)
+    distance_m = record.conditions.distance_m
+    where = "no drogue" if distance_m is None else f"drogue at {distance_m:.2f} m"
+    # Time stamps say nothing of pairs that belong to no sequence.
+    when = "" if record.sequence_id is None else f", sequence {record.sequence_id}, {record.time_s:.2f} s"
+    _write(bar, f"frame {record.frame_index}{when}: {where}", (14, 26), _TEXT_RGB)
+    _write(bar, "true", (14, 52), TRUE_RGB)
+    if method:
+        _write(bar, f"{method}: {_verdict(record, estimate)}", (72, 52), ESTIMATE_RGB)
+        _write(bar, "+ measured centres, left eye", (width - 290, 26), _SOFT_RGB)
+    return bar
+
+
+def _verdict(record: PairRecord, estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "says nothing of this pair"
+    if isinstance(estimate, NoFix):
+        return f"no fix, {estimate.reason}"[:110]
+    if record.left_from_drogue is None:
+        return "a fix, and there is no drogue"
+    error = pose_error(estimate.left_from_drogue, record.left_from_drogue)
+    x_mm, y_mm, z_mm = 1e3 * error.components[:3]
+    pitch_deg, yaw_deg = error.components[3:]
+    return (
+        f"{1e3 * error.position_m:.2f} mm off (x {x_mm:+.2f}, y {y_mm:+.2f}, z {z_mm:+.2f}), "
+        f"pitch {pitch_deg:+.2f} deg, yaw {yaw_deg:+.2f} deg"
+    )
+
+
+def _write(bar: Picture, text: str, place: tuple[int, int], color: Rgb) -> None:
+    # OpenCV's fonts have ASCII only; of other signs it would make question marks anyhow.
+    shown = text.encode("ascii", "replace").decode("ascii")
+    cv2.putText(bar, shown, place, cv2.FONT_HERSHEY_SIMPLEX, 0.56, color, 1, cv2.LINE_AA)

@@ -1,0 +1,268 @@
+"""What the viewer is told of each pair.
+
+Everything stands in the left camera's frame, `rig`. The viewer counts pixels from the image's corner, half a pixel more
+than the dataset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import TypeVar
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from datasets_manifest.types.estimates import Estimate, PoseEstimate
+from datasets_manifest.types.records import PixelBox, ViewRecord
+from drogue_models.meshes import drogue_meshes
+from drogue_models.parameters import DrogueParameters
+from drogue_models.parts import FIRST_MARKER_ID, Part
+from drogue_models.tanker import tanker_mesh
+from droguekit.benchmark.poses.pose_errors import pose_error
+from droguekit.benchmark.report.label_drawing import BOX_RGB, MARKER_RGB, Rgb, display_picture
+from droguekit.visualization.rerun.shown_pairs import ShownPair
+from geometry.circles import disc_outline
+from geometry.se3 import Array, RigidTransform
+from geometry.stereo import EYES, Eye, StereoRig
+
+Faces = NDArray[np.int64]
+_Body = TypeVar("_Body")
+
+APPLICATION = "droguekit"
+FRAMES, SECONDS = "frame", "time"
+CURVES = ("position_mm", "pitch_deg", "yaw_deg")
+_HUB_RGB: Rgb = (255, 120, 220)
+_STEEL_RGB: Rgb = (138, 150, 163)
+_HOSE_RGB: Rgb = (70, 70, 76)
+# Of as many methods as a legend has room for; further ones begin again. Bright enough for the viewer's black.
+_METHOD_RGB: tuple[Rgb, ...] = (
+    (255, 138, 31),
+    (90, 170, 255),
+    (90, 210, 110),
+    (255, 95, 115),
+    (185, 145, 255),
+    (60, 210, 220),
+)
+# Sizes on the screen, whatever the image's scale.
+_TRUE_POINTS, _MEASURED_POINTS, _WIRES = (
+    np.atleast_1d(np.asarray(rr.Radius.ui_points(size))) for size in (2.5, 1.5, 1.0)
+)
+# The chord of a rim of 0.35 m then leaves it by 0.4 mm.
+_CIRCLE_POINTS = 64
+_QUALITY = 80
+_IMAGE_PLANE_M = 0.6
+
+
+class PairRecorder:
+    """Tells a recording of one pair after another."""
+
+    def __init__(self, recording: rr.RecordingStream, rig: StereoRig, methods: Sequence[str]) -> None:
+        """Tell it of what does not change.
+
+        Args:
+            recording: a file or a viewer.
+            rig: the cameras.
+            methods: whose estimates there will be.
+        """
+        self._to = recording
+        self._methods = {name: _METHOD_RGB[k % len(_METHOD_RGB)] for k, name in enumerate(methods)}
+        # Bodies that are shown now, and what of.
+        self._shown: dict[str, object] = {}
+        self._log("rig", rr.ViewCoordinates.RDF, static=True)
+        for eye in EYES:
+            self._log(f"rig/{eye}", *_eye(rig, eye), static=True)
+        for curve in CURVES:
+            for name, color in self._methods.items():
+                self._log(_path("errors", curve, name), rr.SeriesLine(color=color, name=name), static=True)
+
+    def add(self, pair: ShownPair, answers: Mapping[str, Estimate]) -> None:
+        """Tell it of a pair and of what the methods say of it."""
+        rr.set_time_sequence(FRAMES, pair.frame_index, recording=self._to)
+        rr.set_time_seconds(SECONDS, pair.images.time_s, recording=self._to)
+        self._add_images(pair)
+        if pair.record is not None:
+            self._add_truth(pair)
+        for method in self._methods:
+            self._add_answer(method, answers.get(method), pair)
+
+    def _log(self, path: str, *what: rr.AsComponents, static: bool = False) -> None:
+        rr.log(path, *what, static=static, recording=self._to)
+
+    def _clear(self, path: str) -> None:
+        self._log(path, rr.Clear(recursive=True))
+
+    def _show(
+        self, path: str, body: _Body | None, pose: RigidTransform | None, draw: Callable[[_Body], rr.AsComponents]
+    ) -> None:
+        """Place a body, or remove it; what it looks like is sent when another one was there before."""
+        if body is None or pose is None:
+            self._clear(path)
+            self._shown.pop(path, None)
+            return
+        if self._shown.get(path) != body:
+            self._log(f"{path}/body", draw(body))
+            self._shown[path] = body
+        self._log(path, rr.Transform3D(translation=pose.translation_m, mat3x3=pose.rotation))
+
+    def _add_images(self, pair: ShownPair) -> None:
+        for eye in EYES:
+            picture = display_picture(replace(pair.images, left=getattr(pair.images, eye)))
+            _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            self._log(f"rig/{eye}/image", rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg"))
+
+    def _add_truth(self, pair: ShownPair) -> None:
+        record = pair.record
+        if record is None:
+            return
+        frame = record.frame
+        self._show("rig/drogue", frame.drogue, record.left_from_drogue, _drogue)
+        self._show("rig/tanker", _STEEL_RGB, frame.left_from_tanker, _tanker)
+        if frame.hose_nodes_left_m is None or frame.drogue is None:
+            self._clear("rig/hose")
+        else:
+            radius_m = frame.drogue.hose_radius_m
+            self._log("rig/hose", rr.LineStrips3D([frame.hose_nodes_left_m], radii=[radius_m], colors=[_HOSE_RGB]))
+        if record.conditions.distance_m is None:
+            self._clear("distance_m")
+        else:
+            self._log("distance_m", rr.Scalar(record.conditions.distance_m))
+        for eye, view in (("left", record.views.left), ("right", record.views.right)):
+            self._add_view(f"rig/{eye}", view)
+
+    def _add_view(self, path: str, view: ViewRecord) -> None:
+        for name, box in (("box_full", view.box_full_xywh_px), ("box_visible", view.box_visible_xywh_px)):
+            if box is None:
+                self._clear(f"{path}/{name}")
+            else:
+                self._log(f"{path}/{name}", _box(box))
+        seen = [marker.center_ellipse_px for marker in view.markers if marker.visible_fraction > 0]
+        self._log(f"{path}/markers", rr.Points2D(_corner_px(seen), colors=[MARKER_RGB], radii=_TRUE_POINTS))
+        hubs = [view.hub.center_ellipse_px] if view.hub is not None and view.hub.visible_fraction > 0 else []
+        self._log(f"{path}/hub", rr.Points2D(_corner_px(hubs), colors=[_HUB_RGB], radii=_TRUE_POINTS))
+
+    def _add_answer(self, method: str, estimate: Estimate | None, pair: ShownPair) -> None:
+        pose = estimate.left_from_drogue if isinstance(estimate, PoseEstimate) else None
+        color = self._methods[method]
+        self._show(_path("rig", "estimates", method), pair.drogue, pose, partial(_wires, color=color))
+        for eye in EYES:
+            found = [f.center_px for f in estimate.features if f.eye == eye] if estimate is not None else []
+            points = rr.Points2D(_corner_px(found), colors=[color], radii=_MEASURED_POINTS)
+            self._log(_path("rig", eye, "measured", method), points)
+        truth = None if pair.record is None else pair.record.left_from_drogue
+        if pose is None or truth is None:
+            # A gap in the curves: a line would say that there were fixes.
+            for curve in CURVES:
+                self._clear(_path("errors", curve, method))
+            return
+        error = pose_error(pose, truth)
+        values = (1e3 * error.position_m, float(error.components[3]), float(error.components[4]))
+        for curve, value in zip(CURVES, values, strict=True):
+            self._log(_path("errors", curve, method), rr.Scalar(value))
+
+
+def blueprint() -> rrb.Blueprint:
+    """Where the viewer puts what: 3-D on the left, all of it and about the drogue, eyes and curves on the right."""
+    whole = rrb.Spatial3DView(origin="rig", name="left camera's frame")
+    close = rrb.Spatial3DView(
+        origin="rig/drogue", contents=["rig/drogue/**", "rig/estimates/**"], name="drogue, true and estimated"
+    )
+    eyes = rrb.Horizontal(*(rrb.Spatial2DView(origin=f"rig/{eye}", name=f"{eye} eye") for eye in EYES))
+    curves = [rrb.TimeSeriesView(origin=f"errors/{curve}", name=f"error, {curve}") for curve in CURVES]
+    curves.append(rrb.TimeSeriesView(origin="distance_m", name="distance [m]"))
+    left, right = rrb.Vertical(whole, close), rrb.Vertical(eyes, rrb.Tabs(*curves), row_shares=[3, 2])
+    return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[2, 3]), collapse_panels=True)
+
+
+@lru_cache(maxsize=8)
+def _drogue(drogue: DrogueParameters) -> rr.Mesh3D:
+    """Its parts as one mesh in their own colours."""
+    vertices, faces, colors, count = [], [], [], 0
+    for part, mesh in drogue_meshes(drogue).items():
+        vertices.append(np.asarray(mesh.vertices))
+        faces.append(np.asarray(mesh.faces) + count)
+        colors.append(np.tile(_screen_color(drogue, part), (len(mesh.vertices), 1)))
+        count += len(mesh.vertices)
+    return _mesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors).astype(np.uint8))
+
+
+def _wires(drogue: DrogueParameters, color: Rgb) -> rr.LineStrips3D:
+    """Rim, opening, markers and hub as circles: a second mesh in nearly the same place would flicker with the first."""
+    middle = (0.0, 0.0, 0.0)
+    circles = [(middle, drogue.rim_radius_m), (middle, drogue.face_inner_radius_m)]
+    circles += [((x, y, 0.0), drogue.marker_radius_m) for x, y in drogue.marker_positions_m]
+    if drogue.hub is not None:
+        circles.append(((0.0, 0.0, drogue.hub.depth_m), drogue.hub.outer_radius_m))
+    itself = RigidTransform.identity()
+    outlines = [disc_outline(itself, center_m, radius_m, _CIRCLE_POINTS) for center_m, radius_m in circles]
+    closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
+    return rr.LineStrips3D(closed, radii=_WIRES, colors=[color])
+
+
+def _screen_color(drogue: DrogueParameters, part: int) -> Array:
+    """A part's reflectance as a screen shows it, 0 to 255."""
+    if part >= FIRST_MARKER_ID:
+        rgb = drogue.marker_reflectance_rgb
+    elif part == Part.HUB and drogue.hub is not None:
+        rgb = drogue.hub.reflectance_rgb
+    elif part == Part.CANOPY:
+        rgb = drogue.canopy_reflectance_rgb
+    elif part in (Part.FACE, Part.RIM):
+        rgb = drogue.face_reflectance_rgb
+    else:
+        rgb = drogue.structure_reflectance_rgb
+    color: Array = 255.0 * np.array(rgb) ** (1 / 2.2)
+    return color
+
+
+def _mesh(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> rr.Mesh3D:
+    """Triangles with sharp edges: vertices of their own, with the triangle's normal."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3).astype(np.float32),
+        vertex_normals=np.repeat(normals, 3, axis=0).astype(np.float32),
+        vertex_colors=colors[faces].reshape(-1, 3),
+    )
+
+
+def _tanker(color: Rgb) -> rr.Mesh3D:
+    mesh = tanker_mesh()
+    colors = np.tile(np.array(color, dtype=np.uint8), (len(mesh.vertices), 1))
+    return _mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), colors)
+
+
+def _eye(rig: StereoRig, eye: Eye) -> tuple[rr.Transform3D, rr.Pinhole]:
+    """Pose and intrinsics of the delivered image's camera; the viewer knows no distortion."""
+    lens = rig.lens(eye)
+    camera = rig.camera if lens is None else lens.camera
+    rotation = np.eye(3) if lens is None else lens.ideal_from_real
+    pinhole = rr.Pinhole(
+        focal_length=(camera.fx_px, camera.fy_px),
+        principal_point=(camera.cx_px + 0.5, camera.cy_px + 0.5),
+        width=camera.width_px,
+        height=camera.height_px,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=_IMAGE_PLANE_M,
+    )
+    return rr.Transform3D(translation=rig.eye_offset_m(eye), mat3x3=rotation), pinhole
+
+
+def _corner_px(points_px: Sequence[tuple[float, float]]) -> Array:
+    """(M, 2) points counted from the image's corner. [px]"""
+    return np.asarray(points_px, dtype=np.float64).reshape(-1, 2) + 0.5
+
+
+def _box(box: PixelBox) -> rr.Boxes2D:
+    x, y, width, height = box
+    return rr.Boxes2D(array=[[x + 0.5, y + 0.5, width, height]], array_format=rr.Box2DFormat.XYWH, colors=[BOX_RGB])
+
+
+def _path(*parts: str) -> str:
+    """An entity's path; a method may be called anything."""
+    return rr.new_entity_path(list(parts))

@@ -1,0 +1,157 @@
+"""A dataset into a file of the viewer, or into a viewer that is opened for it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import rerun as rr
+
+from datasets_manifest.atomic import part_path
+from datasets_manifest.types.estimates import Estimate
+from droguekit.batch.progress import ProgressReport
+from droguekit.visualization.rerun.recording import APPLICATION, PairRecorder, blueprint
+from droguekit.visualization.rerun.shown_pairs import ShownPairs
+
+# Only this machine may tell the viewer anything.
+_HOST = "127.0.0.1"
+# How long a slow machine takes to open the viewer, and how long one may take to find that it gets no window. [s]
+_PATIENCE_S, _SETTLING_S = 30.0, 2.0
+
+
+@dataclass(frozen=True)
+class ViewSummary:
+    """What was shown: indices of pairs, and for those that could not be read a line each."""
+
+    shown: tuple[int, ...]
+    faults: tuple[str, ...]
+
+
+def view_pairs(
+    source: ShownPairs,
+    frames: Sequence[int],
+    answers: Mapping[str, Mapping[int, Estimate]],
+    save: Path | None,
+    report: ProgressReport,
+) -> ViewSummary:
+    """Show pairs and what methods say of them.
+
+    Args:
+        source: the dataset.
+        frames: indices of the pairs, in order.
+        answers: estimates by method and frame.
+        save: an .rrd file to write, which takes its name when it is whole, and without a pair to show is not written;
+            a viewer is opened for None.
+        report: hears how it goes.
+
+    Raises:
+        OSError: the file cannot be written, or no viewer can be opened.
+    """
+    # Each has an id of its own: the viewer joins those that share one.
+    recording = rr.new_recording(APPLICATION)
+    if save is None:
+        _open_viewer(recording)
+        return _tell(recording, source, frames, answers, report)
+    part = part_path(save)
+    try:
+        save.parent.mkdir(parents=True, exist_ok=True)
+        # The library tells of no failed write but this one.
+        part.touch(exist_ok=False)
+        rr.save(part, default_blueprint=blueprint(), recording=recording)
+        summary = _tell(recording, source, frames, answers, report)
+        rr.disconnect(recording=recording)
+        _check(part, len(summary.shown))
+        if summary.shown:
+            part.replace(save)
+    except OSError as error:
+        raise OSError(error.errno, f"{save}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return summary
+
+
+def _open_viewer(recording: rr.RecordingStream) -> None:
+    """Open a viewer and connect to it.
+
+    Raises:
+        OSError: it does not open; the library would drop everything that it is told.
+    """
+    port = _free_port()
+    # The one that came with the library, whatever the search path says; it stays when this process ends.
+    command = [sys.executable, "-m", "rerun_cli", "--bind", _HOST, "--port", str(port)]
+    viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    until_s = time.monotonic() + _PATIENCE_S
+    while viewer.poll() is None and not _answers(port) and time.monotonic() < until_s:
+        time.sleep(0.2)
+    # It listens before it has a window, and ends when it gets none.
+    with suppress(subprocess.TimeoutExpired):
+        viewer.wait(_SETTLING_S)
+    if viewer.returncode is not None or not _answers(port):
+        with suppress(ProcessLookupError):
+            os.killpg(viewer.pid, signal.SIGKILL)
+        raise OSError(None, "the viewer does not open; write a recording with --save FILE.rrd")
+    rr.connect_tcp(f"{_HOST}:{port}", flush_timeout_sec=_PATIENCE_S, default_blueprint=blueprint(), recording=recording)
+
+
+def _free_port() -> int:
+    """Not the usual one: whatever listens there may be no viewer, or one for other things."""
+    with socket.socket() as held:
+        held.bind((_HOST, 0))
+        return int(held.getsockname()[1])
+
+
+def _answers(port: int) -> bool:
+    try:
+        with socket.create_connection((_HOST, port), timeout=1.0):
+            return True
+    except OSError:
+        return False
+
+
+def _tell(
+    recording: rr.RecordingStream,
+    source: ShownPairs,
+    frames: Sequence[int],
+    answers: Mapping[str, Mapping[int, Estimate]],
+    report: ProgressReport,
+) -> ViewSummary:
+    recorder, shown, faults = None, [], []
+    report.begin("pairs", len(frames))
+    try:
+        for index in frames:
+            try:
+                pair = source.read(index)
+            except ValueError as error:
+                faults.append(f"frame {index} is left out: {error}")
+            else:
+                recorder = recorder or PairRecorder(recording, pair.rig, list(answers))
+                recorder.add(pair, {name: found[index] for name, found in answers.items() if index in found})
+                shown.append(index)
+            report.advance()
+    finally:
+        report.end()
+    recording.flush(blocking=True)
+    return ViewSummary(tuple(shown), tuple(faults))
+
+
+def _check(path: Path, pairs: int) -> None:
+    """Read the file again.
+
+    Raises:
+        OSError: it does not hold all pairs.
+    """
+    try:
+        view = rr.dataframe.load_recording(path).view(index="frame", contents="rig/left/image")
+        found = view.select(columns=["frame"]).read_all().num_rows if pairs else 0
+    except (ValueError, RuntimeError) as error:
+        raise OSError(None, "what was written cannot be read again; is the disk full?") from error
+    if found != pairs:
+        raise OSError(None, f"only {found} of {pairs} pairs are in it; is the disk full?")

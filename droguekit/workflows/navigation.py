@@ -1,0 +1,195 @@
+"""What `navigate` does; rooms are imported where they are used, as in `pipelines`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from datasets_manifest.storage.blind import BlindDataset
+    from datasets_manifest.storage.storage import Location
+    from datasets_manifest.types.estimates import Estimate
+    from droguekit.batch.progress import ProgressReport
+    from droguekit.workflows.latency_report import LatencyReport, LatencyTally
+    from nav.sequence_navigator import LatePair, PairAnswers, SequenceSettings
+
+
+@dataclass(frozen=True)
+class NavigationOrder:
+    """How to navigate.
+
+    Attributes:
+        centroids: `own`, `binary` or `edge`.
+        detector: name or file of a network; the default one when None.
+        tracker: name; the detector looks at every pair when None.
+        redetect_every: the detector checks the tracker at every so many pairs; the usual number when None.
+        filtered, smoothed: whether there are also filtered and smoothed estimates.
+        capture_radius_m: of the docking quantities; the drogue's own when None. [m]
+        rate_hz: pairs come at this rate; as fast as they are worked on when None. [Hz]
+        latency_out: gets the latencies as JSON.
+    """
+
+    centroids: str = "own"
+    detector: str | None = None
+    tracker: str | None = None
+    redetect_every: int | None = None
+    filtered: bool = False
+    smoothed: bool = False
+    capture_radius_m: float | None = None
+    rate_hz: float | None = None
+    latency_out: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.redetect_every is not None and self.tracker is None:
+            raise ValueError("--redetect-every: needs --tracker; without one the detector looks at every pair")
+        if self.redetect_every is not None and self.redetect_every < 1:
+            raise ValueError(f"--redetect-every: must be at least 1, got {self.redetect_every}")
+        if self.capture_radius_m is not None:
+            if not (self.filtered or self.smoothed):
+                raise ValueError("--capture-radius: needs --filter or --smooth, whose estimates tell of docking")
+            if not 0 < self.capture_radius_m < float("inf"):
+                raise ValueError(f"--capture-radius: must be above 0 m, got {self.capture_radius_m:g}")
+        if self.rate_hz is not None and not 1e-3 <= self.rate_hz <= 1e4:
+            raise ValueError(f"--rate: must be from 0.001 to 10000 Hz, got {self.rate_hz:g}")
+        if self.latency_out is not None and self.rate_hz is None:
+            raise ValueError("--latency: needs --rate; without one nothing comes at a time")
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """How many poses a method found in how many pairs."""
+
+    method: str
+    fixes: int
+    pairs: int
+
+
+@dataclass(frozen=True)
+class Navigated:
+    """What navigation did.
+
+    Attributes:
+        fixes: of every method.
+        latency: where pairs came at a rate.
+    """
+
+    fixes: list[Fixes]
+    latency: LatencyReport | None
+
+
+def navigate_dataset(
+    dataset: Location,
+    methods: Sequence[str],
+    out: Path,
+    report: ProgressReport,
+    order: NavigationOrder | None = None,
+) -> Navigated:
+    """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
+
+    Raises:
+        ValueError: no such dataset, method, detector, tracker or way to measure centroids, a place for results that
+            is a folder, or an image that cannot be read.
+        OSError: the estimates cannot be written.
+    """
+    from datasets_manifest.atomic import write_text_atomic
+    from datasets_manifest.storage.blind import BlindDataset
+    from datasets_manifest.types.estimates import write_estimates
+    from droguekit.numerical_threads import one_thread
+    from droguekit.workflows.latency_report import LatencyTally
+    from nav.runner import with_smoothed
+
+    order = NavigationOrder() if order is None else order
+    settings = _settings(methods, order)
+    _check_places(out, order.latency_out)
+    blind = BlindDataset(dataset)
+    tally = None if order.rate_hz is None else LatencyTally(order.rate_hz)
+    fixes: Counter[str] = Counter()
+
+    def counted(answers: Iterable[PairAnswers | LatePair]) -> Iterator[Estimate]:
+        for estimate in with_smoothed(_told(answers, tally, report), settings):
+            fixes[estimate.method] += estimate.status == "fix"
+            yield estimate
+
+    opened = _answers(blind, settings, order)
+    # Whatever stops the writing ends the threads that answers come from.
+    with one_thread(), closing(opened) as answers:
+        for file in filter(None, (out, order.latency_out)):
+            file.parent.mkdir(parents=True, exist_ok=True)
+        report.begin("pairs", len(blind.frame_indices))
+        try:
+            write_estimates(out, counted(answers))
+        finally:
+            report.end()
+    latency = None if tally is None else tally.report()
+    if latency is not None and order.latency_out is not None:
+        write_text_atomic(order.latency_out, latency.to_json())
+    return Navigated([Fixes(name, fixes[name], len(blind.frame_indices)) for name in settings.names], latency)
+
+
+def _check_places(out: Path, latency_out: Path | None) -> None:
+    """Find out before the work whether its results can take their names.
+
+    Raises:
+        ValueError: a place is a folder, or the same for both files.
+    """
+    for option, file in (("--out", out), ("--latency", latency_out)):
+        if file is not None and file.is_dir():
+            raise ValueError(f"{option}: must be a file, got the folder {file}")
+    if latency_out is not None and latency_out.resolve() == out.resolve():
+        raise ValueError(f"--latency: must be another file than --out, got {latency_out}")
+
+
+def _settings(methods: Sequence[str], order: NavigationOrder) -> SequenceSettings:
+    from nav.runner import CENTROID_CHOICES, method_names
+    from nav.sequence_navigator import SequenceSettings
+    from nav.tracking.continuity import REDETECT_EVERY
+
+    choice = next((name for name in CENTROID_CHOICES if name == order.centroids), None)
+    if choice is None:
+        raise ValueError(f"--centroids: must be one of {', '.join(CENTROID_CHOICES)}, got {order.centroids!r}")
+    return SequenceSettings(
+        methods=tuple(dict.fromkeys(methods)) or method_names(),
+        centroids=choice,
+        tracker=order.tracker,
+        redetect_every=REDETECT_EVERY if order.redetect_every is None else order.redetect_every,
+        filtered=order.filtered,
+        smoothed=order.smoothed,
+        capture_radius_m=order.capture_radius_m,
+    )
+
+
+def _answers(
+    blind: BlindDataset, settings: SequenceSettings, order: NavigationOrder
+) -> Generator[PairAnswers | LatePair]:
+    """Answers to all pairs, as fast as can be or as they come."""
+    from nav.detector.detectors import DEFAULT_DETECTOR
+    from nav.realtime.pipeline import MonotonicClock, play
+    from nav.runner import answers_of, open_navigator
+
+    navigator = open_navigator(settings, DEFAULT_DETECTOR if order.detector is None else order.detector)
+    if order.rate_hz is None:
+        return answers_of(blind, navigator)
+    return play(blind, navigator, order.rate_hz, MonotonicClock())
+
+
+def _told(
+    answers: Iterable[PairAnswers | LatePair], tally: LatencyTally | None, report: ProgressReport
+) -> Iterator[PairAnswers | LatePair]:
+    """The same, while progress and latencies are told; what happens until the next one is asked for is their output."""
+    from nav.sequence_navigator import LatePair
+
+    for each in answers:
+        start = perf_counter()
+        yield each
+        report.advance()
+        if tally is None:
+            continue
+        if isinstance(each, LatePair):
+            tally.late()
+        elif each.latency_s is not None:
+            tally.worked_on(each.latency_s, {**each.stage_s, "output": perf_counter() - start})

@@ -1,0 +1,100 @@
+"""From recipes and datasets to a trained detector: the part of `droguekit.workflows.datasets` that needs torch."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from datasets_manifest.storage.storage import Location, as_location
+from droguekit.workflows.datasets import RenderOrder, open_recipe, render_frames
+
+if TYPE_CHECKING:
+    from datasets_manifest.recipe.recipe import Recipe
+    from droguekit.batch.progress import ProgressReport
+    from nav.training.training import TrainingResult
+
+_NEEDED = ("torch", "onnx", "onnxscript", "tensorboard")
+
+
+@dataclass(frozen=True)
+class TrainingOrder:
+    """What a detector is trained on, and how.
+
+    Attributes:
+        sources: folders or URLs of datasets, and recipes.
+        settings_file: TOML of training settings, or None.
+        changes: to both the file and the defaults.
+        size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
+        cache: folder for images at the network's size, or None for the training's own.
+        start_from: shipped detector or file of weights to start from, or None for random ones.
+        workers: that render, as many as the machine holds when None.
+    """
+
+    sources: tuple[str, ...]
+    settings_file: Path | None
+    changes: dict[str, Any]
+    size: str | None
+    final_size: str | None
+    cache: Path | None
+    start_from: str | None
+    workers: int | None
+
+
+class _Recipe(NamedTuple):
+    recipe: Recipe
+    text: str
+
+
+def _find(source: str) -> Location | _Recipe:
+    location = as_location(source)
+    if isinstance(location, str) or location.is_dir():
+        return location
+    return _Recipe(*open_recipe(source, None, None))
+
+
+def _render(source: _Recipe, out: Path, workers: int | None, report: ProgressReport) -> Path:
+    """Make the pairs that are not there yet; the dataset's folder."""
+    recipe, place = source.recipe, out / "datasets" / source.recipe.name
+    report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {place}")
+    summary = render_frames(recipe, source.text, place, range(recipe.frames.count), RenderOrder(workers), report)
+    for drop in summary.drops:
+        report.say(f"{place}: frame {drop.frame_index} is missing: {drop.reason}")
+    return place
+
+
+def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> TrainingResult:
+    """Render what is missing, train, evaluate and export.
+
+    Raises:
+        ValueError: a wrong setting, a dataset that cannot be used, or a folder of another training.
+        OSError: a file cannot be written.
+        KeyboardInterrupt: it was told to stop, and what was done is saved.
+    """
+    from droguekit.batch.stop_request import StopRequest
+    from nav.training.training_settings import build_settings, parse_size
+
+    sizes = {"size_px": order.size, "final_size_px": order.final_size}
+    parsed = {name: parse_size(text) for name, text in sizes.items() if text is not None}
+    missing = [name for name in _NEEDED if find_spec(name) is None]
+    if missing:
+        raise ValueError(f"train: {', '.join(missing)} is missing: pip install 'droguekit[train]'")
+    # Threads of torch that wait for each other by spinning lose most of their time where others use the cores too.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from nav.training.starting_weights import read_starting_weights
+
+    start = None if order.start_from is None else read_starting_weights(order.start_from)
+    network = None if start is None or start.network is None else start.network.to_dict()
+    settings = build_settings(order.settings_file, {**order.changes, **parsed}, network)
+    found = [_find(source) for source in order.sources]
+    from nav.training.training import check_before, train
+
+    # Rendering takes hours: what would stop the training afterwards is looked for first.
+    if not any(not isinstance(each, _Recipe) or each.recipe.split.train > 0 for each in found):
+        raise ValueError(f"{order.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
+    check_before(out, settings, start)
+    datasets = [_render(each, out, order.workers, report) if isinstance(each, _Recipe) else each for each in found]
+    with StopRequest(report.say) as stop:
+        return train(datasets, out, settings, report, order.cache, lambda: stop.is_requested, start)

@@ -1,0 +1,39 @@
+"""Part masks as PNG images, a folder a pair: what is seen of every part, and all of it as if it stood alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from datasets_manifest.atomic import new_folder
+from datasets_manifest.storage.png import encode_png
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from geometry.stereo import EYES
+from labelgen.export.export_log import ExportLog
+from labelgen.part_masks import Mask, amodal_masks, joined, mask_parts, visible_mask_of
+
+
+def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
+    """Write `000123/left_rim_visible.png` and `left_rim_amodal.png`, 255 on the part and 0 elsewhere.
+
+    A part that the image has nothing of has no file. Arguments and errors as in `labelgen.export.formats`.
+    """
+    source = Dataset(dataset)
+    with new_folder(out) as folder:
+        for record in log.records(source):
+            pair = folder / f"{record.frame_index:06d}"
+            pair.mkdir()
+            for eye in EYES:
+                part_id = source.part_ids(record.frame_index, eye)
+                alone = amodal_masks(record, eye, part_id)
+                for name, parts in mask_parts(record).items():
+                    _write(pair / f"{eye}_{name}_visible.png", visible_mask_of(part_id, parts))
+                    _write(pair / f"{eye}_{name}_amodal.png", joined(alone, parts, part_id.shape))
+    return [out]
+
+
+def _write(path: Path, mask: Mask) -> None:
+    if mask.any():
+        path.write_bytes(encode_png(mask.astype(np.uint8) * np.uint8(255), of_areas=True))

@@ -1,0 +1,81 @@
+"""Part masks of one eye: what is seen of a part, and all of it as if nothing stood before it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.records import PairRecord
+from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids, part_name
+from geometry.stereo import Eye
+from labelgen.part_meshes import part_triangles
+from labelgen.part_pixels import is_one_of
+from labelgen.silhouettes import silhouette
+from render.analytic_engine.part_masks import flat_part_masks
+
+Mask = NDArray[np.bool_]
+
+# What stands before a drogue without belonging to it.
+OCCLUDERS = (int(Part.PROBE), int(Part.OBSTACLE))
+
+
+def mask_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
+    """Names of the masks of a pair, and the part ids that belong to each.
+
+    `drogue` is all that belongs to its box, `occluder` the receiver's probe and obstacles; the others are single parts.
+    """
+    drogue = record.frame.drogue
+    parts: dict[str, tuple[int, ...]] = {}
+    if drogue is not None:
+        parts["drogue"] = tuple(drogue_part_ids(drogue.marker_count))
+        parts |= {part_name(part): (int(part),) for part in DROGUE_PARTS}
+        parts |= {
+            part_name(FIRST_MARKER_ID + index): (FIRST_MARKER_ID + index,) for index in range(drogue.marker_count)
+        }
+        parts |= {part_name(part): (int(part),) for part in (Part.HOSE, Part.TANKER)}
+    parts["occluder"] = OCCLUDERS
+    parts[part_name(Part.DISTRACTOR)] = (int(Part.DISTRACTOR),)
+    if record.frame.board is not None:
+        parts[part_name(Part.BOARD)] = (int(Part.BOARD),)
+    return parts
+
+
+def visible_mask_of(part_id: NDArray[np.uint8], parts: tuple[int, ...]) -> Mask:
+    """(H, W) whether a pixel centre sees one of some parts."""
+    return is_one_of(part_id, parts)
+
+
+def amodal_masks(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> dict[int, Mask]:
+    """(H, W) by part id, the pixel centres that would see the part if it stood alone.
+
+    Every part is projected alone, as the engine draws it: as a mesh, or as flat rings by the analytic engine. What
+    is seen of a part belongs to all of it, though a ray that passes on an edge may be decided otherwise.
+
+    Args:
+        record: of the pair.
+        eye: which eye.
+        part_id: (H, W) what the eye sees.
+
+    Raises:
+        ValueError: a user's body mesh that is missing or was changed.
+    """
+    alone = flat_part_masks(record.frame, eye) if record.engine == "analytic" else _mesh_masks(record, eye)
+    for part in np.flatnonzero(np.bincount(part_id.ravel(), minlength=256)[: FIRST_MARKER_ID + MAX_MARKERS]):
+        if part != Part.SKY:
+            seen = part_id == part
+            alone[int(part)] = alone[int(part)] | seen if int(part) in alone else seen
+    return alone
+
+
+def joined(masks: dict[int, Mask], parts: tuple[int, ...], shape: tuple[int, ...]) -> Mask:
+    """(H, W) of `shape`, the union of the masks of some parts; parts without a mask count as empty."""
+    union = np.zeros(shape, dtype=np.bool_)
+    for part in parts:
+        if part in masks:
+            union |= masks[part]
+    return union
+
+
+def _mesh_masks(record: PairRecord, eye: Eye) -> dict[int, Mask]:
+    frame = record.frame
+    return {part: silhouette(corners, frame.rig, eye) for part, corners in part_triangles(frame, eye).items()}

@@ -1,0 +1,1 @@
+"""Labels and datasets checked from the outside."""

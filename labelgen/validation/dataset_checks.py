@@ -1,0 +1,256 @@
+"""A dataset's folder checked from the outside: files, hashes, labels against pixels, annotations against records."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import RECORD_FILE, parts_file
+from datasets_manifest.storage.manifest import FrameEntry, Manifest, count_pairs
+from datasets_manifest.storage.png import png_fault
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.storage.writer import leftovers
+from datasets_manifest.types.records import PairRecord
+from drogue_models.frozen_model import FrozenModel
+from drogue_models.marker_layout import marker_layout
+from drogue_models.parts import drogue_part_ids
+from geometry.stereo import EYES, Eye
+from labelgen.part_pixels import FeaturePixels, is_one_of
+from labelgen.validation.bag_checks import bag_faults, bag_files
+from labelgen.validation.calibration_checks import calibration_faults
+from labelgen.validation.coco_checks import CocoFiles
+from labelgen.validation.exr_checks import passes_faults
+from labelgen.validation.label_checks import check_boxes, check_empty, check_unoccluded_marker, named_features
+from labelgen.validation.projection_checks import box_faults, projection_faults
+from labelgen.validation.shard_checks import shard_faults
+
+
+class Check(FrozenModel):
+    """One kind of check.
+
+    Attributes:
+        name: what was checked.
+        count: how often.
+        faults: what was wrong, a line each.
+    """
+
+    name: str
+    count: int
+    faults: tuple[str, ...]
+
+
+class ValidationReport(FrozenModel):
+    """What a validation found.
+
+    Attributes:
+        pairs: in the manifest.
+        checks: in the order in which they were made.
+    """
+
+    pairs: int
+    checks: tuple[Check, ...]
+
+    @property
+    def faults(self) -> list[str]:
+        """All faults, a line each."""
+        return [fault for check in self.checks for fault in check.faults]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.faults
+
+    def table(self) -> str:
+        """The checks with their counts, a line each."""
+        rows = [f"{check.name:<34}{check.count:>9}{len(check.faults):>9}" for check in self.checks]
+        return "\n".join([f"{'check':<34}{'checked':>9}{'faults':>9}", *rows])
+
+
+class _Tally:
+    """Counts and faults by check."""
+
+    def __init__(self) -> None:
+        self._counts: defaultdict[str, int] = defaultdict(int)
+        self._faults: defaultdict[str, list[str]] = defaultdict(list)
+
+    def add(self, name: str, faults: Sequence[str]) -> None:
+        """One more thing was checked."""
+        self._counts[name] += 1
+        self._faults[name] += faults
+
+    def report(self, pairs: int) -> ValidationReport:
+        """The result so far."""
+        checks = (
+            Check(name=name, count=count, faults=tuple(self._faults[name])) for name, count in self._counts.items()
+        )
+        return ValidationReport(pairs=pairs, checks=tuple(checks))
+
+
+def validate_dataset(path: Location) -> ValidationReport:
+    """Check everything that can be checked about a dataset without making it again.
+
+    Args:
+        path: where the dataset lies.
+
+    Returns:
+        What was checked and what is wrong; damaged files are faults, not exceptions.
+
+    Raises:
+        ValueError: there is no such folder, or a URL that cannot be used.
+        OSError: a place that cannot be reached.
+    """
+    storage = open_storage(path)
+    if not storage.is_there():
+        raise ValueError(f"{path}: there is no such dataset folder")
+    tally = _Tally()
+    try:
+        dataset = Dataset(path)
+    except ValueError as error:
+        tally.add("manifest", [str(error)])
+        return tally.report(pairs=0)
+    manifest = dataset.manifest
+    tally.add("manifest", _count_faults(manifest))
+    tally.add("drops", _drop_faults(manifest))
+    tally.add("split", _split_faults(manifest))
+    tally.add("calibration", calibration_faults(path, manifest.recipe.rig))
+    tally.add("leftovers", [f"{entry}: was left by a run that was killed" for entry in leftovers(path)])
+    for name, found in shard_faults(storage):
+        tally.add(name, found)
+    try:
+        for frame_index in sorted({*dataset.frames.indices()} - {*dataset.frame_indices}):
+            tally.add("frames on disk", [f"{dataset.frames.where(frame_index)}: is not in the manifest"])
+    except ValueError as error:
+        tally.add("frames on disk", [str(error)])
+    bags = bag_files(path)
+    if bags:
+        tally.add("bags", bag_faults(dataset, bags))
+    coco = CocoFiles(path, manifest)
+    for fault in coco.faults():
+        tally.add("annotation files", [fault])
+    for entry in manifest.frames:
+        _check_frame(dataset, entry, coco, tally)
+    return tally.report(len(manifest.frames))
+
+
+def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _Tally) -> None:
+    folder = dataset.frames.where(entry.frame_index)
+    file = dataset.frames.where(entry.frame_index, RECORD_FILE)
+    try:
+        record = dataset.record(entry.frame_index)
+    except ValueError as error:
+        tally.add("records", [str(error)])
+        return
+    tally.add("records", [f"{file}: {fault}" for fault in _entry_faults(record, entry)])
+    changed = dataset.verify(entry.frame_index)
+    tally.add("hashes", [*changed, *_stray_files(dataset.frames, record)])
+    try:
+        dataset.images(entry.frame_index)
+        tally.add("images", [])
+    except ValueError as error:
+        tally.add("images", [str(error)])
+    tally.add("projection and epipolar rows", [f"{folder}: {fault}" for fault in projection_faults(record)])
+    tally.add("keypoints in boxes", [f"{folder}: {fault}" for fault in box_faults(record)])
+    for eye in EYES:
+        path = dataset.frames.where(entry.frame_index, parts_file(eye))
+        part_id = _read_part_ids(dataset.frames, record, eye)
+        if part_id is None:
+            tally.add("part ids", [f"{path}: cannot be read as 8 bit grey of the rig's size"])
+            continue
+        tally.add("part ids", [])
+        tally.add("labels against part ids", [f"{path}: {fault}" for fault in _label_faults(record, eye, part_id)])
+        tally.add("annotations", coco.annotation_faults(record, eye, part_id))
+        # What was changed does not reach the decoder; it is a fault already.
+        found = passes_faults(dataset, record, eye, part_id) if not changed else None
+        if found is not None:
+            tally.add("depth and normals", [f"{folder}: {fault}" for fault in found])
+
+
+def _count_faults(manifest: Manifest) -> list[str]:
+    want = count_pairs(manifest.frames)
+    return [] if manifest.counts == want else [f"manifest.json: counts are {manifest.counts}, the frames give {want}"]
+
+
+def _drop_faults(manifest: Manifest) -> list[str]:
+    """Every frame of the recipe is there, or dropped with its reason, or was not asked for; none twice."""
+    indices = [entry.frame_index for entry in manifest.frames]
+    dropped = [drop.frame_index for drop in manifest.drops]
+    count = manifest.recipe.frames.count
+    faults = [f"manifest.json: frame {index} is both there and dropped" for index in sorted({*indices} & {*dropped})]
+    if len({*indices}) < len(indices) or len({*dropped}) < len(dropped):
+        faults.append("manifest.json: frames, drops: must name each frame once")
+    beyond = sorted(index for index in {*indices, *dropped} if index >= count)
+    if beyond:
+        faults.append(f"manifest.json: frame {beyond[0]} is none of the recipe's {count}")
+    if sum(manifest.engines.values()) != len(indices):
+        faults.append(f"manifest.json: engines: give {sum(manifest.engines.values())} pairs, there are {len(indices)}")
+    return faults
+
+
+def _split_faults(manifest: Manifest) -> list[str]:
+    splits: defaultdict[int, set[str]] = defaultdict(set)
+    for entry in manifest.frames:
+        splits[entry.scene_id].add(entry.split)
+    return [
+        f"manifest.json: scene {scene_id} is in more than one split: {', '.join(sorted(names))}"
+        for scene_id, names in splits.items()
+        if len(names) > 1
+    ]
+
+
+def _entry_faults(record: PairRecord, entry: FrameEntry) -> list[str]:
+    faults = []
+    if record.scene_id != entry.scene_id or (record.left_from_drogue is None) != entry.empty:
+        faults.append("scene_id, left_from_drogue: differ from the manifest's entry")
+    if record.frame.frame_index != record.frame_index or record.frame.scene_id != record.scene_id:
+        faults.append("frame: belongs to another frame or scene")
+    if (record.left_from_drogue is None) != (record.frame.drogue is None):
+        faults.append("left_from_drogue: must be given exactly when the frame has a drogue")
+    elif record.left_from_drogue is not None and record.frame.left_from_drogue is not None:
+        difference = record.left_from_drogue.as_matrix() - record.frame.left_from_drogue.as_matrix()
+        if np.abs(difference).max() > 0:
+            faults.append("left_from_drogue: differs from the frame's")
+    return faults
+
+
+def _stray_files(frames: FrameStore, record: PairRecord) -> list[str]:
+    known, index = {*record.file_sha256, RECORD_FILE}, record.frame_index
+    return [f"{frames.where(index, name)}: is not on record" for name in frames.names(index) if name not in known]
+
+
+def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> list[str]:
+    view = record.views.left if eye == "left" else record.views.right
+    pose, drogue = record.left_from_drogue, record.frame.drogue
+    if pose is None or drogue is None:
+        return check_empty(view, part_id)
+    layout = marker_layout(drogue)
+    faults = check_boxes(view, is_one_of(part_id, drogue_part_ids(layout.count)))
+    pixels = FeaturePixels(part_id)
+    if len(view.markers) != layout.count:
+        return [*faults, f"markers: {len(view.markers)} are labelled, the drogue has {layout.count}"]
+    for name, feature, disc in named_features(record, layout, pose, eye):
+        if (feature.visible_fraction > 0) != (pixels.count(disc.part) > 0):
+            faults.append(f"{name}: visible_fraction: is {feature.visible_fraction}, the part ids say otherwise")
+        elif name != "hub" and feature.in_image and feature.visible_fraction == 1:
+            faults += [f"{name}: {fault}" for fault in check_unoccluded_marker(feature, disc, part_id, pixels)]
+    return faults
+
+
+def _read_part_ids(frames: FrameStore, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
+    """The part ids by OpenCV's own reader; None where they cannot be had."""
+    camera = record.frame.rig.camera
+    try:
+        data = frames.read(record.frame_index, parts_file(eye))
+    except ValueError:
+        return None
+    part_id: NDArray[np.uint8] | None = None
+    if png_fault(data) is None:
+        part_id = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if part_id is None or part_id.dtype != np.uint8 or part_id.shape != (camera.height_px, camera.width_px):
+        return None
+    return part_id

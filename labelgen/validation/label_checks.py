@@ -1,0 +1,204 @@
+"""Labels against the passes they were made with: what every frame must stand before it is written."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, ViewRecord
+from drogue_models.marker_layout import MarkerLayout, marker_layout
+from drogue_models.parameters import DrogueParameters
+from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
+from geometry.se3 import Array, RigidTransform
+from geometry.stereo import EYES, Eye
+from labelgen.discs import DiscInEye, hub_discs, marker_discs
+from labelgen.part_pixels import FeaturePixels, is_one_of
+from render.engine import EyeRadiance, StereoRadiance
+
+# Root mean square distance between the centroid of the pixel centres in a disc and the disc's own centre is this times
+# sqrt(a) / b for semi-axes a >= b in pixels: each of the boundary's 2 pi a pixels errs by a variance of 1/12 px^2 at a
+# lever of a / sqrt 2, over an area of pi a b: sqrt(2 a / (12 pi b^2)).
+LATTICE_RMS = float(np.sqrt(2.0 / (12.0 * np.pi)))
+
+# The largest of 1e5 simulated discs was 2.9 rms; the error has an end, unlike a normal one.
+_LATTICE_LIMIT_RMS = 4.0
+
+# Meshes draw circles as polygons of 128 sides and the same area, whose corners stand out by (pi / 128)^2 / 6 = 1e-4.
+_OUTLINE_TOLERANCE = 5e-4
+
+# Rays, vertices and the product of a few transforms, each rounded to float32 at the scale of the distance.
+_DEPTH_ROUNDINGS = 32.0
+
+
+def check_against_passes(record: PairRecord, radiance: StereoRadiance) -> list[str]:
+    """Faults between the labels of a pair and its passes, one line each; empty if there are none.
+
+    Checked: the part id at the centre of every unoccluded marker; that every pixel of a marker or the hub lies on it
+    and has the depth of its plane; the centroid of every unoccluded marker's pixels against `center_ellipse_px`;
+    visible against amodal pixels; the boxes against the pixels; that an empty frame shows no drogue.
+    """
+    faults = []
+    for eye, seen in zip(EYES, (radiance.left, radiance.right), strict=True):
+        view = record.views.left if eye == "left" else record.views.right
+        drogue, pose = record.frame.drogue, record.left_from_drogue
+        if drogue is None or pose is None:
+            found = check_empty(view, seen.part_id)
+        else:
+            found = _check_drogue(record, drogue, pose, eye, seen)
+        faults += [f"frame {record.frame_index}, {eye}: {fault}" for fault in found]
+    return faults
+
+
+def check_empty(view: ViewRecord, part_id: NDArray[np.uint8]) -> list[str]:
+    """Faults of one eye of a frame without a drogue."""
+    faults = []
+    if view.markers or view.hub or view.box_full_xywh_px or view.box_visible_xywh_px or view.visible_drogue_px:
+        faults.append("has labels of a drogue although the frame is empty")
+    belongs = np.isin(part_id, drogue_part_ids(0)) | (part_id >= FIRST_MARKER_ID)
+    if belongs.any():
+        faults.append(f"{np.count_nonzero(belongs)} pixels show a drogue although the frame is empty")
+    return faults
+
+
+def check_boxes(view: ViewRecord, mask: NDArray[np.bool_]) -> list[str]:
+    """Faults of one eye's boxes against the (H, W) pixels that see the drogue."""
+    faults = []
+    count = int(np.count_nonzero(mask))
+    if count != view.visible_drogue_px:
+        faults.append(f"visible_drogue_px: is {view.visible_drogue_px}, the part ids have {count}")
+    box = view.box_visible_xywh_px
+    if (box is None) != (count == 0):
+        faults.append(f"box_visible_xywh_px: is {box} with {count} visible pixels")
+    elif box is not None:
+        column, row, width, height = cv2.boundingRect(mask.view(np.uint8))
+        want = (column - 0.5, row - 0.5, float(width), float(height))
+        if box != want:
+            faults.append(f"box_visible_xywh_px: is {box}, the part ids have {want}")
+        full = view.box_full_xywh_px
+        # A pixel reaches half a pixel beyond its centre on either side.
+        if full is None or not _contains(full, box, margin_px=1.0):
+            faults.append(f"box_visible_xywh_px: {box} is not inside box_full_xywh_px {full}")
+    return faults
+
+
+def check_unoccluded_marker(
+    view: FeatureView, disc: DiscInEye, part_id: NDArray[np.uint8], pixels: FeaturePixels
+) -> list[str]:
+    """Faults of a marker that is wholly visible, against the part ids and its pixels among them."""
+    faults = []
+    if not disc.camera.contains(view.center_proj_px):
+        return [f"in_image: is true, center_proj_px {view.center_proj_px} is not on the image"]
+    column, row = (int(value) for value in np.rint(np.clip(view.center_proj_px, 0, np.array(part_id.shape[::-1]) - 1)))
+    # A marker smaller than a pixel can have its centre's pixel centre outside.
+    inside = float(disc.distance_m(np.array([column, row]))) < 0.9 * disc.radius_m
+    if inside and part_id[row, column] != disc.part:
+        faults.append(f"center_proj_px: pixel {column}, {row} sees part {part_id[row, column]}, not {disc.part}")
+    error_px, rms_px = centroid_error(view, disc, pixels)
+    if np.hypot(*error_px) > _LATTICE_LIMIT_RMS * rms_px:
+        faults.append(
+            f"center_ellipse_px: is {np.hypot(*error_px):.3f} px from the centroid of part {disc.part}, "
+            f"more than {_LATTICE_LIMIT_RMS * rms_px:.3f} px"
+        )
+    return faults
+
+
+def centroid_error(view: FeatureView, disc: DiscInEye, pixels: FeaturePixels) -> tuple[Array, float]:
+    """Centroid of a marker's pixels less `center_ellipse_px`.
+
+    Returns:
+        (2,) error [px], and the root mean square length that the pixel lattice alone gives it [px].
+    """
+    longer, shorter = disc.semi_axes_px()
+    rows, columns = pixels.places(disc.part)
+    error = np.array([columns.mean(), rows.mean()]) - np.array(view.center_ellipse_px)
+    return error, LATTICE_RMS * float(np.sqrt(longer)) / shorter
+
+
+def _check_drogue(
+    record: PairRecord, drogue: DrogueParameters, pose: RigidTransform, eye: Eye, seen: EyeRadiance
+) -> list[str]:
+    """Faults of one eye of a frame with a drogue."""
+    view = record.views.left if eye == "left" else record.views.right
+    layout = marker_layout(drogue)
+    if len(view.markers) != layout.count or (view.hub is None) != (layout.hub_center_m is None):
+        return [f"markers, hub: {len(view.markers)} markers are labelled, the drogue has {layout.count}"]
+    pixels = FeaturePixels(seen.part_id)
+    faults = check_boxes(view, is_one_of(seen.part_id, drogue_part_ids(layout.count)))
+    for name, feature, disc in named_features(record, layout, pose, eye):
+        hole_m = layout.hub_inner_radius_m if name == "hub" else 0.0
+        found = _check_visibility(feature, pixels.count(disc.part), seen.amodal_px.get(disc.part, 0))
+        found += check_pixels(disc, hole_m, seen.depth_m, pixels)
+        if name != "hub" and feature.in_image and feature.visible_fraction == 1:
+            found += check_unoccluded_marker(feature, disc, seen.part_id, pixels)
+        faults += [f"{name}: {fault}" for fault in found]
+    return faults
+
+
+def named_features(
+    record: PairRecord, layout: MarkerLayout, pose: RigidTransform, eye: Eye
+) -> list[tuple[str, FeatureView, DiscInEye]]:
+    """Markers and hub of one eye: name, label and disc (of the hub's outer edge)."""
+    view = record.views.left if eye == "left" else record.views.right
+    rig = record.frame.rig
+    discs = marker_discs(layout, rig, pose, eye)
+    named: list[tuple[str, FeatureView, DiscInEye]] = [
+        (f"markers[{index}]", feature, disc)
+        for index, (feature, disc) in enumerate(zip(view.markers, discs, strict=True))
+    ]
+    hub = hub_discs(layout, rig, pose, eye)
+    if hub is not None and view.hub is not None:
+        named.append(("hub", view.hub, hub[0]))
+    return named
+
+
+def _check_visibility(feature: FeatureView, visible: int, amodal: int) -> list[str]:
+    if visible > amodal:
+        return [f"{visible} pixels are visible of only {amodal}"]
+    want = visible / amodal if amodal else 0.0
+    return [] if feature.visible_fraction == want else [f"visible_fraction: is {feature.visible_fraction}, not {want}"]
+
+
+def check_pixels(disc: DiscInEye, hole_m: float, depth_m: NDArray[np.float32], pixels: FeaturePixels) -> list[str]:
+    """Every pixel of a feature around a hole: whether it lies on it, and its depth against the feature's plane.
+
+    Args:
+        disc: the feature's.
+        hole_m: radius of its hole. [m]
+        depth_m: (H, W) planar depth. [m]
+        pixels: where the eye sees which feature.
+    """
+    rows, columns = pixels.places(disc.part)
+    places_px = np.stack([columns, rows], axis=-1).astype(np.float64)
+    distance_m = disc.distance_m(places_px)
+    faults = []
+    beyond = int(np.count_nonzero(distance_m > disc.radius_m * (1 + _OUTLINE_TOLERANCE)))
+    if beyond:
+        faults.append(f"{beyond} pixels of part {disc.part} lie beyond its edge")
+    # On the outline a ray may slip between two parts that touch; through the hole it sees the inner wall.
+    on_face = (distance_m > hole_m * (1 + _OUTLINE_TOLERANCE)) & (distance_m < disc.radius_m * (1 - _OUTLINE_TOLERANCE))
+    if not on_face.any():
+        return faults
+    rows, columns, places_px = rows[on_face], columns[on_face], places_px[on_face]
+    error_m = np.abs(depth_m[rows, columns].astype(np.float64) - disc.plane_depth_m(places_px))
+    rays = disc.rays(places_px)
+    slant = np.abs(rays @ disc.normal) / np.linalg.norm(rays, axis=-1)
+    reach_m = float(np.linalg.norm(disc.center_m)) + disc.radius_m
+    limit_m = _DEPTH_ROUNDINGS * float(np.finfo(np.float32).eps) * reach_m / slant
+    worst = int(np.argmax(error_m / limit_m))
+    # A depth that is no number is a fault too.
+    if not error_m[worst] <= limit_m[worst]:
+        faults.append(
+            f"depth at pixel {columns[worst]}, {rows[worst]} is {error_m[worst]:.2e} m off the plane of part "
+            f"{disc.part}, more than {limit_m[worst]:.2e} m"
+        )
+    return faults
+
+
+def _contains(outer: PixelBox, inner: PixelBox, margin_px: float) -> bool:
+    return bool(
+        inner[0] >= outer[0] - margin_px
+        and inner[1] >= outer[1] - margin_px
+        and inner[0] + inner[2] <= outer[0] + outer[2] + margin_px
+        and inner[1] + inner[3] <= outer[1] + outer[3] + margin_px
+    )

@@ -1,0 +1,1 @@
+"""Which region of which image is which marker."""

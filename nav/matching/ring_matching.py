@@ -1,0 +1,270 @@
+"""Which blobs of one image are the markers: the largest set that one affine map carries the drogue's layout onto.
+
+An affine map is the image of a flat pattern up to perspective within it, which moves a marker by less than a third of
+its radius where the whole drogue is in view. Missing markers, false blobs and the hub (near the middle, where no marker
+is) need no rule of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.marker_layout import MarkerLayout
+from geometry.se3 import Array
+from nav.matching.blobs import Blobs
+
+# Blurring and thresholds change a disc's apparent radius by less than this factor at 5 px of diameter.
+_SIZE_FACTOR = 1.6
+# Tolerances as a share of a marker's radius: for two-point guesses, which ignore tilt, and for the fitted map.
+_GUESS_TOLERANCE = 0.8
+_FIT_TOLERANCE = 0.4
+# Markers whose places span less than this across their longest line lie on it; the smallest singular value of the fit.
+_ON_A_LINE = 1e-6
+_STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
+_REFINED_GUESSES = 16
+FEW = 4  # markers, where the ring is known to be or another image shows the same
+# A disc that touches the picture's edge is dropped, and perspective puts it off the map by up to a third of its radius.
+_REACH = 1.4
+# A marker that was not found lies this many times as far off the map as the others at most.
+_MOST_OFF = 3.0
+# A complete ring this near its map needs no second guess.
+_GOOD_RMS_FRACTION = 0.1
+_CHUNK = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class RingMatch:
+    """The markers of one image.
+
+    Attributes:
+        affine: (2, 3) map from the rim plane [m] to pixels.
+        blob_of_marker: (N,) index of each marker's blob, -1 where it was not found; modulo the layout's symmetry.
+        rms_fraction: distance of blobs from the map, as a share of a marker's radius.
+    """
+
+    affine: Array
+    blob_of_marker: NDArray[np.int64]
+    rms_fraction: float
+
+    @property
+    def count(self) -> int:
+        """Number of markers found."""
+        return int((self.blob_of_marker >= 0).sum())
+
+    @property
+    def scale_px_per_m(self) -> float:
+        """Largest stretch of the map: focal length over distance. [px/m]"""
+        return _stretches(self.affine)[0]
+
+    def cut(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+        """(N,) markers whose images surely do not lie wholly within a picture of (width, height)."""
+        # As far as a disc reaches to all sides, less what the map may be off.
+        return ~self._inside(layout, size_px, _stretches(self.affine)[1] * (1 - _MOST_OFF * self.rms_fraction))
+
+    def clear(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+        """(N,) markers whose images surely lie wholly within a picture of (width, height)."""
+        return self._inside(layout, size_px, _stretches(self.affine)[0] * _REACH)
+
+    def _inside(self, layout: MarkerLayout, size_px: tuple[int, int], reach_px_per_m: float) -> NDArray[np.bool_]:
+        """(N,) markers whose places are further from the picture's edge than their radius times a stretch."""
+        places_px = layout.centers_m[:, :2] @ self.affine[:, :2].T + self.affine[:, 2]
+        reach_px = layout.radius_m * reach_px_per_m
+        inside: NDArray[np.bool_] = ((places_px > reach_px) & (places_px < np.array(size_px) - 1 - reach_px)).all(
+            axis=1
+        )
+        return inside
+
+    def moved(self, shift_px: tuple[float, float]) -> RingMatch:
+        """The same where all blobs lie further right and down by x and y. [px]"""
+        affine = self.affine.copy()
+        affine[:, 2] += shift_px
+        return replace(self, affine=affine)
+
+
+def least_markers(layout: MarkerLayout) -> int:
+    """Fewest markers that are taken for the drogue: 3/5 of them, and at least four where there are four."""
+    return min(layout.count, max(4, -(-3 * layout.count // 5)))
+
+
+@lru_cache(maxsize=16)
+def symmetry_permutations(layout: MarkerLayout) -> NDArray[np.int64]:
+    """(order, N) for each turn that maps the layout onto itself: which marker comes to lie on marker i."""
+    turns = np.exp(2j * np.pi * np.arange(layout.symmetry_order) / layout.symmetry_order)
+    places = _complex(layout.centers_m[:, :2])
+    gaps = np.abs(turns[:, None, None] * places[None, None, :] - places[None, :, None])
+    permutations: NDArray[np.int64] = np.argmin(gaps, axis=2)
+    permutations.flags.writeable = False
+    return permutations
+
+
+def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
+    """The best consistent set of markers among blobs, or None.
+
+    Args:
+        blobs: of one image.
+        layout: the drogue's markers.
+    """
+    return _best_match(blobs, layout, least_markers(layout))
+
+
+def match_cut_ring(blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int]) -> RingMatch | None:
+    """Four markers or more of a ring whose others the picture's edge cuts off, or None.
+
+    Not enough to take it for the drogue, unless the other eye shows the same.
+
+    Args:
+        blobs: of one image.
+        layout: the drogue's markers.
+        size_px: width and height of the image.
+    """
+    match = _best_match(blobs, layout, FEW)
+    if match is None or (match.clear(layout, size_px) & (match.blob_of_marker < 0)).any():
+        return None
+    return match
+
+
+def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
+    """The set of at least so many markers that has most of them, and fits best, or None."""
+    if len(blobs) < least:
+        return None
+    best: RingMatch | None = None
+    permutations = symmetry_permutations(layout)
+    tried: set[bytes] = set()
+    for turn, shift in _best_guesses(blobs, layout):
+        affine = np.array([[turn.real, -turn.imag, shift.real], [turn.imag, turn.real, shift.imag]])
+        blob_of_marker = _nearest_blobs(affine, blobs, layout, _GUESS_TOLERANCE)
+        # Most guesses are turns of one ring: from the same blobs, named after another turn, comes the same map turned.
+        key = min(blob_of_marker[permutation].tobytes() for permutation in permutations)
+        if key in tried:
+            continue
+        tried.add(key)
+        match = _fit(blob_of_marker, blobs, layout, least)
+        if match is not None and (best is None or _rank(match) > _rank(best)):
+            best = match
+        if best is not None and best.count == layout.count and best.rms_fraction < _GOOD_RMS_FRACTION:
+            break
+    return best
+
+
+def match_ring_near(blobs: Blobs, layout: MarkerLayout, affine: Array, least: int = FEW) -> RingMatch | None:
+    """The markers among blobs where a ring is known to be, or None.
+
+    Few are enough then, where a ring that may be anywhere needs more to be told from other things.
+
+    Args:
+        blobs: of one image.
+        layout: the drogue's markers.
+        affine: (2, 3) map from the rim plane [m] to pixels, right to some tenths of a marker's radius.
+        least: so many must be there, three at least.
+    """
+    if len(blobs) < least:
+        return None
+    return _fit(_nearest_blobs(affine, blobs, layout, _GUESS_TOLERANCE), blobs, layout, least)
+
+
+def _rank(match: RingMatch) -> tuple[int, float]:
+    return match.count, -match.rms_fraction
+
+
+def _complex(points: Array) -> NDArray[np.complex128]:
+    result: NDArray[np.complex128] = points[..., 0] + 1j * points[..., 1]
+    return result
+
+
+def _best_guesses(blobs: Blobs, layout: MarkerLayout) -> list[tuple[complex, complex]]:
+    """Similarity maps `z -> turn z + shift` that carry the most markers onto blobs, from all pairs of blobs."""
+    turns, shifts = _pair_guesses(blobs, layout)
+    places, image = _complex(layout.centers_m[:, :2]), _complex(blobs.centers_px)
+    sizes = blobs.radii_px.astype(np.float32)
+    votes = np.zeros(len(turns))
+    for start in range(0, len(turns), _CHUNK):
+        turn, shift = turns[start : start + _CHUNK, None], shifts[start : start + _CHUNK, None]
+        guess = turn * places + shift
+        gap_x = guess.real.astype(np.float32)[:, :, None] - image.real.astype(np.float32)
+        gap_y = guess.imag.astype(np.float32)[:, :, None] - image.imag.astype(np.float32)
+        radius = (layout.radius_m * np.abs(turn)).astype(np.float32)
+        fits = (sizes < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * sizes)
+        nearest = np.sqrt(
+            (gap_x**2 + gap_y**2 + np.where(fits, np.float32(0), np.float32(np.inf))[:, None]).min(axis=2)
+        )
+        nearness = np.maximum(0, 1 - nearest / (_GUESS_TOLERANCE * radius))
+        # A marker hit counts one, its nearness breaks ties.
+        votes[start : start + _CHUNK] = (nearness > 0).sum(axis=1) + nearness.mean(axis=1) / 2
+    order = np.argsort(-votes, kind="stable")[:_REFINED_GUESSES]
+    return [(complex(turns[i]), complex(shifts[i])) for i in order if votes[i] >= 3]
+
+
+def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Maps that carry two markers onto two blobs of a size that goes with their distance."""
+    places, image = _complex(layout.centers_m[:, :2]), _complex(blobs.centers_px)
+    radii = blobs.radii_px
+    size_scale = np.sqrt(radii[:, None] * radii) / layout.radius_m
+    alike = (radii[:, None] < _SIZE_FACTOR * radii) & (radii < _SIZE_FACTOR * radii[:, None])
+    np.fill_diagonal(alike, False)
+    gaps = np.abs(image[:, None] - image)
+    turns, shifts = [np.zeros(0, complex)], [np.zeros(0, complex)]
+    # One marker of each orbit of the symmetry is enough as the first: the others give the same maps, turned.
+    first_markers = np.unique(symmetry_permutations(layout).min(axis=0))
+    for i in first_markers:
+        arms = np.delete(places, i) - places[i]
+        scale = gaps / np.abs(arms)[:, None, None]
+        plausible = alike & (scale < _SIZE_FACTOR * size_scale) & (size_scale < _SIZE_FACTOR * scale)
+        j, p, q = np.nonzero(plausible)
+        turn = (image[q] - image[p]) / arms[j]
+        turns.append(turn)
+        shifts.append(image[p] - turn * places[i])
+    return np.concatenate(turns), np.concatenate(shifts)
+
+
+def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
+    """Affine map refined from the blobs that a guess hits, or None where they cannot be the drogue."""
+    places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
+    fitted = None
+    for tolerance in (_GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE, None):
+        # Mostly the first guess hits the right blobs already, and the same blobs have the same map.
+        if fitted is None or (blob_of_marker != fitted).any():
+            fitted, hit = blob_of_marker, blob_of_marker >= 0
+            if hit.sum() < least:
+                return None
+            seen, centers_px = places[hit], blobs.centers_px[blob_of_marker[hit]]
+            solution, _, _, singular = np.linalg.lstsq(seen, centers_px, rcond=None)
+            if singular[-1] <= _ON_A_LINE:
+                return None
+            affine = solution.T
+        if tolerance is not None:
+            blob_of_marker = _nearest_blobs(affine, blobs, layout, tolerance)
+    largest, smallest = _stretches(affine)
+    if _determinant(affine) <= 0 or smallest < _STRONGEST_TILT_COSINE * largest:
+        return None
+    residual = seen @ affine.T - centers_px
+    rms_px = np.sqrt((residual**2).sum(axis=1).mean())
+    radius_px = layout.radius_m * np.sqrt(_determinant(affine))
+    return RingMatch(affine, blob_of_marker, float(rms_px / radius_px))
+
+
+def _nearest_blobs(affine: Array, blobs: Blobs, layout: MarkerLayout, tolerance: float) -> NDArray[np.int64]:
+    """(N,) the blob nearest to each marker's image, -1 where none of about its size lies within the tolerance."""
+    places_px = layout.centers_m[:, :2] @ affine[:, :2].T + affine[:, 2]
+    radius_px = layout.radius_m * np.sqrt(abs(_determinant(affine)))
+    gaps = places_px[:, None] - blobs.centers_px
+    distance = np.sqrt(gaps[..., 0] ** 2 + gaps[..., 1] ** 2)
+    alike = (blobs.radii_px < _SIZE_FACTOR * radius_px) & (radius_px < _SIZE_FACTOR * blobs.radii_px)
+    distance[:, ~alike] = np.inf
+    nearest = distance.argmin(axis=1)
+    hit = distance[np.arange(layout.count), nearest] < tolerance * radius_px
+    return np.where(hit, nearest, -1)
+
+
+def _determinant(affine: Array) -> float:
+    return float(affine[0, 0] * affine[1, 1] - affine[0, 1] * affine[1, 0])
+
+
+def _stretches(affine: Array) -> tuple[float, float]:
+    """Largest and smallest stretch of a map: the singular values of its linear part, in closed form."""
+    (a, b), (c, d) = affine[:, :2].tolist()
+    even, odd = np.hypot(a + d, b - c) / 2, np.hypot(a - d, b + c) / 2
+    return float(even + odd), float(abs(even - odd))

@@ -1,0 +1,1 @@
+"""Compiled loops and least squares that centroids and poses share."""

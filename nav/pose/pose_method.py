@@ -1,0 +1,134 @@
+"""What every pose method is given and answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.marker_layout import MarkerLayout
+from geometry.se3 import Array, RigidTransform
+from geometry.stereo import StereoRig
+from nav.pose.stated_tolerances import EXACT, StatedTolerances
+
+# The hub annulus has an inner and an outer edge, in this order; each has its own ellipse centre.
+HUB_EDGES = 2
+INNER_EDGE, OUTER_EDGE = range(HUB_EDGES)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Measured features of one stereo pair, matched with the drogue.
+
+    Attributes:
+        rig: the stereo rig.
+        layout: the drogue's markers and hub.
+        pixels_px: (2, N, 2) centres in the left and the right eye, nan where a marker was not measured.
+        cov_px2: (2, N, 2, 2) their covariances.
+        hub_px: (2, 2, 2) ellipse centres of the hub's inner and outer edge in each eye, nan where not measured; None
+            stands for no hub at all.
+        hub_cov_px2: (2, 2, 2, 2) their covariances; None where `hub_px` is None.
+        tolerances: how far drogue and rig may depart from `layout` and `rig`.
+    """
+
+    rig: StereoRig
+    layout: MarkerLayout
+    pixels_px: Array
+    cov_px2: Array
+    hub_px: Array | None = None
+    hub_cov_px2: Array | None = None
+    tolerances: StatedTolerances = EXACT
+
+    def __post_init__(self) -> None:
+        if (self.hub_px is None) != (self.hub_cov_px2 is None):
+            raise ValueError("hub_px, hub_cov_px2: give both or neither, got one")
+        if self.hub_px is None:
+            object.__setattr__(self, "hub_px", np.full((2, HUB_EDGES, 2), np.nan))
+            object.__setattr__(self, "hub_cov_px2", np.full((2, HUB_EDGES, 2, 2), np.nan))
+        count = self.layout.count
+        for name, shape in (
+            ("pixels_px", (2, count, 2)),
+            ("cov_px2", (2, count, 2, 2)),
+            ("hub_px", (2, HUB_EDGES, 2)),
+            ("hub_cov_px2", (2, HUB_EDGES, 2, 2)),
+        ):
+            frozen = np.array(getattr(self, name), dtype=np.float64)
+            if frozen.shape != shape:
+                raise ValueError(f"{name}: must have shape {shape}, got {frozen.shape}")
+            frozen.flags.writeable = False
+            object.__setattr__(self, name, frozen)
+        if self.layout.hub_center_m is None and self.hub_seen.any():
+            raise ValueError("hub_px: the drogue has no hub, got a measured one")
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(2, N) which markers were measured."""
+        seen: NDArray[np.bool_] = ~np.isnan(self.pixels_px).any(axis=2)
+        return seen
+
+    @property
+    def hub_seen(self) -> NDArray[np.bool_]:
+        """(2, 2) which edges of the hub were measured, by eye and edge."""
+        assert self.hub_px is not None
+        seen: NDArray[np.bool_] = ~np.isnan(self.hub_px).any(axis=2)
+        return seen
+
+    @property
+    def paired(self) -> NDArray[np.bool_]:
+        """(N,) which markers both eyes measured."""
+        paired: NDArray[np.bool_] = self.seen.all(axis=0)
+        return paired
+
+    @property
+    def sigma_px(self) -> float:
+        """Root mean square standard deviation per axis of the measured centres. [px]"""
+        variances = np.diagonal(self.cov_px2[self.seen], axis1=1, axis2=2)
+        return float(np.sqrt(variances.mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMode:
+    """One pose that explains the images.
+
+    Attributes:
+        left_from_drogue: the pose.
+        cost: half the sum of squared residuals in units of their standard deviations, priors included.
+        weight: its share of the posterior.
+    """
+
+    left_from_drogue: RigidTransform
+    cost: float
+    weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A pose.
+
+    Attributes:
+        left_from_drogue: modulo the layout's symmetry.
+        used: (2, N) the measurements of markers on which it rests.
+        covariance: (6, 6) in the tangent `datasets_manifest.types.estimates.TANGENT`, or None.
+        modes: the best first, where the method knows of several.
+        used_hub: (2, 2) the measurements of the hub's edges on which it rests, or None for a method without hub.
+        note: what the user should know of this answer, in one sentence; empty when there is nothing.
+    """
+
+    left_from_drogue: RigidTransform
+    used: NDArray[np.bool_]
+    covariance: Array | None = None
+    modes: tuple[PoseMode, ...] = ()
+    used_hub: NDArray[np.bool_] | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class NoFixReason:
+    """Why there is no pose."""
+
+    reason: str
+
+
+PoseMethod = Callable[[Observation], Solution | NoFixReason]

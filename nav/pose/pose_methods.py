@@ -1,0 +1,90 @@
+"""Pose methods by name: our own, and those that other packages register.
+
+A package offers a method by an entry point of the group `droguekit.pose_estimators`, whose name is the method's and
+whose object is a function as `nav.pose.pose_method.PoseMethod`.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint, entry_points
+
+from nav.pose.constant import constant
+from nav.pose.disparity_plane import disparity_plane
+from nav.pose.joint import joint, joint_hub
+from nav.pose.mean_plane import mean_plane
+from nav.pose.mono import mono_lm
+from nav.pose.mono_circle import mono_circle
+from nav.pose.opencv_pnp import mono_ippe, mono_sqpnp
+from nav.pose.paper import paper
+from nav.pose.paper_literal import paper_literal
+from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
+from nav.pose.rim_circle import circle_fit
+from nav.pose.robust import joint_robust
+
+ENTRY_POINT_GROUP = "droguekit.pose_estimators"
+
+METHODS: dict[str, PoseMethod] = {
+    "paper": paper,
+    "paper-literal": paper_literal,
+    "circle-fit": circle_fit,
+    "mono-circle": mono_circle,
+    "mean-plane": mean_plane,
+    "disparity-plane": disparity_plane,
+    "mono-ippe": mono_ippe,
+    "mono-sqpnp": mono_sqpnp,
+    "mono-lm": mono_lm,
+    "joint": joint,
+    "joint-hub": joint_hub,
+    "joint-robust": joint_robust,
+    "constant": constant,
+}
+
+
+def method_names() -> tuple[str, ...]:
+    """Our own methods, then other packages', by name.
+
+    Raises:
+        ValueError: a package registers a name that is taken.
+    """
+    return (*METHODS, *sorted(_others()))
+
+
+def pose_method(name: str) -> PoseMethod:
+    """The method of that name.
+
+    Raises:
+        ValueError: there is none, or it cannot be loaded.
+    """
+    if name in METHODS:
+        return METHODS[name]
+    others = _others()
+    if name not in others:
+        raise ValueError(f"method: there is no pose method named {name!r}; there are {', '.join([*METHODS, *others])}")
+    return _loaded(others[name])
+
+
+def _others() -> dict[str, EntryPoint]:
+    found: dict[str, EntryPoint] = {}
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        # One installation seen along two paths is one method.
+        if entry.name in METHODS or found.get(entry.name, entry).value != entry.value:
+            raise ValueError(f"method: {entry.value} registers {entry.name!r}, which is taken; rename its entry point")
+        found[entry.name] = entry
+    return dict(sorted(found.items()))
+
+
+def _loaded(entry: EntryPoint) -> PoseMethod:
+    try:
+        solve = entry.load()
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"method: {entry.name!r} cannot be loaded from {entry.value}: {error}") from error
+    if not callable(solve):
+        raise ValueError(f"method: {entry.name!r} must be a function, got {type(solve).__name__} from {entry.value}")
+
+    def checked(observation: Observation) -> Solution | NoFixReason:
+        answer = solve(observation)
+        if not isinstance(answer, Solution | NoFixReason):
+            raise ValueError(f"method: {entry.name!r} must answer Solution or NoFixReason, got {type(answer).__name__}")
+        return answer
+
+    return checked

@@ -1,0 +1,1 @@
+"""Navigation at camera rate: threads, queues, and what is compiled beforehand."""

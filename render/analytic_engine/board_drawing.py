@@ -1,0 +1,113 @@
+"""A calibration board with exact coverage of every pixel by its squares, through whatever lens the eye has."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from datasets_manifest.types.calibration_board import CalibrationBoard, PlacedBoard
+from datasets_manifest.types.frame import FrameSpec
+from drogue_models.parts import Part
+from geometry.se3 import Array
+from geometry.stereo import Eye
+from render.analytic_engine.flat_parts import PlateLight
+from render.analytic_engine.pixel_coverage import pixel_coverage
+from render.analytic_engine.ring_passes import PixelPasses, empty_passes
+from render.engine import EyeRadiance
+from scenes.environment_radiance import surroundings
+
+# A lens bends lines. An edge of 150 px, at twice the curvature of a strong lens (2e-4 / px), bulges by 0.6 px over its
+# length, and by 0.6 / 64^2 = 1.4e-4 px over each of this many pieces.
+_PIECES_PER_SQUARE = 64
+
+
+def board_eye(frame: FrameSpec, placed: PlacedBoard, eye: Eye, behind: NDArray[np.float32]) -> EyeRadiance:
+    """What one eye sees of a frame with a board.
+
+    Args:
+        frame: for rig, light and air.
+        placed: the frame's board.
+        eye: which eye.
+        behind: (H, W, 3) radiance of the surroundings. [cd/m2]
+
+    Raises:
+        ValueError: part of the board is not in front of the camera, or it shows its back.
+    """
+    pose = placed.left_from_board
+    corners_m = pose.apply(placed.shape.outline_m())
+    if corners_m[:, 2].min() <= 0:
+        raise ValueError(f"left_from_board: all of it must be in front of the camera, got {corners_m[:, 2].min():g} m")
+    if (pose.translation_m - frame.rig.eye_offset_m(eye)) @ pose.rotation[:, 2] <= 0:
+        raise ValueError("left_from_board: the board must show its squares to both eyes; its z axis points away")
+    light, depth_m = PlateLight(frame, surroundings(frame.environment), pose), float(pose.translation_m[2])
+    white, black = (
+        light.seen(np.full(3, reflectance), 0.0, depth_m).astype(np.float32)
+        for reflectance in (placed.shape.white_reflectance, placed.shape.black_reflectance)
+    )
+    image = behind.copy()
+    coverage = np.zeros(behind.shape[:2], dtype=np.float32)
+    height_px, width_px = coverage.shape
+    plate = pixel_coverage([_plate_area(frame, placed, eye)], width_px, height_px)
+    if plate is not None:
+        share = plate.share.astype(np.float32)
+        window = plate.rows, plate.columns
+        coverage[window] = share
+        image[window] += share[..., None] * (white - behind[window])
+    squares = pixel_coverage([_black_area(frame, placed, eye)], width_px, height_px)
+    if squares is not None:
+        image[squares.rows, squares.columns] += squares.share.astype(np.float32)[..., None] * (black - white)
+    return EyeRadiance(image, coverage, **vars(_passes(frame, placed, eye, plate is not None)))
+
+
+def _plate_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> shapely.Polygon:
+    corners_m = placed.shape.outline_m()
+    pieces = _pieces(frame, eye) * max(placed.shape.columns, placed.shape.rows)
+    edge_m = _divided(corners_m, np.roll(corners_m, -1, axis=0), pieces).reshape(-1, 3)
+    return shapely.Polygon(frame.rig.image(placed.left_from_board.apply(edge_m), eye))
+
+
+def _black_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> shapely.MultiPolygon:
+    """Every other square, from the one in the low corner on; they touch in the inner corners alone."""
+    corners_m = _black_squares_m(placed.shape)
+    edges_m = _divided(corners_m, np.roll(corners_m, -1, axis=1), _pieces(frame, eye))
+    edges_px = frame.rig.image(placed.left_from_board.apply(edges_m.reshape(-1, 3)), eye)
+    return shapely.MultiPolygon([shapely.Polygon(edge) for edge in edges_px.reshape(len(corners_m), -1, 2)])
+
+
+def _black_squares_m(board: CalibrationBoard) -> Array:
+    """(S, 4, 3) corners of the black squares, around each. [m]"""
+    grid = board.grid_m()
+    row, column = np.nonzero(np.indices((board.rows, board.columns)).sum(axis=0) % 2 == 0)
+    around = ((0, 0), (0, 1), (1, 1), (1, 0))
+    return np.stack([grid[row + down, column + right] for down, right in around], axis=1)
+
+
+def _pieces(frame: FrameSpec, eye: Eye) -> int:
+    return 1 if frame.rig.lens(eye) is None else _PIECES_PER_SQUARE
+
+
+def _divided(start: Array, end: Array, pieces: int) -> Array:
+    """(..., pieces, 3) points along the way from (..., 3) starts to ends, without the ends."""
+    share: Array = np.linspace(0.0, 1.0, pieces, endpoint=False)[:, None]
+    points: Array = start[..., None, :] * (1.0 - share) + end[..., None, :] * share
+    return points
+
+
+def _passes(frame: FrameSpec, placed: PlacedBoard, eye: Eye, is_seen: bool) -> PixelPasses:
+    """Part id, depth and normal where the rays through the pixel centres meet the plate."""
+    passes = empty_passes(frame.rig.camera)
+    if not is_seen:
+        return passes
+    pose, camera = placed.left_from_board, frame.rig.camera
+    rays = frame.rig.rays(np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1), eye)
+    center_m, axis = pose.translation_m - frame.rig.eye_offset_m(eye), pose.rotation[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth_m = (center_m @ axis) / (rays @ axis)
+        place_m = (rays * depth_m[..., None] - center_m) @ pose.rotation[:, :2]
+        half_m = np.array(placed.shape.size_m) / 2
+        met = (depth_m > 0) & (np.abs(place_m) <= half_m).all(axis=-1)
+    passes.part_id[met] = int(Part.BOARD)
+    passes.depth_m[met] = depth_m[met]
+    passes.normal[met] = -axis
+    return passes

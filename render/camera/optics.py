@@ -1,0 +1,163 @@
+"""The lens: what becomes of the light between a scene seen perfectly and the sensor's sites."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.frame import FrameSpec, Optics
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import Array
+from geometry.stereo import Eye
+from render.background import background
+from render.camera.lens_glare import sun_glare
+from render.engine import EyeRadiance
+
+# Beyond four sigma the Gaussian holds less than 1e-4 of the light.
+_KERNEL_REACH_SIGMA = 4.0
+# A smaller circle of blur adds less than a 500th to the variance of a pixel's own box.
+_SHARP_BELOW_PX = 0.05
+_MOST_DEFOCUS_PX = 200.0
+_CHORDS_PER_PX = 64
+
+
+def light_on_sensor(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np.float32]:
+    """(H, W, 3) what one eye's sensor receives: defocused, blurred by the point spread, veiled by glare, less losses.
+
+    Returns:
+        In units of the scene's radiance on the axis. [cd/m2]
+    """
+    image = blur(_defocused(frame, seen, eye), frame.sensor.psf_sigma_px)
+    veil = sun_glare(frame, seen)
+    if veil is not None:
+        image = image + veil
+    optics = frame.sensor.optics
+    if optics.natural_vignetting or optics.mechanical_falloff_fraction > 0:
+        lens = frame.rig.lens(eye)
+        return image * transmission(frame.rig.camera if lens is None else lens.camera, optics)[..., None]
+    return image
+
+
+def blur(radiance: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    """Gaussian point spread of lens and pixel crosstalk.
+
+    Args:
+        radiance: (H, W, C), box-sampled.
+        sigma_px: standard deviation. [px]
+    """
+    if sigma_px == 0:
+        return radiance
+    reach = int(np.ceil(_KERNEL_REACH_SIGMA * sigma_px))
+    kernel = cv2.getGaussianKernel(2 * reach + 1, sigma_px, cv2.CV_32F)
+    blurred: NDArray[np.float32] = cv2.sepFilter2D(
+        radiance, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE
+    )
+    return blurred
+
+
+@lru_cache(maxsize=4)
+def transmission(camera: PinholeCamera, optics: Optics) -> NDArray[np.float32]:
+    """(H, W) share of the light on the axis that reaches each pixel.
+
+    Source: illuminance falls with cos^4 of the angle from the axis (natural vignetting, EMVA Standard 1288); the
+    barrel's share is our model, `1 - a rho^4`, rho the distance from the principal point over that of the corner
+    farthest from it.
+    """
+    u = np.arange(camera.width_px) - camera.cx_px
+    v = np.arange(camera.height_px) - camera.cy_px
+    square_px = u**2 + v[:, None] ** 2
+    share = 1.0 - optics.mechanical_falloff_fraction * (square_px / square_px.max()) ** 2
+    if optics.natural_vignetting:
+        share /= (1.0 + (u / camera.fx_px) ** 2 + (v[:, None] / camera.fy_px) ** 2) ** 2
+    result: NDArray[np.float32] = share.astype(np.float32)
+    return result
+
+
+def blur_circle_px(frame: FrameSpec, depth_m: float) -> float:
+    """Diameter of the blur circle of points at a planar depth, inf for the sky. [px]
+
+    Source: thin lens of aperture D focused on depth s, sensor at image distance v: points at z meet at v' with
+    1/v' = 1/v + 1/s - 1/z, and their cone is D |1 - v/v'| = D v |1/s - 1/z| wide on the sensor.
+    """
+    optics, camera = frame.sensor.optics, frame.rig.camera
+    if optics.focus_distance_m is None:
+        return 0.0
+    focal_m = camera.fx_px * optics.pixel_pitch_um * 1e-6
+    aperture_m = focal_m / frame.exposure.f_number
+    return aperture_m * camera.fx_px * abs(1.0 / optics.focus_distance_m - 1.0 / depth_m)
+
+
+def _defocused(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np.float32]:
+    """(H, W, 3) radiance with two layers out of focus: all parts by the depth of the rim's centre, and the far sky.
+
+    A calibration board goes by its own centre. A blurred part lets through what it no longer covers:
+    `sky (1 - coverage) + parts`, each blurred by its own circle.
+    """
+    sky_px = blur_circle_px(frame, np.inf)
+    pose = frame.board.left_from_board if frame.board is not None else frame.left_from_drogue
+    part_px = sky_px if pose is None else blur_circle_px(frame, float(pose.translation_m[2]))
+    if max(sky_px, part_px) < _SHARP_BELOW_PX:
+        return seen.radiance_cd_m2
+    if max(sky_px, part_px) > _MOST_DEFOCUS_PX:
+        raise ValueError(
+            f"focus_distance_m: gives a blur circle of {max(sky_px, part_px):.0f} px, more than "
+            f"{_MOST_DEFOCUS_PX:.0f}; focus farther away, or close the aperture"
+        )
+    if pose is None:
+        return _disc_blur(seen.radiance_cd_m2, sky_px)
+    behind = background(frame, eye)
+    open_share = 1.0 - seen.coverage[..., None]
+    parts = np.where(open_share < 1.0, seen.radiance_cd_m2 - open_share * behind, np.float32(0.0))
+    covered = _disc_blur(seen.coverage, part_px)[..., None]
+    result: NDArray[np.float32] = _disc_blur(behind, sky_px) * (1.0 - covered) + _disc_blur(parts, part_px)
+    return result
+
+
+def _disc_blur(image: NDArray[np.float32], diameter_px: float) -> NDArray[np.float32]:
+    if diameter_px < _SHARP_BELOW_PX:
+        return image
+    blurred: NDArray[np.float32] = cv2.filter2D(
+        image, cv2.CV_32F, disc_kernel(diameter_px).astype(np.float32), borderType=cv2.BORDER_REPLICATE
+    )
+    return blurred
+
+
+@lru_cache(maxsize=8)
+def disc_kernel(diameter_px: float) -> Array:
+    """(2 k + 1, 2 k + 1) weights of an even disc of light on box-sampled pixels.
+
+    Pixels spread the disc by their own box; the diameter drawn is the one whose weights have the variance of the true
+    disc, a sixteenth of its diameter squared, so that small circles blur as much as they should.
+    """
+    wanted = diameter_px**2 / 16.0
+    low, high = 0.0, diameter_px + 2.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        weights = _covered_by_disc(middle)
+        low, high = (middle, high) if _variance(weights) < wanted else (low, middle)
+    weights = _covered_by_disc(high)
+    weights.flags.writeable = False
+    return weights
+
+
+def _covered_by_disc(diameter_px: float) -> Array:
+    """Share of a disc in the middle of the grid that falls into each pixel, by its chords."""
+    reach = int(np.ceil(diameter_px / 2 - 0.5)) if diameter_px > 1 else 0
+    chords = (2 * reach + 1) * _CHORDS_PER_PX
+    y = (np.arange(chords) + 0.5) / _CHORDS_PER_PX - reach - 0.5
+    half = np.sqrt(np.maximum(diameter_px**2 / 4 - y**2, 0.0))[:, None]
+    x = np.arange(-reach, reach + 1)
+    length = np.maximum(np.minimum(half, x + 0.5) - np.maximum(-half, x - 0.5), 0.0)
+    weights: Array = length.reshape(2 * reach + 1, _CHORDS_PER_PX, 2 * reach + 1).sum(axis=1)
+    weights = (weights + weights.T) / 2
+    total = weights.sum()
+    return weights / total if total > 0 else np.ones((1, 1))
+
+
+def _variance(weights: Array) -> float:
+    """Variance of a centred kernel along one axis. [px^2]"""
+    reach = weights.shape[0] // 2
+    return float(weights.sum(axis=0) @ np.arange(-reach, reach + 1) ** 2)

@@ -1,0 +1,1 @@
+"""Rays and paths of one frame, and the light that they bring."""

@@ -1,0 +1,92 @@
+"""How much of an image's noise is the renderer's own, measured on pixels that were rendered twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.frame import FrameSpec
+from render.camera.sensor import MONO_WEIGHTS
+from scenes.sky.light import REC709_LUMINANCE
+
+# Every so many pixels are rendered twice: a sixteenth more work, and some dozen pairs from the smallest drogue.
+TWICE_EVERY = 16
+
+
+@dataclass(frozen=True)
+class MonteCarloNoise:
+    """Noise of the renderer on pixels of the drogue.
+
+    Attributes:
+        fraction: root mean square error of luminance over root mean square luminance.
+        over_sensor: root mean square error of the sensor's electrons over the standard deviation of shot and read
+            noise, both behind the lens.
+    """
+
+    fraction: float
+    over_sensor: float
+
+
+NO_NOISE = MonteCarloNoise(0.0, 0.0)
+"""Of an image without a drogue, and of an engine without sampling."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorNoise:
+    """What the sensor of a frame makes of light and of its errors.
+
+    Attributes:
+        weights: (3, C) of the three bands in each of the sensor's channels.
+        per_cd_m2: electrons per luminance. [e- m2/cd]
+        read_noise_e: standard deviation of the read noise. [e-]
+        left_by_lens: share of errors that are independent between neighbours.
+    """
+
+    weights: NDArray[np.float64]
+    per_cd_m2: float
+    read_noise_e: float
+    left_by_lens: float
+
+    @classmethod
+    def of(cls, frame: FrameSpec) -> SensorNoise:
+        """Of a frame's sensor at its exposure."""
+        sensor = frame.sensor
+        left_by_lens = 1.0
+        if sensor.psf_sigma_px > 0:
+            reach = int(np.ceil(4 * sensor.psf_sigma_px))
+            # Twice the square root of the kernel's energy along one axis: rows and columns.
+            left_by_lens = float(np.sum(cv2.getGaussianKernel(2 * reach + 1, sensor.psf_sigma_px) ** 2))
+        weights = MONO_WEIGHTS.T.astype(np.float64) if sensor.color == "mono" else np.eye(3)
+        return cls(weights, sensor.electrons_per_cd_m2(frame.exposure), sensor.read_noise_e, left_by_lens)
+
+    def variance(self, mean: NDArray[np.float64]) -> float:
+        """Of shot and read noise, of (P, 3) light on average. [cd2/m4]"""
+        electrons = float(np.mean(np.maximum(mean @ self.weights, 0.0))) * self.per_cd_m2
+        return (electrons + self.read_noise_e**2) / self.per_cd_m2**2
+
+
+def measure_noise(
+    frame: FrameSpec, first: NDArray[np.float32], second: NDArray[np.float32], shared: NDArray[np.float32]
+) -> MonteCarloNoise:
+    """Noise of one estimate of pixels, from two independent ones.
+
+    The lens averages over neighbours, whose errors are independent, and so leaves a known share of them; of an error
+    that neighbours share it leaves all.
+
+    Args:
+        frame: with sensor and exposure.
+        first, second: (P, 3) estimates of the same pixels, independent but for: [cd/m2]
+        shared: (P, 3) what is known of the error that both have, and their neighbours with them. [cd/m2]
+    """
+    if not len(first):
+        return NO_NOISE
+    # float64: squares of 1e-5 of daylight matter in the sums.
+    error, mean = (first - second).astype(np.float64) / np.sqrt(2), (first + second).astype(np.float64) / 2
+    luminance = [values @ REC709_LUMINANCE for values in (error, shared, mean)]
+    fraction = np.sqrt(np.sum(luminance[0] ** 2 + luminance[1] ** 2) / max(np.sum(luminance[2] ** 2), 1e-30))
+    sensor = SensorNoise.of(frame)
+    behind_lens = np.mean((sensor.left_by_lens * error @ sensor.weights) ** 2 + (shared @ sensor.weights) ** 2)
+    return MonteCarloNoise(float(fraction), float(np.sqrt(behind_lens / sensor.variance(mean))))

@@ -1,0 +1,181 @@
+"""How light spreads through the layers of one scene, and the light of the air itself."""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.weather import CloudLayer
+from scenes.clouds.cloud_layers import BACK_SCATTER, CloudLight, diffuse_transmission, opacity_towards
+from scenes.sky.clear_sky import ClearSky
+from scenes.sky.light import Radiance, hemisphere, henyey_greenstein
+
+HORIZON_ELEVATION_RAD = 0.01
+_DROPLET_ASYMMETRY = 0.8
+# Height over which the haze thins out: how much of it stands before the sky at the horizon.
+_HAZE_SCALE_M = 1500.0
+# Air between a bright deck and dark ground shines with a little more than half of the light that falls into it.
+_AIR_UNDER_DECK, _AIR_IN_MIST = 0.6, 0.75
+_LOWEST_BEAM_SINE = 0.05
+
+
+class LayeredAir:
+    """Light between the layers, from clear sky, cloud layers and mist of one environment."""
+
+    def __init__(self, environment: Environment, sky: ClearSky) -> None:
+        self._environment = environment
+        self._sky = sky
+
+    def seen_from(self, environment: Environment) -> LayeredAir:
+        """The same air from another place: other clouds stand before sun and moon; what is a mean over them stays.
+
+        Args:
+            environment: the same, with another `camera_offset_m`.
+        """
+        moved = copy(self)
+        moved._environment = environment
+        for own in ("beam_share", "beam_illuminance_lux"):
+            vars(moved).pop(own, None)
+        return moved
+
+    @cached_property
+    def sky_level_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a level plane by the clear sky alone. [lux]"""
+        directions, weight = hemisphere(45)
+        result: NDArray[np.float64] = (self._sky.radiance(directions) * weight[..., None]).sum(axis=(0, 1))
+        return result
+
+    @cached_property
+    def _open_level_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a level plane by clear sky and beam. [lux]"""
+        beam = self._sky.beam
+        result: NDArray[np.float64] = self.sky_level_lux + beam.beam_illuminance_lux() * max(beam.direction[2], 0.0)
+        return result
+
+    @cached_property
+    def ground_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of level ground under all layers, on average over them. [lux]"""
+        result: NDArray[np.float64] = self._open_level_lux * _let_through(self._environment.clouds)
+        if self._environment.mist is not None:
+            mist = self._environment.mist
+            result /= 1.0 + BACK_SCATTER * mist.extinction_per_m * (mist.above_m + mist.below_m)
+        return result
+
+    @cached_property
+    def ground_beam_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a plane on the ground that faces the beam, on average over cloud and gaps. [lux]"""
+        beam, mist = self._sky.beam, self._environment.mist
+        share = _open_share(self._environment.clouds)
+        if mist is not None:
+            depth = mist.extinction_per_m * (mist.above_m + mist.below_m)
+            share *= float(np.exp(-depth / max(float(beam.direction[2]), _LOWEST_BEAM_SINE)))
+        result: NDArray[np.float64] = share * beam.beam_illuminance_lux()
+        return result
+
+    @cached_property
+    def beam_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance at the camera of a plane that faces sun or moon, through cloud and mist. [lux]"""
+        result: NDArray[np.float64] = self._sky.beam.beam_illuminance_lux() * self.beam_share
+        return result
+
+    @cached_property
+    def beam_share(self) -> float:
+        """Share of the beam that cloud and mist let through to the camera."""
+        direction, offset_m = self._sky.beam.direction, self._environment.camera_offset_m
+        share = 1.0
+        for layer in self._environment.clouds:
+            share *= 1.0 - opacity_towards(layer, direction, offset_m)
+        return share * self._mist_beam_share
+
+    @property
+    def _mist_beam_share(self) -> float:
+        mist = self._environment.mist
+        if mist is None:
+            return 1.0
+        sine = max(float(self._sky.beam.direction[2]), _LOWEST_BEAM_SINE)
+        return float(np.exp(-mist.extinction_per_m * mist.above_m / sine))
+
+    def light_on(self, layer: CloudLayer) -> CloudLight:
+        """What shines on one cloud layer through those above it and from those below."""
+        environment, beam = self._environment, self._sky.beam
+        height_m = layer.height_above_camera_m
+        above = tuple(other for other in environment.clouds if other.height_above_camera_m > height_m)
+        below = tuple(other for other in environment.clouds if other.height_above_camera_m < height_m)
+        open_share, through = _open_share(above), _let_through(above)
+        spread = np.maximum(through - open_share, 0.0) * self._open_level_lux
+        falling = through * self._open_level_lux
+        ground = np.array(environment.ground_reflectance_rgb) * self.ground_illuminance_lux
+        return CloudLight(
+            direction=beam.direction,
+            beam_lux=open_share * beam.beam_illuminance_lux(max(environment.altitude_m + height_m, 0.0)),
+            sky_lux=open_share * self.sky_level_lux + spread,
+            ground_lux=ground + falling * (1.0 - _let_through(below)),
+        )
+
+    @cached_property
+    def _under_deck(self) -> tuple[float, NDArray[np.float64]]:
+        """Share of the sky that clouds above the camera leave open, and the air's radiance under the rest."""
+        above = tuple(layer for layer in self._environment.clouds if layer.is_above)
+        return _open_share(above), _AIR_UNDER_DECK / np.pi * _let_through(above) * self._open_level_lux
+
+    def sky_and_air(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
+        """Clear sky behind the haze, and endless air, without mist.
+
+        Args:
+            directions: (..., 3) unit vectors in world axes.
+
+        Returns:
+            Two (..., 3) radiances; they meet at the horizon. [cd/m2]
+        """
+        sky = self._sky.radiance(directions)
+        flat = np.array(directions, dtype=np.float64)
+        horizontal = np.maximum(np.hypot(flat[..., 0], flat[..., 1]), 1e-9) / np.cos(HORIZON_ELEVATION_RAD)
+        flat[..., :2] /= horizontal[..., None]
+        flat[..., 2] = np.sin(HORIZON_ELEVATION_RAD)
+        horizon = self._sky.radiance(flat)
+        # Below this the path through the air hardly grows: held there, sky and air meet without a seam.
+        sky = np.where((np.asarray(directions)[..., 2] < np.sin(HORIZON_ELEVATION_RAD))[..., None], horizon, sky)
+        open_share, under_deck = self._under_deck
+        if open_share == 1.0:
+            return sky, horizon
+        air = (open_share * horizon + (1.0 - open_share) * under_deck).astype(np.float32)
+        up = np.maximum(np.asarray(directions)[..., 2], 1e-4)
+        hidden = 1.0 - np.exp(-self._environment.extinction_per_m * _HAZE_SCALE_M / up)
+        return sky + hidden[..., None].astype(np.float32) * (air - horizon), air
+
+    def mist_light(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """(..., 3) radiance of endless mist along (..., 3) unit directions. [cd/m2]"""
+        mist = self._environment.mist
+        assert mist is not None
+        above = tuple(layer for layer in self._environment.clouds if layer.is_above)
+        depth = BACK_SCATTER * mist.extinction_per_m * mist.above_m
+        even = _AIR_IN_MIST / np.pi * _let_through(above) * self._open_level_lux / (1.0 + depth)
+        cosine = np.einsum("...i,i->...", directions, self._sky.beam.direction)
+        peak = henyey_greenstein(cosine, _DROPLET_ASYMMETRY)[..., None] * self.beam_illuminance_lux
+        result: Radiance = (even + peak).astype(np.float32)
+        return result
+
+    def mist_opacity(self, up: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """(...) share of what lies beyond the mist that it hides, by the vertical part of unit directions."""
+        mist = self._environment.mist
+        assert mist is not None
+        reach_m = np.where(up > 0, np.float32(mist.above_m), np.float32(mist.below_m))
+        path_m = reach_m / np.maximum(np.abs(up), np.float32(1e-6))
+        opacity: NDArray[np.float32] = (1.0 - np.exp(-np.float32(mist.extinction_per_m) * path_m)).astype(np.float32)
+        return opacity
+
+
+def _let_through(layers: tuple[CloudLayer, ...]) -> float:
+    """Share of all light that comes through the layers, straight or scattered."""
+    return float(np.prod([diffuse_transmission(layer) for layer in layers])) if layers else 1.0
+
+
+def _open_share(layers: tuple[CloudLayer, ...]) -> float:
+    """Share of the light that comes straight through the layers, on average over their plan."""
+    shares = [1.0 - layer.cover_fraction * (1.0 - np.exp(-layer.optical_depth)) for layer in layers]
+    return float(np.prod(shares)) if shares else 1.0

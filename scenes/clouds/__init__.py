@@ -1,0 +1,1 @@
+"""Cloud layers as densities through which rays are marched."""

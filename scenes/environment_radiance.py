@@ -1,0 +1,312 @@
+"""Everything around the drogue as one function of direction: sky, sun, cloud, haze and ground.
+
+The same function is the background of the images and, as a map, the light on the drogue.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.weather import CloudLayer
+from scenes.air_light import HORIZON_ELEVATION_RAD, LayeredAir
+from scenes.clouds.cloud_layers import band_limited, see_cloud
+from scenes.clouds.ray_march import enlarge
+from scenes.ground.ground_radiance import Ground
+from scenes.ground.sea import GroundLight
+from scenes.ground_view import FARTHEST_M, pixel_angle_rad
+from scenes.sky.clear_sky import ClearSky
+from scenes.sky.equirectangular_sky import load_map
+from scenes.sky.light import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
+
+_LIGHT_MAP_HEIGHT_PX = 128
+# Clouds of a large picture are seen on every second pixel, 5 m at 5 km, which is less than their edges are wide.
+_CLOUD_STEP_PX, _MANY_RAYS = 2, 60_000
+
+
+class Surroundings:
+    """Radiance by direction for one environment.
+
+    Attributes:
+        environment: what it is.
+        sky: clear sky with sun and moon.
+        air: light between the layers.
+    """
+
+    def __init__(self, environment: Environment) -> None:
+        self.environment = environment
+        self.sky = ClearSky(environment)
+        self.air = LayeredAir(environment, self.sky)
+
+    def seen_from(self, environment: Environment) -> Surroundings:
+        """The same surroundings from another place.
+
+        Ground and clouds move, and with them the share of the sun's beam that gets through; the light map stays that
+        of here.
+
+        Args:
+            environment: the same, with another `camera_offset_m`.
+        """
+        # Made here, so that it does not matter who asked first.
+        own = {"ground": self.ground.seen_from(environment), "light_map": self.light_map}
+        moved = copy(self)
+        moved.environment, moved.air = environment, self.air.seen_from(environment)
+        vars(moved).update(own)
+        return moved
+
+    def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
+        """The parts that vary slowly: clear sky, and endless air at the same azimuth.
+
+        Args:
+            directions: (..., 3) unit vectors in world axes.
+
+        Returns:
+            Two (..., 3) radiances. [cd/m2]
+        """
+        return self.air.sky_and_air(directions)
+
+    def radiance(
+        self, directions: NDArray[np.float32], sky: Radiance | None = None, horizon: Radiance | None = None
+    ) -> Radiance:
+        """Radiance of everything but the sun's disc.
+
+        Args:
+            directions: (H, W, 3) unit vectors in world axes.
+            sky, horizon: (H, W, 3) results of `clear_radiance` for the same directions, if at hand.
+
+        Returns:
+            (H, W, 3) luminance-scaled linear Rec. 709. [cd/m2]
+        """
+        if sky is None or horizon is None:
+            sky, horizon = self.clear_radiance(directions)
+        total = sky.copy()
+        layers = sorted(self.environment.clouds, key=lambda layer: -abs(layer.height_above_camera_m))
+        parts = [_rows_with(directions[..., 2] * np.sign(layer.height_above_camera_m) > 0) for layer in layers]
+        pictures = [
+            self._cloud(layer, directions[rows], horizon[rows]) for layer, rows in zip(layers, parts, strict=True)
+        ]
+        rows = _rows_with(directions[..., 2] < 0)
+        uncovered = np.ones(directions.shape[:2], dtype=np.float32)
+        for layer, part, picture in zip(layers, parts, pictures, strict=True):
+            if not layer.is_above:
+                uncovered[part] *= 1.0 - picture[..., 3]
+        self._put_ground(total[rows], directions[rows], horizon[rows], uncovered[rows])
+        for part, picture in zip(parts, pictures, strict=True):
+            total[part] *= 1.0 - picture[..., 3:]
+            total[part] += picture[..., :3]
+        if self.environment.mist is not None:
+            hidden = self.air.mist_opacity(directions[..., 2])[..., None]
+            total += hidden * (self.air.mist_light(directions) - total)
+        return total
+
+    def add_discs(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
+        """Add the discs of sun and moon behind cloud and mist, in place, to (H, W, 3) radiance along directions."""
+        self.sky.add_discs(radiance, directions, self.air.beam_share)
+
+    @property
+    def beam_direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector in world axes towards what casts the shadows: the sun, or at night the moon."""
+        return self.sky.beam.direction
+
+    @property
+    def beam_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a plane at the camera that faces it, through air, cloud and mist. [lux]"""
+        return self.air.beam_illuminance_lux
+
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of air and mist around the camera. [1/m]"""
+        mist = self.environment.mist
+        return self.environment.extinction_per_m + (mist.extinction_per_m if mist is not None else 0.0)
+
+    def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """Radiance of endless air and mist, which things fade into.
+
+        Args:
+            directions: (..., 3) unit vectors in world axes.
+
+        Returns:
+            (..., 3) radiance. [cd/m2]
+        """
+        _, air = self.air.sky_and_air(directions)
+        if self.environment.mist is None:
+            return air
+        droplets = self.environment.mist.extinction_per_m / self.extinction_per_m
+        result: Radiance = air + np.float32(droplets) * (self.air.mist_light(directions) - air)
+        return result
+
+    @property
+    def ground_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of level ground by everything above it, by channel. [lux]"""
+        return self.air.ground_illuminance_lux
+
+    @cached_property
+    def ground(self) -> Ground:
+        """What lies below, in the light that comes down to it."""
+        beam_lux, to_beam = self.air.ground_beam_lux, self.beam_direction
+        sky_lux = np.maximum(self.ground_illuminance_lux - beam_lux * max(float(to_beam[2]), 0.0), 0.0)
+        return Ground(self.environment, GroundLight(sky_lux, to_beam, beam_lux, self.radiance))
+
+    def _put_ground(
+        self, total: Radiance, directions: NDArray[np.float32], horizon: Radiance, uncovered: NDArray[np.float32]
+    ) -> None:
+        """Cover the lower half, in place, with ground that fades into the horizon; `uncovered` of it will be seen."""
+        if directions.size == 0:
+            return
+        altitude_m = np.float32(self.environment.altitude_m)
+        distance_m = altitude_m / np.maximum(-directions[..., 2], altitude_m / np.float32(FARTHEST_M))
+        clear = np.exp(-distance_m * np.float32(self.environment.extinction_per_m))[..., None]
+        seen = self.ground.radiance(directions, uncovered)
+        seen -= horizon
+        seen *= clear
+        seen += horizon
+        below = directions[..., 2] < 0
+        whole = below.all(axis=1)
+        # Rows at once, where they can be: choosing each number takes as long as all before.
+        total[whole] = seen[whole]
+        np.copyto(total, seen, where=(below & ~whole[:, None])[..., None])
+
+    def _cloud(self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance) -> Radiance:
+        """(H, W, 4) light of a cloud layer, itself behind haze, times its opacity, and its opacity."""
+        if directions.size == 0:
+            return np.zeros((*directions.shape[:2], 4), dtype=np.float32)
+        many = directions.shape[0] * directions.shape[1] >= _MANY_RAYS
+        every = _CLOUD_STEP_PX if many else 1
+        chosen, behind_air = directions[::every, ::every], air[::every, ::every]
+        seen = see_cloud(layer, chosen, self.air.light_on(layer), every, self.environment.camera_offset_m)
+        clear = np.exp(seen.distance_m * np.float32(-self.environment.extinction_per_m))[..., None]
+        light = behind_air + clear * (seen.radiance - behind_air)
+        # Light times opacity is interpolated: light where there is no cloud means nothing.
+        layered: Radiance = np.concatenate([light * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
+        if not many:
+            return layered
+        return enlarge(band_limited(layered, layer, chosen), every, (directions.shape[0], directions.shape[1]))
+
+    @cached_property
+    def light_map(self) -> Radiance:
+        """(128, 256, 3) equirectangular map without the sun's disc; row 0 is the zenith, column 0 looks east. [cd/m2]
+
+        Columns go from east towards north; texel centres lie half a texel inside.
+        """
+        height, width = _LIGHT_MAP_HEIGHT_PX, 2 * _LIGHT_MAP_HEIGHT_PX
+        polar = (np.arange(height) + 0.5) * np.pi / height
+        azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
+        p, a = np.meshgrid(polar, azimuth, indexing="ij")
+        directions = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
+        return self.radiance(directions.astype(np.float32))
+
+    def plate_illuminance_lux(self, normal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(3,) illuminance of a plate by sun, sky and ground, by channel.
+
+        Args:
+            normal: (3,) unit normal in world axes.
+        """
+        light = self.light_map
+        height, width = light.shape[:2]
+        polar = (np.arange(height) + 0.5) * np.pi / height
+        azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
+        p, a = np.meshgrid(polar, azimuth, indexing="ij")
+        directions = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
+        weight = (
+            np.maximum(np.einsum("...i,i->...", directions, normal), 0.0)
+            * np.sin(p)
+            * (np.pi / height)
+            * (2 * np.pi / width)
+        )
+        diffuse = (light * weight[..., None]).sum(axis=(0, 1))
+        direct = self.beam_illuminance_lux * max(float(self.beam_direction @ normal), 0.0)
+        result: NDArray[np.float64] = diffuse + direct
+        return result
+
+
+def _rows_with(mask: NDArray[np.bool_]) -> slice:
+    """The rows from the first to the last that hold a true value."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
+
+
+class MappedSurroundings(Surroundings):
+    """Radiance by direction as a user's map has it: sky, ground and sun of an environment are not used."""
+
+    def __init__(self, environment: Environment) -> None:
+        assert environment.map is not None
+        self.environment = environment
+        self._light = load_map(environment.map)
+        self._coarse = self._light.shrunk(_LIGHT_MAP_HEIGHT_PX)
+
+    def seen_from(self, environment: Environment) -> Surroundings:
+        """The same: a map has no depth."""
+        return self
+
+    def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
+        """Coarse radiance, and endless air at the same azimuth; see `Surroundings.clear_radiance`."""
+        return self._coarse.radiance(directions), self.airlight(directions)
+
+    def radiance(
+        self, directions: NDArray[np.float32], sky: Radiance | None = None, horizon: Radiance | None = None
+    ) -> Radiance:
+        """Radiance of everything but the sun's disc; rays that lie far apart see the map averaged."""
+        fine = pixel_angle_rad(directions) < np.pi / _LIGHT_MAP_HEIGHT_PX / 2
+        return (self._light if fine else self._coarse).radiance(directions)
+
+    def add_discs(self, radiance: Radiance, directions: NDArray[np.float32]) -> None:
+        """Add the sun's disc, in place, to (H, W, 3) radiance along directions."""
+        cosine = np.einsum("...i,i->...", directions, self.beam_direction.astype(np.float32))
+        radiance[cosine > np.cos(SUN_RADIUS_RAD)] += (self.beam_illuminance_lux / SUN_SOLID_ANGLE_SR).astype(np.float32)
+
+    @property
+    def beam_direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector in world axes towards the map's sun."""
+        return self._light.sun_direction
+
+    @property
+    def beam_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a plane that faces the map's sun; zeros when it has none. [lux]"""
+        return self._light.sun_lux
+
+    @property
+    def ground_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of level ground by the map, by channel. [lux]"""
+        return self.plate_illuminance_lux(np.array([0.0, 0.0, 1.0]))
+
+    def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """Radiance of endless air: the map's own horizon at the same azimuth; see `Surroundings.airlight`."""
+        level = np.array(directions, dtype=np.float32)
+        length = np.maximum(np.hypot(level[..., 0], level[..., 1]), np.float32(1e-9))
+        level[..., :2] /= length[..., None]
+        level[..., 2] = np.float32(HORIZON_ELEVATION_RAD)
+        return self._coarse.radiance(level.reshape(1, -1, 3)).reshape(level.shape)
+
+
+# A recipe visits its scenes in turn; one takes half a megabyte.
+@lru_cache(maxsize=128)
+def _cached(key: str, folder: Path | None) -> Surroundings:
+    environment = Environment.model_validate_json(key)
+    if environment.map is None:
+        return Surroundings(environment)
+    placed = environment.map.model_copy(update={"folder": folder})
+    return MappedSurroundings(environment.model_copy(update={"map": placed}))
+
+
+# Engine, background and glare of one pair ask in turn.
+@lru_cache(maxsize=2)
+def _passing(key: str, folder: Path | None) -> Surroundings:
+    environment = Environment.model_validate_json(key)
+    still = environment.model_copy(update={"camera_offset_m": (0.0, 0.0)})
+    return _cached(still.model_dump_json(), folder).seen_from(environment)
+
+
+def surroundings(environment: Environment) -> Surroundings:
+    """The surroundings of an environment; the same object for equal environments, as frames share scenes.
+
+    Raises:
+        ValueError: the environment's map cannot be read, or has changed.
+    """
+    made = _cached if environment.camera_offset_m == (0.0, 0.0) else _passing
+    return made(environment.model_dump_json(), environment.map.folder if environment.map is not None else None)

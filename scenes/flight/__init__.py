@@ -1,0 +1,1 @@
+"""Motion in a sequence: hose, turbulence, receiver, and what hides the drogue."""

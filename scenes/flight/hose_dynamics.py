@@ -1,0 +1,208 @@
+"""A towed hose as a chain of rigid links with lumped masses, and the drogue at its end.
+
+Axes are the tanker's (x aft, y right wing, z up; origin at the mean place of the pod's hose exit), which fly along with
+the tanker's mean velocity. Node 0 is the pod's exit, the last node the drogue's coupling. Arrays have the components
+first: (3, S, N + 1) for S sequences that are simulated at once.
+
+Source: the family of models of Ro and Kamman 2010, doi:10.2514/1.45482 (lumped masses, rigid links). Tensions are found
+from the lengths at the end of a step, as in SHAKE (Ryckaert et al. 1977, doi:10.1016/0021-9991(77)90098-5), which
+neither drifts nor feeds in energy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dgtsv
+from scipy.optimize import brentq
+
+from datasets_manifest.recipe.hose import HoseParameters
+from geometry.se3 import Array
+
+LINKS = 16
+TIME_STEP_S = 0.002
+GRAVITY_M_S2 = 9.80665  # standard gravity
+
+
+@dataclass
+class HoseState:
+    """Places and velocities of all nodes; a simulation overwrites it.
+
+    Attributes:
+        nodes_m: (3, S, N + 1) from the pod to the drogue. [m]
+        velocities_m_s: (3, S, N + 1), half a time step earlier. [m/s]
+        tensions_n: (S, N) of the links. [N]
+    """
+
+    nodes_m: Array
+    velocities_m_s: Array
+    tensions_n: Array
+
+
+class HoseModel:
+    """Forces and constraints of one hose."""
+
+    def __init__(self, hose: HoseParameters, sequences: int = 1, links: int = LINKS) -> None:
+        """Precompute what does not change.
+
+        Args:
+            hose: the hose and its flight condition.
+            sequences: how many are simulated at once.
+            links: rigid links in each.
+        """
+        self.links = links
+        self.link_m = hose.length_m / links
+        self.airspeed_m_s = hose.airspeed_m_s
+        masses = np.full(links, hose.mass_per_length_kg_m * self.link_m)
+        masses[-1] = masses[-1] / 2 + hose.drogue_mass_kg
+        self.masses_kg = masses
+        half_density = hose.air_density_kg_m3 / 2
+        self._across = half_density * hose.diameter_m * self.link_m * hose.crossflow_drag_coefficient
+        self._along = half_density * np.pi * hose.diameter_m * self.link_m * hose.skin_drag_coefficient
+        self._drogue = half_density * np.pi / 4 * hose.drogue_diameter_m**2 * hose.drogue_drag_coefficient
+        inverse = 1.0 / masses
+        self._inverse_masses = inverse
+        # One tridiagonal system for all sequences; zeros part them.
+        self._diagonal = np.tile(inverse + np.concatenate([[0.0], inverse[:-1]]), sequences)
+        self._beside = np.tile(np.concatenate([inverse[:-1], [0.0]]), sequences)[:-1]
+        self._sequences = sequences
+
+    def equilibrium(self) -> HoseState:
+        """Still hose in still air; exact for the chain of links."""
+        links, tensions = self._equilibrium_links()
+        nodes = np.zeros((3, self._sequences, self.links + 1))
+        nodes[:, :, 1:] = np.cumsum(links, axis=1)[:, None]
+        return HoseState(nodes, np.zeros_like(nodes), np.tile(tensions, (self._sequences, 1)))
+
+    def check_step(self, time_step_s: float) -> None:
+        """Check that waves along the links and drag are slow against a time step.
+
+        Raises:
+            ValueError: they are not: the hose or the drogue is too light.
+        """
+        _, tensions = self._equilibrium_links()
+        waves = 2 * np.sqrt(tensions.max() / (self.masses_kg[0] * self.link_m))
+        links = 2 * (self._across + self._along) * self.airspeed_m_s / self.masses_kg[0]
+        drogue = 2 * self._drogue * self.airspeed_m_s / self.masses_kg[-1]
+        for name, rate in (("mass_per_length_kg_m", max(waves, links)), ("drogue_mass_kg", drogue)):
+            if rate * time_step_s > 1:
+                raise ValueError(
+                    f"hose.{name}: it moves at {rate:.3g} 1/s, too fast for steps of {time_step_s:g} s; make it heavier"
+                )
+
+    def _equilibrium_links(self) -> tuple[Array, Array]:
+        """(3, N) vectors of the links [m] and (N,) tensions [N], from the drogue up.
+
+        Each link lies along all the force at and beyond its lower end.
+        """
+        wind = np.array([self.airspeed_m_s, 0.0, 0.0])
+        weight = np.array([0.0, 0.0, -GRAVITY_M_S2])
+        beyond = self._drogue * self.airspeed_m_s * wind
+        links, tensions = np.zeros((3, self.links)), np.zeros(self.links)
+        for index in reversed(range(self.links)):
+            beyond = beyond + self.masses_kg[index] * weight
+
+            def force(angle: float, beyond: Array = beyond) -> Array:
+                drag = self._link_drag(_below_the_wind(angle)[:, None], wind[:, None])[:, 0]
+                pull: Array = beyond + drag / 2
+                return pull
+
+            def across(angle: float, force: Callable[[float], Array] = force) -> float:
+                pull = force(angle)
+                return float(pull[0] * np.sin(angle) + pull[2] * np.cos(angle))
+
+            angle = float(brentq(across, 0.0, np.pi / 2 + 1e-6, xtol=1e-15, rtol=8.9e-16))
+            direction = _below_the_wind(angle)
+            tensions[index] = np.linalg.norm(force(angle))
+            links[:, index] = direction * self.link_m
+            beyond = beyond + self._link_drag(direction[:, None], wind[:, None])[:, 0]
+        return links, tensions
+
+    def _link_drag(self, direction: Array, wind_m_s: Array) -> Array:
+        """(3, ...) drag of links along (3, ...) unit vectors in air that moves past them. [N]"""
+        along = np.einsum("i...,i...->...", direction, wind_m_s)
+        tangential = along * direction
+        normal = wind_m_s - tangential
+        speed = np.sqrt(np.einsum("i...,i...->...", normal, normal))
+        drag: Array = (self._across * speed) * normal + (self._along * np.abs(along)) * tangential
+        return drag
+
+    def forces(self, state: HoseState, air_m_s: Array) -> Array:
+        """(3, S, N) drag and weight of the nodes beyond the pod; arguments as `step`. [N]"""
+        between = state.nodes_m[..., 1:] - state.nodes_m[..., :-1]
+        past = air_m_s - state.velocities_m_s
+        half_drag = 0.5 * self._link_drag(between / self.link_m, 0.5 * (past[..., 1:] + past[..., :-1]))
+        force: Array = half_drag.copy()
+        force[..., :-1] += half_drag[..., 1:]
+        at_drogue = past[..., -1]
+        force[..., -1] += self._drogue * np.sqrt((at_drogue * at_drogue).sum(axis=0)) * at_drogue
+        force[2] -= GRAVITY_M_S2 * self.masses_kg
+        return force
+
+    def step(self, state: HoseState, air_m_s: Array, pod_m: Array, time_step_s: float) -> None:
+        """Advance a state by one step of semi-implicit Euler, with tensions that keep the links' lengths at its end.
+
+        Args:
+            state: is overwritten.
+            air_m_s: (3, S, N + 1) velocity of the air at the nodes, in the tanker's axes. [m/s]
+            pod_m: (3, S) place of the pod's exit at the end of the step. [m]
+            time_step_s: [s]
+        """
+        nodes, velocities = state.nodes_m, state.velocities_m_s
+        u = (nodes[..., 1:] - nodes[..., :-1]) / self.link_m
+        # Where the nodes would go with the tensions of the step before.
+        pull = state.tensions_n * u
+        force = self.forces(state, air_m_s) - pull
+        force[..., :-1] += pull[..., 1:]
+        velocity = velocities[..., 1:] + (time_step_s * self._inverse_masses) * force
+        place = np.empty_like(nodes)
+        place[..., 0] = pod_m
+        place[..., 1:] = nodes[..., 1:] + time_step_s * velocity
+        change = self._tension_change(u, place[..., 1:] - place[..., :-1], time_step_s)
+        state.tensions_n += change
+        pull = change * u
+        force = -pull
+        force[..., :-1] += pull[..., 1:]
+        correction = (time_step_s * self._inverse_masses) * force
+        velocities[..., 1:] = velocity + correction
+        velocities[..., 0] = (pod_m - nodes[..., 0]) / time_step_s
+        place[..., 1:] += time_step_s * correction
+        nodes[...] = place
+
+    def _tension_change(self, u: Array, ahead: Array, time_step_s: float) -> Array:
+        """(S, N) what the tensions lack so that links have their lengths at the end of the step. [N]
+
+        One step of Newton's method on the squared lengths: what it leaves is of second order in a change that is itself
+        small, and the next step takes it out.
+
+        Args:
+            u: (3, S, N) directions in which the tensions pull.
+            ahead: (3, S, N) vectors of the links at the end of the step without the change. [m]
+            time_step_s: [s]
+        """
+        excess = np.einsum("isn,isn->sn", ahead, ahead) - self.link_m**2
+        own = np.einsum("isn,isn->sn", ahead, u)
+        before, after = np.zeros_like(own), np.zeros_like(own)
+        before[:, 1:] = np.einsum("isn,isn->sn", ahead[..., 1:], u[..., :-1])
+        after[:, :-1] = np.einsum("isn,isn->sn", ahead[..., :-1], u[..., 1:])
+        _, _, _, change, _ = dgtsv(
+            -self._beside * before.ravel()[1:],
+            self._diagonal * own.ravel(),
+            -self._beside * after.ravel()[:-1],
+            excess.ravel() / (2 * time_step_s**2),
+        )
+        return np.asarray(change).reshape(own.shape)
+
+    def energy_j(self, state: HoseState) -> Array:
+        """(S,) kinetic and potential energy of all nodes beyond the pod. [J]"""
+        kinetic = 0.5 * self.masses_kg * (state.velocities_m_s[..., 1:] ** 2).sum(axis=0)
+        potential = GRAVITY_M_S2 * self.masses_kg * state.nodes_m[2, :, 1:]
+        total: Array = (kinetic + potential).sum(axis=-1)
+        return total
+
+
+def _below_the_wind(angle: float) -> Array:
+    """Unit vector from a link's upper to its lower end, turned down from the wind's direction by an angle [rad]."""
+    return np.array([np.cos(angle), 0.0, -np.sin(angle)])

@@ -1,0 +1,242 @@
+"""Sequences of a recipe: which one a pair belongs to, when it is taken, and where everything is then."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from datasets_manifest.random_streams import frame_generator
+from datasets_manifest.recipe.pose_ranges import Pose
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.sequence_ranges import SequenceRanges
+from drogue_models.parameters import DrogueParameters
+from geometry.body_axes import FRD_FROM_OPTICAL
+from geometry.pinhole import PinholeCamera
+from geometry.se3 import Array, RigidTransform, exp_twist, log_twist
+from scenes.environment import draw
+from scenes.flight.drogue_attitude import drogue_rotation, still_mouth_direction
+from scenes.flight.dropouts import HidingBar, flown_m, hiding_bar, sample_loss, sun_beside
+from scenes.flight.frame_kinematics import Moment
+from scenes.flight.hose_dynamics import HoseModel
+from scenes.flight.oscillation import sample_oscillation
+from scenes.flight.receiver import sample_attitude, wanted_places
+from scenes.flight.suspension import HOSE_OVERLAP_M, WORLD_FROM_TANKER
+from scenes.flight.trajectory import SETTLING_S, Surroundings, Trajectory, simulate
+from scenes.flight.turbulence_field import GUST_PERIOD_S, dryden, sample_gusts
+from scenes.framing import outline
+
+# Between the last pair of a sequence and the first of the next, so that no tracker takes them for neighbours.
+_PAUSE_S = 10.0
+# Bands of the tanker's and the receiver's motion; our choice.
+_TANKER_HZ, _ATTITUDE_HZ, _VIBRATION_HZ = (0.05, 0.2), (0.05, 0.6), (8.0, 40.0)
+# For rates by central differences: they err by (2 pi 40 Hz 1e-5 s)^2 / 6 = 1e-6 of the fastest vibration.
+_HALF_DIFFERENCE_S = 1e-5
+# The foremost a drogue may be: nearer, it would be in the lens. [m]
+_NEAREST_M = 0.1
+# The receiver looks into the mouth, or at least not at the back.
+_MOST_TURNED_DEG = 60.0
+# Samples beyond the last pair, for the ends of splines and differences.
+_SPARE_SAMPLES = 3
+
+
+def moment_of_sequence(recipe: Recipe, sequence: SequenceRanges, drogue: DrogueParameters, frame_index: int) -> Moment:
+    """Where everything is in one frame; the same alone, in any order and in any process.
+
+    Args:
+        recipe: as it holds for the frame's scene.
+        sequence: its section.
+        drogue: that hangs in the scene.
+        frame_index: of the frame.
+
+    Raises:
+        ValueError: the drogue comes to the lens or turns away from it, or the air is too slow for its turbulence.
+    """
+    sequence_id, place = divmod(frame_index, sequence.frames_per_sequence)
+    flight = _flight(recipe.seed, sequence_id, sequence, drogue, recipe.pose, recipe.rig.baseline_m)
+    return flight.moment(place, recipe.rig.camera)
+
+
+# A recipe's frames come in order, more or less: the last sequences that were flown are enough.
+@lru_cache(maxsize=2)
+def _flight(
+    seed: int, sequence_id: int, sequence: SequenceRanges, drogue: DrogueParameters, pose: Pose, baseline_m: float
+) -> Flight:
+    return Flight(seed, sequence_id, sequence, drogue, pose, baseline_m)
+
+
+class Flight:
+    """One sequence of a recipe, simulated."""
+
+    def __init__(
+        self,
+        seed: int,
+        sequence_id: int,
+        sequence: SequenceRanges,
+        drogue: DrogueParameters,
+        pose: Pose,
+        baseline_m: float,
+    ) -> None:
+        """Simulate it; every draw is keyed by the dataset's seed and the sequence.
+
+        Args:
+            seed: of the dataset.
+            sequence_id: which sequence.
+            sequence: how it moves.
+            drogue: that hangs on the hose.
+            pose: ranges of the receiver's mean attitude and the drogue's roll.
+            baseline_m: of the rig. [m]
+        """
+        self._id, self._sequence, self._drogue = sequence_id, sequence, drogue
+        receiver = sequence.receiver
+        tail_m = drogue.hub_depth_m + drogue.coupling_length_m - HOSE_OVERLAP_M
+        self._drogue_from_tail_m = np.array([0.0, 0.0, tail_m])
+        self._roll_rad = float(np.radians(draw(frame_generator(seed, sequence_id, "drogue roll"), pose.roll_deg)))
+        world_from_left = sample_attitude(frame_generator(seed, sequence_id, "receiver"), pose)
+        self._tanker_from_left = WORLD_FROM_TANKER.T @ world_from_left
+        shaking = frame_generator(seed, sequence_id, "receiver shake")
+        attitude_rad, vibration_rad = np.radians([receiver.attitude_sd_deg, receiver.vibration_deg])
+        self._attitude = sample_oscillation(shaking, [attitude_rad] * 3, *_ATTITUDE_HZ)
+        vibration = [receiver.vibration_m] * 3 + [vibration_rad] * 3
+        self._vibration = sample_oscillation(shaking, vibration, *_VIBRATION_HZ)
+        self._baseline_m = baseline_m
+        self._loss = sample_loss(frame_generator(seed, sequence_id, "loss"), sequence.losses, sequence_id)
+        around, settling_s = self._surroundings(seed, baseline_m, tail_m)
+        release_m = None if sequence.release_m is None else np.array(sequence.release_m)
+        self._trajectory = Trajectory(simulate(sequence.hose, around, release_m), settling_s)
+
+    def _surroundings(self, seed: int, baseline_m: float, tail_m: float) -> tuple[Surroundings, float]:
+        """What moves hose and receiver, and how long before the first pair it begins. [s]"""
+        sequence, receiver, sequence_id = self._sequence, self._sequence.receiver, self._id
+        hose = sequence.hose
+        settling_s = SETTLING_S if sequence.release_m is None else 0.0
+        span_s = settling_s + (sequence.frames_per_sequence - 1) / sequence.frame_rate_hz
+        samples = int(np.ceil(span_s / GUST_PERIOD_S)) + _SPARE_SAMPLES
+        severity = sequence.turbulence[sequence_id % len(sequence.turbulence)]
+        air = dryden(severity, hose.turbulence_altitude_m)
+        gusts = sample_gusts(frame_generator(seed, sequence_id, "gusts"), air, hose.airspeed_m_s, (samples, 1))
+        tanker = frame_generator(seed, sequence_id, "tanker motion")
+        pod = sample_oscillation(tanker, [sequence.tanker_motion_m] * 3, *_TANKER_HZ)
+        offsets = frame_generator(seed, sequence_id, "receiver offset")
+        offset_m = draw(offsets, receiver.offset_right_m), draw(offsets, receiver.offset_down_m)
+        manoeuvre = receiver.manoeuvres[sequence_id % len(receiver.manoeuvres)]
+        times = GUST_PERIOD_S * np.arange(samples) - settling_s
+        wanted = wanted_places(receiver, manoeuvre, offset_m, times) + np.array([baseline_m / 2, 0.0, 0.0])
+        links = np.diff(HoseModel(hose).equilibrium().nodes_m[:, 0], axis=-1)
+        mouth = still_mouth_direction(hose.airspeed_m_s, links[:, -1])
+        from_drogue = tail_m * mouth - wanted @ self._tanker_from_left.T
+        nose_m = np.array(receiver.nose_body_m) - np.array([receiver.body_radius_m / 2, 0.0, 0.0])
+        source = self._tanker_from_left @ (FRD_FROM_OPTICAL.inverse().rotate(nose_m))
+        around = Surroundings(gusts, pod.at, from_drogue[..., None], source, receiver.body_radius_m, receiver.follower)
+        return around, settling_s
+
+    def moment(self, place: int, camera: PinholeCamera) -> Moment:
+        """The pair at a place of the sequence.
+
+        Raises:
+            ValueError: the drogue comes to the lens or turns away from it.
+        """
+        time_s = place / self._sequence.frame_rate_hz
+        tanker_from_left = self.tanker_from_left(time_s)
+        left_from_axes = tanker_from_left.inverse()
+        self._check_seen(time_s)
+        nodes = self._trajectory.nodes_m(time_s)
+        east_m, north_m = self._camera_offset_m(time_s, tanker_from_left.translation_m)
+        pod = RigidTransform(np.eye(3), nodes[0])
+        length_s = self._sequence.frames_per_sequence / self._sequence.frame_rate_hz
+        return Moment(
+            sequence_id=self._id,
+            time_s=self._id * (length_s + _PAUSE_S) + time_s,
+            left_from_drogue=left_from_axes @ self.tanker_from_drogue(time_s),
+            world_from_left=RigidTransform(self._world_from_tanker(time_s) @ tanker_from_left.rotation, np.zeros(3)),
+            left_from_tanker=left_from_axes @ pod,
+            left_twist_per_s=_twist(self.tanker_from_left, time_s),
+            drogue_twist_per_s=_twist(self.tanker_from_drogue, time_s),
+            hose_nodes_left_m=left_from_axes.apply(nodes[::-1]),
+            camera_offset_m=(east_m, north_m),
+            loss=self._loss.kind if self._loss is not None and self._loss.acts(time_s) else None,
+            obstacle=None if self._bar is None else self._bar.at(time_s, camera),
+            sun_deg=self._sun_deg,
+        )
+
+    def _world_from_tanker(self, time_s: float) -> Array:
+        """(3, 3) attitude of the formation: eastwards, unless it turns into the sun."""
+        if self._loss is None or self._loss.kind != "glare":
+            return WORLD_FROM_TANKER
+        headed: Array = self._loss.headed(time_s) @ WORLD_FROM_TANKER
+        return headed
+
+    def _camera_offset_m(self, time_s: float, eye_m: Array) -> tuple[float, float]:
+        """East and north of the camera from where the pod was at the sequence's start. [m]"""
+        speed_m_s = self._sequence.hose.airspeed_m_s
+        if self._loss is None or self._loss.kind != "glare":
+            east_m, north_m, _ = (WORLD_FROM_TANKER @ (np.array([-speed_m_s * time_s, 0.0, 0.0]) + eye_m)).tolist()
+            return east_m, north_m
+        place_m = flown_m(self._loss, speed_m_s, time_s) + (self._world_from_tanker(time_s) @ eye_m)[:2]
+        return float(place_m[0]), float(place_m[1])
+
+    def _left_from_drogue(self, time_s: float) -> RigidTransform:
+        pose: RigidTransform = self.tanker_from_left(time_s).inverse() @ self.tanker_from_drogue(time_s)
+        return pose
+
+    @cached_property
+    def _bar(self) -> HidingBar | None:
+        """What hides the drogue in this sequence."""
+        if self._loss is None or self._loss.kind != "occlusion":
+            return None
+        return hiding_bar(self._loss, outline(self._drogue), self._baseline_m, self._left_from_drogue)
+
+    @cached_property
+    def _sun_deg(self) -> tuple[float, float] | None:
+        """Elevation and azimuth of the sun, where this sequence needs it somewhere. [deg]"""
+        if self._loss is None or self._loss.kind != "glare":
+            return None
+        middle_s = self._loss.middle_s
+        rotation = self._world_from_tanker(middle_s) @ self.tanker_from_left(middle_s).rotation
+        world_from_left = RigidTransform(rotation, np.zeros(3))
+        middle_m = self._left_from_drogue(middle_s).translation_m
+        return sun_beside(self._loss, world_from_left, middle_m, self._drogue.rim_radius_m)
+
+    def tanker_from_left(self, time_s: float) -> RigidTransform:
+        """Pose of the left eye in axes that fly along with the tanker."""
+        steady = self._steady_tanker_from_left(time_s)
+        if self._loss is None or self._loss.kind != "out-of-view":
+            return steady
+        return RigidTransform(steady.rotation @ self._loss.turned(time_s), steady.translation_m)
+
+    def _steady_tanker_from_left(self, time_s: float) -> RigidTransform:
+        """The same of a receiver that does not turn aside."""
+        shake = self._vibration.at(time_s)
+        turn = exp_twist(np.concatenate([np.zeros(3), self._attitude.at(time_s) + shake[3:]])).rotation
+        rotation = self._tanker_from_left @ turn
+        return RigidTransform(rotation, self._trajectory.eye_m(time_s) + rotation @ shake[:3])
+
+    def tanker_from_drogue(self, time_s: float) -> RigidTransform:
+        """Pose of the drogue in the same axes: its coupling at the end of the hose, its mouth to the air."""
+        rotation = drogue_rotation(self._trajectory.mouth(time_s), self._roll_rad)
+        return RigidTransform(rotation, self._trajectory.nodes_m(time_s)[-1] - rotation @ self._drogue_from_tail_m)
+
+    def _check_seen(self, time_s: float) -> None:
+        # Of a receiver that does not turn aside: which side of the drogue it sees does not depend on where it looks.
+        left_from_drogue = self._steady_tanker_from_left(time_s).inverse() @ self.tanker_from_drogue(time_s)
+        depth_m = float(left_from_drogue.translation_m[2])
+        what = f"sequence {self._id}: leaves the visible volume at {time_s:.2f} s"
+        if depth_m - self._drogue.rim_radius_m < _NEAREST_M:
+            raise ValueError(
+                f"{what}: the drogue's rim comes to {depth_m:.2f} m from the left eye; raise end_m or abort_m, or take "
+                "a faster follower or calmer air"
+            )
+        turned_deg = float(np.degrees(np.arccos(np.clip(left_from_drogue.rotation[2, 2], -1, 1))))
+        if turned_deg > _MOST_TURNED_DEG:
+            raise ValueError(
+                f"{what}: the drogue's axis is {turned_deg:.0f} degrees from the camera's, more than "
+                f"{_MOST_TURNED_DEG:g}; raise hose.airspeed_m_s, or tilt the camera by pose.camera_pitch_deg"
+            )
+
+
+def _twist(pose_at: Callable[[float], RigidTransform], time_s: float) -> Array:
+    """(6,) rate of a pose in its own frame: velocity [m/s], angular velocity [rad/s]."""
+    step = pose_at(time_s - _HALF_DIFFERENCE_S).inverse() @ pose_at(time_s + _HALF_DIFFERENCE_S)
+    rate: Array = log_twist(step) / (2 * _HALF_DIFFERENCE_S)
+    return rate

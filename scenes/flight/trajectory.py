@@ -1,0 +1,166 @@
+"""How hose, drogue and receiver move through one sequence, at any time of it.
+
+All is simulated from the beginning, on time grids that the asked-for times have no part in; cubic splines through the
+samples are, by definition, the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+
+from datasets_manifest.recipe.hose import HoseParameters
+from datasets_manifest.recipe.sequence_ranges import Follower
+from geometry.se3 import Array
+from scenes.flight.bow_wave import bow_wave
+from scenes.flight.drogue_attitude import mouth_directions
+from scenes.flight.hose_dynamics import LINKS, TIME_STEP_S, HoseModel, HoseState
+from scenes.flight.receiver import Guidance
+from scenes.flight.turbulence_field import GUST_PERIOD_S
+
+# The first moments, in which hose and receiver forget how they began: the slowest swing dies out within a few periods.
+SETTLING_S = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What moves hose and receiver from outside; all arrays start at the first moment of the simulation.
+
+    Attributes:
+        gusts_m_s: (T, 3, S) along the flight, sideways to the right, and up, `GUST_PERIOD_S` apart. [m/s]
+        pod_m: (...) times [s] to (..., 3) places of the pod about its mean [m].
+        from_drogue_m: (T, 3, S) where the receiver's left eye should be from the drogue's coupling. [m]
+        nose_source_m: (3,) source of the bow wave from the left eye, in the tanker's axes. [m]
+        body_radius_m: of the receiver's nose; 0 for no bow wave. [m]
+        follower: the receiver's guidance.
+    """
+
+    gusts_m_s: Array
+    pod_m: Callable[[Array], Array]
+    from_drogue_m: Array
+    nose_source_m: Array
+    body_radius_m: float
+    follower: Follower
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Samples of a simulation, `GUST_PERIOD_S` apart; axes are the tanker's.
+
+    Attributes:
+        nodes_m: (T, 3, S, N + 1) from the pod to the drogue. [m]
+        past_drogue_m_s: (T, 3, S) velocity of the air past the drogue. [m/s]
+        eye_m: (T, 3, S) receiver's left eye. [m]
+    """
+
+    nodes_m: Array
+    past_drogue_m_s: Array
+    eye_m: Array
+
+
+def simulate(
+    hose: HoseParameters, around: Surroundings, release_m: Array | None = None, time_step_s: float = TIME_STEP_S
+) -> Motion:
+    """Simulate sequences from the beginning.
+
+    Args:
+        hose: the hose and its flight condition.
+        around: what moves it.
+        release_m: (3,) where the drogue is let go, or None for the equilibrium in still air. [m]
+        time_step_s: of the hose; a whole part of `GUST_PERIOD_S`. [s]
+
+    Raises:
+        ValueError: a time step that does not fit, a hose that is too light for it, or does not reach to `release_m`.
+    """
+    substeps = round(GUST_PERIOD_S / time_step_s)
+    if substeps < 1 or abs(substeps * time_step_s - GUST_PERIOD_S) > 1e-12:
+        raise ValueError(f"time_step_s: must be a whole part of {GUST_PERIOD_S} s, got {time_step_s}")
+    samples, _, sequences = around.gusts_m_s.shape
+    model = HoseModel(hose, sequences)
+    model.check_step(time_step_s)
+    still = model.equilibrium()
+    state = model.equilibrium() if release_m is None else _released(hose, release_m, sequences)
+    times = time_step_s * np.arange(samples * substeps + 1)
+    pod_m = np.broadcast_to(around.pod_m(times)[..., None], (len(times), 3, sequences))
+    state.nodes_m += pod_m[0][..., None]
+    hanging_m = still.nodes_m[..., -1]
+    begin_m = hanging_m if around.follower.bandwidth_hz == 0 else state.nodes_m[..., -1]
+    guidance = Guidance(around.follower, GUST_PERIOD_S, begin_m + around.from_drogue_m[0])
+    closing_m_s = np.gradient(around.from_drogue_m, GUST_PERIOD_S, axis=0)
+    gusts = np.concatenate([around.gusts_m_s, around.gusts_m_s[-1:]])
+    nodes, past, eyes = [], [], []
+    for k in range(samples):
+        if around.follower.bandwidth_hz == 0:
+            guidance.place_m = hanging_m + around.from_drogue_m[k]
+            guidance.velocity_m_s = closing_m_s[k]
+        else:
+            guidance.steer(state.nodes_m[..., -1], around.from_drogue_m[k], closing_m_s[k])
+        for step in range(substeps):
+            share = step / substeps
+            gust = gusts[k] + share * (gusts[k + 1] - gusts[k])
+            air = np.repeat(gust[..., None], LINKS + 1, axis=-1)
+            air[0] += hose.airspeed_m_s
+            if around.body_radius_m > 0:
+                source = guidance.place_after(share * GUST_PERIOD_S) + around.nose_source_m[:, None]
+                air += bow_wave(state.nodes_m, source, hose.airspeed_m_s, around.body_radius_m)
+            if step == 0:
+                nodes.append(state.nodes_m.copy())
+                past.append(air[..., -1] - state.velocities_m_s[..., -1])
+                eyes.append(guidance.place_m)
+            model.step(state, air, pod_m[k * substeps + step + 1], time_step_s)
+        guidance.move()
+    return Motion(np.stack(nodes), np.stack(past), np.stack(eyes))
+
+
+def _released(hose: HoseParameters, release_m: Array, sequences: int) -> HoseState:
+    """A hose that hangs at rest in an arc from the pod to a place, with all links of their length."""
+    chord_m = float(np.linalg.norm(release_m))
+    ratio = chord_m / hose.length_m
+    if ratio >= 1 or chord_m == 0:
+        raise ValueError(
+            f"release_m: a hose of {hose.length_m:g} m cannot hang between the pod and a place {chord_m:g} m away"
+        )
+    # A polygon of N equal chords of an arc, each turned by `turn` from the one before: sin(N turn/2) / (N sin(turn/2)).
+    turn = brentq(
+        lambda angle: np.sin(LINKS * angle / 2) / (LINKS * np.sin(angle / 2)) - ratio, 1e-9, 2 * np.pi / LINKS
+    )
+    along = np.asarray(release_m) / chord_m
+    down = np.array([0.0, 0.0, -1.0]) - along * -along[2]
+    if np.linalg.norm(down) < 1e-9:
+        down = np.array([1.0, 0.0, 0.0])
+    down = down / np.linalg.norm(down)
+    angles = turn * ((LINKS - 1) / 2 - np.arange(LINKS))
+    links = hose.length_m / LINKS * (np.cos(angles) * along[:, None] + np.sin(angles) * down[:, None])
+    nodes = np.zeros((3, sequences, LINKS + 1))
+    nodes[:, :, 1:] = np.cumsum(links, axis=1)[:, None]
+    return HoseState(nodes, np.zeros_like(nodes), np.zeros((sequences, LINKS)))
+
+
+class Trajectory:
+    """One simulated sequence as functions of time, which starts at 0 when the settling is over."""
+
+    def __init__(self, motion: Motion, settling_s: float) -> None:
+        """Put splines through the samples of the first sequence of a simulation."""
+        times = GUST_PERIOD_S * np.arange(len(motion.nodes_m)) - settling_s
+        nodes = motion.nodes_m[:, :, 0]
+        mouth = mouth_directions(motion.past_drogue_m_s[..., 0], nodes[..., -1] - nodes[..., -2], GUST_PERIOD_S)
+        self.end_s = float(times[-1])
+        self._nodes = CubicSpline(times, nodes.transpose(0, 2, 1))
+        self._mouth = CubicSpline(times, mouth)
+        self._eye = CubicSpline(times, motion.eye_m[..., 0])
+
+    def nodes_m(self, time_s: float) -> Array:
+        """(N + 1, 3) hose from the pod to the drogue's coupling. [m]"""
+        return np.asarray(self._nodes(time_s), dtype=np.float64)
+
+    def mouth(self, time_s: float) -> Array:
+        """(3,) direction from the coupling to the mouth, not of unit length."""
+        return np.asarray(self._mouth(time_s), dtype=np.float64)
+
+    def eye_m(self, time_s: float) -> Array:
+        """(3,) receiver's left eye, without its vibration. [m]"""
+        return np.asarray(self._eye(time_s), dtype=np.float64)

@@ -1,0 +1,1 @@
+"""Land and sea below the camera."""

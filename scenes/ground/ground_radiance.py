@@ -1,0 +1,272 @@
+"""Land and sea below the camera as a function of direction."""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import cached_property, lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.random_streams import frame_generator
+from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.ground import GroundKind
+from drogue_models.parameters import ReflectanceRgb
+from scenes.clouds.ray_march import enlarge
+from scenes.ground.coast import Coast
+from scenes.ground.land_tiles import LandKind, land_tile
+from scenes.ground.sea import GroundLight, Sea
+from scenes.ground.ships import put_ships, sample_ships
+from scenes.ground_view import GroundView, ground_view, pixel_angle_rad
+from scenes.mip_tile import Field, MipTile, power_noise, smooth_noise
+from scenes.sky.light import Radiance
+
+__all__ = ["MEAN_REFLECTANCE", "Ground", "GroundLight"]
+
+MEAN_REFLECTANCE: dict[GroundKind, ReflectanceRgb] = {
+    "sea": (0.006, 0.022, 0.030),  # of the water under the surface, which mirrors besides
+    "forest": (0.036, 0.051, 0.021),
+    "fields": (0.106, 0.110, 0.050),
+    "dry": (0.207, 0.155, 0.107),
+    "coast": (0.106, 0.110, 0.050),  # of its land
+    "town": (0.130, 0.112, 0.090),
+}
+
+_LAND_OF: dict[GroundKind, LandKind] = {
+    "sea": "fields",
+    "coast": "fields",
+    "forest": "forest",
+    "fields": "fields",
+    "dry": "dry",
+    "town": "town",
+}
+_SEED = 3
+# Slowly varying fields are worked out on every so many pixels of a large picture.
+_STEP_PX, _MANY_RAYS = 8, 60_000
+# Pieces in a block of rays are of about one size, so that one or two copies of a picture serve it.
+_BLOCK_ROWS, _BLOCK_COLUMNS = 32, 320
+_SMOOTH_PX, _SMOOTH_TEXEL_M = 512, 60.0
+_WARP_M = 110.0
+# Contrast that is left of ground so far away that its detail need not be worked out.
+_HIDDEN = 0.004
+# With less contrast than this, every other pixel down and across will do.
+_HAZY, _HAZY_STEP_PX = 0.5, 2
+# Standard deviation of the terrain's slope.
+_RELIEF: dict[GroundKind, float] = {"forest": 0.10, "dry": 0.13, "fields": 0.025, "coast": 0.05}
+# Hedges and rows of trees so high, so far apart, hide what lies behind them from low rays; what one sees of them.
+_HEDGE_M, _HEDGE_SPACING_M = 6.0, 220.0
+_HEDGE_SIDE = np.array([0.048, 0.062, 0.026], dtype=np.float32)
+_BRIGHTNESS, _TOWN_ABOVE, _GRAIN_BELOW_M, _GRAIN = 0.13, -0.45, 8.0, 0.22
+# Towns are lit when less daylight than this falls on them; the lamps' radiance is that of a lit street with the lamps.
+_LAMPS_ON_LUX = 40.0
+_LAMP_CD_M2 = np.array([36.0, 25.0, 14.0], dtype=np.float32)
+
+
+@lru_cache(maxsize=1)
+def _regions() -> MipTile:
+    """Three fields whose signs tell regions apart, and one of brightness."""
+    made = [smooth_noise(_SEED, f"region {index}", _SMOOTH_PX, 9.0) for index in range(3)]
+    made.append(power_noise(_SEED, "brightness", _SMOOTH_PX, 1.6, 6.0))
+    return MipTile(np.stack(made, axis=-1), _SMOOTH_TEXEL_M)
+
+
+@lru_cache(maxsize=1)
+def _shapes() -> MipTile:
+    """By how much places are moved east and north, and the terrain's slopes; each of unit variance."""
+    moved = [smooth_noise(_SEED, f"moved {axis}", _SMOOTH_PX, 17.0) for axis in "xy"]
+    height = power_noise(_SEED, "terrain", _SMOOTH_PX, 2.1, 7.0)
+    slopes = [np.roll(height, -1, axis) - np.roll(height, 1, axis) for axis in (1, 0)]
+    return MipTile(np.stack([*moved, *(slope / slope.std() for slope in slopes)], axis=-1), _SMOOTH_TEXEL_M)
+
+
+@lru_cache(maxsize=1)
+def _grain() -> MipTile:
+    """What pictures of land are too coarse to show from low down."""
+    return MipTile(power_noise(_SEED, "grain", 512, 1.0, 24.0)[..., None], 0.4)
+
+
+class Ground:
+    """Land or sea of one environment under its light.
+
+    Args:
+        environment: kind, colour and seed of the ground, altitude and wind.
+        light: what shines on it.
+    """
+
+    def __init__(self, environment: Environment, light: GroundLight) -> None:
+        self._environment = environment
+        self._light = light
+        self._kind = environment.ground
+        rng = frame_generator(environment.ground_texture_seed, 0, "ground")
+        self._shift_m = rng.uniform(0, 1e5, 2).astype(np.float32)
+        angles = rng.uniform(0, 2 * np.pi, 8)
+        self._turns = np.stack([np.cos(angles), np.sin(angles), *rng.uniform(0, 1e5, (2, 8))]).astype(np.float32)
+        wind_rad = float(rng.uniform(-np.pi, np.pi))
+        self._sea = Sea(light, environment.wind_speed_m_s, wind_rad) if self._kind in ("sea", "coast") else None
+        self._coast = Coast(rng, environment.altitude_m) if self._kind == "coast" else None
+        self._ships = sample_ships(rng, environment.altitude_m) if self._kind == "sea" else ()
+
+    def radiance(self, directions: NDArray[np.float32], uncovered: Field | None = None) -> Radiance:
+        """Radiance of the ground as if there were no air before it.
+
+        Args:
+            directions: (H, W, 3) unit vectors in world axes, those above the horizon see the ground's farthest rim.
+            uncovered: (H, W) share that clouds do not hide; what is hidden altogether is not worked out.
+
+        Returns:
+            (H, W, 3) radiance. [cd/m2]
+        """
+        angle_rad = pixel_angle_rad(directions)
+        total = np.empty(directions.shape, dtype=np.float32)
+        every = _STEP_PX if directions.shape[0] * directions.shape[1] >= _MANY_RAYS else 1
+        regions, shapes = self._smooth_fields(directions, every, angle_rad)
+        nearest_m = self._environment.altitude_m / np.maximum(-directions[..., 2].min(axis=1), 1e-6)
+        clear = np.exp(-self._environment.extinction_per_m * nearest_m)
+        for first in range(0, directions.shape[0], _BLOCK_ROWS):
+            rows = slice(first, first + _BLOCK_ROWS)
+            if clear[rows].max() < _HIDDEN:
+                total[rows] = self._mean_radiance
+                continue
+            step = _HAZY_STEP_PX if every > 1 and clear[rows].max() < _HAZY else 1
+            for left in range(0, directions.shape[1], _BLOCK_COLUMNS):
+                block = rows, slice(left, left + _BLOCK_COLUMNS)
+                if uncovered is not None and uncovered[block].max() < _HIDDEN:
+                    total[block] = self._mean_radiance
+                    continue
+                # One ray more than the block has, so that what lies between them can be interpolated.
+                chosen = tuple(slice(part.start, part.stop + step - 1, step) for part in block)
+                view = self._view(directions[chosen], step * angle_rad)
+                seen = self._block(view, regions[chosen], shapes[chosen])
+                height, width = total[block].shape[:2]
+                total[block] = seen if step == 1 else enlarge(seen, step, (height, width))
+        return total
+
+    def seen_from(self, environment: Environment) -> Ground:
+        """The same ground from another place at the same altitude.
+
+        Args:
+            environment: this ground's, with another `camera_offset_m`.
+        """
+        moved = copy(self)
+        moved._environment = environment
+        return moved
+
+    def _view(self, directions: NDArray[np.float32], angle_rad: float) -> GroundView:
+        environment = self._environment
+        return ground_view(directions, environment.altitude_m, angle_rad, environment.camera_offset_m)
+
+    @property
+    def _mean_radiance(self) -> NDArray[np.float32]:
+        reflected = np.array(self._environment.ground_reflectance_rgb) * self._light.level_lux / np.pi
+        return reflected.astype(np.float32)
+
+    def _smooth_fields(self, directions: NDArray[np.float32], every: int, angle_rad: float) -> tuple[Field, Field]:
+        """(H, W, 4) regions; (H, W, 3) by how much places are moved, and the share of the beam that the slope takes."""
+        view = self._view(directions if every == 1 else _between(directions, every), every * angle_rad)
+        x_m, y_m = view.x_m + self._shift_m[0], view.y_m + self._shift_m[1]
+        fields = [tile.sample(x_m, y_m, np.sqrt(view.across_m * view.along_m)) for tile in (_regions(), _shapes())]
+        fields[1] = np.concatenate([fields[1][..., :2], self._facing(fields[1][..., 2:])[..., None]], axis=-1)
+        if every == 1:
+            return fields[0], fields[1]
+        height, width = directions.shape[:2]
+        full = [cv2.resize(field, None, fx=every, fy=every, interpolation=cv2.INTER_LINEAR) for field in fields]
+        return full[0][:height, :width], full[1][:height, :width]
+
+    def _block(self, view: GroundView, regions: Field, shapes: Field) -> Radiance:
+        gusts = np.clip(1.0 + np.float32(0.26) * regions[..., 3] + np.float32(0.08) * shapes[..., 0], 0.4, 1.9)
+        if self._kind == "sea":
+            assert self._sea is not None
+            water = self._sea.radiance(
+                view, np.array(self._environment.ground_reflectance_rgb, dtype=np.float32), gusts
+            )
+            put_ships(water, view, self._ships, self._light)
+            return water
+        offshore_m = None
+        if self._coast is not None:
+            offshore_m = self._coast.offshore_m(view, regions, shapes)
+            if offshore_m.min() > self._coast.reach_m:
+                return self._water(view, offshore_m, gusts)
+        land = self._land(view, regions, shapes, offshore_m)
+        if self._coast is None or offshore_m is None or offshore_m.max() < -self._coast.reach_m:
+            return land
+        wet = self._coast.wet_share(view, offshore_m)[..., None]
+        result: Radiance = land + wet * (self._water(view, offshore_m, gusts) - land)
+        return result
+
+    def _water(self, view: GroundView, offshore_m: Field, gusts: Field) -> Radiance:
+        assert self._coast is not None and self._sea is not None
+        body = self._coast.body_rgb(offshore_m, np.array(MEAN_REFLECTANCE["sea"], dtype=np.float32))
+        water = self._sea.radiance(view, body, gusts)
+        surf = self._coast.surf_share(view, offshore_m)[..., None]
+        foam = np.float32(0.45) * (self._light.level_lux / np.pi).astype(np.float32)
+        result: Radiance = water + surf * (foam - water)
+        return result
+
+    def _land(self, view: GroundView, regions: Field, shapes: Field, offshore_m: Field | None) -> Radiance:
+        kind = _LAND_OF[self._kind]
+        region = (regions[..., 0] > 0).astype(np.intp) + 2 * (regions[..., 1] > 0) + 4 * (regions[..., 2] > 0)
+        cosine, sine, shift_u, shift_v = self._turns[:, region]
+        moved = np.float32(_WARP_M) * shapes[..., :2]
+        turn = cosine, sine
+        shift = (
+            shift_u + cosine * moved[..., 0] + sine * moved[..., 1],
+            shift_v + cosine * moved[..., 1] - sine * moved[..., 0],
+        )
+        seen = view.average(land_tile(kind), turn, shift)
+        if kind == "town":
+            edge = regions[..., 0] + np.float32(0.25) * regions[..., 3] + np.float32(0.2) * shapes[..., 0]
+            outskirts = edge < np.float32(_TOWN_ABOVE)
+            if outskirts.any():
+                seen = np.where(outskirts[..., None], view.average(land_tile("fields"), turn, shift), seen)
+        tint = np.array(self._environment.ground_reflectance_rgb) / land_tile(kind).mean[:3]
+        brightness = np.clip(1.0 + np.float32(_BRIGHTNESS) * regions[..., 3], 0.5, 1.6)
+        if float(view.across_m.min()) < _GRAIN_BELOW_M:
+            near = np.clip(2.0 - 2.0 * view.across_m / np.float32(_GRAIN_BELOW_M), 0.0, 1.0)
+            grain = near * view.average(_grain())[..., 0]
+            brightness = brightness * np.maximum(1.0 + np.float32(_GRAIN) * grain, 0.2)
+        albedo = seen[..., :3] * tint.astype(np.float32) * brightness[..., None]
+        if kind == "fields":
+            # Seen from the side, a hedge takes its height over the sine of the ray out of the ground's length.
+            behind = np.exp(np.float32(-_HEDGE_M / _HEDGE_SPACING_M) / view.sine)[..., None]
+            albedo = _HEDGE_SIDE + behind * (albedo - _HEDGE_SIDE)
+        if self._coast is not None and offshore_m is not None:
+            albedo = self._coast.with_beach(albedo, view, offshore_m)
+        result: Radiance = albedo * self._lit(shapes[..., 2])
+        if self._lamps_on > 0:
+            result += (self._lamps_on * seen[..., 3])[..., None] * _LAMP_CD_M2
+        return result
+
+    def _facing(self, slopes: Field) -> Field:
+        """(H, W) cosine between the beam and the terrain of (H, W, 2) slopes, relative to their spread."""
+        relief = np.float32(_RELIEF.get(self._kind, 0.0))
+        to_sun = self._light.beam_direction.astype(np.float32)
+        east, north = relief * slopes[..., 0], relief * slopes[..., 1]
+        facing = (to_sun[2] - east * to_sun[0] - north * to_sun[1]) / np.sqrt(1.0 + east * east + north * north)
+        result: Field = np.maximum(facing, np.float32(0.0))
+        return result
+
+    def _lit(self, facing: Field) -> Radiance:
+        """(H, W, 3) or (3,) reflected radiance of a white surface that follows the terrain."""
+        light = self._light
+        if self._kind not in _RELIEF or light.beam_direction[2] <= 0:
+            return (light.level_lux / np.pi).astype(np.float32)
+        sky = (light.sky_lux / np.pi).astype(np.float32)
+        result: Radiance = facing[..., None] * (light.beam_lux / np.pi).astype(np.float32) + sky
+        return result
+
+    @cached_property
+    def _lamps_on(self) -> np.float32:
+        """0 by day, 1 by night."""
+        daylight_lux = float(self._light.level_lux.mean())
+        return np.float32(np.clip(2.0 * (1.0 - daylight_lux / _LAMPS_ON_LUX), 0.0, 1.0))
+
+
+def _between(directions: NDArray[np.float32], every: int) -> NDArray[np.float32]:
+    """(H / every, W / every, 3) directions in the middles of squares of rays, rounded up; an even number to a side."""
+    for axis in (0, 1):
+        last = directions.shape[axis] - 1
+        first = np.arange(every // 2 - 1, last + every // 2, every)
+        before, behind = (directions.take(np.minimum(place, last), axis=axis) for place in (first, first + 1))
+        directions = (before + behind) / 2
+    return directions

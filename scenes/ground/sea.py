@@ -1,0 +1,233 @@
+"""The sea: waves, the sky's and the sun's reflections in them, foam."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.random_streams import frame_generator
+from scenes.ground_view import GroundView
+from scenes.mip_tile import Field, MipTile, power_noise
+from scenes.sky.light import Radiance
+
+_WATER_INDEX = 1.34
+_SEED = 5
+_TILE_PX, _TILE_TEXEL_M = 1024, 2.0
+_LONGEST_WAVE_M, _SHORTEST_WAVE_M = 75.0, 4.0
+# Slopes spread evenly over the octaves between gravity waves and ripples; these are the longest 4 of about 13.
+_RESOLVED_SHARE = 0.3
+_FOAM_REFLECTANCE = 0.35  # fresh and fading foam, Koepke 1984 (doi:10.1364/AO.23.001816)
+_FOAM_PATCHES = 0.01  # share of the tile under foam patches
+_TABLE_ROWS, _TABLE_COLUMNS = 20, 36
+_SKY_ROWS, _SKY_COLUMNS = 24, 72
+
+
+@dataclass(frozen=True, eq=False)
+class GroundLight:
+    """What shines on the ground.
+
+    Attributes:
+        sky_lux: (3,) illuminance of level ground by everything but the beam. [lux]
+        beam_direction: (3,) unit vector towards sun or moon.
+        beam_lux: (3,) illuminance of a plane that faces it. [lux]
+        sky_radiance: radiance of the sky along (H, W, 3) directions above the horizon. [cd/m2]
+    """
+
+    sky_lux: NDArray[np.float64]
+    beam_direction: NDArray[np.float64]
+    beam_lux: NDArray[np.float64]
+    sky_radiance: Callable[[NDArray[np.float32]], Radiance]
+
+    @property
+    def level_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of level ground. [lux]"""
+        result: NDArray[np.float64] = self.sky_lux + self.beam_lux * max(float(self.beam_direction[2]), 0.0)
+        return result
+
+
+def slope_variances(wind_speed_m_s: float) -> tuple[float, float]:
+    """Mean squares of the slopes of a clean sea, along the wind and across it.
+
+    Source: Cox and Munk 1954 (doi:10.1364/JOSA.44.000838), from the wind at 12.5 m.
+    """
+    return 0.00316 * wind_speed_m_s + 1e-3, 0.003 + 0.00192 * wind_speed_m_s
+
+
+def foam_fraction(wind_speed_m_s: float) -> float:
+    """Share of the sea under whitecaps. Source: Monahan and O'Muircheartaigh 1980, W = 3.84e-6 U^3.41."""
+    return float(3.84e-6 * wind_speed_m_s**3.41)
+
+
+def fresnel(cosine: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Share of unpolarised light that water reflects, from the cosine of the angle of incidence."""
+    inside = np.sqrt(1.0 - (1.0 - cosine * cosine) / _WATER_INDEX**2)
+    across = ((cosine - _WATER_INDEX * inside) / (cosine + _WATER_INDEX * inside)) ** 2
+    along = ((inside - _WATER_INDEX * cosine) / (inside + _WATER_INDEX * cosine)) ** 2
+    result: NDArray[np.floating[Any]] = 0.5 * (across + along)
+    return result
+
+
+def hidden_share(sine: NDArray[np.floating[Any]], variance: float) -> NDArray[np.floating[Any]]:
+    """Smith's Lambda: what waves hide of each other, against what is seen of them.
+
+    Source: Smith 1967 (doi:10.1109/TAP.1967.1138991), with Walter et al. 2007's rational approximation
+    (doi:10.2312/EGWR/EGSR07/195-206).
+    """
+    cotangent = sine / np.sqrt(np.maximum(1.0 - sine * sine, 1e-6))
+    a = cotangent / np.sqrt(2.0 * variance)
+    result: NDArray[np.floating[Any]] = np.where(
+        a < 1.6, (1 - 1.259 * a + 0.396 * a * a) / (3.535 * a + 2.181 * a * a), 0
+    )
+    return result
+
+
+@lru_cache(maxsize=1)
+def _wave_tile() -> MipTile:
+    """Slopes along and across the wind (together of unit variance), and patches of foam (mean `_FOAM_PATCHES`)."""
+    rng = frame_generator(_SEED, 0, "waves")
+    k1, k2 = np.meshgrid(
+        np.fft.fftfreq(_TILE_PX, _TILE_TEXEL_M), np.fft.rfftfreq(_TILE_PX, _TILE_TEXEL_M), indexing="ij"
+    )
+    k = np.hypot(k1, k2)
+    safe = np.maximum(k, 1e-9)
+    # Equal slope variance in every octave: the height's amplitude goes as k^-2 in two dimensions.
+    band = np.exp(-((1.0 / (safe * _LONGEST_WAVE_M)) ** 4)) * (k < 1.0 / _SHORTEST_WAVE_M)
+    spread = np.sqrt(0.25 + (k2 / safe) ** 4)
+    height = np.fft.rfft2(rng.standard_normal((_TILE_PX, _TILE_PX))) * np.where(k > 0, band * spread / safe**2, 0.0)
+    size = (_TILE_PX, _TILE_PX)
+    along, across = np.fft.irfft2(1j * k2 * height, s=size), np.fft.irfft2(1j * k1 * height, s=size)
+    scale = 1.0 / np.sqrt(along.var() + across.var())
+    noise = power_noise(_SEED, "foam", _TILE_PX, 0.9, 60.0)
+    foam = noise > np.quantile(noise, 1.0 - _FOAM_PATCHES)
+    return MipTile(np.stack([along * scale, across * scale, foam], axis=-1).astype(np.float32), _TILE_TEXEL_M)
+
+
+class Sea:
+    """Water under one sky and wind.
+
+    Args:
+        light: what shines on it.
+        wind_speed_m_s: at 12.5 m above it. [m/s]
+        wind_rad: where the wind blows to, from east towards north. [rad]
+    """
+
+    def __init__(self, light: GroundLight, wind_speed_m_s: float, wind_rad: float) -> None:
+        self._light = light
+        self._along, self._across = slope_variances(wind_speed_m_s)
+        self._foam = foam_fraction(wind_speed_m_s)
+        self._wind = np.float32(np.cos(wind_rad)), np.float32(np.sin(wind_rad))
+        self._table = self._sky_table()
+
+    def radiance(self, view: GroundView, body_rgb: Field, gusts: Field) -> Radiance:
+        """(H, W, 3) radiance of the water. [cd/m2]
+
+        Args:
+            view: which pieces of it.
+            body_rgb: (H, W, 3) or (3,) diffuse reflectance of what lies under the surface.
+            gusts: (H, W) by which the variance of the slopes is larger than elsewhere.
+        """
+        cosine, sine = (np.full_like(view.x_m, value) for value in self._wind)
+        waves = view.average(_wave_tile(), (cosine, sine))
+        size = np.float32(np.sqrt(_RESOLVED_SHARE * (self._along + self._across))) * np.sqrt(gusts)
+        slope_x = size * (cosine * waves[..., 0] - sine * waves[..., 1])
+        slope_y = size * (sine * waves[..., 0] + cosine * waves[..., 1])
+        towards = slope_x * view.away_x + slope_y * view.away_y
+        mirrored = self._mirrored_sky(view, towards)
+        mirrored += self._glint(view, slope_x, slope_y, gusts)
+        level = (self._light.level_lux / np.pi).astype(np.float32)
+        foam = np.minimum(waves[..., 2] * gusts * np.float32(self._foam / _FOAM_PATCHES), 1.0)[..., None]
+        water = mirrored + np.asarray(body_rgb, dtype=np.float32) * level
+        result: Radiance = water + foam * (np.float32(_FOAM_REFLECTANCE) * level - water)
+        return result
+
+    def _mirrored_sky(self, view: GroundView, towards: Field) -> Radiance:
+        """Sky in waves that are tilted by a resolved slope towards the camera; the finer ones are in the table."""
+        elevation = np.arcsin(np.clip(view.sine, 0.0, 1.0)) + towards
+        row = _row_of_elevation(np.clip(elevation, 0.0, np.pi / 2)).astype(np.float32)
+        azimuth = np.arctan2(view.away_y, view.away_x)
+        column = np.mod(azimuth * np.float32(_TABLE_COLUMNS / (2 * np.pi)), np.float32(_TABLE_COLUMNS))
+        # One column is repeated at the end, for remap wraps rows as well as columns.
+        seen = cv2.remap(self._table, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(seen, dtype=np.float32).reshape(*view.x_m.shape, 3)
+
+    def _glint(self, view: GroundView, slope_x: Field, slope_y: Field, gusts: Field) -> Radiance:
+        """Sun or moon in the waves: the share of the surface that is tilted just so.
+
+        Source: Cox and Munk 1954, as above; L = R E p / (4 sin(elevation of the camera) cos^4(tilt)).
+        """
+        to_sun = self._light.beam_direction.astype(np.float32)
+        if to_sun[2] <= 0 or self._light.beam_lux.max() <= 0:
+            return np.zeros((*view.x_m.shape, 3), dtype=np.float32)
+        level = np.sqrt(np.maximum(1.0 - view.sine * view.sine, 0.0))
+        half_x, half_y = to_sun[0] - level * view.away_x, to_sun[1] - level * view.away_y
+        half_z = to_sun[2] + view.sine
+        length = np.sqrt(half_x**2 + half_y**2 + half_z**2)
+        tilt_x, tilt_y = -half_x / half_z - slope_x, -half_y / half_z - slope_y
+        cosine, sine = self._wind
+        along, across = cosine * tilt_x + sine * tilt_y, cosine * tilt_y - sine * tilt_x
+        left = np.float32(1.0 - _RESOLVED_SHARE) * gusts
+        vu, vc = np.float32(self._along) * left, np.float32(self._across) * left
+        density = np.exp(-0.5 * (along**2 / vu + across**2 / vc)) / (np.float32(2 * np.pi) * np.sqrt(vu * vc))
+        incidence = np.clip(0.5 * length, 0.0, 1.0)
+        variance = 0.5 * (self._along + self._across)
+        seen = 1.0 / (1.0 + hidden_share(view.sine, variance) + hidden_share(to_sun[2:], variance))
+        fourth = (half_z / length) ** 4
+        share = fresnel(incidence) * density * seen / (4.0 * np.maximum(view.sine, 0.01) * fourth)
+        result: Radiance = share.astype(np.float32)[..., None] * self._light.beam_lux.astype(np.float32)
+        return result
+
+    def _sky_table(self) -> Radiance:
+        """(rows, columns + 1, 3) reflected sky by elevation of the camera over the water and azimuth of the ray."""
+        elevation = _elevation_of_row(np.arange(_TABLE_ROWS))
+        azimuth = np.arange(_TABLE_COLUMNS + 1) * 2 * np.pi / _TABLE_COLUMNS
+        e, a = np.meshgrid(elevation, azimuth, indexing="ij")
+        back = np.stack([-np.cos(e) * np.cos(a), -np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
+        total, weights = np.zeros((*e.shape, 3)), np.zeros(e.shape)
+        sky = self._sky_map()
+        cosine, sine = self._wind
+        steps = np.linspace(-2.5, 2.5, 9)
+        for s, t in np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2):
+            along, across = s * np.sqrt(self._along), t * np.sqrt(self._across)
+            normal = np.array([-(cosine * along - sine * across), -(sine * along + cosine * across), 1.0])
+            normal /= np.linalg.norm(normal)
+            facing = np.maximum(back @ normal, 0.0)
+            weight = np.exp(-0.5 * (s * s + t * t)) * facing / normal[2]
+            up = 2 * facing[..., None] * normal - back
+            total += (weight * fresnel(facing))[..., None] * _looked_up(sky, up)
+            weights += weight
+        result: Radiance = (total / np.maximum(weights, 1e-12)[..., None]).astype(np.float32)
+        return result
+
+    def _sky_map(self) -> Radiance:
+        elevation = (np.arange(_SKY_ROWS) + 0.5) * (np.pi / 2) / _SKY_ROWS
+        azimuth = np.arange(_SKY_COLUMNS) * 2 * np.pi / _SKY_COLUMNS
+        e, a = np.meshgrid(elevation, azimuth, indexing="ij")
+        directions = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
+        return self._light.sky_radiance(directions.astype(np.float32))
+
+
+def _looked_up(sky: Radiance, directions: NDArray[np.float64]) -> Radiance:
+    """The nearest texels of a sky map; what points below the horizon meets the next wave, which mirrors low sky."""
+    elevation = np.arcsin(np.clip(np.abs(directions[..., 2]), 0.0, 1.0))
+    row = np.clip((elevation / (np.pi / 2) * _SKY_ROWS).astype(int), 0, _SKY_ROWS - 1)
+    turns = np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi)
+    column = np.rint(turns * _SKY_COLUMNS).astype(int) % _SKY_COLUMNS
+    result: Radiance = sky[row, column]
+    return result
+
+
+def _elevation_of_row(row: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    result: NDArray[np.float64] = np.maximum((row / (_TABLE_ROWS - 1)) ** 1.5 * (np.pi / 2), 2e-3)
+    return result
+
+
+def _row_of_elevation(elevation_rad: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Rows lie closer together where the camera looks along the water."""
+    result: NDArray[np.floating[Any]] = (_TABLE_ROWS - 1) * (elevation_rad / (np.pi / 2)) ** (2 / 3)
+    return result

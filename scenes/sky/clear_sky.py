@@ -1,0 +1,175 @@
+"""The clear sky at any hour: sun, moon and night sky in absolute units, as a function of direction."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.frame import Environment
+from scenes.sky.daylight import DaylightSky
+from scenes.sky.light import (
+    REC709_LUMINANCE,
+    SOLAR_ILLUMINANCE_LUX,
+    SUN_RADIUS_RAD,
+    SUN_SOLID_ANGLE_SR,
+    Radiance,
+    beam_transmission,
+    direction_from_angles,
+)
+from scenes.sky.night import lit_side_of_moon, moon_illuminance_lux, night_radiance
+from scenes.sky.twilight import TwilightSky, twilight_illuminance_lux
+
+__all__ = ["REC709_LUMINANCE", "ClearSky", "Luminary", "Radiance", "direction_from_angles"]
+
+# Below the first elevation the sky is the twilight model's, above the second the daylight model's. [deg]
+_TWILIGHT_BELOW_DEG, _DAYLIGHT_ABOVE_DEG = 2.0, 9.0
+# Preetham's sky is three times too bright under a low sun: between these elevations its level goes over to the measured
+# one. [deg]
+_MEASURED_BELOW_DEG, _MODEL_ABOVE_DEG = 4.0, 22.0
+# Lower than this, the sun adds nothing that the night sky would not hide. [deg]
+_NIGHT_BELOW_DEG = -18.5
+
+
+def _smooth_step(value: float, low: float, high: float) -> float:
+    """0 up to `low`, 1 from `high` on, without a kink."""
+    rise = min(max((value - low) / (high - low), 0.0), 1.0)
+    return rise * rise * (3.0 - 2.0 * rise)
+
+
+class Luminary:
+    """The sun, or the moon as a weaker sun, and the sky that it lights.
+
+    Args:
+        elevation_deg, azimuth_deg: direction to it. [deg]
+        turbidity: as in `Environment`.
+        illuminance_lux: of a facing plane outside the atmosphere.
+        altitude_m: of the camera. [m]
+    """
+
+    def __init__(
+        self, elevation_deg: float, azimuth_deg: float, turbidity: float, illuminance_lux: float, altitude_m: float
+    ) -> None:
+        self.direction = direction_from_angles(elevation_deg, azimuth_deg)
+        self._share = illuminance_lux / SOLAR_ILLUMINANCE_LUX
+        self._elevation_deg = elevation_deg
+        self._turbidity = turbidity
+        day = _smooth_step(elevation_deg, _TWILIGHT_BELOW_DEG, _DAYLIGHT_ABOVE_DEG)
+        self._skies: list[tuple[float, DaylightSky | TwilightSky]] = []
+        brighter = 1.0
+        if day > 0:
+            sky = DaylightSky(turbidity, elevation_deg, azimuth_deg, altitude_m)
+            measured_lux, modelled_lux = twilight_illuminance_lux(elevation_deg), sky.level_illuminance_lux
+            modelled = _smooth_step(elevation_deg, _MEASURED_BELOW_DEG, _MODEL_ABOVE_DEG)
+            brighter = (modelled_lux / measured_lux) ** modelled
+            self._skies.append((day * brighter * measured_lux / modelled_lux, sky))
+        if day < 1 and elevation_deg > _NIGHT_BELOW_DEG:
+            self._skies.append(((1.0 - day) * brighter, TwilightSky(turbidity, elevation_deg, azimuth_deg)))
+
+    def beam_illuminance_lux(self, height_m: float = 0.0) -> NDArray[np.float64]:
+        """(3,) illuminance of a plane that faces it, by channel; from higher up it sets later. [lux]"""
+        dip_deg = float(np.degrees(np.sqrt(2.0 * max(height_m, 0.0) / 6.371e6)))
+        through = beam_transmission(self._elevation_deg + dip_deg, self._turbidity)
+        result: NDArray[np.float64] = SOLAR_ILLUMINANCE_LUX * self._share * through
+        return result
+
+    def sky_radiance(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """(..., 3) radiance of the sky that it lights, along (..., 3) unit directions. [cd/m2]"""
+        total = np.zeros(np.shape(directions), dtype=np.float32)
+        for weight, sky in self._skies:
+            total += np.float32(weight * self._share) * sky.radiance(directions)
+        return total
+
+
+class ClearSky:
+    """Sun, moon and night sky through clear air, seen from the ground and used at altitude unchanged.
+
+    Attributes:
+        sun, moon: what shines; no moon, or a moon.
+        beam: the one of them that casts the shadows.
+    """
+
+    def __init__(self, environment: Environment) -> None:
+        self._moon = environment.moon
+        self._sun_azimuth_deg = environment.sun_azimuth_deg
+        turbidity = environment.turbidity
+        self.sun = Luminary(
+            environment.sun_elevation_deg,
+            environment.sun_azimuth_deg,
+            turbidity,
+            SOLAR_ILLUMINANCE_LUX,
+            environment.altitude_m,
+        )
+        self.moon: Luminary | None = None
+        if environment.moon is not None:
+            self.moon = Luminary(
+                environment.moon.elevation_deg,
+                environment.moon.azimuth_deg,
+                turbidity,
+                moon_illuminance_lux(environment.moon.phase_angle_deg),
+                environment.altitude_m,
+            )
+        self.beam = self.sun
+        if self.moon is not None and self.moon.beam_illuminance_lux().sum() > self.sun.beam_illuminance_lux().sum():
+            self.beam = self.moon
+
+    @property
+    def sun_direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector towards the sun in world axes."""
+        return self.sun.direction
+
+    @cached_property
+    def sun_illuminance_lux(self) -> NDArray[np.float64]:
+        """(3,) illuminance of a plane that faces the sun, by channel. [lux]"""
+        return self.sun.beam_illuminance_lux()
+
+    def radiance(self, directions: NDArray[np.floating[Any]]) -> Radiance:
+        """Radiance of the sky without the discs of sun and moon.
+
+        Args:
+            directions: (..., 3) unit vectors in world axes; those below the horizon get the horizon's radiance.
+
+        Returns:
+            (..., 3) luminance-scaled linear Rec. 709. [cd/m2]
+        """
+        total = self.sun.sky_radiance(directions)
+        if self.moon is not None:
+            total += self.moon.sky_radiance(directions)
+        total += night_radiance(directions)
+        return total
+
+    def add_discs(self, radiance: Radiance, directions: NDArray[np.float32], through: float) -> None:
+        """Add the discs of sun and moon, in place.
+
+        Args:
+            radiance: (..., 3) seen along `directions`.
+            directions: (..., 3) unit vectors in world axes.
+            through: share of the beam that cloud and mist let through.
+        """
+        for luminary in (self.sun, self.moon):
+            if luminary is None:
+                continue
+            cosine = np.einsum("...i,i->...", directions, luminary.direction.astype(np.float32))
+            disc = (cosine > np.cos(SUN_RADIUS_RAD)) & (directions[..., 2] > 0)
+            if not disc.any():
+                continue
+            lit, area_sr = np.ones(int(disc.sum()), dtype=bool), SUN_SOLID_ANGLE_SR
+            if luminary is self.moon and self._moon is not None:
+                lit = self._lit_moon(directions[disc])
+                area_sr *= 0.5 * (1.0 + np.cos(np.radians(self._moon.phase_angle_deg)))
+            share = luminary.beam_illuminance_lux() * through / max(area_sr, 0.01 * SUN_SOLID_ANGLE_SR)
+            radiance[disc] += lit[:, None] * share.astype(np.float32)
+
+    def _lit_moon(self, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which (N, 3) directions into the moon's disc meet its lit side."""
+        assert self.moon is not None and self._moon is not None
+        to_moon = self.moon.direction
+        away = to_moon * (to_moon @ self.sun.direction) - self.sun.direction
+        length = float(np.linalg.norm(away))
+        away = away / length if length > 1e-6 else np.cross(to_moon, [0.0, 0.0, 1.0])
+        offset = (directions.astype(np.float64) - to_moon) / SUN_RADIUS_RAD
+        along = np.einsum("ni,i->n", offset, away)
+        across = np.einsum("ni,i->n", offset, np.cross(to_moon, away))
+        return lit_side_of_moon(self._moon, across.astype(np.float32), along.astype(np.float32))

@@ -1,0 +1,136 @@
+"""Pose methods on many drawn frames: batched where navigation can, frame by frame otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drogue_models.marker_layout import MarkerLayout
+from geometry.se3 import Array
+from geometry.stereo import StereoRig
+from nav.pose.batched import solve_from, solve_joint_batch
+from nav.pose.features import Features, stack_features
+from nav.pose.pose_method import NoFixReason, Observation
+from nav.pose.pose_methods import pose_method
+from nav.pose.stated_tolerances import EXACT, StatedTolerances
+from nav.pose.two_fold_start import two_fold_start
+from studies.acceptance.centroid_level.drawn_poses import Poses
+
+BATCHED = ("joint", "joint-hub")
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Measured centres of many frames.
+
+    Attributes:
+        rig, layout: as the estimator knows them.
+        markers_px: (n, 2, N, 2).
+        hub_px: (n, 2, 2) centres of the hub's outer edge, or None where no hub is measured.
+        sigma_px, hub_sigma_px: standard deviations that the estimator is told.
+        tolerances: as the estimator is told.
+    """
+
+    rig: StereoRig
+    layout: MarkerLayout
+    markers_px: Array
+    hub_px: Array | None
+    sigma_px: float
+    hub_sigma_px: float
+    tolerances: StatedTolerances = EXACT
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What a method made of many frames.
+
+    Attributes:
+        poses: n of them; those without a fix mean nothing.
+        best: the pose with the smallest residuals, where the method reports a mean over several or weighs them by what
+            is likely; the flip law is about these.
+        covariances: (n, 6, 6), or None for a method without.
+        fixed: (n,) which have a pose.
+    """
+
+    poses: Poses
+    best: Poses
+    covariances: Array | None
+    fixed: NDArray[np.bool_]
+
+
+def solve(method: str, measured: Measured) -> Solved:
+    """Poses of all frames by one method.
+
+    Raises:
+        ValueError: a method that does not exist.
+    """
+    return _batched(method, measured) if method in BATCHED else _one_by_one(method, measured)
+
+
+def hub_edges(measured: Measured) -> tuple[Array, Array]:
+    """Pixels (n, 2, 2, 2) and covariances (2, 2, 2, 2) of the hub's edges, of which only the outer one is measured.
+
+    A single edge keeps the noise of the hub one number, as it is in the bound.
+    """
+    assert measured.hub_px is not None
+    pixels = np.full((len(measured.hub_px), 2, 2, 2), np.nan)
+    pixels[:, :, 1] = measured.hub_px
+    return pixels, np.broadcast_to(np.eye(2) * measured.hub_sigma_px**2, (2, 2, 2, 2))
+
+
+def observations(measured: Measured) -> list[Observation]:
+    """Every frame as pose methods take it."""
+    cov = np.broadcast_to(np.eye(2) * measured.sigma_px**2, (2, measured.layout.count, 2, 2))
+    hub, hub_cov = (None, None) if measured.hub_px is None else hub_edges(measured)
+    return [
+        Observation(
+            measured.rig,
+            measured.layout,
+            pixels,
+            cov,
+            None if hub is None else hub[index],
+            hub_cov,
+            measured.tolerances,
+        )
+        for index, pixels in enumerate(measured.markers_px)
+    ]
+
+
+def _batched(method: str, measured: Measured) -> Solved:
+    pixels = measured.markers_px
+    cov = np.broadcast_to(np.eye(2) * measured.sigma_px**2, (2, measured.layout.count, 2, 2))
+    if method == "joint-hub":
+        hub, hub_cov = hub_edges(measured)
+        pixels, cov = np.concatenate([pixels, hub], axis=2), np.concatenate([cov, hub_cov], axis=1)
+    found = solve_joint_batch(measured.rig, measured.layout, pixels, cov, measured.tolerances)
+    features = stack_features(measured.rig, measured.layout, pixels, cov, measured.tolerances)
+    return Solved(Poses(found.rotations, found.translations_m), _best(features), found.covariances, found.sound)
+
+
+def _best(features: Features) -> Poses:
+    """Of the two poses that both starts lead to, the one with the smaller residuals."""
+    both = solve_from(features, *two_fold_start(features))
+    chosen = 2 * np.arange(features.frames) + both.costs.reshape(-1, 2).argmin(axis=1)
+    return Poses(both.rotations[chosen], both.translations_m[chosen])
+
+
+def _one_by_one(method: str, measured: Measured) -> Solved:
+    solver = pose_method(method)
+    count = len(measured.markers_px)
+    rotations, places = np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), np.zeros((count, 3))
+    covariances, fixed, known = np.zeros((count, 6, 6)), np.zeros(count, dtype=np.bool_), True
+    for index, observation in enumerate(observations(measured)):
+        solution = solver(observation)
+        if isinstance(solution, NoFixReason):
+            continue
+        fixed[index] = True
+        rotations[index] = solution.left_from_drogue.rotation
+        places[index] = solution.left_from_drogue.translation_m
+        if solution.covariance is None:
+            known = False
+        else:
+            covariances[index] = solution.covariance
+    poses = Poses(rotations, places)
+    return Solved(poses, poses, covariances if known else None, fixed)

@@ -1,0 +1,1 @@
+"""Tiers A, B, E and docking: bars on rendered pairs and flights."""

@@ -1,0 +1,144 @@
+"""Pairs of sequences, scored one by one against the records: what the bars of whole flights rest on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
+from droguekit.benchmark.poses.bounds import component_deviations
+from droguekit.benchmark.poses.centroid_errors import centroid_errors
+from droguekit.benchmark.poses.frame_truth import DrogueTruth, drogue_truth
+from droguekit.benchmark.poses.pose_errors import by_method, pose_error
+from droguekit.benchmark.poses.reference import build_reference
+from droguekit.benchmark.sequences.sequence_latency import worked_s
+from droguekit.benchmark.sequences.sequence_truth import Sight, moment
+from geometry.se3 import Array
+from studies.acceptance.rendered.image_rows import BEST
+
+# Our best method, with the filter behind it.
+FILTERED = f"{BEST}+filter"
+# Of the bars: "at least four markers and the hub in view", in both images.
+_FEWEST_MARKERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class TruePair:
+    """What the truth says of one pair.
+
+    Attributes:
+        frame_index: which pair.
+        sequence_id: of its sequence; a pair that belongs to none is one of its own.
+        family: of its conditions.
+        truth: of the drogue.
+        in_view: whether both images show four markers and the hub, if the drogue has one, and no sun outshines them.
+        sight: of the pair; `seen` for a single one.
+    """
+
+    frame_index: int
+    sequence_id: int
+    family: str
+    truth: DrogueTruth
+    in_view: bool
+    sight: Sight
+
+    @property
+    def distance_m(self) -> float:
+        """Z of the rim's centre. [m]"""
+        return self.truth.distance_m
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredPair:
+    """One method's answer to a pair.
+
+    Attributes:
+        pair: the truth.
+        error: (5,) X, Y, Z [m], pitch and yaw [deg], estimate minus truth; None without a pose.
+        sd_m: root of the trace of the position's reported covariance; None without one. [m]
+        over_bound: (5,) error over its bound at the noise measured in its family, of markers and of hubs; None without.
+        reason: why there is no pose; empty where there is one, or no word at all.
+        work_s: of all stages but those in which the pair waits, where they are told. [s]
+    """
+
+    pair: TruePair
+    error: Array | None
+    sd_m: float | None
+    over_bound: Array | None
+    reason: str
+    work_s: float | None
+
+    @property
+    def position_m(self) -> float:
+        """Length of the position error, of a pair with a pose. [m]"""
+        assert self.error is not None
+        return float(np.linalg.norm(self.error[:3]))
+
+
+Scores = Mapping[str, Sequence[ScoredPair]]
+
+
+def score_pairs(dataset: Path, estimates: Path) -> dict[str, list[ScoredPair]]:
+    """Every method's answers to all pairs that have a drogue, in the order of frames.
+
+    Raises:
+        ValueError: a dataset or estimates that cannot be read.
+    """
+    data = Dataset(dataset)
+    found = by_method(read_estimates(estimates), data.frame_indices, str(estimates))
+    pairs = [pair for pair in (_true_pair(data, index) for index in data.frame_indices) if pair is not None]
+    bounds = _bounds(pairs, found)
+    return {
+        name: [_scored(pair, answers.get(pair.frame_index), bounds[pair.frame_index]) for pair in pairs]
+        for name, answers in found.items()
+    }
+
+
+def _true_pair(data: Dataset, index: int) -> TruePair | None:
+    record = data.record(index)
+    truth, flown = drogue_truth(record), moment(record)
+    if truth is None:
+        return None
+    sight: Sight = "seen" if flown is None else flown.sight
+    markers = truth.visible[:, : truth.layout.count].sum(axis=1)
+    in_view = bool((markers >= _FEWEST_MARKERS).all() and truth.visible[:, truth.layout.count :].all())
+    return TruePair(
+        frame_index=index,
+        sequence_id=index if record.sequence_id is None else record.sequence_id,
+        family=record.conditions.family,
+        truth=truth,
+        in_view=in_view and sight != "dazzled",
+        sight=sight,
+    )
+
+
+def _bounds(pairs: Sequence[TruePair], methods: Mapping[str, Mapping[int, Estimate]]) -> dict[int, Array | None]:
+    """(5,) bound of every pair, the same for all methods, by the noise of its family's best markers and hubs."""
+    bounds: dict[int, Array | None] = {}
+    for family in sorted({pair.family for pair in pairs}):
+        truths = {pair.frame_index: pair.truth for pair in pairs if pair.family == family}
+        centroids = {
+            name: {
+                index: centroid_errors(truth, answers[index].features if index in answers else ())
+                for index, truth in truths.items()
+            }
+            for name, answers in methods.items()
+        }
+        for index, covariance in build_reference(truths, centroids).covariances.items():
+            pose = truths[index].left_from_drogue
+            bounds[index] = None if covariance is None else component_deviations(pose, covariance)
+    return bounds
+
+
+def _scored(pair: TruePair, answer: Estimate | None, bound: Array | None) -> ScoredPair:
+    work_s = None if answer is None else worked_s(answer.stage_s)
+    if not isinstance(answer, PoseEstimate):
+        reason = "" if answer is None else answer.reason
+        return ScoredPair(pair, None, None, None, reason, work_s)
+    error = pose_error(answer.left_from_drogue, pair.truth.left_from_drogue).components
+    sd_m = None if answer.covariance is None else float(np.sqrt(max(np.trace(answer.covariance[:3, :3]), 0.0)))
+    return ScoredPair(pair, error, sd_m, None if bound is None else error / bound, "", work_s)

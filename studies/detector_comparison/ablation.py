@@ -1,0 +1,176 @@
+"""Our network with one thing changed at a time, trained by `droguekit train` on the same budget of image passes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.storage.blind import BlindDataset, read_blind_index
+from droguekit.benchmark.detection.detection_matching import Evaluation
+from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection.detection_tables import share
+from droguekit.benchmark.detection.detection_truth import ImageTruth, read_detection_truth
+from nav.detector.detector import Detector
+from nav.detector.onnx_cost import network_cost
+from nav.detector.onnx_detector import OnnxDetector
+from studies.detector_comparison.latency import measure_latency
+from studies.detector_comparison.one_view import OneViewDetector
+
+ONE_VIEW = "one-view"
+"""Trained on single eyes, and timed with a pass for each: what do both eyes in one batch change?"""
+# The first is what we ship; the others are the seed paper's ablations, and one of views.
+CHANGES: dict[str, tuple[str, ...]] = {
+    "eca-asff": (),
+    "se": ("--attention", "se"),
+    "concat": ("--fusion", "concat"),
+    "no-mosaic": ("--no-mosaic",),
+    ONE_VIEW: ("--views", "one"),
+}
+_INTERRUPTED = 130
+_TIMED_PAIRS = 4
+
+
+@dataclass(frozen=True)
+class AblationOrder:
+    """What is trained.
+
+    Attributes:
+        corpus: dataset to train on.
+        test: dataset whose test split is scored.
+        variant: of the network, `l` or `s`.
+        image_passes: through each network.
+        size_px: width and height of its input.
+        threads, seed, device: of training.
+        rounds: of timing.
+    """
+
+    corpus: Path
+    test: Path
+    variant: str
+    image_passes: int
+    size_px: tuple[int, int]
+    threads: int
+    seed: int
+    device: str
+    rounds: int
+
+    def __post_init__(self) -> None:
+        if self.image_passes < 1:
+            raise ValueError(f"--image-passes: must be at least 1, got {self.image_passes}")
+
+
+def ablate(order: AblationOrder, out: Path, say: Callable[[str], None]) -> list[str]:
+    """Train what is not trained yet, time all in turns, and make the table.
+
+    Args:
+        order: what to train.
+        out: folder, with one for each training.
+        say: takes a line about what goes on.
+
+    Returns:
+        The table's lines; `ablation.json` has the numbers.
+
+    Raises:
+        ValueError: a wrong number, or a network or the test dataset that cannot be read.
+        OSError: a training failed; says what it said last.
+    """
+    read_blind_index(order.test)  # before hours of training
+    for name, changes in CHANGES.items():
+        _train(order, out / name, changes, say)
+    rows = measured_networks(order, {name: out / name / "detector.onnx" for name in CHANGES}, say)
+    write_text_atomic(out / "ablation.json", json.dumps({"schema": 1, "networks": rows}, indent=1) + "\n")
+    return ablation_lines(rows)
+
+
+def measured_networks(
+    order: AblationOrder, files: dict[str, Path], say: Callable[[str], None]
+) -> dict[str, dict[str, Any]]:
+    """Accuracy on the test split as `benchmark` scores it, time in turns, and cost of networks.
+
+    Args:
+        order: what was trained.
+        files: by name; the one of `ONE_VIEW` gets a pass for each eye.
+        say: takes a line about what goes on.
+
+    Raises:
+        ValueError: a network or the test dataset cannot be read.
+    """
+    detectors: dict[str, Detector] = {
+        name: (OneViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, order.threads, order.size_px)
+        for name, file in files.items()
+    }
+    source = BlindDataset(order.test)
+    pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
+    say("timing in turns")
+    latencies = measure_latency(detectors, pairs, order.rounds)
+    say("looking for the drogue in the test split")
+    images = [image for image in read_detection_truth(order.test).images if image.split == "test"]
+    return {
+        name: {"test": _test_precision(order.test, detector, images)}
+        | latencies[name]._asdict()
+        | network_cost(files[name], order.size_px)._asdict()
+        for name, detector in detectors.items()
+    }
+
+
+def _test_precision(dataset: Path, detector: Detector, images: Sequence[ImageTruth]) -> dict[str, float | None] | None:
+    """Average precision on some images by the rules of `benchmark`; None without images."""
+    if not images:
+        return None
+    looking = DetectorPass(dataset, lambda drogue: detector, sorted({image.frame_index for image in images}))
+    boxes = list(looking.boxes(LEAST_SCORE, lambda: None))
+    return Evaluation(images, boxes).average_precision(images)._asdict()
+
+
+def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
+    """A line a network: accuracy on the test split, and time."""
+    lines = [
+        f"{'network':<12} {'parameters':>11} {'GFLOPs':>7} {'AP50':>8} {'AP':>8} {'wall [ms]':>10} {'CPU [ms]':>9}"
+    ]
+    for name, row in rows.items():
+        test = row["test"]
+        ap50, ap = (share(None if test is None else test[key]) for key in ("ap50", "ap"))
+        lines.append(
+            f"{name:<12} {row['parameters']:>11,} {row['gflops_per_image']:7.2f} {ap50:>8} {ap:>8} "
+            f"{row['wall_ms'][0]:10.1f} {row['cpu_ms'][0]:9.1f}"
+        )
+    return lines
+
+
+def _train(order: AblationOrder, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]) -> None:
+    """Begin a training, or go on with it, unless it is over."""
+    width, height = order.size_px
+    options = {
+        "--out": folder,
+        "--cache": folder.parent / "cache",
+        "--variant": order.variant,
+        "--image-passes": order.image_passes,
+        "--size": f"{height}x{width}",
+        "--seed": order.seed,
+        "--device": order.device,
+        "--threads": order.threads,
+    }
+    say(f"{folder.name}: training, unless it is over; {folder / 'train.log'}")
+    folder.mkdir(parents=True, exist_ok=True)
+    words = [str(word) for option in options.items() for word in option]
+    with (folder / "train.log").open("a", encoding="utf-8") as log:
+        ended = subprocess.run(
+            # -P: a file that lies where the user works must not stand in for a module of ours.
+            [sys.executable, "-P", "-m", "droguekit.cli.main", "train", str(order.corpus), *words, *changes],
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            check=False,
+        )
+    if ended.returncode == _INTERRUPTED:
+        raise OSError(f"{folder}: the training was interrupted; the same command goes on with it")
+    if ended.returncode != 0:
+        said = (folder / "train.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        raise OSError(f"{folder / 'train.log'}: {said[-1] if said else 'the training failed silently'}")

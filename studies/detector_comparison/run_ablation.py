@@ -1,0 +1,56 @@
+"""`python -m studies.detector_comparison.run_ablation`: our network with one thing changed at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from studies.detector_comparison.ablation import AblationOrder, ablate
+from studies.detector_comparison.options import (
+    CorpusOption,
+    DeviceOption,
+    PassesOption,
+    SeedOption,
+    SizeOption,
+    TestOption,
+    ThreadsOption,
+    input_size_px,
+    tell,
+)
+
+_EXAMPLES = """Examples:
+
+  python -m studies.detector_comparison.run_ablation --corpus data/detector-small --image-passes 5000
+  python -m studies.detector_comparison.run_ablation --corpus data/detector-train --test data/detector-test"""
+
+
+def main(
+    corpus: CorpusOption,
+    out: Annotated[Path, typer.Option("--out", help="Folder; trainings found there go on.")] = Path("out/ablation"),
+    test: TestOption = None,
+    variant: Annotated[str, typer.Option("--variant", help="Of the network: l or s.")] = "s",
+    image_passes: PassesOption = 5_000,
+    size: SizeOption = "320x416",
+    threads: ThreadsOption = 2,
+    seed: SeedOption = 0,
+    device: DeviceOption = "cpu",
+    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Of timing.")] = 30,
+) -> None:
+    """Train our network with one thing changed at a time, on the same budget: accuracy and time of each."""
+    try:
+        order = AblationOrder(
+            corpus, test or corpus, variant, image_passes, input_size_px(size), threads, seed, device, rounds
+        )
+        lines = ablate(order, out, tell)
+    except (ValueError, OSError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+    typer.echo("\n".join(lines))
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False)
+    app.command(epilog=_EXAMPLES)(main)
+    app()

@@ -1,0 +1,97 @@
+"""Our corpus as ultralytics reads it: pictures as our own networks see them, with the drogue as the only class."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from datasets_manifest.atomic import new_folder
+from datasets_manifest.storage.manifest import SplitName
+from datasets_manifest.storage.png import encode_png
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.records import PixelBox
+from geometry.stereo import EYES
+from nav.detector.input_image import Letterbox, input_image
+
+SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
+
+
+def check_corpus(corpus: Path, test: Path) -> None:
+    """Refuse datasets without pairs to train on, to choose by or to score, and two of the same scenes.
+
+    Args:
+        corpus: needs pairs to train on and to choose by.
+        test: needs pairs to score; may be the corpus.
+
+    Raises:
+        ValueError: a dataset cannot be read or lacks a split, or two have the same seed, from which scenes follow.
+    """
+    needed: dict[Path, tuple[SplitName, ...]] = {corpus: ("train", "val")}
+    needed[test] = (*needed.get(test, ()), "test")
+    manifests = {dataset: Dataset(dataset).manifest for dataset in needed}
+    for dataset, splits in needed.items():
+        counts = manifests[dataset].counts.by_split
+        if not all(counts.get(split) for split in splits):
+            raise ValueError(f"{dataset}: needs pairs in the splits {', '.join(splits)}, got {dict(counts)}")
+    seeds = {manifest.recipe.seed for manifest in manifests.values()}
+    if len(seeds) < len(needed):
+        raise ValueError(
+            f"{test}: has scenes of {corpus}, for both have the seed {min(seeds)}; render one with another seed, "
+            "or leave --test away to score the corpus's own split"
+        )
+
+
+def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
+    """Write images and boxes, unless they are there already.
+
+    Args:
+        corpus: a dataset.
+        out: folder.
+        size_px: width and height of the pictures, which are made like our networks' input: the peers would shrink the
+            images in another way than ours do.
+
+    Returns:
+        The file `data.yaml`.
+
+    Raises:
+        ValueError: the corpus cannot be read.
+        OSError: the folder cannot be written; it is then not there.
+    """
+    data = out / "data.yaml"
+    if data.exists():
+        return data
+    source = Dataset(corpus)
+    splits = source.manifest.split_of_frame()
+    with new_folder(out) as folder:
+        for split in SPLITS:
+            for kind in ("images", "labels"):
+                (folder / kind / split).mkdir(parents=True)
+        for index in source.frame_indices:
+            record, images = source.record(index), source.images(index)
+            for eye in EYES:
+                picture, place = input_image(images, eye, size_px)
+                name = f"{splits[index]}/{index:06d}_{eye}"
+                (folder / "images" / f"{name}.png").write_bytes(encode_png(picture))
+                box = (record.views.left if eye == "left" else record.views.right).box_visible_xywh_px
+                row = "" if box is None else _row(box, place, size_px)
+                (folder / "labels" / f"{name}.txt").write_text(row, encoding="utf-8")
+        lines = "".join(f"{split}: images/{split}\n" for split in SPLITS)
+        (folder / "data.yaml").write_text(f'path: ""\n{lines}names:\n  0: drogue\n', encoding="utf-8")
+    return data
+
+
+def images_to_train_on(corpus: Path) -> int:
+    """How many images an epoch has: both eyes of every pair of the split `train`.
+
+    Raises:
+        ValueError: the corpus cannot be read.
+    """
+    return 2 * Dataset(corpus).manifest.counts.by_split.get("train", 0)
+
+
+def _row(box_px: PixelBox, place: Letterbox, size_px: tuple[int, int]) -> str:
+    """Class, middle and size of an image's box, as shares of the picture."""
+    x, y, width, height = place.to_input(np.array([box_px]))[0].tolist()
+    shares = [(x + width / 2) / size_px[0], (y + height / 2) / size_px[1], width / size_px[0], height / size_px[1]]
+    return f"0 {' '.join(map(repr, shares))}\n"

@@ -1,0 +1,105 @@
+"""What a pair costs by either engine at the same noise."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.recipe.recipe import RenderSettings
+from drogue_models.parts import drogue_part_ids
+from geometry.stereo import EYES
+from render.engine import RenderEngine, StereoRadiance
+from studies.engine_agreement.measures import eye_of, luminance
+from studies.engine_agreement.paired_frames import frame_at, recipe_of_family
+
+COST_STATIONS_M = (40.0, 20.0, 10.0, 5.0, 2.0)
+COST_FAMILY = "demo"
+# Even squares, tried in turn: on edges noise falls faster than any law by which it could be carried on.
+_SAMPLES = (16, 64, 144, 256, 400, 576)
+
+
+@dataclass(frozen=True)
+class EngineCost:
+    """One pair by one engine.
+
+    Attributes:
+        samples: through each pixel of the drogue.
+        cpu_s: without sensor, labels and disk. [s]
+        noise: root mean square error of luminance by sampling over its mean, on the pixels whose centres see the
+            drogue, edges included.
+    """
+
+    samples: int
+    cpu_s: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class CostAt:
+    """Both engines at one distance: the first with the samples of recipes that do not say, the other as quiet as that.
+
+    Attributes:
+        distance_m: of the drogue. [m]
+        one: first engine.
+        other: second engine with the fewest samples of those tried that are no noisier, or with the most.
+    """
+
+    distance_m: float
+    one: EngineCost
+    other: EngineCost
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether the second engine came down to the noise of the first."""
+        return self.other.noise <= self.one.noise
+
+    def row(self) -> dict[str, Any]:
+        """All figures, for JSON."""
+        return asdict(self) | {"is_reached": self.is_reached}
+
+
+def cost_of(row: dict[str, Any]) -> CostAt:
+    """The figures as `CostAt.row` has put them."""
+    return CostAt(row["distance_m"], EngineCost(**row["one"]), EngineCost(**row["other"]))
+
+
+def measure_costs(distance_m: float, seed: int, one: RenderEngine, other: RenderEngine) -> CostAt:
+    """Render one frame by both engines, each twice with samples of its own.
+
+    The engines must have rendered something before: the first picture of a process pays for compiling.
+
+    Args:
+        distance_m: of the drogue. [m]
+        seed: of the frame.
+        one, other: engines.
+    """
+    first = _cost(distance_m, seed, one, RenderSettings().samples_per_px)
+    for samples in _SAMPLES:
+        second = _cost(distance_m, seed, other, samples)
+        if second.noise <= first.noise:
+            break
+    return CostAt(distance_m, first, second)
+
+
+def _cost(distance_m: float, seed: int, engine: RenderEngine, samples: int) -> EngineCost:
+    frame = frame_at(recipe_of_family(COST_FAMILY, seed), distance_m, 1, 0)
+    assert frame.drogue is not None
+    settings = RenderSettings(engine=engine.name, samples_per_px=samples)
+    pictures = [engine.render(frame.model_copy(update={"seed": seed + number}), settings) for number in range(2)]
+    parts = drogue_part_ids(frame.drogue.marker_count)
+    first, second = (_on_parts(picture, pictures[0], parts) for picture in pictures)
+    return EngineCost(
+        samples,
+        float(np.mean([sum(picture.stage_s.values()) for picture in pictures])),
+        float(np.sqrt(np.mean(np.square(first - second)) / 2) / np.mean((first + second) / 2)),
+    )
+
+
+def _on_parts(picture: StereoRadiance, where: StereoRadiance, parts: list[int]) -> NDArray[np.float64]:
+    """Luminance of both eyes where `where` sees the parts."""
+    return np.concatenate(
+        [luminance(eye_of(picture, eye).radiance_cd_m2[np.isin(eye_of(where, eye).part_id, parts)]) for eye in EYES]
+    )

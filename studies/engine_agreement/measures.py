@@ -1,0 +1,147 @@
+"""What two renderings of one frame are compared by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.frame import FrameSpec
+from drogue_models.marker_layout import marker_layout
+from drogue_models.parts import FIRST_MARKER_ID, Part, drogue_part_ids
+from geometry.circles import disc_area_px2, project_disc_centers
+from geometry.stereo import EYES, Eye
+from render.engine import EyeRadiance, StereoRadiance
+from scenes.sky.clear_sky import REC709_LUMINANCE
+from studies.engine_agreement.paired_frames import LAMP_CD_M2, Rendered
+
+_FEWEST_PIXELS = 20
+# Beyond a disc's outline: blur of a moving drogue and the edge pixels.
+_REACH_PX = 2.5
+# Of the light that a whole disc would give; less is a lamp that is hidden, out, or behind thick mist.
+_LEAST_LIGHT = 0.02
+MARKERS = "markers"
+
+
+@dataclass(frozen=True)
+class FrameAgreement:
+    """One frame by two engines.
+
+    Attributes:
+        centroids_px: (M, 3, 2) per marker and eye: the label, and the centroid of its lamp's light by either engine.
+        drogue_iou: intersection over union of the drogue's masks, both eyes together.
+        rib_distance_px: farthest that a rib's pixel lies from the other engine's ribs, 0 without ribs. [px]
+        part_sums: by part name: pixels, and the sums of luminance over them by either engine. [cd/m2]
+    """
+
+    centroids_px: NDArray[np.float64]
+    drogue_iou: float
+    rib_distance_px: float
+    part_sums: dict[str, tuple[int, float, float]]
+
+    def row(self) -> dict[str, Any]:
+        """All figures, for JSON."""
+        return vars(self) | {"centroids_px": self.centroids_px.tolist()}
+
+
+def agreement_of(row: dict[str, Any]) -> FrameAgreement:
+    """The figures as `FrameAgreement.row` has put them."""
+    return FrameAgreement(
+        np.array(row["centroids_px"], dtype=np.float64).reshape(-1, 3, 2),
+        row["drogue_iou"],
+        row["rib_distance_px"],
+        {name: tuple(sums) for name, sums in row["part_sums"].items()},
+    )
+
+
+def compare(frame: FrameSpec, one: Rendered, other: Rendered) -> FrameAgreement:
+    """Measure how far two engines agree on a frame."""
+    assert frame.drogue is not None
+    both = [(eye_of(one.plain, eye), eye_of(other.plain, eye)) for eye in EYES]
+    ids = np.stack([[a.part_id, b.part_id] for a, b in both], axis=1)
+    drogue = np.isin(ids, drogue_part_ids(frame.drogue.marker_count))
+    union = np.count_nonzero(drogue[0] | drogue[1])
+    return FrameAgreement(
+        np.concatenate([_centroids(frame, one, other, eye) for eye in EYES]),
+        np.count_nonzero(drogue[0] & drogue[1]) / union if union else 1.0,
+        max(_farthest_px(a.part_id == Part.RIBS, b.part_id == Part.RIBS) for a, b in both),
+        _part_sums(both),
+    )
+
+
+def eye_of(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
+    """What one eye sees."""
+    return radiance.left if eye == "left" else radiance.right
+
+
+def luminance(radiance_cd_m2: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """(...) luminance of (..., 3) radiance. [cd/m2]"""
+    result: NDArray[np.float64] = np.einsum("...c,c->...", radiance_cd_m2.astype(np.float64), REC709_LUMINANCE)
+    return result
+
+
+def _centroids(frame: FrameSpec, one: Rendered, other: Rendered, eye: Eye) -> NDArray[np.float64]:
+    """(M, 3, 2) of the markers that both engines show whole."""
+    assert frame.drogue is not None and frame.left_from_drogue is not None
+    layout = marker_layout(frame.drogue)
+    pose = frame.left_from_drogue
+    labels = project_disc_centers(frame.rig, pose, layout.centers_m, np.full(layout.count, layout.radius_m), eye)
+    images = [luminance(eye_of(r.lit, eye).radiance_cd_m2 - eye_of(r.plain, eye).radiance_cd_m2) for r in (one, other)]
+    rows = []
+    for index, (center_m, label) in enumerate(zip(layout.centers_m, labels, strict=True)):
+        area = disc_area_px2(frame.rig, pose, center_m, layout.radius_m, eye)
+        reach = 1.1 * float(np.sqrt(area / np.pi)) + _REACH_PX
+        if not frame.rig.camera.contains(label, reach) or not _is_whole(one, eye, index):
+            continue
+        measured = [_centroid(image, label, reach, _LEAST_LIGHT * area) for image in images]
+        if measured[0] is not None and measured[1] is not None:
+            rows.append([label, measured[0], measured[1]])
+    return np.array(rows, dtype=np.float64).reshape(-1, 3, 2)
+
+
+def _is_whole(rendered: Rendered, eye: Eye, marker: int) -> bool:
+    seen = eye_of(rendered.plain, eye)
+    part = FIRST_MARKER_ID + marker
+    amodal = seen.amodal_px.get(part, 0)
+    return amodal > 0 and amodal == np.count_nonzero(seen.part_id == part)
+
+
+def _centroid(
+    image: NDArray[np.float64], near_px: NDArray[np.float64], reach_px: float, least_px2: float
+) -> NDArray[np.float64] | None:
+    u0, v0 = np.floor(near_px - reach_px).astype(int)
+    u1, v1 = np.ceil(near_px + reach_px).astype(int) + 1
+    v, u = np.mgrid[v0:v1, u0:u1]
+    inside = np.hypot(u - near_px[0], v - near_px[1]) <= reach_px
+    weight = np.where(inside, image[v0:v1, u0:u1], 0.0) / LAMP_CD_M2
+    total = weight.sum()
+    return np.array([(weight * u).sum(), (weight * v).sum()]) / total if total > least_px2 else None
+
+
+def _farthest_px(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+    """Largest distance of a pixel of either mask from the other mask. [px]"""
+    if not one.any() or not other.any():
+        return 0.0 if one.any() == other.any() else float(np.linalg.norm(one.shape))
+    far = 0.0
+    for mask, target in ((one, other), (other, one)):
+        to_target = cv2.distanceTransform((~target).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        far = max(far, float(to_target[mask].max()))
+    return far
+
+
+def _part_sums(both: list[tuple[EyeRadiance, EyeRadiance]]) -> dict[str, tuple[int, float, float]]:
+    """Sums over the pixels that both engines give to a part; all markers together."""
+    sums: dict[str, tuple[int, float, float]] = {}
+    for a, b in both:
+        values = luminance(a.radiance_cd_m2), luminance(b.radiance_cd_m2)
+        for part in np.unique(a.part_id):
+            if part == Part.SKY:
+                continue
+            name = MARKERS if part >= FIRST_MARKER_ID else Part(part).name.lower()
+            same = (a.part_id == part) & (b.part_id == part)
+            count, one, other = sums.get(name, (0, 0.0, 0.0))
+            sums[name] = count + int(same.sum()), one + values[0][same].sum(), other + values[1][same].sum()
+    return {name: row for name, row in sums.items() if row[0] >= _FEWEST_PIXELS}

@@ -1,0 +1,122 @@
+"""Navigation on the same poses, lights and sensor noise, drawn by either engine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.estimates import PoseEstimate, write_estimates
+from droguekit.batch.progress import ProgressReport
+from droguekit.batch.render_dataset import render_dataset
+from droguekit.benchmark.poses.pose_errors import COMPONENTS, pose_error
+from geometry.se3 import Array
+from nav.runner import navigate
+from studies.engine_agreement.navigation_errors import PairedErrors
+
+METHOD = "joint"
+RECIPE = "pose-tier-b"
+STATIONS_M = (40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
+# So many that the renderers' noise, of which each has its own, is small beside the sensor's, which is the same in both.
+_SAMPLES_AT_5_M, _MOST_SAMPLES = 64, 576
+
+
+@dataclass(frozen=True)
+class PairedDatasets:
+    """The same poses at one distance as two datasets.
+
+    Attributes:
+        distance_m: of the drogue. [m]
+        one, other: folders.
+    """
+
+    distance_m: float
+    one: Path
+    other: Path
+
+
+def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> tuple[Recipe, str]:
+    """What is rendered at one distance, and the text that it comes from.
+
+    Every pixel of the drogue gets as many samples by either engine: where one of them spent more on the markers' edges,
+    its poses would err less for that alone.
+    """
+    recipe, text = load_recipe(RECIPE, seed)
+    side = 2 * round(np.sqrt(_SAMPLES_AT_5_M) * distance_m / 5.0 / 2)
+    samples = int(np.clip(side**2, 4, _MOST_SAMPLES))
+    changes = {
+        "frames": {"count": pairs, "scenes": pairs},
+        "distance": {"law": "stations", "stations_m": (distance_m,)},
+        "render": {
+            **recipe.render.model_dump(),
+            "engine": engine,
+            "samples_per_px": samples,
+            "open_samples_per_px": samples,
+            "edge_samples_per_px": samples,
+        },
+    }
+    return Recipe.model_validate({**recipe.model_dump(), **changes}), text
+
+
+def pairs_by_station(stations_m: Sequence[float], pairs: int) -> dict[float, int]:
+    """As many pairs at each distance, the first ones of them taking the rest."""
+    each, rest = divmod(pairs, len(stations_m))
+    return {station_m: each + (place < rest) for place, station_m in enumerate(stations_m) if each + (place < rest)}
+
+
+def render_paired(
+    out: Path, engines: tuple[str, str], station_m: float, pairs: int, seed: int, report: ProgressReport
+) -> PairedDatasets:
+    """Render the poses of one distance by both engines; pairs that are there already are kept.
+
+    Raises:
+        ValueError: a folder of something else, an engine that cannot be used, or frames that could not be made.
+        OSError: the folder cannot be written.
+    """
+    folders = []
+    for engine in engines:
+        recipe, text = station_recipe(engine, station_m, pairs, seed)
+        folder = out / engine / f"{station_m:g}m"
+        report.say(f"navigation at {station_m:g} m: {pairs} pairs by {engine}, {recipe.render.samples_per_px} samples")
+        summary = render_dataset(recipe, text, folder, range(pairs), 1, report)
+        if summary.drops:
+            raise ValueError(f"{folder}: {len(summary.drops)} frames could not be made: {summary.drops[0].reason}")
+        folders.append(folder)
+    return PairedDatasets(station_m, folders[0], folders[1])
+
+
+def paired_errors(paired: PairedDatasets) -> PairedErrors:
+    """Navigate on both datasets, without their truth, and compare with it.
+
+    Raises:
+        ValueError: the datasets are not of the same frames, or cannot be read.
+        OSError: the estimates cannot be written beside the datasets.
+    """
+    datasets = Dataset(paired.one), Dataset(paired.other)
+    frames: list[dict[int, str]] = [
+        {index: dataset.record(index).frame.model_dump_json() for index in dataset.frame_indices}
+        for dataset in datasets
+    ]
+    if frames[0] != frames[1]:
+        raise ValueError(f"{paired.one}, {paired.other}: do not hold the same frames; remove both and render again")
+    found = _errors(datasets[0], paired.one), _errors(datasets[1], paired.other)
+    common = sorted(found[0].keys() & found[1].keys())
+    one, other = (np.array([errors[i] for i in common]).reshape(-1, len(COMPONENTS)) for errors in found)
+    return PairedErrors(paired.distance_m, len(datasets[0].frame_indices), one, other)
+
+
+def _errors(dataset: Dataset, folder: Path) -> dict[int, Array]:
+    """(5,) errors by frame, of the frames that gave a pose."""
+    estimates = list(navigate(BlindDataset(folder), (METHOD,)))
+    write_estimates(folder.parent / f"{folder.name}.jsonl", estimates)
+    errors = {}
+    for estimate in estimates:
+        truth = dataset.record(estimate.frame_index).left_from_drogue
+        if isinstance(estimate, PoseEstimate) and truth is not None:
+            errors[estimate.frame_index] = pose_error(estimate.left_from_drogue, truth).components
+    return errors

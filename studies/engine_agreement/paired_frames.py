@@ -1,0 +1,133 @@
+"""The frames that both engines render, and their light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from datasets_manifest.recipe.pose_ranges import DistanceLaw
+from datasets_manifest.recipe.recipe import FrameCounts, Recipe, RenderSettings, load_recipe, recipe_names
+from datasets_manifest.types.frame import FrameSpec
+from render.engine import RenderEngine, StereoRadiance
+from scenes.sampler import sample_frame
+
+STATIONS_M = (2.0, 5.0, 10.0, 3.5, 20.0, 7.0, 40.0, 14.0)
+# Day and dusk with paint alone, then the 13 families of `world-89`, two of them with lit markers.
+FAMILIES = (
+    *("demo", "pose-tier-b", "pose-tier-b-dusk", "pose-tier-a", "pose-tier-a-dusk", "daylight-10m"),
+    *("world-89/clear", "world-89/cumulus-above", "world-89/cumulus-below", "world-89/overcast", "world-89/above-deck"),
+    *("world-89/cirrus", "world-89/between-layers", "world-89/in-haze", "world-89/sea", "world-89/low-sun"),
+    *("world-89/sunset", "world-89/dusk", "world-89/moonlit-night"),
+)
+# Far brighter than any sky.
+LAMP_CD_M2 = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class PairedFrame:
+    """One frame to be rendered by both engines.
+
+    Attributes:
+        family: what it is drawn from, see `recipe_of_family`.
+        distance_m: of the drogue. [m]
+        frame: with a drogue.
+        settings: as many samples as its size in the image can afford.
+    """
+
+    family: str
+    distance_m: float
+    frame: FrameSpec
+    settings: RenderSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One frame by one engine: as it is, and with the markers lit; CPU time of the first of both. [s]"""
+
+    plain: StereoRadiance
+    lit: StereoRadiance
+    cpu_s: float
+
+
+def recipe_of_family(name: str, seed: int) -> Recipe:
+    """The recipe that draws one kind of frames.
+
+    Args:
+        name: of a recipe, or a recipe file; `recipe/family` for one family of a recipe that has them.
+        seed: of everything drawn.
+
+    Raises:
+        ValueError: no such recipe or family.
+    """
+    head, _, tail = name.rpartition("/")
+    if head not in recipe_names() and not Path(head).is_file():
+        return load_recipe(name, seed)[0]
+    recipe, _ = load_recipe(head, seed)
+    chosen = tuple(family for family in recipe.families if family.name == tail)
+    if not chosen:
+        known = ", ".join(family.name for family in recipe.families) or "none"
+        raise ValueError(f"family: recipe {head} has none named {tail!r}; there are {known}")
+    return recipe.model_copy(update={"families": chosen})
+
+
+def paired_frames(
+    families: Sequence[str], stations_m: Sequence[float], count: int, most_samples: int, seed: int
+) -> list[PairedFrame]:
+    """Frames that go through families and distances in turn.
+
+    Args:
+        families: see `recipe_of_family`.
+        stations_m: distances of the drogue; where a rig cannot see all of it, the nearest at which it can. [m]
+        count: number of frames.
+        most_samples: through a pixel of the drogue.
+        seed: of everything drawn.
+
+    Raises:
+        ValueError: no such recipe or family, or one with real lenses or without drogues.
+    """
+    frames = []
+    for index in range(count):
+        family, station_m = families[index % len(families)], stations_m[index % len(stations_m)]
+        recipe = recipe_of_family(family, seed)
+        if recipe.rig.lenses is not None or recipe.frames.empty_fraction == 1:
+            raise ValueError(f"family: {family} has real lenses or no drogue; engines are compared on ideal eyes")
+        distance_m = max(station_m, 1.02 * recipe.rig.nearest_full_view_m(recipe.drogue.rim_radius_m))
+        frame = frame_at(recipe, distance_m, count, index)
+        frames.append(PairedFrame(family, distance_m, frame, _settings(recipe, distance_m, most_samples)))
+    return frames
+
+
+def frame_at(recipe: Recipe, distance_m: float, count: int, index: int) -> FrameSpec:
+    """One of `count` frames, each of a scene of its own, with the drogue at a distance [m]."""
+    changes = {
+        "frames": FrameCounts(count=count, scenes=count),
+        "distance": DistanceLaw(law="stations", stations_m=(distance_m,)),
+    }
+    # A dump would lose the folder of an environment's map.
+    return sample_frame(recipe.model_copy(update=changes), index)
+
+
+def _settings(recipe: Recipe, distance_m: float, most_samples: int) -> RenderSettings:
+    """All samples from 10 m on, fewer where the drogue has more pixels; hose and tanker a quarter of that."""
+    # Even squares, which samplers can spread evenly over a pixel.
+    side = 2 * max(1, round(np.sqrt(most_samples) * min(distance_m / 10.0, 1.0) / 2))
+    return recipe.render.model_copy(
+        update={"samples_per_px": side**2, "surround_samples_per_px": max(4, (side // 2) ** 2)}
+    )
+
+
+def render_both(paired: PairedFrame, engine: RenderEngine) -> Rendered:
+    """The frame as it is and with lit markers, from the same samples: their difference is the lamps' light alone."""
+    plain = engine.render(paired.frame, paired.settings)
+    lit = engine.render(lamps_lit(paired.frame, LAMP_CD_M2), paired.settings)
+    return Rendered(plain, lit, sum(plain.stage_s.values()))
+
+
+def lamps_lit(frame: FrameSpec, luminance_cd_m2: float) -> FrameSpec:
+    """The frame with its markers shining by themselves."""
+    assert frame.drogue is not None
+    drogue = frame.drogue.model_copy(update={"marker_luminance_cd_m2": luminance_cd_m2})
+    return frame.model_copy(update={"drogue": drogue})

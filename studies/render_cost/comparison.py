@@ -1,0 +1,92 @@
+"""All renderers at one distance, kept on disk, and the table of what was found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from datasets_manifest.atomic import write_text_atomic
+from droguekit.batch.workers import run_alone
+from studies.render_cost.noise_search import Cost, NoiseAt
+from studies.render_cost.own_path import measure_own_path
+from studies.render_cost.plain_cycles import measure_plain_cycles
+from studies.render_cost.plain_mitsuba import measure_plain_mitsuba
+
+OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
+
+
+def compare_at(
+    distance_m: float, seed: int, repeat: int, full_samples: int | None, say: Callable[[str], None]
+) -> dict[str, Any]:
+    """Noise and cost of a pair by all renderers at one distance.
+
+    Args:
+        distance_m: of the drogue. [m]
+        seed: of the frames.
+        repeat: pairs over which our own cost is averaged.
+        full_samples: most samples of Cycles over every pixel, or None for as many as are needed.
+        say: takes a line about what goes on.
+
+    Raises:
+        ValueError: Mitsuba or Blender is missing.
+        OSError: a process ended.
+    """
+    say(f"{distance_m:g} m: {OWN}")
+    own, own_cost, view = run_alone(partial(measure_own_path, distance_m, seed, repeat))
+    rows = {OWN: _row(own, own_cost)}
+    say(f"{distance_m:g} m: {MITSUBA}, to reach a noise of {own.noise:.1%}")
+    rows[MITSUBA] = _row(*run_alone(partial(measure_plain_mitsuba, view, own.noise)))
+    say(f"{distance_m:g} m: {CYCLES}, to reach a noise of {own.noise:.1%}")
+    rows[CYCLES] = _row(*measure_plain_cycles(view, own.noise, full_samples))
+    return {"schema": 1, "distance_m": distance_m, "seed": seed, "full_samples": full_samples, "renderers": rows}
+
+
+def _row(noise: NoiseAt, cost: Cost) -> dict[str, Any]:
+    return asdict(noise) | asdict(cost)
+
+
+def station_file(out: Path, distance_m: float) -> Path:
+    """Where what was found at a distance is kept."""
+    return out / f"{distance_m:g}m.json"
+
+
+def write_station(out: Path, found: dict[str, Any]) -> None:
+    """Keep what was found at a distance; a file is there whole or not at all."""
+    write_text_atomic(station_file(out, found["distance_m"]), json.dumps(found, indent=1) + "\n")
+
+
+def read_station(out: Path, distance_m: float, seed: int, full_samples: int | None) -> dict[str, Any] | None:
+    """What was found before at a distance with this seed and this limit, None if nothing was."""
+    file = station_file(out, distance_m)
+    if not file.exists():
+        return None
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return found if (found["seed"], found["full_samples"]) == (seed, full_samples) else None
+
+
+def table_lines(stations: list[dict[str, Any]]) -> list[str]:
+    """One line a distance: cost of each, and how much more the others take."""
+    lines = [
+        "| distance | noise | own path | plain Mitsuba | plain Cycles, OIDN | Mitsuba / own | Cycles / own |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for station in stations:
+        own, mitsuba, cycles = (station["renderers"][name] for name in (OWN, MITSUBA, CYCLES))
+        lines.append(
+            f"| {station['distance_m']:g} m | {own['noise']:.1%} | {own['cpu_s']:.2f} s | {_cost(mitsuba)} | "
+            f"{_cost(cycles)} | {_ratio(mitsuba, own)} | {_ratio(cycles, own)} |"
+        )
+    return lines
+
+
+def _cost(row: dict[str, Any]) -> str:
+    mark = "*" if row["is_carried_on"] else ""
+    return f"{'at least ' if row['is_least'] else ''}{row['cpu_s']:.0f} s at {row['samples']}{mark}"
+
+
+def _ratio(row: dict[str, Any], own: dict[str, Any]) -> str:
+    return f"{'at least ' if row['is_least'] else ''}{row['cpu_s'] / own['cpu_s']:.0f}"

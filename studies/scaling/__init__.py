@@ -1,0 +1,1 @@
+"""What spreading frames over workers gains and costs."""

@@ -1,0 +1,110 @@
+"""The automatic exposure: time within its limits first, then gain within its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from drogue_models.parameters import WHITE_PAINT
+from scenes.auto_exposure import meter
+from scenes.environment import environment_of_scene
+from scenes.environment_radiance import surroundings
+from scenes.sampler import sample_frame
+from scenes.sky.light import luminance
+
+TABLE = """
+name = "meter-test"
+rig = { preset = "rgb-ideal", width_px = 64, height_px = 48, focal_px = 107.0 }
+[frames]
+count = 1
+[distance]
+law = "stations"
+stations_m = [5.0]
+[exposure]
+%s
+"""
+
+
+def recipe(exposure: str = "") -> Recipe:
+    return parse_recipe(TABLE % exposure)
+
+
+def exposure_of(text: str):
+    return sample_frame(recipe(text), 0).exposure
+
+
+FREE = exposure_of("")
+
+
+def test_time_alone_when_its_limits_suffice():
+    with_gain = exposure_of("auto_gain = [1, 16]")
+    assert with_gain == FREE
+    assert FREE.gain == 1
+
+
+def test_gain_makes_up_for_a_time_at_its_limit():
+    longest_s = FREE.time_s / 5
+    got = exposure_of(f"auto_time_s = [1e-6, {longest_s!r}]\nauto_gain = [1, 16]")
+    assert got.time_s == longest_s
+    assert got.gain == pytest.approx(5, rel=1e-12)
+
+
+def test_gain_stays_within_its_limits():
+    got = exposure_of(f"auto_time_s = [1e-6, {FREE.time_s / 5!r}]\nauto_gain = [1, 3]")
+    assert got.gain == 3
+
+
+def test_a_gain_that_must_be_high_shortens_the_time():
+    got = exposure_of("auto_gain = [4, 16]")
+    assert got.gain == 4
+    assert got.time_s == pytest.approx(FREE.time_s / 4, rel=1e-12)
+
+
+def test_a_low_gain_takes_a_shortest_time_that_is_too_long():
+    got = exposure_of(f"auto_time_s = [{2 * FREE.time_s!r}, 1]\nauto_gain = [0.1, 1]")
+    assert got.time_s == 2 * FREE.time_s
+    assert got.gain == pytest.approx(0.5, rel=1e-12)
+
+
+def test_a_fixed_time_keeps_its_gain_or_meters_it():
+    time_s = FREE.time_s / 8
+    assert exposure_of(f"time_s = {time_s!r}").gain == 1
+    assert exposure_of(f"time_s = {time_s!r}\nauto_gain = 6").gain == 6
+    assert exposure_of(f"time_s = {time_s!r}\nauto_gain = [1, 64]").gain == pytest.approx(8, rel=1e-12)
+
+
+def test_product_of_time_and_gain_answers_the_aperture():
+    wide, narrow = (exposure_of(f"f_number = {f}\nauto_time_s = [1e-6, 1]\nauto_gain = [1, 64]") for f in (2.0, 4.0))
+    assert narrow.time_s * narrow.gain == pytest.approx(4 * wide.time_s * wide.gain, rel=1e-12)
+
+
+def test_the_meter_alone_with_a_scene():
+    made = recipe()
+    environment = environment_of_scene(made.seed, 0, made.environment)
+    frame = sample_frame(made, 0)
+    assert meter(made.exposure, environment, made.rig.camera, frame.world_from_left, made.sensor) == FREE
+
+
+def test_a_meter_on_the_plate_minds_no_sky_behind_it():
+    made = recipe('auto_meter = "plate"\nauto_level_fraction = 0.5\nauto_time_s = [1e-6, 1]')
+    environment = environment_of_scene(made.seed, 0, made.environment)
+    pose = sample_frame(made, 0).world_from_left
+    longer = []
+    for azimuth_deg in (0.0, 180.0):
+        around = environment.model_copy(update={"sun_elevation_deg": 12.0, "sun_azimuth_deg": azimuth_deg})
+        got = meter(made.exposure, around, made.rig.camera, pose, made.sensor)
+        plate = surroundings(around).plate_illuminance_lux(-pose.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
+        electrons = made.sensor.electrons_per_cd_m2(got) * float(luminance(plate))
+        assert electrons == pytest.approx(0.5 * made.sensor.full_well_e, rel=1e-9)
+        of_view = made.exposure.model_copy(update={"auto_meter": "view"})
+        longer.append(got.time_s / meter(of_view, around, made.rig.camera, pose, made.sensor).time_s)
+    # With the sun ahead the sky is brighter than the shaded plate; with the sun behind the plate is brighter.
+    assert longer[0] > 2
+    assert longer[1] == 1
+
+
+@pytest.mark.parametrize("text", ["auto_gain = [0.01, 1]", "auto_gain = [1, 100]", "auto_gain = [4, 2]"])
+def test_impossible_gains_are_refused(text):
+    with pytest.raises(ValueError, match="gain"):
+        recipe(text)

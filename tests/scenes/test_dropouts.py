@@ -1,0 +1,304 @@
+"""Sequences that lose the drogue for a while: what hides it hides all of it, and nothing else changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datasets_manifest.random_streams import frame_generator
+from datasets_manifest.recipe.dropout_ranges import LossRanges
+from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from drogue_models.parts import Part
+from geometry.se3 import log_twist
+from geometry.stereo import EYES
+from labelgen.boxes import drogue_hull_m
+from scenes.flight.dropouts import LossEvent, flown_m, sample_loss
+from scenes.sampler import sample_frame
+from scenes.sky.light import direction_from_angles
+
+FRAMES = 40
+BASE = """
+name = "loss-test"
+seed = %d
+%s
+[frames]
+count = 40
+[pose]
+camera_pitch_deg = 10
+[exposure]
+time_s = 0.002
+[sequence]
+frames_per_sequence = 40
+frame_rate_hz = 20
+release_m = [13.8, 0.5, -5]
+[sequence.receiver]
+manoeuvres = ["station"]
+start_m = %g
+[sequence.losses]
+kinds = ["%s"]
+begins_s = 0.6
+lasts_s = 0.5
+onset_s = 0.4
+%s
+"""
+
+
+def recipe(kind, seed=2, start_m=6.0, rig="", more=""):
+    return parse_recipe(BASE % (seed, rig, start_m, kind, more))
+
+
+def event(drawn):
+    return sample_loss(frame_generator(drawn.seed, 0, "loss"), drawn.sequence.losses, 0)
+
+
+def lost(drawn):
+    """Frames of the stretch itself, without coming and going."""
+    happens = event(drawn)
+    return [k for k in range(FRAMES) if happens.begin_s <= k / 20 <= happens.end_s]
+
+
+def lines_of_sight(frame):
+    """(2 N, 3) origins and unit directions from both eyes to all corners of the drogue. [m]"""
+    points = frame.left_from_drogue.apply(drogue_hull_m(frame.drogue))
+    origins = np.repeat([frame.rig.eye_offset_m(eye) for eye in EYES], len(points), axis=0)
+    ways = np.tile(points, (2, 1)) - origins
+    return origins, ways / np.linalg.norm(ways, axis=1, keepdims=True)
+
+
+def clearance_m(bar, origins, directions):
+    """(N,) distance of lines from a bar's surface; negative where they pierce it. [m]"""
+    axis, center = bar.left_from_object.rotation[:, 2], bar.left_from_object.translation_m
+    normal = np.cross(directions, axis)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.abs(np.einsum("ni,ni->n", origins - center, normal)) - bar.shape.radius_m
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4, 5])
+def test_a_bar_hides_all_of_the_drogue_and_comes_from_outside_the_picture(seed):
+    drawn = recipe("occlusion", seed)
+    frames = {k: sample_frame(drawn, k) for k in range(FRAMES)}
+    for k in lost(drawn):
+        (bar,) = frames[k].bystanders
+        assert bar.kind == "obstacle"
+        assert clearance_m(bar, *lines_of_sight(frames[k])).max() < 0
+        assert bar.left_from_object.translation_m[2] + bar.shape.radius_m < frames[k].left_from_drogue.translation_m[2]
+    barred = [k for k, frame in frames.items() if frame.bystanders]
+    assert barred == [k for k, frame in frames.items() if frame.loss == "occlusion"]
+    assert 0 not in barred and FRAMES - 1 not in barred
+    # The moment before it comes into sight and after it has gone: beyond every line of sight of either eye.
+    happens, flown = event(drawn), frames[barred[0]]
+    camera = flown.rig.camera
+    edge = np.array([[u, v] for u in (-0.5, camera.width_px - 0.5) for v in (-0.5, camera.height_px - 0.5)])
+    rays = camera.rays(edge)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for time_s in (happens.begin_s - happens.onset_s + 1e-6, happens.end_s + happens.onset_s - 1e-6):
+        bar = bar_at(drawn, time_s)
+        for eye in EYES:
+            assert clearance_m(bar, np.tile(flown.rig.eye_offset_m(eye), (4, 1)), rays).min() > -1e-6
+
+
+def bar_at(drawn, time_s):
+    from scenes.flight.sequence import _flight
+
+    flight = _flight(drawn.seed, 0, drawn.sequence, drawn.drogue, drawn.pose, drawn.rig.baseline_m)
+    return flight._bar.at(time_s, drawn.rig.camera)
+
+
+def test_nothing_else_of_a_sequence_changes_with_a_bar():
+    with_bar, without = recipe("occlusion"), recipe("none")
+    for k in (0, 10, 16, 39):
+        changed = sample_frame(with_bar, k).model_copy(update={"bystanders": (), "loss": None})
+        assert changed.model_dump_json() == sample_frame(without, k).model_dump_json()
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_turned_receiver_sees_nothing_of_the_drogue_from_the_same_place(seed):
+    drawn, plain = recipe("out-of-view", seed), recipe("none", seed)
+    inside = lost(drawn)
+    for k in range(0, FRAMES, 3):
+        turned, straight = sample_frame(drawn, k), sample_frame(plain, k)
+        places = [frame.left_from_drogue.inverse().translation_m for frame in (turned, straight)]
+        # Rounding.
+        np.testing.assert_allclose(*places, atol=1e-9)
+        if turned.loss is None:
+            np.testing.assert_allclose(
+                turned.left_from_drogue.as_matrix(), straight.left_from_drogue.as_matrix(), atol=1e-12
+            )
+    for k in inside:
+        frame = sample_frame(drawn, k)
+        points = frame.left_from_drogue.apply(drogue_hull_m(frame.drogue))
+        for eye in EYES:
+            assert not frame.rig.camera.contains(frame.rig.image(points, eye)).any()
+
+
+def test_the_turn_is_in_the_twists():
+    drawn = parse_recipe(
+        (BASE % (2, "", 6.0, "out-of-view", ""))
+        .replace("frame_rate_hz = 20", "frame_rate_hz = 1000")
+        .replace("time_s = 0.002", "time_s = 0.0005")
+        .replace("= 40", "= 2000")
+    )
+    happens = sample_loss(frame_generator(2, 0, "loss"), drawn.sequence.losses, 0)
+    middle = round(1000 * (happens.begin_s - happens.onset_s / 2))
+    earlier, frame, later = (sample_frame(drawn, middle + step) for step in (-1, 0, 1))
+    relative = log_twist(earlier.left_from_drogue.inverse() @ later.left_from_drogue) / 0.002
+    at = [frame.left_from_drogue_at(step) for step in (-1e-4, 1e-4)]
+    # As for sequences without losses: vibration of 40 Hz at a lever of 6 m.
+    np.testing.assert_allclose(log_twist(at[0].inverse() @ at[1]) / 2e-4, relative, atol=8e-3)
+    # A half cosine is fastest in the middle, by pi/2 over its mean.
+    assert np.linalg.norm(frame.left_twist_per_s[3:]) == pytest.approx(
+        np.pi / 2 * happens.turn_rad / happens.onset_s, rel=0.03
+    )
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_the_sun_comes_beside_the_drogue_and_goes(seed):
+    drawn, plain = recipe("glare", seed), recipe("none", seed)
+    happens = event(drawn)
+    beside = {}
+    for k in range(FRAMES):
+        frame = sample_frame(drawn, k)
+        environment = frame.environment
+        assert environment.sun_elevation_deg > 1
+        sun = direction_from_angles(environment.sun_elevation_deg, environment.sun_azimuth_deg)
+        to_sun = frame.world_from_left.inverse().rotate(sun)
+        middle = frame.left_from_drogue.translation_m
+        distance_m = np.linalg.norm(middle)
+        angle = np.arccos(to_sun @ middle / distance_m)
+        beside[k] = angle - np.arcsin(frame.drogue.rim_radius_m / distance_m)
+        np.testing.assert_allclose(
+            frame.left_from_drogue.as_matrix(), sample_frame(plain, k).left_from_drogue.as_matrix(), atol=1e-12
+        )
+    nearest = min(beside, key=lambda k: abs(k / 20 - happens.middle_s))
+    # The pair nearest to the middle is half a period off, in which attitude and drogue move by tenths of a degree.
+    assert beside[nearest] == pytest.approx(happens.sun_offset_rad, abs=np.radians(0.5))
+    away = [angle for k, angle in beside.items() if abs(happens.away(k / 20)) == 1]
+    # Off by the whole sweep to one side and the other, but for the sun's place on one side of the drogue and the swing.
+    half_drogue = np.arcsin(0.33 / 6.0)
+    assert min(away) > 0.95 * happens.sweep_rad - happens.sun_offset_rad - 2 * half_drogue - np.radians(2)
+    headings = [happens.heading_rad(k / 20) for k in (0, FRAMES - 1)]
+    assert headings[0] == pytest.approx(-headings[1]) and abs(headings[0]) == pytest.approx(happens.sweep_rad)
+
+
+def test_a_formation_that_turns_flies_where_it_heads():
+    happens = sample_loss(np.random.default_rng(1), LossRanges(kinds=("glare",)), 0)
+    time_s, step_s = 2.3, 1e-3
+    moved = (flown_m(happens, 120.0, time_s + step_s) - flown_m(happens, 120.0, time_s - step_s)) / (2 * step_s)
+    heading = happens.heading_rad(time_s)
+    # The middles of 121 pieces of two seconds: (0.02 s)^2 / 24 of the second derivative, 1e-4 of 120 m/s.
+    np.testing.assert_allclose(moved, 120.0 * np.array([np.cos(heading), np.sin(heading)]), atol=0.05)
+
+
+def test_it_comes_lasts_and_goes_smoothly():
+    happens = LossEvent("occlusion", 2.0, 4.0, 0.5, 1, 1.0, 1.0, 0.5, 0.1, 0.2)
+    times = np.linspace(0, 6, 6001)
+    away = np.array([happens.away(time) for time in times])
+    np.testing.assert_array_equal(away[(times >= 2) & (times <= 4)], 0)
+    assert (away[times <= 1.499] == 1).all() and (away[times >= 4.501] == -1).all()
+    assert (np.diff(away) <= 1e-12).all()
+    # Half a cosine over half a second.
+    assert np.abs(np.gradient(away, times)).max() == pytest.approx(np.pi, rel=1e-3)
+    assert [happens.acts(time) for time in (1.4, 1.6, 3.0, 4.4, 4.6)] == [False, True, True, True, False]
+
+
+def test_kinds_come_in_turn_and_draws_do_not_depend_on_them():
+    ranges = LossRanges(kinds=("occlusion", "none", "glare"))
+    drawn = [sample_loss(frame_generator(1, k, "loss"), ranges, k) for k in range(6)]
+    assert [None if one is None else one.kind for one in drawn] == ["occlusion", None, "glare"] * 2
+    other = sample_loss(frame_generator(1, 0, "loss"), LossRanges(kinds=("glare",)), 0)
+    assert (other.tilt_rad, other.side) == (drawn[0].tilt_rad, drawn[0].side)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "fault"),
+    [
+        ("occlusion", {"more": 'thickness_m = 2'}, r"sequence.losses.thickness_m"),
+        ("hail", {}, r"sequence.losses.kinds"),
+        ("out-of-view", {"more": "turn_deg = 15"}, r"turn_deg: 15 degrees leave part of the drogue in view at 6 m"),
+        ("glare", {"more": "sun_offset_deg = [0, 9]"}, r"look up at the drogue by at least 10.4 degrees"),
+        ("occlusion", {"more": "[render]\nengine = 'analytic'"}, r"render.engine: analytic draws no obstacles"),
+    ],
+)  # fmt: skip
+def test_wrong_losses_are_named_on_one_line(kind, changes, fault):
+    with pytest.raises(ValueError, match=fault) as caught:
+        recipe(kind, **changes)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "fault"),
+    [
+        ("begins_s = 0.6", "begins_s = 0.3", r"begins_s: must be at least onset_s, 0.4 s"),
+        ("lasts_s = 0.5", "lasts_s = 5", r"losses last until 6 s, which is 122 frames, got 40"),
+        (
+            "camera_pitch_deg = 10",
+            "camera_pitch_deg = 0",
+            r"pose.camera_pitch_deg: glare needs the receiver to look up",
+        ),
+    ],
+)
+def test_losses_that_do_not_fit_are_refused(before, after, fault):
+    with pytest.raises(ValueError, match=fault):
+        parse_recipe((BASE % (2, "", 6.0, "glare", "")).replace(before, after))
+
+
+def test_a_bar_as_thick_as_its_distance_is_refused():
+    drawn = recipe("occlusion", more="obstacle_distance_m = 0.4", start_m=2.0)
+    with pytest.raises(ValueError, match=r"obstacle_distance_m: a bar that hides the drogue all along"):
+        sample_frame(drawn, 0)
+
+
+@pytest.mark.parametrize(("start_m", "obstacle_m"), [(4.0, 5.0), (4.0, 3.6)])
+def test_a_bar_that_does_not_stand_before_the_drogue_is_refused(start_m, obstacle_m):
+    drawn = recipe("occlusion", more=f"obstacle_distance_m = {obstacle_m}", start_m=start_m)
+    with pytest.raises(ValueError, match=r"sequence.losses.obstacle_distance_m: .* does not stand before all of"):
+        sample_frame(drawn, 0)
+
+
+def test_a_sun_below_the_horizon_is_refused():
+    low = BASE % (2, "", 6.0, "glare", "")
+    low = low.replace("[sequence.losses]", "offset_down_m = 0.9\n[sequence.losses]")
+    low = low.replace("camera_pitch_deg = 10", "camera_pitch_deg = 5")
+    # The drogue is seen 8.5 degrees below the axis, which is pitched up by 5, and the sun at most 2.8 above it.
+    with pytest.raises(ValueError, match=r"sun_offset_deg: the sun beside .* below the horizon"):
+        sample_frame(parse_recipe(low), 0)
+
+
+@pytest.mark.parametrize("offset", ["[0, 0.8]", "[-0.8, 0]"])
+def test_a_turn_must_lose_a_drogue_that_is_beside_the_axis(offset):
+    text = (BASE % (2, "", 6.0, "out-of-view", "turn_deg = 28")).replace(
+        "[sequence.losses]", f"offset_right_m = {offset}\n[sequence.losses]"
+    )
+    # Half a field of 16.7 degrees, and rim, baseline and offset of 1.25 m in all at 6 m: 28.5 degrees.
+    with pytest.raises(ValueError, match=r"turn_deg: 28 degrees leave part .* at 6 m; turn by at least"):
+        parse_recipe(text)
+    parse_recipe(text.replace("turn_deg = 28", "turn_deg = 40"))
+
+
+def test_recipes_without_losses_do_not_know_of_them():
+    drawn, _ = load_recipe("docking-10m")
+    text = drawn.model_dump_json()
+    assert not any(word in text for word in ("losses", "in_turn", "scattered_fraction"))
+    assert '"loss"' not in sample_frame(recipe("none"), 0).model_dump_json()
+
+
+@pytest.mark.mitsuba
+def test_records_of_a_hidden_drogue_say_so():
+    from labelgen.frame_labels import label_frame
+    from labelgen.validation.label_checks import check_against_passes
+    from render.camera.sensor import expose
+    from render.engine import load_engine
+
+    rig = 'rig = { preset = "rgb-ideal", width_px = 160, height_px = 120, focal_px = 266.0 }'
+    drawn = recipe("occlusion", rig=rig, more="[render]\nsamples_per_px = 1\nedge_samples_per_px = 4")
+    for k, hidden in ((0, False), (lost(drawn)[0], True)):
+        frame = sample_frame(drawn, k)
+        radiance = load_engine("mitsuba").render(frame, drawn.render)
+        record = label_frame(frame, radiance, expose(frame, radiance))
+        assert check_against_passes(record, radiance) == []
+        for view, seen in ((record.views.left, radiance.left), (record.views.right, radiance.right)):
+            assert (view.visible_drogue_px == 0) == hidden and (view.box_visible_xywh_px is None) == hidden
+            assert {marker.visible_fraction for marker in view.markers} == {0.0 if hidden else 1.0}
+            assert (seen.part_id == Part.OBSTACLE).any() == hidden
+        # On the image all the same, as occlusion does not count there.
+        assert record.conditions.markers_in_view == (8, 8)

@@ -1,0 +1,104 @@
+"""Limits of the bars against scipy's own tests and against what they promise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from studies.acceptance import confidence
+from studies.acceptance.table import BarTable, at_most, between, not_measured
+
+
+def rng(stream: int) -> np.random.Generator:
+    return np.random.default_rng(stream)
+
+
+def test_the_limit_of_a_root_mean_square_is_the_chi_square_one() -> None:
+    values = rng(1).normal(size=400)
+    rms, limit = confidence.rms_limit(values)
+    assert rms == pytest.approx(np.sqrt(np.mean(values**2)))
+    # At the limit, so small a sum of squares has just the probability of 5 %.
+    assert stats.chi2.cdf(400 * rms**2 / limit**2, 400) == pytest.approx(0.05)
+
+
+def test_the_limit_of_a_mean_is_students() -> None:
+    values = rng(2).normal(3.0, 2.0, size=30)
+    _, limit = confidence.mean_limit(values)
+    assert limit == pytest.approx(stats.ttest_1samp(values, 0.0, alternative="less").confidence_interval(0.95).high)
+
+
+@pytest.mark.parametrize(("hits", "count"), [(0, 400), (7, 400), (399, 400), (400, 400)])
+def test_the_limit_of_a_share_is_the_exact_one(hits: int, count: int) -> None:
+    share, limit = confidence.share_limit(hits, count)
+    test = stats.binomtest(hits, count, alternative="less")
+    assert share == hits / count
+    assert limit == pytest.approx(test.proportion_ci(0.95, method="exact").high)
+
+
+def test_the_limit_of_a_percentile_covers_it_in_19_of_20_samples() -> None:
+    true = stats.halfnorm.ppf(0.99)
+    samples = rng(3).normal(size=(2000, 600))
+    covered = np.mean([confidence.percentile_limit(sample, 99.0)[1] >= true for sample in samples])
+    # The order statistic is the first that reaches 95 %; four standard errors of 2000 trials are 2 %.
+    assert covered >= 0.95 - 0.02
+
+
+def test_the_limit_of_a_ratio_in_the_same_frames_covers_it_in_19_of_20_samples() -> None:
+    draws = rng(4)
+    place = draws.exponential(1.0, (4000, 40, 10))
+    above, below = (size * (place * draws.exponential(1.0, place.shape)).sum(axis=2) for size in (2.0, 1.0))
+    limits = np.array([confidence.paired_ratio_limit(a, b)[1] for a, b in zip(above, below, strict=True)])
+    # First order in the number of blocks, and four standard errors of 4000 trials: 1.4 %.
+    assert np.mean(limits >= 2.0) == pytest.approx(0.95, abs=0.025)
+
+
+def test_what_two_errors_share_does_not_widen_the_limit_of_their_ratio() -> None:
+    draws = rng(7)
+    below = draws.normal(0, 1.0, (4000, 300))
+    # Uncorrelated with `below - above`, as an optimal estimate is with what another adds; of variance 0.9.
+    above = 0.9 * below + np.sqrt(0.9 * 0.1) * draws.normal(0, 1.0, below.shape)
+    limits = []
+    for a, b in zip(above, below, strict=True):
+        sizes = np.sqrt(np.mean(a**2)), np.sqrt(np.mean(b**2))
+        correlation = np.mean(a * b) / (sizes[0] * sizes[1])
+        limits.append(confidence.paired_rms_ratio_limit(*sizes, correlation, a.size)[1])
+    # As above.
+    assert np.mean(np.array(limits) >= np.sqrt(0.9)) == pytest.approx(0.95, abs=0.02)
+    # Taken as independent the limit would be 7 % above the ratio.
+    assert np.mean(limits) < 1.035 * np.sqrt(0.9)
+
+
+def test_the_limit_of_a_ratio_of_root_mean_squares_covers_it_in_19_of_20_samples() -> None:
+    above, below = rng(5).normal(0, 3.0, (4000, 200)), rng(6).normal(0, 1.0, (4000, 300))
+    limits = [
+        confidence.rms_ratio_limit((np.sqrt(np.mean(a**2)), a.size), (np.sqrt(np.mean(b**2)), b.size))[1]
+        for a, b in zip(above, below, strict=True)
+    ]
+    # As above.
+    assert np.mean(np.array(limits) >= 3.0) == pytest.approx(0.95, abs=0.02)
+
+
+def test_the_limits_of_nees_hold_the_chi_square_quantiles() -> None:
+    freedom = 2000
+    value, low, high = confidence.nees_limits(1.0, freedom)
+    quantiles = stats.chi2.ppf([0.05, 0.95], freedom) / freedom
+    # The normal law departs from chi-square by the order of 1/freedom.
+    assert (value, low, high) == pytest.approx((1.0, *quantiles), abs=2 / freedom)
+
+
+def test_a_bar_is_met_when_its_limit_is_and_not_when_only_its_value_is() -> None:
+    assert at_most("5", "x", 1.2, (1.1, 1.19), 10).met
+    assert not at_most("5", "x", 1.2, (1.1, 1.21), 10).met
+    assert between("9", "x", (0.85, 1.2), (1.0, 0.9, 1.1), 10).met
+    assert not between("9", "x", (0.85, 1.2), (1.0, 0.8, 1.1), 10).met
+    assert not not_measured("4", "x", 1.0, "why").met
+
+
+def test_the_table_counts_numbered_bars_and_shows_all() -> None:
+    rows = (at_most("5", "five", 1, (2, 3), 4), at_most("goal", "aim", 1, (2, 3), 4), at_most("6", "six", 1, (0, 0), 4))
+    table = BarTable(tier="a", seed=1, code_version="0", rows=rows)
+    assert table.missed == 1
+    assert "1 of 2 bars are met" in table.to_markdown()
+    assert [line.split()[0] for line in table.to_lines()] == ["bar", "5", "goal", "6"]
+    assert BarTable.model_validate_json(table.to_json()) == table

@@ -1,0 +1,330 @@
+"""What is asked of the peers, without their environment: their corpus, the length of their training, and faults."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.storage.reader import Dataset
+from droguekit.batch.progress import PlainProgress
+from droguekit.batch.render_dataset import render_dataset
+from droguekit.benchmark.detection.detection_benchmark import DetectorRun, score_detections
+from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection.detection_truth import read_detection_truth
+from droguekit.cli.main import DONE, run
+from geometry.stereo import EYES
+from nav.detector.input_image import input_image
+from nav.detector.onnx_detector import OnnxDetector
+from studies.detector_comparison.ablation import (
+    CHANGES,
+    ONE_VIEW,
+    AblationOrder,
+    ablate,
+    ablation_lines,
+    measured_networks,
+)
+from studies.detector_comparison.comparison import PEERS, PeerOrder, compare_peers, run_script, training_length
+from studies.detector_comparison.one_view import OneViewDetector
+from studies.detector_comparison.options import input_size_px
+from studies.detector_comparison.table import comparison_lines
+from studies.detector_comparison.yolo_corpus import check_corpus, export_corpus, images_to_train_on
+
+
+@pytest.fixture(scope="module")
+def screen_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six small pairs as a screen wants them, two in each split."""
+    _, text = load_recipe("smoke")
+    changed = text.replace('preset = "rgb-ideal"', 'preset = "rgb-ideal"\nencoding = "gamma"')
+    changed = changed.replace("scenes = 2", "scenes = 3\nempty_fraction = 0.2").replace("train = 0.5", "train = 0.34")
+    changed = changed.replace("val = 0.0", "val = 0.33").replace("test = 0.5", "test = 0.33")
+    changed = changed.replace("[render]", '[render]\nengine = "analytic"').replace("seed = 1", "seed = 8")
+    recipe = parse_recipe(changed)
+    out = tmp_path_factory.mktemp("screen") / "dataset"
+    with (out.parent / "log").open("w") as told:
+        render_dataset(recipe, changed, out, range(6), 0, PlainProgress(told))
+    return out
+
+
+def order(corpus: Path, folder: Path, **changes: object) -> PeerOrder:
+    values: dict[str, object] = {
+        "corpus": corpus,
+        "test": corpus,
+        "ours": (),
+        "image_passes": 100,
+        "size_px": (64, 64),
+        "batch": 4,
+        "threads": 1,
+        "rounds": 2,
+        "device": "cpu",
+        "seed": 0,
+        "environment": folder / "environment",
+    }
+    return PeerOrder(**{**values, **changes})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("size_px", [(160, 96), (320, 256)])
+def test_the_corpus_of_the_peers_has_one_class_and_what_our_networks_see(
+    screen_dataset: Path, tmp_path: Path, size_px: tuple[int, int]
+) -> None:
+    data = export_corpus(screen_dataset, tmp_path / "corpus", size_px)
+    assert data.read_text().endswith("test: images/test\nnames:\n  0: drogue\n")
+    annotations = json.loads((screen_dataset / "annotations" / "all.json").read_text())
+    expected = {annotation["image_id"]: annotation["bbox"] for annotation in annotations["annotations"]}
+    source = Dataset(screen_dataset)
+    camera = source.manifest.recipe.rig.camera
+    # 320 x 240 px fit into 160 x 96 as 128 x 96, and stay as they are in 320 x 256.
+    scale, offset = (0.4, (16, 0)) if size_px == (160, 96) else (1.0, (0, 8))
+    assert (camera.width_px, camera.height_px) == (320, 240)
+    labels = sorted((data.parent / "labels").rglob("*.txt"))
+    assert len(labels) == 12 and images_to_train_on(screen_dataset) == 4
+    for label in labels:
+        frame, eye = label.stem.split("_")
+        rows = [[float(number) for number in row.split()] for row in label.read_text().splitlines()]
+        box = expected.get(2 * int(frame) + (eye == "right") + 1)
+        assert len(rows) == (box is not None)
+        if box is not None:
+            number, x, y, width, height = rows[0]
+            found = [(x - width / 2) * size_px[0], (y - height / 2) * size_px[1], width * size_px[0]]
+            want = [box[0] * scale + offset[0], box[1] * scale + offset[1], box[2] * scale]
+            # Divided by the picture's size and multiplied by it again, in double precision.
+            assert number == 0 and found == pytest.approx(want, abs=1e-9)
+        picture = data.parent / "images" / label.relative_to(data.parent / "labels").with_suffix(".png")
+        seen, _ = input_image(source.images(int(frame)), "right" if eye == "right" else "left", size_px)
+        np.testing.assert_array_equal(cv2.imread(str(picture))[..., ::-1], seen)
+    # What is there already stays.
+    label.write_text("")
+    export_corpus(screen_dataset, tmp_path / "corpus", size_px)
+    assert label.read_text() == ""
+
+
+def test_a_corpus_that_would_be_scored_on_what_was_trained_on_is_refused(smoke_dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="needs pairs in the splits train, val, test, got"):
+        compare_peers(order(smoke_dataset, tmp_path), tmp_path / "out", print)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_corpus_without_a_test_split_is_scored_on_another_dataset(
+    screen_dataset: Path, smoke_dataset: Path, tmp_path: Path
+) -> None:
+    # The one lacks pairs to choose by, so it serves to be scored on but not to train on.
+    compared = order(screen_dataset, tmp_path, test=smoke_dataset)
+    check_corpus(compared.corpus, compared.test)
+    with pytest.raises(ValueError, match="needs pairs in the splits train, val, got"):
+        compare_peers(order(smoke_dataset, tmp_path, test=screen_dataset), tmp_path / "out", print)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scenes_that_were_trained_on_are_not_scored(screen_dataset: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(screen_dataset, again)
+    with pytest.raises(ValueError, match=r"again: has scenes of .*, for both have the seed 8; render one with"):
+        compare_peers(order(screen_dataset, tmp_path, test=again), tmp_path / "out", print)
+    assert list(tmp_path.iterdir()) == [again]
+
+
+def test_a_folder_in_which_another_comparison_is_at_work_is_refused(screen_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    with (out / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(ValueError, match="out: another comparison is at work in it; wait for its end"):
+            compare_peers(order(screen_dataset, tmp_path), out, print)
+    assert [file.name for file in out.iterdir()] == [".lock"]
+
+
+@pytest.mark.parametrize(
+    ("passes", "images", "expected"),
+    [
+        (1, 1000, (1, 0.001, 1)),
+        (300, 1000, (1, 0.3, 300)),
+        (1000, 1000, (1, 1.0, 1000)),
+        (1400, 1000, (1, 1.0, 1000)),
+        (1600, 1000, (2, 1.0, 2000)),
+        (40_000, 1_680, (24, 1.0, 40_320)),
+    ],
+)
+def test_passes_are_rounded_to_whole_epochs_of_all_images(
+    passes: int, images: int, expected: tuple[int, float, int]
+) -> None:
+    assert training_length(passes, images) == expected
+
+
+def test_a_training_without_images_is_refused() -> None:
+    with pytest.raises(ValueError, match="has no images to train on"):
+        training_length(100, 0)
+
+
+def test_a_fault_of_the_peers_names_the_log_and_what_was_said_last(tmp_path: Path) -> None:
+    # Our own interpreter has no ultralytics.
+    with pytest.raises(OSError, match=r"export\.log: ultralytics ended with status 1: ModuleNotFoundError"):
+        run_script(Path(sys.executable), {"do": "export"}, tmp_path / "new" / "export.log", {})
+
+
+def test_the_script_needs_nothing_of_ours() -> None:
+    # In isolated mode with another folder as home, as in the peers' environment.
+    script = Path(run_script.__code__.co_filename).with_name("yolo_script.py")
+    ended = subprocess.run([sys.executable, "-I", str(script)], input="{}", capture_output=True, text=True, check=False)
+    assert "No module named 'ultralytics'" in ended.stderr
+
+
+def test_a_folder_of_another_comparison_is_refused(screen_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "settings.json").write_text(json.dumps({"image_passes": "7"}))
+    with pytest.raises(
+        ValueError, match="holds a comparison with another batch, corpus, image_passes, seed, size_px, test"
+    ):
+        compare_peers(order(screen_dataset, tmp_path), out, print)
+    (out / "settings.json").write_text("[1]")
+    with pytest.raises(ValueError, match=r"settings\.json: must hold the settings of a comparison, got list"):
+        compare_peers(order(screen_dataset, tmp_path), out, print)
+    (out / "settings.json").write_text("{")
+    with pytest.raises(ValueError, match=r"settings\.json: is not JSON"):
+        compare_peers(order(screen_dataset, tmp_path), out, print)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("ours.onnx", "cannot be read"), ("yolov8s.onnx", "another detector is named 'yolov8s'")]
+)
+def test_what_is_wrong_with_ours_is_said_before_anything_is_trained(
+    screen_dataset: Path, tmp_path: Path, name: str, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        compare_peers(order(screen_dataset, tmp_path, ours=(tmp_path / name,)), tmp_path / "out", print)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_network_of_ours_that_cannot_be_counted_is_refused_before_anything_is_trained(
+    screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
+) -> None:
+    odd = maps_network(tmp_path / "odd.onnx", is_countable=False)
+    with pytest.raises(ValueError, match="its shape cannot be told"):
+        compare_peers(order(screen_dataset, tmp_path, ours=(odd,)), tmp_path / "out", print)
+    assert list(tmp_path.iterdir()) == [odd]
+
+
+def test_what_is_trained_already_is_timed_and_scored_as_benchmark_scores_it(
+    screen_dataset: Path, rows_network: Callable[..., Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    truth = {image.image_id: image for image in read_detection_truth(screen_dataset).images if image.split == "test"}
+    some = next(image for image in truth.values() if image.box_xywh is not None and image.eye == "left")
+    assert some.box_xywh is not None
+    x, y, width, height = (0.2 * number for number in some.box_xywh)
+    rows = np.zeros((2, 5, 2), np.float32)
+    # 320 x 240 px fit into 64 x 64 as 64 x 48, from row 8 on. The one network finds the drogue in one image.
+    rows[0, :, 0] = [x + width / 2, y + 8 + height / 2, width, height, 0.8]
+    rows_network(out / "yolov8s.onnx", rows)
+    rows_network(out / "yolov8n.onnx", np.zeros_like(rows))
+    told: list[str] = []
+    found = compare_peers(order(screen_dataset, tmp_path), out, told.append)
+    assert not any("training" in line or "installing" in line for line in told)
+    files = [word for name in PEERS for word in ("--detections", str(out / "detections" / f"{name}.json"))]
+    words = ["benchmark", str(screen_dataset), *files, "--split", "test", "--json", str(tmp_path / "scores.json")]
+    assert run(words) == DONE
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert scores["dataset"]["images"] == len(truth) == 4
+    table = json.loads((out / "comparison.json").read_text())
+    assert list(table["detectors"]) == list(PEERS) and table["order"]["peer_image_passes"] == "100"
+    for name in PEERS:
+        row, overall = table["detectors"][name], scores["detectors"][name]["overall"]
+        assert row == json.loads(json.dumps(found[name]))
+        assert {key: row[key] for key in ("ap", "ap50", "ap75", "recall")} == {
+            key: overall[key] for key in ("ap", "ap50", "ap75", "recall")
+        }
+    assert table["detectors"]["yolov8n"]["ap50"] == 0.0 < table["detectors"]["yolov8s"]["ap50"] < 1.0
+
+
+def test_scored_are_the_pairs_of_the_test_dataset(
+    screen_dataset: Path, smoke_dataset: Path, rows_network: Callable[..., Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    for name in PEERS:
+        rows_network(out / f"{name}.onnx", np.zeros((2, 5, 2), np.float32))
+    compare_peers(order(screen_dataset, tmp_path, test=smoke_dataset), out, lambda line: None)
+    scored = json.loads((out / "scores.json").read_text())["dataset"]
+    assert scored["sha256"] == Dataset(smoke_dataset).manifest.dataset_sha256
+
+
+def test_ablations_are_scored_like_everything_and_one_view_finds_the_same_boxes(
+    screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
+) -> None:
+    file = maps_network(tmp_path / "detector.onnx")
+    nowhere = tmp_path / "nowhere"
+    ablation = AblationOrder(nowhere, screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
+    rows = measured_networks(ablation, {"eca-asff": file, ONE_VIEW: file}, lambda line: None)
+    truth = read_detection_truth(screen_dataset)
+    boxes = list(DetectorPass(screen_dataset, lambda drogue: OnnxDetector(file)).boxes(LEAST_SCORE, lambda: None))
+    overall = score_detections(truth, {"mine": DetectorRun(boxes)}, "test").result.detectors["mine"].overall
+    assert {box.image_id for box in boxes} > {image.image_id for image in truth.images if image.split == "test"}
+    for row in rows.values():
+        # The same numbers from batches of other sizes.
+        assert row["test"] == pytest.approx({key: getattr(overall, key) for key in ("ap", "ap50", "ap75")}, abs=1e-6)
+        assert row["ratio"] > 0 and row["parameters"] > 0
+    images = Dataset(screen_dataset).images(0)
+    one, both = (kind(file).candidates(images, 0.0) for kind in (OneViewDetector, OnnxDetector))
+    for eye in EYES:
+        assert len(one[eye]) == len(both[eye]) > 0
+        for single, paired in zip(one[eye], both[eye], strict=True):
+            assert single.box_xywh_px == pytest.approx(paired.box_xywh_px, abs=1e-3)
+
+
+def test_a_run_is_not_lost_for_operations_that_nobody_can_count(
+    screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
+) -> None:
+    plain, odd = (maps_network(tmp_path / f"{name}.onnx", name == "plain") for name in ("plain", "odd"))
+    words = ["benchmark", str(screen_dataset), "--detector", str(plain), "--detector", str(odd)]
+    assert run([*words, "--json", str(tmp_path / "scores.json")]) == DONE
+    scores = json.loads((tmp_path / "scores.json").read_text())["detectors"]
+    # Each scale has 64 / stride squared places of 5 channels, each of 3 stride^2 products, and the weights for them.
+    assert scores["plain"]["gflops_per_image"] == pytest.approx(2e-9 * 3 * 5 * 3 * 64**2, rel=1e-9)
+    assert scores["plain"]["parameters"] == 5 * 3 * (8**2 + 16**2 + 32**2)
+    assert (scores["odd"]["gflops_per_image"], scores["odd"]["parameters"]) == (None, None)
+    assert scores["odd"]["times"]["pairs"] == 6
+
+
+@pytest.mark.parametrize("changes", [{"image_passes": -1}, {"batch": 0}, {"threads": 0}, {"rounds": 0}])
+def test_absurd_numbers_are_refused(tmp_path: Path, changes: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="must be positive, got"):
+        order(tmp_path, tmp_path, **changes)
+
+
+def test_sizes_have_their_height_first_and_are_multiples_of_32(tmp_path: Path) -> None:
+    assert input_size_px("480x640") == (640, 480)
+    for text in ("480", "480x", "axb", "-32x64", "9" * 20):
+        with pytest.raises(ValueError, match="--size: must be HEIGHTxWIDTH"):
+            input_size_px(text)
+    with pytest.raises(ValueError, match="size: must be multiples of 32 px, got 100x64"):
+        order(tmp_path, tmp_path, size_px=(64, 100))
+
+
+def test_tables_have_a_line_for_each_network() -> None:
+    row = {
+        "parameters": 3_011_043,
+        "gflops_per_image": 6.1,
+        "wall_ms": (50.0, 60.0, 70.0),
+        "cpu_ms": (99.0, 100.0, 101.0),
+    }
+    lines = list(comparison_lines({"a": row | {"ratio": 1.0}, "b": row | {"ratio": 0.4, "ap50": 0.9876, "ap": 0.8}}))
+    assert len(lines) == 4 and "CPU / a" in lines[0] and "98.76 %" in lines[2] and "3,011,043" in lines[1]
+    ablation = ablation_lines({name: row | {"test": None} for name in CHANGES})
+    assert len(ablation) == 1 + len(CHANGES)
+    with pytest.raises(ValueError, match="--image-passes: must be at least 1, got 0"):
+        AblationOrder(Path(), Path(), "s", 0, (64, 64), 1, 0, "cpu", 1)
+
+
+def test_a_test_that_is_not_there_is_found_before_training(screen_dataset: Path, tmp_path: Path) -> None:
+    ablation = AblationOrder(screen_dataset, tmp_path / "nowhere", "s", 8, (64, 64), 1, 0, "cpu", 1)
+    with pytest.raises(ValueError, match="nowhere"):
+        ablate(ablation, tmp_path / "out", lambda line: None)
+    assert not (tmp_path / "out").exists()

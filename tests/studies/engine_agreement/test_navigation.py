@@ -1,0 +1,152 @@
+"""Whether navigation errs alike on two engines' images: equal errors pass, and every kind of inequality is found."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+
+import numpy as np
+import pytest
+
+from datasets_manifest.storage.reader import Dataset
+from droguekit.batch.progress import PlainProgress
+from studies.engine_agreement.agreement import navigation_bars
+from studies.engine_agreement.navigation import (
+    PairedDatasets,
+    paired_errors,
+    pairs_by_station,
+    render_paired,
+    station_recipe,
+)
+from studies.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios
+
+from ..small_datasets import rendered
+
+
+def drawn(seed, other_size=1.0, shift=0.0):
+    """Errors at two distances, a hundred times as large at the far one; a third of their variance is the renderer's."""
+    rng = np.random.Generator(np.random.Philox(seed))
+    stations = []
+    for distance_m, scale in ((5.0, 1e-3), (40.0, 0.1)):
+        common, one, other = rng.normal(size=(3, 50, 5))
+        stations.append(
+            PairedErrors(
+                distance_m,
+                50,
+                scale * (common + 0.7 * one),
+                scale * (other_size * (common + 0.7 * other) + shift),
+            )
+        )
+    return stations
+
+
+def missed(stations):
+    return {bar.name.split(",")[0] for bar in navigation_bars(stations) if not bar.reached}
+
+
+def test_errors_of_one_law_pass_as_often_as_the_intervals_say():
+    passed = sum(not missed(drawn(seed)) for seed in range(40))
+    # Two intervals of 95 % and one of 95 % for five components: at least 0.85 of all; 40 draws, 4 standard errors.
+    assert passed >= 40 * (0.85 - 4 * np.sqrt(0.85 * 0.15 / 40))
+
+
+def test_larger_errors_are_found_at_any_scale():
+    assert missed(drawn(1, other_size=1.5)) >= {"position errors", "attitude errors"}
+    ratio = size_ratios(drawn(1, other_size=1.5))[0]
+    # 100 pairs know a ratio of root mean squares with this correlation to 6 %.
+    assert ratio.n == 100 and ratio.ratio == pytest.approx(1.5, rel=0.25)
+    assert ratio.interval[0] < ratio.ratio < ratio.interval[1]
+
+
+def test_a_pull_to_one_side_is_found():
+    assert "x error" in missed(drawn(2, shift=1.0))
+    row = mean_differences(drawn(2, shift=1.0))[0]
+    # A shift of one common deviation, in units of a root mean square of 1.22 to 1.5.
+    assert 0.5 < row.mean < 1.0
+
+
+def test_pairs_are_spread_over_distances():
+    assert pairs_by_station((5.0, 10.0, 40.0), 8) == {5.0: 3, 10.0: 3, 40.0: 2}
+    assert pairs_by_station((5.0, 10.0, 40.0), 2) == {5.0: 1, 10.0: 1}
+
+
+def test_samples_grow_with_distance_and_stay_within_their_bounds():
+    samples = [station_recipe("blender", d, 1, 0)[0].render.samples_per_px for d in (1.7, 5.0, 10.0, 40.0)]
+    assert samples == [4, 64, 256, 576]
+
+
+@pytest.mark.parametrize("distance_m", [5.0, 40.0])
+def test_no_engine_may_spend_more_on_edges(distance_m):
+    settings = station_recipe("mitsuba", distance_m, 1, 0)[0].render
+    assert {settings.open_samples_per_px, settings.edge_samples_per_px} == {settings.samples_per_px}
+    assert not settings.denoise
+
+
+def test_one_engine_against_itself_errs_alike_and_stays_when_run_again(tmp_path):
+    report = PlainProgress(io.StringIO())
+    paired = render_paired(tmp_path, ("analytic", "analytic"), 10.0, 2, 3, report)
+    assert paired.one == paired.other
+    written = {file: file.stat().st_mtime_ns for file in paired.one.rglob("*.png")}
+    assert written
+    render_paired(tmp_path, ("analytic", "analytic"), 10.0, 2, 3, report)
+    assert {file: file.stat().st_mtime_ns for file in paired.one.rglob("*.png")} == written
+    errors = paired_errors(paired)
+    assert errors.pairs == 2 and errors.one.shape == (2, 5)
+    assert np.array_equal(errors.one, errors.other)
+    # The benchmark's own expectation for joint adjustment at 10 m is some millimetres.
+    assert 0 < np.abs(errors.one[:, :3]).max() < 0.1
+
+
+SMALL = """
+name = "small"
+seed = %d
+rig = { preset = "rgb-ideal", width_px = 160, height_px = 120, focal_px = 266.7 }
+[frames]
+count = 1
+[distance]
+law = "stations"
+stations_m = [3.0]
+[render]
+engine = "%s"
+samples_per_px = 4
+"""
+
+
+def small_dataset(folder, engine, seed=1):
+    return rendered(SMALL % (seed, engine), folder)
+
+
+def test_datasets_of_other_frames_are_refused(tmp_path):
+    one, other = (small_dataset(tmp_path / str(seed), "analytic", seed) for seed in (1, 2))
+    with pytest.raises(ValueError, match="do not hold the same frames"):
+        paired_errors(PairedDatasets(3.0, one, other))
+
+
+@pytest.mark.mitsuba
+@pytest.mark.blender
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is missing: pip install 'droguekit[blender]'")
+def test_both_engines_make_datasets_of_one_truth(tmp_path):
+    one, other = (Dataset(small_dataset(tmp_path / name, name)).record(0) for name in ("mitsuba", "blender"))
+    assert (one.engine, other.engine) == ("mitsuba", "blender")
+    tables = [record.model_dump(mode="json") for record in (one, other)]
+    counts = [take_out_pixels(table) for table in tables]
+    assert tables[0] == tables[1]
+    for ours, theirs in zip(*counts, strict=True):
+        # Pixel centres on an edge may fall to either side within rounding: a few of thousands, one of a marker's 60.
+        assert ours == pytest.approx(theirs, rel=0.02)
+
+
+def take_out_pixels(table):
+    """Remove from a record's table what comes from pixels, and return what the passes say of them."""
+    for key in ("engine", "engine_version", "file_sha256"):
+        del table[key]
+    for key in ("background_luminance_cd_m2", "monte_carlo_noise_fraction", "monte_carlo_over_sensor_noise"):
+        del table["conditions"][key]
+    counts = []
+    for view in table["views"].values():
+        features = [*view["markers"], view["hub"]]
+        for feature in features:
+            del feature["signal_to_noise"]
+        box = view.pop("box_visible_xywh_px")
+        counts += [view.pop("visible_drogue_px"), *box[2:], *(f.pop("visible_fraction") for f in features)]
+    return counts

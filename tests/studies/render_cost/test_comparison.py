@@ -1,0 +1,49 @@
+"""What is kept of a distance, and the table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from studies.render_cost.comparison import CYCLES, MITSUBA, OWN, read_station, table_lines, write_station
+from studies.render_cost.views import View, frame_at, recipe_at
+
+
+def station() -> dict[str, Any]:
+    row = {"noise": 0.05, "samples": 16, "cpu_s": 2.0, "is_least": False, "is_carried_on": False}
+    others = {MITSUBA: row | {"cpu_s": 50.0, "is_carried_on": True}, CYCLES: row | {"cpu_s": 80.0, "is_least": True}}
+    return {"schema": 1, "distance_m": 10.0, "seed": 3, "full_samples": 4, "renderers": {OWN: row, **others}}
+
+
+def test_what_was_written_is_found_again_for_the_same_seed(tmp_path: Path) -> None:
+    write_station(tmp_path, station())
+    assert read_station(tmp_path, 10.0, 3, 4) == station()
+    assert read_station(tmp_path, 10.0, 4, 4) is None
+    assert read_station(tmp_path, 10.0, 3, None) is None
+    assert read_station(tmp_path, 20.0, 3, 4) is None
+
+
+def test_lower_bounds_and_extrapolations_are_marked() -> None:
+    assert table_lines([station()])[-1] == (
+        "| 10 m | 5.0% | 2.00 s | 50 s at 16* | at least 80 s at 16 | 25 | at least 40 |"
+    )
+
+
+def test_the_crop_holds_the_drogue() -> None:
+    drogue = np.zeros((960, 1280), dtype=bool)
+    drogue[400:450, 5:90] = True
+    view = View(frame_at(10.0, 1), recipe_at(10.0, 1).render, drogue, drogue)
+    left, top, width, height = view.crop
+    assert left == 0 and top < 400 and top + height > 450 and width > 90
+    assert all(np.count_nonzero(mask) == 50 * 85 for mask in view.masks)
+
+
+@pytest.mark.parametrize("distance_m", [2.0, 40.0])
+def test_frames_rest_at_their_distance(distance_m: float) -> None:
+    frame = frame_at(distance_m, 1)
+    assert frame.left_from_drogue is not None
+    assert frame.left_from_drogue.translation_m[2] == pytest.approx(distance_m, rel=1e-9)
+    assert frame_at(distance_m, 1, 1).environment != frame.environment
