@@ -2,8 +2,8 @@
 
 In each image the drogue's ring is found among the regions (`nav.matching.ring_matching`), which orders the markers up
 to the layout's symmetry and leaves gaps where one is missing; an image that shows too few of them for a ring by itself
-is looked at where the other one's ring must be, and where the images' edges cut the ring, what they leave of it is enough
-where both images show the same. Then every turn of the right image's order against the left's is
+is looked at where the other one's ring must be, and where the images' edges cut the ring, what they leave of it is
+enough where both images show the same. Then every turn of the right image's order against the left's is
 tried, and the one with the smallest epipolar and disparity cost is taken.
 """
 

@@ -7,6 +7,7 @@ import importlib
 import keyword
 import os
 import sys
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
@@ -56,8 +57,8 @@ COMMANDS = {
     "bench": Command("droguekit.cli.bench", "Measure the CPU time of a pair by distance and stage."),
     "doctor": Command("droguekit.cli.doctor", "Show what is installed and which engines work."),
 }
-# Commands whose module is in the repository and not in the wheel.
-_STUDIES = "studies."
+# Studies are in the repository and not in the wheel: in a clone they lie beside this package.
+_STUDIES, _REPOSITORY = "studies.", Path(__file__).resolve().parents[2]
 
 HELP = """Synthetic stereo pairs of a refuelling drogue with ground truth, and navigation measured against it.
 
@@ -72,6 +73,8 @@ def load_command(name: str) -> Any:
     if name not in COMMANDS:
         return None
     chosen = COMMANDS[name]
+    if chosen.module.startswith(_STUDIES):
+        sys.path.append(str(_REPOSITORY))
     try:
         module = importlib.import_module(chosen.module)
     except ModuleNotFoundError as error:
