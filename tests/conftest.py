@@ -1,4 +1,4 @@
-"""What tests of several packages share; recipes of small datasets are in `small_datasets.py`."""
+"""What tests of several packages share; recipes of small datasets are in `tests/support/small_datasets.py`."""
 
 from __future__ import annotations
 

@@ -140,11 +140,13 @@ def explain(error: BaseException) -> str:
     return f"internal fault, {type(error).__name__}: {text}; please report it with what --debug shows"
 
 
-def run(arguments: list[str]) -> int:
-    """Run the command line.
+def run(arguments: list[str], command: typer.Typer = app, name: str = "droguekit") -> int:
+    """Run a command line.
 
     Args:
         arguments: everything after the command's name. A `--debug` anywhere in it lets errors show their traceback.
+        command: whose arguments they are.
+        name: of the command, in its help and its errors.
 
     Returns:
         The exit code.
@@ -152,16 +154,16 @@ def run(arguments: list[str]) -> int:
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
     try:
-        typer.main.get_command(app).main(args=arguments, prog_name="droguekit", standalone_mode=True)
+        typer.main.get_command(command).main(args=arguments, prog_name=name, standalone_mode=True)
     except SystemExit as exit_:
         code = exit_.code if isinstance(exit_.code, int) else DONE if exit_.code is None else WRONG_INPUT
         if code == INTERRUPTED:
-            print("droguekit: interrupted; the same command goes on with what is finished", file=sys.stderr)
+            print(f"{name}: interrupted; the same command goes on with what is finished", file=sys.stderr)
         return code
     except Exception as error:
         if debug:
             raise
-        print(f"droguekit: error: {explain(error)}", file=sys.stderr)
+        print(f"{name}: error: {explain(error)}", file=sys.stderr)
         return WRONG_INPUT
     return DONE
 

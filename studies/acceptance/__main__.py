@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import typer
+import sys
 
-from studies.acceptance.command import EXAMPLES, bars
+from studies.acceptance.command import run_command
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    app.command(epilog="\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES)]))(bars)
-    app()
+    sys.exit(run_command(sys.argv[1:]))

@@ -10,7 +10,7 @@ import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import WorkersOption
-from droguekit.cli.main import FAULT
+from droguekit.cli.main import FAULT, run
 from studies.acceptance.measurement import DEFAULT_RIG, DEFAULT_TRACKER, BarsOrder, FlightOrder, run_bars
 
 EXAMPLES = (
@@ -128,3 +128,10 @@ def bars(
     if table.missed:
         typer.echo(f"{table.missed} bars are missed", err=True)
         raise typer.Exit(FAULT)
+
+
+def run_command(arguments: list[str]) -> int:
+    """Run the command line of the acceptance study, and return its exit code."""
+    command = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    command.command(epilog="\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES)]))(bars)
+    return run(arguments, command, "python -m studies.acceptance")

@@ -16,8 +16,7 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, sync_playwright
 
 from droguekit.visualization.print_pdf import NO_BROWSER, find_browser
-
-from .browsed_dataset import BrowsedDataset, browse_dataset
+from tests.support.browsed_dataset import BrowsedDataset, browse_dataset
 
 PHONE_PX = 360
 DESKTOP_PX = 1280

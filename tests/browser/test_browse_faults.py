@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from .browsed_dataset import BrowsedDataset, show
+from tests.support.browsed_dataset import BrowsedDataset, show
 
 OpenPage = Callable[..., Any]
 

@@ -13,8 +13,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from datasets_manifest.types.estimates import PoseEstimate
-
-from .browsed_dataset import HOSTILE, OTHER, PAIRS, BrowsedDataset, show, shown_frames
+from tests.support.browsed_dataset import HOSTILE, OTHER, PAIRS, BrowsedDataset, show, shown_frames
 
 OpenPage = Callable[..., Any]
 

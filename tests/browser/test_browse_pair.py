@@ -21,8 +21,7 @@ from droguekit.visualization.browse.browse import write_browse
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
-
-from .browsed_dataset import OTHER, BrowsedDataset, show, shown_frames
+from tests.support.browsed_dataset import OTHER, BrowsedDataset, show, shown_frames
 
 OpenPage = Callable[..., Any]
 # Labels are rounded to a thousandth of a pixel, outlines to a tenth of that.

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from labelgen.validation.dataset_checks import validate_dataset
-
-from .whole_dataset import write_whole_dataset
+from tests.support.whole_dataset import write_whole_dataset
 
 
 @pytest.fixture(scope="session")

@@ -21,8 +21,7 @@ from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 from labelgen.validation.dataset_checks import validate_dataset
-
-from .strategies import byte_edits, fuzz, json_edits, quietly
+from tests.support.damage_strategies import byte_edits, fuzz, json_edits, quietly
 
 SECRET = "must not be read, changed or joined"
 FRAME_FILES = ["record.json", *(f"{eye}{rest}" for eye in EYES for rest in (".png", "_parts.png", ".exr"))]

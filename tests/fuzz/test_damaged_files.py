@@ -28,9 +28,8 @@ from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
-
-from .strategies import HOSTILE, byte_edits, fuzz, json_edits, quietly
-from .whole_dataset import RECIPE
+from tests.support.damage_strategies import HOSTILE, byte_edits, fuzz, json_edits, quietly
+from tests.support.whole_dataset import RECIPE
 
 
 @fuzz(60)

@@ -8,9 +8,8 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from scenes.sampler import sample_frame
-
-from ..small_datasets import RIG_160_PX
-from .drawn_pairs import Pair, write_drawn_dataset
+from tests.support.drawn_pairs import Pair, write_drawn_dataset
+from tests.support.small_datasets import RIG_160_PX
 
 RECIPE = f"""
 name = "small"

@@ -17,8 +17,7 @@ from render.camera.optics import light_on_sensor
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
-
-from ..small_datasets import rendered
+from tests.support.small_datasets import rendered
 
 TABLE = """
 name = "real-lenses"

@@ -8,8 +8,7 @@ from pycocotools.coco import COCO
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
 from labelgen.validation.dataset_checks import validate_dataset
-
-from ..small_datasets import RIG_320_PX, rendered
+from tests.support.small_datasets import RIG_320_PX, rendered
 
 TABLE = f"""
 name = "variants"

@@ -19,8 +19,7 @@ from nav.navigator import DETECTOR, Navigator
 from nav.pair_measurement import regions_of
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason
 from nav.tracking.rim_boxes import rim_boxes
-
-from .conftest import FACE_RGB, background, expose, paint_disc
+from tests.nav.conftest import FACE_RGB, background, expose, paint_disc
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]

@@ -19,8 +19,7 @@ from nav.centroids.grey_centroid import grey_centroids
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.patches import disc_pixels
 from studies.acceptance.rendered.centroid_bounds import center_bound_px
-
-from .drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
+from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
 
 
 @pytest.mark.parametrize("light", [DAY, DUSK], ids=["day", "dusk"])

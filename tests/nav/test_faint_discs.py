@@ -15,8 +15,7 @@ from nav.centroids.edge_model import fit_discs
 from nav.centroids.patches import disc_pixels
 from nav.numerics.levenberg_marquardt import evaluate
 from studies.acceptance.rendered.centroid_bounds import center_bound_px
-
-from .drawn_discs import DAY, DUSK, draw_discs, fit_many, rough_start
+from tests.support.drawn_discs import DAY, DUSK, draw_discs, fit_many, rough_start
 
 
 def faint(contrast_sigma):

@@ -12,7 +12,7 @@ from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import moving
 from nav.centroids.patches import disc_pixels
-from tests.nav.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, rough_start
+from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, rough_start
 
 PARTS = 32
 

@@ -69,7 +69,8 @@ def test_targets_of_make_exist() -> None:
 
 
 def test_files_named_in_the_docs_exist() -> None:
-    pattern = r"`((?:geometry|drogue_models|datasets_manifest|scenes|render|labelgen|nav|droguekit|studies|tests|docs)/[\w/.]+)`"
+    packages = "geometry|drogue_models|datasets_manifest|scenes|render|labelgen|nav|droguekit|studies|tests|docs"
+    pattern = rf"`((?:{packages})/[\w/.]+)`"
     named = {name for page in PAGES for name in re.findall(pattern, page.read_text(encoding="utf-8"))}
     assert named and [name for name in sorted(named) if "NAME" not in name and not (REPOSITORY / name).exists()] == []
 

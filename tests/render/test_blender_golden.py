@@ -11,8 +11,7 @@ from drogue_models.parts import Part
 from geometry.stereo import EYES
 from scenes.sampler import sample_frame
 from scenes.sky.light import REC709_LUMINANCE
-
-from .golden_frame import GOLDEN, golden_recipe
+from tests.render.golden_frame import GOLDEN, golden_recipe
 
 pytestmark = [
     pytest.mark.blender,

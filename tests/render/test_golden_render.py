@@ -15,8 +15,7 @@ from geometry.stereo import EYES
 from render.engine import load_engine
 from scenes.sampler import sample_frame
 from scenes.sky.light import REC709_LUMINANCE
-
-from .golden_frame import GOLDEN, golden_recipe
+from tests.render.golden_frame import GOLDEN, golden_recipe
 
 pytestmark = pytest.mark.mitsuba
 

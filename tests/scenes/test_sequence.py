@@ -13,8 +13,7 @@ from geometry.stereo import EYES
 from scenes.flight.sequence import _flight
 from scenes.flight.suspension import WORLD_FROM_TANKER
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
-
-from .sequence_recipe import BASE, recipe
+from tests.support.sequence_recipe import BASE, recipe
 
 # Where the drogue hangs, nearly: without the time in which the hose settles.
 RELEASED = "release_m = [13.8, 0.5, -5]\n"

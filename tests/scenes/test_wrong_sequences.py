@@ -6,8 +6,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from scenes.sampler import sample_frame
-
-from .sequence_recipe import BASE, recipe
+from tests.support.sequence_recipe import BASE, recipe
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,7 @@ from PIL import Image
 from datasets_manifest.storage.reader import Dataset
 from droguekit.cli.main import DONE, run
 from labelgen.validation.dataset_checks import validate_dataset
-
-from ..small_datasets import docking_recipe, rendered
+from tests.support.small_datasets import docking_recipe, rendered
 
 
 @pytest.fixture(scope="module")

@@ -17,8 +17,7 @@ from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.visualization.overlay_video import ESTIMATE_RGB, TRUE_RGB, draw_overlay, write_overlay_video
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
-
-from ..small_datasets import RIG_320_PX, rendered
+from tests.support.small_datasets import RIG_320_PX, rendered
 
 RECIPE = f"""
 name = "flight"

@@ -13,8 +13,7 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform
 from scenes.sampler import sample_frame
-
-from ..drawn_pairs import Pair, write_drawn_dataset
+from tests.support.drawn_pairs import Pair, write_drawn_dataset
 
 SMALL = """
 name = "mixed"

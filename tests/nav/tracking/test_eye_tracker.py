@@ -11,8 +11,7 @@ from geometry.stereo import EYES
 from nav.detector.detector import Detection, StereoDetection
 from nav.tracking.tracker import Tracker
 from nav.tracking.trackers import open_tracker, tracker_names
-
-from .painted_sequences import Place, film, overlap
+from tests.support.painted_sequences import Place, film, overlap
 
 NOWHERE = StereoDetection(None, None)
 

@@ -6,8 +6,7 @@ import pytest
 
 from nav.detector.detector import Detection, StereoDetection
 from nav.tracking.trackers import open_tracker
-
-from .painted_sequences import Place, film, overlap
+from tests.support.painted_sequences import Place, film, overlap
 
 NOWHERE = StereoDetection(None, None)
 

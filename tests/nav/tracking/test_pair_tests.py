@@ -8,8 +8,7 @@ import pytest
 from geometry.se3 import Array
 from nav.tracking.pixel_comparison_features import PairTests
 from nav.tracking.region import EyeImage, ImageRegion, box_center, image_region
-
-from .painted_sequences import Look, Place, film
+from tests.support.painted_sequences import Look, Place, film
 
 PLACE = Place(320, 240, 96)
 BOX = PLACE.box("left")

@@ -15,8 +15,7 @@ from nav.detector.detector import Detection, StereoDetection
 from nav.tracking.continuity import REDETECT_EVERY, begins_sequence
 from nav.tracking.tracked_detector import TrackedDetector, tracked_detector_factory
 from nav.tracking.trackers import open_tracker
-
-from .painted_sequences import RATE_HZ, Look, Place, film, overlap
+from tests.support.painted_sequences import RATE_HZ, Look, Place, film, overlap
 
 
 class CountingDetector(ColorBlobDetector):

@@ -12,8 +12,7 @@ from geometry.stereo import EYES
 from nav.detector.detector import Detection, StereoDetection
 from nav.tracking.tracker import Tracker
 from nav.tracking.trackers import open_tracker, tracker_names
-
-from .painted_sequences import Look, Place, film, growing, overlap, swing
+from tests.support.painted_sequences import Look, Place, film, growing, overlap, swing
 
 NOWHERE = StereoDetection(None, None)
 # The binary chain widens boxes by 6 % a side; what is smaller by no more than that still holds all markers.

@@ -12,8 +12,9 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import read_estimates
 from droguekit.batch.progress import PlainProgress
-from droguekit.cli.main import WRONG_INPUT, run
+from droguekit.cli.main import WRONG_INPUT
 from nav.runner import method_names
+from studies.acceptance.command import run_command
 from studies.acceptance.measurement import (
     BarsOrder,
     FlightOrder,
@@ -27,8 +28,7 @@ from studies.acceptance.rendered.flight_rows import approach_rows, lost_rows
 from studies.acceptance.rendered.image_rows import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
 from studies.acceptance.table import BarRow
-
-from ..small_datasets import RIG_320_PX
+from tests.support.small_datasets import RIG_320_PX
 
 RECIPE = f"""
 name = "small-flights"
@@ -239,6 +239,6 @@ def test_centroids_are_timed_on_pairs_that_are_made_once(tmp_path: Path, monkeyp
 def test_options_of_other_tiers_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], fault: str
 ) -> None:
-    assert run(["bars", *arguments, "--out", str(tmp_path / "out")]) == WRONG_INPUT
+    assert run_command([*arguments, "--out", str(tmp_path / "out")]) == WRONG_INPUT
     assert fault in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

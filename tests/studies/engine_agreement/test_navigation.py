@@ -19,8 +19,7 @@ from studies.engine_agreement.navigation import (
     station_recipe,
 )
 from studies.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios
-
-from ..small_datasets import rendered
+from tests.support.small_datasets import rendered
 
 
 def drawn(seed, other_size=1.0, shift=0.0):

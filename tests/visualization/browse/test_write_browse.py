@@ -24,8 +24,7 @@ from droguekit.benchmark.report.label_drawing import display_picture
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from droguekit.visualization.browse.browse import write_browse
 from geometry.se3 import RigidTransform
-
-from ..small_datasets import rendered, single_pairs_recipe
+from tests.support.small_datasets import rendered, single_pairs_recipe
 
 RECIPE = single_pairs_recipe(2)
 

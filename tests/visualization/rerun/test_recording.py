@@ -17,8 +17,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.se3 import RigidTransform, rotation_from_angles
-
-from ..small_datasets import docking_recipe, rendered, single_pairs_recipe
+from tests.support.small_datasets import docking_recipe, rendered, single_pairs_recipe
 
 SINGLE_PAIRS = single_pairs_recipe(3, count=8, empty_fraction=0.4)
 METHOD = "joint+filter/2"

@@ -14,8 +14,7 @@ from datasets_manifest.types.records import PairRecord
 from droguekit.batch.progress import PlainProgress
 from droguekit.visualization.browse.browse import write_browse
 from geometry.se3 import RigidTransform
-
-from ..small_datasets import rendered
+from tests.support.small_datasets import rendered
 
 # Real lenses: an overlay that knew only the ideal camera would be off by pixels.
 RECIPE = """

@@ -1,0 +1,215 @@
+"""Datasets of tiny recipes, engines with accidents, and how tests make them: fixtures of batch and studies."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.storage.layout import EVENTS_FILE
+from droguekit.batch.progress import PlainProgress
+from droguekit.batch.render_dataset import RunSummary, Spread, render_dataset
+from tests.support.small_datasets import RIG_160_PX, RIG_320_PX
+
+TINY_RECIPE = f"""
+name = "tiny"
+seed = 5
+{RIG_320_PX}
+[frames]
+count = 4
+scenes = 2
+[distance]
+law = "log-uniform"
+low_m = 3.0
+high_m = 12.0
+[render]
+samples_per_px = 1
+surround_samples_per_px = 1
+max_depth = 2
+[split]
+train = 0.5
+test = 0.5
+"""
+
+# A real engine that other packages could bring: the analytic one, with accidents on frames that the environment names.
+TROUBLED_ENGINE = """
+import ctypes, json, os, resource
+from pathlib import Path
+from render.analytic_engine.engine import AnalyticEngine
+
+class TroubledEngine(AnalyticEngine):
+    def render(self, frame, settings):
+        for trouble, frames in json.loads(os.environ.get("TROUBLES", "{}")).items():
+            if frame.frame_index in frames:
+                getattr(self, trouble)(frame.frame_index)
+        return super().render(frame, settings)
+
+    def abort(self, index):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        os.abort()
+
+    def abort_once(self, index):
+        if self._first("abort", index):
+            self.abort(index)
+
+    def hang(self, index):
+        ctypes.PyDLL(None).pause()  # holds Python's lock: nothing in this process can end it
+
+    def hang_once(self, index):
+        if self._first("hang", index):
+            self.hang(index)
+
+    def refuse(self, index):
+        raise RuntimeError(f"frame {index} is\\nbeyond me")
+
+    def no_space(self, index):
+        raise OSError(28, "No space left on device", "/scratch")
+
+    def wait(self, index):
+        # Opening a pipe waits for its other end: tells that the frame is begun, and goes on when it is told.
+        with open(os.environ["TROUBLE_BEGUN"], "w") as stream:
+            stream.write(f"{index}\\n")
+        with open(os.environ["TROUBLE_GO_ON"]) as stream:
+            stream.read()
+
+    def _first(self, name, index):
+        mark = Path(os.environ["TROUBLE_MARKS"]) / f"{name}-{index}"
+        known = mark.exists()
+        mark.touch()
+        return not known
+"""
+
+# Pairs of 160 x 120 pixels without a renderer.
+QUICK_RECIPE = f"""
+name = "quick"
+seed = 5
+{RIG_160_PX}
+[frames]
+count = 8
+scenes = 2
+[distance]
+law = "log-uniform"
+low_m = 3.0
+high_m = 12.0
+[render]
+engine = "troubled"
+[split]
+train = 0.5
+test = 0.5
+"""
+
+ANALYTIC_RECIPE = QUICK_RECIPE.replace('"troubled"', '"analytic"')
+
+Make = Callable[..., RunSummary]
+Hashes = Callable[[Path], dict[str, str]]
+
+
+def _make(
+    out: Path,
+    frames: Sequence[int] | None = None,
+    workers: int | Spread = 1,
+    text: str = TINY_RECIPE,
+    told: io.StringIO | None = None,
+) -> RunSummary:
+    recipe = parse_recipe(text)
+    chosen = range(recipe.frames.count) if frames is None else frames
+    return render_dataset(recipe, text, out, chosen, workers, PlainProgress(told or io.StringIO()))
+
+
+@pytest.fixture(scope="session")
+def tiny_recipe() -> str:
+    """Four pairs of 320 x 240 pixels, as TOML."""
+    return TINY_RECIPE
+
+
+@pytest.fixture(scope="session")
+def make() -> Make:
+    """Renders frames of a recipe, without a word: `make(out, frames, workers, text, told)`."""
+    return _make
+
+
+@pytest.fixture(scope="session")
+def hashes() -> Hashes:
+    """Hashes of a dataset's files by their path, without the events, which tell of times and hosts."""
+    return lambda dataset: {
+        str(path.relative_to(dataset)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(dataset.rglob("*"))
+        if path.is_file() and path.name != EVENTS_FILE
+    }
+
+
+@pytest.fixture(scope="session")
+def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of `tiny_recipe`, made by one worker in ascending order; to be read only."""
+    out = tmp_path_factory.mktemp("tiny") / "dataset"
+    assert _make(out).drops == ()
+    return out
+
+
+@pytest.fixture(scope="session")
+def troubled_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of Python packages with the engine `troubled` installed in it."""
+    site = tmp_path_factory.mktemp("site")
+    (site / "troubled_engine.py").write_text(TROUBLED_ENGINE)
+    information = site / "troubled_engine-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: troubled-engine\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[droguekit.engines]\ntroubled = troubled_engine:TroubledEngine\n")
+    return site
+
+
+@pytest.fixture
+def troubled(troubled_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Installs the engine `troubled`, for this process and those that it starts, with accidents by name and frame.
+
+    The function returns the folder where accidents that happen once leave their marks.
+    """
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    monkeypatch.syspath_prepend(troubled_site)
+    monkeypatch.setenv("PYTHONPATH", str(troubled_site), prepend=os.pathsep)
+    monkeypatch.setenv("TROUBLE_MARKS", str(marks))
+
+    def set_troubles(**frames: Sequence[int]) -> Path:
+        monkeypatch.setenv("TROUBLES", json.dumps(frames))
+        return marks
+
+    set_troubles()
+    return set_troubles
+
+
+@pytest.fixture(scope="session")
+def quick_dataset(troubled_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of `quick_recipe`, made by one worker without an accident; to be read only."""
+    out = tmp_path_factory.mktemp("quick") / "dataset"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.syspath_prepend(troubled_site)
+        summary = _make(out, text=QUICK_RECIPE)
+    assert (summary.drops, summary.totals.retries) == ((), 0)
+    return out
+
+
+@pytest.fixture(scope="session")
+def analytic_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of `analytic_recipe`, made by one worker; to be read only."""
+    out = tmp_path_factory.mktemp("analytic") / "dataset"
+    assert _make(out, text=ANALYTIC_RECIPE).drops == ()
+    return out
+
+
+@pytest.fixture(scope="session")
+def quick_recipe() -> str:
+    """Eight pairs by the engine `troubled`, as TOML."""
+    return QUICK_RECIPE
+
+
+@pytest.fixture(scope="session")
+def analytic_recipe() -> str:
+    """The same pairs by the engine that ships, as TOML."""
+    return ANALYTIC_RECIPE
