@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
 # where the folder lies.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
+.PHONY: help setup demo docs test test-slow torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -17,6 +17,11 @@ demo: ## render a small dataset, navigate on it blind, and report how accurate t
 	@echo "demo: rendering, navigating and scoring into out/demo"
 	@$(BIN)/droguekit demo --out out/demo
 	@echo "demo: the report is $(CURDIR)/out/demo/report.html"
+
+docs: ## build the documentation into out/docs (installs mkdocs-material)
+	@scripts/setup docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "docs: open $(CURDIR)/out/docs/index.html"
 
 # Three for two cores: tests of commands and pages wait for other processes much of their time.
 # A process that crashes ends the tests, with the name of the test that it ran: replaced, it may leave them waiting for
@@ -35,12 +40,13 @@ torture: setup ## kill a run 50 times on its way through 200 pairs, and compare 
 fuzz: setup ## 10,000 damaged and hostile files through every reader, validate and every export (minutes)
 	@DROGUEKIT_FUZZ_TIMES=20 $(BIN)/python -m pytest tests/fuzz
 
-lint: setup ## formatting, style, types, walls between the packages
-	@echo "lint: ruff, import-linter, mypy"
+lint: setup ## formatting, style, types, walls between the packages, links of the documentation
+	@echo "lint: ruff, import-linter, mypy, mkdocs"
 	@$(BIN)/ruff format --check --quiet . || { echo "lint: run .venv/bin/ruff format"; exit 1; }
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/mypy
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (an hour; installs Blender; goes on where it stopped)
 	@scripts/setup all

@@ -111,7 +111,9 @@ class DrogueParameters(FrozenModel):
     face_inner_radius_m: Metres = 0.21  # leaves 10 mm of face inside every marker
     rim_tube_radius_m: Metres = 0.006
     marker_positions_m: tuple[PlanePoint, ...] = Field(min_length=3, max_length=32)
-    marker_radius_m: Metres = 0.05  # seed paper, section 4.3, read as a diameter of 10 cm (docs/conventions.md)
+    marker_radius_m: Metres = (
+        0.05  # seed paper, section 4.3, read as a diameter of 10 cm (docs/reference/conventions.md)
+    )
     marker_reflectance_rgb: ReflectanceRgb = RED_PAINT
     marker_luminance_cd_m2: float = Field(default=0.0, ge=0, le=1e6)
     marker_emission_rgb: ReflectanceRgb = (1.0, 0.05, 0.05)

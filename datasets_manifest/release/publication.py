@@ -22,7 +22,8 @@ from drogue_models.presets import explain
 
 _DECIMALS = 9
 _SHOWN = 8
-# Numbers agree within 1e-9 on any machine (docs/conventions.md); rounding to nine decimals adds half a unit either way.
+# Numbers agree within 1e-9 on any machine (docs/reference/conventions.md).
+# Rounding to nine decimals adds half a unit either way.
 _TOLERANCE = 2e-9
 
 Rounded = tuple[Annotated[float, AfterValidator(lambda value: round(value, _DECIMALS) + 0.0)], ...]

@@ -64,7 +64,9 @@ WorkersOption = Annotated[
 ]
 DetectorOption = Annotated[
     str | None,
-    typer.Option("--detector", metavar="NAME|FILE.onnx", help="A detector's name, or a network; docs/detection.md."),
+    typer.Option(
+        "--detector", metavar="NAME|FILE.onnx", help="A detector's name, or a network; docs/reference/detection.md."
+    ),
 ]
 EngineOption = Annotated[str | None, typer.Option("--engine", metavar="NAME", help="Replaces the recipe's engine.")]
 

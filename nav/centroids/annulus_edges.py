@@ -60,7 +60,7 @@ _LIT_SHARE = 0.3
 _MOST_CLIPPED_FRACTION = 0.05
 _LARGEST_MOVE_FRACTION = 0.3
 _LARGEST_SCALE = 1.25
-# Fits that end beside the hub state far more, right ones at dusk hardly ever so much (docs/centroids.md). [px]
+# Fits that miss the hub state far more, right ones at dusk hardly ever so much (docs/explanation/centroids.md). [px]
 _CERTAIN_SIGMA_PX = 0.1
 
 

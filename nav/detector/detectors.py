@@ -36,7 +36,7 @@ def detector_factory(name_or_file: str, threads: int = 1) -> Callable[[DroguePar
     """What makes detectors of the drogue that it is told; a network is opened once, and is the same for all.
 
     Args:
-        name_or_file: one of `detector_names`, or a file `*.onnx` that keeps the contract of docs/detector.md.
+        name_or_file: one of `detector_names`, or a file `*.onnx` with the contract of docs/reference/detectors.md.
         threads: of a network.
 
     Raises:

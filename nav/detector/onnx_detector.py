@@ -1,4 +1,4 @@
-"""A detector network in an ONNX file, run by onnxruntime. The contract of such a file is in docs/detector.md."""
+"""A detector network in an ONNX file, run by onnxruntime; docs/reference/detectors.md has the contract of the file."""
 
 from __future__ import annotations
 
@@ -108,7 +108,9 @@ class OnnxDetector:
         want = [(len(EYES), MAP_CHANNELS, size_px[1] // stride, size_px[0] // stride) for stride in STRIDES]
         got = [np.shape(each) for each in maps]
         if got != want or any(not np.issubdtype(each.dtype, np.floating) for each in maps):
-            raise ValueError(f"{self._file}: outputs must be maps of numbers {want}, got {got}; see docs/detector.md")
+            raise ValueError(
+                f"{self._file}: outputs must be maps of numbers {want}, got {got}; see docs/reference/detectors.md"
+            )
 
 
 def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
@@ -135,7 +137,9 @@ def _checked_input(file: Path, session: onnxruntime.InferenceSession) -> tuple[s
     shape = list(inputs[0].shape) if len(inputs) == 1 else []
     if len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
         got = ", ".join(f"{each.name}: {each.type} {each.shape}" for each in inputs)
-        raise ValueError(f"{file}: must have one float32 input (B, 3, H, W), got {got}; see docs/detector.md")
+        raise ValueError(
+            f"{file}: must have one float32 input (B, 3, H, W), got {got}; see docs/reference/detectors.md"
+        )
     if shape[0] == 1:
         raise ValueError(f"{file}: takes one image a pass, must take both eyes; export it with a dynamic batch")
     width, height = shape[3], shape[2]

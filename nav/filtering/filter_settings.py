@@ -20,7 +20,7 @@ _MAY_BE_ZERO = (
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """Densities of white acceleration, vibration, and the filter's limits; docs/filtering.md says where they come from.
+    """Densities of white acceleration, vibration, and the filter's limits; sources: docs/explanation/filtering.md.
 
     Attributes:
         acceleration_m2_s3: density of the drogue's acceleration against the receiver, along each axis. [m^2/s^3]

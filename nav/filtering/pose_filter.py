@@ -44,7 +44,7 @@ class _Entry:
 
 
 class PoseFilter:
-    """Error-state Kalman filter of one drogue's motion against the left camera; see docs/filtering.md."""
+    """Error-state Kalman filter of one drogue's motion against the left camera; see docs/explanation/filtering.md."""
 
     def __init__(self, settings: FilterSettings, symmetry_order: int) -> None:
         """Begin with nothing.

@@ -2,7 +2,8 @@
 
 Every three triangulated markers give a candidate for the drogue's origin; the candidate whose reprojection into both
 eyes fits all markers best is taken. Attitude: the plane through all markers.
-Source: the seed paper, section 3.3, eqs. 1-13; docs/paper.md lists what is corrected, and why eqs. 14-16 are left out.
+Source: the seed paper, section 3.3, eqs. 1-13; docs/explanation/paper.md lists what is corrected, and why
+eqs. 14-16 are left out.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ class BarRow(BaseModel):
     """One bar.
 
     Attributes:
-        bar: its number in docs/bars.md, `goal` for what is aimed at without being demanded, or `beside` for what stands
-            there to be compared with.
+        bar: its number in docs/explanation/acceptance.md, `goal` for an aim that is not demanded, or `beside` for a
+            figure to compare with.
         quantity: what is measured, with its unit.
         low, high: between which limits it must lie; no lower one when None.
         measured: None where nothing could be measured.

@@ -14,7 +14,7 @@ from studies.engine_agreement.navigation_errors import PairedErrors, mean_differ
 from studies.engine_agreement.paired_frames import PairedFrame, Rendered, render_both
 from studies.engine_agreement.plates import PlateLight
 
-# The bars of the agreement: see docs/blender.md.
+# The bars of the agreement: see docs/explanation/blender.md.
 MOST_CENTROID_RMS_PX = 0.02
 LEAST_DROGUE_IOU = 0.995
 IOU_FROM_M = 5.0

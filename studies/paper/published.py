@@ -1,7 +1,7 @@
 """What the seed paper prints of its experiments, digit for digit; all of it is of data that are not public.
 
 Source: "Research of an Unmanned Aerial Vehicle Autonomous Aerial Refueling Docking Method Based on Binocular Vision"
-(docs/paper.md). Its table of detectors stands in `droguekit.benchmark.detection.detection_published`.
+(docs/explanation/paper.md). Its table of detectors stands in `droguekit.benchmark.detection.detection_published`.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ _MARGIN = 1.35
 _MOST_PX = 480
 _OUTLINE_POINTS = 48
 
-# On a photograph, the same in light and dark pages; docs/report.md names them.
+# On a photograph, the same in light and dark pages; docs/how-to/report-beside-the-paper.md names them.
 TRUE_COLOR, ESTIMATED_COLOR, CENTROID_COLOR, BOX_COLOR = "#00e5ff", "#ff9100", "#ffffff", "#ffdd33"
 _EDGE_COLOR = "#000000"
 

@@ -106,7 +106,7 @@ def outlines(rng, count, radius_px, side_px):
 
 
 def inwards(outline, index, x, y):
-    """Distances inwards of all pixels of an image from one outline, as docs/centroids.md has it for circles."""
+    """Distances inwards of all pixels from one outline; for circles docs/explanation/centroids.md has it."""
     arms = np.linalg.solve(
         outline.shapes_px[index], np.stack([x, y]).reshape(2, -1) - outline.centers_px[index][:, None]
     )

@@ -1,4 +1,4 @@
-"""The seed paper's printed equations, written out as printed: what docs/paper.md says of them, in numbers."""
+"""The seed paper's printed equations, written out as printed, and docs/explanation/paper.md's claims in numbers."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from nav.pose.pose_methods import ENTRY_POINT_GROUP
 from nav.runner import method_names
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PAGES = sorted([REPOSITORY / "README.md", REPOSITORY / "CHANGELOG.md", *(REPOSITORY / "docs").glob("*.md")])
+PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("studies/*/*.md")])
 
 
 def text(name: str) -> str:
@@ -40,7 +40,7 @@ def code_blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_links_lead_somewhere(page: Path) -> None:
     broken = []
     for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
@@ -53,7 +53,7 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert broken == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_commands_and_their_options_exist(page: Path) -> None:
     for line in re.findall(r"^droguekit (.+)$", "".join(code_blocks(page, "")), re.MULTILINE):
         name, *words = line.split("#")[0].split()
@@ -76,21 +76,21 @@ def test_files_named_in_the_docs_exist() -> None:
 
 
 def test_the_example_of_an_estimates_file_can_be_read(tmp_path: Path) -> None:
-    (example,) = code_blocks(REPOSITORY / "docs/benchmark.md", "json")
+    (example,) = code_blocks(REPOSITORY / "docs/reference/benchmark.md", "json")
     (tmp_path / "estimates.jsonl").write_text(example, encoding="utf-8")
     assert [estimate.status for estimate in read_estimates(tmp_path / "estimates.jsonl")] == ["fix", "no_fix"]
 
 
 def test_the_example_of_a_recipe_can_be_read(tmp_path: Path) -> None:
-    (example,) = code_blocks(REPOSITORY / "docs/adding-a-drogue.md", "toml")
+    (example,) = code_blocks(REPOSITORY / "docs/how-to/add-a-drogue.md", "toml")
     (tmp_path / "my-recipe.toml").write_text(example, encoding="utf-8")
     (tmp_path / "my-drogue.toml").write_text(text("drogue_models/examples/seven-markers.toml"), encoding="utf-8")
     assert load_recipe(str(tmp_path / "my-recipe.toml"))[0].drogue.name == "seven-markers"
 
 
 def test_the_example_of_a_method_finds_a_pose() -> None:
-    (entry,) = code_blocks(REPOSITORY / "docs/adding-an-estimator.md", "toml")
-    (example,) = code_blocks(REPOSITORY / "docs/adding-an-estimator.md", "python")
+    (entry,) = code_blocks(REPOSITORY / "docs/how-to/add-an-estimator.md", "toml")
+    (example,) = code_blocks(REPOSITORY / "docs/how-to/add-an-estimator.md", "python")
     (name,) = tomllib.loads(entry)["project"]["entry-points"][ENTRY_POINT_GROUP]
     namespace: dict[str, Any] = {}
     exec(compile(example, "adding-an-estimator.md", "exec", dont_inherit=True), namespace)
@@ -104,12 +104,12 @@ def test_the_example_of_a_method_finds_a_pose() -> None:
 
 
 def test_every_test_named_for_the_paper_exists() -> None:
-    named = set(re.findall(r"`(test_\w+)`", text("docs/paper.md")))
+    named = set(re.findall(r"`(test_\w+)`", text("docs/explanation/paper.md")))
     there = set(re.findall(r"^def (test_\w+)", "".join(p.read_text() for p in REPOSITORY.glob("tests/*/*.py")), re.M))
     assert named and named <= there
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/benchmark.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/reference/benchmark.md"])
 def test_tables_of_methods_name_their_centroids(page: str) -> None:
     rows = re.findall(r"^\| (`[a-z]+[^|]*) \|.* \| (binary|edge) \|$", text(page), re.MULTILINE)
     centroids = {name: kind for names, kind in rows for name in re.findall(r"`([^`]+)`", names)}
@@ -124,7 +124,7 @@ def test_recipes_that_ship_are_documented(recipe: Path) -> None:
 
 
 def test_methods_and_drogues_that_ship_are_documented() -> None:
-    table = text("docs/benchmark.md")
+    table = text("docs/reference/benchmark.md")
     assert [name for name in method_names() if f"| `{name}` |" not in table] == []
-    drogues = text("docs/adding-a-drogue.md")
+    drogues = text("docs/how-to/add-a-drogue.md")
     assert [name for name in PRESETS if f"`{name}`" not in drogues] == []

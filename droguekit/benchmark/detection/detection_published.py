@@ -22,7 +22,7 @@ class PublishedDetector(NamedTuple):
     image_s: float
 
 
-# Table 1 of the seed paper (docs/paper.md), digit for digit.
+# Table 1 of the seed paper (docs/explanation/paper.md), digit for digit.
 PUBLISHED_DETECTORS = (
     PublishedDetector("YOLOv8s", 0.9266, 0.9521, 0.9839, 28.6, 0.0387),
     PublishedDetector("YOLOv5s", 0.9174, 0.9599, 0.9812, 16.5, 0.0311),

@@ -1,7 +1,7 @@
 """Boxes that a detector found, as the file that `droguekit detect` writes: COCO results.
 
 A JSON list of `{"image_id", "category_id", "bbox", "score"}`. `image_id` is that of `annotations/all.json`,
-`category_id` is 1, the drogue, and `bbox` counts from the image's corner (docs/conventions.md).
+`category_id` is 1, the drogue, and `bbox` counts from the image's corner (docs/reference/conventions.md).
 """
 
 from __future__ import annotations

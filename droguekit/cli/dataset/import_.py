@@ -107,7 +107,7 @@ def _open_source(
         if topics is not None:
             raise ValueError(f"--topics: {source} is no bag")
         if given is None:
-            raise ValueError("--calibration: images need one; see docs/calibration.md for how to make it")
+            raise ValueError("--calibration: images need one; see docs/how-to/calibrate.md for how to make it")
         rig = rig_of_calibration(given)
         return ImageFolder(source, rig.camera.width_px, rate_hz), rig
     names = None if topics is None else tuple(topics.split(","))

@@ -30,7 +30,7 @@ def detect(
             "--tracker",
             metavar="NAME",
             help="Follow the drogue from pair to pair with bernoulli, flow, mil or pose-predict; the detector looks "
-            "where it is lost, and at every 25th pair. docs/tracking.md.",
+            "where it is lost, and at every 25th pair. docs/explanation/tracking.md.",
         ),
     ] = None,
 ) -> None:

@@ -102,7 +102,7 @@ def test_ids_are_unique_and_stable(truth, mixed_dataset):
     ids = [annotation["id"] for annotation in truth.dataset["annotations"]]
     assert len(set(ids)) == len(ids) and min(ids) >= 1
     for annotation in truth.dataset["annotations"]:
-        # What docs/dataset-format.md promises.
+        # What docs/reference/dataset-format.md promises.
         upper, image_id = divmod(annotation["id"], 2**32)
         assert image_id == annotation["image_id"]
         index = annotation["droguekit"].get("marker_index")

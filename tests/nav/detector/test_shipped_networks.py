@@ -15,7 +15,7 @@ from nav.detector.detectors import COLOR_BLOB, DEFAULT_DETECTOR, detector_names,
 from nav.detector.onnx_detector import OnnxDetector
 
 NETWORKS = [name for name in detector_names() if name != COLOR_BLOB]
-CARD = Path(__file__).parents[3] / "docs" / "detector.md"
+CARD = Path(__file__).parents[3] / "docs/reference/detectors.md"
 
 
 def shipped(name: str) -> OnnxDetector:

@@ -19,7 +19,7 @@ from studies.scaling.scaling import RESULTS_FILE, measure, table
 from studies.scaling.spreading_cost import dask_cost
 
 Hashes = Callable[[Path], dict[str, str]]
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "scaling.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs/how-to/scale-out.md"
 
 
 def test_empty_frames_are_measured_once(tmp_path: Path) -> None:
