@@ -18,10 +18,11 @@ from moto.server import ThreadedMotoServer
 from s3fs import S3FileSystem
 
 from datasets_manifest.recipe.recipe import parse_recipe
-from datasets_manifest.storage import layout, open_storage
+from datasets_manifest.storage import layout
 from datasets_manifest.storage.frame_store import FrameStore, frames_there
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.storage.writer import encode_record, leftovers
 from droguekit.batch.execution import Spread
 from droguekit.batch.render_dataset import RunSummary, render_dataset
