@@ -11,7 +11,7 @@ from geometry.stereo import Eye
 from labelgen.part_meshes import part_triangles
 from labelgen.part_pixels import is_one_of
 from labelgen.silhouettes import silhouette
-from render.analytic_engine.part_masks import flat_part_masks
+from render.analytic_engine.ring_passes import flat_part_masks
 
 Mask = NDArray[np.bool_]
 

@@ -1,4 +1,4 @@
-"""What a path tracer hands back for one eye, and how that goes over the surroundings."""
+"""The traced pixels of an eye, composited behind the air and over the background."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID, Part
+from geometry.stereo import EYES, Eye
+from render.background import air_before
 from render.engine import EyeRadiance
 
 # Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
@@ -111,3 +114,49 @@ def inside_one_part(part_id: NDArray[np.uint8], reach_px: int = 1) -> NDArray[np
     kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
     alone: NDArray[np.bool_] = (cv2.erode(part_id, kernel) == cv2.dilate(part_id, kernel)) & (part_id > 0)
     return alone
+
+
+@dataclass(frozen=True, eq=False)
+class InPicture:
+    """Both eyes of one frame; flat indices of the right eye come after all of the left.
+
+    Attributes:
+        frame: with its air.
+        eyes: passes at mid-exposure.
+        behind: (H, W, 3) surroundings of each eye. [cd/m2]
+    """
+
+    frame: FrameSpec
+    eyes: dict[Eye, TracedEye]
+    behind: dict[Eye, NDArray[np.float32]]
+
+    def radiance(
+        self, pixel: NDArray[np.int64], light: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(P, S, 3) radiance in the picture, and (P, 1) the share that the air leaves of parts' light.
+
+        Args:
+            pixel: (P,) flat indices.
+            light: (P, S, 4) radiance and coverage of parts alone, by some samples of each pixel.
+        """
+        shown, clear = np.empty((*light.shape[:2], 3), dtype=np.float32), np.empty((len(pixel), 1), dtype=np.float32)
+        for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
+            air, optical_depth_per_m = air_before(self.frame, own_pixel)
+            clear[own] = self.eyes[eye].clear_share(own_pixel, optical_depth_per_m)
+            behind = self.behind[eye].reshape(-1, 3)[own_pixel]
+            # What a sample shows if it meets a part, less what it shows if it meets none.
+            of_part = (1.0 - clear[own]) * air - behind
+            shown[own] = light[own, :, :3] * clear[own, None] + light[own, :, 3:] * of_part[:, None] + behind[:, None]
+        return shown, clear
+
+    def shows(self, parts: NDArray[np.uint8], pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(P,) whether the pixels' centres see one of the parts that a table by part id marks."""
+        shows = np.zeros(len(pixel), dtype=np.bool_)
+        for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
+            shows[own] = parts[self.eyes[eye].part_id.reshape(-1)[own_pixel]] > 0
+        return shows
+
+    def by_eye(self, pixel: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], NDArray[np.int64]]]:
+        """For each eye (P,) which pixels are its own, and their indices in it."""
+        size = self.eyes[EYES[0]].part_id.size
+        return [(pixel // size == index, pixel[pixel // size == index] - index * size) for index in range(len(EYES))]

@@ -1,13 +1,120 @@
-"""Where rays meet the ground, and how large a piece of it each one sees."""
+"""Pieces of ground that rays see, and periodic textures averaged over them without aliasing."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.mip_tile import Field, MipTile
+from datasets_manifest.random_streams import frame_generator
+
+Field = NDArray[np.float32]
+
+_SMALLEST_LEVEL_PX = 8
+# The finest levels hold square roots in eight bits: detail hides the steps, and the memory is a quarter.
+_BYTE_LEVELS = 2
+
+
+def power_noise(seed: int, stream: str, size_px: int, slope: float, cycles: float) -> Field:
+    """(size, size) periodic Gaussian texture of unit variance, rough at all scales.
+
+    Args:
+        seed, stream: of the random numbers.
+        size_px: width and height; a power of two.
+        slope: how fast the amplitude spectrum falls above its peak.
+        cycles: of the largest blobs in one repeat.
+    """
+    frequency = _frequencies(size_px)
+    return _noise_of_spectrum(seed, stream, np.where(frequency > 0, (frequency**2 + cycles**2) ** (-slope / 2), 0.0))
+
+
+def smooth_noise(seed: int, stream: str, size_px: int, cycles: float) -> Field:
+    """(size, size) periodic Gaussian texture of unit variance with one scale only; arguments as in `power_noise`."""
+    frequency = _frequencies(size_px) / cycles
+    return _noise_of_spectrum(seed, stream, frequency * np.exp(-frequency * frequency))
+
+
+def _frequencies(size_px: int) -> NDArray[np.float64]:
+    """(size, size / 2 + 1) cycles in one repeat."""
+    down, across = np.fft.fftfreq(size_px), np.fft.rfftfreq(size_px)
+    result: NDArray[np.float64] = np.hypot(down[:, None], across[None, :]) * float(size_px)
+    return result
+
+
+def _noise_of_spectrum(seed: int, stream: str, amplitude: NDArray[np.float64]) -> Field:
+    size_px = amplitude.shape[0]
+    white = frame_generator(seed, 0, stream).standard_normal((size_px, size_px))
+    noise = np.fft.irfft2(np.fft.rfft2(white) * amplitude, s=(size_px, size_px))
+    result: Field = (noise / noise.std()).astype(np.float32)
+    return result
+
+
+class MipTile:
+    """A periodic picture with copies of half, a quarter... its size.
+
+    Args:
+        texels: (N, N, C) values, C up to 4, N a power of two; not negative when `coded`.
+        texel_m: size of one. [m]
+        coded: keep the finest copies as square roots in eight bits; for reflectances up to 1.
+    """
+
+    def __init__(self, texels: Field, texel_m: float, coded: bool = False) -> None:
+        self._texel_m = texel_m
+        self._levels: list[NDArray[np.float32] | NDArray[np.uint8]] = []
+        level = texels
+        while True:
+            keep = coded and len(self._levels) < _BYTE_LEVELS
+            self._levels.append(np.rint(255 * np.sqrt(np.clip(level, 0, 1))).astype(np.uint8) if keep else level)
+            if level.shape[0] <= _SMALLEST_LEVEL_PX:
+                break
+            level = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        self.mean: NDArray[np.float64] = texels.mean(axis=(0, 1), dtype=np.float64)
+
+    def sample(self, x_m: Field, y_m: Field, footprint_m: Field) -> Field:
+        """Values averaged over about the footprint.
+
+        Args:
+            x_m, y_m: (H, W) places. [m]
+            footprint_m: (H, W) width over which to average. [m]
+
+        Returns:
+            (H, W, C) values.
+        """
+        top = len(self._levels) - 1
+        height = np.clip(np.log2(np.maximum(footprint_m, 1e-3) / np.float32(self._texel_m)), 0, top).astype(np.float32)
+        first = int(height.min())
+        last = min(top, int(np.ceil(height.max())))
+        # remap wraps only by its border mode and holds 16-bit coordinates: reduce to one repeat first.
+        size, per_m = np.float32(self._levels[0].shape[0]), np.float32(1.0 / self._texel_m)
+        u, v = x_m * per_m, y_m * per_m
+        u -= np.floor(u / size) * size
+        v -= np.floor(v / size) * size
+        if first == last:
+            return self._at_level(first, u, v)
+        total: Field | None = None
+        for level in range(first, last + 1):
+            weight = np.maximum(1.0 - np.abs(height - np.float32(level)), np.float32(0.0))
+            part = self._at_level(level, u, v)
+            part *= weight[..., None]
+            total = part if total is None else total + part
+        assert total is not None
+        return total
+
+    def _at_level(self, level: int, u: Field, v: Field) -> Field:
+        """(H, W, C) values of one copy at places in texels of the finest, within one repeat."""
+        picture = self._levels[level]
+        scale, half = np.float32(0.5**level), np.float32(0.5)
+        seen = cv2.remap(picture, u * scale - half, v * scale - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        seen = seen.reshape(*u.shape, -1)
+        if picture.dtype == np.uint8:
+            root: Field = seen.astype(np.float32)
+            root *= np.float32(1 / 255)
+            root *= root
+            return root
+        return np.asarray(seen, dtype=np.float32)
+
 
 FARTHEST_M = 4e5  # beyond this the haze has hidden everything
 # A piece seen at a grazing angle is drawn out; it is averaged over at most so many places along its length.

@@ -7,22 +7,71 @@ from typing import Literal
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.rangefinder import Rangefinder
+from datasets_manifest.recipe.recipe import Family, Recipe
 from datasets_manifest.types.calibration_board import PlacedBoard
 from datasets_manifest.types.frame import Environment, FrameSpec
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from scenes.auto_exposure import meter
-from scenes.distance import sample_distance_m
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_bystanders
 from scenes.environment import environment_of_scene
-from scenes.flight.frame_kinematics import Moment
+from scenes.flight.frame_kinematics import Moment, sample_suspension
 from scenes.flight.receiver import sample_attitude
 from scenes.flight.sequence import moment_of_sequence
-from scenes.flight.suspension import sample_suspension
-from scenes.framing import outline, sample_pose
-from scenes.rangefinder_reading import sample_reading_m
-from scenes.scene_family import recipe_of_scene
+from scenes.framing import outline, sample_distance_m, sample_pose
+
+
+def family_of_scene(recipe: Recipe, scene_id: int) -> Family | None:
+    """The family of a scene, or None in a recipe without families.
+
+    Every family gets its share of the scenes, rounded by largest remainders, and which ones is drawn, unless they come
+    in turn.
+    """
+    if not recipe.families:
+        return None
+    if recipe.frames.in_turn:
+        return recipe.families[scene_id % len(recipe.families)]
+    scenes = recipe.frames.scenes
+    place = int(np.flatnonzero(frame_generator(recipe.seed, 0, "families").permutation(scenes) == scene_id)[0])
+    ends = np.cumsum(scenes_per_family(recipe))
+    return recipe.families[int(np.searchsorted(ends, place, side="right"))]
+
+
+def scenes_per_family(recipe: Recipe) -> list[int]:
+    """How many scenes each family gets."""
+    scenes = recipe.frames.scenes
+    weights = np.array([family.weight for family in recipe.families])
+    shares = weights / weights.sum() * scenes
+    counts = np.floor(shares).astype(int)
+    largest_first = np.argsort(-(shares - counts), kind="stable")
+    counts[largest_first[: scenes - int(counts.sum())]] += 1
+    return [int(count) for count in counts]
+
+
+def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
+    """The recipe as it holds for one scene: with the name and the conditions of its family."""
+    family = family_of_scene(recipe, scene_id)
+    if family is None:
+        return recipe
+    changes = {
+        "family": family.name,
+        "pose": family.pose,
+        "target": family.target,
+        "environment": family.environment,
+        "exposure": family.exposure,
+    }
+    return recipe.model_copy(update=changes)
+
+
+def sample_reading_m(rangefinder: Rangefinder, seed: int, frame_index: int, distance_m: float) -> float:
+    """The reading at one distance: the same offset in all frames of a dataset, noise of each frame's own. [m]"""
+    offset_m = frame_generator(seed, 0, "rangefinder offset").uniform(-1.0, 1.0) * rangefinder.offset_m
+    noise_m = frame_generator(seed, frame_index, "rangefinder noise").standard_normal() * rangefinder.noise_m
+    reading_m, step_m = distance_m + offset_m + noise_m, rangefinder.resolution_m
+    # Decimal digits rather than a multiple of a step that float64 cannot hold.
+    return float(np.round(step_m * np.rint(reading_m / step_m), 12)) if step_m > 0 else float(reading_m)
+
 
 SplitName = Literal["train", "val", "test"]
 SPLITS: tuple[SplitName, ...] = ("train", "val", "test")

@@ -11,7 +11,7 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
 from geometry.se3 import Array
 from geometry.stereo import Eye
-from render.analytic_engine.flat_parts import PlateLight
+from render.analytic_engine.flat_drogue import PlateLight
 from render.analytic_engine.pixel_coverage import pixel_coverage
 from render.analytic_engine.ring_passes import PixelPasses, empty_passes
 from render.engine import EyeRadiance

@@ -14,9 +14,8 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import EYES, Eye
 from render.analytic_engine.board_drawing import board_eye
-from render.analytic_engine.flat_parts import flat_drogue, ring_radiance
-from render.analytic_engine.outlines import EyeView, seen_areas
-from render.analytic_engine.painting import paint
+from render.analytic_engine.flat_drogue import EyeView, flat_drogue, ring_radiance, seen_areas
+from render.analytic_engine.pixel_coverage import paint
 from render.analytic_engine.ring_passes import empty_passes, pixel_passes
 from render.background import backgrounds
 from render.camera.exposure_motion import blur_px

@@ -1,18 +1,70 @@
-"""Part id, depth and normal at the pixel centres of one eye, by the rays' meeting with flat rings."""
+"""Part id, depth and normal where the rays through the pixel centres of an eye meet flat rings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID, Part
+from geometry.circles import disc_outline
+from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
-from render.analytic_engine.flat_parts import FlatDrogue, FlatRing
-from render.analytic_engine.lens_passes import RingPixels, lens_ring_pixels
-from render.analytic_engine.outlines import EyeView
+from geometry.stereo import Eye
+from render.analytic_engine.flat_drogue import EyeView, FlatDrogue, FlatRing, flat_drogue
+from render.surfaces import missing_parts
+
+_OUTLINE_POINTS = 128
+# Chords of the outline fall short of the circle by 3e-4 of its radius.
+_MARGIN_PX = 2
+
+
+@dataclass(frozen=True, eq=False)
+class RingPixels:
+    """A window of the image and what of it a ring covers.
+
+    Attributes:
+        rows, columns: where the window lies.
+        inside: (h, w) whether the ray through a pixel centre meets the ring.
+        depth_m: (h, w) planar depth at which it meets the ring's plane. [m]
+    """
+
+    rows: slice
+    columns: slice
+    inside: NDArray[np.bool_]
+    depth_m: NDArray[np.float32]
+
+
+@lru_cache(maxsize=2)
+def _pixel_rays(lens: Lens) -> Array:
+    """(H, W, 2) x and y at z = 1 of the rays through all pixel centres."""
+    u, v = np.meshgrid(np.arange(lens.camera.width_px), np.arange(lens.camera.height_px))
+    rays: Array = lens.rays(np.stack([u, v], axis=-1))[..., :2]
+    return rays
+
+
+def lens_ring_pixels(ring: FlatRing, view: EyeView, lens: Lens) -> RingPixels | None:
+    """Window around a ring, or None where it lies beside the image."""
+    outline_px = view.rig.image(
+        disc_outline(view.left_from_drogue, ring.center_m, ring.outer_radius_m, _OUTLINE_POINTS), view.eye
+    )
+    size = np.array([lens.camera.width_px, lens.camera.height_px])
+    low = np.clip(np.floor(outline_px.min(axis=0)).astype(int) - _MARGIN_PX, 0, size)
+    high = np.clip(np.ceil(outline_px.max(axis=0)).astype(int) + _MARGIN_PX + 1, 0, size)
+    if (low >= high).any():
+        return None
+    rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+    rays = _pixel_rays(lens)[rows, columns]
+    center_m, axis = view.center_m(ring), view.left_from_drogue.rotation[:, 2]
+    x, y = rays[..., 0], rays[..., 1]
+    depth_m = (center_m @ axis) / (x * axis[0] + y * axis[1] + axis[2])
+    square_m2 = (x * depth_m - center_m[0]) ** 2 + (y * depth_m - center_m[1]) ** 2 + (depth_m - center_m[2]) ** 2
+    inside = (square_m2 <= ring.outer_radius_m**2) & (square_m2 >= ring.inner_radius_m**2)
+    return RingPixels(rows, columns, inside, depth_m.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,3 +173,18 @@ def _disc_spans(ring: FlatRing, radius_m: float, view: EyeView) -> _RowSpans:
     last = np.floor((-half[rows] + width) / conic[0, 0] + middle[0])
     on_image = np.clip(first, 0, camera.width_px), np.clip(last, -1, camera.width_px - 1)
     return _RowSpans(int(rows.start), on_image[0].astype(np.int64), on_image[1].astype(np.int64))
+
+
+def flat_part_masks(frame: FrameSpec, eye: Eye) -> dict[int, NDArray[np.bool_]]:
+    """(H, W) by part id, the pixel centres whose rays would meet the part's rings if these stood alone.
+
+    Empty for a frame without a drogue.
+    """
+    if frame.drogue is None or frame.left_from_drogue is None:
+        return {}
+    view = EyeView(frame.rig, eye, frame.left_from_drogue)
+    masks: dict[int, NDArray[np.bool_]] = {}
+    for ring in flat_drogue(frame.drogue, missing_parts(frame)).back_to_front:
+        alone = pixel_passes(FlatDrogue((), (ring,), ()), view).part_id == ring.part
+        masks[ring.part] = masks[ring.part] | alone if ring.part in masks else alone
+    return masks

@@ -11,7 +11,7 @@ from geometry.distortion import Lens
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import Eye, StereoRig
 from render.blender_engine.messages import CameraPath, RealEye, Window
-from render.image_windows import NEAREST_M, window_of
+from render.camera.exposure_motion import NEAREST_M, window_of
 
 _SHARP_BELOW_PX = 0.05
 _MOMENTS = 5

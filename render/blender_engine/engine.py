@@ -16,8 +16,15 @@ from geometry.stereo import EYES, Eye
 from render.background import air_before, backgrounds
 from render.blender_engine.camera_path import EyePath, holds
 from render.blender_engine.messages import CENTER_SAMPLE, FEATURES, FIRST_RANDOM_SAMPLE, LIGHT, PASSES, Picture, Window
-from render.blender_engine.picture_arrays import CenterPixels, place, read_light, read_passes
-from render.blender_engine.process import BlenderEndedError, BlenderProcess, bpy_version
+from render.blender_engine.process import (
+    BlenderEndedError,
+    BlenderProcess,
+    CenterPixels,
+    bpy_version,
+    place,
+    read_light,
+    read_passes,
+)
 from render.blender_engine.stage import Stage
 from render.compositing import TracedEye, amodal_counts
 from render.engine import EyeRadiance, StereoRadiance

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from drogue_models.parts import Part
 from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import blur_px
-from render.compositing import TracedEye
-from render.mitsuba_engine.jit_registry import reserve_numbers
+from render.compositing import InPicture, TracedEye
+from render.mitsuba_engine.jit_arrays import reserve_numbers
 from render.mitsuba_engine.paths.center_passes import CenterPasses
-from render.mitsuba_engine.paths.compositor import InPicture
 from render.mitsuba_engine.paths.context_paths import trace_around
 from render.mitsuba_engine.paths.denoised_paths import SmoothedPaths
 from render.mitsuba_engine.paths.drogue_paths import trace_paths

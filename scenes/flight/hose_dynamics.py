@@ -1,11 +1,13 @@
 """A towed hose as a chain of rigid links with lumped masses, and the drogue at its end.
 
-Axes are the tanker's (x aft, y right wing, z up; origin at the mean place of the pod's hose exit), which fly along with
+Axes are the tanker's (x aft, y right wing, z up; origin at the mean position of the pod's hose exit), which move with
 the tanker's mean velocity. Node 0 is the pod's exit, the last node the drogue's coupling. Arrays have the components
 first: (3, S, N + 1) for S sequences that are simulated at once.
 
-Source: the family of models of Ro and Kamman 2010, doi:10.2514/1.45482 (lumped masses, rigid links). Tensions are found
-from the lengths at the end of a step, as in SHAKE (Ryckaert et al. 1977, doi:10.1016/0021-9991(77)90098-5), which
+The drogue points between the relative wind and the last link of the hose, with a lag.
+
+Source: the family of models of Ro and Kamman 2010, doi:10.2514/1.45482 (lumped masses, rigid links). Tensions follow
+from the link lengths at the end of a step, as in SHAKE (Ryckaert et al. 1977, doi:10.1016/0021-9991(77)90098-5), which
 neither drifts nor feeds in energy.
 """
 
@@ -19,7 +21,7 @@ from scipy.linalg.lapack import dgtsv
 from scipy.optimize import brentq
 
 from datasets_manifest.recipe.hose import HoseParameters
-from geometry.se3 import Array
+from geometry.se3 import Array, angles_from_axis, rotation_from_angles
 
 LINKS = 16
 TIME_STEP_S = 0.002
@@ -206,3 +208,57 @@ class HoseModel:
 def _below_the_wind(angle: float) -> Array:
     """Unit vector from a link's upper to its lower end, turned down from the wind's direction by an angle [rad]."""
     return np.array([np.cos(angle), 0.0, -np.sin(angle)])
+
+
+# Share of the relative wind in the direction; the rest is the last link's. Our reconstruction.
+_WIND_SHARE = 0.7
+_LAG_S = 0.15
+# Slower air than this turns the drogue less than its own weight does. [m/s]
+_WEAK_WIND_M_S = 1.0
+# A level camera that looks ahead (right, down, forward), seen from the tanker's axes (aft, right, up).
+LEVEL_CAMERA_FROM_TANKER = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+
+
+def mouth_directions(past_m_s: Array, last_link: Array, period_s: float) -> Array:
+    """Directions from the coupling to the mouth, lagged and not of unit length.
+
+    Args:
+        past_m_s: (T, 3) velocity of the air past the drogue. [m/s]
+        last_link: (T, 3) last link of the hose, towards the drogue.
+        period_s: of the samples. [s]
+
+    Returns:
+        (T, 3) a first-order lag of what the air and the hose want, straight between the samples.
+    """
+    wanted = _wanted(past_m_s, last_link)
+    ratio = period_s / _LAG_S
+    keep = np.exp(-ratio)
+    # Exact for an input that goes straight from sample to sample.
+    newer = 1 - (1 - keep) / ratio
+    lagged = np.empty_like(wanted)
+    lagged[0] = wanted[0]
+    for k in range(1, len(wanted)):
+        lagged[k] = keep * lagged[k - 1] + (1 - keep - newer) * wanted[k - 1] + newer * wanted[k]
+    return lagged
+
+
+def still_mouth_direction(airspeed_m_s: float, last_link: Array) -> Array:
+    """(3,) unit direction from the coupling to the mouth in still air, with the hose's (3,) last link."""
+    return _wanted(np.array([airspeed_m_s, 0.0, 0.0]), last_link)
+
+
+def _wanted(past_m_s: Array, last_link: Array) -> Array:
+    """(..., 3) unit directions that air and hose want the mouth to have."""
+    speed = np.linalg.norm(past_m_s, axis=-1, keepdims=True)
+    wind = past_m_s / np.hypot(speed, _WEAK_WIND_M_S)
+    link = last_link / np.linalg.norm(last_link, axis=-1, keepdims=True)
+    wanted: Array = _WIND_SHARE * wind + (1 - _WIND_SHARE) * link
+    wanted /= np.linalg.norm(wanted, axis=-1, keepdims=True)
+    return wanted
+
+
+def drogue_rotation(mouth: Array, roll_rad: float) -> Array:
+    """(3, 3) rotation `tanker_from_drogue` of a drogue whose mouth points along (3,) `mouth`, without spin."""
+    pitch, yaw = angles_from_axis(-LEVEL_CAMERA_FROM_TANKER @ (mouth / np.linalg.norm(mouth)))
+    rotation: Array = LEVEL_CAMERA_FROM_TANKER.T @ rotation_from_angles(float(pitch), float(yaw), roll_rad)
+    return rotation

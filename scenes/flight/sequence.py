@@ -1,11 +1,13 @@
-"""Sequences of a recipe: which one a pair belongs to, when it is taken, and where everything is then."""
+"""Sequences of a recipe: which sequence a pair belongs to, when it is taken, and where everything is then."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.pose_ranges import Pose
@@ -16,16 +18,53 @@ from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, exp_twist, log_twist
 from scenes.environment import draw
-from scenes.flight.drogue_attitude import drogue_rotation, still_mouth_direction
+from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.dropouts import HidingBar, flown_m, hiding_bar, sample_loss, sun_beside
-from scenes.flight.frame_kinematics import Moment
-from scenes.flight.hose_dynamics import HoseModel
-from scenes.flight.oscillation import sample_oscillation
+from scenes.flight.frame_kinematics import HOSE_OVERLAP_M, WORLD_FROM_TANKER, Moment
+from scenes.flight.hose_dynamics import HoseModel, drogue_rotation, still_mouth_direction
 from scenes.flight.receiver import sample_attitude, wanted_places
-from scenes.flight.suspension import HOSE_OVERLAP_M, WORLD_FROM_TANKER
 from scenes.flight.trajectory import SETTLING_S, Surroundings, Trajectory, simulate
-from scenes.flight.turbulence_field import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.framing import outline
+
+_SINES = 8
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """A sum of sines along several axes.
+
+    Attributes:
+        amplitudes: (A,) of each sine, the same for all of an axis.
+        rates_rad_s: (A, N) angular frequencies. [rad/s]
+        phases_rad: (A, N). [rad]
+    """
+
+    amplitudes: Array
+    rates_rad_s: Array
+    phases_rad: Array
+
+    def at(self, time_s: ArrayLike) -> Array:
+        """(..., A) values at (...) times."""
+        time = np.asarray(time_s, dtype=np.float64)[..., None, None]
+        value: Array = self.amplitudes * np.sin(self.rates_rad_s * time + self.phases_rad).sum(axis=-1)
+        return value
+
+
+def sample_oscillation(rng: np.random.Generator, sd: ArrayLike, low_hz: float, high_hz: float) -> Oscillation:
+    """Draw one.
+
+    Args:
+        rng: draws frequencies, one in each of equal parts of the band, and phases.
+        sd: (A,) standard deviation of each axis.
+        low_hz, high_hz: the band. [Hz]
+    """
+    deviations = np.asarray(sd, dtype=np.float64)
+    shape = (len(deviations), _SINES)
+    steps = (np.arange(_SINES) + rng.random(shape)) / _SINES
+    rates = 2 * np.pi * (low_hz + (high_hz - low_hz) * steps)
+    phases = rng.uniform(0.0, 2 * np.pi, shape)
+    return Oscillation(deviations * np.sqrt(2.0 / _SINES), rates, phases)
+
 
 # Between the last pair of a sequence and the first of the next, so that no tracker takes them for neighbours.
 _PAUSE_S = 10.0

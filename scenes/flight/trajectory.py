@@ -16,11 +16,9 @@ from scipy.optimize import brentq
 from datasets_manifest.recipe.hose import HoseParameters
 from datasets_manifest.recipe.sequence_ranges import Follower
 from geometry.se3 import Array
-from scenes.flight.bow_wave import bow_wave
-from scenes.flight.drogue_attitude import mouth_directions
-from scenes.flight.hose_dynamics import LINKS, TIME_STEP_S, HoseModel, HoseState
+from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
+from scenes.flight.hose_dynamics import LINKS, TIME_STEP_S, HoseModel, HoseState, mouth_directions
 from scenes.flight.receiver import Guidance
-from scenes.flight.turbulence_field import GUST_PERIOD_S
 
 # The first moments, in which hose and receiver forget how they began: the slowest swing dies out within a few periods.
 SETTLING_S = 20.0

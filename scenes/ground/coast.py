@@ -6,8 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from scenes.ground_view import GroundView
-from scenes.mip_tile import Field, MipTile, power_noise
+from scenes.ground_view import Field, GroundView, MipTile, power_noise
 
 _SEED = 6
 _SAND = np.array([0.30, 0.255, 0.185], dtype=np.float32)

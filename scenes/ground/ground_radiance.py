@@ -16,10 +16,8 @@ from drogue_models.parameters import ReflectanceRgb
 from scenes.clouds.ray_march import enlarge
 from scenes.ground.coast import Coast
 from scenes.ground.land_tiles import LandKind, land_tile
-from scenes.ground.sea import GroundLight, Sea
-from scenes.ground.ships import put_ships, sample_ships
-from scenes.ground_view import GroundView, ground_view, pixel_angle_rad
-from scenes.mip_tile import Field, MipTile, power_noise, smooth_noise
+from scenes.ground.sea import GroundLight, Sea, put_ships, sample_ships
+from scenes.ground_view import Field, GroundView, MipTile, ground_view, pixel_angle_rad, power_noise, smooth_noise
 from scenes.sky.light import Radiance
 
 __all__ = ["MEAN_REFLECTANCE", "Ground", "GroundLight"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
-from scenes.mip_tile import Field, MipTile, power_noise, smooth_noise
+from scenes.ground_view import Field, MipTile, power_noise, smooth_noise
 
 LandKind = Literal["fields", "forest", "dry", "town"]
 Rgb = tuple[float, float, float]

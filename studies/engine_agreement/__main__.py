@@ -14,21 +14,7 @@ import typer
 
 from droguekit.batch.progress import PlainProgress
 from studies.engine_agreement.agreement import Bar, centroid_offset, frame_bars, navigation_bars, plate_bars
-from studies.engine_agreement.measures import agreement_of
-from studies.engine_agreement.navigation import (
-    METHOD,
-    RECIPE,
-    paired_errors,
-    pairs_by_station,
-    render_paired,
-)
-from studies.engine_agreement.navigation import (
-    STATIONS_M as NAVIGATION_STATIONS_M,
-)
-from studies.engine_agreement.navigation_errors import navigation_table
-from studies.engine_agreement.own_sky import write_own_sky
-from studies.engine_agreement.paired_frames import FAMILIES, STATIONS_M, paired_frames
-from studies.engine_agreement.report import (
+from studies.engine_agreement.agreement_report import (
     bar_lines,
     cost_line,
     frame_figures,
@@ -39,7 +25,20 @@ from studies.engine_agreement.report import (
     plate_line,
     write_json,
 )
-from studies.engine_agreement.work import Engines, Work
+from studies.engine_agreement.comparison_run import Engines, Work
+from studies.engine_agreement.measures import agreement_of
+from studies.engine_agreement.navigation_agreement import (
+    METHOD,
+    RECIPE,
+    navigation_table,
+    paired_errors,
+    pairs_by_station,
+    render_paired,
+)
+from studies.engine_agreement.navigation_agreement import (
+    STATIONS_M as NAVIGATION_STATIONS_M,
+)
+from studies.engine_agreement.paired_frames import FAMILIES, STATIONS_M, paired_frames, write_own_sky
 
 _EXAMPLES = """Examples:
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.engine import RenderEngine
-from studies.engine_agreement.measures import FrameAgreement, compare
-from studies.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios
+from studies.engine_agreement.measures import FrameAgreement, PlateLight, compare
+from studies.engine_agreement.navigation_agreement import PairedErrors, mean_differences, size_ratios
 from studies.engine_agreement.paired_frames import PairedFrame, Rendered, render_both
-from studies.engine_agreement.plates import PlateLight
 
 # The bars of the agreement: see docs/explanation/blender.md.
 MOST_CENTROID_RMS_PX = 0.02

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from studies.render_cost.comparison import compare_at, read_station, table_lines, write_station
-from studies.render_cost.views import SCENES, STATIONS_M
+from studies.render_cost.noise_search import SCENES, STATIONS_M
 
 _EXAMPLES = """Examples:
 

@@ -16,8 +16,7 @@ import bpy
 
 from render.blender_engine.blender_scene import BlenderScene, set_threads
 from render.blender_engine.messages import LIGHT
-from studies.render_cost.cycles_orders import CyclesOrder, DenoisedPicture
-from studies.render_cost.noise_search import cpu_seconds
+from studies.render_cost.cycles_messages import CyclesOrder, DenoisedPicture, cpu_seconds
 
 _SENSOR_WIDTH_MM = 36.0
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5

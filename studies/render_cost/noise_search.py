@@ -1,14 +1,17 @@
-"""Noise of a renderer from pictures of one view with different seeds, and the samples that reach a given noise."""
+"""The view that every renderer draws, its noise on the drogue, and the samples that reach a given noise."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from datasets_manifest.recipe.recipe import Recipe, RenderSettings, load_recipe
+from datasets_manifest.types.frame import FrameSpec
+from scenes.sampler import sample_frame
 
 # Noise that is measured on a few hundred pixels is itself known to some percent.
 _CLOSE_ENOUGH = 0.1
@@ -50,12 +53,6 @@ class Cost:
 
     cpu_s: float
     is_least: bool = False
-
-
-def cpu_seconds() -> float:
-    """User and system time of this process and of its children that have ended. [s]"""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
 
 
 def relative_noise(
@@ -105,3 +102,64 @@ def reach_noise(measure: Callable[[int], NoiseAt], noise: float, pilot: int, mos
             return best
         samples = min(samples_for(best, noise), most_samples)
     return best.with_samples(samples_for(best, noise)) if best.noise > noise else best
+
+
+STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
+# What a denoiser may look at beyond the drogue.
+_MARGIN_PX = 32
+_RECIPE = "daylight-10m"
+# Enough for scenes that differ, so that nothing kept from one frame serves the next.
+SCENES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What every renderer draws.
+
+    Attributes:
+        frame: a drogue in its surroundings.
+        settings: those that a recipe has by default.
+        drogue: (H, W) pixels of the left eye whose centres see the drogue.
+        inside: those of them around which all pixels see the same part.
+    """
+
+    frame: FrameSpec
+    settings: RenderSettings
+    drogue: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+
+    @property
+    def crop(self) -> tuple[int, int, int, int]:
+        """(left, top, width, height) of the part of the left eye that holds the drogue. [px]"""
+        rows, columns = (np.flatnonzero(self.drogue.any(axis=axis)) for axis in (1, 0))
+        top, left = max(int(rows[0]) - _MARGIN_PX, 0), max(int(columns[0]) - _MARGIN_PX, 0)
+        height, width = self.drogue.shape
+        right, bottom = min(int(columns[-1]) + _MARGIN_PX, width - 1), min(int(rows[-1]) + _MARGIN_PX, height - 1)
+        return left, top, right - left + 1, bottom - top + 1
+
+    @property
+    def masks(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """The drogue's pixels and those inside its parts, of the crop."""
+        left, top, width, height = self.crop
+        within = slice(top, top + height), slice(left, left + width)
+        return self.drogue[within], self.inside[within]
+
+
+def recipe_at(distance_m: float, seed: int) -> Recipe:
+    """The recipe with every drogue at one distance. [m]"""
+    recipe, _ = load_recipe(_RECIPE, seed)
+    changes = {
+        "frames": {"count": SCENES, "scenes": SCENES, "empty_fraction": 0.0},
+        "distance": {"law": "stations", "stations_m": (distance_m,)},
+    }
+    return Recipe.model_validate({**recipe.model_dump(), **changes})
+
+
+def reseeded(frame: FrameSpec, by: int) -> FrameSpec:
+    """The same frame with other samples and other noise of the sensor."""
+    return frame.model_copy(update={"seed": frame.seed + by})
+
+
+def frame_at(distance_m: float, seed: int, index: int = 0) -> FrameSpec:
+    """A frame at one distance. [m]"""
+    return sample_frame(recipe_at(distance_m, seed), index)

@@ -15,7 +15,7 @@ from droguekit.benchmark.poses.pose_errors import by_method
 from droguekit.benchmark.report.report import write_report
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform
-from scenes.rangefinder_reading import sample_reading_m
+from scenes.sampler import sample_reading_m
 
 
 def read(record: PairRecord, reading_m: float) -> PairRecord:

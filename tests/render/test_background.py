@@ -4,8 +4,7 @@ import numpy as np
 
 from datasets_manifest.types.weather import CloudLayer
 from geometry.se3 import RigidTransform
-from render.background import background
-from render.stars import add_stars
+from render.background import add_stars, background
 from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
 from scenes.sky.light import luminance

@@ -83,7 +83,7 @@ def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of, make_recipe):
     import mitsuba as mi
 
     from render.mitsuba_engine.jit_arrays import jit_array
-    from render.mitsuba_engine.paths.camera_rays import CameraRays
+    from render.mitsuba_engine.paths.rays import CameraRays
     from render.mitsuba_engine.scene import by_shape
 
     rays = 1_000_000

@@ -25,14 +25,14 @@ class Bits:
 
 @pytest.fixture
 def place(engine):
-    from render.mitsuba_engine.paths.edge_samples import PlacedSamples
+    from render.mitsuba_engine.paths.sample_allocation import PlacedSamples
 
     return PlacedSamples
 
 
 @pytest.fixture
 def counts_of(engine):
-    from render.mitsuba_engine.paths.edge_samples import counts_by_variance
+    from render.mitsuba_engine.paths.sample_allocation import counts_by_variance
 
     return counts_by_variance
 
@@ -65,7 +65,7 @@ def test_numbers_are_those_of_sobol(engine):
     import mitsuba as mi
     from scipy.stats.qmc import Sobol
 
-    from render.mitsuba_engine.paths.edge_samples import _sobol
+    from render.mitsuba_engine.paths.sample_allocation import _sobol
 
     index = dr.arange(mi.UInt32, 64)
     ours = np.stack([np.array(dr.brev(index)), np.array(_sobol(index, (1,))), np.array(_sobol(index, (1, 3)))], axis=1)
@@ -123,9 +123,8 @@ def test_even_pixels_take_the_fewest_rays(counts_of):
 
 def test_rays_that_agree_do_not_prove_a_pixel_even(engine, make_recipe):
     """Nine rays miss what fills a twentieth of a pixel three times in five."""
-    from render.compositing import TracedEye
-    from render.mitsuba_engine.paths.compositor import InPicture
-    from render.mitsuba_engine.paths.noise_budget import NoiseBudget
+    from render.compositing import InPicture, TracedEye
+    from render.mitsuba_engine.paths.sample_allocation import NoiseBudget
 
     frame = sample_frame(make_recipe(scale=0.1), 0)
     shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)

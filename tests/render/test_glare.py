@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.weather import CloudLayer
-from render.camera.lens_glare import glare_spread_per_sr, sun_glare
+from render.camera.optics import glare_spread_per_sr, sun_glare
 from render.engine import EyeRadiance
 from scenes.clouds.cloud_layers import opacity_towards
 from scenes.environment_radiance import surroundings

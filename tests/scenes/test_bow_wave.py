@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.sequence_ranges import Follower, Receiver, SequenceRanges
-from scenes.flight.bow_wave import bow_wave
+from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
 from scenes.flight.trajectory import Surroundings, simulate
-from scenes.flight.turbulence_field import GUST_PERIOD_S
 
 
 def test_bow_wave_of_a_half_body():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
-from render.dirt import DIRT_MAP_PX, dirt_map
+from render.surfaces import DIRT_MAP_PX, dirt_map
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.sampler import sample_frame
 

@@ -8,8 +8,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
 from droguekit.batch.planning.recipe_plan import plan_recipe
-from scenes.sampler import sample_frame, split_of_scenes
-from scenes.scene_family import family_of_scene, recipe_of_scene, scenes_per_family
+from scenes.sampler import family_of_scene, recipe_of_scene, sample_frame, scenes_per_family, split_of_scenes
 
 BASE = """
 name = "families-test"

@@ -10,8 +10,7 @@ from datasets_manifest.types.ground import GROUND_KINDS
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
 from scenes.ground.land_tiles import land_tile
 from scenes.ground.sea import Sea, fresnel, slope_variances
-from scenes.ground_view import FARTHEST_M, ground_view, pixel_angle_rad
-from scenes.mip_tile import MipTile, power_noise
+from scenes.ground_view import FARTHEST_M, MipTile, ground_view, pixel_angle_rad, power_noise
 from scenes.sky.light import luminance
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from datasets_manifest.recipe.hose import HOSES
 from datasets_manifest.recipe.sequence_ranges import Follower
+from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.hose_dynamics import GRAVITY_M_S2, LINKS, TIME_STEP_S, HoseModel, HoseState
 from scenes.flight.trajectory import Surroundings, simulate
-from scenes.flight.turbulence_field import GUST_PERIOD_S, dryden, sample_gusts
 
 FULL_SIZE = HOSES["full-size"]
 VACUUM = FULL_SIZE.model_copy(update={"air_density_kg_m3": 1e-12})

@@ -11,7 +11,7 @@ from datasets_manifest.types.frame import Environment
 from datasets_manifest.types.weather import CloudLayer
 from scenes.clouds.cloud_layers import CloudLight, see_cloud
 from scenes.environment_radiance import surroundings
-from scenes.flight.suspension import WORLD_FROM_TANKER
+from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
 from scenes.sampler import sample_frame
 from scenes.sky.light import luminance

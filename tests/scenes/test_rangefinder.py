@@ -6,8 +6,7 @@ import numpy as np
 
 from datasets_manifest.recipe.rangefinder import Rangefinder
 from datasets_manifest.recipe.recipe import parse_recipe
-from scenes.rangefinder_reading import sample_reading_m
-from scenes.sampler import sample_frame
+from scenes.sampler import sample_frame, sample_reading_m
 
 RECIPE = """
 name = "bench"

@@ -8,7 +8,7 @@ from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES
-from scenes.distance import sample_distance_m
+from scenes.framing import sample_distance_m
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
 BASE = """

@@ -5,7 +5,7 @@ import pytest
 
 from datasets_manifest.types.frame import Environment
 from datasets_manifest.types.weather import CloudLayer, Moon
-from scenes.clouds.noise_texture import sample_texture
+from scenes.clouds.cloud_density import sample_texture
 from scenes.environment_radiance import Surroundings
 from scenes.sky.clear_sky import ClearSky, direction_from_angles
 from scenes.sky.light import REC709_FROM_XYZ, hemisphere, luminance

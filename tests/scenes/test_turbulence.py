@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.signal import welch
 
-from scenes.flight.turbulence_field import GUST_PERIOD_S, Dryden, dryden, sample_gusts, spectrum
+from scenes.flight.airflow import GUST_PERIOD_S, Dryden, dryden, sample_gusts, spectrum
 
 AIR = Dryden((1.0, 2.0, 0.5), (180.0, 100.0, 40.0))
 SPEED_M_S = 120.0

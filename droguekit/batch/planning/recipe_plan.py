@@ -15,8 +15,7 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
 from labelgen.boxes import full_box
 from scenes.drogue_appearance import drogue_of_scene
-from scenes.sampler import sample_left_from_drogue, scene_of_frame, split_of_scenes
-from scenes.scene_family import family_of_scene, recipe_of_scene
+from scenes.sampler import family_of_scene, recipe_of_scene, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
 # A worker may have to load its engine and compile kernels within its first frame.
 _START_S = 300.0

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import Eye
+from render.camera.exposure_motion import window_of
 from render.compositing import TracedEye, amodal_counts
-from render.image_windows import window_of
 from render.mitsuba_engine.jit_arrays import jit_array
-from render.mitsuba_engine.paths.camera_rays import CameraRays
-from render.mitsuba_engine.paths.rays import rows_of
+from render.mitsuba_engine.paths.rays import CameraRays, rows_of
 from render.mitsuba_engine.scene import DrogueScene, by_shape
 from render.mitsuba_engine.trace_request import ASIDE, OF_DROGUE, parts_in, slipped_through
 

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import RenderSettings
 from geometry.stereo import Eye
+from render.compositing import InPicture
 from render.mitsuba_engine.jit_arrays import jit_array
-from render.mitsuba_engine.paths.compositor import InPicture
-from render.mitsuba_engine.paths.edge_samples import PILOT_COUNT, PlacedSamples, in_parts
-from render.mitsuba_engine.paths.noise_budget import NoiseBudget
 from render.mitsuba_engine.paths.rays import FrameRays, Sampled, and_some_again, means_by_pixel
+from render.mitsuba_engine.paths.sample_allocation import PILOT_COUNT, NoiseBudget, PlacedSamples, in_parts
 from render.mitsuba_engine.paths.sun_sky_integrator import trace_first
 from render.mitsuba_engine.paths.surface_light import SMOOTHING_M, SurfaceLight
 from render.mitsuba_engine.render_noise import TWICE_EVERY

@@ -14,8 +14,7 @@ from droguekit.benchmark.poses.frame_truth import DrogueTruth
 from geometry.se3 import RigidTransform
 from geometry.stereo import paper_rig
 from scenes.drogue_appearance import drogue_of_scene
-from scenes.sampler import scene_of_frame
-from scenes.scene_family import recipe_of_scene
+from scenes.sampler import recipe_of_scene, scene_of_frame
 from studies.acceptance.rendered.bench_rows import bench_rows, speed_rows
 from studies.acceptance.rendered.flight_data import FLIGHT_TIERS, part_length, with_parts
 from studies.acceptance.rendered.flight_rows import approach_rows, bound_ratio, condition_rows, lost_rows

@@ -9,9 +9,8 @@ import pytest
 
 from render.engine import load_engine
 from studies.engine_agreement.agreement import frame_bars, part_ratios, plate_bars
-from studies.engine_agreement.measures import compare
+from studies.engine_agreement.measures import PlateLight, compare
 from studies.engine_agreement.paired_frames import Rendered, paired_frames, render_both
-from studies.engine_agreement.plates import PlateLight
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,16 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
 from studies.engine_agreement.agreement import navigation_bars
-from studies.engine_agreement.navigation import (
+from studies.engine_agreement.navigation_agreement import (
     PairedDatasets,
+    PairedErrors,
+    mean_differences,
     paired_errors,
     pairs_by_station,
     render_paired,
+    size_ratios,
     station_recipe,
 )
-from studies.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios
 from tests.support.small_datasets import rendered
 
 

@@ -13,10 +13,9 @@ from render.engine import load_engine
 from scenes.environment_radiance import surroundings
 from scenes.sampler import sample_frame
 from studies.engine_agreement.__main__ import main
+from studies.engine_agreement.comparison_run import Findings
 from studies.engine_agreement.costs import CostAt, EngineCost, cost_of, measure_costs
-from studies.engine_agreement.findings import Findings
-from studies.engine_agreement.own_sky import write_own_sky
-from studies.engine_agreement.paired_frames import FAMILIES, paired_frames, recipe_of_family
+from studies.engine_agreement.paired_frames import FAMILIES, paired_frames, recipe_of_family, write_own_sky
 
 
 def run(*arguments):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from studies.render_cost.comparison import CYCLES, MITSUBA, OWN, read_station, table_lines, write_station
-from studies.render_cost.views import View, frame_at, recipe_at
+from studies.render_cost.noise_search import View, frame_at, recipe_at
 
 
 def station() -> dict[str, Any]:

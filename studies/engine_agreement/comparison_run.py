@@ -1,22 +1,53 @@
-"""The parts of the comparison one after the other, each thing found kept as soon as it is known."""
+"""Runs the parts of the comparison in turn, and keeps each result on disk, so that a stopped run can resume."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import RenderSettings
 from render.engine import RenderEngine, load_engine
 from studies.engine_agreement.agreement import compare_frame
+from studies.engine_agreement.agreement_report import frame_row, write_picture
 from studies.engine_agreement.costs import COST_FAMILY, COST_STATIONS_M, CostAt, cost_of, measure_costs
-from studies.engine_agreement.findings import Findings, Found
+from studies.engine_agreement.measures import TILTS_DEG, PlateLight, compare_plate, plate_frame
 from studies.engine_agreement.paired_frames import PairedFrame, frame_at, recipe_of_family
-from studies.engine_agreement.plates import TILTS_DEG, PlateLight, compare_plate, plate_frame
-from studies.engine_agreement.report import frame_row, write_picture
+
+Found = dict[str, Any]
+
+
+class Findings:
+    """A folder of found things; each names what it was made from, and counts for nothing else."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def get(self, name: str, made_from: Found) -> Found | None:
+        """What was found under this name from the same things, None if nothing was."""
+        try:
+            kept = json.loads(self._file(name).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        # As JSON has it: tuples are lists there.
+        same = isinstance(kept, dict) and kept.get("made_from") == json.loads(json.dumps(made_from))
+        return kept["found"] if same else None
+
+    def keep(self, name: str, made_from: Found, found: Found) -> None:
+        """Keep what was found; the file is there whole or not at all.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        write_text_atomic(self._file(name), json.dumps({"made_from": made_from, "found": found}, indent=1) + "\n")
+
+    def _file(self, name: str) -> Path:
+        return self._folder / f"{name}.json"
 
 
 class Engines:

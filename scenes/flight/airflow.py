@@ -1,8 +1,9 @@
-"""Atmospheric turbulence of Dryden's form, as a frozen field flown through at constant speed.
+"""The moving air around hose and receiver: Dryden turbulence, and the bow wave of the receiver's nose.
 
-Gusts are drawn on a grid of time of their own by the exact discretisation of the shaping filters, so that neither their
-spectrum nor their values depend on the time step of whatever they shake. The scales are those of MIL-F-8785C and its
-spectra; the lateral and vertical scales of MIL-HDBK-1797, which are half as long, belong to other formulas.
+Turbulence is a frozen field flown through at constant speed. Gusts are drawn on a time grid of their own by the exact
+discretisation of the shaping filters, so that neither their spectrum nor their values depend on the time step of the
+simulation that uses them. The scales are those of MIL-F-8785C and its spectra; the lateral and vertical scales of
+MIL-HDBK-1797, which are half as long, belong to other formulas.
 
 Source: MIL-F-8785C (1980), section 3.7.
 """
@@ -154,3 +155,23 @@ def spectrum(turbulence: Dryden, airspeed_m_s: float, angular_rate_rad_s: ArrayL
         else:
             densities.append(sd**2 * lag / np.pi * (1 + 3 * x2) / (1 + x2) ** 2)
     return np.stack(densities)
+
+
+def bow_wave(points_m: Array, source_m: Array, airspeed_m_s: float, body_radius_m: float) -> Array:
+    """What a round nose adds to the velocity of the air.
+
+    Args:
+        points_m: (3, S, M) where. [m]
+        source_m: (3, S) places of the sources, half a radius behind the tips of the noses. [m]
+        airspeed_m_s: of the receiver. [m/s]
+        body_radius_m: of the body far behind its nose. [m]
+
+    Returns:
+        (3, S, M) `V a^2 / 4 r / |r|^3`; inside the body no more than the airspeed, its value at the tip. [m/s]
+
+    Source: Rankine's half-body, a point source in a uniform stream; Milne-Thomson, Theoretical Hydrodynamics, ch. 15.
+    """
+    away = points_m - source_m[..., None]
+    square = np.maximum(np.einsum("ism,ism->sm", away, away), (body_radius_m / 2) ** 2)
+    pushed: Array = (airspeed_m_s * body_radius_m**2 / 4) * away / (square * np.sqrt(square))
+    return pushed

@@ -1,7 +1,8 @@
-"""What Blender's process of the comparison is told."""
+"""What both sides of Blender's process share: requests, and the clock for CPU time."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 from render.blender_engine.messages import CameraPath, FrameSetup, Window
@@ -34,3 +35,9 @@ class CyclesOrder:
 
     setup: FrameSetup
     pictures: tuple[DenoisedPicture, ...]
+
+
+def cpu_seconds() -> float:
+    """User and system time of this process and of its children that have ended. [s]"""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system

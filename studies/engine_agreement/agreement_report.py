@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from datasets_manifest.atomic import write_text_atomic
 from studies.engine_agreement.agreement import Bar, CentroidOffset, ComparedFrame, part_ratios
 from studies.engine_agreement.costs import CostAt
-from studies.engine_agreement.measures import FrameAgreement, luminance
-from studies.engine_agreement.navigation_errors import PairedErrors, mean_differences, size_ratios, station_rows
-from studies.engine_agreement.plates import PlateLight
+from studies.engine_agreement.measures import FrameAgreement, PlateLight, luminance
+from studies.engine_agreement.navigation_agreement import PairedErrors, mean_differences, size_ratios, station_rows
 
 # A difference of a fortieth of the picture's white fills the scale from middle grey to black or white.
 _DIFFERENCE_SCALE = 40.0

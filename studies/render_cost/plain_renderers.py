@@ -1,0 +1,196 @@
+"""A stereo pair as plain scripts around Mitsuba and Blender render it: every pixel gets the same number of samples.
+
+Mitsuba renders with its own sensor and path integrator, in a process of its own; Blender by `cycles_script`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.se3 import exp_twist
+from geometry.stereo import EYES, Eye
+from render.blender_engine.camera_path import EyePath
+from render.blender_engine.messages import FrameSetup, Window
+from render.blender_engine.process import bpy_version, read_light
+from render.blender_engine.stage import Stage
+from render.engine import load_engine
+from scenes.environment_radiance import surroundings
+from scenes.sky.clear_sky import REC709_LUMINANCE
+from studies.render_cost.cycles_messages import CyclesOrder, DenoisedPicture, cpu_seconds
+from studies.render_cost.noise_search import Cost, NoiseAt, View, noise_of, reach_noise
+
+STEP = 8
+"""Samples of one launch: more are launched again, which bounds memory and is the same to independent samples."""
+
+_NEAREST_M, _FARTHEST_M = 0.01, 1e5
+_MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+_MOST_PATHS_MITSUBA = 100_000_000
+_Crop = tuple[int, int, int, int]
+
+
+def measure_plain_mitsuba(view: View, noise: float) -> tuple[NoiseAt, Cost]:
+    """Samples and cost of a pair with a given noise; loading the scene and compiling kernels do not count.
+
+    Noise is measured around the drogue, and the cost with one launch over every pixel of both eyes.
+
+    Args:
+        view: what to draw.
+        noise: to be reached.
+    """
+    # Chooses the variant and the number of threads, as for our own path.
+    load_engine("mitsuba")
+    import mitsuba as mi
+
+    from render.mitsuba_engine.scene import SceneCache
+
+    scene = SceneCache().scene_of(view.frame, surroundings(view.frame.environment)).scene
+    # Nothing is ended by lot, as everywhere in this comparison.
+    depth = view.settings.max_depth
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": depth + 1})
+
+    def launched(sensor: Any, seed: int) -> NDArray[np.float64]:
+        image = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=STEP, seed=seed))
+        luminance: NDArray[np.float64] = image[..., :3] @ REC709_LUMINANCE
+        return luminance
+
+    around = mi.load_dict(_sensor(view, "left", view.crop))
+
+    def noise_at(samples: int) -> NoiseAt:
+        launches = -(-samples // STEP)
+        one, other = (
+            np.mean([launched(around, first * launches + each) for each in range(launches)], axis=0) for first in (0, 1)
+        )
+        return noise_of(launches * STEP, (one, other), view.masks)
+
+    most_samples = max(STEP, _MOST_PATHS_MITSUBA // view.masks[0].size)
+    found = reach_noise(noise_at, noise, STEP, most_samples)
+    whole = [mi.load_dict(_sensor(view, eye)) for eye in EYES]
+    launched(whole[0], 0)
+    began_s = cpu_seconds()
+    for sensor in whole:
+        launched(sensor, 1)
+    return found, Cost((cpu_seconds() - began_s) * -(-found.samples // STEP))
+
+
+def _sensor(view: View, eye: Eye, crop: _Crop | None = None) -> dict[str, Any]:
+    import mitsuba as mi
+
+    camera = view.frame.rig.camera
+    left, top, width, height = crop or (0, 0, camera.width_px, camera.height_px)
+    eye_from_left = exp_twist(np.concatenate([-view.frame.rig.eye_offset_m(eye), np.zeros(3)]))
+    stage_from_eye = (eye_from_left @ view.frame.left_from_stage_at(0.0)).inverse().as_matrix()
+    return {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f((stage_from_eye @ _MITSUBA_FROM_OPENCV).tolist()),
+        "fov": float(np.degrees(2 * np.arctan(camera.width_px / 2 / camera.fx_px))),
+        "fov_axis": "x",
+        "principal_point_offset_x": 0.5 - (camera.cx_px + 0.5) / camera.width_px,
+        "principal_point_offset_y": 0.5 - (camera.cy_px + 0.5) / camera.height_px,
+        "near_clip": _NEAREST_M,
+        "far_clip": _FARTHEST_M,
+        "sampler": {"type": "independent", "sample_count": STEP},
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width_px,
+            "height": camera.height_px,
+            "crop_offset_x": left,
+            "crop_offset_y": top,
+            "crop_width": width,
+            "crop_height": height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+    }
+
+
+_PILOT_SAMPLES = 4
+_MOST_PATHS_CYCLES = 20_000_000
+
+
+def measure_plain_cycles(view: View, noise: float, full_samples: int | None) -> tuple[NoiseAt, Cost]:
+    """Samples and cost of a denoised pair with a given noise; starting Blender and loading the scene do not count.
+
+    Noise is measured around the drogue, and the cost over every pixel of both eyes.
+
+    Args:
+        view: what to draw.
+        noise: to be reached.
+        full_samples: most samples over every pixel; with fewer than needed the cost is a lower bound.
+
+    Raises:
+        ValueError: Blender is not installed.
+        OSError: its process failed; says what it said last.
+    """
+    bpy_version()
+    setup = Stage().set_frame(view.frame, surroundings(view.frame.environment))
+    around = view.crop
+
+    def noise_at(samples: int) -> NoiseAt:
+        orders = [_Wanted("left", around, samples, seed) for seed in (1, 2)]
+        (_, one), (_, other) = _taken(view, setup, orders)
+        return noise_of(samples, (one, other), view.masks)
+
+    found = reach_noise(noise_at, noise, _PILOT_SAMPLES, max(_PILOT_SAMPLES, _MOST_PATHS_CYCLES // view.masks[0].size))
+    camera = view.frame.rig.camera
+    whole = (0, 0, camera.width_px, camera.height_px)
+    samples = min(found.samples, full_samples or found.samples)
+    # The first one loads the scene.
+    orders = [_Wanted("left", around, 1, 1), *(_Wanted(eye, whole, samples, 1) for eye in EYES)]
+    spent_s = [cpu_s for cpu_s, _ in _taken(view, setup, orders)]
+    return found, Cost(sum(spent_s[1:]), samples < found.samples)
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    eye: Eye
+    crop: tuple[int, int, int, int]
+    samples: int
+    seed: int
+
+
+def _taken(view: View, setup: FrameSetup, orders: list[_Wanted]) -> list[tuple[float, NDArray[np.float32]]]:
+    """CPU time and luminance of each picture. [s, unit of the light]"""
+    camera = view.frame.rig.camera
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        files = [Path(folder) / str(index) for index in range(len(orders))]
+        pictures = []
+        for order, file in zip(orders, files, strict=True):
+            window = Window(*order.crop, camera.fx_px, (camera.cx_px, camera.cy_px))
+            path = EyePath(view.frame, order.eye, np.zeros((0, 3), dtype=np.float32)).still
+            bounces = view.settings.max_depth - 2
+            pictures.append(DenoisedPicture(window, path, order.samples, bounces, order.seed, str(file)))
+        spent_s = _run(CyclesOrder(setup, tuple(pictures)), Path(folder))
+        unit = np.float32(setup.light.unit_cd_m2)
+        seen = [read_light(file.with_suffix(".exr"))[..., :3] @ REC709_LUMINANCE * unit for file in files]
+    return list(zip(spent_s, seen, strict=True))
+
+
+def _run(order: CyclesOrder, folder: Path) -> list[float]:
+    """CPU time of each picture. [s]"""
+    ended = subprocess.run(
+        # -P: a file that lies where the user works must not stand in for a module of Blender's.
+        [sys.executable, "-P", "-m", "studies.render_cost.cycles_script"],
+        input=pickle.dumps(order),
+        capture_output=True,
+        env={**os.environ, "BLENDER_USER_RESOURCES": str(folder)},
+        check=False,
+    )
+    if ended.returncode != 0:
+        last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        raise OSError(f"Blender's process ended with status {ended.returncode}: {' '.join(last)}")
+    spent_s: list[float] = json.loads(ended.stdout)
+    return spent_s
