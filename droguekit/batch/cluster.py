@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 from datasets_manifest.storage.layout import EVENTS_FILE
 from datasets_manifest.storage.provenance import cpu_features, software_versions
 from datasets_manifest.storage.storage import absolute, open_storage
+from droguekit.batch.execution import resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
-from droguekit.batch.machine import resident_gib
 from droguekit.batch.stop_request import StopRequest
-from droguekit.batch.workers import MAX_ATTEMPTS, Attempt, run_alone
+from droguekit.batch.worker_pool import MAX_ATTEMPTS, Attempt, run_alone
 from render.engine import load_engine
 
 if TYPE_CHECKING:

@@ -10,9 +10,8 @@ from datasets_manifest.storage.packing import pack_if_complete, packing_of
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.storage.writer import write_frame
-from droguekit.batch.execution import Events, Totals
 from droguekit.batch.progress import ProgressReport
-from droguekit.batch.render_dataset import RunSummary, describe_dataset, still_missing
+from droguekit.batch.render_dataset import Events, RunSummary, Totals, describe_dataset, still_missing
 from droguekit.batch.resume import differing_keys, open_dataset, sort_frames
 from render.version import RENDER_VERSION
 

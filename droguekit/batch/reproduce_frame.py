@@ -18,7 +18,7 @@ from datasets_manifest.storage.provenance import cpu_features, differing_builds,
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from droguekit.batch.frame_task import FrameTask
-from droguekit.batch.workers import run_alone
+from droguekit.batch.worker_pool import run_alone
 
 # Numbers that do not come from noisy paths agree this well on any machine: numpy's exp, log, tan, arctan2 and matmul
 # differ in their last bits between instruction sets.

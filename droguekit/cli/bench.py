@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from droguekit.cli.arguments import EngineOption, WorkersOption
-from droguekit.workflows.datasets import BENCH_QUALITIES, open_bench_recipe, open_uniform_bench_recipe
+from droguekit.workflows.render_timing import BENCH_QUALITIES, open_bench_recipe, open_uniform_bench_recipe
 
 if TYPE_CHECKING:
-    from droguekit.batch.frame_cost import MeasuredFrame
     from droguekit.batch.frame_task import FrameReport
+    from droguekit.batch.frame_timing import MeasuredFrame
 
 EXAMPLES = ("droguekit bench", "droguekit bench --repeat 5 --workers 8", "droguekit bench --pairs 500")
 
@@ -31,8 +31,8 @@ def bench(
     sensor's (root mean square over pairs), and how much more memory the process holds after the last pair than after
     the first fifth. Last, how many pairs a second all workers make of these, by the clock.
     """
-    from droguekit.batch.frame_cost import frames_per_second, measure_closely, measure_frames, warm_up
-    from droguekit.batch.machine import default_workers
+    from droguekit.batch.execution import default_workers
+    from droguekit.batch.frame_timing import frames_per_second, measure_closely, measure_frames, warm_up
 
     workers = default_workers() if workers is None else workers
     if workers < 1:

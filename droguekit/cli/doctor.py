@@ -54,7 +54,7 @@ def doctor() -> None:
 
 def _show_machine() -> None:
     from datasets_manifest.storage.provenance import cpu_features
-    from droguekit.batch.machine import available_cores, available_memory_gib, default_workers
+    from droguekit.batch.execution import available_cores, available_memory_gib, default_workers
 
     typer.echo(f"python     {platform.python_version()}, {sys.executable}")
     typer.echo(f"system     {platform.platform()}")

@@ -23,8 +23,8 @@ from droguekit.benchmark.report.label_drawing import (
     draw_crosses,
     resized,
 )
-from droguekit.visualization.animation import evenly, period_s, write_movie
-from droguekit.visualization.browse.drogue_rings import drogue_rings, ring_images
+from droguekit.visualization.drogue_outlines import drogue_rings, ring_images
+from droguekit.visualization.video_file import evenly, period_s, write_movie
 from geometry.se3 import Array, RigidTransform
 
 TRUE_RGB: Rgb = (80, 255, 100)

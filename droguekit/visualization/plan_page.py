@@ -1,17 +1,190 @@
-"""A plan as one HTML page that needs nothing from outside."""
+"""A plan as one HTML page that needs nothing from outside, with its pictures."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib
+import numpy as np
 from jinja2 import Environment, StrictUndefined
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import Recipe
-from droguekit.batch.planning.recipe_plan import Plan
-from droguekit.visualization.plan_figures import plan_figures
+from droguekit.batch.recipe_plan import Plan, check_places, check_sizes, distance_share
+from geometry.se3 import Array
+
+_PANEL_IN = (6.2, 4.4)
+_DPI = 130
+_BAR, _LAW = "#7aa9d8", "#b03a2e"
+_BINS = 24
+_CELL_PX = 40
+
+
+@dataclass(frozen=True)
+class PlanFigure:
+    """One picture.
+
+    Attributes:
+        title: what it shows, without its caption.
+        caption: how to read it.
+        png: the file's contents.
+    """
+
+    title: str
+    caption: str
+    png: bytes
+
+
+def plan_figures(recipe: Recipe, planned: Plan) -> Iterator[PlanFigure]:
+    """The pictures of a plan; those of boxes only where there are drogues."""
+    if planned.by_family:
+        yield _figure(
+            "Pairs by family of conditions",
+            "Every family has its share of the scenes, and every scene about as many pairs.",
+            lambda axes: _families(axes, planned),
+        )
+    drawn = planned.drawn
+    if not np.isfinite(drawn.distances_m).any():
+        return
+    of = "" if len(drawn.indices) == recipe.frames.count else f" Of {len(drawn.indices)} drawn pairs."
+    yield _figure(
+        "Distance of the drogue",
+        f"Planar distance of the rim's centre from the left camera.{_law_note(recipe)}{of}",
+        lambda axes: _distances(axes, recipe, planned),
+    )
+    yield _figure(
+        "Size of the drogue's box",
+        f"Side of the square with the area of the whole drogue's box, left image.{_chance(recipe, planned)}{of}",
+        lambda axes: _sizes(axes, recipe, planned),
+    )
+    yield _figure(
+        "Place of the drogue's box",
+        f"Middles of the boxes in the left image, counted in equal cells.{_place_note(recipe, planned)}{of}",
+        lambda axes: _places(axes, recipe, planned),
+    )
+
+
+def _draws_distance(recipe: Recipe) -> bool:
+    return (
+        recipe.distance.law != "stations"
+        and recipe.sequence is None
+        and recipe.distance.low_m != recipe.distance.high_m
+    )
+
+
+def _law_note(recipe: Recipe) -> str:
+    return " Line: what the recipe intends." if _draws_distance(recipe) else ""
+
+
+def _place_note(recipe: Recipe, planned: Plan) -> str:
+    places = check_places(planned.drawn, recipe.rig.camera)
+    if places is None:
+        return ""
+    chance = f" Chi-square against that law: p = {places.p_value:.2g}." if places.degrees else ""
+    return (
+        " All places at which both cameras see all of the drogue are equally likely: a near one has little room, and a "
+        f"margin stays empty.{chance}"
+    )
+
+
+def _chance(recipe: Recipe, planned: Plan) -> str:
+    sizes = check_sizes(planned.drawn, recipe)
+    if sizes is None or not sizes[0].degrees:
+        return ""
+    return f" Line: what the recipe intends; chi-square against it: p = {sizes[0].p_value:.2g}."
+
+
+def _families(axes: Axes, planned: Plan) -> None:
+    names = list(planned.by_family)
+    pairs = [pairs for _, pairs in planned.by_family.values()]
+    bars = axes.barh(names, pairs, color=_BAR)
+    labels = [f" {count} in {scenes} scenes" for scenes, count in planned.by_family.values()]
+    axes.bar_label(bars, labels, fontsize=9)
+    axes.invert_yaxis()
+    axes.set_xlim(0, max(pairs) * 1.4)
+    axes.set_xlabel("Stereo pairs")
+
+
+def _distances(axes: Axes, recipe: Recipe, planned: Plan) -> None:
+    distances = planned.drawn.distances_m[np.isfinite(planned.drawn.distances_m)]
+    law = recipe.distance
+    axes.set_xlabel("Distance [m]")
+    if law.stations_m is not None:
+        stations, counts = np.unique(distances.round(9), return_counts=True)
+        axes.bar([f"{station:g}" for station in stations], counts, color=_BAR)
+        axes.set_ylabel("Stereo pairs at each station")
+        return
+    edges = _log_edges(distances)
+    axes.stairs(np.histogram(distances, edges)[0], edges, color=_BAR, fill=True)
+    if _draws_distance(recipe):
+        axes.stairs(np.diff(distance_share(law, edges)) * len(distances), edges, color=_LAW, linewidth=1.6)
+    _logarithmic(axes)
+
+
+def _sizes(axes: Axes, recipe: Recipe, planned: Plan) -> None:
+    sides = planned.drawn.sides_px[np.isfinite(planned.drawn.sides_px)]
+    axes.set_xlabel("Side of the box [px]")
+    sizes = check_sizes(planned.drawn, recipe)
+    if sizes is None:
+        edges = _log_edges(sides)
+        axes.stairs(np.histogram(sides, edges)[0], edges, color=_BAR, fill=True)
+    else:
+        check, edges = sizes
+        axes.stairs(check.counts, edges, color=_BAR, fill=True)
+        axes.stairs(check.expected, edges, color=_LAW, linewidth=1.6)
+    _logarithmic(axes)
+
+
+def _places(axes: Axes, recipe: Recipe, planned: Plan) -> None:
+    camera = recipe.rig.camera
+    centers = planned.drawn.centers_px[np.isfinite(planned.drawn.centers_px).all(axis=1)]
+    edges = [np.linspace(-0.5, n - 0.5, max(4, n // _CELL_PX) + 1) for n in (camera.width_px, camera.height_px)]
+    counts = np.histogramdd(centers, edges)[0].T
+    image = axes.pcolormesh(edges[0], edges[1], np.where(counts > 0, counts, np.nan), cmap="viridis", vmin=0)
+    axes.figure.colorbar(image, ax=axes, label="Stereo pairs in a cell", shrink=0.8)
+    axes.set(aspect="equal", xlim=(-0.5, camera.width_px - 0.5), ylim=(camera.height_px - 0.5, -0.5))
+    axes.set_xlabel("u, to the right [px]")
+    axes.set_ylabel("v, down [px]")
+
+
+def _log_edges(values: Array) -> Array:
+    low, high = float(values.min()), float(values.max())
+    return np.geomspace(low * (1 - 1e-9), max(high, low * 1.01) * (1 + 1e-9), _BINS + 1)
+
+
+def _logarithmic(axes: Axes) -> None:
+    axes.set_xscale("log")
+    axes.set_ylabel("Stereo pairs in a bin")
+    low, high = axes.get_xlim()
+    # Within a decade or so more of its numbers are named.
+    named = (1.0, 2.0, 4.0) if high > 12 * low else (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+    axes.xaxis.set_major_locator(LogLocator(base=10, subs=named, numticks=12))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigure:
+    """Draw without pyplot and without a trace in matplotlib's settings."""
+    with matplotlib.rc_context({"font.family": "sans-serif", "font.size": 10.0}):
+        figure = Figure(figsize=_PANEL_IN, dpi=_DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        axes.set_title(title, loc="left", fontsize=11.5)
+        draw(axes)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png", metadata={"Software": None})
+    return PlanFigure(title, caption, stream.getvalue())
+
 
 _TEMPLATE = """<!DOCTYPE html>
 <html lang="en">

@@ -1,6 +1,9 @@
-"""Tanker, hose, drogue and receiver from the side, beside what the left camera sees: one picture of an animation."""
+"""An animation of a flight: tanker, hose, drogue and receiver from the side, beside what the left camera sees."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -11,11 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
+from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
 from drogue_models.tanker import tanker_mesh
 from droguekit.benchmark.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
+from droguekit.visualization.video_file import evenly, period_s, write_movie
 from geometry.se3 import Array, RigidTransform
 
 _INCHES, _DPI = (12.8, 5.4), 100
@@ -26,6 +31,45 @@ _CLOSE_M = 1.6
 # Our sketch of a receiver, which no truth speaks of. [m]
 _BODY_RADIUS_M, _BODY_LENGTH_M, _NOSE_LENGTH_M, _BELOW_EYE_M = 0.5, 7.0, 1.6, 0.6
 _RING = 32
+
+
+def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int | None) -> tuple[int, float]:
+    """Draw pairs of a dataset, spread evenly, and write them as they follow each other in time.
+
+    Args:
+        dataset: where they come from.
+        path: ends in .gif or .mp4; takes its name when it is whole.
+        count: pairs at most.
+        sequence_id: only pairs of this sequence, or None for all.
+
+    Returns:
+        How many pairs it shows, and how long it lasts. [s]
+
+    Raises:
+        ValueError: no such pairs, or one that cannot be read.
+        OSError: it cannot be written.
+    """
+    records = [dataset.record(index) for index in _chosen(dataset, count, sequence_id)]
+    length_s = period_s(records)
+    side_view = SideView(records)
+    write_movie(path, (side_view.draw(record, dataset.images(record.frame_index)) for record in records), length_s)
+    return len(records), len(records) * length_s
+
+
+def _chosen(dataset: Dataset, count: int, sequence_id: int | None) -> list[int]:
+    """Indices of the pairs to show, in order."""
+    fitting = list(_with_drogue(dataset, sequence_id))
+    if not fitting:
+        which = "" if sequence_id is None else f" of sequence {sequence_id}"
+        raise ValueError(f"{dataset.path}: holds no pairs{which} with drogue and tanker to animate")
+    return evenly(fitting, count)
+
+
+def _with_drogue(dataset: Dataset, sequence_id: int | None) -> Iterator[int]:
+    empty = {entry.frame_index for entry in dataset.manifest.frames if entry.empty}
+    for index in dataset.frame_indices:
+        if index not in empty and (sequence_id is None or dataset.record(index).sequence_id == sequence_id):
+            yield index
 
 
 class SideView:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from datasets_manifest.storage.storage import Location, as_location
-from droguekit.workflows.datasets import RenderOrder, open_recipe, render_frames
+from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frames
 
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe

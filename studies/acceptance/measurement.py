@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from droguekit.workflows.datasets import RenderOrder, benchmark_dataset, open_recipe, render_frames
+from droguekit.workflows.benchmarking import benchmark_dataset
 from droguekit.workflows.navigation import NavigationOrder, navigate_dataset
+from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frames
 
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe

@@ -13,7 +13,7 @@ from pathlib import Path
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.release.publication import build_publication, publication_text
-from droguekit.batch.machine import default_workers
+from droguekit.batch.execution import default_workers
 from droguekit.batch.progress import ProgressReport, progress_report
 from droguekit.batch.render_dataset import render_dataset
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.types.frame import FrameSpec
-from droguekit.batch.workers import run_alone
+from droguekit.batch.worker_pool import run_alone
 from render.camera.sensor import expose
 from render.compositing import inside_one_part
 from render.engine import load_engine

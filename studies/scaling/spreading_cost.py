@@ -20,10 +20,10 @@ from typing import Any
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage.layout import EVENTS_FILE
-from droguekit.batch.execution import Events, Spread, make_frames
+from droguekit.batch.execution import resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask
-from droguekit.batch.machine import resident_gib
 from droguekit.batch.progress import ProgressReport
+from droguekit.batch.render_dataset import Events, Spread, make_frames
 
 EMPTY_RECIPE = """
 name = "empty"

@@ -24,7 +24,7 @@ TRESPASSES = [
     ("rooms", "labelgen/trespass.py", "import nav.runner"),
     ("rooms", "droguekit/trespass.py", "import studies.acceptance.table"),
     ("application", "droguekit/workflows/trespass.py", "import droguekit.cli.main"),
-    ("application", "droguekit/benchmark/trespass.py", "import droguekit.batch.workers"),
+    ("application", "droguekit/benchmark/trespass.py", "import droguekit.batch.worker_pool"),
     ("application", "droguekit/batch/trespass.py", "import droguekit.benchmark.benchmark"),
     ("application", "droguekit/batch/trespass.py", "import droguekit.cli.main"),
     ("blind", "nav/trespass.py", "import datasets_manifest.types.records"),

@@ -24,8 +24,7 @@ from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.storage.writer import encode_record, leftovers
-from droguekit.batch.execution import Spread
-from droguekit.batch.render_dataset import RunSummary, render_dataset
+from droguekit.batch.render_dataset import RunSummary, Spread, render_dataset
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from labelgen.validation.dataset_checks import validate_dataset
 

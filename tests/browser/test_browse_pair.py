@@ -17,7 +17,7 @@ from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, run
-from droguekit.visualization.browse.browse import write_browse
+from droguekit.visualization.browse.page import write_browse
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES

@@ -17,7 +17,7 @@ from droguekit.batch.render_dataset import render_dataset
 from droguekit.benchmark.detection.detection_published import PUBLISHED_DETECTORS
 from droguekit.benchmark.detection.detection_speed import published_name, speed_panel
 from droguekit.cli.main import DONE, run
-from droguekit.workflows.datasets import open_recipe
+from droguekit.workflows.rendering import open_recipe
 from geometry.se3 import RigidTransform
 from studies.paper.contenders import CONTENDERS
 from studies.paper.page import read_detection

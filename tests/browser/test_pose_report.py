@@ -16,7 +16,7 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
 from droguekit.benchmark.report.report_tables import MOST_OPEN_ROWS
 from droguekit.cli.main import DONE, run
-from droguekit.workflows.datasets import open_recipe
+from droguekit.workflows.rendering import open_recipe
 from geometry.se3 import RigidTransform
 
 OpenPage = Callable[..., Any]

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import pytest
 
-from droguekit.workflows.interrupts import interrupts_wait
+from droguekit.workflows.rendering import interrupts_wait
 
 
 @pytest.fixture(autouse=True)

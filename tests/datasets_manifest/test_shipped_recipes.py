@@ -7,7 +7,7 @@ import pytest
 
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.recipe import load_recipe, recipe_names
-from droguekit.batch.planning.recipe_plan import draw_frames, plan_recipe
+from droguekit.batch.recipe_plan import draw_frames, plan_recipe
 from scenes.drogue_appearance import sample_bystanders
 from scenes.sampler import sample_left_from_drogue
 

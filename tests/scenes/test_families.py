@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
-from droguekit.batch.planning.recipe_plan import plan_recipe
+from droguekit.batch.recipe_plan import plan_recipe
 from scenes.sampler import family_of_scene, recipe_of_scene, sample_frame, scenes_per_family, split_of_scenes
 
 BASE = """

@@ -12,7 +12,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate, write_estimates
 from datasets_manifest.types.records import PairRecord
 from droguekit.batch.progress import PlainProgress
-from droguekit.visualization.browse.browse import write_browse
+from droguekit.visualization.browse.page import write_browse
 from geometry.se3 import RigidTransform
 from tests.support.small_datasets import rendered
 

@@ -10,16 +10,15 @@ import typer
 
 from droguekit.batch.progress import duration
 from droguekit.cli.arguments import EngineOption, RecipeArgument, SeedOption, WorkersOption, human_size, output_option
-from droguekit.workflows.datasets import open_recipe
+from droguekit.workflows.rendering import open_recipe
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from datasets_manifest.recipe.recipe import Recipe
     from datasets_manifest.storage.manifest import Drop
-    from droguekit.batch.planning.plan_cost import Cost
-    from droguekit.batch.planning.plan_laws import LawCheck
-    from droguekit.batch.planning.recipe_plan import Plan
+    from droguekit.batch.cost_estimate import Cost
+    from droguekit.batch.recipe_plan import LawCheck, Plan
 
 EXAMPLES = (
     "droguekit plan demo",
@@ -44,9 +43,9 @@ def plan(
     html: Annotated[Path | None, output_option("--html", "FILE", "Write the plan with its plots as one page.")] = None,
 ) -> None:
     """Show what a recipe will make, how long it will take and how large it will get, without making it."""
-    from droguekit.batch.machine import default_workers
-    from droguekit.batch.planning.plan_cost import probe_cost
-    from droguekit.batch.planning.recipe_plan import frame_timeout_s, plan_recipe
+    from droguekit.batch.cost_estimate import probe_cost
+    from droguekit.batch.execution import default_workers
+    from droguekit.batch.recipe_plan import frame_timeout_s, plan_recipe
 
     if workers is not None and (not probe or workers < 1):
         raise ValueError("--workers: must be at least 1, and goes with the probe; leave it or --no-probe out")
@@ -120,7 +119,7 @@ def _distances(recipe: Recipe, planned: Plan) -> Iterator[str]:
 
 
 def _laws(recipe: Recipe, planned: Plan) -> Iterator[str]:
-    from droguekit.batch.planning.plan_laws import check_places, check_sizes
+    from droguekit.batch.recipe_plan import check_places, check_sizes
 
     sizes = check_sizes(planned.drawn, recipe)
     if sizes is not None:
@@ -150,7 +149,7 @@ def _verdict(check: LawCheck) -> str:
 
 
 def _cost(cost: Cost, workers: int) -> Iterator[str]:
-    from droguekit.batch.planning.plan_probe import cpu_s
+    from droguekit.batch.cost_estimate import cpu_s
 
     yield "measured, with one worker, once it was warm:"
     for frame_index, report in cost.probed.items():

@@ -20,7 +20,7 @@ from droguekit.cli.arguments import (
     parse_shard,
 )
 from droguekit.cli.main import FAULT
-from droguekit.workflows.datasets import RenderOrder, open_recipe, render_frames
+from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frames
 
 EXAMPLES = (
     "droguekit render demo --out data/demo",

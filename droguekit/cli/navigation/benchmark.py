@@ -12,7 +12,7 @@ from datasets_manifest.storage.layout import BLIND_FILE
 from datasets_manifest.storage.storage import Location, open_storage
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument, output_option
-from droguekit.workflows.datasets import benchmark_dataset, check_blind_dataset
+from droguekit.workflows.benchmarking import benchmark_dataset, check_blind_dataset
 from droguekit.workflows.detection import DetectionOrder, benchmark_detections
 
 if TYPE_CHECKING:

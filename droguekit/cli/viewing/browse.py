@@ -30,9 +30,9 @@ def browse(
     It needs no server and no network. Run again it keeps the pictures that are still right. Exit code 1 says that some
     pairs could not be read; they are named, and the page has the others.
     """
-    from droguekit.batch.machine import default_workers
+    from droguekit.batch.execution import default_workers
     from droguekit.batch.progress import progress_report
-    from droguekit.visualization.browse.browse import write_browse
+    from droguekit.visualization.browse.page import write_browse
 
     if workers is not None and workers < 0:
         raise ValueError(f"--workers: must not be negative, got {workers}")

@@ -87,7 +87,7 @@ def preview(
 
 
 def _animate(source: Dataset, path: Path, count: int, sequence: int | None) -> None:
-    from droguekit.visualization.animation import write_animation
+    from droguekit.visualization.side_view import write_animation
 
     _check_film("--animate", path, count)
     shown, length_s = write_animation(source, path, count, sequence)
@@ -107,7 +107,7 @@ def _overlay(
 
 
 def _check_film(option: str, path: Path, count: int) -> None:
-    from droguekit.visualization.animation import SUFFIXES
+    from droguekit.visualization.video_file import SUFFIXES
 
     if not 1 <= count <= 2000:
         raise ValueError(f"--count: must be from 1 to 2000 in a film, got {count}")

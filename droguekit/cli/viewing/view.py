@@ -45,8 +45,8 @@ def view(
     from datasets_manifest.types.estimates import read_estimates
     from droguekit.batch.progress import progress_report
     from droguekit.benchmark.poses.pose_errors import by_method
-    from droguekit.visualization.rerun.session import view_pairs
-    from droguekit.visualization.rerun.shown_pairs import open_pairs
+    from droguekit.visualization.rerun_viewer.recording import open_pairs
+    from droguekit.visualization.rerun_viewer.session import view_pairs
 
     source = open_pairs(dataset)
     if not source.frame_indices:

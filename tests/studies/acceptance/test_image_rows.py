@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe
-from droguekit.batch.planning.recipe_plan import plan_recipe
+from droguekit.batch.recipe_plan import plan_recipe
 from studies.acceptance.protocol import STATIONS_M
 from studies.acceptance.rendered import image_rows
 from studies.acceptance.rendered.disc_light import contrast_from_snr

@@ -10,7 +10,7 @@ import pytest
 from datasets_manifest.types.estimates import NoFix, write_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.workflows.datasets import open_recipe
+from droguekit.workflows.rendering import open_recipe
 from studies.acceptance.rendered.sequence_pairs import score_pairs
 
 

@@ -14,7 +14,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.workflows.datasets import open_recipe
+from droguekit.workflows.rendering import open_recipe
 from geometry.se3 import RigidTransform
 
 # Of both sequences of the recipe, near and far, with gaps between.

@@ -22,7 +22,7 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import Spread, render_dataset
 from droguekit.benchmark.report.label_drawing import display_picture
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
-from droguekit.visualization.browse.browse import write_browse
+from droguekit.visualization.browse.page import write_browse
 from geometry.se3 import RigidTransform
 from tests.support.small_datasets import rendered, single_pairs_recipe
 

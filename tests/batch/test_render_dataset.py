@@ -19,7 +19,7 @@ from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
 from droguekit.batch.frame_task import FrameTask
 from droguekit.batch.render_dataset import RunSummary
-from droguekit.batch.workers import run_alone
+from droguekit.batch.worker_pool import run_alone
 
 Make = Callable[..., RunSummary]
 Hashes = Callable[[Path], dict[str, str]]

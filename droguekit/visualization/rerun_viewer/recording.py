@@ -1,6 +1,6 @@
-"""What the viewer is told of each pair.
+"""Pairs with their truth, and what is logged of each for the rerun viewer.
 
-Everything stands in the left camera's frame, `rig`. The viewer counts pixels from the image's corner, half a pixel more
+Everything is in the left camera's frame, `rig`. The viewer counts pixels from the image's corner, half a pixel more
 than the dataset.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -17,18 +17,64 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.storage.layout import BLIND_FILE
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
-from datasets_manifest.types.records import PixelBox, ViewRecord
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.tanker import tanker_mesh
 from droguekit.benchmark.poses.pose_errors import pose_error
 from droguekit.benchmark.report.label_drawing import BOX_RGB, MARKER_RGB, Rgb, display_picture
-from droguekit.visualization.rerun.shown_pairs import ShownPair
 from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
+
+
+class ShownPair(NamedTuple):
+    """One pair: its images, the rig, the drogue that is there or looked for, and its truth or None."""
+
+    frame_index: int
+    images: StereoImages
+    rig: StereoRig
+    drogue: DrogueParameters | None
+    record: PairRecord | None
+
+
+class ShownPairs(NamedTuple):
+    """The indices of a dataset's pairs, ascending, and how to read one."""
+
+    frame_indices: tuple[int, ...]
+    read: Callable[[int], ShownPair]
+
+
+def open_pairs(dataset: Location) -> ShownPairs:
+    """The pairs of a dataset, with or without truth.
+
+    Raises:
+        ValueError: no dataset there, or one that cannot be trusted.
+    """
+    if open_storage(dataset).exists(BLIND_FILE):
+        blind = BlindDataset(dataset)
+
+        def read_blind(index: int) -> ShownPair:
+            pair = blind.pair(index)
+            return ShownPair(index, pair.images, pair.rig, pair.drogue, None)
+
+        return ShownPairs(blind.frame_indices, read_blind)
+    source = Dataset(dataset)
+
+    def read(index: int) -> ShownPair:
+        record = source.record(index)
+        drogue = source.drogue_sought(record)
+        return ShownPair(index, source.images(index), record.frame.rig, drogue, record)
+
+    return ShownPairs(source.frame_indices, read)
+
 
 Faces = NDArray[np.int64]
 _Body = TypeVar("_Body")

@@ -18,8 +18,7 @@ import rerun as rr
 from datasets_manifest.atomic import part_path
 from datasets_manifest.types.estimates import Estimate
 from droguekit.batch.progress import ProgressReport
-from droguekit.visualization.rerun.recording import APPLICATION, PairRecorder, blueprint
-from droguekit.visualization.rerun.shown_pairs import ShownPairs
+from droguekit.visualization.rerun_viewer.recording import APPLICATION, PairRecorder, ShownPairs, blueprint
 
 # Only this machine may tell the viewer anything.
 _HOST = "127.0.0.1"

@@ -14,7 +14,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.reader import read_record_table
 from droguekit.batch.frame_task import FrameReport, FrameTask
-from droguekit.batch.workers import run_alone, run_tasks
+from droguekit.batch.worker_pool import run_alone, run_tasks
 
 # A worker's first frames compile kernels.
 _WARM_UP_FRAMES = 4

@@ -1,8 +1,8 @@
-"""An animation of a dataset's sequence: the flight from the side beside the left camera's view, as GIF or MP4."""
+"""Videos of pictures as GIF or MP4, and which pairs of a dataset they show for how long."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -10,10 +10,8 @@ import numpy as np
 from PIL import Image
 
 from datasets_manifest.atomic import part_path
-from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.report.label_drawing import Picture, resized
-from droguekit.visualization.side_view import SideView
 
 SUFFIXES = (".gif", ".mp4")
 # Pairs that have nothing to do with each other are shown as single pictures.
@@ -22,29 +20,6 @@ _FASTEST_S, _SLOWEST_S = 0.02, 2.0
 # Players of GIFs take time in hundredths of a second.
 _GIF_TICK_MS = 10
 _GIF_COLORS, _GIF_WIDTH_PX = 128, 960
-
-
-def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int | None) -> tuple[int, float]:
-    """Draw pairs of a dataset, spread evenly, and write them as they follow each other in time.
-
-    Args:
-        dataset: where they come from.
-        path: ends in .gif or .mp4; takes its name when it is whole.
-        count: pairs at most.
-        sequence_id: only pairs of this sequence, or None for all.
-
-    Returns:
-        How many pairs it shows, and how long it lasts. [s]
-
-    Raises:
-        ValueError: no such pairs, or one that cannot be read.
-        OSError: it cannot be written.
-    """
-    records = [dataset.record(index) for index in _chosen(dataset, count, sequence_id)]
-    length_s = period_s(records)
-    side_view = SideView(records)
-    write_movie(path, (side_view.draw(record, dataset.images(record.frame_index)) for record in records), length_s)
-    return len(records), len(records) * length_s
 
 
 def write_movie(path: Path, pictures: Iterable[Picture], picture_s: float) -> None:
@@ -75,22 +50,6 @@ def evenly(indices: Sequence[int], count: int) -> list[int]:
     """Up to `count` of them, spread evenly, in order."""
     places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round()
     return [indices[int(place)] for place in places]
-
-
-def _chosen(dataset: Dataset, count: int, sequence_id: int | None) -> list[int]:
-    """Indices of the pairs to show, in order."""
-    fitting = list(_with_drogue(dataset, sequence_id))
-    if not fitting:
-        which = "" if sequence_id is None else f" of sequence {sequence_id}"
-        raise ValueError(f"{dataset.path}: holds no pairs{which} with drogue and tanker to animate")
-    return evenly(fitting, count)
-
-
-def _with_drogue(dataset: Dataset, sequence_id: int | None) -> Iterator[int]:
-    empty = {entry.frame_index for entry in dataset.manifest.frames if entry.empty}
-    for index in dataset.frame_indices:
-        if index not in empty and (sequence_id is None or dataset.record(index).sequence_id == sequence_id):
-            yield index
 
 
 def period_s(records: Sequence[PairRecord]) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
-from droguekit.batch.planning.recipe_plan import draw_frames, plan_recipe
+from droguekit.batch.recipe_plan import draw_frames, plan_recipe
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 from labelgen.boxes import full_box

@@ -12,12 +12,19 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from datasets_manifest.storage.manifest import Drop
+from droguekit.batch.cost_estimate import (
+    Cost,
+    Probe,
+    choose_frames,
+    fit_over_distance,
+    make_in_turn,
+    probe_cost,
+    reckon,
+)
 from droguekit.batch.failure_policy import drop_of
 from droguekit.batch.frame_task import FrameReport
-from droguekit.batch.planning.plan_cost import Cost, fit_over_distance, probe_cost, reckon
-from droguekit.batch.planning.plan_probe import Probe, choose_frames, make_in_turn
-from droguekit.batch.planning.recipe_plan import Plan, plan_recipe
-from droguekit.batch.workers import Limits
+from droguekit.batch.recipe_plan import Plan, plan_recipe
+from droguekit.batch.worker_pool import Limits
 from droguekit.cli.dataset.plan import _cost
 
 RECIPE = """

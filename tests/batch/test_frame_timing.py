@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
-from droguekit.batch import frame_cost as measure
-from droguekit.batch.frame_cost import frames_per_second, warm_up
+from droguekit.batch import frame_timing as measure
+from droguekit.batch.frame_timing import frames_per_second, warm_up
 
 
 def of_frames(recipe_text, count):

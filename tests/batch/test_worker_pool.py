@@ -12,9 +12,18 @@ from types import ModuleType
 
 import pytest
 
-from droguekit.batch.machine import available_cores, available_memory_gib, default_workers
-from droguekit.batch.worker_process import READY, UNTIMED, TaskTimeoutError, Worker, WorkerDiedError
-from droguekit.batch.workers import MAX_ATTEMPTS, Limits, run_alone, run_tasks
+from droguekit.batch.execution import available_cores, available_memory_gib, default_workers
+from droguekit.batch.worker_pool import (
+    MAX_ATTEMPTS,
+    READY,
+    UNTIMED,
+    Limits,
+    TaskTimeoutError,
+    Worker,
+    WorkerDiedError,
+    run_alone,
+    run_tasks,
+)
 
 # Workers are fresh processes: what they run must be importable there, which a test module is not.
 TASKS = """
@@ -166,7 +175,7 @@ def test_workers_end_with_the_process_that_started_them(tasks: ModuleType, tmp_p
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
         "from functools import partial\n"
         "import worker_tasks\n"
-        "from droguekit.batch.workers import run_tasks\n"
+        "from droguekit.batch.worker_pool import run_tasks\n"
         "if __name__ == '__main__':\n"
         f"    list(run_tasks(partial(worker_tasks.tell_and_wait, {str(pipe)!r}), [0], 1))\n"
     )

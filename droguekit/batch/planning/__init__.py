@@ -1,1 +1,0 @@
-"""What a recipe will make, and what it will cost."""

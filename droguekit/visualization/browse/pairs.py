@@ -1,0 +1,397 @@
+"""What the page says of each pair: a row of the catalogue, its labels as numbers, and its pictures."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import cv2
+
+from datasets_manifest.atomic import write_bytes_atomic
+from datasets_manifest.storage.blind import BlindDataset, read_blind_index
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import BLIND_FILE, image_file
+from datasets_manifest.storage.manifest import FrameEntry as ManifestEntry
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.types.estimates import Estimate, PoseEstimate
+from datasets_manifest.types.frame import Environment, FrameSpec
+from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, ViewRecord
+from drogue_models.parameters import DrogueParameters
+from droguekit.benchmark.poses.pose_errors import pose_error
+from droguekit.benchmark.report.label_drawing import Picture, display_picture, resized
+from droguekit.benchmark.report.number_text import plain_number
+from droguekit.visualization.drogue_outlines import Ring, drogue_rings
+from geometry.se3 import RigidTransform
+from geometry.stereo import EYES, StereoRig
+
+# Our choice: night, dusk, a dull day's shade and a bright sky, by the luminance behind the drogue. [cd/m2]
+LIGHTS = ("below 1 cd/m²", "1 to 100 cd/m²", "100 to 3000 cd/m²", "from 3000 cd/m²")
+LIGHT_EDGES_CD_M2 = (1.0, 100.0, 3000.0)
+
+
+def light_of(luminance_cd_m2: float) -> str:
+    """The class of light that a background's luminance belongs to, one of `LIGHTS`. [cd/m2]"""
+    return LIGHTS[sum(luminance_cd_m2 >= edge for edge in LIGHT_EDGES_CD_M2)]
+
+
+def search_text(record: PairRecord, split: str) -> str:
+    """Words by which a pair can be found."""
+    frame, sky = record.frame, record.frame.environment
+    words = [record.conditions.family, split, f"scene {record.scene_id}", record.engine, sky.ground]
+    words += [cloud.kind for cloud in sky.clouds]
+    words += [kind for kind, there in (("mist", sky.mist), ("moon", sky.moon), ("map", sky.map)) if there is not None]
+    words += [object_.kind for object_ in frame.bystanders]
+    words += ["no drogue" if frame.drogue is None else frame.drogue.name]
+    words += [] if frame.board is None else ["board"]
+    return " ".join(words).lower()
+
+
+def conditions_table(record: PairRecord, split: str) -> list[tuple[str, str]]:
+    """Names and values, the most telling first."""
+    frame, conditions = record.frame, record.conditions
+    rows = [("Distance", "no drogue" if conditions.distance_m is None else f"{plain_number(conditions.distance_m)} m")]
+    if record.pitch_deg is not None and record.yaw_deg is not None and record.roll_deg is not None:
+        angles = (record.pitch_deg, record.yaw_deg, record.roll_deg)
+        rows.append(("Pitch, yaw, roll", ", ".join(f"{plain_number(angle)}°" for angle in angles)))
+    if frame.drogue is not None:
+        rows.append(("Drogue", f"{frame.drogue.name}, {frame.drogue.marker_count} markers"))
+    rows.append(("Family", conditions.family))
+    rows.append(("Split, scene", f"{split}, {record.scene_id}"))
+    if record.sequence_id is not None:
+        rows.append(("Sequence, time", f"{record.sequence_id}, {record.time_s:.3f} s"))
+    rows.append(("Background", f"{plain_number(conditions.background_luminance_cd_m2)} cd/m²"))
+    rows += _sky(frame.environment)
+    exposure = frame.exposure
+    rows.append(
+        ("Exposure", f"{plain_number(1e3 * exposure.time_s)} ms, f/{exposure.f_number:g}, gain {exposure.gain:g}")
+    )
+    rows += _objects(frame)
+    noise = conditions.monte_carlo_noise_fraction
+    rows.append(("Noise of the renderer", f"{plain_number(100 * noise)} % of the luminance"))
+    rows.append(("Made by", record.engine_version))
+    return rows
+
+
+def _sky(sky: Environment) -> list[tuple[str, str]]:
+    rows = [("Sun", f"{plain_number(sky.sun_elevation_deg)}° high, azimuth {plain_number(sky.sun_azimuth_deg)}°")]
+    if sky.map is not None:
+        rows.append(("Surroundings", "a picture of sky and ground"))
+        return rows
+    rows.append(("Visibility", f"{plain_number(sky.visibility_m / 1e3)} km"))
+    rows.append(("Clouds", ", ".join(cloud.kind for cloud in sky.clouds) or "none"))
+    if sky.mist is not None:
+        rows.append(("Mist", "around the camera"))
+    if sky.moon is not None:
+        rows.append(("Moon", "in the sky"))
+    rows.append(("Ground", f"{sky.ground}, {plain_number(sky.altitude_m)} m below"))
+    return rows
+
+
+def _objects(frame: FrameSpec) -> list[tuple[str, str]]:
+    rows = []
+    if frame.bystanders:
+        rows.append(("Also in view", ", ".join(object_.kind for object_ in frame.bystanders)))
+    if frame.board is not None:
+        rows.append(("Board", "for calibration, in the drogue's place"))
+    if frame.rangefinder_reading_m is not None:
+        rows.append(("Rangefinder", f"{plain_number(frame.rangefinder_reading_m)} m"))
+    return rows
+
+
+PICTURE_KINDS = ("small", "left", "right")
+_SMALL_WIDTH_PX = 240
+_QUALITY, _SMALL_QUALITY = 85, 78
+# A thousandth of a pixel is far below what a screen shows, and a page of thousands of pairs half as large.
+_PX_DIGITS, _POSE_DIGITS = 3, 9
+
+
+@dataclass(frozen=True)
+class FrameEntry:
+    """What the page says of one pair.
+
+    Attributes:
+        row: its values by column of the catalogue.
+        labels: numbers of its own file.
+        rings: of the drogue that is there or looked for, which many pairs share.
+        left_from_drogue: its true pose, or None.
+    """
+
+    row: dict[str, Any]
+    labels: dict[str, Any]
+    rings: tuple[Ring, ...]
+    left_from_drogue: RigidTransform | None
+
+
+def frame_entry(record: PairRecord, drogue: DrogueParameters, split: str, record_sha256: str) -> FrameEntry:
+    """What the page says of a pair, but for estimates.
+
+    Args:
+        record: its truth.
+        drogue: that is there or looked for.
+        split: of the dataset that it belongs to.
+        record_sha256: stands for the pair's pixels too.
+    """
+    rings = drogue_rings(drogue)
+    conditions, distance_m = record.conditions, record.conditions.distance_m
+    row = {
+        "frame": record.frame_index,
+        "distance_m": None if distance_m is None else round(distance_m, 4),
+        "family": conditions.family,
+        "split": split,
+        "sequence": record.sequence_id,
+        "light": light_of(conditions.background_luminance_cd_m2),
+        "text": search_text(record, split),
+        "picture": picture_stem(record.frame_index, record_sha256),
+        "box_px": _box(record.views.left.box_visible_xywh_px),
+    }
+    labels = {
+        "pose": _pose(record.left_from_drogue),
+        "drogue": rings_name(rings),
+        "left": _view(record.views.left),
+        "right": _view(record.views.right),
+        "conditions": conditions_table(record, split),
+    }
+    return FrameEntry(row, labels, rings, record.left_from_drogue)
+
+
+def blind_entry(frame_index: int, time_s: float, rings: tuple[Ring, ...], pixels_sha256: str) -> FrameEntry:
+    """What the page says of a pair without truth.
+
+    Args:
+        frame_index: place in the dataset.
+        time_s: mid-exposure. [s]
+        rings: of the drogue that is looked for.
+        pixels_sha256: stands for its images.
+    """
+    nothing: dict[str, Any] = {"box_full_px": None, "box_visible_px": None, "markers": [], "hub": None}
+    view = nothing | {"board_corners_px": []}
+    row: dict[str, Any] = dict.fromkeys(("distance_m", "family", "split", "sequence", "light", "box_px"))
+    row |= {"frame": frame_index, "text": "", "picture": picture_stem(frame_index, pixels_sha256)}
+    labels = {"pose": None, "drogue": rings_name(rings), "left": view, "right": view}
+    return FrameEntry(row, labels | {"conditions": [("Time", f"{time_s:.3f} s")]}, rings, None)
+
+
+def with_answers(entry: FrameEntry, estimates: Sequence[Estimate | None]) -> FrameEntry:
+    """The same with what estimators said of the pair: one estimate a method, None where it said nothing."""
+    truth = entry.left_from_drogue
+    answers = [None if estimate is None else _answer(estimate, truth) for estimate in estimates]
+    row = entry.row | {"answers": [_in_short(answer) for answer in answers]}
+    return replace(entry, row=row, labels=entry.labels | {"answers": [answer for answer in answers if answer]})
+
+
+def _in_short(answer: dict[str, Any] | None) -> float | str | None:
+    """The error of position [mm], or what there is instead; None where nothing was said."""
+    if answer is None:
+        return None
+    if answer["pose"] is None:
+        return "no fix"
+    # There is no truth to compare it with.
+    return "fix" if answer["error"] is None else float(answer["error"][0])
+
+
+def rings_name(rings: tuple[Ring, ...]) -> str:
+    """What pairs call a drogue by."""
+    return hashlib.sha256(repr(rings).encode()).hexdigest()[:12]
+
+
+def picture_stem(frame_index: int, record_sha256: str) -> str:
+    """How the names of a pair's pictures begin: other pixels have another name."""
+    return f"{frame_index:06d}-{record_sha256[:12]}"
+
+
+def picture_files(folder: Path, stem: str) -> list[Path]:
+    """A pair's pictures, there or not, in the order of `PICTURE_KINDS`."""
+    return [folder / f"{stem}-{kind}.jpg" for kind in PICTURE_KINDS]
+
+
+def write_pictures(files: Sequence[Path], images: StereoImages) -> None:
+    """Write a pair's pictures as a screen wants them.
+
+    Raises:
+        OSError: one cannot be written; names it.
+    """
+    left, right = display_picture(images), display_picture(replace(images, left=images.right, right=images.left))
+    small, _ = resized(left, min(_SMALL_WIDTH_PX, left.shape[1]))
+    for path, picture, quality in zip(files, (small, left, right), (_SMALL_QUALITY, _QUALITY, _QUALITY), strict=True):
+        write_bytes_atomic(path, _jpeg(picture, quality))
+
+
+def _jpeg(picture: Picture, quality: int) -> bytes:
+    # Colour at full resolution: small red markers would bleed into their dark face.
+    sampling = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+    _, data = cv2.imencode(".jpg", picture[..., ::-1], options)
+    return data.tobytes()
+
+
+def _answer(estimate: Estimate, truth: RigidTransform | None) -> dict[str, Any]:
+    pose = estimate.left_from_drogue if isinstance(estimate, PoseEstimate) else None
+    error = None if pose is None or truth is None else pose_error(pose, truth)
+    return {
+        "method": estimate.method,
+        "pose": _pose(pose),
+        "reason": None if isinstance(estimate, PoseEstimate) else estimate.reason,
+        # Position [mm], pitch and yaw [deg].
+        "error": error and [round(1e3 * error.position_m, 3), *(round(float(e), 4) for e in error.components[3:])],
+        "centroids": [
+            [f.eye, str(f.index), *(round(c, _PX_DIGITS) for c in f.center_px), f.used] for f in estimate.features
+        ],
+    }
+
+
+def _pose(pose: RigidTransform | None) -> list[float] | None:
+    """(12,) the upper three rows of the matrix."""
+    return None if pose is None else [round(value, _POSE_DIGITS) for value in pose.as_matrix()[:3].ravel().tolist()]
+
+
+def _view(view: ViewRecord) -> dict[str, Any]:
+    return {
+        "box_full_px": _box(view.box_full_xywh_px),
+        "box_visible_px": _box(view.box_visible_xywh_px),
+        "markers": [_feature(marker) for marker in view.markers],
+        "hub": None if view.hub is None else _feature(view.hub),
+        "board_corners_px": [[round(c, _PX_DIGITS) for c in corner] for corner in view.board_corners_px],
+    }
+
+
+def _feature(feature: FeatureView) -> list[float]:
+    """x, y [px], visible fraction, signal-to-noise."""
+    x_px, y_px = (round(c, _PX_DIGITS) for c in feature.center_ellipse_px)
+    return [x_px, y_px, round(feature.visible_fraction, 3), round(feature.signal_to_noise, 1)]
+
+
+def _box(box: PixelBox | None) -> list[float] | None:
+    return None if box is None else [round(side, _PX_DIGITS) for side in box]
+
+
+class DatasetFacts(NamedTuple):
+    """What stands at the top of the page, and the cameras.
+
+    Attributes:
+        facts: sentences on what is in the dataset.
+        is_blind: it has no truth.
+    """
+
+    name: str
+    facts: tuple[str, ...]
+    rig: StereoRig
+    is_blind: bool
+
+
+class PairSource(Protocol):
+    """Pairs by their index; may be pickled for another process."""
+
+    def facts(self) -> DatasetFacts:
+        """What is to be said of the whole."""
+        ...
+
+    def frame_indices(self) -> tuple[int, ...]:
+        """Of the pairs, ascending."""
+        ...
+
+    def entry(self, frame_index: int) -> FrameEntry:
+        """What the page says of a pair; `ValueError` where it cannot be read."""
+        ...
+
+    def images(self, frame_index: int) -> StereoImages:
+        """What the cameras saw; `ValueError` where it cannot be read."""
+        ...
+
+
+def open_source(dataset: Location) -> PairSource:
+    """The pairs of a dataset.
+
+    Raises:
+        ValueError: no dataset there, or one that cannot be trusted.
+    """
+    source: PairSource = BlindPairs(dataset) if open_storage(dataset).exists(BLIND_FILE) else TruePairs(dataset)
+    source.frame_indices()
+    return source
+
+
+class _Opened:
+    """Opens the dataset when it is asked for, in each process anew."""
+
+    def __init__(self, dataset: Location) -> None:
+        self._place = dataset
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_place": self._place}
+
+
+class TruePairs(_Opened):
+    """Pairs with their truth."""
+
+    @cached_property
+    def _dataset(self) -> Dataset:
+        return Dataset(self._place)
+
+    @cached_property
+    def _known(self) -> dict[int, ManifestEntry]:
+        return {entry.frame_index: entry for entry in self._dataset.manifest.frames}
+
+    def facts(self) -> DatasetFacts:
+        """From the manifest."""
+        manifest = self._dataset.manifest
+        counts = f"{manifest.counts.pairs} stereo pairs, {manifest.counts.empty} of them without a drogue."
+        origin = f"Content hash {manifest.dataset_sha256}; data under {manifest.data_licence}."
+        facts = tuple(filter(None, (manifest.recipe.description, counts, origin)))
+        return DatasetFacts(manifest.name, facts, manifest.recipe.rig, False)
+
+    def frame_indices(self) -> tuple[int, ...]:
+        """Of the manifest."""
+        return self._dataset.frame_indices
+
+    def entry(self, frame_index: int) -> FrameEntry:
+        """From its record."""
+        known, record = self._known[frame_index], self._dataset.record(frame_index)
+        drogue = self._dataset.drogue_sought(record)
+        return frame_entry(record, drogue, known.split, known.record_sha256)
+
+    def images(self, frame_index: int) -> StereoImages:
+        """Decoded, if they are those on record: its hash stands for them in the names of the pictures."""
+        frames, hashes = self._dataset.frames, self._dataset.record(frame_index).file_sha256
+        for name in map(image_file, EYES):
+            if hashlib.sha256(frames.read(frame_index, name)).hexdigest() != hashes.get(name):
+                where = frames.where(frame_index, name)
+                raise ValueError(f"{where}: was changed, its hash is not the one on record")
+        return self._dataset.images(frame_index)
+
+
+class BlindPairs(_Opened):
+    """Pairs without truth."""
+
+    @cached_property
+    def _dataset(self) -> BlindDataset:
+        return BlindDataset(self._place)
+
+    @cached_property
+    def _frames(self) -> FrameStore:
+        return FrameStore(self._place)
+
+    def facts(self) -> DatasetFacts:
+        """From the index."""
+        index = read_blind_index(self._place)
+        return DatasetFacts(index.name, (f"{len(index.frames)} stereo pairs without truth.",), index.rig, True)
+
+    def frame_indices(self) -> tuple[int, ...]:
+        """Of the index."""
+        return self._dataset.frame_indices
+
+    def entry(self, frame_index: int) -> FrameEntry:
+        """Of the pair's time and drogue; its images' own hash stands for them."""
+        pixels = hashlib.sha256()
+        for eye in EYES:
+            pixels.update(self._frames.read(frame_index, image_file(eye)))
+        pair = self._dataset.pair(frame_index)
+        return blind_entry(frame_index, pair.images.time_s, drogue_rings(pair.drogue), pixels.hexdigest())
+
+    def images(self, frame_index: int) -> StereoImages:
+        """Decoded."""
+        return self._dataset.pair(frame_index).images

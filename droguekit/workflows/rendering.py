@@ -1,0 +1,119 @@
+"""From a recipe to a dataset.
+
+Packages are imported where they are used: a command loads only what it needs, and those that need no renderer work
+without one.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from datasets_manifest.recipe.recipe import Recipe
+    from datasets_manifest.storage.storage import Location
+    from droguekit.batch.progress import ProgressReport
+    from droguekit.batch.render_dataset import RunSummary
+
+
+def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tuple[Recipe, str]:
+    """A recipe and its text as given, with seed and engine replaced where they are not None.
+
+    Raises:
+        ValueError: no such recipe, wrong keys, or no such engine.
+    """
+    from pydantic import ValidationError
+
+    from datasets_manifest.recipe.recipe import Recipe, load_recipe
+    from drogue_models.presets import explain
+    from render.engine import EngineUnavailableError, engine_names
+
+    recipe, text = load_recipe(name_or_path, seed)
+    if engine is not None:
+        settings = recipe.render.model_copy(update={"engine": engine})
+        try:
+            # Checked anew, for not every engine can draw everything.
+            recipe = Recipe.model_validate(dict(recipe) | {"render": settings})
+        except ValidationError as error:
+            raise ValueError(f"--engine {engine}: {explain(error)}") from error
+    if recipe.render.engine not in engine_names():
+        raise EngineUnavailableError(
+            f"engine: no engine named {recipe.render.engine!r}; there are {', '.join(engine_names())}"
+        )
+    return recipe, text
+
+
+@dataclass(frozen=True)
+class RenderOrder:
+    """Who makes frames, and how long each may take.
+
+    Attributes:
+        workers: processes of this machine, as many as it holds when None.
+        timeout_s: for one frame, by the recipe when None. [s]
+        scheduler: address of a Dask scheduler whose workers do it instead, or None.
+        pairs_per_tar: how many frames come into a tar file; None leaves that as it is, folders at first.
+    """
+
+    workers: int | None = None
+    timeout_s: float | None = None
+    scheduler: str | None = None
+    pairs_per_tar: int | None = None
+
+
+def render_frames(
+    recipe: Recipe, text: str, out: Location, frames: Sequence[int], order: RenderOrder, report: ProgressReport
+) -> RunSummary:
+    """Make frames of a recipe into a dataset.
+
+    Raises:
+        ValueError: a folder of another recipe, or an engine that cannot be used.
+        OSError: the folder cannot be written or the disk is full; finished frames stay.
+    """
+    with interrupts_wait():
+        from droguekit.batch.execution import default_workers
+        from droguekit.batch.render_dataset import Spread, render_dataset
+        from render.engine import engine_notice
+
+    workers = default_workers() if order.workers is None else order.workers
+    if workers < 0:
+        raise ValueError(f"workers: must not be negative, got {workers}")
+    if order.timeout_s is not None and not order.timeout_s > 0:
+        raise ValueError(f"--timeout: must be above 0 s, got {order.timeout_s:g}")
+    if order.scheduler is not None and order.workers is not None:
+        raise ValueError("--workers: means processes of this machine; with --scheduler leave it out")
+    if str(out).startswith("memory:") and workers != 0:
+        raise ValueError(f"--out: {out} is the memory of one process; give --workers 0, or another place")
+    notice = engine_notice(recipe.render.engine)
+    if notice is not None:
+        report.say(notice)
+    spread = Spread(workers, order.timeout_s, order.scheduler, order.pairs_per_tar)
+    return render_dataset(recipe, text, out, frames, spread, report)
+
+
+@contextmanager
+def interrupts_wait() -> Iterator[None]:
+    """Let Ctrl-C wait until the block is done.
+
+    Mesh libraries try optional imports and catch whatever comes of them, the exception of a Ctrl-C too: it were lost.
+    At the end it goes to whoever handled it before, by default as `KeyboardInterrupt`.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard: list[int] = []
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        heard.append(number)
+
+    before = signal.signal(signal.SIGINT, hear)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if heard:
+        signal.raise_signal(signal.SIGINT)
