@@ -6,7 +6,7 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.types.estimates import Estimate, NoFix
-from nav.detector.detectors import DEFAULT_DETECTOR, detector_factory
+from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 from nav.navigator import CENTROID_CHOICES, CentroidChoice
 from nav.pose.pose_methods import method_names, pose_method
 from nav.sequence_navigator import LatePair, PairAnswers, SequenceNavigator, SequenceSettings
@@ -29,7 +29,7 @@ def navigate(
         dataset: images, rig and drogue.
         methods: names from `method_names`.
         centroids: `own` for what each method measures on, `binary` or `edge` for all on the same.
-        detector: a name from `nav.detector.detectors.detector_names`, or a network's file.
+        detector: a name from `nav.detector.detector_registry.detector_names`, or a network's file.
 
     Yields:
         One estimate a frame and method, in that order.

@@ -47,7 +47,7 @@ def detect_dataset(
     """
     from droguekit.benchmark.detection.detection_run import DetectorPass
     from droguekit.benchmark.results.detection_boxes import write_detections
-    from nav.detector.detectors import DEFAULT_DETECTOR, detector_factory
+    from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 
     if not 0 <= least_score <= 1:
         raise ValueError(f"--least-score: must be from 0 to 1, got {least_score:g}")
@@ -124,7 +124,7 @@ def _runs(dataset: Location, order: DetectionOrder, report: ProgressReport) -> d
     from droguekit.benchmark.detection.detection_run import DetectorPass
     from droguekit.benchmark.results.detection_boxes import image_id_of, read_detections
     from geometry.stereo import EYES
-    from nav.detector.detectors import detector_factory
+    from nav.detector.detector_registry import detector_factory
 
     # Also of images that are not scored, for a detector answers for all.
     image_ids = frozenset(image_id_of(frame, eye) for frame in read_blind_index(dataset).frames for eye in EYES)
@@ -163,7 +163,7 @@ def _network_cost(name_or_file: str, sizes_px: tuple[tuple[int, int], ...]) -> N
     """Of all passes through a network in a file; None where they cannot be counted, or what counts is missing."""
     from importlib.util import find_spec
 
-    from nav.detector.detectors import network_file
+    from nav.detector.detector_registry import network_file
 
     file = network_file(name_or_file)
     if file is None or not sizes_px or find_spec("onnx") is None:

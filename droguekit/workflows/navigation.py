@@ -256,7 +256,7 @@ def _answers(
     blind: BlindDataset, settings: SequenceSettings, order: NavigationOrder
 ) -> Generator[PairAnswers | LatePair]:
     """Answers to all pairs, as fast as can be or as they come."""
-    from nav.detector.detectors import DEFAULT_DETECTOR
+    from nav.detector.detector_registry import DEFAULT_DETECTOR
     from nav.realtime.pipeline import MonotonicClock, play
     from nav.runner import answers_of, open_navigator
 

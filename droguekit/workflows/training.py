@@ -14,7 +14,7 @@ from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frame
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe
     from droguekit.batch.progress import ProgressReport
-    from nav.training.training import TrainingResult
+    from nav.training.training_run import TrainingResult
 
 _NEEDED = ("torch", "onnx", "onnxscript", "tensorboard")
 
@@ -89,7 +89,7 @@ def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> T
     network = None if start is None or start.network is None else start.network.to_dict()
     settings = build_settings(order.settings_file, {**order.changes, **parsed}, network)
     found = [_find(source) for source in order.sources]
-    from nav.training.training import check_before, train
+    from nav.training.training_run import check_before, train
 
     # Rendering takes hours: what would stop the training afterwards is looked for first.
     if not any(not isinstance(each, _Recipe) or each.recipe.split.train > 0 for each in found):

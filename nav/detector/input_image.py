@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.images import Pixels, StereoImages
 from geometry.se3 import Array
 from geometry.stereo import Eye
-from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX
+from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 PADDING_DN = 114
 """Grey of what the image leaves of the input: between sky and ground, so that its edge is no strong one."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX
+from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 METADATA_KEY = "droguekit_detector"
 """Under this key an ONNX file has the JSON text of `ModelMetadata`."""

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.detector.decoding import decode, non_maximum_suppression
 from nav.detector.input_image import Letterbox, fit_picture
-from nav.detector.maps import SIZE_STEP_PX
+from nav.detector.output_maps import SIZE_STEP_PX, decode, non_maximum_suppression
 
 Found = tuple[Array, Array]
 """(n, 4) boxes x, y, width, height in corner coordinates of the input [px], and (n,) scores, the best first."""
@@ -43,7 +42,7 @@ def find_at_scales(
 
     Args:
         pictures: (H, W, 3) each, as `nav.detector.input_image` makes them.
-        run: the network, from pictures of one size to maps, see `nav.detector.maps`.
+        run: the network, from pictures of one size to maps, see `nav.detector.output_maps`.
         large_from_px: see `joined`; 0 for a single pass.
         least_score: what scores lower is left out.
         most: how many boxes a picture has at most.

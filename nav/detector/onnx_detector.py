@@ -15,9 +15,9 @@ from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import input_image, letterbox, network_input
-from nav.detector.maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.multiscale_inference import Found, find_at_scales, half_size_px
+from nav.detector.output_maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 
 _FAULTS = (
     faults.EPFail, faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf,

@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
-from nav.training.color_jitter import vary_light
 from nav.training.corpus import Corpus, EyeIndex
-from nav.training.image_views import (
+from nav.training.geometric_augmentation import (
+    TILES,
     Boxes,
     Image,
     ImageView,
     ViewRanges,
     Window,
+    sample_mosaic,
     sample_view,
     show,
     whole_view,
 )
-from nav.training.mosaic import TILES, sample_mosaic
-from nav.training.painted_shapes import distract, occlude
+from nav.training.photometric_augmentation import distract, occlude, vary_light
 from nav.training.prefetch_map import in_order
 from nav.training.training_settings import SizePx, TrainingSettings
 

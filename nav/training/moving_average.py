@@ -13,7 +13,7 @@ _RAMP_STEPS = 10  # the average of the first n steps forgets about n/10 of them 
 
 
 class MovingAverage:
-    """Of weights; running means of batch normalization are measured for them, see `nav.training.batch_statistics`.
+    """Of weights; running means of batch normalization are measured for them, see `nav.training.evaluation`.
 
     Attributes:
         network: that has the averages; never trained.

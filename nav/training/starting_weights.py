@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import nn
 
-from nav.detector.detectors import network_file
-from nav.detector.network.config import NetworkConfig
+from nav.detector.detector_registry import network_file
+from nav.detector.network.network import NetworkConfig
 from nav.training.checkpoint import load
-from nav.training.onnx_import import import_onnx
+from nav.training.onnx_conversion import import_onnx
 from nav.training.training_settings import TrainingSettings
 
 _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training's folder"
@@ -37,7 +37,7 @@ class StartingWeights:
 
     @property
     def lack_statistics(self) -> bool:
-        """Whether they are an exported file's, to be followed by `nav.training.onnx_import.normalise_anew`."""
+        """Whether they are an exported file's, to be followed by `nav.training.onnx_conversion.normalise_anew`."""
         return self.network is not None
 
     def put_into(self, network: nn.Module) -> None:

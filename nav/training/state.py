@@ -11,14 +11,13 @@ from typing import Any
 import torch
 from torch import nn
 
-from nav.detector.network.config import NetworkConfig
-from nav.detector.network.network import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.checkpoint import CHECKPOINT_FILE, load, save
 from nav.training.corpus import DatasetStamp
-from nav.training.history import EpochRow
 from nav.training.moving_average import MovingAverage
 from nav.training.precision import Computing
 from nav.training.starting_weights import StartingWeights
+from nav.training.training_progress import EpochRow
 from nav.training.training_settings import TrainingSettings, differing_settings
 
 _VERSION = 1  # grows with every change of what stands in a checkpoint

@@ -1,4 +1,4 @@
-"""The loop: batches through the network, and what follows from time to time."""
+"""The training loop: optimizer steps, learning-rate schedule, validation after each epoch, checkpoints."""
 
 from __future__ import annotations
 
@@ -7,23 +7,31 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from math import cos, pi
 from pathlib import Path
 
 import torch
 
 from nav.detector.network.detection_loss import DetectionLoss, detection_loss
-from nav.training.average_precision import AveragePrecision, average_precision
-from nav.training.batch_statistics import measure_batch_statistics
 from nav.training.batches import Batch, BatchMaker
 from nav.training.checkpoint import BEST_FILE, save
 from nav.training.corpus import Corpus
-from nav.training.history import VALIDATED, Curves, EpochRow, write_tables
+from nav.training.evaluation import AveragePrecision, answer, average_precision, measure_batch_statistics, to_tensor
 from nav.training.precision import Computing
-from nav.training.predictions import answer, to_tensor
-from nav.training.schedule import learning_rate
 from nav.training.state import TrainingState, save_state
-from nav.training.training_observer import Observer
+from nav.training.training_progress import VALIDATED, Curves, EpochRow, Observer, write_tables
 from nav.training.training_settings import SizePx, TrainingSettings
+
+
+def learning_rate(settings: TrainingSettings, step: int) -> float:
+    """The learning rate of a step, counted from 0."""
+    warmup = min(settings.warmup_passes // settings.batch_images, settings.steps // 2)
+    if step < warmup:
+        return settings.learning_rate * (step + 1) / (warmup + 1)
+    done = (step - warmup) / max(settings.steps - warmup, 1)
+    floor = settings.floor_fraction
+    return settings.learning_rate * (floor + (1 - floor) * (1 + cos(pi * done)) / 2)
+
 
 _CURVE_EVERY_STEPS = 10
 _VALIDATED_EPOCHS = 3  # every so many, before the last input size: the best weights are chosen among those after it

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
-from nav.detector.maps import MOST_SIDE_PX, SIZE_STEP_PX
+from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 SizePx = tuple[int, int]
 """(height, width) of the network's input. [px]"""

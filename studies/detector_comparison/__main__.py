@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.detector_comparison.comparison import PeerOrder, compare_peers
+from studies.detector_comparison.comparison import PeerOrder, compare_peers, comparison_lines
 from studies.detector_comparison.options import (
     CorpusOption,
     DeviceOption,
@@ -19,7 +19,6 @@ from studies.detector_comparison.options import (
     input_size_px,
     tell,
 )
-from studies.detector_comparison.table import comparison_lines
 
 _EXAMPLES = """Examples:
 

@@ -1,4 +1,4 @@
-"""Training, exporting, timing and scoring of peers and ours: a stage whose file is there is over."""
+"""Training, export, timing and scoring of YOLOv8 and our detectors; a stage whose output file exists is skipped."""
 
 from __future__ import annotations
 
@@ -20,10 +20,15 @@ from droguekit.benchmark.results.detection_boxes import write_detections
 from nav.detector.detector import Detector
 from nav.detector.onnx_cost import network_cost
 from nav.detector.onnx_detector import OnnxDetector
-from studies.detector_comparison.environment import peer_python, peer_variables
 from studies.detector_comparison.latency import measure_latency
-from studies.detector_comparison.yolo_corpus import check_corpus, export_corpus, images_to_train_on
 from studies.detector_comparison.yolo_detector import YoloDetector
+from studies.detector_comparison.yolo_training import (
+    check_corpus,
+    export_corpus,
+    images_to_train_on,
+    peer_python,
+    peer_variables,
+)
 
 PEERS = ("yolov8s", "yolov8n")
 _SCRIPT = Path(__file__).with_name("yolo_script.py")
@@ -285,3 +290,23 @@ def _scores(order: PeerOrder, out: Path, detectors: Mapping[str, Detector], say:
 def _detect(corpus: Path, detector: Detector, file: Path) -> None:
     looking = DetectorPass(corpus, lambda drogue: detector)
     write_detections(file, looking.boxes(LEAST_SCORE, lambda: None))
+
+
+def comparison_lines(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """One line a detector; the ratio is of CPU times, round by round, to the first one's."""
+    first = next(iter(rows))
+    yield (
+        f"{'detector':<16} {'parameters':>11} {'GFLOPs':>7} {'wall p50':>9} {'p90':>7} {'p99':>7} {'CPU p50':>9} "
+        f"{'CPU / ' + first:>14} {'AP50':>8} {'AP':>8}"
+    )
+    for name, row in rows.items():
+        wall = " ".join(f"{time_ms:{width}.1f}" for time_ms, width in zip(row["wall_ms"], (9, 7, 7), strict=True))
+        yield (
+            f"{name:<16} {row['parameters']:>11,} {row['gflops_per_image']:7.2f} {wall} {row['cpu_ms'][0]:9.1f} "
+            f"{row['ratio']:14.2f} {_share(row.get('ap50')):>8} {_share(row.get('ap')):>8}"
+        )
+    yield "times in ms for a stereo pair, from full-size images to boxes; GFLOPs of one image"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.2f} %"

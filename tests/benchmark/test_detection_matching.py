@@ -20,7 +20,7 @@ from droguekit.benchmark.detection.detection_matching import AT_50, RECALLS, Eva
 from droguekit.benchmark.detection.detection_truth import ImageTruth
 from droguekit.benchmark.results.detection_boxes import FoundBox
 from geometry.stereo import EYES
-from nav.training.score_threshold import best_threshold
+from nav.training.evaluation import best_threshold
 
 BOX: PixelBox = (100.0, 100.0, 40.0, 30.0)
 

@@ -1,15 +1,120 @@
-"""The trunk of MobileNetV3 (Howard et al. 2019, arXiv:1905.02244), up to where its classifier begins."""
+"""The MobileNetV3 backbone (Howard et al. 2019, arXiv:1905.02244), without its classifier, and its building blocks.
+
+Channel attention is ECA (arXiv:1910.03151), which the seed paper puts in place of squeeze and excitation, or for the
+ablation squeeze and excitation (arXiv:1709.01507) itself.
+"""
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import NamedTuple
+from math import log2
+from typing import Literal, NamedTuple
 
+import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from nav.detector.network.attention import channel_attention
-from nav.detector.network.config import Attention, Variant
-from nav.detector.network.convolution import DepthwiseConv, batch_norm, pointwise
+Variant = Literal["l", "s"]
+Attention = Literal["eca", "se"]
+
+# MobileNetV3 (arXiv:1905.02244) squeezes to a quarter of the channels, as a multiple of 8 that is no tenth less.
+_REDUCTION, _CHANNEL_STEP, _LEAST_SHARE = 4, 8, 0.9
+
+
+def eca_kernel_size(channels: int) -> int:
+    """How many neighbouring channels ECA looks at: |log2(C) / 2 + 1/2|, made odd (arXiv:1910.03151, eq. 12)."""
+    size = int(abs(log2(channels) / 2 + 0.5))
+    return size if size % 2 else size + 1
+
+
+class EfficientChannelAttention(nn.Module):
+    """Each channel's weight from the means of itself and its neighbours (ECA-Net, arXiv:1910.03151)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        size = eca_kernel_size(channels)
+        self.across_channels = nn.Conv1d(1, 1, size, padding=size // 2, bias=False)
+        self.gate = nn.Sigmoid()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, C, H, W) -> (B, C, H, W)."""
+        means = features.mean(dim=(2, 3)).unsqueeze(1)
+        weights: Tensor = self.gate(self.across_channels(means))
+        return features * weights.squeeze(1)[:, :, None, None].to(features.dtype)
+
+
+def squeezed_channels(channels: int) -> int:
+    """Width of the bottleneck of squeeze and excitation."""
+    quarter = channels // _REDUCTION
+    nearest = max((quarter + _CHANNEL_STEP // 2) // _CHANNEL_STEP, 1) * _CHANNEL_STEP
+    return nearest if nearest >= _LEAST_SHARE * quarter else nearest + _CHANNEL_STEP
+
+
+class SqueezeExcitation(nn.Module):
+    """Each channel's weight from all means through a bottleneck (arXiv:1709.01507), as in MobileNetV3."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        squeezed = squeezed_channels(channels)
+        self.squeeze = nn.Conv2d(channels, squeezed, 1)
+        self.excite = nn.Conv2d(squeezed, channels, 1)
+        self.activation, self.gate = nn.ReLU(), nn.Hardsigmoid()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, C, H, W) -> (B, C, H, W)."""
+        means = features.mean(dim=(2, 3), keepdim=True)
+        weights: Tensor = self.gate(self.excite(self.activation(self.squeeze(means))))
+        return features * weights
+
+
+def channel_attention(kind: Attention, channels: int) -> nn.Module:
+    """The attention of that kind."""
+    return EfficientChannelAttention(channels) if kind == "eca" else SqueezeExcitation(channels)
+
+
+# A running mean over about 10 batches: weights move fast in a short training, and old means do not fit them.
+_NORM_MOMENTUM, _NORM_EPSILON = 0.1, 1e-3
+
+
+class DepthwiseConv(nn.Conv2d):
+    """One filter a channel, without bias, padded to keep its place.
+
+    In bf16 autocast on a CPU the slow kinds leave autocast and compute in float32: the bf16 kernels of depthwise
+    filters of 5x5 or of stride 2 are several times slower than the float32 ones, so that autocast would win nothing.
+    The answer has the type that autocast would have given it.
+    """
+
+    def __init__(self, channels: int, kernel: int, stride: int = 1) -> None:
+        super().__init__(channels, channels, kernel, stride, kernel // 2, groups=channels, bias=False)
+        self._slow_in_bf16 = kernel > 3 or stride > 1
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, C, H, W) -> (B, C, H/stride, W/stride)."""
+        device = features.device.type
+        if device != "cpu" or not self._slow_in_bf16 or not torch.is_autocast_enabled(device):
+            return super().forward(features)
+        with torch.autocast(device, enabled=False):
+            filtered = functional.conv2d(
+                features.float(), self.weight, None, self.stride, self.padding, self.dilation, self.groups
+            )
+        return filtered.to(torch.get_autocast_dtype(device))
+
+
+def batch_norm(channels: int) -> nn.BatchNorm2d:
+    """Batch normalisation for small batches and short trainings."""
+    return nn.BatchNorm2d(channels, eps=_NORM_EPSILON, momentum=_NORM_MOMENTUM)
+
+
+def pointwise(inputs: int, outputs: int, activation: type[nn.Module] = nn.ReLU) -> nn.Sequential:
+    """1x1 convolution, normalisation, activation."""
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, bias=False), batch_norm(outputs), activation())
+
+
+def separable(channels: int, stride: int = 1) -> nn.Sequential:
+    """3x3 depthwise convolution, then 1x1, each with normalisation and ReLU (MobileNet, arXiv:1704.04861)."""
+    depthwise = (DepthwiseConv(channels, 3, stride), batch_norm(channels), nn.ReLU())
+    return nn.Sequential(*depthwise, *pointwise(channels, channels))
+
 
 _STEM_CHANNELS = 16
 

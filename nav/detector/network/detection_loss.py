@@ -1,8 +1,15 @@
-"""What training makes small."""
+"""The training loss: task-aligned assignment, quality focal loss of the scores, and CIoU loss of the boxes.
+
+Boxes here are (..., 4): left, top, right, bottom. [px]
+
+Sources: assignment, TOOD (Feng et al. 2021, arXiv:2108.07755, section 3.2); score, quality focal loss (Li et al. 2020,
+arXiv:2006.04388, eq. 3); box, complete IoU (Zheng et al. 2020, arXiv:1911.08287, eq. 10).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import pi
 from typing import NamedTuple
 
 import torch
@@ -10,9 +17,108 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils.rnn import pad_sequence
 
-from nav.detector.network.anchor_points import boxes_of, cells_of, in_one_row
-from nav.detector.network.assignment import assign
-from nav.detector.network.iou import complete_iou
+from nav.detector.network.head import boxes_of, cells_of, in_one_row
+
+_LEAST_AREA_PX2 = 1e-6
+
+
+def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
+    """IoU of boxes that broadcast against each other: (..., 4) and (..., 4) -> (...)."""
+    sides = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp(min=0)
+    shared = sides[..., 0] * sides[..., 1]
+    return shared / (_area(a) + _area(b) - shared).clamp(min=_LEAST_AREA_PX2)
+
+
+def complete_iou(a: Tensor, b: Tensor) -> Tensor:
+    """IoU less the distance of the centres and the difference of the shapes (CIoU, arXiv:1911.08287, eq. 10).
+
+    Differentiable, -1.5 to 1, and still telling where boxes do not touch.
+
+    Args:
+        a: (N, 4) answers.
+        b: (N, 4) truth.
+
+    Returns:
+        (N,)
+    """
+    iou = intersection_over_union(a, b)
+    hull = torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])
+    between = (a[:, :2] + a[:, 2:] - b[:, :2] - b[:, 2:]) / 2
+    apart = between.square().sum(dim=1) / hull.square().sum(dim=1).clamp(min=_LEAST_AREA_PX2)
+    shape = (4 / pi**2) * (_diagonal_angle(a) - _diagonal_angle(b)).square()
+    with torch.no_grad():
+        weight = shape / (1 - iou + shape).clamp(min=_LEAST_AREA_PX2)
+    return iou - apart - weight * shape
+
+
+def _area(boxes: Tensor) -> Tensor:
+    sides = boxes[..., 2:] - boxes[..., :2]
+    return sides[..., 0] * sides[..., 1]
+
+
+def _diagonal_angle(boxes: Tensor) -> Tensor:
+    sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=_LEAST_AREA_PX2)
+    return torch.atan2(sides[:, 0], sides[:, 1])
+
+
+# A cell's claim to a box is score^a IoU^b; so many of the cells with the best claims answer for it.
+_SCORE_POWER, _OVERLAP_POWER = 0.5, 6.0
+_CELLS_A_BOX = 10
+_TINY = 1e-12
+
+
+class Assignment(NamedTuple):
+    """What the cells of a batch should answer.
+
+    Attributes:
+        scores: (B, N) 0 to 1; 0 for cells that answer for no box.
+        box_index: (B, N) which box of its image a cell answers for; 0 where it answers for none.
+        answers: (B, N) bool: the cell answers for a box.
+    """
+
+    scores: Tensor
+    box_index: Tensor
+    answers: Tensor
+
+
+@torch.no_grad()
+def assign(scores: Tensor, boxes_px: Tensor, centers_px: Tensor, truth_px: Tensor, present: Tensor) -> Assignment:
+    """Give every box its cells.
+
+    Cells within a box claim it; a box too small to have any goes to the nearest cell. A cell that is among the best of
+    several boxes answers for the one that it overlaps most. The score asked of a cell is its claim relative to the best
+    claim, times the best overlap, so that a score also says how good its box is.
+
+    Args:
+        scores: (B, N) of the cells, 0 to 1.
+        boxes_px: (B, N, 4) of the cells: left, top, right, bottom.
+        centers_px: (N, 2) of the cells, finer maps first.
+        truth_px: (B, M, 4) true boxes, left, top, right, bottom; M at least 1.
+        present: (B, M) bool: false for rows of `truth_px` that only fill up.
+    """
+    may_claim = _within(centers_px, truth_px) & present[:, :, None]
+    overlap = intersection_over_union(truth_px[:, :, None], boxes_px[:, None])
+    claim = (scores[:, None].pow(_SCORE_POWER) * overlap.pow(_OVERLAP_POWER)).clamp(min=_TINY) * may_claim
+    best = claim.topk(min(_CELLS_A_BOX, claim.shape[2]), dim=2).indices
+    chosen = torch.zeros_like(may_claim).scatter_(2, best, True) & may_claim
+    box_index = torch.where(chosen, overlap, -1.0).argmax(dim=1)
+    chosen &= functional.one_hot(box_index, chosen.shape[1]).transpose(1, 2).bool()
+    claim, overlap = claim * chosen, overlap * chosen
+    quality = claim / claim.amax(dim=2, keepdim=True).clamp(min=_TINY) * overlap.amax(dim=2, keepdim=True)
+    return Assignment(quality.amax(dim=1), box_index, chosen.any(dim=1))
+
+
+def _within(centers_px: Tensor, truth_px: Tensor) -> Tensor:
+    """(B, M, N) whether a cell's centre lies within a box, or is the nearest to a box that holds none."""
+    low = centers_px - truth_px[:, :, None, :2]
+    high = truth_px[:, :, None, 2:] - centers_px
+    inside = torch.cat((low, high), dim=3).amin(dim=3) > 0
+    middle_px = (truth_px[..., :2] + truth_px[..., 2:]) / 2
+    # The first of equally near ones is that of the finest map.
+    nearest = (centers_px - middle_px[:, :, None]).square().sum(dim=3).argmin(dim=2)
+    only = functional.one_hot(nearest, centers_px.shape[0]).bool()
+    return torch.where(inside.any(dim=2, keepdim=True), inside, only)
+
 
 # How much less a cell counts whose score is nearly right (quality focal loss, arXiv:2006.04388, eq. 3). It is between
 # the 2 of that paper, with which scores rose later in short trainings on few images, and 0, plain cross entropy, in

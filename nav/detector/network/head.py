@@ -1,14 +1,16 @@
-"""One-stage head of one level: a score and a box in every cell, without anchors."""
+"""The detection head, its anchor points, and the boxes that it predicts at them; see `nav.detector.output_maps`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import log
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from nav.detector.maps import MAP_CHANNELS
-from nav.detector.network.convolution import separable
+from nav.detector.network.backbone import separable
+from nav.detector.output_maps import LOG_DISTANCE_RANGE, MAP_CHANNELS, STRIDES
 
 # Before training a cell holds the drogue with this chance, so that the many empty cells don't drown the few others
 # (RetinaNet, arXiv:1708.02002, section 4.1) ...
@@ -36,7 +38,7 @@ class DetectionHead(nn.Module):
             nn.init.constant_(layer.bias, bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, 5, H, W), see `nav.detector.maps`; float32 in autocast too."""
+        """(B, C, H, W) -> (B, 5, H, W), see `nav.detector.output_maps`; float32 in autocast too."""
         score_features: Tensor = self.score_features(features)
         box_features: Tensor = self.box_features(features)
         device = features.device.type
@@ -45,3 +47,48 @@ class DetectionHead(nn.Module):
         # bf16 has 8 bits: logarithms of distances would be rounded to half a percent of the box.
         with torch.autocast(device, enabled=False):
             return torch.cat((self.score(score_features.float()), self.box(box_features.float())), dim=1)
+
+
+class Cells(NamedTuple):
+    """N cells of all maps.
+
+    Attributes:
+        centers_px: (N, 2) x, y from the corner of the input.
+        strides_px: (N, 1)
+    """
+
+    centers_px: Tensor
+    strides_px: Tensor
+
+
+def cells_of(maps: Sequence[Tensor]) -> Cells:
+    """Places of the cells of maps (B, 5, H, W), the finest map first, row by row."""
+    centers, strides = [], []
+    for stride, each in zip(STRIDES, maps, strict=True):
+        rows, columns = (
+            (torch.arange(count, device=each.device, dtype=torch.float32) + 0.5) * stride for count in each.shape[2:]
+        )
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        centers.append(torch.stack((x.flatten(), y.flatten()), dim=1))
+        strides.append(torch.full((x.numel(), 1), float(stride), device=each.device))
+    return Cells(torch.cat(centers), torch.cat(strides))
+
+
+def in_one_row(maps: Sequence[Tensor]) -> Tensor:
+    """(B, N, 5) of float32 from maps (B, 5, H, W), in the order of `cells_of`."""
+    return torch.cat([each.float().flatten(2) for each in maps], dim=2).transpose(1, 2)
+
+
+def boxes_of(log_distances: Tensor, cells: Cells) -> Tensor:
+    """Boxes of all cells.
+
+    Args:
+        log_distances: (B, N, 4) logarithms of the distances to left, top, right, bottom in strides.
+        cells: where they are.
+
+    Returns:
+        (B, N, 4) left, top, right, bottom. [px]
+    """
+    distances_px = log_distances.clamp(*LOG_DISTANCE_RANGE).exp() * cells.strides_px
+    low_px = cells.centers_px - distances_px[..., :2]
+    return torch.cat((low_px, cells.centers_px + distances_px[..., 2:]), dim=-1)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from nav.detector.maps import STRIDES
-from nav.detector.network.config import Fusion
-from nav.detector.network.convolution import pointwise, separable
+from nav.detector.network.backbone import pointwise, separable
+from nav.detector.output_maps import STRIDES
+
+Fusion = Literal["asff", "concat"]
 
 # Channels from which the fusion weights of a level are computed (ASFF's reference has 8 or 16).
 _WEIGHT_CHANNELS = 8

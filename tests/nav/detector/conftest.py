@@ -12,8 +12,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.network.config import NetworkConfig
-from nav.detector.network.network import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork, NetworkConfig
 
 SQUARE_STRIDES = (8, 16, 32)
 # A cell that is all red has this logit, one that is a quarter red or grey a score below one in ten thousand.

@@ -5,9 +5,8 @@ import pytest
 import torch
 from pycocotools import mask
 
-from nav.detector.network.anchor_points import boxes_of, cells_of
-from nav.detector.network.assignment import assign
-from nav.detector.network.iou import complete_iou, intersection_over_union
+from nav.detector.network.detection_loss import assign, complete_iou, intersection_over_union
+from nav.detector.network.head import boxes_of, cells_of
 
 CELLS = cells_of([torch.zeros(1, 5, 128 // stride, 160 // stride) for stride in (8, 16, 32)])
 MOST_CELLS = 10

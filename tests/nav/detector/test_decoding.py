@@ -5,8 +5,7 @@ from math import exp
 import numpy as np
 import pytest
 
-from nav.detector.decoding import decode
-from nav.detector.maps import STRIDES
+from nav.detector.output_maps import STRIDES, decode
 
 HEIGHT, WIDTH = 64, 96
 

@@ -4,10 +4,9 @@ import pytest
 import torch
 from pycocotools import mask
 
-from nav.detector.decoding import decode
-from nav.detector.maps import STRIDES
-from nav.detector.network.config import NetworkConfig
 from nav.detector.network.detection_loss import detection_loss
+from nav.detector.network.network import NetworkConfig
+from nav.detector.output_maps import STRIDES, decode
 
 HEIGHT, WIDTH = 128, 160
 NONE = torch.zeros(0, 4)

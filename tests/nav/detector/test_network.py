@@ -10,19 +10,18 @@ import pytest
 import torch
 from torch import nn
 
-from nav.detector.maps import STRIDES
-from nav.detector.network.attention import (
+from nav.detector.network.backbone import (
+    BLOCKS,
+    DepthwiseConv,
     EfficientChannelAttention,
+    MobileNetV3,
     SqueezeExcitation,
     eca_kernel_size,
     squeezed_channels,
 )
-from nav.detector.network.backbone import BLOCKS, MobileNetV3
-from nav.detector.network.complexity import complexity
-from nav.detector.network.config import NetworkConfig
-from nav.detector.network.convolution import DepthwiseConv
 from nav.detector.network.neck import AdaptiveFusion, LevelResize
-from nav.detector.network.network import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork, NetworkConfig, complexity
+from nav.detector.output_maps import STRIDES
 
 CONFIGS = [NetworkConfig(*each) for each in product(("l", "s"), ("eca", "se"), ("asff", "concat"))]
 MOST_WEIGHTS_BYTES = 12e6

@@ -13,9 +13,9 @@ from onnx import TensorProto, helper
 from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.network.config import NetworkConfig
+from nav.detector.network.network import NetworkConfig
 from nav.detector.onnx_detector import OnnxDetector
-from nav.training.onnx_export import INPUT_NAME, OUTPUT_NAMES, export_onnx
+from nav.training.onnx_conversion import INPUT_NAME, OUTPUT_NAMES, export_onnx
 
 METADATA = ModelMetadata(input_size_px=(320, 256), score_threshold=0.6, licence="Apache-2.0")
 # In cells of 8 px of the 320x256 input: column and row of a red square of one cell.

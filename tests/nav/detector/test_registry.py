@@ -10,9 +10,15 @@ from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.types.estimates import NoFix
 from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
-from nav.detector import detectors as registry
+from nav.detector import detector_registry as registry
 from nav.detector.color_blob import ColorBlobDetector
-from nav.detector.detectors import DEFAULT_DETECTOR, detector_factory, detector_names, network_file, open_detector
+from nav.detector.detector_registry import (
+    DEFAULT_DETECTOR,
+    detector_factory,
+    detector_names,
+    network_file,
+    open_detector,
+)
 from nav.detector.model_metadata import ModelMetadata
 from nav.runner import navigate
 
@@ -79,7 +85,7 @@ def test_navigation_asks_the_detector_that_is_named(smoke_dataset, red_squares):
 
 def test_naming_detectors_imports_nothing_heavy():
     code = (
-        "import sys, nav.detector.detectors as registry; registry.detector_names();"
+        "import sys, nav.detector.detector_registry as registry; registry.detector_names();"
         "print([name for name in ('torch', 'onnxruntime', 'cv2', 'onnx') if name in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

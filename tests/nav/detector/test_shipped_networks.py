@@ -11,7 +11,7 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.images import StereoImages
 from droguekit.cli.main import DONE, run
-from nav.detector.detectors import COLOR_BLOB, DEFAULT_DETECTOR, detector_names, network_file
+from nav.detector.detector_registry import COLOR_BLOB, DEFAULT_DETECTOR, detector_names, network_file
 from nav.detector.onnx_detector import OnnxDetector
 
 NETWORKS = [name for name in detector_names() if name != COLOR_BLOB]

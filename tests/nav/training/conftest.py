@@ -13,8 +13,7 @@ import pytest
 from datasets_manifest.recipe.recipe import parse_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from nav.training.corpus import Corpus
-from nav.training.image_cache import CachedPair, ImageCache
+from nav.training.corpus import CachedPair, Corpus, ImageCache
 
 RECIPE = {
     "seed": "5",

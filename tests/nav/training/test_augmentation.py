@@ -6,9 +6,8 @@ import pytest
 
 from datasets_manifest.random_streams import sample_generator
 from nav.training.batches import BatchMaker
-from nav.training.color_jitter import vary_light
 from nav.training.corpus import Corpus
-from nav.training.painted_shapes import distract, occlude, paint_ring
+from nav.training.photometric_augmentation import distract, occlude, paint_ring, vary_light
 from nav.training.training_settings import build_settings
 
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])

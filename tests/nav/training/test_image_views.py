@@ -7,9 +7,9 @@ import torch
 
 from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import PADDING_DN, input_image, network_input
-from nav.training.corpus import Corpus
-from nav.training.image_cache import CachedPair, ImageCache
-from nav.training.image_views import (
+from nav.training.corpus import CachedPair, Corpus, ImageCache
+from nav.training.evaluation import to_tensor, whole_image
+from nav.training.geometric_augmentation import (
     LEAST_VISIBLE_FRACTION,
     ImageView,
     ViewRanges,
@@ -18,12 +18,11 @@ from nav.training.image_views import (
     draw_view,
     moved_boxes,
     sample_view,
+    sample_windows,
     show,
     whole_view,
 )
-from nav.training.mosaic import sample_windows
 from nav.training.precision import Computing
-from nav.training.predictions import to_tensor, whole_image
 
 SOURCE_WH = (160, 120)
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])

@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from nav.training.average_precision import average_precision
-from nav.training.batch_statistics import measure_batch_statistics
 from nav.training.checkpoint import load, save
 from nav.training.corpus import Corpus
+from nav.training.evaluation import average_precision, best_threshold, measure_batch_statistics, to_tensor, whole_image
 from nav.training.moving_average import MovingAverage
 from nav.training.precision import Computing
-from nav.training.predictions import to_tensor, whole_image
-from nav.training.schedule import learning_rate
-from nav.training.score_threshold import best_threshold
 from nav.training.state import new_network
+from nav.training.trainer import learning_rate
 from nav.training.training_settings import TrainingSettings, build_settings, parse_size
 
 NONE = (np.zeros((0, 4)), np.zeros(0))

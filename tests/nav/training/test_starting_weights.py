@@ -14,16 +14,14 @@ from onnx import numpy_helper
 from torch import nn
 
 from droguekit.batch.progress import PlainProgress
-from nav.detector.detectors import network_file
+from nav.detector.detector_registry import network_file
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.network.config import NetworkConfig
-from nav.detector.network.network import DetectorNetwork
+from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.checkpoint import save
-from nav.training.onnx_export import export_onnx
-from nav.training.onnx_import import import_onnx, normalise_anew
+from nav.training.onnx_conversion import export_onnx, import_onnx, normalise_anew
 from nav.training.starting_weights import read_starting_weights
-from nav.training.training import check_before, train
+from nav.training.training_run import check_before, train
 from nav.training.training_settings import build_settings
 
 NETWORKS = [NetworkConfig("l", "eca", "asff"), NetworkConfig("s", "se", "concat")]

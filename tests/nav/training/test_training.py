@@ -21,15 +21,13 @@ import torch
 from droguekit.batch.progress import PlainProgress
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.training.average_precision import average_precision
-from nav.training.batch_statistics import measure_batch_statistics
 from nav.training.checkpoint import BEST_FILE, CHECKPOINT_FILE, load
 from nav.training.corpus import open_corpus
+from nav.training.evaluation import answer, average_precision, measure_batch_statistics, to_tensor, whole_image
 from nav.training.precision import Computing, open_computing, own_threads
-from nav.training.predictions import answer, to_tensor, whole_image
 from nav.training.starting_weights import read_starting_weights
 from nav.training.state import new_network, new_state, restore_state
-from nav.training.training import TrainingResult, check_before, train
+from nav.training.training_run import TrainingResult, check_before, train
 from nav.training.training_settings import build_settings
 
 # One thread and float32: the same sums in the same order, whoever else uses the machine.
@@ -58,7 +56,7 @@ import io, os, signal, sys
 from pathlib import Path
 from droguekit.batch.progress import PlainProgress
 from nav.training.training_settings import TrainingSettings
-from nav.training.training import train
+from nav.training.training_run import train
 
 calls = 0
 def kill():

@@ -10,8 +10,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from nav.detector.maps import MAP_CHANNELS, STRIDES
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
+from nav.detector.output_maps import MAP_CHANNELS, STRIDES
 
 
 def _rows_network(path: Path, rows: np.ndarray, size_px: tuple[int, int] = (64, 64)) -> Path:

@@ -29,15 +29,21 @@ from studies.detector_comparison.ablation import (
     CHANGES,
     ONE_VIEW,
     AblationOrder,
+    OneViewDetector,
     ablate,
     ablation_lines,
     measured_networks,
 )
-from studies.detector_comparison.comparison import PEERS, PeerOrder, compare_peers, run_script, training_length
-from studies.detector_comparison.one_view import OneViewDetector
+from studies.detector_comparison.comparison import (
+    PEERS,
+    PeerOrder,
+    compare_peers,
+    comparison_lines,
+    run_script,
+    training_length,
+)
 from studies.detector_comparison.options import input_size_px
-from studies.detector_comparison.table import comparison_lines
-from studies.detector_comparison.yolo_corpus import check_corpus, export_corpus, images_to_train_on
+from studies.detector_comparison.yolo_training import check_corpus, export_corpus, images_to_train_on
 
 
 @pytest.fixture(scope="module")

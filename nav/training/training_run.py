@@ -15,20 +15,24 @@ from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.storage import Location
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.network.network import DetectorNetwork
-from nav.training.average_precision import AveragePrecision, average_precision
-from nav.training.batch_statistics import measure_batch_statistics, statistics_batches
 from nav.training.checkpoint import BEST_FILE, load, remove_leftovers
 from nav.training.corpus import Corpus, open_corpus
+from nav.training.evaluation import (
+    Answers,
+    AveragePrecision,
+    answer,
+    average_precision,
+    best_threshold,
+    measure_batch_statistics,
+    statistics_batches,
+)
 from nav.training.moving_average import MovingAverage
-from nav.training.onnx_export import export_onnx
-from nav.training.onnx_import import normalise_anew
+from nav.training.onnx_conversion import export_onnx, normalise_anew
 from nav.training.precision import Computing, open_computing, own_threads
-from nav.training.predictions import Answers, answer
-from nav.training.score_threshold import best_threshold
 from nav.training.starting_weights import StartingWeights, settings_from_start
 from nav.training.state import TrainingState, check_settings, new_network, new_state, restore_state
 from nav.training.trainer import Trainer
-from nav.training.training_observer import Observer
+from nav.training.training_progress import Observer
 from nav.training.training_settings import TrainingSettings
 
 SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"

@@ -1,4 +1,4 @@
-"""How a training went: a row an epoch, as a table on disk and for people, and the curves of TensorBoard."""
+"""What a training reports: progress to its observer, a row of results for each epoch, tables, TensorBoard curves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from datasets_manifest.atomic import write_text_atomic
 
@@ -108,3 +108,23 @@ class Curves:
     def close(self) -> None:
         """Write what is left."""
         self._writer.close()
+
+
+class Observer(Protocol):
+    """What long work tells while it runs."""
+
+    def begin(self, what: str, total: int) -> None:
+        """`total` pieces of work of the kind `what` are about to start."""
+        ...
+
+    def advance(self) -> None:
+        """One piece is finished."""
+        ...
+
+    def say(self, text: str) -> None:
+        """A line for the user."""
+        ...
+
+    def end(self) -> None:
+        """The work that `begin` announced is over."""
+        ...

@@ -1,4 +1,10 @@
-"""A network's maps to boxes, in numpy."""
+"""The output of a detector network, and how boxes are decoded from it, in numpy.
+
+A network has one output map for each stride. A cell (row i, column j) of stride s has its anchor point at
+`((j + 0.5) s, (i + 0.5) s)` in the input image, counted from the image's corner. Its five channels are the logit of the
+score and the logarithms of the distances, in strides, from the anchor point to the left, top, right and bottom side of
+the box.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +16,22 @@ from numpy.typing import NDArray
 
 from geometry.boxes import intersection_area
 from geometry.se3 import Array
-from nav.detector.maps import LOG_DISTANCE_RANGE, STRIDES
+
+STRIDES = (8, 16, 32)
+"""Pixels of the input image between cells, by map. [px]"""
+
+MAP_CHANNELS = 5
+"""Logit of the score, then left, top, right, bottom."""
+
+SIZE_STEP_PX = STRIDES[-1]
+"""Width and height of an input image are multiples of it. [px]"""
+
+MOST_SIDE_PX = 4096
+"""Width and height of an input image are at most this: a wrong number is refused before it asks for memory. [px]"""
+
+LOG_DISTANCE_RANGE = (-6.0, 6.0)
+"""Beyond it a logarithm of a distance is cut: from a 400th of a stride to 400 strides."""
+
 
 # Two drogues cannot overlap more than this; cells of one drogue answer boxes that nearly coincide.
 _MOST_OVERLAP = 0.5
@@ -22,7 +43,7 @@ def decode(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, most: 
     """Boxes and scores of every image, the best first, without those that overlap a better one.
 
     Args:
-        maps: three times (B, 5, H, W), see `nav.detector.maps`.
+        maps: three times (B, 5, H, W), see `nav.detector.output_maps`.
         least_score: what scores lower is left out.
         most: how many boxes an image has at most.
 

@@ -1,11 +1,14 @@
-"""Geometric augmentation: a flipped, scaled, turned and cropped view of an image, and what of its boxes it shows.
+"""Geometric augmentation: mirrored, scaled, rotated and cropped views of images, one alone or four in a mosaic.
 
-Boxes are (n, 4) x, y of the low corner, width, height, counted from the corner of the image: all of it is
-(0, 0, W, H). A drogue is round, so what is turned is the ellipse in its box.
+Boxes are (n, 4) x, y of the low corner, width, height, counted from the corner of the image: the whole image is
+(0, 0, W, H). A drogue is round, so the ellipse in its box is what rotates.
+
+Source of the mosaic: Bochkovskiy et al. 2020, arXiv:2004.10934, section 3.3; the seed paper trains with it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -179,3 +182,34 @@ def show(canvas: Image, image: Image, boxes: Boxes, view: ImageView) -> Boxes:
     for x, y, width, height in visible[~kept & (shares > 0)]:
         canvas[int(y) : int(np.ceil(y + height)), int(x) : int(np.ceil(x + width))] = PADDING_DN
     return visible[kept]
+
+
+TILES = 4
+_CROSSING_RANGE = (0.3, 0.7)  # where the four meet, as shares of width and height; nearer to an edge one is a sliver
+
+
+def sample_windows(rng: np.random.Generator, canvas_wh: tuple[int, int]) -> list[Window]:
+    """Four rectangles that fill a canvas and meet in one point."""
+    x, y = (round(rng.uniform(*_CROSSING_RANGE) * side) for side in canvas_wh)
+    width, height = canvas_wh
+    return [
+        Window(0, 0, x, y),
+        Window(x, 0, width - x, y),
+        Window(0, y, x, height - y),
+        Window(x, y, width - x, height - y),
+    ]
+
+
+def sample_mosaic(
+    rng: np.random.Generator,
+    source_whs: Sequence[tuple[int, int]],
+    boxes: Sequence[Boxes],
+    canvas_wh: tuple[int, int],
+    ranges: ViewRanges,
+) -> list[ImageView]:
+    """A view of each of four images, one for each rectangle."""
+    windows = sample_windows(rng, canvas_wh)
+    return [
+        sample_view(rng, source_wh, own, window, ranges)
+        for source_wh, own, window in zip(source_whs, boxes, windows, strict=True)
+    ]
