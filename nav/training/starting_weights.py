@@ -11,9 +11,10 @@ import torch
 from torch import nn
 
 from nav.detector.detector_registry import network_file
-from nav.detector.network.network import NetworkConfig
+from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.checkpoint import load
 from nav.training.onnx_conversion import import_onnx
+from nav.training.state import new_network
 from nav.training.training_settings import TrainingSettings
 
 _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training's folder"
@@ -90,6 +91,18 @@ def _from_checkpoint(path: Path) -> StartingWeights:
     if not isinstance(values, dict) or not all(isinstance(value, torch.Tensor) for value in values.values()):
         raise ValueError(f"{path}: holds no weights; {_ADVICE}")
     return StartingWeights(path, hashlib.sha256(path.read_bytes()).hexdigest(), values)
+
+
+def starting_network(settings: TrainingSettings, start: StartingWeights | None) -> DetectorNetwork:
+    """The network that a training begins with: its weights are random, or those of another training.
+
+    Raises:
+        ValueError: the weights do not fit the network.
+    """
+    network = new_network(settings)
+    if start is not None:
+        start.put_into(network)
+    return network
 
 
 def settings_from_start(settings: TrainingSettings, start: StartingWeights | None) -> TrainingSettings:

@@ -16,7 +16,6 @@ from nav.training.checkpoint import CHECKPOINT_FILE, load, save
 from nav.training.corpus import DatasetStamp
 from nav.training.moving_average import MovingAverage
 from nav.training.precision import Computing
-from nav.training.starting_weights import StartingWeights
 from nav.training.training_progress import EpochRow
 from nav.training.training_settings import TrainingSettings, differing_settings
 
@@ -57,15 +56,8 @@ def new_network(settings: TrainingSettings) -> DetectorNetwork:
         return DetectorNetwork(config)
 
 
-def new_state(settings: TrainingSettings, computing: Computing, start: StartingWeights | None = None) -> TrainingState:
-    """The state before the first step, with random weights or others.
-
-    Raises:
-        ValueError: the others do not fit the network.
-    """
-    network = new_network(settings)
-    if start is not None:
-        start.put_into(network)
+def new_state(network: DetectorNetwork, settings: TrainingSettings, computing: Computing) -> TrainingState:
+    """The state of a network before the first step."""
     network.to(computing.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return TrainingState(network, MovingAverage(network, settings.ema_decay), _new_optimizer(network, settings))
 

@@ -29,7 +29,7 @@ from nav.training.evaluation import (
 from nav.training.moving_average import MovingAverage
 from nav.training.onnx_conversion import export_onnx, normalise_anew
 from nav.training.precision import Computing, open_computing, own_threads
-from nav.training.starting_weights import StartingWeights, settings_from_start
+from nav.training.starting_weights import StartingWeights, settings_from_start, starting_network
 from nav.training.state import TrainingState, check_settings, new_network, new_state, restore_state
 from nav.training.trainer import Trainer
 from nav.training.training_progress import Observer
@@ -92,7 +92,7 @@ def train(
         remove_leftovers(out)
         size, threads = settings.largest_size_px, settings.loader_threads
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
-        state = new_state(settings, computing, start)
+        state = new_state(starting_network(settings, start), settings, computing)
         goes_on = restore_state(out, state, settings, corpus.datasets)
         if start is not None and start.lack_statistics and not goes_on:
             _measure_start(state, corpus, settings, computing)
@@ -111,7 +111,8 @@ def check_before(out: Path, settings: TrainingSettings, start: StartingWeights |
             another run is at work.
     """
     settings = settings_from_start(settings, start)
-    new_state(settings, open_computing(settings), start)
+    computing = open_computing(settings)
+    new_state(starting_network(settings, start), settings, computing)
     _check_place(out)
     if out.exists():
         with _locked(out):

@@ -243,7 +243,7 @@ def test_forty_pairs_are_learned_by_heart(toy_dataset: Path, tmp_path: Path) -> 
     train([toy_dataset], tmp_path, settings, PlainProgress(io.StringIO()))
     corpus = open_corpus([toy_dataset], tmp_path / "cache", settings.size_px, 1, PlainProgress(io.StringIO()))
     computing = open_computing(settings)
-    state = new_state(settings, computing)
+    state = new_state(new_network(settings), settings, computing)
     restore_state(tmp_path, state, settings, corpus.datasets)
     with own_threads(1):
         answers = answer(state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, computing)
