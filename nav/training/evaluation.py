@@ -27,9 +27,9 @@ from nav.detector.input_image import PADDING_DN
 from nav.detector.multiscale_inference import find_at_scales
 from nav.training.corpus import Corpus
 from nav.training.geometric_augmentation import Boxes, Image, show, whole_view
-from nav.training.precision import Computing
 from nav.training.prefetch_map import in_order
 from nav.training.training_settings import SizePx
+from nav.training.training_state import Computing
 
 MOST_BOXES = 10
 """Answers of an image that count, the best first."""

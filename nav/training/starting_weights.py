@@ -12,10 +12,9 @@ from torch import nn
 
 from nav.detector.detector_registry import network_file
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
-from nav.training.checkpoint import load
 from nav.training.onnx_conversion import import_onnx
-from nav.training.state import new_network
 from nav.training.training_settings import TrainingSettings
+from nav.training.training_state import load, new_network
 
 _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training's folder"
 

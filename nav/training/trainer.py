@@ -14,13 +14,11 @@ import torch
 
 from nav.detector.network.detection_loss import DetectionLoss, detection_loss
 from nav.training.batches import Batch, BatchMaker
-from nav.training.checkpoint import BEST_FILE, save
 from nav.training.corpus import Corpus
 from nav.training.evaluation import AveragePrecision, answer, average_precision, measure_batch_statistics, to_tensor
-from nav.training.precision import Computing
-from nav.training.state import TrainingState, save_state
 from nav.training.training_progress import VALIDATED, Curves, EpochRow, Observer, write_tables
 from nav.training.training_settings import SizePx, TrainingSettings
+from nav.training.training_state import BEST_FILE, Computing, TrainingState, save, save_state
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:

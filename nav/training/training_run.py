@@ -15,7 +15,6 @@ from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.storage import Location
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.network.network import DetectorNetwork
-from nav.training.checkpoint import BEST_FILE, load, remove_leftovers
 from nav.training.corpus import Corpus, open_corpus
 from nav.training.evaluation import (
     Answers,
@@ -26,14 +25,25 @@ from nav.training.evaluation import (
     measure_batch_statistics,
     statistics_batches,
 )
-from nav.training.moving_average import MovingAverage
 from nav.training.onnx_conversion import export_onnx, normalise_anew
-from nav.training.precision import Computing, open_computing, own_threads
 from nav.training.starting_weights import StartingWeights, settings_from_start, starting_network
-from nav.training.state import TrainingState, check_settings, new_network, new_state, restore_state
 from nav.training.trainer import Trainer
 from nav.training.training_progress import Observer
 from nav.training.training_settings import TrainingSettings
+from nav.training.training_state import (
+    BEST_FILE,
+    Computing,
+    MovingAverage,
+    TrainingState,
+    check_settings,
+    load,
+    new_network,
+    new_state,
+    open_computing,
+    own_threads,
+    remove_leftovers,
+    restore_state,
+)
 
 SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"
 _LOCK_FILE = ".lock"

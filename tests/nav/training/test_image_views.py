@@ -22,7 +22,7 @@ from nav.training.geometric_augmentation import (
     show,
     whole_view,
 )
-from nav.training.precision import Computing
+from nav.training.training_state import Computing
 
 SOURCE_WH = (160, 120)
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])

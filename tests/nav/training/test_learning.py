@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from nav.training.checkpoint import load, save
 from nav.training.corpus import Corpus
 from nav.training.evaluation import average_precision, best_threshold, measure_batch_statistics, to_tensor, whole_image
-from nav.training.moving_average import MovingAverage
-from nav.training.precision import Computing
-from nav.training.state import new_network
 from nav.training.trainer import learning_rate
 from nav.training.training_settings import TrainingSettings, build_settings, parse_size
+from nav.training.training_state import Computing, MovingAverage, load, new_network, save
 
 NONE = (np.zeros((0, 4)), np.zeros(0))
 BOX = np.array([[10.0, 10.0, 20.0, 20.0]])

@@ -18,11 +18,11 @@ from nav.detector.detector_registry import network_file
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
-from nav.training.checkpoint import save
 from nav.training.onnx_conversion import export_onnx, import_onnx, normalise_anew
 from nav.training.starting_weights import read_starting_weights
 from nav.training.training_run import check_before, train
 from nav.training.training_settings import build_settings
+from nav.training.training_state import save
 
 NETWORKS = [NetworkConfig("l", "eca", "asff"), NetworkConfig("s", "se", "concat")]
 

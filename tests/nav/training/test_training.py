@@ -21,14 +21,22 @@ import torch
 from droguekit.batch.progress import PlainProgress
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.training.checkpoint import BEST_FILE, CHECKPOINT_FILE, load
 from nav.training.corpus import open_corpus
 from nav.training.evaluation import answer, average_precision, measure_batch_statistics, to_tensor, whole_image
-from nav.training.precision import Computing, open_computing, own_threads
 from nav.training.starting_weights import read_starting_weights
-from nav.training.state import new_network, new_state, restore_state
 from nav.training.training_run import TrainingResult, check_before, train
 from nav.training.training_settings import build_settings
+from nav.training.training_state import (
+    BEST_FILE,
+    CHECKPOINT_FILE,
+    Computing,
+    load,
+    new_network,
+    new_state,
+    open_computing,
+    own_threads,
+    restore_state,
+)
 
 # One thread and float32: the same sums in the same order, whoever else uses the machine.
 SMALL = {

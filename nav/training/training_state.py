@@ -1,23 +1,146 @@
-"""Everything that changes while a training runs, and its way to disk and back."""
+"""Everything that changes while a training runs, on which device, and the checkpoint that it can be resumed from."""
 
 from __future__ import annotations
 
+import copy
+import io
 import math
-from collections.abc import Sequence
+import os
+import pickle
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from datasets_manifest.atomic import PART_SUFFIX, open_bytes_atomic
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
-from nav.training.checkpoint import CHECKPOINT_FILE, load, save
 from nav.training.corpus import DatasetStamp
-from nav.training.moving_average import MovingAverage
-from nav.training.precision import Computing
 from nav.training.training_progress import EpochRow
 from nav.training.training_settings import TrainingSettings, differing_settings
+
+CHECKPOINT_FILE, BEST_FILE = "checkpoint.pt", "best.pt"
+
+
+def save(path: Path, state: dict[str, Any]) -> None:
+    """Write or replace a file of tensors and plain values by one rename.
+
+    Raises:
+        OSError: it cannot be written; what was there before stays.
+    """
+    # torch's own writer reports a full disk as an internal error.
+    stream = io.BytesIO()
+    torch.save(state, stream)
+    with open_bytes_atomic(path) as file:
+        file.write(stream.getbuffer())
+
+
+def load(path: Path, advice: str = "delete it, or train into another folder") -> dict[str, Any] | None:
+    """What `save` wrote; None where there is no such file.
+
+    Args:
+        path: of the file.
+        advice: what to do about a file that is damaged.
+
+    Raises:
+        ValueError: truncated, or another kind of file; names it.
+    """
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        # Nothing but tensors and plain values is accepted: a file runs no code.
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path}: is truncated or no checkpoint; {advice}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{path}: is no checkpoint; {advice}")
+    return state
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what a killed training left half-written."""
+    for leftover in folder.glob(f".*{PART_SUFFIX}"):
+        if leftover.is_file():
+            leftover.unlink()
+
+
+_RAMP_STEPS = 10  # the average of the first n steps forgets about n/10 of them at a time
+
+
+class MovingAverage:
+    """Of weights; running means of batch normalization are measured for them, see `nav.training.evaluation`.
+
+    Attributes:
+        network: that has the averages; never trained.
+    """
+
+    def __init__(self, network: DetectorNetwork, decay: float) -> None:
+        self.network = copy.deepcopy(network).eval().requires_grad_(False)
+        self._decay = decay
+
+    @torch.no_grad()
+    def update(self, network: DetectorNetwork, step: int) -> None:
+        """Take in the weights after a step, counted from 0."""
+        decay = min(self._decay, (1 + step) / (_RAMP_STEPS + step))
+        averages: list[Tensor] = []
+        currents: list[Tensor] = []
+        for average, current in zip(self.network.state_dict().values(), network.state_dict().values(), strict=True):
+            if average.is_floating_point():
+                averages.append(average)
+                currents.append(current)
+            else:
+                average.copy_(current)
+        torch._foreach_lerp_(averages, currents, 1 - decay)
+
+
+@dataclass(frozen=True)
+class Computing:
+    """A device, and whether most of it is computed in bfloat16 there."""
+
+    device: torch.device
+    bf16: bool
+
+    def autocast(self) -> AbstractContextManager[object]:
+        """Within it a network computes as precisely as this says."""
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16)
+
+
+def open_computing(settings: TrainingSettings) -> Computing:
+    """The device that the settings name.
+
+    Raises:
+        ValueError: it is not there.
+    """
+    device = torch.device(settings.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device: torch sees no CUDA device here; take cpu, or install torch with CUDA")
+    if settings.precision != "auto":
+        return Computing(device, settings.precision == "bf16")
+    # Without such instructions bfloat16 is emulated and slower than float32.
+    has_bf16 = torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.cpu._is_avx512_bf16_supported()
+    return Computing(device, bool(has_bf16))
+
+
+@contextmanager
+def own_threads(threads: int) -> Iterator[None]:
+    """Compute with so many threads meanwhile, all cores that it may use by 0; images are prepared by others."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(threads or len(os.sched_getaffinity(0)))
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
+
 
 _VERSION = 1  # grows with every change of what stands in a checkpoint
 
