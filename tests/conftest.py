@@ -38,9 +38,9 @@ def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from droguekit.batch.progress import PlainProgress
     from droguekit.batch.render_dataset import render_dataset
 
-    recipe, text = load_recipe("smoke")
+    source = load_recipe("smoke")
     out = tmp_path_factory.mktemp("smoke") / "dataset"
     told = io.StringIO()
-    summary = render_dataset(recipe, text, out, range(recipe.frames.count), 2, PlainProgress(told))
+    summary = render_dataset(source, out, range(source.recipe.frames.count), 2, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     return out

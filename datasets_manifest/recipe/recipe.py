@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Self
@@ -236,21 +237,31 @@ class Recipe(FrozenModel):
         return self
 
 
+@dataclass(frozen=True)
+class RecipeSource:
+    """A recipe and the text that it was read from.
+
+    Attributes:
+        recipe: with every reference to presets and files resolved.
+        text: TOML as the user gave it; a dataset keeps it beside the resolved recipe.
+    """
+
+    recipe: Recipe
+    text: str
+
+
 def recipe_names() -> list[str]:
     """Names of the recipes that ship."""
     folder = files("datasets_manifest") / "recipes"
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def load_recipe(name_or_path: str, seed: int | None = None) -> tuple[Recipe, str]:
+def load_recipe(name_or_path: str, seed: int | None = None) -> RecipeSource:
     """A recipe by the name of a shipped one, or from a TOML file.
 
     Args:
         name_or_path: name, or path of a `.toml` file.
         seed: replaces the recipe's own.
-
-    Returns:
-        The recipe with all references resolved, and its text as given.
 
     Raises:
         ValueError: there is no such recipe, or keys are wrong; names each key.
@@ -270,7 +281,7 @@ def load_recipe(name_or_path: str, seed: int | None = None) -> tuple[Recipe, str
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"{path}: cannot be read: {error}") from error
     try:
-        return parse_recipe(text, base, seed), text
+        return RecipeSource(parse_recipe(text, base, seed), text)
     except ValueError as error:
         raise ValueError(f"recipe {name_or_path}: {error}") from error
 

@@ -29,7 +29,7 @@ _FEWEST_PROBES, _MOST_PROBES = 3, 12
 
 
 @dataclass(frozen=True)
-class ProbeOrder:
+class ProbeFrames:
     """Frames to make, in this order.
 
     Attributes:
@@ -61,7 +61,7 @@ class Probe:
     drops: tuple[Drop, ...]
 
 
-def choose_frames(drawn: DrawnFrames, count: int) -> ProbeOrder:
+def choose_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
     """One frame from each of several strata of distance, one without a drogue if there are any, and as many before.
 
     Nearest and farthest are counted. Within a stratum the family, and then the scene, that has had the fewest comes
@@ -81,7 +81,7 @@ def choose_frames(drawn: DrawnFrames, count: int) -> ProbeOrder:
     counted = _rarest(drawn, [*ends, empty])
     rest = [stratum[~np.isin(stratum, counted)] for stratum in strata]
     warm_up = _rarest(drawn, rest) or counted[:1]
-    return ProbeOrder(*(tuple(drawn.indices[place] for place in places) for places in (warm_up, counted)))
+    return ProbeFrames(*(tuple(drawn.indices[place] for place in places) for places in (warm_up, counted)))
 
 
 def _rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]:
@@ -98,7 +98,7 @@ def _rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]
     return chosen
 
 
-def probe(recipe: Recipe, order: ProbeOrder) -> Probe:
+def probe(recipe: Recipe, order: ProbeFrames) -> Probe:
     """Make frames in a temporary folder, in a process of their own with one thread, and throw them away.
 
     A frame that `render` would drop is one here.
@@ -110,7 +110,7 @@ def probe(recipe: Recipe, order: ProbeOrder) -> Probe:
     return run_alone(partial(_probe, recipe, order))
 
 
-def _probe(recipe: Recipe, order: ProbeOrder) -> Probe:
+def _probe(recipe: Recipe, order: ProbeFrames) -> Probe:
     drops = list[Drop]()
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         task = FrameTask(recipe, Path(folder))

@@ -1,13 +1,41 @@
-"""What this machine, or the share of it that a container or a job was given, can carry."""
+"""Who makes frames: worker processes of this machine, as many as it can carry, or a Dask scheduler."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 # A worker with the engine loaded and a 1280 x 960 pair in work stays below this.
 GIB_PER_WORKER = 1.5
 _GROUP = Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True)
+class ExecutionOptions:
+    """Who makes frames, and how long each may take.
+
+    Attributes:
+        workers: processes of this machine; 0 works in this process, for debugging; None is as many as the machine
+            can carry.
+        timeout_s: for one frame; None computes it from the recipe. [s]
+        scheduler: address of a Dask scheduler whose workers make the frames instead, or None.
+        pairs_per_tar: how many frames come into a tar file; None keeps what the dataset has, folders at first.
+    """
+
+    workers: int | None = None
+    timeout_s: float | None = None
+    scheduler: str | None = None
+    pairs_per_tar: int | None = None
+
+    def worker_count(self) -> int:
+        """`workers`, or the default of this machine where it is None."""
+        return default_workers() if self.workers is None else self.workers
+
+    def with_workers(self) -> Self:
+        """The same with the number of workers filled in."""
+        return replace(self, workers=self.worker_count())
 
 
 def available_cores(group: Path = _GROUP) -> int:

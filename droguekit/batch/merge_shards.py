@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage.layout import RECIPE_FILE
 from datasets_manifest.storage.manifest import Manifest, read_manifest
 from datasets_manifest.storage.packing import pack_if_complete, packing_of
@@ -45,8 +46,8 @@ def merge_shards(
     drops = [drop for other in manifests.values() for drop in other.drops if drop.frame_index not in sources]
     _complete(manifest.recipe.frames.count, {*sources, *(drop.frame_index for drop in drops)})
     datasets = {shard: Dataset(shard) for shard in shards}
-    recipe_text = open_storage(first).read(RECIPE_FILE).decode()
-    with open_dataset(out, manifest.recipe, recipe_text, pairs_per_tar) as stream:
+    source = RecipeSource(manifest.recipe, open_storage(first).read(RECIPE_FILE).decode())
+    with open_dataset(out, source, pairs_per_tar) as stream:
         events = Events(stream)
         whole = sort_frames(out, read_manifest(out)).whole
         events.write("merge", shards=[str(shard) for shard in shards], kept=len(whole))

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import Any, TextIO
 
 from datasets_manifest.calibration.calibration import write_calibration
-from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.release.card import write_card
 from datasets_manifest.release.croissant import write_croissant
 from datasets_manifest.storage.frame_store import frames_there
@@ -20,7 +20,7 @@ from datasets_manifest.storage.manifest import Drop, Manifest, build_manifest, m
 from datasets_manifest.storage.packing import packing_of
 from datasets_manifest.storage.storage import Location, join
 from droguekit.batch.cluster import LostWorkersError, run_on_cluster
-from droguekit.batch.execution import GIB_PER_WORKER, available_memory_gib
+from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, available_memory_gib
 from droguekit.batch.failure_policy import ERRORS_OF_THE_PLACE, FIRST_FRAMES, reason_of
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.progress import ProgressReport
@@ -31,23 +31,6 @@ from droguekit.batch.worker_pool import MAX_ATTEMPTS, Attempt, Limits, is_accide
 from labelgen.export.coco import write_annotations
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
-
-
-@dataclass(frozen=True)
-class Spread:
-    """By whom frames are made.
-
-    Attributes:
-        workers: processes of this machine; 0 works in this process, for debugging.
-        timeout_s: for one frame; None reckons it from the recipe. [s]
-        scheduler: address of a Dask scheduler whose workers make the frames instead, or None.
-        pairs_per_tar: how many frames come into a tar file; None leaves that as it is, folders at first.
-    """
-
-    workers: int
-    timeout_s: float | None = None
-    scheduler: str | None = None
-    pairs_per_tar: int | None = None
 
 
 @dataclass
@@ -94,14 +77,14 @@ class Events:
 
 
 def make_frames(
-    task: FrameTask, todo: Sequence[int], spread: Spread, report: ProgressReport, events: Events
+    task: FrameTask, todo: Sequence[int], options: ExecutionOptions, report: ProgressReport, events: Events
 ) -> tuple[Totals, list[Drop]]:
     """Make frames; those that cannot be made are dropped with their reason, and the others go on.
 
     Args:
         task: makes a frame.
         todo: indices of the frames, without repetition, in the order in which they begin.
-        spread: by whom.
+        options: who makes them.
         report: hears how it goes.
         events: are told of every attempt.
 
@@ -115,7 +98,7 @@ def make_frames(
         return totals, drops
     report.begin("pairs", len(todo))
     try:
-        with StopRequest(report.say) as stop, closing(_attempts(task, todo, spread, stop)) as attempts:
+        with StopRequest(report.say) as stop, closing(_attempts(task, todo, options, stop)) as attempts:
             for attempt in attempts:
                 _take(attempt, totals, drops, len(todo), report, events)
     finally:
@@ -164,12 +147,12 @@ def _state(retries: int, drops: int, workers_gib: float) -> str:
 
 
 def _attempts(
-    task: FrameTask, todo: Sequence[int], spread: Spread, stop: StopRequest
+    task: FrameTask, todo: Sequence[int], options: ExecutionOptions, stop: StopRequest
 ) -> Generator[Attempt[FrameReport], None, None]:
-    timeout_s = frame_timeout_s(task.recipe) if spread.timeout_s is None else spread.timeout_s
-    if spread.scheduler is not None:
-        return run_on_cluster(task, todo, spread.scheduler, timeout_s, stop)
-    workers = min(spread.workers, len(todo))
+    timeout_s = frame_timeout_s(task.recipe) if options.timeout_s is None else options.timeout_s
+    if options.scheduler is not None:
+        return run_on_cluster(task, todo, options.scheduler, timeout_s, stop)
+    workers = min(options.worker_count(), len(todo))
     share_gib = available_memory_gib() / max(workers, 1)
     limits = Limits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib))
     return run_tasks(task, todo, workers, limits, stop, task.pack)
@@ -218,7 +201,11 @@ class RunSummary:
 
 
 def render_dataset(
-    recipe: Recipe, recipe_text: str, out: Location, frames: Sequence[int], spread: int | Spread, report: ProgressReport
+    source: RecipeSource,
+    out: Location,
+    frames: Sequence[int],
+    options: int | ExecutionOptions,
+    report: ProgressReport,
 ) -> RunSummary:
     """Make the frames of a recipe that are not there yet, then describe the whole dataset.
 
@@ -226,11 +213,10 @@ def render_dataset(
     started again. A dataset of part of the frames is a valid one, which a later run completes.
 
     Args:
-        recipe: what to make.
-        recipe_text: the recipe as given, kept in the dataset.
+        source: the recipe; its text is kept in the dataset.
         out: where the dataset lies: a folder, or a URL that all who make frames can reach.
         frames: indices of the frames to make, in that order.
-        spread: by whom; a number is that many worker processes of this machine.
+        options: who makes them; a number is that many worker processes of this machine.
         report: hears how it goes.
 
     Raises:
@@ -238,10 +224,11 @@ def render_dataset(
         OSError: the folder cannot be written or the disk is full; finished frames stay.
         KeyboardInterrupt: it was told to stop; finished frames stay, and what describes the dataset is as before.
     """
+    recipe = source.recipe
     if len(set(frames)) != len(frames) or any(not 0 <= index < recipe.frames.count for index in frames):
         raise ValueError(f"frames: must be different indices from 0 to {recipe.frames.count - 1}")
-    spread = Spread(spread) if isinstance(spread, int) else spread
-    with open_dataset(out, recipe, recipe_text, spread.pairs_per_tar) as stream:
+    options = (ExecutionOptions(options) if isinstance(options, int) else options).with_workers()
+    with open_dataset(out, source, options.pairs_per_tar) as stream:
         events = Events(stream)
         manifest = read_manifest(out)
         present = len(frames_there(out))
@@ -253,11 +240,11 @@ def render_dataset(
             report.say(f"{kept} of {len(frames)} pairs are there already and whole")
         if there.damaged:
             report.say(f"{len(there.damaged)} pairs are damaged and made again: {_few(there.damaged)}")
-        events.write("start", frames=len(frames), kept=kept, damaged=there.damaged, **asdict(spread))
+        events.write("start", frames=len(frames), kept=kept, damaged=there.damaged, **asdict(options))
         packing = packing_of(out, frames if isinstance(frames, range) else range(recipe.frames.count))
         task = FrameTask(recipe, out, there.engine_version, packing)
         todo = list(dict.fromkeys([*(index for index in frames if index not in there.whole), *there.damaged]))
-        totals, dropped = make_frames(task, todo, spread, report, events)
+        totals, dropped = make_frames(task, todo, options, report, events)
         drops = still_missing([*manifest.drops, *dropped], out)
         if kept + len(totals.made) >= _MANY_PAIRS:
             report.say(f"writing manifest and annotations of {kept + len(totals.made)} pairs")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.locking import takes_lock
@@ -38,7 +38,7 @@ _OURS = {
 
 
 @contextmanager
-def open_dataset(out: Location, recipe: Recipe, recipe_text: str, pairs_per_tar: int | None = None) -> Iterator[TextIO]:
+def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None = None) -> Iterator[TextIO]:
     """A dataset, new or to be completed, that nobody else writes into meanwhile.
 
     Frames that a manifest does not vouch for are removed, and so is what killed runs left half-written. A folder that
@@ -49,8 +49,7 @@ def open_dataset(out: Location, recipe: Recipe, recipe_text: str, pairs_per_tar:
 
     Args:
         out: where it lies.
-        recipe: what it is made from.
-        recipe_text: the recipe as given.
+        source: the recipe that it is made from.
         pairs_per_tar: how many frames come into a tar file; None leaves that as it is.
 
     Yields:
@@ -64,7 +63,7 @@ def open_dataset(out: Location, recipe: Recipe, recipe_text: str, pairs_per_tar:
     folder = open_storage(out).path("")
     with _open_place(out) if folder is None else _open_folder(folder) as events:
         remove_leftovers(out)
-        _start(out, recipe, recipe_text)
+        _start(out, source)
         choose_packing(out, pairs_per_tar)
         mend_shards(out)
         yield events
@@ -127,9 +126,9 @@ def _lock(events: TextIO, out: Path) -> None:
         raise ValueError(f"{out}: another run is writing into it; wait for its end, or give another folder")
 
 
-def _start(out: Location, recipe: Recipe, recipe_text: str) -> None:
+def _start(out: Location, source: RecipeSource) -> None:
     """See that the place belongs to the recipe; a new one gets its manifest before its first frame."""
-    storage = open_storage(out)
+    storage, recipe = open_storage(out), source.recipe
     if storage.exists(layout.MANIFEST_FILE):
         manifest = read_manifest(out)
         differing = differing_keys(manifest.recipe.model_dump(mode="json"), recipe.model_dump(mode="json"))
@@ -147,7 +146,7 @@ def _start(out: Location, recipe: Recipe, recipe_text: str) -> None:
     for number in shard_numbers(storage):
         storage.delete(layout.shard_index_file(number))
         storage.delete(layout.shard_file(number))
-    storage.write(layout.RECIPE_FILE, recipe_text.encode())
+    storage.write(layout.RECIPE_FILE, source.text.encode())
     write_manifest(out, build_manifest(out, recipe, RENDER_VERSION, split_of_scenes(recipe)))
 
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from droguekit.batch.execution import ExecutionOptions
 from droguekit.workflows.benchmarking import benchmark_dataset
 from droguekit.workflows.navigation import navigate_dataset
-from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frames
+from droguekit.workflows.rendering import open_recipe, render_frames
 
 if TYPE_CHECKING:
     from droguekit.batch.progress import ProgressReport
@@ -33,10 +34,10 @@ def run_demo(recipe_name: str, out: Path, workers: int | None, report: ProgressR
         OSError: the folder cannot be written.
     """
     files = DemoFiles(out / "dataset", out / "estimates.jsonl", out / "benchmark.json", out / "report.html")
-    recipe, text = open_recipe(recipe_name, None, None)
-    count = recipe.frames.count
+    source = open_recipe(recipe_name, None, None)
+    count = source.recipe.frames.count
     report.say(f"1 of 3: rendering {count} stereo pairs into {files.dataset}")
-    summary = render_frames(recipe, text, files.dataset, range(count), RenderOrder(workers), report)
+    summary = render_frames(source, files.dataset, range(count), ExecutionOptions(workers), report)
     report.say("2 of 3: navigating on them, without the truth, by every method")
     navigate_dataset(files.dataset, (), files.estimates, report)
     report.say("3 of 3: comparing the estimates with the truth")

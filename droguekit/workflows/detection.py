@@ -73,7 +73,7 @@ def detect_dataset(
 
 
 @dataclass(frozen=True)
-class DetectionOrder:
+class DetectionOptions:
     """Which boxes to score, and how.
 
     Attributes:
@@ -90,7 +90,7 @@ class DetectionOrder:
 
 
 def benchmark_detections(
-    dataset: Location, order: DetectionOrder, json_out: Path | None, html_out: Path | None, report: ProgressReport
+    dataset: Location, options: DetectionOptions, json_out: Path | None, html_out: Path | None, report: ProgressReport
 ) -> DetectionResult:
     """Compare boxes with the truth, and write the numbers and the report where a place is given for them.
 
@@ -104,12 +104,12 @@ def benchmark_detections(
     from droguekit.benchmark.detection.detection_scores import split_to_score
     from droguekit.benchmark.detection.detection_truth import read_detection_truth
 
-    if order.threshold is not None and not 0 <= order.threshold <= 1:
-        raise ValueError(f"--threshold: must be from 0 to 1, got {order.threshold:g}")
+    if options.threshold is not None and not 0 <= options.threshold <= 1:
+        raise ValueError(f"--threshold: must be from 0 to 1, got {options.threshold:g}")
     truth = read_detection_truth(dataset)
     # Whatever is wrong is said before a detector looks at the first image.
-    split = split_to_score(truth.images, order.split)
-    scored = score_detections(truth, _runs(dataset, order, report), split, order.threshold)
+    split = split_to_score(truth.images, options.split)
+    scored = score_detections(truth, _runs(dataset, options, report), split, options.threshold)
     if json_out is not None:
         write_text_atomic(json_out, scored.result.to_json())
     if html_out is not None:
@@ -117,7 +117,7 @@ def benchmark_detections(
     return scored.result
 
 
-def _runs(dataset: Location, order: DetectionOrder, report: ProgressReport) -> dict[str, DetectorRun]:
+def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorRun]:
     """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
     from droguekit.benchmark.detection.detection_benchmark import DetectorRun
@@ -128,8 +128,8 @@ def _runs(dataset: Location, order: DetectionOrder, report: ProgressReport) -> d
 
     # Also of images that are not scored, for a detector answers for all.
     image_ids = frozenset(image_id_of(frame, eye) for frame in read_blind_index(dataset).frames for eye in EYES)
-    runs = [(file.stem, DetectorRun(read_detections(file, image_ids))) for file in order.files]
-    passes = [(name, DetectorPass(dataset, detector_factory(name))) for name in order.detectors]
+    runs = [(file.stem, DetectorRun(read_detections(file, image_ids))) for file in options.files]
+    passes = [(name, DetectorPass(dataset, detector_factory(name))) for name in options.detectors]
     names = [name for name, _ in runs] + [detecting.name for _, detecting in passes]
     for name in names:
         if names.count(name) > 1:

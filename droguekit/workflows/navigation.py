@@ -110,7 +110,7 @@ def _percentiles(times_s: list[float], count: int) -> Percentiles:
 
 
 @dataclass(frozen=True)
-class NavigationOrder:
+class NavigationOptions:
     """How to navigate.
 
     Attributes:
@@ -177,7 +177,7 @@ def navigate_dataset(
     methods: Sequence[str],
     out: Path,
     report: ProgressReport,
-    order: NavigationOrder | None = None,
+    options: NavigationOptions | None = None,
 ) -> Navigated:
     """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
 
@@ -192,11 +192,11 @@ def navigate_dataset(
     from droguekit.numerical_threads import one_thread
     from nav.runner import with_smoothed
 
-    order = NavigationOrder() if order is None else order
-    settings = _settings(methods, order)
-    _check_places(out, order.latency_out)
+    options = NavigationOptions() if options is None else options
+    settings = _settings(methods, options)
+    _check_places(out, options.latency_out)
     blind = BlindDataset(dataset)
-    tally = None if order.rate_hz is None else LatencyTally(order.rate_hz)
+    tally = None if options.rate_hz is None else LatencyTally(options.rate_hz)
     fixes: Counter[str] = Counter()
 
     def counted(answers: Iterable[PairAnswers | LatePair]) -> Iterator[Estimate]:
@@ -204,10 +204,10 @@ def navigate_dataset(
             fixes[estimate.method] += estimate.status == "fix"
             yield estimate
 
-    opened = _answers(blind, settings, order)
+    opened = _answers(blind, settings, options)
     # Whatever stops the writing ends the threads that answers come from.
     with one_thread(), closing(opened) as answers:
-        for file in filter(None, (out, order.latency_out)):
+        for file in filter(None, (out, options.latency_out)):
             file.parent.mkdir(parents=True, exist_ok=True)
         report.begin("pairs", len(blind.frame_indices))
         try:
@@ -215,8 +215,8 @@ def navigate_dataset(
         finally:
             report.end()
     latency = None if tally is None else tally.report()
-    if latency is not None and order.latency_out is not None:
-        write_text_atomic(order.latency_out, latency.to_json())
+    if latency is not None and options.latency_out is not None:
+        write_text_atomic(options.latency_out, latency.to_json())
     return Navigated([Fixes(name, fixes[name], len(blind.frame_indices)) for name in settings.names], latency)
 
 
@@ -233,37 +233,37 @@ def _check_places(out: Path, latency_out: Path | None) -> None:
         raise ValueError(f"--latency: must be another file than --out, got {latency_out}")
 
 
-def _settings(methods: Sequence[str], order: NavigationOrder) -> SequenceSettings:
+def _settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSettings:
     from nav.runner import CENTROID_CHOICES, method_names
     from nav.sequence_navigator import SequenceSettings
     from nav.tracking.continuity import REDETECT_EVERY
 
-    choice = next((name for name in CENTROID_CHOICES if name == order.centroids), None)
+    choice = next((name for name in CENTROID_CHOICES if name == options.centroids), None)
     if choice is None:
-        raise ValueError(f"--centroids: must be one of {', '.join(CENTROID_CHOICES)}, got {order.centroids!r}")
+        raise ValueError(f"--centroids: must be one of {', '.join(CENTROID_CHOICES)}, got {options.centroids!r}")
     return SequenceSettings(
         methods=tuple(dict.fromkeys(methods)) or method_names(),
         centroids=choice,
-        tracker=order.tracker,
-        redetect_every=REDETECT_EVERY if order.redetect_every is None else order.redetect_every,
-        filtered=order.filtered,
-        smoothed=order.smoothed,
-        capture_radius_m=order.capture_radius_m,
+        tracker=options.tracker,
+        redetect_every=REDETECT_EVERY if options.redetect_every is None else options.redetect_every,
+        filtered=options.filtered,
+        smoothed=options.smoothed,
+        capture_radius_m=options.capture_radius_m,
     )
 
 
 def _answers(
-    blind: BlindDataset, settings: SequenceSettings, order: NavigationOrder
+    blind: BlindDataset, settings: SequenceSettings, options: NavigationOptions
 ) -> Generator[PairAnswers | LatePair]:
     """Answers to all pairs, as fast as can be or as they come."""
     from nav.detector.detector_registry import DEFAULT_DETECTOR
     from nav.realtime.pipeline import MonotonicClock, play
     from nav.runner import answers_of, open_navigator
 
-    navigator = open_navigator(settings, DEFAULT_DETECTOR if order.detector is None else order.detector)
-    if order.rate_hz is None:
+    navigator = open_navigator(settings, DEFAULT_DETECTOR if options.detector is None else options.detector)
+    if options.rate_hz is None:
         return answers_of(blind, navigator)
-    return play(blind, navigator, order.rate_hz, MonotonicClock())
+    return play(blind, navigator, options.rate_hz, MonotonicClock())
 
 
 def _told(

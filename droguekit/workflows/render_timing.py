@@ -58,7 +58,7 @@ def open_uniform_bench_recipe(pairs: int, quality: str, engine: str | None) -> R
 def _bench_recipe(frames: dict[str, int], distance: dict[str, object], quality: str, engine: str | None) -> Recipe:
     from datasets_manifest.recipe.recipe import Recipe
 
-    demo, _ = open_recipe("demo", None, engine)
+    demo = open_recipe("demo", None, engine).recipe
     changes = {
         "frames": frames,
         "distance": distance,

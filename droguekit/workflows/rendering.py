@@ -10,30 +10,31 @@ import signal
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from datasets_manifest.recipe.recipe import Recipe
+    from datasets_manifest.recipe.recipe import RecipeSource
     from datasets_manifest.storage.storage import Location
+    from droguekit.batch.execution import ExecutionOptions
     from droguekit.batch.progress import ProgressReport
     from droguekit.batch.render_dataset import RunSummary
 
 
-def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tuple[Recipe, str]:
-    """A recipe and its text as given, with seed and engine replaced where they are not None.
+def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> RecipeSource:
+    """A recipe with its text, its seed and engine replaced where they are not None.
 
     Raises:
         ValueError: no such recipe, wrong keys, or no such engine.
     """
     from pydantic import ValidationError
 
-    from datasets_manifest.recipe.recipe import Recipe, load_recipe
+    from datasets_manifest.recipe.recipe import Recipe, RecipeSource, load_recipe
     from drogue_models.presets import explain
     from render.engine import EngineUnavailableError, engine_names
 
-    recipe, text = load_recipe(name_or_path, seed)
+    source = load_recipe(name_or_path, seed)
+    recipe = source.recipe
     if engine is not None:
         settings = recipe.render.model_copy(update={"engine": engine})
         try:
@@ -45,28 +46,11 @@ def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> tupl
         raise EngineUnavailableError(
             f"engine: no engine named {recipe.render.engine!r}; there are {', '.join(engine_names())}"
         )
-    return recipe, text
-
-
-@dataclass(frozen=True)
-class RenderOrder:
-    """Who makes frames, and how long each may take.
-
-    Attributes:
-        workers: processes of this machine, as many as it holds when None.
-        timeout_s: for one frame, by the recipe when None. [s]
-        scheduler: address of a Dask scheduler whose workers do it instead, or None.
-        pairs_per_tar: how many frames come into a tar file; None leaves that as it is, folders at first.
-    """
-
-    workers: int | None = None
-    timeout_s: float | None = None
-    scheduler: str | None = None
-    pairs_per_tar: int | None = None
+    return RecipeSource(recipe, source.text)
 
 
 def render_frames(
-    recipe: Recipe, text: str, out: Location, frames: Sequence[int], order: RenderOrder, report: ProgressReport
+    source: RecipeSource, out: Location, frames: Sequence[int], options: ExecutionOptions, report: ProgressReport
 ) -> RunSummary:
     """Make frames of a recipe into a dataset.
 
@@ -75,24 +59,21 @@ def render_frames(
         OSError: the folder cannot be written or the disk is full; finished frames stay.
     """
     with interrupts_wait():
-        from droguekit.batch.execution import default_workers
-        from droguekit.batch.render_dataset import Spread, render_dataset
+        from droguekit.batch.render_dataset import render_dataset
         from render.engine import engine_notice
 
-    workers = default_workers() if order.workers is None else order.workers
-    if workers < 0:
-        raise ValueError(f"workers: must not be negative, got {workers}")
-    if order.timeout_s is not None and not order.timeout_s > 0:
-        raise ValueError(f"--timeout: must be above 0 s, got {order.timeout_s:g}")
-    if order.scheduler is not None and order.workers is not None:
+    if options.workers is not None and options.workers < 0:
+        raise ValueError(f"workers: must not be negative, got {options.workers}")
+    if options.timeout_s is not None and not options.timeout_s > 0:
+        raise ValueError(f"--timeout: must be above 0 s, got {options.timeout_s:g}")
+    if options.scheduler is not None and options.workers is not None:
         raise ValueError("--workers: means processes of this machine; with --scheduler leave it out")
-    if str(out).startswith("memory:") and workers != 0:
+    if str(out).startswith("memory:") and options.worker_count() != 0:
         raise ValueError(f"--out: {out} is the memory of one process; give --workers 0, or another place")
-    notice = engine_notice(recipe.render.engine)
+    notice = engine_notice(source.recipe.render.engine)
     if notice is not None:
         report.say(notice)
-    spread = Spread(workers, order.timeout_s, order.scheduler, order.pairs_per_tar)
-    return render_dataset(recipe, text, out, frames, spread, report)
+    return render_dataset(source, out, frames, options, report)
 
 
 @contextmanager

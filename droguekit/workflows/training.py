@@ -1,4 +1,4 @@
-"""From recipes and datasets to a trained detector: the part of `droguekit.workflows.datasets` that needs torch."""
+"""From recipes and datasets to a trained detector; needs torch."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import os
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage.storage import Location, as_location
-from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frames
+from droguekit.batch.execution import ExecutionOptions
+from droguekit.workflows.rendering import open_recipe, render_frames
 
 if TYPE_CHECKING:
-    from datasets_manifest.recipe.recipe import Recipe
     from droguekit.batch.progress import ProgressReport
     from nav.training.training_run import TrainingResult
 
@@ -20,7 +21,7 @@ _NEEDED = ("torch", "onnx", "onnxscript", "tensorboard")
 
 
 @dataclass(frozen=True)
-class TrainingOrder:
+class TrainingOptions:
     """What a detector is trained on, and how.
 
     Attributes:
@@ -43,29 +44,24 @@ class TrainingOrder:
     workers: int | None
 
 
-class _Recipe(NamedTuple):
-    recipe: Recipe
-    text: str
-
-
-def _find(source: str) -> Location | _Recipe:
+def _find(source: str) -> Location | RecipeSource:
     location = as_location(source)
     if isinstance(location, str) or location.is_dir():
         return location
-    return _Recipe(*open_recipe(source, None, None))
+    return open_recipe(source, None, None)
 
 
-def _render(source: _Recipe, out: Path, workers: int | None, report: ProgressReport) -> Path:
+def _render(source: RecipeSource, out: Path, workers: int | None, report: ProgressReport) -> Path:
     """Make the pairs that are not there yet; the dataset's folder."""
     recipe, place = source.recipe, out / "datasets" / source.recipe.name
     report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {place}")
-    summary = render_frames(recipe, source.text, place, range(recipe.frames.count), RenderOrder(workers), report)
+    summary = render_frames(source, place, range(recipe.frames.count), ExecutionOptions(workers), report)
     for drop in summary.drops:
         report.say(f"{place}: frame {drop.frame_index} is missing: {drop.reason}")
     return place
 
 
-def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> TrainingResult:
+def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) -> TrainingResult:
     """Render what is missing, train, evaluate and export.
 
     Raises:
@@ -76,7 +72,7 @@ def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> T
     from droguekit.batch.stop_request import StopRequest
     from nav.training.training_settings import build_settings, parse_size
 
-    sizes = {"size_px": order.size, "final_size_px": order.final_size}
+    sizes = {"size_px": options.size, "final_size_px": options.final_size}
     parsed = {name: parse_size(text) for name, text in sizes.items() if text is not None}
     missing = [name for name in _NEEDED if find_spec(name) is None]
     if missing:
@@ -85,16 +81,18 @@ def train_detector(order: TrainingOrder, out: Path, report: ProgressReport) -> T
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from nav.training.starting_weights import read_starting_weights
 
-    start = None if order.start_from is None else read_starting_weights(order.start_from)
+    start = None if options.start_from is None else read_starting_weights(options.start_from)
     network = None if start is None or start.network is None else start.network.to_dict()
-    settings = build_settings(order.settings_file, {**order.changes, **parsed}, network)
-    found = [_find(source) for source in order.sources]
+    settings = build_settings(options.settings_file, {**options.changes, **parsed}, network)
+    found = [_find(source) for source in options.sources]
     from nav.training.training_run import check_before, train
 
     # Rendering takes hours: what would stop the training afterwards is looked for first.
-    if not any(not isinstance(each, _Recipe) or each.recipe.split.train > 0 for each in found):
-        raise ValueError(f"{order.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
+    if not any(not isinstance(each, RecipeSource) or each.recipe.split.train > 0 for each in found):
+        raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
     check_before(out, settings, start)
-    datasets = [_render(each, out, order.workers, report) if isinstance(each, _Recipe) else each for each in found]
+    datasets = [
+        _render(each, out, options.workers, report) if isinstance(each, RecipeSource) else each for each in found
+    ]
     with StopRequest(report.say) as stop:
-        return train(datasets, out, settings, report, order.cache, lambda: stop.is_requested, start)
+        return train(datasets, out, settings, report, options.cache, lambda: stop.is_requested, start)

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from datasets_manifest.recipe.recipe import RecipeSource
+from droguekit.batch.execution import ExecutionOptions
 from droguekit.workflows.benchmarking import benchmark_dataset
-from droguekit.workflows.navigation import NavigationOrder, navigate_dataset
-from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frames
+from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
+from droguekit.workflows.rendering import open_recipe, render_frames
 
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe
@@ -106,14 +108,12 @@ class PlannedData:
     """One dataset that is to be made, from an order that was checked.
 
     Attributes:
-        recipe: what to make.
-        text: of the recipe, as given.
+        source: the recipe.
         count: its first so many pairs.
         names: of engine, recipe or light, and rig, as far as they are told apart: folder and title.
     """
 
-    recipe: Recipe
-    text: str
+    source: RecipeSource
     count: int
     names: tuple[str, ...]
 
@@ -133,7 +133,7 @@ def image_bars(order: BarsOrder, out: Path, report: ProgressReport) -> list[BarR
     for light, plan in plans:
         folder = out.joinpath(*plan.names)
         sha256 = _render(plan, folder, order, report)
-        estimates = _navigated(folder, "estimates", sha256, METHODS, NavigationOrder(), report)
+        estimates = _navigated(folder, "estimates", sha256, METHODS, NavigationOptions(), report)
         result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
         measured = IMAGE_TIERS[order.tier](TierData(light, folder / "dataset", estimates, result))
         by_engine = "".join(f"{name}, " for name in plan.names[:-1])
@@ -152,14 +152,15 @@ def plan_images(order: BarsOrder) -> list[tuple[Literal["day", "dusk"], PlannedD
     plans = []
     for engine in order.engines or (None,):
         for light in order.lights:
-            recipe, text = open_recipe(recipe_of(order.tier, light), order.seed, engine)
+            source = open_recipe(recipe_of(order.tier, light), order.seed, engine)
+            recipe = source.recipe
             stations = len(recipe.distance.stations_m or ())
             most = recipe.frames.count // stations
             pairs = most if order.pairs_per_station is None else order.pairs_per_station
             if not 1 <= pairs <= most:
                 raise ValueError(f"--pairs-per-station: must be from 1 to {most}, got {pairs}")
             names = (light,) if engine is None else (engine, light)
-            plans.append((light, PlannedData(recipe, text, stations * pairs, names)))
+            plans.append((light, PlannedData(source, stations * pairs, names)))
     return plans
 
 
@@ -167,8 +168,8 @@ def _timed_pairs(order: BarsOrder, out: Path, report: ProgressReport) -> Path:
     """A dataset of analytic pairs by day at every distance."""
     from studies.acceptance.rendered.image_tiers import recipe_of
 
-    recipe, text = open_recipe(recipe_of("a", "day"), order.seed, None)
-    plan = PlannedData(recipe, text, _TIMED_PAIRS * len(recipe.distance.stations_m or ()), ())
+    source = open_recipe(recipe_of("a", "day"), order.seed, None)
+    plan = PlannedData(source, _TIMED_PAIRS * len(source.recipe.distance.stations_m or ()), ())
     _render(plan, out, order, report)
     return out / "dataset"
 
@@ -211,11 +212,12 @@ def plan_flights(order: BarsOrder, data: Sequence[FlightData]) -> list[tuple[Fli
             continue
         parts = each.parts if flights.sequences is None else flights.sequences
         for engine in order.engines or (None,):
-            recipe, text = open_recipe(each.recipe, order.seed, engine)
-            recipe = with_parts(recipe, max(each.parts, parts))
+            source = open_recipe(each.recipe, order.seed, engine)
+            recipe = with_parts(source.recipe, max(each.parts, parts))
             for rig in flights.rigs if each.follows else (DEFAULT_RIG,):
                 made = recipe.render.engine, recipe.name, *([] if rig == DEFAULT_RIG else [rig])
-                plans.append((each, PlannedData(_with_rig(recipe, rig), text, parts * part_length(recipe), made)))
+                seen = RecipeSource(_with_rig(recipe, rig), source.text)
+                plans.append((each, PlannedData(seen, parts * part_length(recipe), made)))
     return plans
 
 
@@ -232,7 +234,7 @@ def _flight_rows(
 
     title, folder, is_beside = ", ".join(plan.names), out.joinpath(*plan.names), len(plan.names) > _NAMES_OF_BARS
     sha256 = _render(plan, folder, order, report)
-    tracked = NavigationOrder(tracker=order.flights.tracker, filtered=True) if data.follows else NavigationOrder()
+    tracked = NavigationOptions(tracker=order.flights.tracker, filtered=True) if data.follows else NavigationOptions()
     estimates = _navigated(folder, "estimates", sha256, METHODS, tracked, report)
     result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
     scores = score_pairs(folder / "dataset", estimates)
@@ -244,11 +246,11 @@ def _flight_rows(
     untracked = f"{title}, detector at every pair"
     if data.times:
         rows += speed_rows(f"{title}, {order.flights.tracker}", scores[FILTERED], is_beside)
-        alone = _navigated(folder, "detector-alone", sha256, (BEST,), NavigationOrder(filtered=True), report)
+        alone = _navigated(folder, "detector-alone", sha256, (BEST,), NavigationOptions(filtered=True), report)
         rows += speed_rows(untracked, score_pairs(folder / "dataset", alone)[FILTERED], True)
     if data.compares:
         # Apart, so that the time of many methods is in that of no pair above.
-        all_methods = _navigated(folder, "all-methods", sha256, method_names(), NavigationOrder(), report)
+        all_methods = _navigated(folder, "all-methods", sha256, method_names(), NavigationOptions(), report)
         rows += data.rows(untracked, score_pairs(folder / "dataset", all_methods), True)
     return rows
 
@@ -261,7 +263,7 @@ def _check_engines(plans: Sequence[PlannedData]) -> None:
     """
     from render.engine import load_engine
 
-    for name in dict.fromkeys(plan.recipe.render.engine for plan in plans):
+    for name in dict.fromkeys(plan.source.recipe.render.engine for plan in plans):
         load_engine(name)
 
 
@@ -297,8 +299,8 @@ def _render(plan: PlannedData, folder: Path, order: BarsOrder, report: ProgressR
         ValueError: pairs could not be made; without them bars would look better than they are.
     """
     dataset = folder / "dataset"
-    report.say(f"{folder.name}: rendering {plan.count} pairs of {plan.recipe.name} into {dataset}")
-    made = render_frames(plan.recipe, plan.text, dataset, range(plan.count), RenderOrder(order.workers), report)
+    report.say(f"{folder.name}: rendering {plan.count} pairs of {plan.source.recipe.name} into {dataset}")
+    made = render_frames(plan.source, dataset, range(plan.count), ExecutionOptions(order.workers), report)
     if made.drops:
         first = min(made.drops, key=lambda drop: drop.frame_index)
         raise ValueError(
@@ -309,7 +311,7 @@ def _render(plan: PlannedData, folder: Path, order: BarsOrder, report: ProgressR
 
 
 def _navigated(
-    folder: Path, name: str, sha256: str, methods: Sequence[str], how: NavigationOrder, report: ProgressReport
+    folder: Path, name: str, sha256: str, methods: Sequence[str], how: NavigationOptions, report: ProgressReport
 ) -> Path:
     """Estimates of a folder's dataset, made unless they are there already; what they were made with counts."""
     from studies.acceptance.rendered.finished_estimates import is_navigated, mark_navigated

@@ -200,7 +200,7 @@ def plate_frame(samples: int, tilt_deg: tuple[float, float]) -> tuple[FrameSpec,
 
 
 def _plate_recipe(samples: int) -> Recipe:
-    recipe, _ = load_recipe("smoke")
+    recipe = load_recipe("smoke").recipe
     changes = {
         "distance": {"law": "stations", "stations_m": (4.0,)},
         "render": {**recipe.render.model_dump(), "samples_per_px": samples, "surround_samples_per_px": 4},

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t
 
-from datasets_manifest.recipe.recipe import Recipe, load_recipe
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource, load_recipe
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import PoseEstimate, write_estimates
@@ -178,27 +178,27 @@ class PairedDatasets:
     other: Path
 
 
-def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> tuple[Recipe, str]:
-    """What is rendered at one distance, and the text that it comes from.
+def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> RecipeSource:
+    """What is rendered at one distance.
 
     Every pixel of the drogue gets as many samples by either engine: where one of them spent more on the markers' edges,
     its poses would err less for that alone.
     """
-    recipe, text = load_recipe(RECIPE, seed)
+    source = load_recipe(RECIPE, seed)
     side = 2 * round(np.sqrt(_SAMPLES_AT_5_M) * distance_m / 5.0 / 2)
     samples = int(np.clip(side**2, 4, _MOST_SAMPLES))
     changes = {
         "frames": {"count": pairs, "scenes": pairs},
         "distance": {"law": "stations", "stations_m": (distance_m,)},
         "render": {
-            **recipe.render.model_dump(),
+            **source.recipe.render.model_dump(),
             "engine": engine,
             "samples_per_px": samples,
             "open_samples_per_px": samples,
             "edge_samples_per_px": samples,
         },
     }
-    return Recipe.model_validate({**recipe.model_dump(), **changes}), text
+    return RecipeSource(Recipe.model_validate({**source.recipe.model_dump(), **changes}), source.text)
 
 
 def pairs_by_station(stations_m: Sequence[float], pairs: int) -> dict[float, int]:
@@ -218,10 +218,12 @@ def render_paired(
     """
     folders = []
     for engine in engines:
-        recipe, text = station_recipe(engine, station_m, pairs, seed)
+        source = station_recipe(engine, station_m, pairs, seed)
         folder = out / engine / f"{station_m:g}m"
-        report.say(f"navigation at {station_m:g} m: {pairs} pairs by {engine}, {recipe.render.samples_per_px} samples")
-        summary = render_dataset(recipe, text, folder, range(pairs), 1, report)
+        report.say(
+            f"navigation at {station_m:g} m: {pairs} pairs by {engine}, {source.recipe.render.samples_per_px} samples"
+        )
+        summary = render_dataset(source, folder, range(pairs), 1, report)
         if summary.drops:
             raise ValueError(f"{folder}: {len(summary.drops)} frames could not be made: {summary.drops[0].reason}")
         folders.append(folder)

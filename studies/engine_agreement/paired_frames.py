@@ -68,8 +68,8 @@ def recipe_of_family(name: str, seed: int) -> Recipe:
     """
     head, _, tail = name.rpartition("/")
     if head not in recipe_names() and not Path(head).is_file():
-        return load_recipe(name, seed)[0]
-    recipe, _ = load_recipe(head, seed)
+        return load_recipe(name, seed).recipe
+    recipe = load_recipe(head, seed).recipe
     chosen = tuple(family for family in recipe.families if family.name == tail)
     if not chosen:
         known = ", ".join(family.name for family in recipe.families) or "none"

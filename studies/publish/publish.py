@@ -47,9 +47,9 @@ def publish(name: str, pairs: int | None, work: Path, out: Path, report: Progres
     dataset = work / name
     if dataset.exists():
         raise ValueError(f"{dataset}: is there already; what is published is made anew, so delete it first")
-    recipe, text = load_recipe(name)
-    count = recipe.frames.count if pairs is None else pairs
-    render_dataset(recipe, text, dataset, range(count), default_workers(), report)
+    source = load_recipe(name)
+    count = source.recipe.frames.count if pairs is None else pairs
+    render_dataset(source, dataset, range(count), default_workers(), report)
     path = out / f"{name}.json"
     write_text_atomic(path, publication_text(build_publication(dataset)))
     return path

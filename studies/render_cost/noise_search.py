@@ -147,7 +147,7 @@ class View:
 
 def recipe_at(distance_m: float, seed: int) -> Recipe:
     """The recipe with every drogue at one distance. [m]"""
-    recipe, _ = load_recipe(_RECIPE, seed)
+    recipe = load_recipe(_RECIPE, seed).recipe
     changes = {
         "frames": {"count": SCENES, "scenes": SCENES, "empty_fraction": 0.0},
         "distance": {"law": "stations", "stations_m": (distance_m,)},

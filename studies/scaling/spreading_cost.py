@@ -20,10 +20,10 @@ from typing import Any
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage.layout import EVENTS_FILE
-from droguekit.batch.execution import resident_gib
+from droguekit.batch.execution import ExecutionOptions, resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.progress import ProgressReport
-from droguekit.batch.render_dataset import Events, Spread, make_frames
+from droguekit.batch.render_dataset import Events, make_frames
 
 EMPTY_RECIPE = """
 name = "empty"
@@ -108,7 +108,7 @@ def local_cost(folder: Path, frames: int, workers: int, report: ProgressReport) 
         OSError: processes cannot be started.
     """
     before_s = children_cpu_s()
-    cost = _run(folder, frames, Spread(workers), report)
+    cost = _run(folder, frames, ExecutionOptions(workers), report)
     cost["cpu_ms"]["workers"] = 1000 * (children_cpu_s() - before_s) / frames
     return cost
 
@@ -130,7 +130,7 @@ def dask_cost(folder: Path, frames: int, workers: int, report: ProgressReport) -
     """
     with _dask(workers) as (address, scheduler, crew):
         before_s = _cpu_s(scheduler), sum(map(_cpu_s, crew))
-        cost = _run(folder, frames, Spread(0, scheduler=address), report)
+        cost = _run(folder, frames, ExecutionOptions(0, scheduler=address), report)
         after_s = _cpu_s(scheduler), sum(map(_cpu_s, crew))
     for name, before, after in zip(("scheduler", "workers"), before_s, after_s, strict=True):
         cost["cpu_ms"][name] = 1000 * (after - before) / frames
@@ -143,14 +143,14 @@ def children_cpu_s() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def _run(folder: Path, frames: int, spread: Spread, report: ProgressReport) -> dict[str, Any]:
+def _run(folder: Path, frames: int, options: ExecutionOptions, report: ProgressReport) -> dict[str, Any]:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     task = EmptyFrameTask(parse_recipe(EMPTY_RECIPE.format(count=frames)), folder)
     samples = MemorySamples(report, max(1, frames // _SAMPLES))
     began_s, began_cpu_s = time.monotonic(), time.process_time()
     with (folder / EVENTS_FILE).open("a", encoding="utf-8") as stream:
-        make_frames(task, range(frames), spread, samples, Events(stream))
+        make_frames(task, range(frames), options, samples, Events(stream))
     cpu_ms = {"client": 1000 * (time.process_time() - began_cpu_s) / frames}
     wall_ms = 1000 * (time.monotonic() - began_s) / frames
     return {"cpu_ms": cpu_ms, "wall_ms": wall_ms, "client_mib": samples.client_mib}

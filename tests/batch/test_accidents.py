@@ -19,7 +19,8 @@ import pytest
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
-from droguekit.batch.render_dataset import RunSummary, Spread
+from droguekit.batch.execution import ExecutionOptions
+from droguekit.batch.render_dataset import RunSummary
 from droguekit.cli.main import INTERRUPTED
 
 Make = Callable[..., RunSummary]
@@ -68,7 +69,7 @@ def test_a_frame_that_hangs_is_stopped_and_tried_again(
 ) -> None:
     marks = troubled(hang_once=[1])
     told, out = io.StringIO(), tmp_path / "out"
-    summary = make(out, [1], Spread(1, timeout_s=60.0), quick_recipe, told)
+    summary = make(out, [1], ExecutionOptions(1, timeout_s=60.0), quick_recipe, told)
     assert (marks / "hang-1").exists()
     assert "frame 1: it was still at work after 60 s and was stopped, attempt 1 of 3; it is tried" in told.getvalue()
     # The frame takes about 50 ms; where a crowded machine gives all its attempts too little time, it is made later.

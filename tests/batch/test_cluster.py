@@ -13,11 +13,13 @@ from pathlib import Path
 
 import pytest
 
+from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
 from droguekit.batch import cluster
 from droguekit.batch.cluster import Build, ClusterTask, build_here
+from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.frame_task import FrameTask, OtherBuildError
-from droguekit.batch.render_dataset import RunSummary, Spread
+from droguekit.batch.render_dataset import RunSummary
 from droguekit.cli.main import WRONG_INPUT, run
 
 distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
@@ -101,7 +103,9 @@ def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
 
     report = OnFrame(3, change_the_crew)
     out = tmp_path / "out"
-    summary = render_dataset(parse_recipe(text), text, out, range(24), Spread(0, scheduler=scheduler), report)
+    summary = render_dataset(
+        RecipeSource(parse_recipe(text), text), out, range(24), ExecutionOptions(0, scheduler=scheduler), report
+    )
     assert summary.drops == ()
     assert hashes(out) == hashes(tmp_path / "calm")
     lines = [json.loads(line) for line in (out / layout.EVENTS_FILE).read_text().splitlines()]
@@ -121,7 +125,9 @@ def test_a_request_to_stop_finishes_the_frames_in_hand(
     report = OnFrame(2, lambda: os.kill(os.getpid(), signal.SIGINT))
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
-        render_dataset(parse_recipe(text), text, out, range(24), Spread(0, scheduler=scheduler), report)
+        render_dataset(
+            RecipeSource(parse_recipe(text), text), out, range(24), ExecutionOptions(0, scheduler=scheduler), report
+        )
     made = len(layout.frame_indices(out))
     # Two were finished, and at most two more were with the one worker.
     assert 2 <= made <= 4
@@ -145,7 +151,7 @@ def test_a_frame_that_ends_every_worker_takes_none_with_it(
     monkeypatch.setattr(cluster, "ALLOWED_FAILURES", 0)
     worker(start, scheduler, "--nanny")
     out, told = tmp_path / "out", io.StringIO()
-    summary = make(out, [1, 2, 3, 4], Spread(0, scheduler=scheduler), quick_recipe, told)
+    summary = make(out, [1, 2, 3, 4], ExecutionOptions(0, scheduler=scheduler), quick_recipe, told)
     reason = "3 Dask workers died or ran out of time with it alone"
     assert [(drop.frame_index, drop.reason) for drop in summary.drops] == [(2, reason)], told.getvalue()
     assert sorted(summary.totals.made) == [1, 3, 4]
@@ -170,7 +176,7 @@ def test_a_frame_that_hangs_ends_its_worker_and_is_made_by_the_next(
     worker(start, scheduler, "--nanny")
     out = tmp_path / "out"
     # The frame takes about 50 ms; where a crowded machine gives all its attempts too little time, it is made later.
-    summary = make(out, [1], Spread(0, timeout_s=60.0, scheduler=scheduler), quick_recipe)
+    summary = make(out, [1], ExecutionOptions(0, timeout_s=60.0, scheduler=scheduler), quick_recipe)
     assert (marks / "hang-1").exists()
     assert summary.totals.made == [1] or [drop.frame_index for drop in summary.drops] == [1]
     assert make(out, [1], text=quick_recipe).pairs == 1
@@ -212,7 +218,9 @@ def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
         scheduler_options={"dashboard": False, "dashboard_address": ":0"},
     ) as cluster:
         cluster.scale(jobs=2)
-        summary = make(tmp_path / "out", workers=Spread(0, scheduler=cluster.scheduler_address), text=analytic_recipe)
+        summary = make(
+            tmp_path / "out", workers=ExecutionOptions(0, scheduler=cluster.scheduler_address), text=analytic_recipe
+        )
     assert len((tmp_path / "started").read_text().split()) >= 1
     assert summary.drops == ()
     assert hashes(tmp_path / "out") == hashes(analytic_dataset)

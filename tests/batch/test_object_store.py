@@ -17,14 +17,15 @@ import pytest
 from moto.server import ThreadedMotoServer
 from s3fs import S3FileSystem
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.frame_store import FrameStore, frames_there
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.storage.writer import encode_record, leftovers
-from droguekit.batch.render_dataset import RunSummary, Spread, render_dataset
+from droguekit.batch.execution import ExecutionOptions
+from droguekit.batch.render_dataset import RunSummary, render_dataset
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from labelgen.validation.dataset_checks import validate_dataset
 
@@ -75,7 +76,7 @@ def local(tmp_path_factory: pytest.TempPathFactory, text: str, make: Make) -> Pa
 def local_tars(tmp_path_factory: pytest.TempPathFactory, text: str, make: Make) -> Path:
     """The same in tar files of two pairs."""
     out = tmp_path_factory.mktemp("local-tars") / "dataset"
-    make(out, workers=Spread(0, pairs_per_tar=2), text=text)
+    make(out, workers=ExecutionOptions(0, pairs_per_tar=2), text=text)
     return out
 
 
@@ -94,7 +95,7 @@ def contents(dataset: Path | str) -> dict[str, bytes]:
 def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
     place: str, pairs_per_tar: int | None, text: str, local: Path, local_tars: Path, make: Make
 ) -> None:
-    spread = Spread(0, pairs_per_tar=pairs_per_tar)
+    spread = ExecutionOptions(0, pairs_per_tar=pairs_per_tar)
     first = make(place, range(1, 4), spread, text)
     assert (first.kept, first.pairs) == (0, 3)
     # A frame half written, one that lacks a file, and one with another picture.
@@ -122,7 +123,7 @@ def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
 def packed(server: ThreadedMotoServer, make: Make, text: str) -> str:
     """A dataset in tar files on the object store; to be read only."""
     place = f"s3://{BUCKET}/packed"
-    make(place, workers=Spread(0, pairs_per_tar=2), text=text)
+    make(place, workers=ExecutionOptions(0, pairs_per_tar=2), text=text)
     return place
 
 
@@ -155,7 +156,7 @@ def test_images_and_records_are_those_on_disk(packed: str, local: Path) -> None:
 
 
 def test_a_changed_tar_file_is_found(make: Make, text: str, place: str) -> None:
-    make(place, range(2), Spread(0, pairs_per_tar=2), text)
+    make(place, range(2), ExecutionOptions(0, pairs_per_tar=2), text)
     storage = open_storage(place)
     file = FrameStore(place)._shard(0).frames[1]["left_parts.png"]
     data = bytearray(storage.read("shards/000000.tar"))
@@ -172,7 +173,7 @@ def test_a_changed_tar_file_is_found(make: Make, text: str, place: str) -> None:
 def test_shards_are_merged_from_there_and_to_there(
     local: Path, place: str, make: Make, text: str, tmp_path: Path
 ) -> None:
-    make(f"{place}/even", range(0, 5, 2), Spread(0, pairs_per_tar=4), text)
+    make(f"{place}/even", range(0, 5, 2), ExecutionOptions(0, pairs_per_tar=4), text)
     make(tmp_path / "odd", range(1, 5, 2), 0, text)
     assert frames_there(f"{place}/even") == [0, 2, 4]
     # Complete within the run: neighbours of a part come together in one file.
@@ -267,7 +268,7 @@ def test_dask_workers_write_there_themselves(place: str, text: str, local: Path,
     distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
     options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}
     with distributed.LocalCluster(processes=True, **options) as cluster:
-        spread = Spread(0, scheduler=cluster.scheduler_address, pairs_per_tar=2)
+        spread = ExecutionOptions(0, scheduler=cluster.scheduler_address, pairs_per_tar=2)
         assert make(place, workers=spread, text=text).drops == ()
     assert contents(place) == contents(local)
     assert leftovers(place) == [] and open_storage(place).names(layout.FRAMES_FOLDER) == []
@@ -302,7 +303,7 @@ def test_a_lost_connection_ends_the_run_in_one_line_and_finished_frames_stay(
 ) -> None:
     host, port = server.get_host_and_port()
     with pytest.raises(OSError, match=f"{place}/.*cannot be ") as caught:
-        render_dataset(parse_recipe(text), text, place, range(5), Spread(0), Ends(server))
+        render_dataset(RecipeSource(parse_recipe(text), text), place, range(5), ExecutionOptions(0), Ends(server))
     assert "\n" not in str(caught.value)
     ThreadedMotoServer.__init__(server, ip_address=host, port=port, verbose=False)
     server.start()  # its contents belong to the process

@@ -92,7 +92,7 @@ def test_places_that_keep_to_one_side_are_found_out() -> None:
 
 
 def test_what_is_not_drawn_is_not_judged() -> None:
-    recipe, _ = load_recipe("demo")
+    recipe = load_recipe("demo").recipe
     assert check_sizes(plan_recipe(recipe).drawn, recipe) is None
     on_axis = parse_recipe(RECIPE.format(law="uniform", count=20, seed=1) + "[pose]\non_axis = true\n")
     assert check_places(plan_recipe(on_axis).drawn, on_axis.rig.camera) is None

@@ -89,7 +89,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
     # Tells of each finished frame on a line, which is when the test kills it.
     script.write_text(
         "from pathlib import Path\n"
-        "from datasets_manifest.recipe.recipe import parse_recipe\n"
+        "from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe\n"
         "from droguekit.batch.render_dataset import render_dataset\n"
         "class Tell:\n"
         "    def begin(self, what, total): pass\n"
@@ -99,7 +99,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
         "    def end(self): pass\n"
         "if __name__ == '__main__':\n"
         f"    text = {tiny_recipe!r}\n"
-        f"    render_dataset(parse_recipe(text), text, Path({str(out)!r}), range(4), 1, Tell())\n"
+        f"    render_dataset(RecipeSource(parse_recipe(text), text), Path({str(out)!r}), range(4), 1, Tell())\n"
     )
     with subprocess.Popen(
         [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

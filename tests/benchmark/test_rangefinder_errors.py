@@ -58,7 +58,7 @@ def test_a_perfect_method_has_the_errors_of_the_shipped_rangefinder(
     build: SimpleNamespace, rng: np.random.Generator
 ) -> None:
     """What the paper's bench would say of a method that does not err."""
-    rangefinder = load_recipe("semi-physical-7")[0].rangefinder
+    rangefinder = load_recipe("semi-physical-7").recipe.rangefinder
     records = [
         read(record, sample_reading_m(rangefinder, 3, record.frame_index, record.left_from_drogue.translation_m[2]))
         for record in build.records([5.0], 100, rng)

@@ -108,7 +108,7 @@ def test_shaking_averages_out(build: SimpleNamespace, rng: np.random.Generator) 
 @pytest.mark.slow
 def test_the_motion_is_that_of_the_simulation_without_its_vibration() -> None:
     """The simulator knows both: the poses that the cameras see, and how all would move if nothing shook."""
-    recipe = load_recipe("docking-10m")[0]
+    recipe = load_recipe("docking-10m").recipe
     assert recipe.sequence is not None and recipe.sequence.receiver is not None
     receiver = recipe.sequence.receiver.model_copy(update={"vibration_deg": 0.0, "vibration_m": 0.0})
     calm = recipe.model_copy(update={"sequence": recipe.sequence.model_copy(update={"receiver": receiver})})

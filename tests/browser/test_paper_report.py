@@ -31,9 +31,9 @@ SCREENS = ((320, "light"), (360, "dark"), (1280, "light"), (1280, "dark"))
 
 
 def _render(folder: Path, recipe_name: str, frames: Sequence[int]) -> Path:
-    recipe, text = open_recipe(recipe_name, None, "analytic")
+    source = open_recipe(recipe_name, None, "analytic")
     told = io.StringIO()
-    render_dataset(recipe, text, folder, list(frames), 0, PlainProgress(told))
+    render_dataset(source, folder, list(frames), 0, PlainProgress(told))
     return folder
 
 

@@ -29,8 +29,8 @@ METHODS = MOST_OPEN_ROWS + 1
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Some pairs, with poses of many methods that err a little."""
     folder, rng = tmp_path_factory.mktemp("pose-report"), np.random.default_rng(5)
-    recipe, text = open_recipe("semi-physical-7", None, "analytic")
-    render_dataset(recipe, text, folder / "data", list(range(PAIRS)), 0, PlainProgress(io.StringIO()))
+    source = open_recipe("semi-physical-7", None, "analytic")
+    render_dataset(source, folder / "data", list(range(PAIRS)), 0, PlainProgress(io.StringIO()))
     data, estimates = Dataset(folder / "data"), []
     for index in data.frame_indices:
         pose = data.record(index).left_from_drogue

@@ -75,7 +75,7 @@ def test_the_card_says_what_how_licence_limits_and_how_to_cite(described: Path) 
 def test_missing_pairs_and_the_rangefinder_are_told(described: Path) -> None:
     manifest = read_manifest(described)
     frames = manifest.recipe.frames.model_copy(update={"count": manifest.counts.pairs + 3})
-    bench = load_recipe("semi-physical-5")[0].rangefinder
+    bench = load_recipe("semi-physical-5").recipe.rangefinder
     recipe = manifest.recipe.model_copy(update={"frames": frames, "rangefinder": bench})
     text = card_text(manifest.model_copy(update={"recipe": recipe}))
     assert f"3 of the recipe's {frames.count} pairs are not in it." in text
@@ -130,7 +130,7 @@ def test_croissant_is_valid_for_its_makers_reader(described: Path) -> None:
 
 
 def test_a_dataset_without_pairs_is_described_too(tmp_path: Path) -> None:
-    recipe, _ = load_recipe("smoke")
+    recipe = load_recipe("smoke").recipe
     write_manifest(tmp_path, build_manifest(tmp_path, recipe, "0", dict.fromkeys(range(recipe.frames.scenes), "train")))
     manifest = read_manifest(tmp_path)
     assert "* 0 stereo pairs" in card_text(manifest)

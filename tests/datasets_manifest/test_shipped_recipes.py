@@ -14,14 +14,14 @@ from scenes.sampler import sample_left_from_drogue
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_every_recipe_can_be_read_and_carries_its_name(name: str) -> None:
-    recipe, _ = load_recipe(name)
+    recipe = load_recipe(name).recipe
     assert recipe.name == name
     assert recipe.description
 
 
 @pytest.mark.parametrize(("name", "markers"), [("semi-physical-5", 5), ("semi-physical-7", 7)])
 def test_semi_physical_has_100_sets_at_stations_1_m_apart(name: str, markers: int) -> None:
-    recipe, _ = load_recipe(name)
+    recipe = load_recipe(name).recipe
     assert recipe.drogue.marker_count == markers
     distances = draw_frames(recipe, tuple(range(0, 900, 7))).distances_m
     np.testing.assert_allclose(distances, [2 + index % 9 for index in range(0, 900, 7)], rtol=1e-12)
@@ -31,7 +31,7 @@ def test_semi_physical_has_100_sets_at_stations_1_m_apart(name: str, markers: in
 
 def test_any_prefix_of_a_station_recipe_covers_all_its_distances() -> None:
     for name in ("semi-physical-5", "semi-physical-7", "low-light", "cloud"):
-        recipe, _ = load_recipe(name)
+        recipe = load_recipe(name).recipe
         stations = recipe.distance.stations_m
         assert stations is not None
         poses = [sample_left_from_drogue(recipe, index) for index in range(len(stations))]
@@ -39,7 +39,7 @@ def test_any_prefix_of_a_station_recipe_covers_all_its_distances() -> None:
 
 
 def test_paper_corpus_counts_as_the_paper_does() -> None:
-    recipe, _ = load_recipe("paper-corpus")
+    recipe = load_recipe("paper-corpus").recipe
     plan = plan_recipe(recipe, most_sampled=400)
     assert 2 * sum(plan.by_scene.values()) == 14_298
     assert len(plan.by_scene) == 89
@@ -52,7 +52,7 @@ def test_paper_corpus_counts_as_the_paper_does() -> None:
 
 
 def test_detector_small_has_empty_frames_and_things_that_are_no_drogue() -> None:
-    recipe, _ = load_recipe("detector-small")
+    recipe = load_recipe("detector-small").recipe
     plan = plan_recipe(recipe)
     # 1200 draws at 12.5 %: a standard deviation of 1 %.
     assert abs(plan.empty_fraction - 0.125) < 0.03

@@ -35,7 +35,7 @@ from tests.support.whole_dataset import RECIPE
 @fuzz(60)
 @given(edits=st.lists(byte_edits(), min_size=1, max_size=3), swap=st.tuples(st.integers(0, 400), HOSTILE))
 def test_damaged_recipes(edits, swap):
-    text = load_recipe("smoke")[1] if swap[0] % 2 else RECIPE
+    text = load_recipe("smoke").text if swap[0] % 2 else RECIPE
     lines = text.splitlines()
     line = swap[0] % len(lines)
     if " = " in lines[line]:

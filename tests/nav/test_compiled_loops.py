@@ -184,7 +184,7 @@ def compiled():
 
 fit_once()
 before = compiled()
-recipe, _ = load_recipe("pose-tier-a")
+recipe = load_recipe("pose-tier-a").recipe
 for index in (1, 4):
     frame = sample_frame(recipe, index)
     images = expose(frame, load_engine("analytic").render(frame, recipe.render))

@@ -17,7 +17,7 @@ from datasets_manifest.importers.pair_source import SourcePair
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, read_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, WRONG_INPUT, run
-from droguekit.workflows.navigation import NavigationOrder, navigate_dataset
+from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
 from geometry.se3 import RigidTransform, rotation_from_angles
 
 PAIRS = 6
@@ -180,7 +180,7 @@ def test_an_interrupt_leaves_the_old_file_no_thread_and_all_settings(flight, tmp
     out = tmp_path / "estimates.jsonl"
     out.write_text("old")
     threads, handler = set(threading.enumerate()), signal.signal(signal.SIGINT, signal.default_int_handler)
-    cores, order = cv2.getNumThreads(), NavigationOrder(rate_hz=rate_hz)
+    cores, order = cv2.getNumThreads(), NavigationOptions(rate_hz=rate_hz)
     try:
         cv2.setNumThreads(2)
         with (

@@ -85,7 +85,7 @@ def test_the_example_of_a_recipe_can_be_read(tmp_path: Path) -> None:
     (example,) = code_blocks(REPOSITORY / "docs/how-to/add-a-drogue.md", "toml")
     (tmp_path / "my-recipe.toml").write_text(example, encoding="utf-8")
     (tmp_path / "my-drogue.toml").write_text(text("drogue_models/examples/seven-markers.toml"), encoding="utf-8")
-    assert load_recipe(str(tmp_path / "my-recipe.toml"))[0].drogue.name == "seven-markers"
+    assert load_recipe(str(tmp_path / "my-recipe.toml")).recipe.drogue.name == "seven-markers"
 
 
 def test_the_example_of_a_method_finds_a_pose() -> None:

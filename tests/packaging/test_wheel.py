@@ -106,7 +106,7 @@ def test_installed_clean_it_lists_and_reads_its_recipes(installed: Path) -> None
 import datasets_manifest.recipe.recipe as recipe
 print(recipe.__file__)
 for name in recipe.recipe_names():
-    print(recipe.load_recipe(name)[0].name)
+    print(recipe.load_recipe(name).recipe.name)
 """
     where, *names = run_installed(installed, code).split()
     assert Path(where).is_relative_to(installed)

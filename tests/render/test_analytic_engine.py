@@ -11,7 +11,7 @@ import pytest
 import shapely
 from scipy.special import j1
 
-from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, load_recipe
 from datasets_manifest.types.ranges import Range
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID, Part
@@ -328,10 +328,11 @@ def test_moving_drogue_is_blurred_around_its_middle(analytic, make_recipe):
 
 
 def test_dataset_is_made_and_valid(tmp_path):
-    recipe, text = load_recipe("smoke")
+    source = load_recipe("smoke")
+    recipe = source.recipe
     recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"engine": "analytic"})})
     told = io.StringIO()
-    summary = render_dataset(recipe, text, tmp_path / "dataset", range(6), 1, PlainProgress(told))
+    summary = render_dataset(RecipeSource(recipe, source.text), tmp_path / "dataset", range(6), 1, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     report = validate_dataset(tmp_path / "dataset")
     assert report.faults == []

@@ -137,7 +137,7 @@ def test_boards_that_cannot_be_are_refused(change, message):
 
 
 def test_other_datasets_know_nothing_of_boards():
-    recipe, _ = load_recipe("smoke")
+    recipe = load_recipe("smoke").recipe
     assert "board" not in recipe.model_dump(mode="json")
     assert "board" not in sample_frame(recipe, 0).model_dump(mode="json")
 
@@ -159,7 +159,7 @@ def documented_calibration():
 @pytest.mark.parametrize("rig", ["paper-real", "rgb-ideal"])
 def test_a_calibration_finds_the_rig_again(rig, tmp_path):
     """The documented code on the shipped recipe's pictures: OpenCV's finder, calibrations and rectification."""
-    _, text = load_recipe("calibration-board")
+    text = load_recipe("calibration-board").text
     recipe = parse_recipe(text.replace('rig = "paper-real"', f'rig = "{rig}"'))
     truth, corners = {eye: [] for eye in EYES}, recipe.board.corners_m()
     for index in range(recipe.frames.count):

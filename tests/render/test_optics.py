@@ -23,7 +23,7 @@ def with_optics(frame, f_number=2.8, psf_sigma_px=0.0, **optics):
 
 
 def rendered(frame):
-    recipe, _ = load_recipe("pose-tier-a")
+    recipe = load_recipe("pose-tier-a").recipe
     return load_engine("analytic").render(frame, recipe.render).left
 
 

@@ -152,7 +152,7 @@ def test_moving_drogue_is_blurred_around_its_middle(engine, make_recipe):
 
 def test_rays_through_seams_are_sent_again(engine):
     """At this place a pixel centre's ray slips between two triangles of a marker's front and ends on its back."""
-    recipe, _ = load_recipe("demo", seed=11)
+    recipe = load_recipe("demo", seed=11).recipe
     settings = recipe.render.model_copy(update={"samples_per_px": 1, "surround_samples_per_px": 1})
     frame = sample_frame(recipe, 49)
     seen = engine.render(frame, settings).right
@@ -167,7 +167,7 @@ def test_rays_through_seams_are_sent_again(engine):
 @pytest.mark.parametrize("index", [341, 594])
 def test_rays_that_slip_into_a_markers_pocket_are_sent_again(engine, index):
     """In these frames a ray just beyond a marker slips through the face's front and ends on the marker's wall."""
-    recipe, _ = load_recipe("detector-small", seed=1)
+    recipe = load_recipe("detector-small", seed=1).recipe
     settings = recipe.render.model_copy(
         update={"samples_per_px": 1, "open_samples_per_px": 1, "edge_samples_per_px": 1, "surround_samples_per_px": 1}
     )

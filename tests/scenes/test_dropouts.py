@@ -276,7 +276,7 @@ def test_a_turn_must_lose_a_drogue_that_is_beside_the_axis(offset):
 
 
 def test_recipes_without_losses_do_not_know_of_them():
-    drawn, _ = load_recipe("docking-10m")
+    drawn = load_recipe("docking-10m").recipe
     text = drawn.model_dump_json()
     assert not any(word in text for word in ("losses", "in_turn", "scattered_fraction"))
     assert '"loss"' not in sample_frame(recipe("none"), 0).model_dump_json()

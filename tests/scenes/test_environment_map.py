@@ -54,7 +54,7 @@ def write(path, values):
 def recipe(folder, name="sky.exr", more="cd_m2_per_unit = 1000.0"):
     path = folder / "mine.toml"
     path.write_text(RECIPE % (name, more), encoding="utf-8")
-    return load_recipe(str(path))[0]
+    return load_recipe(str(path)).recipe
 
 
 def environment(folder, name="sky.exr", more="cd_m2_per_unit = 1000.0"):
@@ -116,7 +116,7 @@ def test_rotations_are_drawn_by_scene(tmp_path):
         "count = 4", "count = 4\nscenes = 4"
     )
     (tmp_path / "four.toml").write_text(text, encoding="utf-8")
-    drawn = load_recipe(str(tmp_path / "four.toml"))[0]
+    drawn = load_recipe(str(tmp_path / "four.toml")).recipe
     environments = [sample_frame(drawn, index).environment for index in range(4)]
     assert len({env.map.rotation_deg for env in environments}) == 4
     assert len({round(env.sun_azimuth_deg, 6) for env in environments}) == 4

@@ -101,7 +101,7 @@ def test_wrong_families_are_named(more, message):
 
 def test_the_paper_count_ships():
     """89 scenes and 14,298 images, as many as the paper trains on, over all families."""
-    world, _ = load_recipe("world-89")
+    world = load_recipe("world-89").recipe
     assert world.frames.scenes == 89 and 2 * world.frames.count == 14_298
     assert scenes_per_family(world) == [round(family.weight) for family in world.families]
     assert len(world.families) >= 12

@@ -107,13 +107,13 @@ def share_in_view(drawn, frames):
 
 
 def test_a_guided_receiver_keeps_the_drogue_in_view():
-    drawn, _ = load_recipe("docking-10m")
+    drawn = load_recipe("docking-10m").recipe
     poses = [sample_left_from_drogue(drawn, index) for index in (0, 449, 450, 899)]
     # From 10 m to 1.7 m, as far as the follower lags and the drogue pitches: a few centimetres.
     assert [pose.translation_m[2] for pose in poses] == pytest.approx([10.0, 1.7, 10.0, 1.7], abs=0.15)
     # The project's acceptance value, for light and for moderate turbulence. It is a mean over flights: one may lose the
     # drogue for a few of its last frames.
-    flights = [drawn, *(load_recipe("docking-10m", seed)[0] for seed in (2, 3))]
+    flights = [drawn, *(load_recipe("docking-10m", seed).recipe for seed in (2, 3))]
     assert np.mean([share_in_view(flight, range(0, 450, 9)) for flight in flights]) >= 0.97
     assert np.mean([share_in_view(flight, range(450, 900, 9)) for flight in flights]) >= 0.97
 
@@ -121,7 +121,7 @@ def test_a_guided_receiver_keeps_the_drogue_in_view():
 @pytest.mark.slow
 @pytest.mark.parametrize("turbulence", ["light", "moderate"])
 def test_guided_receivers_of_many_sequences_keep_the_drogue_in_view(turbulence):
-    drawn, _ = load_recipe("docking-10m", seed=11)
+    drawn = load_recipe("docking-10m", seed=11).recipe
     sequence = drawn.sequence.model_copy(update={"turbulence": (turbulence,)})
     frames = drawn.frames.model_copy(update={"count": 12 * 450})
     drawn = drawn.model_copy(update={"sequence": sequence, "frames": frames})
@@ -143,7 +143,7 @@ def test_a_small_pair_flies():
 
 
 def test_recipes_without_sequences_do_not_know_of_them():
-    drawn, _ = load_recipe("smoke")
+    drawn = load_recipe("smoke").recipe
     assert "sequence" not in drawn.model_dump() and drawn.sequence is None
-    sequence, _ = load_recipe("docking-10m")
+    sequence = load_recipe("docking-10m").recipe
     assert type(sequence).model_validate_json(sequence.model_dump_json()).model_dump() == sequence.model_dump()

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage.layout import EVENTS_FILE
+from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import PlainProgress
-from droguekit.batch.render_dataset import RunSummary, Spread, render_dataset
+from droguekit.batch.render_dataset import RunSummary, render_dataset
 from tests.support.small_datasets import RIG_160_PX, RIG_320_PX
 
 TINY_RECIPE = f"""
@@ -113,13 +114,13 @@ Hashes = Callable[[Path], dict[str, str]]
 def _make(
     out: Path,
     frames: Sequence[int] | None = None,
-    workers: int | Spread = 1,
+    workers: int | ExecutionOptions = 1,
     text: str = TINY_RECIPE,
     told: io.StringIO | None = None,
 ) -> RunSummary:
     recipe = parse_recipe(text)
     chosen = range(recipe.frames.count) if frames is None else frames
-    return render_dataset(recipe, text, out, chosen, workers, PlainProgress(told or io.StringIO()))
+    return render_dataset(RecipeSource(recipe, text), out, chosen, workers, PlainProgress(told or io.StringIO()))
 
 
 @pytest.fixture(scope="session")

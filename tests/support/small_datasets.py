@@ -9,7 +9,7 @@ import io
 from collections.abc import Iterable
 from pathlib import Path
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
 
@@ -71,6 +71,6 @@ def rendered(text: str, out: Path, frames: Iterable[int] | None = None) -> Path:
     """The dataset of a recipe's frames, all of them unless some are named, in `out`: in this process, none dropped."""
     recipe, told = parse_recipe(text), io.StringIO()
     chosen = range(recipe.frames.count) if frames is None else list(frames)
-    summary = render_dataset(recipe, text, out, chosen, 0, PlainProgress(told))
+    summary = render_dataset(RecipeSource(recipe, text), out, chosen, 0, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     return out

@@ -49,7 +49,7 @@ def plan(
 
     if workers is not None and (not probe or workers < 1):
         raise ValueError("--workers: must be at least 1, and goes with the probe; leave it or --no-probe out")
-    chosen, _ = open_recipe(recipe, seed, engine)
+    chosen = open_recipe(recipe, seed, engine).recipe
     planned = plan_recipe(chosen)
     said = [*_counts(chosen, planned), *_distances(chosen, planned), *_laws(chosen, planned)]
     said.append(f"a frame that is at work for {duration(frame_timeout_s(chosen))} counts as hung and is tried again")

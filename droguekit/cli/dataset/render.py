@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from datasets_manifest.storage.storage import as_location
+from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import duration, progress_report
 from droguekit.cli.arguments import (
     EngineOption,
@@ -20,7 +21,7 @@ from droguekit.cli.arguments import (
     parse_shard,
 )
 from droguekit.cli.main import FAULT
-from droguekit.workflows.rendering import RenderOrder, open_recipe, render_frames
+from droguekit.workflows.rendering import open_recipe, render_frames
 
 EXAMPLES = (
     "droguekit render demo --out data/demo",
@@ -69,10 +70,10 @@ def render(
     and the result is the same as that of one undisturbed run. Ctrl-C finishes the pairs in hand and stops; twice stops
     at once.
     """
-    chosen, text = open_recipe(recipe, seed, engine)
-    wanted = parse_shard(shard, parse_frames(frames, chosen.frames.count))
-    order = RenderOrder(workers, timeout, scheduler, tar)
-    summary = render_frames(chosen, text, out, wanted, order, progress_report())
+    source = open_recipe(recipe, seed, engine)
+    wanted = parse_shard(shard, parse_frames(frames, source.recipe.frames.count))
+    options = ExecutionOptions(workers, timeout, scheduler, tar)
+    summary = render_frames(source, out, wanted, options, progress_report())
     totals = summary.totals
     cpu_s, retries = sum(totals.stage_s.values()), f", {totals.retries} attempts repeated" if totals.retries else ""
     typer.echo(

@@ -13,7 +13,7 @@ from datasets_manifest.storage.storage import Location, open_storage
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument, output_option
 from droguekit.workflows.benchmarking import benchmark_dataset, check_blind_dataset
-from droguekit.workflows.detection import DetectionOrder, benchmark_detections
+from droguekit.workflows.detection import DetectionOptions, benchmark_detections
 
 if TYPE_CHECKING:
     from droguekit.benchmark.benchmark import BenchmarkResult
@@ -56,8 +56,8 @@ def benchmark(
 
     An imported dataset has none: there, estimates are compared with their own measurements, and both with boxes if any.
     """
-    order = DetectionOrder(detections or (), detector or (), split, threshold)
-    for line in _lines(dataset, estimates, order, json_, html):
+    options = DetectionOptions(detections or (), detector or (), split, threshold)
+    for line in _lines(dataset, estimates, options, json_, html):
         typer.echo(line)
     for path in (json_, html):
         if path is not None:
@@ -65,16 +65,16 @@ def benchmark(
 
 
 def _lines(
-    dataset: Location, estimates: Path | None, order: DetectionOrder, json_out: Path | None, html_out: Path | None
+    dataset: Location, estimates: Path | None, options: DetectionOptions, json_out: Path | None, html_out: Path | None
 ) -> Iterator[str]:
-    wants_detections = bool(order.files or order.detectors)
+    wants_detections = bool(options.files or options.detectors)
     if (estimates is not None) == wants_detections:
         raise ValueError("--estimates: give either estimates, or detections (--detections, --detector)")
     if estimates is None:
         from droguekit.benchmark.detection.detection_tables import detector_lines
 
-        return detector_lines(benchmark_detections(dataset, order, json_out, html_out, progress_report()))
-    if order.split is not None or order.threshold is not None:
+        return detector_lines(benchmark_detections(dataset, options, json_out, html_out, progress_report()))
+    if options.split is not None or options.threshold is not None:
         raise ValueError("--split, --threshold: are for detections, not for estimates")
     if open_storage(dataset).exists(BLIND_FILE):
         return _blind_lines(check_blind_dataset(dataset, estimates, json_out, html_out))

@@ -9,7 +9,7 @@ import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import DatasetArgument, DetectorOption, output_option
-from droguekit.workflows.navigation import NavigationOrder, navigate_dataset
+from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
 
 EXAMPLES = (
     "droguekit navigate data/demo --out estimates.jsonl",
@@ -67,7 +67,7 @@ def navigate(
     ] = None,
 ) -> None:
     """Estimate the drogue's pose in every pair of a dataset, from images, rig and drogue alone."""
-    order = NavigationOrder(
+    options = NavigationOptions(
         centroids=centroids,
         detector=detector,
         tracker=tracker,
@@ -78,7 +78,7 @@ def navigate(
         rate_hz=rate,
         latency_out=latency,
     )
-    done = navigate_dataset(dataset, method or (), out, progress_report(), order)
+    done = navigate_dataset(dataset, method or (), out, progress_report(), options)
     width = max(16, *(len(fixes.method) for fixes in done.fixes))
     for fixes in done.fixes:
         typer.echo(f"{fixes.method:<{width}} {fixes.fixes} fixes in {fixes.pairs} pairs")

@@ -9,7 +9,7 @@ import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import WorkersOption, output_option
-from droguekit.workflows.training import TrainingOrder, train_detector
+from droguekit.workflows.training import TrainingOptions, train_detector
 
 EXAMPLES = (
     "droguekit train detector-small --out out/detector   (renders the recipe first)",
@@ -88,8 +88,8 @@ def train(
         "threads": threads,
     }
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    order = TrainingOrder(tuple(sources), settings, changes, size, final_size, cache, start_from, workers)
-    result = train_detector(order, out, progress_report())
+    options = TrainingOptions(tuple(sources), settings, changes, size, final_size, cache, start_from, workers)
+    result = train_detector(options, out, progress_report())
     for split, reached in (("val", result.validation), ("test", result.test)):
         if reached is not None:
             ap50, ap75, ap, recall50 = (

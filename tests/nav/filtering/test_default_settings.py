@@ -18,7 +18,7 @@ AHEAD = 10
 
 
 def test_a_docking_run_in_moderate_air(rng: np.random.Generator, measure: Measure, covariance: Array) -> None:
-    recipe, _ = load_recipe("docking-10m", 1)
+    recipe = load_recipe("docking-10m", 1).recipe
     poses = [sample_left_from_drogue(recipe, index) for index in range(450, 750)]
     fine, fixes = covariance * 0.01, PoseFilter(FilterSettings(), 8)
     nis: list[float] = []

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
 from nav.training.corpus import CachedPair, Corpus, ImageCache
@@ -29,7 +29,7 @@ def make_dataset(folder: Path, **changes: str) -> Path:
     values = {"name": '"toy"', "description": '"Near drogues."', **RECIPE, **changes}
     text = "".join(f"{key} = {value}\n" for key, value in values.items())
     recipe, told = parse_recipe(text), io.StringIO()
-    summary = render_dataset(recipe, text, folder, range(recipe.frames.count), 0, PlainProgress(told))
+    summary = render_dataset(RecipeSource(recipe, text), folder, range(recipe.frames.count), 0, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     return folder
 

@@ -188,15 +188,20 @@ def test_the_first_sequences_are_those_of_the_full_measurement() -> None:
         for (data, few), (_, full) in zip(
             plan_flights(order(sequences=1), tier), plan_flights(order(), tier), strict=True
         ):
-            assert few.recipe.model_dump_json() == full.recipe.model_dump_json() and few.names == full.names
-            assert (few.count, full.count) == (part_length(few.recipe), data.parts * part_length(few.recipe))
+            assert (
+                few.source.recipe.model_dump_json() == full.source.recipe.model_dump_json() and few.names == full.names
+            )
+            assert (few.count, full.count) == (
+                part_length(few.source.recipe),
+                data.parts * part_length(few.source.recipe),
+            )
 
 
 def test_tier_b_has_a_dataset_for_each_engine_that_is_named() -> None:
     tier_b = BarsOrder("b", 3, pairs_per_station=2, engines=("mitsuba", "blender"))
     plans = [plan for _, plan in plan_images(tier_b)]
     assert [plan.names for plan in plans] == [(e, light) for e in tier_b.engines for light in ("day", "dusk")]
-    assert [plan.recipe.render.engine for plan in plans] == ["mitsuba", "mitsuba", "blender", "blender"]
+    assert [plan.source.recipe.render.engine for plan in plans] == ["mitsuba", "mitsuba", "blender", "blender"]
     assert [plan.names for _, plan in plan_images(BarsOrder("b", 3))] == [("day",), ("dusk",)]
 
 
@@ -206,7 +211,7 @@ def test_one_light_alone_has_the_dataset_that_it_has_beside_the_other() -> None:
         plan_images(BarsOrder("a", 3, lights=("dusk",))),
     )
     assert light == "dusk" and (alone.names, alone.count) == (beside.names, beside.count)
-    assert alone.recipe.model_dump_json() == beside.recipe.model_dump_json()
+    assert alone.source.recipe.model_dump_json() == beside.source.recipe.model_dump_json()
 
 
 @pytest.mark.slow

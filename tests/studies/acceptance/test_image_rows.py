@@ -117,7 +117,7 @@ def test_contrast_follows_from_the_recorded_signal_to_noise(contrast_e: float, s
 @pytest.mark.parametrize("tier", ["a", "b"])
 @pytest.mark.parametrize("light_name", ["day", "dusk"])
 def test_the_recipes_hold_the_protocol(tier: str, light_name: str) -> None:
-    recipe, _ = load_recipe(recipe_of(tier, light_name))
+    recipe = load_recipe(recipe_of(tier, light_name)).recipe
     assert recipe.distance.stations_m == STATIONS_M
     assert recipe.frames.count == len(STATIONS_M) * {"a": 400, "b": 64}[tier]
     assert recipe.render.engine == {"a": "analytic", "b": "mitsuba"}[tier]

@@ -15,9 +15,9 @@ from studies.acceptance.rendered.sequence_pairs import score_pairs
 
 
 def test_waiting_is_no_work(tmp_path: Path) -> None:
-    recipe, text = open_recipe("smoke", None, "analytic")
+    source = open_recipe("smoke", None, "analytic")
     told = io.StringIO()
-    summary = render_dataset(recipe, text, tmp_path / "dataset", range(1), 0, PlainProgress(told))
+    summary = render_dataset(source, tmp_path / "dataset", range(1), 0, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     # Milliseconds that tell the stages apart in a sum.
     stages_ms = {

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, load_recipe, parse_recipe
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
@@ -49,7 +49,7 @@ from studies.detector_comparison.yolo_training import check_corpus, export_corpu
 @pytest.fixture(scope="module")
 def screen_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six small pairs as a screen wants them, two in each split."""
-    _, text = load_recipe("smoke")
+    text = load_recipe("smoke").text
     changed = text.replace('preset = "rgb-ideal"', 'preset = "rgb-ideal"\nencoding = "gamma"')
     changed = changed.replace("scenes = 2", "scenes = 3\nempty_fraction = 0.2").replace("train = 0.5", "train = 0.34")
     changed = changed.replace("val = 0.0", "val = 0.33").replace("test = 0.5", "test = 0.33")
@@ -57,7 +57,7 @@ def screen_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = parse_recipe(changed)
     out = tmp_path_factory.mktemp("screen") / "dataset"
     with (out.parent / "log").open("w") as told:
-        render_dataset(recipe, changed, out, range(6), 0, PlainProgress(told))
+        render_dataset(RecipeSource(recipe, changed), out, range(6), 0, PlainProgress(told))
     return out
 
 

@@ -72,13 +72,13 @@ def test_pairs_are_spread_over_distances():
 
 
 def test_samples_grow_with_distance_and_stay_within_their_bounds():
-    samples = [station_recipe("blender", d, 1, 0)[0].render.samples_per_px for d in (1.7, 5.0, 10.0, 40.0)]
+    samples = [station_recipe("blender", d, 1, 0).recipe.render.samples_per_px for d in (1.7, 5.0, 10.0, 40.0)]
     assert samples == [4, 64, 256, 576]
 
 
 @pytest.mark.parametrize("distance_m", [5.0, 40.0])
 def test_no_engine_may_spend_more_on_edges(distance_m):
-    settings = station_recipe("mitsuba", distance_m, 1, 0)[0].render
+    settings = station_recipe("mitsuba", distance_m, 1, 0).recipe.render
     assert {settings.open_samples_per_px, settings.edge_samples_per_px} == {settings.samples_per_px}
     assert not settings.denoise
 

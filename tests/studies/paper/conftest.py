@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from droguekit.batch.progress import PlainProgress
@@ -24,12 +24,12 @@ WriteEstimates = Callable[..., Path]
 
 
 def _render(folder: Path, recipe_name: str, frames: Iterable[int]) -> Path:
-    return _render_recipe(folder, *open_recipe(recipe_name, None, "analytic"), frames)
+    return _render_recipe(folder, open_recipe(recipe_name, None, "analytic"), frames)
 
 
-def _render_recipe(folder: Path, recipe: Recipe, text: str, frames: Iterable[int]) -> Path:
+def _render_recipe(folder: Path, source: RecipeSource, frames: Iterable[int]) -> Path:
     told = io.StringIO()
-    summary = render_dataset(recipe, text, folder, list(frames), 0, PlainProgress(told))
+    summary = render_dataset(source, folder, list(frames), 0, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     return folder
 
@@ -43,10 +43,10 @@ def docking(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def single_pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four pairs of the docking scenes that follow no sequence, 0 and 2 without a drogue; to be read only."""
-    recipe, text = open_recipe("docking-10m", None, "analytic")
-    frames = recipe.frames.model_copy(update={"count": 8, "empty_fraction": 0.5})
-    recipe = Recipe.model_validate(dict(recipe) | {"sequence": None, "frames": frames})
-    folder = _render_recipe(tmp_path_factory.mktemp("single") / "dataset", recipe, text, range(4))
+    source = open_recipe("docking-10m", None, "analytic")
+    frames = source.recipe.frames.model_copy(update={"count": 8, "empty_fraction": 0.5})
+    recipe = Recipe.model_validate(dict(source.recipe) | {"sequence": None, "frames": frames})
+    folder = _render_recipe(tmp_path_factory.mktemp("single") / "dataset", RecipeSource(recipe, source.text), range(4))
     data = Dataset(folder)
     assert [data.record(k).left_from_drogue is None for k in range(4)] == [True, False, True, False]
     return folder

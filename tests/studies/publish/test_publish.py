@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, load_recipe, parse_recipe
 from datasets_manifest.release.publication import (
     Comparison,
     Publication,
@@ -47,7 +47,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory, analytic_recipe: str) -> P
 
 def _render(text: str, out: Path, seed: int | None = None) -> RunSummary:
     recipe = parse_recipe(text, seed=seed)
-    return render_dataset(recipe, text, out, range(recipe.frames.count), 0, PlainProgress(io.StringIO()))
+    return render_dataset(RecipeSource(recipe, text), out, range(recipe.frames.count), 0, PlainProgress(io.StringIO()))
 
 
 def relit(dataset: Path, out: Path, features: tuple[str, ...] | None = None) -> Path:
@@ -140,9 +140,9 @@ def test_nothing_published_is_one_clear_line(dataset: Path, capsys: pytest.Captu
 
 
 def test_the_command_says_what_it_proved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe, text = load_recipe("pose-tier-a")
+    source = load_recipe("pose-tier-a")
     out = tmp_path / "dataset"
-    render_dataset(recipe, text, out, range(2), 0, PlainProgress(io.StringIO()))
+    render_dataset(source, out, range(2), 0, PlainProgress(io.StringIO()))
     code = run(["validate", str(out), "--published"])
     shown = capsys.readouterr().out
     here, there = read_manifest(out), read_publication("pose-tier-a").manifest

@@ -14,12 +14,13 @@ import fsspec
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
+from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import PlainProgress
-from droguekit.batch.render_dataset import Spread, render_dataset
+from droguekit.batch.render_dataset import render_dataset
 from droguekit.benchmark.report.label_drawing import display_picture
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from droguekit.visualization.browse.page import write_browse
@@ -213,7 +214,13 @@ def test_pages_do_not_depend_on_where_the_pairs_lie(tiny: Path, tmp_path: Path, 
     source: Path | str = tmp_path / "tar"
     if place == "memory":
         source = f"memory://{tmp_path.name}-browse"
-    render_dataset(recipe, RECIPE, source, range(4), Spread(0, pairs_per_tar=3 if place == "tar" else None), told())
+    render_dataset(
+        RecipeSource(recipe, RECIPE),
+        source,
+        range(4),
+        ExecutionOptions(0, pairs_per_tar=3 if place == "tar" else None),
+        told(),
+    )
     try:
         write_browse(source, tmp_path / "page", None, 0, told())
     finally:
