@@ -18,6 +18,7 @@ RATIO_RESAMPLES = 2000
 _DRAWS_AT_ONCE = 2_000_000
 
 Interval = tuple[float, float]
+"""The two ends of a confidence interval."""
 
 
 def root_mean_square(values: Array) -> float:

@@ -125,7 +125,8 @@ def image_bars(order: BarsOrder, out: Path, report: ProgressReport) -> list[BarR
         ValueError: no such engine, a wrong number, or pairs that could not be made.
         OSError: the folder cannot be written.
     """
-    from studies.acceptance.rendered.image_tiers import IMAGE_TIERS, METHODS, TierData
+    from studies.acceptance.rendered.image_tiers import IMAGE_TIERS, TierData
+    from studies.acceptance.rendered.scored_frames import METHODS
 
     plans = plan_images(order)
     _check_engines([plan for _, plan in plans])
@@ -227,9 +228,8 @@ def _flight_rows(
     """The rows of one dataset."""
     from nav.runner import method_names
     from studies.acceptance.rendered.bench_rows import speed_rows
-    from studies.acceptance.rendered.flight_data import METHODS
     from studies.acceptance.rendered.following_rows import following_rows
-    from studies.acceptance.rendered.image_rows import BEST
+    from studies.acceptance.rendered.scored_frames import BEST, METHODS
     from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
 
     title, folder, is_beside = ", ".join(plan.names), out.joinpath(*plan.names), len(plan.names) > _NAMES_OF_BARS

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 from droguekit.benchmark.detection.detection_published import PUBLISHED_DETECTORS
 from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
-from droguekit.benchmark.results.detection_result import DetectionResult, DetectionRow, DetectorResult, Ends
+from droguekit.benchmark.results.detection_result import DetectionResult, DetectionRow, DetectorResult
+from droguekit.benchmark.statistics import Interval
 
 SUMMARY_COLUMNS = ("precision", "recall", "AP50", "95 % interval", "AP", "95 % interval", "AP75")
 SUMMARY_COLUMNS_MORE = (
@@ -94,7 +95,7 @@ def share(fraction: float | None) -> str:
     return f"{shown:.2f} %"
 
 
-def shares(ends: Ends | None) -> str:
+def shares(ends: Interval | None) -> str:
     """An interval of fractions."""
     return ABSENT if ends is None else f"{100 * ends[0]:.2f} to {100 * ends[1]:.2f}"
 

@@ -12,9 +12,8 @@ from droguekit.benchmark.poses.bounds import FeatureNoise, component_deviations,
 from droguekit.benchmark.poses.centroid_errors import CentroidErrors, centroid_statistics
 from droguekit.benchmark.poses.distance_bins import DistanceBin, distance_bins
 from droguekit.benchmark.poses.frame_truth import DrogueTruth
-from droguekit.benchmark.poses.summary import mean_bound
 from droguekit.benchmark.results.benchmark_result import ReferenceBin
-from droguekit.benchmark.results.result_parts import Centroids
+from droguekit.benchmark.results.result_parts import Bound, Centroids
 from geometry.se3 import Array, angles_from_axis
 
 # A method whose centroids are the best of the file, but which shows only the easy ones, sets no standard.
@@ -80,6 +79,17 @@ def bound_covariance(truth: DrogueTruth, seen: NDArray[np.bool_], noise: Feature
         return None
     whitened = truth.jacobian / noise.by_feature(truth.layout)[:, None, None]
     return pose_covariance(whitened[seen])
+
+
+def mean_bound(bounds: Sequence[Array | None]) -> Bound | None:
+    """Root mean square of the bounds of the frames that have one, or None where none has."""
+    known = [bound for bound in bounds if bound is not None]
+    if not known:
+        return None
+    squares = np.mean(np.square(known), axis=0)
+    x, y, z, pitch, yaw = np.sqrt(squares).tolist()
+    position = float(np.sqrt(squares[:3].sum()))
+    return Bound(position_m=position, x_m=x, y_m=y, z_m=z, pitch_deg=pitch, yaw_deg=yaw)
 
 
 def feature_noise(marker_px: float | None, hub_px: float | None) -> FeatureNoise | None:

@@ -12,6 +12,7 @@ from droguekit.benchmark.poses.consistency import nees, normalized_errors
 from droguekit.benchmark.poses.flips import FlipTrials, flip_row
 from droguekit.benchmark.poses.pose_errors import COMPONENTS, PoseError
 from droguekit.benchmark.poses.rangefinder_errors import Depth, rangefinder_errors
+from droguekit.benchmark.poses.reference import mean_bound
 from droguekit.benchmark.results.benchmark_result import Row
 from droguekit.benchmark.results.result_parts import Bound, ComponentErrors, ComponentRatios
 from droguekit.benchmark.statistics import (
@@ -101,17 +102,6 @@ def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Ro
             "rangefinder": rangefinder_errors([pose.depth for pose in poses if pose.depth is not None]),
         }
     )
-
-
-def mean_bound(bounds: Sequence[Array | None]) -> Bound | None:
-    """Root mean square of the bounds of the frames that have one, or None where none has."""
-    known = [bound for bound in bounds if bound is not None]
-    if not known:
-        return None
-    squares = np.mean(np.square(known), axis=0)
-    x, y, z, pitch, yaw = np.sqrt(squares).tolist()
-    position = float(np.sqrt(squares[:3].sum()))
-    return Bound(position_m=position, x_m=x, y_m=y, z_m=z, pitch_deg=pitch, yaw_deg=yaw)
 
 
 def _error_numbers(errors: Sequence[PoseError], key: str) -> tuple[dict[str, float], dict[str, Interval]]:

@@ -20,6 +20,7 @@ from droguekit.benchmark.results.result_parts import (
     ResultModel,
 )
 from droguekit.benchmark.results.sequence_result import SequencesResult
+from droguekit.benchmark.statistics import Interval
 
 
 class Row(ResultModel):
@@ -87,7 +88,7 @@ class Row(ResultModel):
     yaw_p99_deg: float | None = None
     pitch_max_deg: float | None = None
     yaw_max_deg: float | None = None
-    intervals: dict[str, tuple[float, float]]
+    intervals: dict[str, Interval]
     bound: Bound | None
     bound_ratio: ComponentRatios | None
     centroids: Centroids
@@ -127,7 +128,7 @@ class EmptyFrames(ResultModel):
     n: int
     false_fixes: int
     false_fix_fraction: float | None
-    interval: tuple[float, float] | None
+    interval: Interval | None
 
 
 class MethodResult(ResultModel):

@@ -9,8 +9,7 @@ from pydantic import Field
 
 from droguekit.benchmark.results.result_parts import ResultModel
 from droguekit.benchmark.results.tracking_result import Tracking
-
-Ends = tuple[float, float]
+from droguekit.benchmark.statistics import Interval
 
 
 class DetectionDataset(ResultModel):
@@ -52,11 +51,11 @@ class DetectionRow(ResultModel):
     ap: float | None
     ap50: float | None
     ap75: float | None
-    ap_interval: Ends | None = None
-    ap50_interval: Ends | None
+    ap_interval: Interval | None = None
+    ap50_interval: Interval | None
     precision: float | None
     recall: float | None
-    recall_interval: Ends | None
+    recall_interval: Interval | None
     note: str | None
 
 
@@ -93,7 +92,7 @@ class FalseAlarms(ResultModel):
     frames_with_any: int
     boxes_per_600_frames: float
     frames_with_any_per_600: float
-    interval_per_600_frames: Ends
+    interval_per_600_frames: Interval
 
 
 class PairTimes(ResultModel):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from droguekit.benchmark.results.result_parts import ResultModel
-
-Ends = tuple[float, float]
+from droguekit.benchmark.statistics import Interval
 
 
 class BodyAxes(ResultModel):
@@ -83,7 +82,7 @@ class DockingRow(ResultModel):
     mouth_rmse_m: BodyAxes
     mouth_bias_m: BodyAxes
     mouth_rms_m: float
-    mouth_interval: Ends | None
+    mouth_interval: Interval | None
     calibration: dict[str, Calibration | None]
     closure_n: int
     closure_rmse_m_s: float | None

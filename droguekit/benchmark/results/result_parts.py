@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict
 
+from droguekit.benchmark.statistics import Interval
+
 
 class ResultModel(BaseModel):
     """A part of the result; numbers are finite, what is not defined is null."""
@@ -124,7 +126,7 @@ class Flips(ResultModel):
     n: int
     flips: int
     rate: float | None
-    interval: tuple[float, float] | None
+    interval: Interval | None
     predicted: float | None
 
 
@@ -172,9 +174,9 @@ class MeanRatios(ResultModel):
     n: int
     blocks: int
     position: float | None
-    position_interval: tuple[float, float] | None
+    position_interval: Interval | None
     attitude: float | None
-    attitude_interval: tuple[float, float] | None
+    attitude_interval: Interval | None
 
 
 class BinRatios(MeanRatios):

@@ -5,8 +5,7 @@ from __future__ import annotations
 from droguekit.benchmark.results.docking_result import DockingErrors
 from droguekit.benchmark.results.result_parts import Comparison, NeesPart, ResultModel
 from droguekit.benchmark.results.tracking_result import Reacquisition, Tracking
-
-Ends = tuple[float, float]
+from droguekit.benchmark.statistics import Interval
 
 
 class Axes(ResultModel):
@@ -45,10 +44,10 @@ class MotionRow(ResultModel):
     of: int
     velocity_rmse_m_s: Axes
     speed_rmse_m_s: float
-    speed_interval: Ends | None
+    speed_interval: Interval | None
     rate_rmse_deg_s: Axes
     turn_rmse_deg_s: float
-    turn_interval: Ends | None
+    turn_interval: Interval | None
 
 
 class MotionBin(MotionRow):
@@ -72,7 +71,7 @@ class MotionNees(ResultModel):
     velocity: NeesPart | None
     rate: NeesPart | None
     motion: NeesPart | None
-    interval: Ends | None
+    interval: Interval | None
 
 
 class Lag(ResultModel):
@@ -84,7 +83,7 @@ class Lag(ResultModel):
     """
 
     lag_s: float | None
-    interval: Ends | None
+    interval: Interval | None
 
 
 class Filtering(ResultModel):

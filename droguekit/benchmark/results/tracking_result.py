@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from droguekit.benchmark.results.result_parts import ResultModel
-
-Ends = tuple[float, float]
+from droguekit.benchmark.statistics import Interval
 
 
 class OverlapRow(ResultModel):
@@ -24,10 +23,10 @@ class OverlapRow(ResultModel):
 
     n: int
     auc: float
-    auc_interval: Ends | None
+    auc_interval: Interval | None
     mean_overlap: float
     precision: float
-    precision_interval: Ends | None
+    precision_interval: Interval | None
     normalized_precision: float
     center_rms_px: float | None
     success: tuple[float, ...]
@@ -54,7 +53,7 @@ class Losses(ResultModel):
     minutes: float
     count: int
     per_minute: float
-    per_minute_interval: Ends
+    per_minute_interval: Interval
     lost_fraction: float
 
 

@@ -84,17 +84,17 @@ def eye_tracks(
 
 def eye_tracking(tracks: Sequence[EyeTrack], key: str) -> EyeTracking:
     """The scores of one eye's images; `key` is that of the bootstrap's random stream."""
-    return _tracking(tracks, _losses(tracks), key)
+    return _track_scores(tracks, _losses(tracks), key)
 
 
 def both_eyes_tracking(by_eye: Mapping[Eye, Sequence[EyeTrack]]) -> EyeTracking:
     """The scores of both eyes' images; losses are those of the eye that has more."""
     losses = [found for found in map(_losses, by_eye.values()) if found is not None]
     worse = max(losses, key=lambda found: (found.count, found.per_minute), default=None)
-    return _tracking([track for eye in EYES for track in by_eye[eye]], worse, "both eyes")
+    return _track_scores([track for eye in EYES for track in by_eye[eye]], worse, "both eyes")
 
 
-def _tracking(tracks: Sequence[EyeTrack], losses: Losses | None, key: str) -> EyeTracking:
+def _track_scores(tracks: Sequence[EyeTrack], losses: Losses | None, key: str) -> EyeTracking:
     boxed = [box is not None for track in tracks for box in track.sources]
     hidden = [sight == "hidden" for track in tracks for sight in track.sights]
     found = [(track.overlap >= LEAST_FOUND_OVERLAP).tolist() for track in tracks]

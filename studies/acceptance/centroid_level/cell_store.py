@@ -9,8 +9,8 @@ from importlib.resources import files
 from pathlib import Path
 
 from datasets_manifest.atomic import write_text_atomic
+from droguekit.batch.progress import ProgressReport
 from studies.acceptance.centroid_level.monte_carlo import Cell, CellResult, run_cell
-from studies.acceptance.reporter import Reporter
 
 CELLS_FILE = "cells.json"
 _MAKE_RESULTS = {".py", ".onnx"}
@@ -28,7 +28,7 @@ def code_fingerprint(rooms: Sequence[str] = _ROOMS) -> str:
     return digest.hexdigest()
 
 
-def run_cells(cells: Sequence[Cell], out: Path, report: Reporter) -> dict[Cell, CellResult]:
+def run_cells(cells: Sequence[Cell], out: Path, report: ProgressReport) -> dict[Cell, CellResult]:
     """Results of all cells; those that `out` holds already, made by the same code, are not made again.
 
     Raises:
@@ -53,7 +53,7 @@ def run_cells(cells: Sequence[Cell], out: Path, report: Reporter) -> dict[Cell, 
     return {cell: known[repr(cell)] for cell in wanted}
 
 
-def _read(path: Path, code: str, report: Reporter) -> dict[str, CellResult]:
+def _read(path: Path, code: str, report: ProgressReport) -> dict[str, CellResult]:
     if not path.exists():
         return {}
     try:

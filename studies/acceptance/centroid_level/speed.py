@@ -14,6 +14,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
+from droguekit.batch.progress import ProgressReport
 from droguekit.benchmark.poses.bounds import feature_points
 from droguekit.numerical_threads import one_thread
 from geometry.stereo import paper_rig
@@ -26,7 +27,6 @@ from studies.acceptance.centroid_level.corruption import Corruption, draw_shifts
 from studies.acceptance.centroid_level.drawn_poses import draw_poses, ellipse_centers_px
 from studies.acceptance.centroid_level.solvers import Measured, observations, solve
 from studies.acceptance.protocol import DOCKING_RANGE_M
-from studies.acceptance.reporter import Reporter
 from studies.acceptance.table import BarRow, at_most
 
 _SIGMA_PX = 0.1
@@ -35,7 +35,7 @@ _MOST_CENTROIDS_MS = {10.0: 8.0, 2.0: 40.0}
 _REPEATS = 5
 
 
-def bars_speed(dataset: Path, seed: int, draws: int | None, report: Reporter) -> list[BarRow]:
+def bars_speed(dataset: Path, seed: int, draws: int | None, report: ProgressReport) -> list[BarRow]:
     """Time the centroids, and single, batched and robust adjustment, on one thread.
 
     Args:

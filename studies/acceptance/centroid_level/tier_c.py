@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import norm
 
 from drogue_models.presets import RING_RADIUS_M
+from droguekit.batch.progress import ProgressReport
 from droguekit.benchmark.poses.closed_forms import FacingRing
 from droguekit.benchmark.statistics import CONFIDENCE, rms_upper_limit
 from geometry.stereo import paper_rig
@@ -17,7 +18,6 @@ from studies.acceptance.centroid_level.monte_carlo import Cell, CellResult
 from studies.acceptance.centroid_level.tolerances import AS_BUILT, RING_ONLY, TOLERANCED, Tolerances, stated_tolerances
 from studies.acceptance.confidence import Limited, nees_limits, paired_rms_ratio_limit
 from studies.acceptance.protocol import BATCHED_DRAWS, FLIP_DRAWS, MARKER_COUNTS, SIGMAS_PX, STATIONS_M
-from studies.acceptance.reporter import Reporter
 from studies.acceptance.table import BarRow, at_most, between, worst
 
 # Where the ring's radius outweighs all else, knowing of it or not changes nothing: the ratio is 1, and its limit above.
@@ -26,7 +26,7 @@ _NEVER_WORSE = 1.01
 Results = Mapping[Cell, CellResult]
 
 
-def bars_tier_c(out: Path, seed: int, draws: int | None, report: Reporter) -> list[BarRow]:
+def bars_tier_c(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[BarRow]:
     """Run what is not there yet, and compare it with bars 5, 6, 7, 9 and 10.
 
     Args:

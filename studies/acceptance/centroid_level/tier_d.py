@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from droguekit.batch.progress import ProgressReport
 from studies.acceptance.centroid_level.cell_store import run_cells
 from studies.acceptance.centroid_level.corruption import CLEAN, Corruption
 from studies.acceptance.centroid_level.monte_carlo import Cell, CellResult
+from studies.acceptance.centroid_level.tier_c import Results
 from studies.acceptance.confidence import Limited, paired_ratio_limit
 from studies.acceptance.protocol import (
     DOCKING_RANGE_M,
@@ -18,10 +20,8 @@ from studies.acceptance.protocol import (
     SIGMAS_PX,
     SINGLE_DRAWS,
 )
-from studies.acceptance.reporter import Reporter
 from studies.acceptance.table import BarRow, at_most, worst
 
-Results = Mapping[Cell, CellResult]
 CellMaker = Callable[[str, int, float, Corruption], Cell]
 
 # Centroid noise at which robust methods are compared with themselves on clean markers.
@@ -35,7 +35,7 @@ _BAD = {
 }
 
 
-def bars_tier_d(out: Path, seed: int, draws: int | None, report: Reporter) -> list[BarRow]:
+def bars_tier_d(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[BarRow]:
     """Run what is not there yet, and compare it with bars 11 and 12.
 
     Arguments and errors as `tier_c.bars_tier_c`.

@@ -8,7 +8,7 @@ import numpy as np
 
 from studies.acceptance.confidence import Limited, mean_limit, share_limit
 from studies.acceptance.rendered.block_limits import block_percentile_limit
-from studies.acceptance.rendered.image_rows import BEST
+from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import ScoredPair, Scores
 from studies.acceptance.table import BESIDE, BarRow, at_most, not_measured, worst
 

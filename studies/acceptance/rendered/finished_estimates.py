@@ -11,7 +11,7 @@ from datasets_manifest.atomic import write_text_atomic
 from studies.acceptance.centroid_level.cell_store import code_fingerprint
 
 # Whatever lies between the pixels and the estimates; those of readers and estimates among it.
-_ROOMS = ("geometry", "drogue_models", "datasets_manifest", "nav")
+_ROOMS_OF_ESTIMATES = ("geometry", "drogue_models", "datasets_manifest", "nav")
 
 
 def is_navigated(estimates: Path, dataset_sha256: str, methods: Sequence[str]) -> bool:
@@ -39,7 +39,7 @@ def _stamp(estimates: Path, dataset_sha256: str, methods: Sequence[str]) -> str:
     made_from = {
         "dataset_sha256": dataset_sha256,
         "methods": list(methods),
-        "code": code_fingerprint(_ROOMS),
+        "code": code_fingerprint(_ROOMS_OF_ESTIMATES),
         "estimates_sha256": hashlib.sha256(estimates.read_bytes()).hexdigest(),
     }
     return json.dumps(made_from, indent=1) + "\n"

@@ -8,12 +8,9 @@ from dataclasses import dataclass
 from datasets_manifest.recipe.recipe import FrameCounts, Recipe
 from studies.acceptance.rendered.bench_rows import bench_rows
 from studies.acceptance.rendered.flight_rows import approach_rows, condition_rows, lost_rows
-from studies.acceptance.rendered.image_rows import BEST, CHAIN
 from studies.acceptance.rendered.sequence_pairs import Scores
 from studies.acceptance.table import BarRow
 
-# Our best method, and the seed paper's; each measured and filtered.
-METHODS = (BEST, CHAIN)
 # Of recipes without sequences, the bench's: ten sets at each of its nine stations.
 _BENCH_PART = 90
 

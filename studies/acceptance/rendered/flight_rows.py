@@ -16,7 +16,7 @@ from studies.acceptance.rendered.block_limits import (
     block_rms_limit,
     block_share_limit,
 )
-from studies.acceptance.rendered.image_rows import BEST
+from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, Scores
 from studies.acceptance.table import BESIDE, BarRow, at_most, not_measured
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
 from studies.acceptance.confidence import paired_ratio_limit
-from studies.acceptance.rendered.image_rows import BEST
+from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, Scores
 from studies.acceptance.table import GOAL, BarRow, at_most, between
 

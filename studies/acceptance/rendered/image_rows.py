@@ -17,10 +17,17 @@ from studies.acceptance.confidence import (
     rms_ratio_limit,
     size_of_mean_limit,
 )
-from studies.acceptance.rendered.scored_frames import Frames, MarkerErrors, between_m, pose_array, stacked_px
+from studies.acceptance.rendered.scored_frames import (
+    BEST,
+    CHAIN,
+    Frames,
+    MarkerErrors,
+    between_m,
+    pose_array,
+    stacked_px,
+)
 from studies.acceptance.table import BarRow, at_most, not_measured
 
-BEST, CHAIN = "joint-hub", "paper"
 NEAR_M, FAR_M = 1.7, 40.0
 
 

@@ -9,8 +9,6 @@ from typing import Literal
 
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
 from studies.acceptance.rendered.image_rows import (
-    BEST,
-    CHAIN,
     Light,
     absolute_rows,
     centroid_bound_rows,
@@ -20,11 +18,8 @@ from studies.acceptance.rendered.image_rows import (
     paper_rows,
 )
 from studies.acceptance.rendered.normalized_rows import tier_a_rows, tier_b_rows
-from studies.acceptance.rendered.scored_frames import score_frames
+from studies.acceptance.rendered.scored_frames import METHODS, score_frames
 from studies.acceptance.table import BarRow
-
-# What must be navigated for the bars: our best method, and the seed paper's.
-METHODS = (BEST, CHAIN)
 
 
 @dataclass(frozen=True)
@@ -77,4 +72,4 @@ IMAGE_TIERS: dict[str, Callable[[TierData], list[BarRow]]] = {"a": tier_a_bars, 
 
 
 def _light(data: TierData) -> Light:
-    return Light(data.light, score_frames(data.dataset, data.estimates, (BEST, CHAIN)))
+    return Light(data.light, score_frames(data.dataset, data.estimates, METHODS))

@@ -10,7 +10,7 @@ from droguekit.benchmark.poses.pose_errors import COMPONENTS
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, BinRow
 from droguekit.benchmark.statistics import rms_upper_limit
 from studies.acceptance.confidence import nees_limits, share_limit
-from studies.acceptance.rendered.image_rows import BEST
+from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.table import BarRow, at_most, between, not_measured, worst
 
 _POSITION, _ATTITUDE = COMPONENTS[:3], COMPONENTS[3:]

@@ -16,6 +16,11 @@ from droguekit.benchmark.poses.pose_errors import by_method, pose_error
 from geometry.se3 import Array
 from studies.acceptance.rendered.disc_light import center_bounds_px
 
+BEST, CHAIN = "joint-hub", "paper"
+"""Our best method, and the seed paper's."""
+METHODS = (BEST, CHAIN)
+"""What must be navigated to judge a tier."""
+
 
 @dataclass(frozen=True, eq=False)
 class MarkerErrors:

@@ -18,7 +18,7 @@ from droguekit.benchmark.poses.reference import build_reference
 from droguekit.benchmark.sequences.sequence_latency import worked_s
 from droguekit.benchmark.sequences.sequence_truth import Sight, moment
 from geometry.se3 import Array
-from studies.acceptance.rendered.image_rows import BEST
+from studies.acceptance.rendered.scored_frames import BEST
 
 # Our best method, with the filter behind it.
 FILTERED = f"{BEST}+filter"

@@ -25,7 +25,7 @@ from studies.acceptance.measurement import (
 )
 from studies.acceptance.rendered.flight_data import FLIGHT_TIERS, FlightData, part_length
 from studies.acceptance.rendered.flight_rows import approach_rows, lost_rows
-from studies.acceptance.rendered.image_rows import BEST
+from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
 from studies.acceptance.table import BarRow
 from tests.support.small_datasets import RIG_320_PX

@@ -18,7 +18,7 @@ from scenes.sampler import recipe_of_scene, scene_of_frame
 from studies.acceptance.rendered.bench_rows import bench_rows, speed_rows
 from studies.acceptance.rendered.flight_data import FLIGHT_TIERS, part_length, with_parts
 from studies.acceptance.rendered.flight_rows import approach_rows, bound_ratio, condition_rows, lost_rows
-from studies.acceptance.rendered.image_rows import BEST, CHAIN
+from studies.acceptance.rendered.scored_frames import BEST, CHAIN
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, TruePair
 from studies.acceptance.table import BarRow
 

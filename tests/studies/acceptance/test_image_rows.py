@@ -13,9 +13,9 @@ from studies.acceptance.protocol import STATIONS_M
 from studies.acceptance.rendered import image_rows
 from studies.acceptance.rendered.disc_light import contrast_from_snr
 from studies.acceptance.rendered.finished_estimates import is_navigated, mark_navigated
-from studies.acceptance.rendered.image_rows import BEST, CHAIN, Light
+from studies.acceptance.rendered.image_rows import Light
 from studies.acceptance.rendered.image_tiers import recipe_of
-from studies.acceptance.rendered.scored_frames import FrameErrors, MarkerErrors
+from studies.acceptance.rendered.scored_frames import BEST, CHAIN, FrameErrors, MarkerErrors
 
 PER_STATION = 30
 
