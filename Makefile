@@ -58,7 +58,7 @@ bench-peers: ## CPU seconds per pair of our path, plain Cycles and plain Mitsuba
 
 bench-scaling: ## two workers against one on 200 pairs, and what a frame costs besides its work (minutes; on a machine that does nothing else; goes on where it stopped)
 	@scripts/setup all
-	@$(BIN)/python -m studies.scaling.scaling --out out/scaling
+	@$(BIN)/python -m studies.scaling --out out/scaling
 
 CORPUS ?= out/detector/datasets/detector-small
 bench-detectors: ## detectors OURS=FILE.onnx beside YOLOv8n and YOLOv8s, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; goes on where it stopped)
@@ -100,7 +100,7 @@ bars-nav-docking: ## accuracy bars of whole docking runs, by both engines and be
 publish: ## make the published manifests of the small recipes anew (minutes); after a change of pixels or recipes
 	@scripts/setup mitsuba
 	@rm -rf out/publish
-	@$(BIN)/python -m studies.publish.publish --work out/publish --out datasets_manifest/published
+	@$(BIN)/python -m studies.publish --work out/publish --out datasets_manifest/published
 
 clean: ## remove the environment, caches and build results; out/ stays
 	rm -rf .venv .bootstrap build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

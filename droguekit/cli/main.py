@@ -50,7 +50,8 @@ COMMANDS = {
         "droguekit.cli.navigation.benchmark", "Compare estimates with the truth: numbers and a report."
     ),
     "report": Command(
-        "studies.paper.command", "Put our numbers beside the seed paper's: its tables and figures, as page and PDF."
+        "studies.paper.report_command",
+        "Put our numbers beside the seed paper's: its tables and figures, as page and PDF.",
     ),
     "model": Command("droguekit.cli.viewing.model", "Write the drogue as a mesh."),
     "demo": Command("droguekit.cli.demo", "Render a small dataset, navigate on it, and report."),

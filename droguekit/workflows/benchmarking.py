@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
-    from droguekit.benchmark.benchmark import BenchmarkResult
     from droguekit.benchmark.blind_check import BlindCheck
+    from droguekit.benchmark.pose_benchmark import BenchmarkResult
 
 
 def benchmark_dataset(
@@ -21,8 +21,8 @@ def benchmark_dataset(
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.benchmark.benchmark import run_benchmark
-    from droguekit.benchmark.report.report import write_report
+    from droguekit.benchmark.pose_benchmark import run_benchmark
+    from droguekit.benchmark.report.pose_report import write_report
     from droguekit.numerical_threads import one_thread
 
     with one_thread():
@@ -42,8 +42,7 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.benchmark.blind_check import check_blind
-    from droguekit.benchmark.blind_report import write_blind_report
+    from droguekit.benchmark.blind_check import check_blind, write_blind_report
     from droguekit.numerical_threads import one_thread
 
     with one_thread():

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from droguekit.batch.progress import ProgressReport
-    from droguekit.benchmark.detection.detection_benchmark import DetectorRun
     from droguekit.benchmark.detection.detection_run import DetectorPass
-    from droguekit.benchmark.results.detection_boxes import FoundBox
-    from droguekit.benchmark.results.detection_result import DetectionResult, PairTimes
+    from droguekit.benchmark.detection.detection_scores import DetectorRun
+    from droguekit.benchmark.results.detection_result import DetectionResult, FoundBox, PairTimes
     from nav.detector.onnx_cost import NetworkCost
 
 
@@ -46,7 +45,7 @@ def detect_dataset(
         OSError: the file cannot be written; it is then left as it was.
     """
     from droguekit.benchmark.detection.detection_run import DetectorPass
-    from droguekit.benchmark.results.detection_boxes import write_detections
+    from droguekit.benchmark.results.detection_result import write_detections
     from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 
     if not 0 <= least_score <= 1:
@@ -99,9 +98,8 @@ def benchmark_detections(
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.benchmark.detection.detection_benchmark import score_detections
     from droguekit.benchmark.detection.detection_report import write_detection_report
-    from droguekit.benchmark.detection.detection_scores import split_to_score
+    from droguekit.benchmark.detection.detection_scores import score_detections, split_to_score
     from droguekit.benchmark.detection.detection_truth import read_detection_truth
 
     if options.threshold is not None and not 0 <= options.threshold <= 1:
@@ -120,9 +118,9 @@ def benchmark_detections(
 def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorRun]:
     """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
-    from droguekit.benchmark.detection.detection_benchmark import DetectorRun
     from droguekit.benchmark.detection.detection_run import DetectorPass
-    from droguekit.benchmark.results.detection_boxes import image_id_of, read_detections
+    from droguekit.benchmark.detection.detection_scores import DetectorRun
+    from droguekit.benchmark.results.detection_result import image_id_of, read_detections
     from geometry.stereo import EYES
     from nav.detector.detector_registry import detector_factory
 
@@ -140,8 +138,8 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
 
 def _detector_run(name_or_file: str, detecting: DetectorPass, report: ProgressReport) -> DetectorRun:
     """What a detector finds in all images."""
-    from droguekit.benchmark.detection.detection_benchmark import DetectorRun
     from droguekit.benchmark.detection.detection_run import LEAST_SCORE
+    from droguekit.benchmark.detection.detection_scores import DetectorRun
 
     report.say(f"{detecting.name}: looking for the drogue, without the truth")
     report.begin("pairs", detecting.pairs)

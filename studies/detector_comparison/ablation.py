@@ -14,7 +14,7 @@ from typing import Any
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset, read_blind_index
 from datasets_manifest.types.images import StereoImages
-from droguekit.benchmark.detection.detection_matching import Evaluation
+from droguekit.benchmark.detection.detection_metrics import Evaluation
 from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
 from droguekit.benchmark.detection.detection_tables import share
 from droguekit.benchmark.detection.detection_truth import ImageTruth, read_detection_truth

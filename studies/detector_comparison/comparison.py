@@ -16,7 +16,7 @@ from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.locking import takes_lock
 from datasets_manifest.storage.reader import Dataset
 from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
-from droguekit.benchmark.results.detection_boxes import write_detections
+from droguekit.benchmark.results.detection_result import write_detections
 from nav.detector.detector import Detector
 from nav.detector.onnx_cost import network_cost
 from nav.detector.onnx_detector import OnnxDetector

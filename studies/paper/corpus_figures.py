@@ -17,7 +17,7 @@ from datasets_manifest.types.records import PixelBox
 from droguekit.benchmark.report.figures import INK, PANEL_IN, drawing, svg_element
 from droguekit.benchmark.report.number_text import plain_number
 from geometry.se3 import Array
-from studies.paper.provenance import source_text
+from studies.paper.paper_inputs import source_text
 
 # Blue that stands out on white and on black; how many drogues are meant is told by its opacity.
 _COLOR = "#1f78c8"

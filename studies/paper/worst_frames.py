@@ -15,13 +15,12 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import NoFix, PoseEstimate
 from datasets_manifest.types.records import PairRecord, PixelBox
 from drogue_models.marker_layout import MarkerLayout, marker_layout
-from droguekit.benchmark.report.label_drawing import Picture, display_picture
-from droguekit.benchmark.report.label_thumbnails import jpeg_uri
+from droguekit.benchmark.report.label_drawing import Picture, display_picture, jpeg_uri
 from droguekit.benchmark.report.number_text import plain_number, three_digits
 from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
-from studies.paper.docking_run import DockingData
+from studies.paper.docking_experiment import DockingData
 
 WORST_COUNT = 10
 

@@ -54,7 +54,13 @@ def test_the_block_holds(package: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["nav.runner", "droguekit.benchmark.benchmark", "droguekit.benchmark.report.report", "droguekit.cli.main"]
+    "module",
+    [
+        "nav.runner",
+        "droguekit.benchmark.pose_benchmark",
+        "droguekit.benchmark.report.pose_report",
+        "droguekit.cli.main",
+    ],
 )
 def test_modules_import_without_renderer_meshes_and_torch(module: str, tmp_path: Path) -> None:
     result = run_blocked(f"import {module}", [], tmp_path)

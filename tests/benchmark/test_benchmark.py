@@ -9,9 +9,9 @@ import pytest
 
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.benchmark import run_benchmark, score
+from droguekit.benchmark.pose_benchmark import run_benchmark, score
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
-from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.poses.pose_errors import by_method
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform, exp_twist
@@ -292,8 +292,8 @@ class Wall:
 
 
 sys.meta_path.insert(0, Wall())
-from droguekit.benchmark.benchmark import run_benchmark
-from droguekit.benchmark.report.report import write_report
+from droguekit.benchmark.pose_benchmark import run_benchmark
+from droguekit.benchmark.report.pose_report import write_report
 folder, estimates, page = map(Path, sys.argv[1:])
 write_report(folder, estimates, run_benchmark(folder, estimates), page)
 """

@@ -8,7 +8,13 @@ import pytest
 
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parameters import even_ring
-from droguekit.benchmark.poses.bounds import FeatureNoise, center_jacobian, feature_points, features_seen, pose_bound
+from droguekit.benchmark.poses.cramer_rao import (
+    FeatureNoise,
+    center_jacobian,
+    feature_points,
+    features_seen,
+    pose_bound,
+)
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, Eye
 

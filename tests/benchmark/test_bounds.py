@@ -5,7 +5,7 @@ import pytest
 
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.parameters import even_ring
-from droguekit.benchmark.poses.bounds import angles_jacobian, center_jacobian, feature_points, pose_bound
+from droguekit.benchmark.poses.cramer_rao import angles_jacobian, center_jacobian, feature_points, pose_bound
 from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform, angles_from_axis, exp_twist
 from geometry.stereo import EYES, Eye

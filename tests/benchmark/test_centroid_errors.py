@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.estimates import Feature
-from droguekit.benchmark.poses.bounds import pose_bound
 from droguekit.benchmark.poses.centroid_errors import (
     centroid_errors,
     centroid_statistics,
     position_error_from_centroids,
     symmetric_orders,
 )
-from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.poses.cramer_rao import pose_bound
+from droguekit.benchmark.poses.drogue_truth import drogue_truth
 
 
 def test_sigma_and_bias_are_those_of_the_noise(build: SimpleNamespace, rng: np.random.Generator) -> None:

@@ -5,8 +5,7 @@ import pytest
 
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parameters import even_ring
-from droguekit.benchmark.poses.bounds import FeatureNoise, features_seen, pose_bound
-from droguekit.benchmark.poses.closed_forms import FacingRing, flip_probability
+from droguekit.benchmark.poses.cramer_rao import FacingRing, FeatureNoise, features_seen, flip_probability, pose_bound
 from geometry.stereo import paper_rig
 
 RING_M = 0.28

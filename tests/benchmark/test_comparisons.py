@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from droguekit.benchmark.poses.comparisons import PairGroups, compare
-from droguekit.benchmark.poses.distance_bins import DistanceBin
+from droguekit.benchmark.confidence_intervals import ratio_intervals
+from droguekit.benchmark.poses.method_comparison import PairGroups, compare
 from droguekit.benchmark.poses.pose_errors import PoseError
-from droguekit.benchmark.statistics import ratio_intervals
+from droguekit.benchmark.poses.reference import DistanceBin
 
 
 def error(position_m: float, angle_deg: float = 1.0) -> PoseError:

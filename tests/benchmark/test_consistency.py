@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.estimates import PoseEstimate
-from droguekit.benchmark.poses.bounds import component_covariance
-from droguekit.benchmark.poses.consistency import nees, normalized_errors, squared_errors
-from droguekit.benchmark.poses.pose_errors import PoseError, pose_error
-from droguekit.benchmark.statistics import mean_square_region, rms_upper_limit
+from droguekit.benchmark.confidence_intervals import mean_square_region, rms_upper_limit
+from droguekit.benchmark.poses.cramer_rao import component_covariance
+from droguekit.benchmark.poses.pose_errors import PoseError, nees, normalized_errors, pose_error, squared_errors
 from geometry.se3 import RigidTransform, exp_twist
 
 

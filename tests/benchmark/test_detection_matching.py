@@ -14,11 +14,19 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from datasets_manifest.types.records import PixelBox
-from droguekit.benchmark.detection.detection_curve import best_f1, operating_point, precision_recall
-from droguekit.benchmark.detection.detection_intervals import average_precision_interval, resampled_precision
-from droguekit.benchmark.detection.detection_matching import AT_50, RECALLS, Evaluation, Matches
+from droguekit.benchmark.detection.detection_metrics import (
+    AT_50,
+    RECALLS,
+    Evaluation,
+    Matches,
+    average_precision_interval,
+    best_f1,
+    operating_point,
+    precision_recall,
+    resampled_precision,
+)
 from droguekit.benchmark.detection.detection_truth import ImageTruth
-from droguekit.benchmark.results.detection_boxes import FoundBox
+from droguekit.benchmark.results.detection_result import FoundBox
 from geometry.stereo import EYES
 from nav.training.evaluation import best_threshold
 

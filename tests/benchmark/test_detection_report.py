@@ -13,19 +13,25 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.detection.detection_benchmark import DetectorRun, ScoredDetections, score_detections
 from droguekit.benchmark.detection.detection_figures import (
     MEASURES,
     curve_panel,
     distance_panel,
+    is_timed,
+    published_name,
     score_panel,
     size_panel,
+    speed_panel,
 )
-from droguekit.benchmark.detection.detection_pictures import detection_picture, worst_false_alarms, worst_misses
-from droguekit.benchmark.detection.detection_published import PUBLISHED_DETECTORS
-from droguekit.benchmark.detection.detection_report import write_detection_report
-from droguekit.benchmark.detection.detection_speed import is_timed, published_name, speed_panel
+from droguekit.benchmark.detection.detection_report import (
+    detection_picture,
+    worst_false_alarms,
+    worst_misses,
+    write_detection_report,
+)
+from droguekit.benchmark.detection.detection_scores import DetectorRun, ScoredDetections, score_detections
 from droguekit.benchmark.detection.detection_tables import (
+    PUBLISHED_DETECTORS,
     SUMMARY_COLUMNS,
     SUMMARY_COLUMNS_MORE,
     detector_lines,
@@ -35,8 +41,7 @@ from droguekit.benchmark.detection.detection_tables import (
 )
 from droguekit.benchmark.detection.detection_truth import DetectionTruth, ImageTruth, read_detection_truth
 from droguekit.benchmark.report.label_drawing import BOX_RGB, MARKER_RGB
-from droguekit.benchmark.results.detection_boxes import FoundBox
-from droguekit.benchmark.results.detection_result import DetectionResult, PairTimes
+from droguekit.benchmark.results.detection_result import DetectionResult, FoundBox, PairTimes
 from geometry.stereo import EYES
 
 FALSE_BOX = (700.0, 40.0, 60.0, 60.0)

@@ -16,8 +16,8 @@ from pycocotools.coco import COCO
 from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.types.records import PairRecord, ViewRecord
 from droguekit.benchmark.detection.detection_truth import image_truth, read_detection_truth
-from droguekit.benchmark.poses.visibility import LEAST_SEEN_FRACTION, seen_fraction
-from droguekit.benchmark.results.detection_boxes import (
+from droguekit.benchmark.poses.drogue_truth import LEAST_SEEN_FRACTION, seen_fraction
+from droguekit.benchmark.results.detection_result import (
     FoundBox,
     center_box,
     clipped_box,

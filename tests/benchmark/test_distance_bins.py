@@ -3,7 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from droguekit.benchmark.poses.distance_bins import distance_bins
+from droguekit.benchmark.poses.reference import distance_bins
 
 
 def test_stations_get_a_bin_each(rng: np.random.Generator) -> None:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
-from droguekit.benchmark.poses.closed_forms import FacingRing, flip_probability
-from droguekit.benchmark.poses.flips import FlipTrial, flip_row, flip_trials, ring_tilt_scale
-from droguekit.benchmark.poses.frame_truth import DrogueTruth, drogue_truth
+from droguekit.benchmark.poses.cramer_rao import FacingRing, flip_probability
+from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
+from droguekit.benchmark.poses.pose_errors import FlipTrial, flip_row, flip_trials, ring_tilt_scale
 from geometry.se3 import RigidTransform
 
 MIDDLE_M = 0.06

@@ -9,10 +9,10 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.estimates import write_estimates
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.benchmark import run_benchmark, score
-from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.pose_benchmark import run_benchmark, score
+from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.poses.pose_errors import by_method
-from droguekit.benchmark.report.report import write_report
+from droguekit.benchmark.report.pose_report import write_report
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform
 from scenes.sampler import sample_reading_m

@@ -11,13 +11,12 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import NoFix, write_estimates
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.benchmark import run_benchmark
-from droguekit.benchmark.poses.ranking import best_method
+from droguekit.benchmark.pose_benchmark import run_benchmark
+from droguekit.benchmark.poses.method_comparison import best_method
 from droguekit.benchmark.report.figures import QUANTITIES, error_panel, method_styles
-from droguekit.benchmark.report.label_thumbnails import contact_tiles, label_picture
-from droguekit.benchmark.report.narrative import result_sentences
+from droguekit.benchmark.report.label_drawing import contact_tiles, label_picture
 from droguekit.benchmark.report.number_text import distance_text, percent, plain_number, three_digits
-from droguekit.benchmark.report.report import stage_times_ms, write_report
+from droguekit.benchmark.report.pose_report import result_sentences, stage_times_ms, write_report
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
 
 DatasetFixture = tuple[Path, list[PairRecord]]

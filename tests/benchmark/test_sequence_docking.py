@@ -9,18 +9,19 @@ from scipy.optimize import brentq
 
 from datasets_manifest.types.estimates import Docking, Motion, PoseEstimate
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.poses.frame_truth import drogue_truth
-from droguekit.benchmark.results.docking_result import Captures
-from droguekit.benchmark.sequences.docking_scores import calibration, docking_errors
-from droguekit.benchmark.sequences.sequence_docking import (
+from droguekit.benchmark.pose_benchmark import sequence_data
+from droguekit.benchmark.poses.drogue_truth import drogue_truth
+from droguekit.benchmark.results.sequence_result import Captures
+from droguekit.benchmark.sequences.docking_errors import (
     Arrival,
     arrivals_in_the_end,
+    calibration,
+    docking_errors,
     predicted_arrival,
     tip_in_left_m,
     true_dockings,
 )
-from droguekit.benchmark.sequences.sequence_filtering import SequenceData
-from droguekit.benchmark.sequences.sequence_scores import sequence_data
+from droguekit.benchmark.sequences.filter_errors import SequenceData
 from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
 from nav.docking import capture_radius_m, docking_of
 

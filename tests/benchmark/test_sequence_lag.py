@@ -8,7 +8,7 @@ import pytest
 
 from datasets_manifest.types.estimates import PoseEstimate
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
-from droguekit.benchmark.sequences.sequence_lag import MOST_LAG_S, lags
+from droguekit.benchmark.sequences.filter_errors import MOST_LAG_S, lags
 from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
 from geometry.se3 import RigidTransform
 

@@ -11,18 +11,21 @@ from scipy.stats import multivariate_normal
 
 from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from datasets_manifest.types.estimates import Motion, PoseEstimate
-from droguekit.benchmark.poses.consistency import normalized_squares
-from droguekit.benchmark.poses.frame_truth import drogue_truth
-from droguekit.benchmark.sequences.sequence_filtering import filtering
-from droguekit.benchmark.sequences.sequence_motion import (
+from droguekit.benchmark.pose_benchmark import sequence_data
+from droguekit.benchmark.poses.drogue_truth import drogue_truth
+from droguekit.benchmark.poses.pose_errors import normalized_squares
+from droguekit.benchmark.sequences.filter_errors import filtering
+from droguekit.benchmark.sequences.sequence_truth import (
     MOTION_PARTS,
+    Moment,
+    TrueSequence,
+    moment,
     motion_errors,
     pairs_per_knot,
     smoothing_spline,
     true_motions,
+    true_sequences,
 )
-from droguekit.benchmark.sequences.sequence_scores import sequence_data
-from droguekit.benchmark.sequences.sequence_truth import Moment, TrueSequence, moment, true_sequences
 from geometry.se3 import RigidTransform
 from scenes.flight.sequence import moment_of_sequence
 

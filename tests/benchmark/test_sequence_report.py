@@ -15,19 +15,17 @@ import pytest
 
 from datasets_manifest.types.estimates import Docking, Estimate, Motion, NoFix, PoseEstimate, Region, write_estimates
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.benchmark import run_benchmark
-from droguekit.benchmark.detection.detection_benchmark import DetectorRun, score_detections
 from droguekit.benchmark.detection.detection_report import write_detection_report
+from droguekit.benchmark.detection.detection_scores import DetectorRun, score_detections
 from droguekit.benchmark.detection.detection_truth import read_detection_truth
-from droguekit.benchmark.poses.frame_truth import drogue_truth
-from droguekit.benchmark.report.figures import legend_key, method_styles
-from droguekit.benchmark.report.report import write_report
-from droguekit.benchmark.report.sequence_figures import DistanceLine, Point, distance_lines_panel
+from droguekit.benchmark.pose_benchmark import run_benchmark, score_sequences
+from droguekit.benchmark.poses.drogue_truth import drogue_truth
+from droguekit.benchmark.report.figures import DistanceLine, Point, distance_lines_panel, legend_key, method_styles
+from droguekit.benchmark.report.pose_report import write_report
 from droguekit.benchmark.report.sequence_report import sequence_section, sequence_sentences
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
-from droguekit.benchmark.results.detection_boxes import FoundBox, corner_box, image_id_of
+from droguekit.benchmark.results.detection_result import FoundBox, corner_box, image_id_of
 from droguekit.benchmark.results.sequence_result import SequencesResult
-from droguekit.benchmark.sequences.sequence_scores import score_sequences
 from droguekit.benchmark.sequences.sequence_truth import moment, true_sequences
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES

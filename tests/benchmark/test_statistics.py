@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from datasets_manifest.random_streams import named_generator
-from droguekit.benchmark.statistics import (
+from droguekit.benchmark.confidence_intervals import (
     CONFIDENCE,
     bootstrap_intervals,
     fraction_interval,

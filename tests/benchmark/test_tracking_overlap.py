@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pycocotools import mask
 
-from droguekit.benchmark.sequences.tracking_overlap import (
+from droguekit.benchmark.sequences.tracking_scores import (
     CENTER_ERRORS_PX,
     NO_BOX,
     NORMALIZED_ERRORS,

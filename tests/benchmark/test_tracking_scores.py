@@ -8,14 +8,13 @@ from scipy.stats import poisson
 
 from datasets_manifest.types.estimates import Estimate, NoFix, Region
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.poses.frame_truth import drogue_truth
+from droguekit.benchmark.confidence_intervals import rate_interval
+from droguekit.benchmark.pose_benchmark import score_sequences
+from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.report.sequence_report import sequence_sentences
-from droguekit.benchmark.results.detection_boxes import FoundBox, corner_box, image_id_of
-from droguekit.benchmark.sequences.sequence_scores import score_sequences
+from droguekit.benchmark.results.detection_result import FoundBox, corner_box, image_id_of
 from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
-from droguekit.benchmark.sequences.tracking import track_found_boxes, track_regions
-from droguekit.benchmark.sequences.tracking_scores import reacquisition
-from droguekit.benchmark.statistics import rate_interval
+from droguekit.benchmark.sequences.tracking_scores import reacquisition, track_found_boxes, track_regions
 from geometry.stereo import EYES
 
 SEEN, HIDDEN, PARTLY, DAZZLED = "seen", "hidden", "partly", "dazzled"

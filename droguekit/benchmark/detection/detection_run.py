@@ -11,8 +11,7 @@ from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.images import StereoImages
 from drogue_models.parameters import DrogueParameters
-from droguekit.benchmark.results.detection_boxes import FoundBox, clipped_box, corner_box, image_id_of
-from droguekit.benchmark.results.detection_result import PairTimes
+from droguekit.benchmark.results.detection_result import FoundBox, PairTimes, clipped_box, corner_box, image_id_of
 from geometry.stereo import EYES
 from nav.detector.detector import Detector
 

@@ -15,8 +15,8 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.records import PairRecord, PixelBox
 from droguekit.benchmark.blind_check import blind_scenes
-from droguekit.benchmark.poses.visibility import LEAST_SEEN_FRACTION, seen_fraction
-from droguekit.benchmark.results.detection_boxes import FoundBox, clipped_box, corner_box, image_id_of
+from droguekit.benchmark.poses.drogue_truth import LEAST_SEEN_FRACTION, seen_fraction
+from droguekit.benchmark.results.detection_result import FoundBox, clipped_box, corner_box, image_id_of
 from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
 from geometry.stereo import EYES, Eye
 

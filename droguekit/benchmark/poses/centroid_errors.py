@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.estimates import Feature
 from drogue_models.marker_layout import MarkerLayout
-from droguekit.benchmark.poses.bounds import pose_covariance
-from droguekit.benchmark.poses.frame_truth import DrogueTruth
-from droguekit.benchmark.results.result_parts import Centroids
+from droguekit.benchmark.poses.cramer_rao import pose_covariance
+from droguekit.benchmark.poses.drogue_truth import DrogueTruth
+from droguekit.benchmark.results.pose_result import Centroids
 from geometry.se3 import Array
 from geometry.stereo import EYES
 

@@ -1,15 +1,18 @@
-"""Images as a screen wants them, with boxes and centres drawn where the labels say."""
+"""Images with boxes and centres drawn in, and small pictures of pairs as data URIs."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import StereoImages
-from datasets_manifest.types.records import PixelBox, PixelPoint
+from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
 
 Picture = NDArray[np.uint8]
 Rgb = tuple[int, int, int]
@@ -87,3 +90,124 @@ def _fixed_point(point: PixelPoint, scale: float, corner: PixelPoint) -> tuple[i
     """Where an image point lies in a cut-out, in OpenCV's fixed point."""
     x, y = ((value - low) * scale - 0.5 for value, low in zip(point, corner, strict=True))
     return round(x * 2**_SHIFT), round(y * 2**_SHIFT)
+
+
+TILE_WIDTH_PX = 400
+_JPEG_QUALITY = 82
+
+# A drogue smaller than this share of the picture's width is shown once more, enlarged, in a corner.
+ENLARGE_BELOW = 0.3
+_INSET_SHARE = 0.38
+_INSET_MARGIN = 1.25
+
+# Pairs looked at for their distance: enough to spread a dozen over any range of distances.
+_MOST_LOOKED_AT = 240
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One picture.
+
+    Attributes:
+        frame_index: of the pair.
+        distance_m: Z of the rim's centre in the left camera. [m]
+        data_uri: JPEG of the left image.
+        width_px, height_px: its size.
+    """
+
+    frame_index: int
+    distance_m: float
+    data_uri: str
+    width_px: int
+    height_px: int
+
+
+def contact_tiles(dataset: Dataset, count: int = 12) -> list[Tile]:
+    """Up to `count` pairs spread over the distances, nearest first; empty if no pair shows a drogue."""
+    indices = dataset.frame_indices
+    looked_at = [indices[k] for k in spread(len(indices), _MOST_LOOKED_AT)]
+    records = [record for record in map(dataset.record, looked_at) if record.left_from_drogue is not None]
+    records.sort(key=lambda record: (_distance_m(record), record.frame_index))
+    tiles = []
+    for record in (records[k] for k in spread(len(records), count)):
+        view = record.views.left
+        centers = [marker.center_ellipse_px for marker in view.markers if marker.visible_fraction > 0]
+        picture = label_picture(display_picture(dataset.images(record.frame_index)), view.box_visible_xywh_px, centers)
+        tiles.append(tile_of(record.frame_index, _distance_m(record), picture))
+    return tiles
+
+
+def tile_of(frame_index: int, distance_m: float, picture: Picture) -> Tile:
+    """A picture as a page holds it."""
+    return Tile(frame_index, distance_m, jpeg_uri(picture), picture.shape[1], picture.shape[0])
+
+
+def label_picture(picture: Picture, box: PixelBox | None, centers: Sequence[PixelPoint]) -> Picture:
+    """A small copy of an image with a box and the marker centres; a far drogue also enlarged in a corner.
+
+    Args:
+        picture: (H, W, 3) the image.
+        box: around the drogue, or None where it is not seen; nothing is drawn then.
+        centers: of the markers in sight. [px]
+    """
+    width = picture.shape[1]
+    tile, scale = resized(picture, TILE_WIDTH_PX)
+    if box is None:
+        return tile
+    draw_box(tile, box, scale)
+    if box[2] >= ENLARGE_BELOW * width:
+        draw_crosses(tile, centers, scale)
+    else:
+        _put_inset(tile, picture, box, centers)
+    return tile
+
+
+def jpeg_uri(picture: Picture) -> str:
+    """An RGB picture as a JPEG data URI."""
+    _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+
+
+def _put_inset(tile: Picture, picture: Picture, box: PixelBox, centers: Sequence[PixelPoint]) -> None:
+    """Enlarge the surroundings of the box into the corner that is farthest from it."""
+    inset, scale, corner = enlarged_surroundings(picture, box, tile.shape[0])
+    draw_crosses(inset, centers, scale, corner)
+    put_in_far_corner(tile, inset, (box[0] + box[2] / 2) / picture.shape[1], (box[1] + box[3] / 2) / picture.shape[0])
+
+
+def enlarged_surroundings(picture: Picture, box: PixelBox, tile_height: int) -> tuple[Picture, float, PixelPoint]:
+    """A square around a box, as large as an inset of a tile of that height.
+
+    Returns:
+        The inset, its size over that of what it shows, and the low corner of what it shows. [px]
+    """
+    side = round(_INSET_SHARE * tile_height)
+    middle = (box[0] + box[2] / 2, box[1] + box[3] / 2)
+    reach = _INSET_MARGIN * max(box[2], box[3])
+    scale = side / reach
+    corner = (middle[0] - reach / 2, middle[1] - reach / 2)
+    # Pixel (i, j) of the inset shows the image at corner + (i + 1/2) / scale, in pixel-centre coordinates.
+    start = [low + 0.5 / scale for low in corner]
+    warp = np.array([[1 / scale, 0, start[0]], [0, 1 / scale, start[1]]])
+    inset = cv2.warpAffine(
+        picture, warp, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(inset, dtype=np.uint8), scale, corner
+
+
+def put_in_far_corner(tile: Picture, inset: Picture, x_share: float, y_share: float) -> None:
+    """Frame an inset and put it into the corner that is farthest from a place, given as shares of the tile's size."""
+    side = inset.shape[0]
+    cv2.rectangle(inset, (0, 0), (side - 1, side - 1), BOX_RGB, 1)
+    x = 0 if x_share > 0.5 else tile.shape[1] - side
+    y = 0 if y_share > 0.5 else tile.shape[0] - side
+    tile[y : y + side, x : x + side] = inset
+
+
+def spread(length: int, count: int) -> list[int]:
+    """Up to `count` places spread over a list, both ends among them."""
+    return sorted({round(place) for place in np.linspace(0, length - 1, min(count, length))}) if length else []
+
+
+def _distance_m(record: PairRecord) -> float:
+    return float(record.left_from_drogue.translation_m[2]) if record.left_from_drogue is not None else 0.0

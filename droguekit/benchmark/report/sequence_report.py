@@ -8,13 +8,20 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from droguekit.benchmark.report.figures import MethodStyle
+from droguekit.benchmark.report.figures import DistanceLine, MethodStyle, Point, distance_lines_panel
 from droguekit.benchmark.report.number_text import millimetres, percent, plain_number, three_digits
-from droguekit.benchmark.report.sequence_figures import DistanceLine, Point, distance_lines_panel
-from droguekit.benchmark.report.sequence_tables import docking_tables, filter_tables, hiding_table, latency_tables
-from droguekit.benchmark.report.tracking_tables import ReportPart, legend_of, tracking_part
-from droguekit.benchmark.results.docking_result import DockingBin, DockingErrors
+from droguekit.benchmark.report.sequence_tables import (
+    ReportPart,
+    docking_tables,
+    filter_tables,
+    hiding_table,
+    latency_tables,
+    legend_of,
+    tracking_part,
+)
 from droguekit.benchmark.results.sequence_result import (
+    DockingBin,
+    DockingErrors,
     Filtering,
     Latency,
     LatencyBin,

@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 from pydantic import Field, model_serializer
 
-from droguekit.benchmark.results.result_parts import (
+from droguekit.benchmark.confidence_intervals import Interval
+from droguekit.benchmark.results.pose_result import (
     Bound,
     Centroids,
     Comparison,
@@ -20,7 +21,6 @@ from droguekit.benchmark.results.result_parts import (
     ResultModel,
 )
 from droguekit.benchmark.results.sequence_result import SequencesResult
-from droguekit.benchmark.statistics import Interval
 
 
 class Row(ResultModel):

@@ -8,7 +8,7 @@ import numpy as np
 
 from datasets_manifest.types.estimates import Estimate, NoFix
 from droguekit.benchmark.results.sequence_result import Latency, LatencyBin, Percentiles
-from droguekit.benchmark.sequences.sequence_filtering import SequenceData
+from droguekit.benchmark.sequences.filter_errors import SequenceData
 
 LATE = "late:"
 """How the reason begins of a pair that was not worked on, because newer ones had come."""

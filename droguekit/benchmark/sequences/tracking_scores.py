@@ -8,25 +8,69 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.types.estimates import Estimate, Region
 from datasets_manifest.types.records import PixelBox
-from droguekit.benchmark.results.detection_boxes import center_box, clipped_box, corner_box
-from droguekit.benchmark.results.tracking_result import EyeTracking, Losses, OverlapRow, Reacquisition
-from droguekit.benchmark.sequences.sequence_truth import Sight, TrueSequence
-from droguekit.benchmark.sequences.tracking_overlap import (
-    CENTER_ERRORS_PX,
-    NO_BOX,
-    NORMALIZED_ERRORS,
-    OVERLAPS,
-    PRECISION_AT_PX,
-    center_errors_px,
-    normalized_center_errors,
-    precision_curve,
-    success_curve,
+from droguekit.benchmark.confidence_intervals import mean_interval, rate_interval, root_mean_square
+from droguekit.benchmark.results.detection_result import FoundBox, center_box, clipped_box, corner_box
+from droguekit.benchmark.results.sequence_result import (
+    EyeTracking,
+    Losses,
+    OverlapRow,
+    Reacquisition,
+    SourceTracking,
+    Tracking,
 )
-from droguekit.benchmark.statistics import mean_interval, rate_interval, root_mean_square
+from droguekit.benchmark.sequences.sequence_latency import worked_s
+from droguekit.benchmark.sequences.sequence_truth import Sight, TrueSequence
 from geometry.boxes import intersection_over_union
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
+
+OVERLAPS: Array = np.linspace(0.0, 1.0, 21)
+"""Overlaps of the success plot."""
+CENTER_ERRORS_PX: Array = np.arange(0.0, 51.0)
+"""Distances of the precision plot. [px]"""
+NORMALIZED_ERRORS: Array = np.linspace(0.0, 0.5, 51)
+"""Distances of the normalised precision plot, in sizes of the true box."""
+PRECISION_AT_PX = 20.0
+"""Where the precision plot is read off. [px]"""
+NO_BOX = (np.nan, np.nan, np.nan, np.nan)
+
+
+def center_errors_px(found: Array, truth: Array) -> Array:
+    """(n,) distances of the centres of (n, 4) boxes; infinite where a box is `NO_BOX`. [px]"""
+    return _lengths(_center_offsets(found, truth))
+
+
+def normalized_center_errors(found: Array, truth: Array) -> Array:
+    """(n,) the same with offsets to the side over the true box's width, and up or down over its height."""
+    return _lengths(_center_offsets(found, truth) / truth[:, 2:])
+
+
+def success_curve(overlap: Array) -> Array:
+    """(21,) share of the images whose overlap is larger than each of `OVERLAPS`."""
+    return _shares(overlap[:, None] > OVERLAPS)
+
+
+def precision_curve(errors: Array, limits: Array) -> Array:
+    """(len(limits),) share of the images whose error is at most each of the limits."""
+    return _shares(errors[:, None] <= limits)
+
+
+def _center_offsets(found: Array, truth: Array) -> Array:
+    offsets: Array = found[:, :2] + found[:, 2:] / 2 - truth[:, :2] - truth[:, 2:] / 2
+    return offsets
+
+
+def _lengths(offsets: Array) -> Array:
+    lengths: Array = np.nan_to_num(np.hypot(offsets[:, 0], offsets[:, 1]), nan=np.inf)
+    return lengths
+
+
+def _shares(passed: NDArray[np.bool_]) -> Array:
+    shares: Array = np.mean(passed, axis=0)
+    return shares
+
 
 LEAST_FOLLOWED_OVERLAP = 0.1
 """A box that overlaps the true one by less has lost the drogue (our choice)."""
@@ -224,3 +268,84 @@ def _on_image(box: SourcedBox | None, size_px: tuple[int, int]) -> SourcedBox | 
         return None
     clipped = clipped_box(corner_box(box.box_px), size_px)
     return None if clipped is None else SourcedBox(center_box(clipped), box.source)
+
+
+Boxes = Mapping[tuple[int, Eye], SourcedBox]
+StageTimes = Mapping[int, Mapping[str, float]]
+
+# The stages of an estimate that find or follow the drogue's box, and teach the tracker.
+_BOX_STAGES = frozenset({"detect", "track", "correct"})
+
+
+def track_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> Tracking:
+    """Scores of the regions that a method reports; one that reports none has lost the drogue everywhere.
+
+    Args:
+        sequences: the truth.
+        estimates: of the method, by frame.
+    """
+    boxes = {
+        (index, region.eye): SourcedBox(region.box_xywh_px, region.source)
+        for index, estimate in estimates.items()
+        # Of several in one eye the last one stays, which is the best.
+        for region in sorted(estimate.regions, key=lambda region: region.score)
+        if _has_area(region)
+    }
+    return _tracking(sequences, boxes, {i: estimate.stage_s for i, estimate in estimates.items()})
+
+
+def track_found_boxes(
+    sequences: Sequence[TrueSequence], found: Iterable[FoundBox], threshold: float
+) -> Tracking | None:
+    """Scores of a file of boxes: of each image the best one, if it scores at least the threshold.
+
+    Returns:
+        None without sequences.
+    """
+    if not sequences:
+        return None
+    best: dict[tuple[int, Eye], SourcedBox] = {}
+    for box in sorted(found, key=lambda box: box.score):
+        if box.score >= threshold:
+            frame, eye = divmod(box.image_id - 1, len(EYES))
+            best[frame, EYES[eye]] = SourcedBox(center_box(box.box_xywh), "")
+    return _tracking(sequences, best, {})
+
+
+def _tracking(sequences: Sequence[TrueSequence], boxes: Boxes, stages_s: StageTimes) -> Tracking:
+    by_eye = eye_tracks(sequences, boxes)
+    tracks = [track for eye in EYES for track in by_eye[eye]]
+    sources = sorted({box.source for box in boxes.values() if box.source})
+    return Tracking(
+        both=both_eyes_tracking(by_eye),
+        eyes={eye: eye_tracking(by_eye[eye], f"eye {eye}") for eye in EYES},
+        sources={source: _source_tracking(source, tracks, stages_s) for source in sources},
+    )
+
+
+def _source_tracking(source: str, tracks: Sequence[EyeTrack], stages_s: StageTimes) -> SourceTracking:
+    def is_own(track: EyeTrack) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        return np.array([name == source for name in track.sources])
+
+    pairs = {
+        index for track in tracks for index, own in zip(track.frame_index, is_own(track).tolist(), strict=True) if own
+    }
+    told = [stages_s[index] for index in sorted(pairs & stages_s.keys())]
+    times_ms = [1e3 * work_s for work_s in map(worked_s, told) if work_s is not None]
+    box_ms = [
+        1e3 * sum(spent_s for stage, spent_s in stages.items() if stage in _BOX_STAGES)
+        for stages in told
+        if _BOX_STAGES & stages.keys()
+    ]
+    return SourceTracking(
+        overlap=overlap_row(tracks, lambda track: is_own(track) & track.seen, f"source {source}"),
+        pairs=len(pairs),
+        box_ms=float(np.median(box_ms)) if box_ms else None,
+        frame_ms=float(np.median(times_ms)) if times_ms else None,
+        frame_p95_ms=float(np.percentile(times_ms, 95)) if times_ms else None,
+    )
+
+
+def _has_area(region: Region) -> bool:
+    """Whether the box is one; others are as good as none."""
+    return min(region.box_xywh_px[2:]) > 0

@@ -16,8 +16,8 @@ from droguekit.workflows.benchmarking import benchmark_dataset, check_blind_data
 from droguekit.workflows.detection import DetectionOptions, benchmark_detections
 
 if TYPE_CHECKING:
-    from droguekit.benchmark.benchmark import BenchmarkResult
     from droguekit.benchmark.blind_check import BlindCheck
+    from droguekit.benchmark.pose_benchmark import BenchmarkResult
 
 EXAMPLES = (
     "droguekit benchmark data/demo --estimates estimates.jsonl --json benchmark.json --html report.html",
@@ -91,7 +91,7 @@ def _error_lines(result: BenchmarkResult) -> Iterator[str]:
 
 
 def _blind_lines(check: BlindCheck) -> Iterator[str]:
-    from droguekit.benchmark.blind_report import COLUMNS, row_cells
+    from droguekit.benchmark.blind_check import COLUMNS, row_cells
 
     yield f"{check.dataset.name} has no true poses: estimates are compared with their own measurements and with boxes"
     yield " ".join([f"{'method':<16}", *(f"{column:>16}" for column in COLUMNS)])

@@ -16,7 +16,7 @@ from nav.pose.pose_method import NoFixReason, Observation
 from nav.pose.pose_methods import pose_method
 from nav.pose.stated_tolerances import EXACT, StatedTolerances
 from nav.pose.two_fold_start import two_fold_start
-from studies.acceptance.centroid_level.drawn_poses import Poses
+from studies.acceptance.centroid_level.drawn_frames import Poses
 
 BATCHED = ("joint", "joint-hub")
 

@@ -15,7 +15,7 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
 from droguekit.batch.progress import ProgressReport
-from droguekit.benchmark.poses.bounds import feature_points
+from droguekit.benchmark.poses.cramer_rao import feature_points
 from droguekit.numerical_threads import one_thread
 from geometry.stereo import paper_rig
 from nav.navigator import Navigator
@@ -23,11 +23,10 @@ from nav.pair_measurement import Sighting
 from nav.pose.joint import joint
 from nav.pose.pose_method import Observation, Solution
 from nav.pose.pose_methods import pose_method
-from studies.acceptance.centroid_level.corruption import Corruption, draw_shifts
-from studies.acceptance.centroid_level.drawn_poses import draw_poses, ellipse_centers_px
+from studies.acceptance.centroid_level.drawn_frames import Corruption, draw_poses, draw_shifts, ellipse_centers_px
+from studies.acceptance.centroid_level.monte_carlo import DOCKING_RANGE_M
 from studies.acceptance.centroid_level.solvers import Measured, observations, solve
-from studies.acceptance.protocol import DOCKING_RANGE_M
-from studies.acceptance.table import BarRow, at_most
+from studies.acceptance.criteria import BarRow, at_most
 
 _SIGMA_PX = 0.1
 _SINGLE_FRAMES, _BATCH_FRAMES = 100, 1000

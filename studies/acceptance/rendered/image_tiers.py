@@ -2,24 +2,286 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from droguekit.benchmark.results.benchmark_result import BenchmarkResult
-from studies.acceptance.rendered.image_rows import (
-    Light,
-    absolute_rows,
-    centroid_bound_rows,
-    centroid_rows,
-    chain_rows,
-    goal_rows,
-    paper_rows,
+import numpy as np
+
+from droguekit.benchmark.confidence_intervals import ratio_intervals, rms_upper_limit
+from droguekit.benchmark.poses.pose_errors import COMPONENTS
+from droguekit.benchmark.results.benchmark_result import BenchmarkResult, BinRow
+from geometry.se3 import Array
+from studies.acceptance.confidence_limits import (
+    mean_limit,
+    nees_limits,
+    percentile_limit,
+    rms_limit,
+    rms_ratio_limit,
+    share_limit,
+    size_of_mean_limit,
 )
-from studies.acceptance.rendered.normalized_rows import tier_a_rows, tier_b_rows
-from studies.acceptance.rendered.scored_frames import METHODS, score_frames
-from studies.acceptance.table import BarRow
+from studies.acceptance.criteria import BarRow, at_most, between, not_measured, worst
+from studies.acceptance.rendered.scored_frames import (
+    BEST,
+    CHAIN,
+    METHODS,
+    Frames,
+    MarkerErrors,
+    between_m,
+    pose_array,
+    score_frames,
+    stacked_px,
+)
+
+NEAR_M, FAR_M = 1.7, 40.0
+
+
+@dataclass(frozen=True)
+class Light:
+    """One dataset of a tier: what to call it, and which level of light."""
+
+    name: Literal["day", "dusk"]
+    scores: Mapping[str, Frames]
+
+    @property
+    def best(self) -> Frames:
+        """Frames of our best method."""
+        return self.scores[BEST]
+
+    def title(self, quantity: str) -> str:
+        """A quantity with the light in front."""
+        return f"{self.name}: {quantity}"
+
+
+def centroid_bound_rows(light: Light) -> list[BarRow]:
+    """Bar 1."""
+    rows = []
+    for low_m, high_m, bar in ((NEAR_M, 20.0, 1.25), (30.0, FAR_M, 1.40)):
+        quantity = light.title(f"centroid RMS / its Cramer-Rao bound, {low_m:g} to {high_m:g} m")
+        frames = between_m(light.best, low_m, high_m).values()
+        ratios = [_over_bound(frame.markers) for frame in frames]
+        values = np.concatenate([np.zeros((0, 2)), *ratios])
+        rows.append(
+            at_most("1", quantity, bar, rms_limit(values), values.size) if len(values) else _none("1", quantity, bar)
+        )
+    return rows
+
+
+def centroid_rows(light: Light) -> list[BarRow]:
+    """Bars 2 and 3: absolute errors of centroids, in day also their bias."""
+    bars = (
+        ((10.0, 0.015), (20.0, 0.025), (FAR_M, 0.035))
+        if light.name == "day"
+        else ((10.0, 0.02), (20.0, 0.03), (FAR_M, 0.04))
+    )
+    number, low_m, rows = "2" if light.name == "day" else "3", NEAR_M, []
+    for high_m, bar in bars:
+        quantity = light.title(f"centroid RMS, {low_m:g} to {high_m:g} m [px]")
+        offsets = stacked_px(between_m(light.best, low_m, high_m))
+        rows.append(
+            at_most(number, quantity, bar, rms_limit(offsets), offsets.size)
+            if len(offsets)
+            else _none(number, quantity, bar)
+        )
+        low_m = 1.02 * high_m
+    if light.name == "day":
+        rows += _bias_rows(light)
+    return rows
+
+
+def chain_rows(light: Light, bar: float) -> list[BarRow]:
+    """Bar 4: our centroids against the paper's, on the frames where both have some."""
+    quantity = light.title(f"centroid RMS / that of '{CHAIN}', 5 m and beyond")
+    ours, theirs = (between_m(light.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
+    common = [i for i in ours if len(ours[i].markers.offset_px) and len(theirs[i].markers.offset_px)]
+    if not common:
+        return [_none("4", quantity, bar)]
+    first, second = (stacked_px({i: frames[i] for i in common}) for frames in (ours, theirs))
+    if first.shape == second.shape and np.array_equal(first, second):
+        return [not_measured("4", quantity, bar, f"'{CHAIN}' was given the same centroids")]
+    sizes = [(rms_limit(values)[0], values.size) for values in (first, second)]
+    return [at_most("4", quantity, bar, rms_ratio_limit(sizes[0], sizes[1]), len(common))]
+
+
+def absolute_rows(light: Light) -> list[BarRow]:
+    """Bars 13 and 14."""
+    near = between_m(light.best, NEAR_M, 10.0)
+    errors, bar_mm = pose_array(near), 0.3 if light.name == "day" else 0.5
+    quantity = light.title("mean position error, 1.7 to 10 m [mm]")
+    if not len(errors):
+        return [_none("13", quantity, bar_mm)]
+    position_mm = 1e3 * np.linalg.norm(errors[:, :3], axis=1)
+    rows = [at_most("13", quantity, bar_mm, mean_limit(position_mm), len(errors), _failures(near))]
+    for column, name in ((3, "pitch"), (4, "yaw")):
+        title = light.title(f"99th percentile of {name} error, 1.7 to 10 m [deg]")
+        rows.append(at_most("14", title, 0.15, percentile_limit(errors[:, column], 99.0), len(errors)))
+    far = pose_array(between_m(light.best, FAR_M, FAR_M))
+    if light.name == "day" and len(far):
+        for column, name in ((3, "pitch"), (4, "yaw")):
+            rows.append(
+                at_most("14", light.title(f"{name} RMSE at 40 m [deg]"), 0.3, rms_limit(far[:, column]), len(far))
+            )
+    return rows
+
+
+def paper_rows(light: Light) -> list[BarRow]:
+    """Bar 15, by the bootstrap of paired frames."""
+    bar = 1 / 15 if light.name == "day" else 1 / 12
+    quantity = light.title(f"mean position error / that of '{CHAIN}', 5 m and beyond")
+    ours, theirs = (between_m(light.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
+    common = [i for i in ours if ours[i].pose is not None and theirs[i].pose is not None]
+    if len(common) < 2:
+        return [_none("15", quantity, bar)]
+    above, below = (
+        np.linalg.norm(pose_array({i: frames[i] for i in common})[:, :3], axis=1)[:, None] for frames in (ours, theirs)
+    )
+    (ends,) = ratio_intervals(above, below, common, f"bars, {light.name}")
+    ratio = float(above.mean() / below.mean())
+    return [at_most("15", quantity, bar, (ratio, ratio if ends is None else ends[1]), len(common))]
+
+
+# Z m, transverse m, pitch and yaw deg at each distance: what rendered daylight is expected to allow.
+_GOALS = {
+    2.0: (0.015e-3, 0.010e-3, 0.005),
+    5.0: (0.15e-3, 0.024e-3, 0.012),
+    10.0: (0.9e-3, 0.06e-3, 0.04),
+    20.0: (5e-3, 0.20e-3, 0.09),
+    40.0: (40e-3, 1.0e-3, 0.3),
+}
+
+
+def goal_rows(light: Light) -> list[BarRow]:
+    """What is aimed at by distance."""
+    rows = []
+    for station, (z_m, transverse_m, angle_deg) in _GOALS.items():
+        frames = {i: f for i, f in between_m(light.best, station, station).items() if f.pose is not None}
+        errors = pose_array(frames)
+        if not len(errors):
+            continue
+        across = np.array([frame.transverse_m for frame in frames.values()])
+        where = f"at {station:g} m"
+        rows += [
+            at_most("goal", light.title(f"Z RMSE {where} [mm]"), 1e3 * z_m, rms_limit(1e3 * errors[:, 2]), len(errors)),
+            at_most(
+                "goal",
+                light.title(f"transverse RMSE {where} [mm]"),
+                1e3 * transverse_m,
+                rms_limit(1e3 * across),
+                len(errors),
+            ),
+            at_most(
+                "goal", light.title(f"pitch, yaw RMSE {where} [deg]"), angle_deg, rms_limit(errors[:, 3:]), len(errors)
+            ),
+        ]
+    return rows
+
+
+def _bias_rows(light: Light) -> list[BarRow]:
+    """Mean residuals; every frame's mean is one independent number."""
+    rows = []
+    seen = {i: f for i, f in light.best.items() if len(f.markers.offset_px)}
+    for axis, name in enumerate("uv"):
+        blocks = np.array([f.markers.offset_px[:, axis].mean() for f in seen.values()])
+        title = light.title(f"|mean centroid residual| in {name} [px]")
+        rows.append(
+            at_most("2", title, 0.005, size_of_mean_limit(blocks), len(blocks))
+            if len(blocks)
+            else _none("2", title, 0.005)
+        )
+    for low_m, high_m, bar in ((NEAR_M, 20.0, 0.002), (30.0, FAR_M, 0.006)):
+        title = light.title(f"|mean radial centroid residual|, {low_m:g} to {high_m:g} m [px]")
+        blocks = np.array([f.markers.outward_px.mean() for f in between_m(seen, low_m, high_m).values()])
+        rows.append(
+            at_most("2", title, bar, size_of_mean_limit(blocks), len(blocks)) if len(blocks) else _none("2", title, bar)
+        )
+    return rows
+
+
+def _over_bound(markers: MarkerErrors) -> Array:
+    """(K, 2) offsets over their bounds, of the markers that have one: one without light has none."""
+    lit = np.isfinite(markers.bound_px)
+    ratios: Array = markers.offset_px[lit] / markers.bound_px[lit, None]
+    return ratios
+
+
+def _failures(frames: Frames) -> str:
+    missing = sum(frame.pose is None for frame in frames.values())
+    return f"{missing} of {len(frames)} pairs without a pose" if missing else ""
+
+
+def _none(bar: str, quantity: str, high: float) -> BarRow:
+    return not_measured(bar, quantity, high, "nothing was measured there")
+
+
+_POSITION, _ATTITUDE = COMPONENTS[:3], COMPONENTS[3:]
+# Stations lie in bins of their own; a bin counts as within a distance when its upper end does, by this leeway.
+_LEEWAY = 1.02
+
+
+def tier_a_rows(name: str, result: BenchmarkResult) -> list[BarRow]:
+    """Bars 5, 6 and 9."""
+    bins = result.methods[BEST].bins
+    flips = [(row.sight_flips.flips, row.sight_flips.n) for row in bins]
+    hits, n = sum(f for f, _ in flips), sum(n for _, n in flips)
+    flip_title = f"{name}: flips, {BEST}, all distances"
+    rows = [
+        *_pooled_and_worst("5", f"{name}: X, Y, Z NRMS", _POSITION, (1.08, 1.20), bins),
+        *_pooled_and_worst("6", f"{name}: pitch, yaw NRMS, hub", _ATTITUDE, (1.10, 1.25), bins),
+    ]
+    if n:
+        # The bar is no flip at all among these; the limit says what rate that excludes.
+        shown = at_most("6", flip_title, 0.0, (float(hits), float(hits)), n)
+        rows.append(shown.model_copy(update={"note": f"rate below {share_limit(hits, n)[1]:.2g} (95 %)"}))
+    else:
+        rows.append(not_measured("6", flip_title, 0.0, "no tilt was clear"))
+    nees = result.methods[BEST].overall.nees
+    title = f"{name}: NEES/dof, {BEST}"
+    if nees is None or nees.pose is None:
+        return [*rows, not_measured("9", title, 1.20, "no covariance was reported")]
+    limits = nees_limits(nees.pose.per_freedom, nees.n * nees.pose.freedom)
+    return [*rows, between("9", title, (0.85, 1.20), limits, nees.n)]
+
+
+def tier_b_rows(name: str, result: BenchmarkResult) -> list[BarRow]:
+    """Bar 8."""
+    bins = [row for row in result.methods[BEST].bins if row.high_m <= _LEEWAY * 20.0]
+    return [_pooled("8", f"{name}: pose NRMS, 1.7 to 20 m, pooled", COMPONENTS, 1.30, bins)]
+
+
+def _pooled_and_worst(
+    bar: str, quantity: str, names: Sequence[str], bars: tuple[float, float], bins: Sequence[BinRow]
+) -> list[BarRow]:
+    cells = [
+        (
+            f"{row.low_m:g} to {row.high_m:g} m, {name}",
+            getattr(row.normalized.nrms, name),
+            getattr(row.normalized.upper, name),
+        )
+        for row in bins
+        if row.normalized is not None
+        for name in names
+    ]
+    pooled = _pooled(bar, f"{quantity}, pooled", names, bars[0], bins)
+    title = f"{quantity}, worst distance"
+    if not cells:
+        return [pooled, not_measured(bar, title, bars[1], "no pose has a bound")]
+    where, value, limit = worst(cells)
+    fewest = min(row.normalized.n for row in bins if row.normalized is not None)
+    return [pooled, at_most(bar, title, bars[1], (value, limit), fewest, where)]
+
+
+def _pooled(bar: str, quantity: str, names: Sequence[str], high: float, bins: Sequence[BinRow]) -> BarRow:
+    """The worst component over all bins together."""
+    known = [row.normalized for row in bins if row.normalized is not None]
+    if not known:
+        return not_measured(bar, quantity, high, "no pose has a bound")
+    counts = np.array([row.n for row in known])
+    squares = np.array([[getattr(row.nrms, name) ** 2 for name in names] for row in known])
+    means = np.sqrt(counts @ squares / counts.sum())
+    value, n = float(means.max()), int(counts.sum())
+    return at_most(bar, quantity, high, (value, rms_upper_limit(value, n)), n, names[int(means.argmax())])
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
-from droguekit.benchmark.poses.bounds import component_deviations
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
-from droguekit.benchmark.poses.frame_truth import DrogueTruth, drogue_truth
+from droguekit.benchmark.poses.cramer_rao import component_deviations
+from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
 from droguekit.benchmark.poses.pose_errors import by_method, pose_error
 from droguekit.benchmark.poses.reference import build_reference
 from droguekit.benchmark.sequences.sequence_latency import worked_s

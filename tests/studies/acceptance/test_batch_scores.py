@@ -8,21 +8,35 @@ import pytest
 from datasets_manifest.random_streams import seeded_generator
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
-from droguekit.benchmark.poses.bounds import FeatureNoise, angles_jacobian, feature_points, features_seen, pose_bound
+from droguekit.benchmark.poses.cramer_rao import (
+    FeatureNoise,
+    angles_jacobian,
+    feature_points,
+    features_seen,
+    pose_bound,
+)
 from droguekit.benchmark.poses.pose_errors import pose_error
 from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
-from studies.acceptance.centroid_level.batch_scores import (
+from studies.acceptance.centroid_level.drawn_frames import (
+    AS_BUILT,
+    TOLERANCED,
+    Corruption,
+    Poses,
+    Tolerances,
+    draw_features,
+    draw_poses,
+    draw_shifts,
+    ellipse_centers_px,
+)
+from studies.acceptance.centroid_level.monte_carlo import (
     bound_deviations,
     component_slopes,
     flipped,
     pose_errors,
     sight_tilts,
 )
-from studies.acceptance.centroid_level.corruption import Corruption, draw_shifts
-from studies.acceptance.centroid_level.drawn_poses import Poses, draw_poses, ellipse_centers_px
-from studies.acceptance.centroid_level.tolerances import AS_BUILT, TOLERANCED, Tolerances, draw_features
 
 RIG = paper_rig()
 DROGUE = load_drogue("red-8")

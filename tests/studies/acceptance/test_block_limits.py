@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.acceptance.rendered.block_limits import (
+from studies.acceptance.confidence_limits import (
     block_mean_limit,
     block_percentile_limit,
     block_rms_limit,

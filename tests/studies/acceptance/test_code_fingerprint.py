@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from studies.acceptance.centroid_level.cell_store import code_fingerprint
+from studies.acceptance.finished_results import code_fingerprint
 
 ROOM = "a_room_of_this_test"
 

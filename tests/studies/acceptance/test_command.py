@@ -14,8 +14,8 @@ from datasets_manifest.types.estimates import read_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import WRONG_INPUT
 from nav.runner import method_names
-from studies.acceptance.command import run_command
-from studies.acceptance.measurement import (
+from studies.acceptance.__main__ import run_command
+from studies.acceptance.acceptance_run import (
     BarsOrder,
     FlightOrder,
     flight_bars,
@@ -23,11 +23,10 @@ from studies.acceptance.measurement import (
     plan_images,
     run_bars,
 )
-from studies.acceptance.rendered.flight_data import FLIGHT_TIERS, FlightData, part_length
-from studies.acceptance.rendered.flight_rows import approach_rows, lost_rows
+from studies.acceptance.criteria import BarRow
+from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS, FlightData, approach_rows, lost_rows, part_length
 from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
-from studies.acceptance.table import BarRow
 from tests.support.small_datasets import RIG_320_PX
 
 RECIPE = f"""
@@ -223,7 +222,7 @@ def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> No
 
 
 def test_centroids_are_timed_on_pairs_that_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("studies.acceptance.measurement._TIMED_PAIRS", 1)
+    monkeypatch.setattr("studies.acceptance.acceptance_run._TIMED_PAIRS", 1)
     told = io.StringIO()
     tables = [run_bars(BarsOrder("speed", 3, draws=2, workers=0), tmp_path, PlainProgress(told)) for _ in range(2)]
     assert "9 of 9 pairs are there already" in told.getvalue()

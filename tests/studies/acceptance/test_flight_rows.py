@@ -10,17 +10,25 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
-from droguekit.benchmark.poses.frame_truth import DrogueTruth
+from droguekit.benchmark.poses.drogue_truth import DrogueTruth
 from geometry.se3 import RigidTransform
 from geometry.stereo import paper_rig
 from scenes.drogue_appearance import drogue_of_scene
 from scenes.sampler import recipe_of_scene, scene_of_frame
-from studies.acceptance.rendered.bench_rows import bench_rows, speed_rows
-from studies.acceptance.rendered.flight_data import FLIGHT_TIERS, part_length, with_parts
-from studies.acceptance.rendered.flight_rows import approach_rows, bound_ratio, condition_rows, lost_rows
+from studies.acceptance.criteria import BarRow
+from studies.acceptance.rendered.flight_tiers import (
+    FLIGHT_TIERS,
+    approach_rows,
+    bench_rows,
+    bound_ratio,
+    condition_rows,
+    lost_rows,
+    part_length,
+    speed_rows,
+    with_parts,
+)
 from studies.acceptance.rendered.scored_frames import BEST, CHAIN
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, TruePair
-from studies.acceptance.table import BarRow
 
 LAYOUT, RIG = marker_layout(load_drogue("red-8")), paper_rig()
 

@@ -9,12 +9,10 @@ import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe
 from droguekit.batch.recipe_plan import plan_recipe
-from studies.acceptance.protocol import STATIONS_M
-from studies.acceptance.rendered import image_rows
-from studies.acceptance.rendered.disc_light import contrast_from_snr
-from studies.acceptance.rendered.finished_estimates import is_navigated, mark_navigated
-from studies.acceptance.rendered.image_rows import Light
-from studies.acceptance.rendered.image_tiers import recipe_of
+from studies.acceptance.centroid_level.monte_carlo import STATIONS_M
+from studies.acceptance.finished_results import is_navigated, mark_navigated
+from studies.acceptance.rendered.centroid_bounds import contrast_from_snr
+from studies.acceptance.rendered.image_tiers import Light, recipe_of
 from studies.acceptance.rendered.scored_frames import BEST, CHAIN, FrameErrors, MarkerErrors
 
 PER_STATION = 30
@@ -37,7 +35,7 @@ def light(name: str = "day", **changes: dict[int, FrameErrors]) -> Light:
 
 
 def test_centroids_over_their_bound() -> None:
-    rows = image_rows.centroid_bound_rows(light())
+    rows = image_tiers.centroid_bound_rows(light())
     assert [row.n for row in rows] == [7 * PER_STATION * 32, 2 * PER_STATION * 32]
     # Root mean square of 1920 numbers and more: 1.6 %; four of these.
     assert [row.measured for row in rows] == pytest.approx([1.2, 1.2], rel=0.065)
@@ -50,13 +48,13 @@ def test_markers_without_light_do_not_count() -> None:
     bound = np.full(16, 0.01)
     bound[:3] = np.inf
     dark[one] = FrameErrors(1.7, None, 0.0, MarkerErrors(np.full((16, 2), 0.012), np.zeros(16), bound))
-    rows = image_rows.centroid_bound_rows(light(**{BEST: dark}))
+    rows = image_tiers.centroid_bound_rows(light(**{BEST: dark}))
     assert rows[0].n == 7 * PER_STATION * 32 - 6
 
 
 @pytest.mark.parametrize(("name", "number"), [("day", "2"), ("dusk", "3")])
 def test_every_distance_counts_once_in_absolute_centroids(name: str, number: str) -> None:
-    rows = [row for row in image_rows.centroid_rows(light(name)) if "RMS" in row.quantity]
+    rows = [row for row in image_tiers.centroid_rows(light(name)) if "RMS" in row.quantity]
     assert [row.bar for row in rows] == [number] * 3
     assert sum(row.n for row in rows) == PER_STATION * len(STATIONS_M) * 32
 
@@ -64,14 +62,14 @@ def test_every_distance_counts_once_in_absolute_centroids(name: str, number: str
 def test_a_bias_towards_the_outside_is_found_whatever_its_sign() -> None:
     for outward_px in (0.01, -0.01):
         biased = light(**{BEST: frames(0.012, 0.1, 1, outward_px)})
-        rows = [row for row in image_rows.centroid_rows(biased) if "radial" in row.quantity]
+        rows = [row for row in image_tiers.centroid_rows(biased) if "radial" in row.quantity]
         # A constant has no spread.
         assert [row.measured for row in rows] == pytest.approx([0.01, 0.01])
         assert not any(row.met for row in rows)
 
 
 def test_our_centroids_against_the_chain() -> None:
-    (row,) = image_rows.chain_rows(light(), 1 / 4)
+    (row,) = image_tiers.chain_rows(light(), 1 / 4)
     # Two root mean squares of 5760 numbers: 1.3 % together; four of these.
     assert row.measured == pytest.approx(0.2, rel=0.055)
     assert row.met
@@ -79,17 +77,17 @@ def test_our_centroids_against_the_chain() -> None:
 
 def test_the_same_centroids_compare_nothing() -> None:
     same = frames(0.01, 1.0, 1)
-    (row,) = image_rows.chain_rows(light(**{BEST: same, CHAIN: same}), 1 / 4)
+    (row,) = image_tiers.chain_rows(light(**{BEST: same, CHAIN: same}), 1 / 4)
     assert row.measured is None
     assert not row.met
 
 
 def test_absolute_poses_and_the_comparison_with_the_paper() -> None:
-    position, pitch, _, far_pitch, _ = image_rows.absolute_rows(light())
+    position, pitch, _, far_pitch, _ = image_tiers.absolute_rows(light())
     assert (position.measured, position.n, position.met) == (pytest.approx(0.1), 5 * PER_STATION, True)
     assert pitch.measured == pytest.approx(0.1)
     assert far_pitch.n == PER_STATION
-    (ratio,) = image_rows.paper_rows(light())
+    (ratio,) = image_tiers.paper_rows(light())
     assert ratio.measured == pytest.approx(0.05)
     assert ratio.met
 
@@ -97,12 +95,12 @@ def test_absolute_poses_and_the_comparison_with_the_paper() -> None:
 def test_pairs_without_a_pose_are_told() -> None:
     some = frames(0.012, 0.1, 1)
     some[0] = FrameErrors(some[0].distance_m, None, 0.0, some[0].markers)
-    row = image_rows.absolute_rows(light(**{BEST: some}))[0]
+    row = image_tiers.absolute_rows(light(**{BEST: some}))[0]
     assert row.note == f"1 of {5 * PER_STATION} pairs without a pose"
 
 
 def test_goals_are_there_for_every_distance() -> None:
-    rows = image_rows.goal_rows(light())
+    rows = image_tiers.goal_rows(light())
     assert len(rows) == 15
     assert {row.bar for row in rows} == {"goal"}
 

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from studies.acceptance.centroid_level.cell_store import CELLS_FILE, run_cells
-from studies.acceptance.centroid_level.corruption import Corruption
-from studies.acceptance.centroid_level.monte_carlo import Cell, run_cell
-from studies.acceptance.centroid_level.tier_c import bars_tier_c
-from studies.acceptance.centroid_level.tier_d import bars_tier_d
+from studies.acceptance.centroid_level.centroid_tiers import bars_tier_c, bars_tier_d
+from studies.acceptance.centroid_level.drawn_frames import Corruption
+from studies.acceptance.centroid_level.monte_carlo import CELLS_FILE, Cell, run_cell, run_cells
 
 CELL = Cell("joint-hub", 8, (5.0, 5.0), 0.1, 200, 1)
 

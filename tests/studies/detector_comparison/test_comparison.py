@@ -18,8 +18,8 @@ from datasets_manifest.recipe.recipe import RecipeSource, load_recipe, parse_rec
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.detection.detection_benchmark import DetectorRun, score_detections
 from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection.detection_scores import DetectorRun, score_detections
 from droguekit.benchmark.detection.detection_truth import read_detection_truth
 from droguekit.cli.main import DONE, run
 from geometry.stereo import EYES

@@ -15,10 +15,9 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
 from droguekit.benchmark.report.number_text import ABSENT
-from studies.paper.claims import docking_claims
-from studies.paper.docking_run import read_docking
-from studies.paper.page_tables import docking_table
-from studies.paper.sections import failures, time_rows
+from studies.paper.docking_experiment import read_docking
+from studies.paper.paper_report import failures, time_rows
+from studies.paper.paper_tables import docking_claims, docking_table
 from studies.paper.worst_frames import clipped, failure_reasons, outlines_px, worst_frames
 
 WriteEstimates = Callable[..., Path]

@@ -9,7 +9,7 @@ import pytest
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PairRecord
-from studies.paper.in_view import chosen_scores, frames_in_view
+from studies.paper.docking_experiment import chosen_scores, frames_in_view
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.paper.provenance import code_facts, code_sha256, file_sha256
+from studies.paper.paper_inputs import code_facts, code_sha256, file_sha256
 
 
 def test_the_hash_of_a_file(tmp_path: Path) -> None:

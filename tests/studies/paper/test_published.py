@@ -7,14 +7,14 @@ import pytest
 
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
-from droguekit.benchmark.detection.detection_published import PUBLISHED_DETECTORS
+from droguekit.benchmark.detection.detection_tables import PUBLISHED_DETECTORS
 from droguekit.benchmark.poses.pose_errors import pose_error
 from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, paper_rig
 from nav.pose.pose_method import Observation, Solution
 from nav.pose.pose_methods import pose_method
-from studies.paper.published import (
+from studies.paper.published_results import (
     CONTRADICTION,
     DETECTION_FPS,
     DETECTION_MAP,

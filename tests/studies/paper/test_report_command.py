@@ -19,7 +19,7 @@ from droguekit.benchmark.results.detection_result import (
     PairTimes,
 )
 from droguekit.cli.main import COMMANDS, DONE, WRONG_INPUT, load_command, run
-from studies.paper.page import ReportInputs, left_out
+from studies.paper.paper_report import ReportInputs, left_out
 
 WriteEstimates = Callable[..., Path]
 VOID = {"meta", "img", "link", "br", "hr"}

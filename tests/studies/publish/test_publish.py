@@ -32,7 +32,7 @@ from geometry.stereo import EYES
 from labelgen.boxes import full_box
 from render.version import RENDER_VERSION
 from scenes.sampler import sample_left_from_drogue, split_of_scenes
-from studies.publish.publish import PUBLISHED, publish
+from studies.publish.__main__ import PUBLISHED, publish
 
 OTHER_FEATURES = ("SSE", "SSE2")
 

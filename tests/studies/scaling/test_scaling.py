@@ -15,7 +15,7 @@ import pytest
 
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, run
-from studies.scaling.scaling import RESULTS_FILE, measure, table
+from studies.scaling.__main__ import RESULTS_FILE, measure, table
 from studies.scaling.spreading_cost import dask_cost
 
 Hashes = Callable[[Path], dict[str, str]]

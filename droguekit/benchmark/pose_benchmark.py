@@ -1,0 +1,232 @@
+"""A dataset and a file of estimates in, the numbers of `benchmark.json` out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
+from droguekit.benchmark.confidence_intervals import CONFIDENCE, fraction_interval
+from droguekit.benchmark.poses.centroid_errors import CentroidErrors, centroid_errors
+from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
+from droguekit.benchmark.poses.method_comparison import PAPER_METHOD, PairGroups, best_method, compare
+from droguekit.benchmark.poses.method_scores import FrameScore, frame_scores, summarize
+from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.poses.reference import DistanceBin, Reference, build_reference, distance_bins
+from droguekit.benchmark.results.benchmark_result import (
+    BenchmarkResult,
+    BinRow,
+    DatasetFacts,
+    EmptyFrames,
+    MethodResult,
+)
+from droguekit.benchmark.results.pose_result import Comparison
+from droguekit.benchmark.results.sequence_result import HiddenPairs, MethodSequences, SequencesResult
+from droguekit.benchmark.sequences.docking_errors import docking_errors, true_dockings
+from droguekit.benchmark.sequences.filter_errors import SequenceData, filtering, root_mean_length
+from droguekit.benchmark.sequences.sequence_latency import latency
+from droguekit.benchmark.sequences.sequence_truth import Moment, TrueSequence, moment, true_motions, true_sequences
+from droguekit.benchmark.sequences.tracking_scores import reacquisition, track_regions
+
+Methods = Mapping[str, Mapping[int, Estimate]]
+
+
+def score_sequences(
+    sequences: Sequence[TrueSequence], drogues: Mapping[int, DrogueTruth], methods: Methods
+) -> SequencesResult | None:
+    """Score what estimates say of boxes, motion, docking and time.
+
+    Args:
+        sequences: of the dataset.
+        drogues: the truth of all pairs that show one, in ascending order of frames.
+        methods: estimates by method and frame.
+
+    Returns:
+        None where there are no sequences, or no estimate of one says anything of these.
+    """
+    if not sequences:
+        return None
+    data = sequence_data(sequences, drogues)
+    dockings = true_dockings(sequences, data.motions)
+    # Where some report boxes, those who have none failed to.
+    has_regions = any(answer.regions for estimates in methods.values() for answer in estimates.values())
+    scored: dict[str, MethodSequences] = {}
+    for name, estimates in methods.items():
+        parts = {
+            "tracking": track_regions(sequences, estimates) if has_regions else None,
+            "filtering": filtering(data, name, methods),
+            "docking": docking_errors(data, dockings, estimates, f"{name}, docking"),
+            "latency": latency(data, estimates),
+        }
+        if any(part is not None for part in parts.values()):
+            scored[name] = MethodSequences(hiding=_hidden_pairs(sequences, estimates), **parts)
+    if not scored:
+        return None
+    spans = [sequence.moments[-1].time_s - sequence.moments[0].time_s for sequence in sequences]
+    return SequencesResult(
+        count=len(sequences),
+        pairs=sum(len(sequence.moments) for sequence in sequences),
+        minutes=float(np.sum(spans)) / 60,
+        vibration_rms_m_s=root_mean_length(
+            [motion.vibration_m_s for motion in data.motions.values() if motion.vibration_m_s is not None]
+        ),
+        methods=scored,
+    )
+
+
+def sequence_data(sequences: Sequence[TrueSequence], drogues: Mapping[int, DrogueTruth]) -> SequenceData:
+    """The truth that sequences are scored with; arguments as those of `score_sequences`."""
+    bins, labels = distance_bins([truth.distance_m for truth in drogues.values()])
+    groups = PairGroups(
+        bins,
+        dict(zip(drogues, labels, strict=True)),
+        {index: truth.sequence_id for index, truth in drogues.items()},
+    )
+    return SequenceData(sequences, drogues, true_motions(sequences), groups)
+
+
+def _hidden_pairs(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> HiddenPairs:
+    moments = [moment for sequence in sequences for moment in sequence.moments if moment.sight == "hidden"]
+    courses = [
+        (
+            [moment.sight for moment in sequence.moments],
+            [_has_found(moment, estimates.get(moment.frame_index)) for moment in sequence.moments],
+        )
+        for sequence in sequences
+    ]
+    return HiddenPairs(
+        hidden=len(moments),
+        poses_while_hidden=sum(isinstance(estimates.get(moment.frame_index), PoseEstimate) for moment in moments),
+        reacquisition=reacquisition(courses),
+    )
+
+
+def _has_found(moment: Moment, estimate: Estimate | None) -> bool:
+    """Whether an answer is a pose that lies within the rim of the drogue."""
+    pose, drogue = moment.left_from_drogue, moment.drogue
+    if pose is None or drogue is None or not isinstance(estimate, PoseEstimate):
+        return False
+    error_m = estimate.left_from_drogue.translation_m - pose.translation_m
+    return float(np.linalg.norm(error_m)) <= drogue.rim_radius_m
+
+
+__all__ = ["BenchmarkResult", "run_benchmark", "score"]
+
+Truths = Mapping[int, DrogueTruth | None]
+
+
+def run_benchmark(dataset: Location, estimates: Path) -> BenchmarkResult:
+    """Score every method of a file of estimates on a dataset.
+
+    Args:
+        dataset: the dataset's folder.
+        estimates: a JSON-lines file, whoever wrote it. A pair without an estimate of a method counts as not fixed.
+
+    Raises:
+        ValueError: the dataset or the file cannot be read, the file is empty, names pairs that the dataset lacks, or
+            names one twice for a method.
+    """
+    data = Dataset(dataset)
+    methods = by_method(read_estimates(estimates), data.frame_indices, str(estimates))
+    truths, moments = {}, []
+    for index in data.frame_indices:
+        record = data.record(index)
+        truths[index] = drogue_truth(record)
+        moments.append(moment(record))
+    facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(data.frame_indices))
+    return score(facts, truths, methods, true_sequences(moments))
+
+
+def score(
+    facts: DatasetFacts,
+    truths: Truths,
+    methods: Mapping[str, Mapping[int, Estimate]],
+    sequences: Sequence[TrueSequence] = (),
+) -> BenchmarkResult:
+    """Score estimates that are sorted by method and frame against the truth of each frame.
+
+    Args:
+        facts: of the dataset.
+        truths: by frame.
+        methods: estimates by method and frame.
+        sequences: the same frames as they follow each other, where they do.
+
+    Raises:
+        ValueError: no pair shows a drogue, or a feature that the drogue does not have.
+    """
+    drogues = {index: truth for index, truth in sorted(truths.items()) if truth is not None}
+    if not drogues:
+        raise ValueError("dataset: no pair shows a drogue, so there is nothing to compare poses with")
+    centroids = {name: _centroids(name, drogues, estimates) for name, estimates in methods.items()}
+    reference = build_reference(drogues, centroids)
+    scores = {name: frame_scores(drogues, methods[name], centroids[name], reference) for name in methods}
+    rows = {
+        name: MethodResult(**_rows(scores[name], reference), empty_frames=_empty_frames(truths, estimates))
+        for name, estimates in methods.items()
+    }
+    return BenchmarkResult(
+        dataset=facts,
+        code_version=version("droguekit"),
+        confidence=CONFIDENCE,
+        reference=reference.bins,
+        methods=rows,
+        comparisons=_comparisons(drogues, rows, scores, reference),
+        sequences=score_sequences(sequences, drogues, methods),
+    )
+
+
+def _centroids(
+    method: str, drogues: Mapping[int, DrogueTruth], estimates: Mapping[int, Estimate]
+) -> dict[int, CentroidErrors]:
+    found = {}
+    for index, truth in drogues.items():
+        estimate = estimates.get(index)
+        try:
+            found[index] = centroid_errors(truth, estimate.features if estimate is not None else ())
+        except ValueError as error:
+            raise ValueError(f"estimates: method {method!r}: frame {index}: {error}") from error
+    return found
+
+
+def _rows(scores: Mapping[int, FrameScore], reference: Reference) -> dict[str, object]:
+    spread, bins = reference.truth_spread, []
+    for k, place in enumerate(reference.bins):
+        inside = [score for index, score in scores.items() if reference.bin_of_frame[index] == k]
+        bins.append(BinRow(**dict(summarize(inside, spread, f"bin {k}")), low_m=place.low_m, high_m=place.high_m))
+    return {"overall": summarize(list(scores.values()), spread, "overall"), "bins": bins}
+
+
+def _comparisons(
+    drogues: Mapping[int, DrogueTruth],
+    rows: Mapping[str, MethodResult],
+    scores: Mapping[str, Mapping[int, FrameScore]],
+    reference: Reference,
+) -> list[Comparison]:
+    """Every method beside the best one and beside the seed paper's."""
+    errors = {
+        name: {index: score.pose.error for index, score in frames.items() if score.pose is not None}
+        for name, frames in scores.items()
+    }
+    groups = PairGroups(
+        [DistanceBin(place.low_m, place.high_m) for place in reference.bins],
+        reference.bin_of_frame,
+        {index: truth.sequence_id for index, truth in drogues.items()},
+    )
+    best = best_method(rows)
+    return compare(errors, [name for name in (best, PAPER_METHOD) if name in errors], groups)
+
+
+def _empty_frames(truths: Truths, estimates: Mapping[int, Estimate]) -> EmptyFrames:
+    empty = [index for index, truth in truths.items() if truth is None]
+    false = sum(isinstance(estimates.get(index), PoseEstimate) for index in empty)
+    return EmptyFrames(
+        n=len(empty),
+        false_fixes=false,
+        false_fix_fraction=false / len(empty) if empty else None,
+        interval=fraction_interval(false, len(empty)) if empty else None,
+    )

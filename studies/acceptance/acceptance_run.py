@@ -1,0 +1,324 @@
+"""What `bars` does; rooms are imported where they are used, as in `pipelines`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from datasets_manifest.recipe.recipe import RecipeSource
+from droguekit.batch.execution import ExecutionOptions
+from droguekit.workflows.benchmarking import benchmark_dataset
+from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
+from droguekit.workflows.rendering import open_recipe, render_frames
+
+if TYPE_CHECKING:
+    from datasets_manifest.recipe.recipe import Recipe
+    from droguekit.batch.progress import ProgressReport
+    from studies.acceptance.criteria import BarRow, BarTable
+    from studies.acceptance.rendered.flight_tiers import FlightData
+
+DEFAULT_TRACKER, DEFAULT_RIG = "pose-predict", "rgb-ideal"
+# Engine and recipe; data of another rig than the bars' name it besides.
+_NAMES_OF_BARS = 2
+# At each distance, whose centroids are timed.
+_TIMED_PAIRS = 8
+
+
+@dataclass(frozen=True)
+class FlightOrder:
+    """What of the tiers `e` and `docking` to measure, and with what.
+
+    Attributes:
+        recipes: names of those recipes of the tier to take; all when empty.
+        rigs: that see; bars are those of `rgb-ideal`, the others' figures stand beside. Ignored by recipes of a bench.
+        sequences: of each recipe; as many as a full measurement takes when None.
+        tracker: name.
+    """
+
+    recipes: tuple[str, ...] = ()
+    rigs: tuple[str, ...] = (DEFAULT_RIG,)
+    sequences: int | None = None
+    tracker: str = DEFAULT_TRACKER
+
+
+@dataclass(frozen=True)
+class BarsOrder:
+    """Which bars to measure, and how much to spend on them.
+
+    Attributes:
+        tier: `a`, `b`, `c`, `d`, `e`, `docking` or `speed`.
+        seed: of everything drawn.
+        pairs_per_station: rendered pairs at each distance, the recipe's when None; tiers a and b.
+        draws: frames of a cell, the protocol's when None; tiers c and d, and speed.
+        engines: that render; the recipes' own when empty. Tiers b, e and docking.
+        lights: to measure by, in tiers a and b.
+        workers: that render, as many as the machine holds when None.
+        flights: of the tiers e and docking.
+    """
+
+    tier: str
+    seed: int
+    pairs_per_station: int | None = None
+    draws: int | None = None
+    engines: tuple[str, ...] = ()
+    lights: tuple[Literal["day", "dusk"], ...] = ("day", "dusk")
+    workers: int | None = None
+    flights: FlightOrder = FlightOrder()
+
+
+def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
+    """Measure the bars of a tier and write bars.json and bars.md; what an earlier run finished is kept.
+
+    Raises:
+        ValueError: no such tier, a wrong number, or a folder of something else.
+        OSError: the folder cannot be written.
+    """
+    from importlib.metadata import version
+
+    from datasets_manifest.atomic import write_text_atomic
+    from studies.acceptance.centroid_level.centroid_tiers import bars_tier_c, bars_tier_d
+    from studies.acceptance.centroid_level.speed import bars_speed
+    from studies.acceptance.criteria import BarTable
+    from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS
+    from studies.acceptance.rendered.image_tiers import IMAGE_TIERS
+
+    drawn = {"c": bars_tier_c, "d": bars_tier_d}
+    if order.tier in IMAGE_TIERS:
+        rows = image_bars(order, out, report)
+    elif order.tier in drawn:
+        rows = drawn[order.tier](out, order.seed, order.draws, report)
+    elif order.tier == "speed":
+        rows = bars_speed(_timed_pairs(order, out, report), order.seed, order.draws, report)
+    elif order.tier in FLIGHT_TIERS:
+        rows = flight_bars(order, FLIGHT_TIERS[order.tier], out, report)
+    else:
+        tiers = ", ".join((*IMAGE_TIERS, *drawn, *FLIGHT_TIERS, "speed"))
+        raise ValueError(f"tier: there is none named {order.tier!r}; there are {tiers}")
+    table = BarTable(tier=order.tier, seed=order.seed, code_version=version("droguekit"), rows=tuple(rows))
+    write_text_atomic(out / "bars.json", table.to_json())
+    write_text_atomic(out / "bars.md", table.to_markdown())
+    return table
+
+
+@dataclass(frozen=True)
+class PlannedData:
+    """One dataset that is to be made, from an order that was checked.
+
+    Attributes:
+        source: the recipe.
+        count: its first so many pairs.
+        names: of engine, recipe or light, and rig, as far as they are told apart: folder and title.
+    """
+
+    source: RecipeSource
+    count: int
+    names: tuple[str, ...]
+
+
+def image_bars(order: BarsOrder, out: Path, report: ProgressReport) -> list[BarRow]:
+    """Measure the bars of tier `a` or `b`, engine by engine and light by light.
+
+    Raises:
+        ValueError: no such engine, a wrong number, or pairs that could not be made.
+        OSError: the folder cannot be written.
+    """
+    from studies.acceptance.rendered.image_tiers import IMAGE_TIERS, TierData
+    from studies.acceptance.rendered.scored_frames import METHODS
+
+    plans = plan_images(order)
+    _check_engines([plan for _, plan in plans])
+    rows: list[BarRow] = []
+    for light, plan in plans:
+        folder = out.joinpath(*plan.names)
+        sha256 = _render(plan, folder, order, report)
+        estimates = _navigated(folder, "estimates", sha256, METHODS, NavigationOptions(), report)
+        result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
+        measured = IMAGE_TIERS[order.tier](TierData(light, folder / "dataset", estimates, result))
+        by_engine = "".join(f"{name}, " for name in plan.names[:-1])
+        rows += [row.model_copy(update={"quantity": by_engine + row.quantity}) for row in measured]
+    return rows
+
+
+def plan_images(order: BarsOrder) -> list[tuple[Literal["day", "dusk"], PlannedData]]:
+    """The datasets to make; an engine has folders of its own where it is asked for by name.
+
+    Raises:
+        ValueError: no such engine, or a wrong number.
+    """
+    from studies.acceptance.rendered.image_tiers import recipe_of
+
+    plans = []
+    for engine in order.engines or (None,):
+        for light in order.lights:
+            source = open_recipe(recipe_of(order.tier, light), order.seed, engine)
+            recipe = source.recipe
+            stations = len(recipe.distance.stations_m or ())
+            most = recipe.frames.count // stations
+            pairs = most if order.pairs_per_station is None else order.pairs_per_station
+            if not 1 <= pairs <= most:
+                raise ValueError(f"--pairs-per-station: must be from 1 to {most}, got {pairs}")
+            names = (light,) if engine is None else (engine, light)
+            plans.append((light, PlannedData(source, stations * pairs, names)))
+    return plans
+
+
+def _timed_pairs(order: BarsOrder, out: Path, report: ProgressReport) -> Path:
+    """A dataset of analytic pairs by day at every distance."""
+    from studies.acceptance.rendered.image_tiers import recipe_of
+
+    source = open_recipe(recipe_of("a", "day"), order.seed, None)
+    plan = PlannedData(source, _TIMED_PAIRS * len(source.recipe.distance.stations_m or ()), ())
+    _render(plan, out, order, report)
+    return out / "dataset"
+
+
+def flight_bars(order: BarsOrder, data: Sequence[FlightData], out: Path, report: ProgressReport) -> list[BarRow]:
+    """Measure the bars of whole flights, dataset by dataset; a wrong order is found before anything is made.
+
+    Raises:
+        ValueError: no such recipe in the tier, engine, rig or tracker, a wrong number, or pairs that could not be made.
+        OSError: the folder cannot be written.
+    """
+    from nav.tracking.trackers import tracker_names
+
+    if order.flights.tracker not in tracker_names():
+        raise ValueError(f"--tracker: must be one of {', '.join(tracker_names())}, got {order.flights.tracker!r}")
+    plans = plan_flights(order, data)
+    _check_engines([plan for _, plan in plans])
+    return [row for each, plan in plans for row in _flight_rows(order, each, plan, out, report)]
+
+
+def plan_flights(order: BarsOrder, data: Sequence[FlightData]) -> list[tuple[FlightData, PlannedData]]:
+    """The datasets to make. The first sequences of a recipe are the same however many are asked for.
+
+    That holds up to a full measurement; beyond it the recipe is another.
+
+    Raises:
+        ValueError: no such recipe in the tier, engine or rig, or a wrong number.
+    """
+    from studies.acceptance.rendered.flight_tiers import part_length, with_parts
+
+    flights, names = order.flights, [each.recipe for each in data]
+    for name in flights.recipes:
+        if name not in names:
+            raise ValueError(f"--recipe: {order.tier} has none named {name!r}; there are {', '.join(names)}")
+    if flights.sequences is not None and flights.sequences < 1:
+        raise ValueError(f"--sequences: must be at least 1, got {flights.sequences}")
+    plans = []
+    for each in data:
+        if flights.recipes and each.recipe not in flights.recipes:
+            continue
+        parts = each.parts if flights.sequences is None else flights.sequences
+        for engine in order.engines or (None,):
+            source = open_recipe(each.recipe, order.seed, engine)
+            recipe = with_parts(source.recipe, max(each.parts, parts))
+            for rig in flights.rigs if each.follows else (DEFAULT_RIG,):
+                made = recipe.render.engine, recipe.name, *([] if rig == DEFAULT_RIG else [rig])
+                seen = RecipeSource(_with_rig(recipe, rig), source.text)
+                plans.append((each, PlannedData(seen, parts * part_length(recipe), made)))
+    return plans
+
+
+def _flight_rows(
+    order: BarsOrder, data: FlightData, plan: PlannedData, out: Path, report: ProgressReport
+) -> list[BarRow]:
+    """The rows of one dataset."""
+    from nav.runner import method_names
+    from studies.acceptance.rendered.flight_tiers import following_rows, speed_rows
+    from studies.acceptance.rendered.scored_frames import BEST, METHODS
+    from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
+
+    title, folder, is_beside = ", ".join(plan.names), out.joinpath(*plan.names), len(plan.names) > _NAMES_OF_BARS
+    sha256 = _render(plan, folder, order, report)
+    tracked = NavigationOptions(tracker=order.flights.tracker, filtered=True) if data.follows else NavigationOptions()
+    estimates = _navigated(folder, "estimates", sha256, METHODS, tracked, report)
+    result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
+    scores = score_pairs(folder / "dataset", estimates)
+    # The paper's method tells no covariance, so that a filter has nothing to go by.
+    scores = {name: scores[name] for name in (*METHODS, FILTERED) if name in scores}
+    rows = data.rows(title, scores, is_beside)
+    if data.follows:
+        rows += following_rows(title, scores, result)
+    untracked = f"{title}, detector at every pair"
+    if data.times:
+        rows += speed_rows(f"{title}, {order.flights.tracker}", scores[FILTERED], is_beside)
+        alone = _navigated(folder, "detector-alone", sha256, (BEST,), NavigationOptions(filtered=True), report)
+        rows += speed_rows(untracked, score_pairs(folder / "dataset", alone)[FILTERED], True)
+    if data.compares:
+        # Apart, so that the time of many methods is in that of no pair above.
+        all_methods = _navigated(folder, "all-methods", sha256, method_names(), NavigationOptions(), report)
+        rows += data.rows(untracked, score_pairs(folder / "dataset", all_methods), True)
+    return rows
+
+
+def _check_engines(plans: Sequence[PlannedData]) -> None:
+    """Check that every engine can be loaded.
+
+    Raises:
+        ValueError: one is unknown or not installed.
+    """
+    from render.engine import load_engine
+
+    for name in dict.fromkeys(plan.source.recipe.render.engine for plan in plans):
+        load_engine(name)
+
+
+def _with_rig(recipe: Recipe, rig: str) -> Recipe:
+    """The recipe with another of the rigs that ship, and a lens as clean as its own; the default leaves it as it is.
+
+    Raises:
+        ValueError: no such rig, or one that the engine cannot draw.
+    """
+    from pydantic import ValidationError
+
+    from datasets_manifest.recipe.recipe import Recipe
+    from datasets_manifest.recipe.rigs import resolve_rig
+    from drogue_models.presets import explain
+
+    if rig == DEFAULT_RIG:
+        return recipe
+    try:
+        seen_by, sensor = resolve_rig(rig, recipe.seed)
+        clean = {"scattered_fraction": recipe.sensor.optics.scattered_fraction}
+        sensor = sensor.model_copy(update={"optics": sensor.optics.model_copy(update=clean)})
+        return Recipe.model_validate(dict(recipe) | {"rig": seen_by, "sensor": sensor})
+    except ValidationError as error:
+        raise ValueError(f"--rig {rig}: {explain(error)}") from error
+    except ValueError as error:
+        raise ValueError(f"--rig {rig}: {error}") from error
+
+
+def _render(plan: PlannedData, folder: Path, order: BarsOrder, report: ProgressReport) -> str:
+    """Make what is missing of a dataset's first pairs; its hash.
+
+    Raises:
+        ValueError: pairs could not be made; without them bars would look better than they are.
+    """
+    dataset = folder / "dataset"
+    report.say(f"{folder.name}: rendering {plan.count} pairs of {plan.source.recipe.name} into {dataset}")
+    made = render_frames(plan.source, dataset, range(plan.count), ExecutionOptions(order.workers), report)
+    if made.drops:
+        first = min(made.drops, key=lambda drop: drop.frame_index)
+        raise ValueError(
+            f"{dataset}: {len(made.drops)} pairs could not be made, pair {first.frame_index} the first: "
+            f"{first.reason}; bars count every pair: change the recipe or the seed, or run again if it was an accident"
+        )
+    return made.dataset_sha256
+
+
+def _navigated(
+    folder: Path, name: str, sha256: str, methods: Sequence[str], how: NavigationOptions, report: ProgressReport
+) -> Path:
+    """Estimates of a folder's dataset, made unless they are there already; what they were made with counts."""
+    from studies.acceptance.finished_results import is_navigated, mark_navigated
+
+    estimates = folder / f"{name}.jsonl"
+    made_with = [*methods, *([f"tracker {how.tracker}"] if how.tracker else []), *(["filter"] if how.filtered else [])]
+    if is_navigated(estimates, sha256, made_with):
+        report.say(f"{folder.name}: {estimates} is there already")
+        return estimates
+    navigate_dataset(folder / "dataset", methods, estimates, report, how)
+    mark_navigated(estimates, sha256, made_with)
+    return estimates
