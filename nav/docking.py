@@ -10,7 +10,7 @@ from datasets_manifest.types.estimates import Docking, PoseEstimate
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
-from nav.filtering.filter_state import FilterState
+from nav.filtering.pose_filter import FilterState
 
 # Straight motion tells nothing of what comes later; 40 m at 1.6 m/s take 25 s. [s]
 _LONGEST_WAY_S = 60.0

@@ -25,8 +25,7 @@ from nav.lens_correction import ideal_centroids
 from nav.map_views import for_each_eye
 from nav.matching.marker_channel import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
 from nav.pair_measurement import Sighting, estimate_pose, regions_of
-from nav.pose.pose_method import NoFixReason, Observation, Solution
-from nav.pose.stated_tolerances import EXACT, StatedTolerances
+from nav.pose.pose_method import EXACT, NoFixReason, Observation, Solution, StatedTolerances
 from nav.refinement import refine
 from nav.stereo_correspondence import correspond, no_ring
 from nav.tracking.rim_boxes import rim_boxes

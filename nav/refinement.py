@@ -25,7 +25,7 @@ from nav.centroids.patches import WHOLE_RADIUS_PX
 from nav.lens_correction import ideal_places, real_places
 from nav.matching.marker_channel import PLAIN, balancing_weight
 from nav.pose.joint import joint
-from nav.pose.mono import mono_lm
+from nav.pose.monocular import mono_lm
 from nav.pose.pose_method import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation, Solution
 
 _OUTLINE_POINTS = 24

@@ -17,14 +17,13 @@ from drogue_models.parameters import DrogueParameters
 from geometry.stereo import StereoRig
 from nav.detector.detector import Detector
 from nav.docking import docking_of
-from nav.filtering.filter_settings import FilterSettings
+from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.smoother import SMOOTHER_SUFFIX
 from nav.navigator import CentroidChoice, Navigator
 from nav.pair_measurement import Sighting
 from nav.tracked_observer import TrackedObserver
-from nav.tracking.continuity import REDETECT_EVERY, begins_sequence
-from nav.tracking.trackers import open_tracker
+from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
 
 
 @dataclass(frozen=True)

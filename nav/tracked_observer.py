@@ -11,14 +11,13 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye, StereoRig
 from nav.detector.detector import StereoDetection
-from nav.filtering.filter_settings import FilterSettings
+from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
 from nav.navigator import DETECTOR, Navigator
 from nav.pair_measurement import Sighting, regions_of
 from nav.pose.pose_method import Solution
-from nav.tracking.continuity import is_same_place
 from nav.tracking.rim_boxes import rim_boxes
-from nav.tracking.tracker import Tracker
+from nav.tracking.tracker import Tracker, is_same_place
 
 _NOWHERE = StereoDetection(None, None)
 

@@ -236,7 +236,7 @@ def _check_places(out: Path, latency_out: Path | None) -> None:
 def _settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSettings:
     from nav.runner import CENTROID_CHOICES, method_names
     from nav.sequence_navigator import SequenceSettings
-    from nav.tracking.continuity import REDETECT_EVERY
+    from nav.tracking.tracker import REDETECT_EVERY
 
     choice = next((name for name in CENTROID_CHOICES if name == options.centroids), None)
     if choice is None:

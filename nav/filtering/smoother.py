@@ -8,13 +8,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate
-from nav.filtering.error_state import SIZE, MotionState
-from nav.filtering.filter_settings import FilterSettings
-from nav.filtering.filter_state import state_of
 from nav.filtering.hypotheses import Bank, Hypothesis, advance_bank, correct_bank, first_bank
-from nav.filtering.motion_model import Step
-from nav.filtering.pose_measurement import Fix, fix_of
-from nav.filtering.track import Memory, take
+from nav.filtering.measurement_update import Fix, fix_of
+from nav.filtering.motion_model import SIZE, FilterSettings, MotionState, Step
+from nav.filtering.pose_filter import Memory, state_of, take
 from nav.pose.pose_method import NoFixReason
 
 SMOOTHER_SUFFIX = "+smoother"

@@ -1,4 +1,4 @@
-"""Weighted Gauss-Newton adjustment of many poses at once, each to its own frame's features."""
+"""Weighted Gauss-Newton adjustment of many poses at once, each to the features of its own frame."""
 
 from __future__ import annotations
 
@@ -8,9 +8,123 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.pose.adjustment_loops import adjust_frames
+from nav.pose.adjustment_loops import Shared, adjust_frames, linearise_frames, predict_centers
 from nav.pose.features import Features
-from nav.pose.reprojection import SQUARES, Loss, State, arrays_of, linearise, shared_of
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Poses that are being adjusted, one for each frame of some features.
+
+    Attributes:
+        rotations: (S, 3, 3) `left_from_drogue`.
+        translations_m: (S, 3).
+        departures: (S, G) from the nominal drogue and rig, in standard deviations, see `Features`.
+    """
+
+    rotations: Array
+    translations_m: Array
+    departures: Array
+
+    @staticmethod
+    def nominal(features: Features, rotations: Array, translations_m: Array) -> State:
+        """Poses of a drogue and rig exactly as built."""
+        return State(rotations, translations_m, np.zeros((len(rotations), features.departures)))
+
+
+@dataclass(frozen=True, eq=False)
+class Loss:
+    """How residuals count.
+
+    Attributes:
+        huber_sigmas: where the loss of a feature's residual turns from square to linear, in standard deviations.
+        tilt_prior_rad: standard deviation of the axis' x and y components about the camera's axis.
+    """
+
+    huber_sigmas: float = np.inf
+    tilt_prior_rad: float = np.inf
+
+
+SQUARES = Loss()
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Residuals and derivatives.
+
+    Attributes:
+        jacobian: (S, K, M) derivatives of M weighted residuals with respect to translation [m], rotation vector [rad]
+            and the departures.
+        residuals: (S, M), in standard deviations.
+        costs: (S,) half the sum of squares, by Huber's loss where one is set; infinite where it is not a number.
+    """
+
+    jacobian: Array
+    residuals: Array
+    costs: Array
+
+    @property
+    def information(self) -> Array:
+        """(S, K, K) `J W J^T`."""
+        information: Array = self.jacobian @ np.swapaxes(self.jacobian, 1, 2)
+        return information
+
+
+def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Linearised:
+    """Residuals of every frame's features in its pose.
+
+    The shift of a disc's ellipse centre is in the residuals and not in the derivatives, where it hardly matters.
+
+    Args:
+        features: S frames.
+        state: S poses.
+        loss: how residuals count.
+    """
+    count, free = len(state.rotations), features.departures
+    rows = 2 * features.measured.shape[2] * features.measured.shape[3] + 2 * np.isfinite(loss.tilt_prior_rad) + free
+    result = Linearised(np.empty((count, 6 + free, rows)), np.empty((count, rows)), np.empty(count))
+    places = (_plain(array) for array in (state.rotations, state.translations_m, state.departures))
+    linearise_frames(shared_of(features, loss), *arrays_of(features), *places, *vars(result).values())
+    return result
+
+
+def predicted_px(features: Features, rotations: Array, translations_m: Array) -> Array:
+    """(S, E, F, 2) ellipse centres that poses of the nominal drogue would show. [px]"""
+    pixels = np.empty((len(rotations), len(features.eye_x_m), len(features.points_m), 2))
+    predict_centers(shared_of(features, SQUARES), _plain(rotations), _plain(translations_m), pixels)
+    return pixels
+
+
+def shared_of(features: Features, loss: Loss) -> Shared:
+    """What the compiled loops take that all frames have in common."""
+    camera = features.camera
+    return Shared(
+        float(camera.fx_px),
+        float(camera.fy_px),
+        float(camera.cx_px),
+        float(camera.cy_px),
+        _plain(features.eye_x_m),
+        _plain(features.points_m),
+        _plain(features.radii_m),
+        _plain(features.shifts_m),
+        float(features.disparity_sigma_px),
+        float(loss.huber_sigmas),
+        float(loss.tilt_prior_rad),
+    )
+
+
+def arrays_of(features: Features) -> tuple[Array, Array]:
+    """What they take of each frame: measurements (5, B, E, F), and couplings (4, B, F) or none (4, B, 0)."""
+    coupling = features.coupling
+    if coupling is None:
+        coupling = np.empty((4, features.frames, 0))
+    return _plain(features.measured), _plain(coupling)
+
+
+def _plain(array: Array) -> Array:
+    """As loops are compiled for: they would be compiled anew for another layout, or for what is not to be written."""
+    plain: Array = np.require(array, requirements=["C", "W"])
+    return plain
 
 
 @dataclass(frozen=True, eq=False)

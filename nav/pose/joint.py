@@ -1,16 +1,19 @@
-"""Methods `joint` and `joint-hub`: the pose that best explains the features in both eyes at once."""
+"""Methods `joint`, `joint-hub` and `joint-robust`: the pose that best explains the features in both eyes at once."""
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from geometry.se3 import Array, RigidTransform
-from nav.pose.batched import JointBatch, solve_features
-from nav.pose.faults import fault, hub_fault
+from nav.pose.adjustment import Adjusted, Loss, State, adjust, linearise, predicted_px
 from nav.pose.features import Features, observed_features
+from nav.pose.joint_batch import JointBatch, solve_features, solve_from, two_fold_start
+from nav.pose.observation_checks import fault, hub_fault
 from nav.pose.pose_method import NoFixReason, Observation, PoseMode, Solution
-from nav.pose.reprojection import predicted_px
 
 # Matched features miss their places by this share of a marker's own radius only when they are not the drogue's.
 _LARGEST_MISS_FRACTION = 0.5
@@ -20,7 +23,7 @@ _LEAST_MISS_PX = 3.0
 def joint(observation: Observation) -> Solution | NoFixReason:
     """Weighted least squares over all markers in both eyes, from both weak-perspective attitudes.
 
-    See `nav.pose.batched` for what is reported where the markers do not tell which way the drogue is tilted.
+    See `nav.pose.joint_batch` for what is reported where the markers do not tell which way the drogue is tilted.
     """
     return fault(observation) or solve_one(observed_features(observation, with_hub=False), observation.seen)
 
@@ -80,3 +83,102 @@ def misfit(features: Features, rotation: Array, translation_m: Array) -> NoFixRe
     if miss_px <= max(_LEAST_MISS_PX, _LARGEST_MISS_FRACTION * float(radius_px)):
         return None
     return NoFixReason(f"the markers do not fit the drogue: they miss their places by {miss_px:.1f} px (rms)")
+
+
+_HUBER = Loss(huber_sigmas=2.0)
+# A feature in both eyes has four residuals; chance exceeds this once in 2000.
+_LARGEST_CHI2 = 20.0
+# Below such a chance residuals are not noise.
+_LEAST_CHANCE = 1e-4
+# Two features can be told from the rest when at least five more remain.
+_LEAST_FOR_TWO_OUT = 7
+# Four markers overdetermine the plane that three fix.
+_LEAST_INLIERS = 4
+
+
+def joint_robust(observation: Observation) -> Solution | NoFixReason:
+    """Huber's loss first; if any feature then stands out, every set without one or two features is tried.
+
+    The set whose pose explains the features best, each counted up to a limit, tells which are wrong; the answer is that
+    of `joint-hub` (or `joint`, where no hub was measured) without them. An edge of the hub counts as a feature.
+    """
+    reason = fault(observation) or hub_fault(observation)
+    if reason is not None:
+        return reason
+    features = observed_features(observation, with_hub=True)
+    good = _inliers(features)
+    count = observation.layout.count
+    markers = int((good & _measured(features))[:count].sum())
+    if not good.all() and markers < _LEAST_INLIERS:
+        return NoFixReason(f"only {markers} markers agree with each other, {_LEAST_INLIERS} are needed")
+    used, used_hub = observation.seen & good[:count], observation.hub_seen & _hub_part(good, count)
+    paired = used.all(axis=0)
+    if paired.sum() < 3:
+        return NoFixReason(f"only {int(paired.sum())} markers that both eyes see agree with each other, 3 are needed")
+    note = hub_note(observation)
+    if not note and not used_hub.any():
+        note = "the hub does not agree with the markers: the tilt rests on the markers alone"
+    return solve_one(features.without(~good), used, used_hub if used_hub.any() else None, note)
+
+
+def _hub_part(good: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+    return good[count:] if len(good) > count else np.zeros(2, dtype=bool)
+
+
+def _inliers(features: Features) -> NDArray[np.bool_]:
+    """(F,) which features agree with the pose that most of them share; unmeasured ones count as agreeing."""
+    found = solve_from(features, *two_fold_start(features), _HUBER)
+    best = int(np.argmin(found.costs))
+    first = _chi2(features.take(np.zeros(2, dtype=np.int64)), found)[best]
+    if (first < _LARGEST_CHI2).all():
+        return np.ones(len(first), dtype=bool)
+    sets = features.take(np.zeros(2 * len(_left_out(features)), dtype=np.int64))
+    mask = np.repeat(_left_out(features), 2, axis=0)
+    fewer = sets.without(mask)
+    starts = two_fold_start(fewer.take(slice(0, None, 2)))
+    tried = adjust(fewer, starts[0].reshape(-1, 3, 3), starts[1].reshape(-1, 3))
+    chi2 = np.vstack([_chi2(sets, tried), first])
+    scores = np.minimum(chi2, _LARGEST_CHI2).sum(axis=1)
+    inliers: NDArray[np.bool_] = chi2[np.argmin(scores)] < _LARGEST_CHI2
+    if (inliers & features.is_marker & _measured(features)).sum() < _LEAST_INLIERS:
+        least = int(np.argmin(np.where(mask, 0.0, chi2[:-1]).sum(axis=1)))
+        kept: NDArray[np.bool_] = ~mask[least]
+        if _explains(features, kept, chi2[least]):
+            return kept
+    return inliers
+
+
+def _explains(features: Features, kept: NDArray[np.bool_], chi2: Array) -> bool:
+    """Whether the residuals of the kept features are together no larger than by chance.
+
+    Among four markers, one in 500 is cut off by chance though all are right; their sum then tells.
+    """
+    freedom = 2 * int(features.seen[0][:, kept].sum()) - 6
+    return freedom > 0 and float(chdtrc(freedom, chi2[kept].sum())) > _LEAST_CHANCE
+
+
+def _left_out(features: Features) -> NDArray[np.bool_]:
+    """(L, F) every choice of one measured feature to leave out, and of two where enough remain."""
+    measured = np.flatnonzero(_measured(features))
+    choices: list[tuple[int, ...]] = [(int(i),) for i in measured]
+    if len(measured) >= _LEAST_FOR_TWO_OUT:
+        choices += combinations(measured.tolist(), 2)
+    mask = np.zeros((len(choices), len(features.points_m)), dtype=bool)
+    for row, choice in enumerate(choices):
+        mask[row, list(choice)] = True
+    return mask
+
+
+def _chi2(features: Features, adjusted: Adjusted) -> Array:
+    """(S, F) squared residuals of every feature in both eyes, in variances; infinite where they are no numbers."""
+    state = State(adjusted.rotations, adjusted.translations_m, adjusted.departures)
+    size = 2 * features.measured.shape[2] * len(features.points_m)
+    residuals = linearise(features, state).residuals[:, :size]
+    squares = (residuals.reshape(len(residuals), -1, len(features.points_m)) ** 2).sum(axis=1)
+    return np.where(np.isfinite(squares), squares, np.inf)
+
+
+def _measured(features: Features) -> NDArray[np.bool_]:
+    """(F,) which features any eye of the first frame measured."""
+    seen: NDArray[np.bool_] = features.seen[0].any(axis=0)
+    return seen

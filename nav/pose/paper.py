@@ -1,24 +1,30 @@
-"""Method `paper`: the seed paper's three-sphere pose, in the reading that works.
+"""Methods `paper` and `paper-literal`: the seed paper's three-sphere pose.
 
-Every three triangulated markers give a candidate for the drogue's origin; the candidate whose reprojection into both
-eyes fits all markers best is taken. Attitude: the plane through all markers.
-Source: the seed paper, section 3.3, eqs. 1-13; docs/explanation/paper.md lists what is corrected, and why
-eqs. 14-16 are left out.
+Every three triangulated markers give a candidate for the drogue's origin. `paper` takes the candidate whose
+reprojection into both eyes fits all markers best, the reading of the paper that works; the attitude is that of the
+plane through all markers. `paper-literal` takes the printed score instead: eq. 13 compares the rows of one reprojected
+point in both eyes. In a rectified rig these are equal for every point, so the printed score is zero for every candidate
+and selects none; a step in depth (eq. 16) would not move anything either.
+
+Source: the seed paper, section 3.3, eqs. 1-13; docs/explanation/paper.md lists what is corrected, and why eqs. 14-16
+are left out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
-from nav.pose.faults import fault
-from nav.pose.pose_method import NoFixReason, Observation, Solution
-from nav.pose.prediction import (
+from geometry.stereo import EYES
+from nav.pose.marker_geometry import (
     eye_points,
     plane_normal,
     predict_px,
@@ -27,6 +33,8 @@ from nav.pose.prediction import (
     used_pairs,
     with_best_roll,
 )
+from nav.pose.observation_checks import fault
+from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
 
 # Threshold of the Huber loss: twice the centroids' standard deviation, and no less than a good centroid's error.
 _HUBER_SIGMAS = 2.0
@@ -182,3 +190,103 @@ def _depth_steps(
         limit = _LARGEST_DEPTH_STEP * origin[2]
         origin = origin + direction * float(np.clip(step, -limit, limit))
     return origin
+
+
+# What the score of a candidate compares:
+#   literal         rows of the candidate's one reprojected point in both eyes;
+#   own_vdiff       measured rows in both eyes of the candidate's three markers;
+#   center_per_eye  the candidate with the rim's centre that each image shows by itself, from a homography;
+#   full_reproj     all markers in both eyes, by Huber's loss; the selection of method `paper`.
+RowReading = Literal["literal", "own_vdiff", "center_per_eye", "full_reproj"]
+
+# Four points fix a homography.
+_LEAST_FOR_HOMOGRAPHY = 4
+# A candidate's rows differ by the rounding of float64 pixels; equal scores must not be told apart by it. [px^2]
+_SAME_SCORE_PX2 = 1e-18
+
+
+def paper_reading(e_v: RowReading) -> PoseMethod:
+    """The paper's method with a reading of its score.
+
+    Args:
+        e_v: what the score compares.
+
+    Raises:
+        ValueError: there is no such reading.
+    """
+    if e_v not in _SCORES:
+        raise ValueError(f"e_v: must be one of {', '.join(_SCORES)}, got {e_v!r}")
+    score = _SCORES[e_v]
+
+    def method(observation: Observation) -> Solution | NoFixReason:
+        reason = fault(observation)
+        if reason is not None:
+            return reason
+        candidates = three_sphere_candidates(observation)
+        if isinstance(candidates, NoFixReason):
+            return candidates
+        scores = score(observation, candidates)
+        if isinstance(scores, NoFixReason):
+            return scores
+        equal = np.flatnonzero(scores <= scores.min() + _SAME_SCORE_PX2)
+        # Where the score does not choose, chance does, keyed by the measurements so that it always does the same.
+        rng = np.random.default_rng(crc32(candidates.pixels_px.tobytes()))
+        chosen = int(rng.choice(equal))
+        return Solution(candidates.pose_at(candidates.origins_m[chosen]), used_pairs(observation))
+
+    return method
+
+
+def paper_literal(observation: Observation) -> Solution | NoFixReason:
+    """Pose by the three-sphere construction and the score of eq. 13 as printed."""
+    return paper_reading("literal")(observation)
+
+
+def _row_difference(observation: Observation, candidates: Candidates) -> Array:
+    left, right = (observation.rig.project(candidates.origins_m, eye)[:, 1] for eye in EYES)
+    scores: Array = (left - right) ** 2 / 2
+    return scores
+
+
+def _own_rows(observation: Observation, candidates: Candidates) -> Array:
+    rows = candidates.pixels_px[0, :, 1] - candidates.pixels_px[1, :, 1]
+    scores: Array = (rows[candidates.members] ** 2).sum(axis=1)
+    return scores
+
+
+def _center_per_eye(observation: Observation, candidates: Candidates) -> Array | NoFixReason:
+    if len(candidates.points_m) < _LEAST_FOR_HOMOGRAPHY:
+        return NoFixReason(f"the rim's centre in one image needs {_LEAST_FOR_HOMOGRAPHY} markers in both eyes")
+    scores = np.zeros(len(candidates.origins_m))
+    for eye, pixels in zip(EYES, candidates.pixels_px, strict=True):
+        center = _projective_center(candidates.layout.centers_m[:, :2], pixels)
+        if center is None:
+            return NoFixReason(f"the markers of the {eye} eye show no centre")
+        scores += ((observation.rig.project(candidates.origins_m, eye) - center) ** 2).sum(axis=1)
+    return scores
+
+
+def _projective_center(places_m: Array, pixels_px: Array) -> Array | None:
+    """(2,) image of the origin under the homography that carries (K, 2) places to (K, 2) pixels. [px]"""
+    mean = pixels_px.mean(axis=0)
+    size = np.sqrt(((pixels_px - mean) ** 2).mean())
+    u, v = ((pixels_px - mean) / size).T
+    x, y = (places_m / np.sqrt((places_m**2).mean())).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows = [
+        np.column_stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u]),
+        np.column_stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v]),
+    ]
+    h = np.linalg.svd(np.vstack(rows))[2][8]
+    if abs(h[8]) <= np.finfo(np.float64).eps:
+        return None
+    center: Array = np.array([h[2], h[5]]) / h[8] * size + mean
+    return center
+
+
+_SCORES: dict[str, Callable[[Observation, Candidates], Array | NoFixReason]] = {
+    "literal": _row_difference,
+    "own_vdiff": _own_rows,
+    "center_per_eye": _center_per_eye,
+    "full_reproj": reprojection_scores,
+}

@@ -8,18 +8,11 @@ from __future__ import annotations
 
 from importlib.metadata import EntryPoint, entry_points
 
-from nav.pose.constant import constant
-from nav.pose.disparity_plane import disparity_plane
-from nav.pose.joint import joint, joint_hub
-from nav.pose.mean_plane import mean_plane
-from nav.pose.mono import mono_lm
-from nav.pose.mono_circle import mono_circle
-from nav.pose.opencv_pnp import mono_ippe, mono_sqpnp
-from nav.pose.paper import paper
-from nav.pose.paper_literal import paper_literal
+from nav.pose.baselines import circle_fit, constant, disparity_plane, mean_plane
+from nav.pose.joint import joint, joint_hub, joint_robust
+from nav.pose.monocular import mono_circle, mono_ippe, mono_lm, mono_sqpnp
+from nav.pose.paper import paper, paper_literal
 from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
-from nav.pose.rim_circle import circle_fit
-from nav.pose.robust import joint_robust
 
 ENTRY_POINT_GROUP = "droguekit.pose_estimators"
 

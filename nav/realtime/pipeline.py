@@ -1,10 +1,10 @@
-"""Navigation in real time: pairs come at a rate, and are worked on in threads of which each has its stage.
+"""Navigation in real time: pairs arrive at a rate, and each stage of the work has its own thread.
 
-The camera's thread reads the next pair before it comes, for a camera delivers pixels and not files. Another thread
-seeks the drogue in it and solves for poses, and whoever asks for the answers writes them. Where a detector looks at
-every pair it has a thread of its own, for OpenCV and a network's run time let other threads run meanwhile. A tracker
-works in Python as the solving does, and the two would only hold each other up. When a stage is free it takes the newest
-pair; older ones that wait are late: they are not worked on, and answered with that reason.
+The camera thread reads the next pair before its arrival time, because a camera delivers pixels and not files. Another
+thread detects the drogue and estimates poses; the caller's thread writes the answers. Where the detector runs on every
+pair it has a thread of its own, since OpenCV and the network's runtime release the interpreter lock. A tracker runs in
+Python, as pose estimation does, and the two would only block each other. A free stage takes the newest pair; older
+pairs that wait are late: they are not processed, and answered with that reason.
 """
 
 from __future__ import annotations
@@ -14,13 +14,100 @@ import threading
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from queue import Full, Queue
+from threading import Condition
 from time import monotonic
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from datasets_manifest.storage.blind import BlindPair
-from nav.realtime.queues import Handover, NewestFirst
 from nav.realtime.warm_up import fit_once
 from nav.sequence_navigator import LatePair, PairAnswers, SequenceNavigator, SoughtPair
+
+Item = TypeVar("Item")
+
+
+class NewestFirst(Generic[Item]):
+    """A place for one numbered thing; a newer one takes the place of what waits there, which then is late."""
+
+    def __init__(self) -> None:
+        """Empty and open."""
+        self._changed = Condition()
+        self._late: list[int] = []
+        self._late_after: list[int] = []
+        self._waiting: tuple[int, Item] | None = None
+        self._is_closed = False
+
+    def put(self, number: int, item: Item) -> None:
+        """Bring the newest thing."""
+        with self._changed:
+            if self._waiting is not None:
+                self._late.append(self._waiting[0])
+            self._late += self._late_after
+            self._late_after = []
+            self._waiting = number, item
+            self._changed.notify_all()
+
+    def skip(self, number: int) -> None:
+        """Name one, newer than all before, that is not brought: the next one came too early for it."""
+        with self._changed:
+            (self._late if self._waiting is None else self._late_after).append(number)
+
+    def take(self) -> tuple[tuple[int, ...], Item] | None:
+        """Wait for a thing.
+
+        Returns:
+            Numbers of those that are late and older than it, ascending and each told once, and the newest; None when
+            there will be no more.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting is not None or self._is_closed)
+            if self._waiting is None:
+                return None
+            (_, item), late = self._waiting, tuple(self._late)
+            self._waiting, self._late, self._late_after = None, self._late_after, []
+            return late, item
+
+    def close(self) -> None:
+        """Nothing more is brought."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+
+class Handover(Generic[Item]):
+    """A place for one thing; whoever brings the next one waits until it is free."""
+
+    def __init__(self) -> None:
+        """Empty and open."""
+        self._changed = Condition()
+        self._waiting: list[Item] = []
+        self._is_closed = False
+
+    def wait_free(self) -> bool:
+        """Wait until there is room; False when it is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._waiting or self._is_closed)
+            return not self._is_closed
+
+    def put(self, item: Item) -> None:
+        """Bring a thing, once the place is free."""
+        with self._changed:
+            self._waiting.append(item)
+            self._changed.notify_all()
+
+    def take(self) -> Item | None:
+        """Wait for a thing; None when there will be no more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_closed)
+            item = self._waiting.pop() if self._waiting else None
+            self._changed.notify_all()
+            return item
+
+    def close(self) -> None:
+        """Nothing more is brought."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
 
 # Answers that wait to be written; more hold up the stages, and pairs become late.
 _WAITING_ANSWERS = 32

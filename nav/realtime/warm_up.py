@@ -16,7 +16,7 @@ from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
 from nav.pose.features import stack_features
 from nav.pose.joint import solve_one
-from nav.pose.prediction import predict_px
+from nav.pose.marker_geometry import predict_px
 
 _RADII_PX = 12.0, 8.0
 _SIDE_PX, _MIDDLE_PX = 40, 20.0

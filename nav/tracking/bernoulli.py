@@ -1,7 +1,7 @@
 """Follows the drogue by N learned comparisons of pixel pairs about a Kalman filter's prediction.
 
 In the spirit of the N-fold Bernoulli tracker, see `nav.tracking.pixel_comparison_features`. Ours: the tests are chosen
-from more at the start, across colours too; `nav.tracking.template_alignment` brings the winner to a fraction of a
+from more at the start, across colours too; `nav.tracking.appearance_model` brings the winner to a fraction of a
 percent, and the tests have the last word on both.
 """
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.detector.detector import Detection
+from nav.tracking.appearance_model import Template
 from nav.tracking.box_motion import BoxMotion, ExpectedBox
 from nav.tracking.pixel_comparison_features import PairTests
 from nav.tracking.region import (
@@ -25,7 +26,6 @@ from nav.tracking.region import (
     grown,
     image_region,
 )
-from nav.tracking.template_alignment import Template
 
 # The box is looked at on a grid that has so many pixels across it, enlarged where it is smaller.
 _GRID = 32

@@ -8,9 +8,7 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, Detector, StereoDetection
-from nav.tracking.continuity import REDETECT_EVERY, begins_sequence, is_same_place
-from nav.tracking.tracker import Tracker
-from nav.tracking.trackers import open_tracker
+from nav.tracking.tracker import REDETECT_EVERY, Tracker, begins_sequence, is_same_place, open_tracker
 
 # The detector is asked at once where both eyes have lost the drogue. Where one has, that is at the second pair in a row
 # and every third one from there, for the drogue may be out of one view for long.
@@ -89,7 +87,7 @@ def tracked_detector_factory(
 
     Args:
         detector_of: makes the detector that starts the tracker.
-        tracker: one of `nav.tracking.trackers.tracker_names`.
+        tracker: one of `nav.tracking.tracker.tracker_names`.
 
     Raises:
         ValueError: no such tracker.

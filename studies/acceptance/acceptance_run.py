@@ -181,7 +181,7 @@ def flight_bars(order: BarsOrder, data: Sequence[FlightData], out: Path, report:
         ValueError: no such recipe in the tier, engine, rig or tracker, a wrong number, or pairs that could not be made.
         OSError: the folder cannot be written.
     """
-    from nav.tracking.trackers import tracker_names
+    from nav.tracking.tracker import tracker_names
 
     if order.flights.tracker not in tracker_names():
         raise ValueError(f"--tracker: must be one of {', '.join(tracker_names())}, got {order.flights.tracker!r}")

@@ -10,7 +10,7 @@ import pytest
 
 from droguekit.benchmark.detection.detection_truth import read_detection_truth
 from droguekit.cli.main import DONE, WRONG_INPUT, run
-from nav.tracking.trackers import tracker_names
+from nav.tracking.tracker import tracker_names
 
 FRAMES = 8
 # It finds all of these flat pictures to a percent; what is tested here is what comes after.

@@ -14,7 +14,7 @@ from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.patches import annulus_pixels, disc_pixels
 from nav.centroids.pixel_sums import sector_sums, zone_sums
 from nav.numerics import damped_steps, matrix_loops
-from nav.pose import adjustment_loops, reprojection_loops
+from nav.pose import adjustment_loops
 
 
 def float32(rng, *shape):
@@ -172,13 +172,13 @@ from nav.centroids import edge_pictures, pixel_sums, window_cells
 from nav.numerics import matrix_loops
 from nav.realtime.warm_up import fit_once
 from nav.navigator import Navigator
-from nav.pose import adjustment_loops, reprojection_loops
+from nav.pose import adjustment_loops
 from render.engine import load_engine
 from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
-    loops = (adjustment_loops, damped_steps, edge_pictures, matrix_loops, pixel_sums, reprojection_loops, window_cells)
+    loops = (adjustment_loops, damped_steps, edge_pictures, matrix_loops, pixel_sums, window_cells)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
@@ -200,7 +200,7 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
 
 
 @pytest.mark.parametrize(
-    "loops", [adjustment_loops, damped_steps, edge_pictures, matrix_loops, pixel_sums, reprojection_loops, window_cells]
+    "loops", [adjustment_loops, damped_steps, edge_pictures, matrix_loops, pixel_sums, window_cells]
 )
 def test_loops_can_be_cached_beside_their_file_or_at_home(loops):
     found = [loop for loop in vars(loops).values() if hasattr(loop, "signatures")]

@@ -11,7 +11,7 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
 from nav.docking import capture_radius_m, docking_of
-from nav.filtering.filter_state import FilterState
+from nav.filtering.pose_filter import FilterState
 
 TIP_M = np.array([1.0, 0.45, 0.35])
 RIG = StereoRig(PinholeCamera(1280, 960, 1000.0, 1000.0, 639.5, 479.5), 0.3, probe_tip_body_m=TIP_M)

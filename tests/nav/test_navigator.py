@@ -20,8 +20,7 @@ from geometry.se3 import angles_from_rotation
 from geometry.stereo import EYES, paper_rig
 from nav.detector.detector import Detection
 from nav.navigator import CENTROID_CHOICES, Navigator
-from nav.pose.pose_method import NoFixReason
-from nav.pose.stated_tolerances import EXACT, StatedTolerances
+from nav.pose.pose_method import EXACT, NoFixReason, StatedTolerances
 from nav.refinement import marker_shapes
 from nav.runner import method_names, navigate
 from render.camera.sensor import expose

@@ -13,9 +13,9 @@ from geometry.circles import project_disc_centers
 from geometry.se3 import angles_from_axis, log_twist
 from geometry.stereo import EYES, paper_rig
 from nav.pose.adjustment import adjust
+from nav.pose.baselines import mean_plane
 from nav.pose.features import observed_features
 from nav.pose.joint import joint
-from nav.pose.mean_plane import mean_plane
 from nav.pose.paper import paper, triple_circles
 from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.pose_methods import METHODS

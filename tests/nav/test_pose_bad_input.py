@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from drogue_models.marker_layout import MarkerLayout
 from geometry.pinhole import PinholeCamera
-from nav.pose.batched import solve_joint_batch
-from nav.pose.pose_method import NoFixReason, Observation, Solution
+from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.pose_method import NoFixReason, Observation, Solution, StatedTolerances
 from nav.pose.pose_methods import METHODS
-from nav.pose.stated_tolerances import StatedTolerances
 
 MONO = [name for name in METHODS if name.startswith("mono-")]
 HUB = ["joint-hub", "joint-robust"]

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from geometry.circles import project_disc_centers
-from nav.pose.batched import solve_joint_batch
 from nav.pose.joint import joint, joint_hub
-from nav.pose.pose_method import Solution
-from nav.pose.stated_tolerances import EXACT, StatedTolerances
+from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.pose_method import EXACT, Solution, StatedTolerances
 
 FOCAL_PX = 8e-3 / 3.75e-6
 BASELINE_M = 0.12

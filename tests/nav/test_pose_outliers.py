@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nav.pose.joint import joint
-from nav.pose.mean_plane import mean_plane
-from nav.pose.paper import paper, three_sphere_candidates
-from nav.pose.paper_literal import _row_difference, paper_literal, paper_reading
-from nav.pose.pose_method import NoFixReason, Solution
-from nav.pose.robust import joint_robust
-from nav.pose.stated_tolerances import StatedTolerances
+from nav.pose.baselines import mean_plane
+from nav.pose.joint import joint, joint_robust
+from nav.pose.paper import _row_difference, paper, paper_literal, paper_reading, three_sphere_candidates
+from nav.pose.pose_method import NoFixReason, Solution, StatedTolerances
 
 
 def corrupt(rng, draws, count: int, eyes: str = "one") -> np.ndarray:

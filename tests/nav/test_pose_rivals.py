@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from drogue_models.marker_layout import MarkerLayout
-from nav.pose.circle_pose import circle_poses, conic_through
-from nav.pose.disparity_plane import disparity_plane
-from nav.pose.mean_plane import mean_plane
+from nav.pose.baselines import circle_center, circle_fit, disparity_plane, mean_plane
+from nav.pose.monocular import circle_poses, conic_through
 from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.pose_methods import METHODS
-from nav.pose.rim_circle import circle_center, circle_fit
 
 MONO = ("mono-circle", "mono-ippe", "mono-sqpnp", "mono-lm")
 

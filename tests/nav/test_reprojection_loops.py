@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from nav.pose.adjustment import adjust
+from nav.pose.adjustment import Loss, State, adjust, linearise, predicted_px
 from nav.pose.features import stack_features
-from nav.pose.reprojection import Loss, State, linearise, predicted_px
-from nav.pose.stated_tolerances import StatedTolerances
+from nav.pose.pose_method import StatedTolerances
 
 SIGMA_PX = 0.1
 STATED = StatedTolerances(

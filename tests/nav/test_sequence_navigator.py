@@ -13,12 +13,12 @@ from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detection, StereoDetection
-from nav.filtering.filter_settings import FilterSettings
+from nav.filtering.motion_model import FilterSettings
 from nav.navigator import Navigator
 from nav.runner import open_navigator, with_smoothed
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings
 from nav.tracked_observer import TrackedObserver
-from nav.tracking.trackers import tracker_names
+from nav.tracking.tracker import tracker_names
 
 DETECTOR = "color-blob"
 STEP_M = (0.012, -0.006, -0.02)

@@ -11,8 +11,7 @@ from datasets_manifest.types.estimates import NoFix, PoseEstimate
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from nav.detector.color_blob import ColorBlobDetector
-from nav.realtime.pipeline import MonotonicClock, play
-from nav.realtime.queues import Handover, NewestFirst
+from nav.realtime.pipeline import Handover, MonotonicClock, NewestFirst, play
 from nav.runner import LATE, open_navigator, with_smoothed
 from nav.sequence_navigator import LatePair, SequenceNavigator, SequenceSettings
 

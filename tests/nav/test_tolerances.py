@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nav.pose.batched import solve_joint_batch
-from nav.pose.features import stack_features
-from nav.pose.joint import joint_hub
+from nav.pose.adjustment import State, linearise
+from nav.pose.features import stack_features, whiten, whiten_displaced
+from nav.pose.joint import joint_hub, joint_robust
+from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.pose_method import EXACT, StatedTolerances
 from nav.pose.pose_methods import METHODS
-from nav.pose.reprojection import State, linearise
-from nav.pose.robust import joint_robust
-from nav.pose.stated_tolerances import EXACT, StatedTolerances
-from nav.pose.whitening import whiten, whiten_displaced
 
 STATED = StatedTolerances(
     ring_radius_m=5e-4, ellipticity=0.002, placement_m=3e-4, hub_lateral_m=1e-3, disparity_px=0.19

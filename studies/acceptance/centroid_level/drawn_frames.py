@@ -12,7 +12,7 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.circles import ellipse_center_points
 from geometry.se3 import Array
 from geometry.stereo import EYES, StereoRig
-from nav.pose.stated_tolerances import StatedTolerances
+from nav.pose.pose_method import StatedTolerances
 
 # The protocol: pitch and yaw within 10 degrees, roll within half of the spacing of eight markers.
 TILT_DEG = 10.0

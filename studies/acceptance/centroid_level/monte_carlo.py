@@ -21,7 +21,7 @@ from droguekit.benchmark.poses.cramer_rao import FacingRing, feature_points
 from droguekit.numerical_threads import one_thread
 from geometry.se3 import Array, angles_from_axis, skew
 from geometry.stereo import StereoRig, paper_rig
-from nav.pose.stated_tolerances import EXACT, StatedTolerances
+from nav.pose.pose_method import EXACT, StatedTolerances
 from studies.acceptance.centroid_level.drawn_frames import (
     AS_BUILT,
     CLEAN,

@@ -10,10 +10,9 @@ from scipy.stats import chi2
 
 from datasets_manifest.types.estimates import PoseEstimate
 from geometry.se3 import Array, RigidTransform
-from nav.filtering.filter_settings import FilterSettings
-from nav.filtering.filter_state import FilterState
-from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.pose_measurement import pose_difference
+from nav.filtering.measurement_update import pose_difference
+from nav.filtering.motion_model import FilterSettings
+from nav.filtering.pose_filter import FilterState, PoseFilter
 
 Measure = Callable[..., PoseEstimate]
 PERIOD_S = 0.04

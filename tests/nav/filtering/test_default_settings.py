@@ -7,9 +7,9 @@ import numpy as np
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.estimates import PoseEstimate
 from geometry.se3 import Array
-from nav.filtering.filter_settings import FilterSettings
+from nav.filtering.measurement_update import pose_difference
+from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.pose_measurement import pose_difference
 from scenes.sampler import sample_left_from_drogue
 
 Measure = Callable[..., PoseEstimate]

@@ -7,11 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geometry.se3 import Array, RigidTransform, exp_rotation, exp_twist, left_jacobian, log_rotation
-from nav.filtering.correction import first_state, innovation_of
-from nav.filtering.error_state import SIZE, MotionState
-from nav.filtering.filter_settings import FilterSettings
-from nav.filtering.motion_model import advance, vibration_covariance
-from nav.filtering.pose_measurement import pose_difference
+from nav.filtering.measurement_update import first_state, innovation_of, pose_difference
+from nav.filtering.motion_model import SIZE, FilterSettings, MotionState, advance, vibration_covariance
 
 # Central differences of smooth functions of order one: their own error is of the square of the step.
 STEP = 1e-5

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from geometry.se3 import Array, RigidTransform
-from nav.filtering.filter_settings import FilterSettings
+from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FilterUpdate, PoseFilter
 from nav.filtering.smoother import smooth
 

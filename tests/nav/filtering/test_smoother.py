@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.estimates import Estimate, Mode, NoFix, PoseEstimate
 from geometry.se3 import Array, RigidTransform
-from nav.filtering.filter_settings import FilterSettings
+from nav.filtering.measurement_update import pose_difference
+from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
-from nav.filtering.pose_measurement import pose_difference
 from nav.filtering.smoother import smooth
 
 Measure = Callable[..., PoseEstimate]

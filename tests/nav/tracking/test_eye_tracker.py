@@ -9,8 +9,7 @@ import pytest
 from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES
 from nav.detector.detector import Detection, StereoDetection
-from nav.tracking.tracker import Tracker
-from nav.tracking.trackers import open_tracker, tracker_names
+from nav.tracking.tracker import Tracker, open_tracker, tracker_names
 from tests.support.painted_sequences import Place, film, overlap
 
 NOWHERE = StereoDetection(None, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nav.detector.detector import Detection, StereoDetection
-from nav.tracking.trackers import open_tracker
+from nav.tracking.tracker import open_tracker
 from tests.support.painted_sequences import Place, film, overlap
 
 NOWHERE = StereoDetection(None, None)

@@ -1,4 +1,4 @@
-"""What a filter takes from an estimate: every pose that explains the images, with its own covariance and share."""
+"""Kalman update of one state by one measured pose: conversion of estimates, innovation, correction."""
 
 from __future__ import annotations
 
@@ -8,7 +8,16 @@ import numpy as np
 
 from datasets_manifest.types.estimates import TANGENT, PoseEstimate
 from geometry.se3 import Array, RigidTransform, exp_rotation, log_rotation
-from nav.filtering.error_state import symmetric
+from nav.filtering.motion_model import (
+    SIZE,
+    VIBRATION,
+    FilterSettings,
+    MotionState,
+    orthonormal,
+    seen_from_turning,
+    symmetric,
+    vibration_covariance,
+)
 from nav.pose.pose_method import NoFixReason
 
 # Places and deviations beyond these are no drogue's, and squares of much larger ones overflow.
@@ -112,3 +121,84 @@ def _without_spread(covariance: Array, spread: Array) -> Array:
     values, vectors = np.linalg.eigh(symmetric(np.eye(6) - inverse @ spread @ inverse.T))
     kept = scale @ vectors * np.sqrt(np.maximum(values, _LEAST_OWN_SHARE))
     return symmetric(kept @ kept.T)
+
+
+_POSE = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What a measured pose says beyond the prediction.
+
+    Attributes:
+        error: (6,) from the predicted to the measured pose, in the tangent of `datasets_manifest.types.estimates`.
+        jacobian: (6, 18) of the predicted pose by the error of the state.
+        whitener: (6, 6) inverse of the lower Cholesky factor of its covariance.
+        white: (6,) `whitener @ error`.
+        nis: its square, chi-square with 6 degrees of freedom.
+        log_likelihood: logarithm of its density.
+    """
+
+    error: Array
+    jacobian: Array
+    whitener: Array
+    white: Array
+    nis: float
+    log_likelihood: float
+
+
+def innovation_of(state: MotionState, pose: RigidTransform, covariance: Array) -> Innovation:
+    """Compare a measured pose with a predicted state.
+
+    Args:
+        state: at the time of the images.
+        pose: measured, with the roll that is nearest to the state's.
+        covariance: (6, 6) of it, positive definite.
+    """
+    jacobian = state.pose_jacobian
+    error = pose_difference(state.pose, pose)
+    factor = np.linalg.cholesky(symmetric(jacobian @ state.covariance @ jacobian.T + covariance))
+    # Of so small a matrix the inverse costs less than three checked calls that solve with the factor.
+    whitener = np.linalg.inv(factor)
+    white = whitener @ error
+    nis = float(white @ white)
+    log_likelihood = -nis / 2 - float(np.log(np.diag(factor)).sum()) - _POSE / 2 * np.log(2 * np.pi)
+    return Innovation(error, jacobian, whitener, white, nis, log_likelihood)
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What a fix makes of a state.
+
+    Attributes:
+        state: after it.
+        kept: (18, 18) `I - K H`, what is left of the error before.
+    """
+
+    state: MotionState
+    kept: Array
+
+
+def correct(state: MotionState, innovation: Innovation, covariance: Array) -> Correction:
+    """Take a measured pose of a (6, 6) covariance.
+
+    The covariance is updated in Joseph's form, which keeps it positive definite.
+    """
+    cross = state.covariance @ innovation.jacobian.T
+    gain = cross @ innovation.whitener.T @ innovation.whitener
+    kept = np.eye(SIZE) - gain @ innovation.jacobian
+    posterior = kept @ state.covariance @ kept.T + gain @ covariance @ gain.T
+    return Correction(state.moved(gain @ innovation.error, posterior), kept)
+
+
+def first_state(pose: RigidTransform, covariance: Array, settings: FilterSettings) -> MotionState:
+    """What one measured pose tells: where the drogue is but for the shaking, and nothing of its motion."""
+    shaking = vibration_covariance(pose.translation_m, settings)
+    initial = np.zeros((SIZE, SIZE))
+    initial[:_POSE, :_POSE] = covariance + shaking
+    initial[:_POSE, VIBRATION] = initial[VIBRATION, :_POSE] = -shaking
+    initial[VIBRATION, VIBRATION] = shaking
+    drogue2, camera2 = (settings.start_speed_m_s**2, settings.start_rate_rad_s**2), settings.start_turn_rad_s**2
+    initial[6:12, 6:12] = seen_from_turning(pose.translation_m, *drogue2, camera2)
+    zero = np.zeros(3)
+    return MotionState(pose.translation_m, orthonormal(pose.rotation), zero, zero, zero, zero, symmetric(initial))

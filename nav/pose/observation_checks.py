@@ -1,4 +1,4 @@
-"""What makes measurements unfit to carry a pose."""
+"""Checks of an observation before a pose is computed from it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a pose would show the markers, for many poses at once, and triangulated markers."""
+"""Projection of the markers for many poses at once, triangulation, and attitudes from an axis."""
 
 from __future__ import annotations
 
