@@ -90,7 +90,7 @@ def broken(make_pose, corrupt) -> Observation:
     return Observation(RIG, LAYOUT, pixels, cov)
 
 
-# Methods of one eye answer without the other; tests/nav/test_pose_bad_input.py has what turns them down.
+# Methods of one eye answer without the other; tests/nav/pose/test_observation_checks.py has what turns them down.
 STEREO_METHODS = [name for name in METHODS if not name.startswith("mono-")]
 
 
