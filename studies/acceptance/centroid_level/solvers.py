@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from geometry.stereo import StereoRig
-from nav.pose.joint_batch import solve_from, solve_joint_batch
 from nav.pose.features import Features, stack_features
-from nav.pose.pose_method import NoFixReason, Observation
+from nav.pose.joint_batch import solve_from, solve_joint_batch, two_fold_start
+from nav.pose.pose_method import EXACT, NoFixReason, Observation, StatedTolerances
 from nav.pose.pose_methods import pose_method
-from nav.pose.pose_method import EXACT, StatedTolerances
-from nav.pose.joint_batch import two_fold_start
 from studies.acceptance.centroid_level.drawn_frames import Poses
 
 BATCHED = ("joint", "joint-hub")
