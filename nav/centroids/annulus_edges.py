@@ -21,7 +21,7 @@ from nav.centroids.annulus_model import (
     shares_of,
     tied_to_pose,
 )
-from nav.centroids.annulus_places import AMPLITUDE, BACKGROUND, INNER, OUTER
+from nav.centroids.annulus_places import ANNULUS_AMPLITUDE, ANNULUS_BACKGROUND, ANNULUS_INNER, ANNULUS_OUTER
 from nav.centroids.annulus_response import response_pictures, starting_with_pictures, with_pictures
 from nav.centroids.background_glare import without_glare
 from nav.centroids.centroid_quality import NoiseModel, beyond_linear, measure_noise, residual_spread
@@ -145,7 +145,7 @@ def fit_annuli(
     final, weights, edge_factor = _weighted_fit(pixels, turns, (start, ties), model, first, ways is None)
     parameters = all_parameters(start, ties, final)
     between, light = shares_of(final, ties)[0], light_above(parameters, turns)
-    contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
+    contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
     uneven = _sector_chi2(final, weights, pixels, contrast)
     if edge_factor < 1:
         # What lies beside the annulus drowns what is on it.
@@ -157,13 +157,13 @@ def fit_annuli(
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
-    centers = np.where(good[:, None], pixels.origins_px + parameters[:, OUTER][:, :2], outer.centers_px)
+    centers = np.where(good[:, None], pixels.origins_px + parameters[:, ANNULUS_OUTER][:, :2], outer.centers_px)
     return AnnulusFits(centers, cov, contrast, lit, inflation, reasons)
 
 
 def _drawn(pixels: PixelSet, light: tuple[Array32, Array32], ways: Array | None) -> Model:
     still = annulus_model(pixels, *light)
-    return still if ways is None else moving(still, ways, (OUTER.start, INNER.start))
+    return still if ways is None else moving(still, ways, (ANNULUS_OUTER.start, ANNULUS_INNER.start))
 
 
 def _first_fit(
@@ -199,7 +199,7 @@ def _weighted_fit(
         parameters = all_parameters(*shape, first)
     between, light = shares_of(first, ties)[0], light_above(parameters, turns)
     leverages = np.minimum(first.leverages(first.covariance(), pixels.present), _MOST_LEVERAGE)
-    contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
+    contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
     noise = measure_noise(first.residuals**2 / (1 - leverages), pixels.present, between, contrast)
     weights = pixels.present / noise.variances(between, light)
     final = minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
@@ -212,8 +212,8 @@ def _sector_chi2(fit: Minimum, weights: Array32, pixels: PixelSet, contrast: Arr
 
 def _unevenness(parameters: Array) -> float:
     """Root mean square of the light's change with the azimuth over its mean, of the less even annulus."""
-    turns = parameters[:, AMPLITUDE:]
-    mean = np.maximum(turns[:, 0] - parameters[:, BACKGROUND], 1.0)  # at least 1 DN
+    turns = parameters[:, ANNULUS_AMPLITUDE:]
+    mean = np.maximum(turns[:, 0] - parameters[:, ANNULUS_BACKGROUND], 1.0)  # at least 1 DN
     return float((np.sqrt((turns[:, 1:] ** 2).sum(axis=1) / 2) / mean).max())
 
 
@@ -253,13 +253,13 @@ def _reasons(
     brightest = np.where(on_it > 0, light, 0).max(axis=1, keepdims=True)
     lit: Array = (on_it * (light > _LIT_SHARE * brightest)).sum(axis=1) / count
     bad = ~np.isfinite(parameters).all(axis=1)
-    for place, edge in zip((OUTER, INNER), predicted, strict=True):
+    for place, edge in zip((ANNULUS_OUTER, ANNULUS_INNER), predicted, strict=True):
         ellipse = parameters[:, place]
         moved = np.hypot(*(ellipse[:, :2] + pixels.origins_px - edge.centers_px).T)
         scale = np.sqrt(np.abs(np.linalg.det(parameter_shapes(ellipse)))) / edge.radii_px
         bad |= moved > 0.5 + _LARGEST_MOVE_FRACTION * edge.radii_px
         bad |= ~((scale > 1 / _LARGEST_SCALE) & (scale < _LARGEST_SCALE))
-    contrast = parameters[:, AMPLITUDE] - parameters[:, BACKGROUND]
+    contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
     sigma = np.sqrt(noise.dark_dn2 + noise.per_signal_dn * np.maximum(contrast, 0))
     tests = (
         (pixels.truncated, "cut by the edge of the image"),

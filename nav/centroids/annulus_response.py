@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.annulus_places import BACKGROUND, HOLE, INNER, OUTER
+from nav.centroids.annulus_places import ANNULUS_BACKGROUND, ANNULUS_HOLE, ANNULUS_INNER, ANNULUS_OUTER
 from nav.centroids.edge_pictures import add_box_pictures
 from nav.centroids.patches import PixelSet
 from nav.centroids.pixel_response import BOX_PICTURES
@@ -22,10 +22,10 @@ def response_pictures(pixels: PixelSet, parameters: Array, shares: tuple[Array32
         shares: (N, K) of the pixels that lie on the annulus, and in the hole.
         light: (N, K) of the annulus above the background.
     """
-    hole = (parameters[:, HOLE] - parameters[:, BACKGROUND]).astype(np.float32)[:, None]
+    hole = (parameters[:, ANNULUS_HOLE] - parameters[:, ANNULUS_BACKGROUND]).astype(np.float32)[:, None]
     pictures = np.zeros((len(parameters), BOX_PICTURES, pixels.x_px.shape[1]), np.float32)
     between, in_hole = shares
-    for place, inside, step in ((OUTER, between + in_hole, light), (INNER, in_hole, hole - light)):
+    for place, inside, step in ((ANNULUS_OUTER, between + in_hole, light), (ANNULUS_INNER, in_hole, hole - light)):
         ellipses = parameters[:, place].astype(np.float32)
         add_box_pictures(ellipses, pixels.x_px, pixels.y_px, pixels.present, inside, step, pictures)
     return pictures

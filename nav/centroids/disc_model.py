@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.disc_places import BACKGROUND, ELLIPSE_PARAMETERS, LEVEL, REST, WIDTH
+from nav.centroids.disc_places import DISC_BACKGROUND, DISC_FIXED_COUNT, DISC_LEVEL, DISC_WIDTH, ELLIPSE_PARAMETER_COUNT
 from nav.centroids.edge_pictures import draw_discs
 from nav.centroids.edge_profile import START_WIDTH_PX, edge_widths, ellipse_parameters
 from nav.centroids.patches import PixelSet, edge_distances
@@ -28,11 +28,11 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, furthe
     x, y = pixels.x_px, pixels.y_px
     if further is None:
         further = np.zeros((len(x), 0, x.shape[1]), np.float32)
-    count = REST + 2 * slope_outside + 2 * slope_inside + further.shape[1]
+    count = DISC_FIXED_COUNT + 2 * slope_outside + 2 * slope_inside + further.shape[1]
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
-        given, widths = parameters.astype(np.float32), edge_widths(parameters[:, WIDTH])
+        given, widths = parameters.astype(np.float32), edge_widths(parameters[:, DISC_WIDTH])
         draw_discs(given, widths, (slope_outside, slope_inside), x, y, further, picture, jacobian)
         return picture, jacobian
 
@@ -41,11 +41,11 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, furthe
 
 def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
     """(N, P) parameters of the initial outlines with the mean levels on either side of them, all further ones zero."""
-    parameters = np.zeros((len(shapes_px), REST + further_count))
-    parameters[:, :ELLIPSE_PARAMETERS] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
-    parameters[:, WIDTH] = START_WIDTH_PX
+    parameters = np.zeros((len(shapes_px), DISC_FIXED_COUNT + further_count))
+    parameters[:, :ELLIPSE_PARAMETER_COUNT] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
+    parameters[:, DISC_WIDTH] = START_WIDTH_PX
     distance = edge_distances(shapes_px, pixels.x_px, pixels.y_px)
-    for column, side in ((BACKGROUND, distance < -_CLEAR_PX), (LEVEL, distance > _CLEAR_PX)):
+    for column, side in ((DISC_BACKGROUND, distance < -_CLEAR_PX), (DISC_LEVEL, distance > _CLEAR_PX)):
         weight = pixels.present * side
         parameters[:, column] = (weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
     return parameters
@@ -53,5 +53,5 @@ def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
 
 def contrasts(fit: Minimum) -> Array:
     """(N,) light of fitted discs above that beside them. [DN]"""
-    contrast: Array = fit.parameters[:, LEVEL] - fit.parameters[:, BACKGROUND]
+    contrast: Array = fit.parameters[:, DISC_LEVEL] - fit.parameters[:, DISC_BACKGROUND]
     return contrast

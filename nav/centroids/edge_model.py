@@ -18,7 +18,7 @@ from nav.centroids.centroid_quality import (
 from nav.centroids.disc_fits import DiscFits, merged, unfitted
 from nav.centroids.disc_location import located
 from nav.centroids.disc_model import contrasts, disc_model, disc_start
-from nav.centroids.disc_places import BACKGROUND, LEVEL, WIDTH
+from nav.centroids.disc_places import DISC_BACKGROUND, DISC_LEVEL, DISC_WIDTH
 from nav.centroids.disc_rejection import rejection_reasons
 from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
 from nav.centroids.ellipses import Ellipses
@@ -84,7 +84,7 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
         pixels, still, first = _first_fit(signals, start, shaded, around, travel)
         model = moving(still, travel.of(start), (0,))
     # The derivative by the disc's level is the share of light from within.
-    inside = np.ascontiguousarray(first.jacobian[:, LEVEL])
+    inside = np.ascontiguousarray(first.jacobian[:, DISC_LEVEL])
     if not plain and travel is None:
         first, beyond_gaussian = without_pixel_response(first, pixels, inside, contrasts(first))
         pixels = replace(pixels, values=pixels.values - beyond_gaussian)
@@ -97,7 +97,7 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
     weights = pixels.present / noise.variances(inside, contrasts(first).astype(np.float32)[:, None])
     final = _weighted(model, pixels, first, weights, plain)
     # What a plain picture shows beside a disc says nothing about the disc.
-    judged = weights * (final.jacobian[:, LEVEL] > _ON_THE_DISC) if plain else weights
+    judged = weights * (final.jacobian[:, DISC_LEVEL] > _ON_THE_DISC) if plain else weights
     contrast = contrasts(final)
     spread = residual_spread(final.residuals, judged, pixels, SECTORS, contrast, final.parameters.shape[1])
     factor = edge_noise_factor(final, judged, pixels.x_px, pixels.y_px)
@@ -107,8 +107,8 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
         _fitted(discs, pixels, final, reasons),
         cov,
         contrast,
-        final.parameters[:, BACKGROUND],
-        final.parameters[:, WIDTH],
+        final.parameters[:, DISC_BACKGROUND],
+        final.parameters[:, DISC_WIDTH],
         spread.chi2_per_dof,
         spread.inflation,
         reasons,
@@ -139,7 +139,7 @@ def _first_fit(
     # The markers' own places now show the face to hundredths of a pixel; around larger discs it is so wide that tenths
     # do.
     found = _fitted(start, pixels, first, (None,) * len(start))
-    width_px = float(np.median(first.parameters[:, WIDTH]))
+    width_px = float(np.median(first.parameters[:, DISC_WIDTH]))
     still = disc_model(pixels, sloped, shaded, shares_beyond(around, found, pixels, width_px, ways))
     model = still if ways is None else moving(still, ways, (0,))
     return pixels, still, evaluate(model, pixels.values, pixels.present, first.parameters)

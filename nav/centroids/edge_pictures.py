@@ -10,7 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from nav.centroids import annulus_places, disc_places
+from nav.centroids.annulus_places import (
+    ANNULUS_AMPLITUDE,
+    ANNULUS_BACKGROUND,
+    ANNULUS_HOLE,
+    ANNULUS_SURROUND,
+    ANNULUS_SURROUND_COUNT,
+    ANNULUS_WIDTH,
+)
+from nav.centroids.disc_places import DISC_BACKGROUND, DISC_FIXED_COUNT, DISC_LEVEL, DISC_WIDTH, ELLIPSE_PARAMETER_COUNT
 from nav.numerics.compiled import Array32, compiled, float_of_bits
 from nav.numerics.rows import add_row, multiply_rows
 
@@ -179,12 +187,12 @@ def draw_discs(
     for n in range(len(x)):
         own, rows, xs, ys, width = parameters[n], jacobian[n], x[n], y[n], widths[n]
         ellipse = (own[0], own[1], own[2], own[3], own[4])
-        outside, inside, at = rows[disc_places.BACKGROUND], rows[disc_places.LEVEL], disc_places.REST
+        outside, inside, at = rows[DISC_BACKGROUND], rows[DISC_LEVEL], DISC_FIXED_COUNT
         _place(xs, ys, ellipse, distance, by_q, by_gradient)
         blurred_steps(distance, _F(_SQRT_HALF) / width, inside, bell)
         for k in range(len(xs)):
             outside[k] = _ONE - inside[k]
-        dark[:], bright[:] = own[disc_places.BACKGROUND], own[disc_places.LEVEL]
+        dark[:], bright[:] = own[DISC_BACKGROUND], own[DISC_LEVEL]
         if slopes[0]:
             _shade(xs, ys, own[at : at + 2], outside, dark, rows[at : at + 2])
             at += 2
@@ -194,7 +202,7 @@ def draw_discs(
         _mix(dark, bright, inside, bell, _F(_BELL_PEAK) / width, picture[n])
         _slopes_by_center(xs, ys, ellipse, by_q, by_gradient, bell, rows)
         _slopes_by_shape(xs, ys, ellipse, by_q, by_gradient, bell, rows)
-        multiply_rows(bell, distance, -_ONE / width, rows[disc_places.WIDTH])
+        multiply_rows(bell, distance, -_ONE / width, rows[DISC_WIDTH])
         for other in range(further.shape[1]):
             rows[at + other] = further[n, other]
             add_row(further[n, other], own[at + other], picture[n])
@@ -226,13 +234,13 @@ def draw_annuli(
     to_outer, to_inner, up, down = (np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0]), np.empty_like(x[0]))
     for n in range(len(x)):
         own, rows, xs, ys, width = parameters[n], jacobian[n], x[n], y[n], widths[n]
-        outside, in_hole = rows[annulus_places.BACKGROUND], rows[annulus_places.HOLE]
-        between = rows[annulus_places.AMPLITUDE]
-        background, hole = own[annulus_places.BACKGROUND], own[annulus_places.HOLE]
+        outside, in_hole = rows[ANNULUS_BACKGROUND], rows[ANNULUS_HOLE]
+        between = rows[ANNULUS_AMPLITUDE]
+        background, hole = own[ANNULUS_BACKGROUND], own[ANNULUS_HOLE]
         outer, inner = (own[0], own[1], own[2], own[3], own[4]), (own[5], own[6], own[7], own[8], own[9])
         light[:] = _F(0)
         for turn in range(turns.shape[1]):
-            add_row(turns[n, turn], own[annulus_places.AMPLITUDE + turn], light)
+            add_row(turns[n, turn], own[ANNULUS_AMPLITUDE + turn], light)
         # The slopes need what `_place` leaves, so one edge is done before the other; `between` is the outer share till
         # the inner one is known.
         _place(xs, ys, outer, to_outer, by_q, by_gradient)
@@ -246,9 +254,9 @@ def draw_annuli(
         blurred_steps(to_inner, _F(_SQRT_HALF) / width, in_hole, down)
         for k in range(len(xs)):
             down[k] *= peak * (hole - light[k])
-        _slopes_by_center(xs, ys, inner, by_q, by_gradient, down, rows[disc_places.ELLIPSE_PARAMETERS :])
-        _slopes_by_shape(xs, ys, inner, by_q, by_gradient, down, rows[disc_places.ELLIPSE_PARAMETERS :])
-        by_width = rows[annulus_places.WIDTH]
+        _slopes_by_center(xs, ys, inner, by_q, by_gradient, down, rows[ELLIPSE_PARAMETER_COUNT:])
+        _slopes_by_shape(xs, ys, inner, by_q, by_gradient, down, rows[ELLIPSE_PARAMETER_COUNT:])
+        by_width = rows[ANNULUS_WIDTH]
         for k in range(len(xs)):
             by_width[k] = -(up[k] * to_outer[k] + down[k] * to_inner[k]) / width
         for k in range(len(xs)):
@@ -256,13 +264,13 @@ def draw_annuli(
             between[k] -= in_hole[k]
         for k in range(len(xs)):
             picture[n, k] = background * outside[k] + light[k] * between[k] + hole * in_hole[k]
-        for turn in range(annulus_places.BEYOND_TURNS):
-            place = annulus_places.BEYOND + turn
+        for turn in range(ANNULUS_SURROUND_COUNT):
+            place = ANNULUS_SURROUND + turn
             multiply_rows(turns[n, turn], beyond[n], _ONE, rows[place])
             add_row(rows[place], own[place], picture[n])
         # The first function is one, so its row is `between` itself, from which the others follow.
         for turn in range(1, turns.shape[1]):
-            multiply_rows(turns[n, turn], between, _ONE, rows[annulus_places.AMPLITUDE + turn])
+            multiply_rows(turns[n, turn], between, _ONE, rows[ANNULUS_AMPLITUDE + turn])
 
 
 # Sides of the pixel and its neighbours, from its middle. [px]

@@ -7,7 +7,6 @@ import numpy as np
 from geometry.se3 import Array
 from nav.centroids.edge_pictures import blurred_steps
 from nav.centroids.ellipses import shape_inverses
-from nav.centroids.patches import edge_distances
 from nav.numerics.compiled import Array32
 
 # Blur of the pixel's box (1/12 px^2) and of a lens and sensor with a Gaussian of 0.5 px: where the fit starts. [px]
@@ -44,9 +43,3 @@ def ellipse_parameters(offsets_px: Array, shapes_px: Array) -> Array:
 def parameter_shapes(ellipse: Array) -> Array:
     """(N, 2, 2) shapes of ellipses with parameters (N, 5)."""
     return shape_inverses(np.stack([ellipse[:, [2, 4]], ellipse[:, [4, 3]]], axis=1))
-
-
-def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float) -> Array32:
-    """(N, K) how much of the light at places (N, K) comes from outside ellipses (N, 2, 2) about the origin."""
-    distance = edge_distances(shapes_px, x_px, y_px)
-    return blurred_step(distance * np.float32(-np.sqrt(0.5) / width_px))[0]

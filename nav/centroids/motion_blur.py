@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.disc_places import ELLIPSE_PARAMETERS, WIDTH
-from nav.centroids.edge_profile import edge_widths, share_outside
+from nav.centroids.disc_places import DISC_WIDTH, ELLIPSE_PARAMETER_COUNT
+from nav.centroids.edge_profile import blurred_step, edge_widths
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.patches import PixelSet
+from nav.centroids.patches import PixelSet, edge_distances
 from nav.centroids.shared_parameters import least_of_all, reduced_equations
 from nav.numerics.compiled import Array32
 from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations
@@ -69,6 +69,12 @@ def steps_along(ways: Array) -> tuple[Array, Array]:
     return np.multiply.outer(shares, ways), shares
 
 
+def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float) -> Array32:
+    """(N, K) how much of the light at places (N, K) comes from outside ellipses (N, 2, 2) about the origin."""
+    distance = edge_distances(shapes_px, x_px, y_px)
+    return blurred_step(distance * np.float32(-np.sqrt(0.5) / width_px))[0]
+
+
 def share_outside_along(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float, ways: Array | None) -> Array32:
     """As `share_outside`, of ellipses that move by (N, 3), or stand still."""
     if ways is None:
@@ -109,7 +115,7 @@ def _further_on(parameters: Array, step: Array, ellipses: tuple[int, ...]) -> Ar
     for first in ellipses:
         there[:, first : first + 2] += step[:, :2]
         # Elements of the inverse shape.
-        there[:, first + 2 : first + ELLIPSE_PARAMETERS] *= 1 - step[:, 2:]
+        there[:, first + 2 : first + ELLIPSE_PARAMETER_COUNT] *= 1 - step[:, 2:]
     return there
 
 
@@ -128,7 +134,7 @@ def seen_travel(fit: Minimum, pixels: PixelSet, discs: Ellipses) -> Travel | Non
     x, y = x.astype(np.float32), y.astype(np.float32)
     # Cosine and sine of twice the azimuth, without the angle itself.
     square = x * x + y * y + np.finfo(np.float32).tiny
-    by_variance = fit.jacobian[:, WIDTH] / (2 * edge_widths(fit.parameters[:, WIDTH])[:, None] * square)
+    by_variance = fit.jacobian[:, DISC_WIDTH] / (2 * edge_widths(fit.parameters[:, DISC_WIDTH])[:, None] * square)
     shapes = np.stack([by_variance * (x * x - y * y), by_variance * (2 * x * y)], axis=1)
     normal, gradient = reduced_equations(fit, shapes, pixels.present)
     freedom = np.maximum(pixels.present.sum() - fit.parameters.size, 1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.disc_places import ELLIPSE_PARAMETERS
+from nav.centroids.disc_places import ELLIPSE_PARAMETER_COUNT
 from nav.centroids.edge_pictures import add_box_pictures
 from nav.centroids.patches import PixelSet
 from nav.centroids.shared_parameters import least_of_all, reduced_equations
@@ -42,7 +42,7 @@ def without_pixel_response(fit: Minimum, pixels: PixelSet, inside: Array32, cont
     weights = pixels.present
     shapes = np.zeros((len(weights), BOX_PICTURES, weights.shape[1]), np.float32)
     steps = np.repeat(contrast.astype(np.float32)[:, None], weights.shape[1], axis=1)
-    ellipses = fit.parameters[:, :ELLIPSE_PARAMETERS].astype(np.float32)
+    ellipses = fit.parameters[:, :ELLIPSE_PARAMETER_COUNT].astype(np.float32)
     add_box_pictures(ellipses, pixels.x_px, pixels.y_px, weights, inside, steps, shapes)
     normal, gradient = reduced_equations(fit, shapes, weights)
     shares = least_of_all(normal.sum(axis=0), gradient.sum(axis=0))

@@ -10,7 +10,7 @@ from nav.numerics.compiled import Array32, compiled
 _F = np.float32
 _ONE, _HALF, _QUARTER = _F(1), _F(0.5), _F(0.25)
 # Keeps the middle of an outline, which lies in no sector, in one.
-_TINY = _F(1e-12)
+_TINY_SINGLE = _F(1e-12)
 
 
 # Of Abramowitz and Stegun's polynomial of the arc tangent (4.4.49), as shares of a turn.
@@ -22,7 +22,7 @@ _ATAN_1, _ATAN_2, _ATAN_3, _ATAN_4, _ATAN_5 = (_F(a / (2 * np.pi)) for a in _ATA
 def _sector(x: np.float32, y: np.float32, count: int) -> int:
     """Which of so many equal sectors about the origin a place lies in, their limits to 1e-5 radians."""
     wide, high = abs(x), abs(y)
-    slope = min(wide, high) / (max(wide, high) + _TINY)
+    slope = min(wide, high) / (max(wide, high) + _TINY_SINGLE)
     square = slope * slope
     turn = slope * (_ATAN_1 + square * (_ATAN_2 + square * (_ATAN_3 + square * (_ATAN_4 + square * _ATAN_5))))
     turn = _QUARTER - turn if high > wide else turn

@@ -8,7 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from nav.centroids import edge_pictures, pixel_sums, window_cells
+import nav.centroids.edge_pictures as edge_pictures
+import nav.centroids.pixel_sums as pixel_sums
+import nav.centroids.window_cells as window_cells
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.patches import annulus_pixels, disc_pixels
@@ -168,7 +170,9 @@ def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile():
 from datasets_manifest.recipe.recipe import load_recipe
 from nav.numerics import damped_steps
 from nav.numerics import damped_steps
-from nav.centroids import edge_pictures, pixel_sums, window_cells
+import nav.centroids.edge_pictures as edge_pictures
+import nav.centroids.pixel_sums as pixel_sums
+import nav.centroids.window_cells as window_cells
 from nav.numerics import matrix_loops
 from nav.realtime.warm_up import fit_once
 from nav.navigator import Navigator

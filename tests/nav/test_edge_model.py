@@ -15,7 +15,7 @@ from nav.centroids.edge_model import fit_discs
 from nav.centroids.edge_profile import START_WIDTH_PX, ellipse_parameters
 from nav.centroids.ellipses import circles
 from nav.centroids.face_background import Surroundings, shares_beyond
-from nav.centroids.grey_centroid import grey_centroids
+from tests.support.grey_centroid import grey_centroids
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.patches import disc_pixels
 from studies.acceptance.rendered.centroid_bounds import center_bound_px

@@ -9,7 +9,7 @@ import pytest
 
 from nav.centroids.centroid_quality import SECTORS, NoiseModel, residual_spread
 from nav.centroids.disc_model import contrasts, disc_model, disc_start
-from nav.centroids.disc_places import LEVEL
+from nav.centroids.disc_places import DISC_LEVEL
 from nav.centroids.disc_rejection import rejection_reasons
 from nav.centroids.edge_model import fit_discs
 from nav.centroids.patches import disc_pixels
@@ -54,7 +54,7 @@ def test_an_outline_turned_inside_out_is_no_disc():
     fit = evaluate(
         disc_model(pixels, False, False), pixels.values, pixels.present, disc_start(pixels, truth.shapes_px, 0)
     )
-    inside, noise = fit.jacobian[:, LEVEL], NoiseModel(50.0, 0.02, 0.0)
+    inside, noise = fit.jacobian[:, DISC_LEVEL], NoiseModel(50.0, 0.02, 0.0)
     cov = np.tile(1e-4 * np.eye(2), (len(truth), 1, 1))
     spread = residual_spread(fit.residuals, pixels.present / 50, pixels, SECTORS, contrasts(fit), 8)
     turned = fit.parameters.copy()
