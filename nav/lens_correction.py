@@ -13,7 +13,7 @@ import numpy as np
 
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_chain import Centroids
+from nav.centroids.binary_centroids import Centroids
 from nav.pose.pose_method import HUB_EDGES, INNER_EDGE, OUTER_EDGE, Observation
 
 _OUTLINE_POINTS = 32

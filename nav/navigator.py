@@ -1,15 +1,13 @@
-"""One stereo pair through detector, centroids and correspondence, then through every method.
-
-Methods that belong to the paper's chain work on its binary centroids, the others on edge-fitted ones; every method can
-be given either, so that estimators are compared on equal measurements too.
-"""
+"""One stereo pair through detector, centroids and correspondence, then through every method."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from time import perf_counter
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -18,17 +16,38 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_chain import NOTHING, Centroids, box_window, window_centroids
+from nav.centroids.binary_centroids import NOTHING, Centroids, box_window, window_centroids
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detector
 from nav.lens_correction import ideal_centroids
-from nav.map_views import for_each_eye
 from nav.matching.marker_channel import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
 from nav.pair_measurement import Sighting, estimate_pose, regions_of
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, Solution, StatedTolerances
 from nav.refinement import refine
 from nav.stereo_correspondence import correspond, no_ring
 from nav.tracking.rim_boxes import rim_boxes
+
+Result = TypeVar("Result")
+
+
+def for_each_eye(work: Callable[[Eye], Result], eyes: Collection[Eye]) -> dict[Eye, Result]:
+    """What `work` gives for each eye; of two eyes the second is worked on in a thread of its own.
+
+    OpenCV, and numpy on large arrays, let the other thread run meanwhile.
+
+    Raises:
+        Exception: whatever `work` raises.
+    """
+    first, *others = eyes
+    waiting = {eye: _other_thread().submit(work, eye) for eye in others}
+    results = {first: work(first)}
+    return results | {eye: result.result() for eye, result in waiting.items()}
+
+
+@cache
+def _other_thread() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="other-eye")
+
 
 # Sources of regions that no tracker has followed: the detector, or the other eye where that alone had found the drogue.
 DETECTOR, OTHER_EYE = "detector", "other eye"

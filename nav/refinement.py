@@ -13,15 +13,15 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.circles import disc_image_centers, disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
-from nav.centroids.annulus_edges import AnnulusFits, fit_annuli
-from nav.centroids.centroid_quality import NoiseModel
-from nav.centroids.disc_rejection import LARGEST_SCALE
-from nav.centroids.edge_model import fit_discs
+from nav.centroids.annuli import AnnulusFits, fit_annuli
+from nav.centroids.centroid_uncertainty import NoiseModel
+from nav.centroids.disc_fit import fit_discs
+from nav.centroids.discs import LARGEST_SCALE
 from nav.centroids.ellipses import Ellipses, outline_shapes, shape_radii
 from nav.centroids.face_background import SEEN_BESIDE_PX, Surroundings
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.motion_blur import Travel
-from nav.centroids.patches import WHOLE_RADIUS_PX
+from nav.centroids.outline_pixels import WHOLE_RADIUS_PX
 from nav.lens_correction import ideal_places, real_places
 from nav.matching.marker_channel import PLAIN, balancing_weight
 from nav.pose.joint import joint

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_chain import Centroids
+from nav.centroids.binary_centroids import Centroids
 from nav.matching.ring_matching import (
     FEW,
     RingMatch,

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.disc_places import DISC_WIDTH, ELLIPSE_PARAMETER_COUNT
-from nav.centroids.edge_profile import blurred_step, edge_widths
+from nav.centroids.blurred_edges import DISC_WIDTH, ELLIPSE_PARAMETER_COUNT, blurred_step, edge_widths
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.patches import PixelSet, edge_distances
-from nav.centroids.shared_parameters import least_of_all, reduced_equations
+from nav.centroids.outline_pixels import PixelSet, edge_distances
+from nav.centroids.pixel_response import least_of_all, reduced_equations
 from nav.numerics.compiled import Array32
+from nav.numerics.least_squares_loops import add_rows
 from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations
-from nav.numerics.matrix_loops import add_rows
 
 # Shorter ways leave an edge that the fit of a still one follows, and cannot be told from its noise. [px]
 _LEAST_TRAVEL_PX = 1.0

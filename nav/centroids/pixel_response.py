@@ -1,22 +1,51 @@
-"""What a pixel takes of the light beside it: how the edges of a frame depart from the blur of a Gaussian.
-
-A pixel takes the light of a square, and a share of what falls on its eight neighbours: across an edge that is no
-Gaussian, and along an image axis another shape than across the corners. A Gaussian in its place moves centres by a
-thousandth of a pixel or two, differently by where in its pixel the edge lies, as much as the noise of bright days.
-"""
+"""What a pixel takes of the light beside it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.disc_places import ELLIPSE_PARAMETER_COUNT
-from nav.centroids.edge_pictures import add_box_pictures
-from nav.centroids.patches import PixelSet
-from nav.centroids.shared_parameters import least_of_all, reduced_equations
+from nav.centroids.blurred_edges import ELLIPSE_PARAMETER_COUNT, add_box_pictures
+from nav.centroids.outline_pixels import PixelSet
 from nav.numerics.compiled import Array32
+from nav.numerics.least_squares_loops import add_rows, couplings, normal_equations
 from nav.numerics.levenberg_marquardt import Minimum
-from nav.numerics.matrix_loops import add_rows
+
+# Of a normal matrix with unit diagonal: what light too dim cannot tell apart is shared out.
+_RIDGE = 1e-3
+
+
+def reduced_equations(fit: Minimum, pictures: Array32, weights: Array32) -> tuple[Array, Array]:
+    """Normal equations of shared amounts of pictures, outline by outline, its own parameters left free.
+
+    Args:
+        fit: of N outlines.
+        pictures: (N, S, K) by what the shared amounts change the data.
+        weights: (N, K).
+
+    Returns:
+        (N, S, S) matrices and (N, S) gradients, whose sums are those of the amounts.
+    """
+    count, shared = fit.parameters.shape[1], pictures.shape[1]
+    pictures = np.ascontiguousarray(pictures)
+    coupled, slopes = np.empty((len(weights), count, shared)), np.empty((len(weights), count, 1))
+    couplings(fit.jacobian, pictures, weights, coupled)
+    couplings(fit.jacobian, fit.residuals[:, None], weights, slopes)
+    normal, gradient = np.empty((len(weights), shared, shared)), np.empty((len(weights), shared))
+    normal_equations(pictures, fit.residuals, weights, normal, gradient)
+    taken = np.matmul(fit.covariance(), coupled)
+    gradient -= np.einsum("nps,np->ns", taken, slopes[..., 0])
+    normal -= np.matmul(coupled.transpose(0, 2, 1), taken)
+    return normal, gradient
+
+
+def least_of_all(normal: Array, gradient: Array) -> Array:
+    """(S,) amounts that solve summed equations."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float32).tiny))
+    unit = normal * scale[:, None] * scale + _RIDGE * np.eye(len(scale))
+    amounts: Array = scale * np.linalg.solve(unit, gradient * scale)
+    return amounts
+
 
 # The pixel's own box, those beside it, and those across its corners.
 BOX_PICTURES = 3

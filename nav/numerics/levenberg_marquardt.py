@@ -10,10 +10,10 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.numerics.compiled import Array32
-from nav.numerics.damped_steps import damped_steps
-from nav.numerics.matrix_loops import (
+from nav.numerics.least_squares_loops import (
     add_rows,
     couplings,
+    damped_steps,
     leverages,
     normal_equations,
     weighted_squares,

@@ -8,7 +8,7 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.numerics.compiled import compiled
-from nav.numerics.damped_steps import solve_damped
+from nav.numerics.least_squares_loops import solve_damped
 
 
 class Shared(NamedTuple):

@@ -9,9 +9,9 @@ import numpy as np
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.stereo import paper_rig
-from nav.centroids.annulus_edges import fit_annuli
-from nav.centroids.edge_model import fit_discs
-from nav.centroids.edge_profile import blurred_step
+from nav.centroids.annuli import fit_annuli
+from nav.centroids.blurred_edges import blurred_step
+from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
 from nav.pose.features import stack_features

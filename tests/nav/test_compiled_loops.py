@@ -8,14 +8,12 @@ import sys
 import numpy as np
 import pytest
 
-import nav.centroids.edge_pictures as edge_pictures
-import nav.centroids.pixel_sums as pixel_sums
-import nav.centroids.window_cells as window_cells
+from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
+from nav.centroids.centroid_uncertainty import sector_sums, zone_sums
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
-from nav.centroids.patches import annulus_pixels, disc_pixels
-from nav.centroids.pixel_sums import sector_sums, zone_sums
-from nav.numerics import damped_steps, matrix_loops
+from nav.centroids.outline_pixels import annulus_pixels, disc_pixels
+from nav.numerics import least_squares_loops
 from nav.pose import adjustment_loops
 
 
@@ -27,23 +25,23 @@ def test_sums_of_least_squares_are_those_of_numpy():
     rng = np.random.default_rng(1)
     jacobian, residuals, weights = float32(rng, 5, 7, 300), float32(rng, 5, 300), rng.random((5, 300), np.float32)
     normal, gradient = np.empty((5, 7, 7)), np.empty((5, 7))
-    matrix_loops.normal_equations(jacobian, residuals, weights, normal, gradient)
+    least_squares_loops.normal_equations(jacobian, residuals, weights, normal, gradient)
     exact = jacobian.astype(np.float64)
     # Single precision over 300 products of numbers around one.
     close = {"rtol": 1e-5, "atol": 1e-3}
     np.testing.assert_allclose(normal, np.einsum("npk,nk,nqk->npq", exact, weights, exact), **close)
     np.testing.assert_allclose(gradient, np.einsum("npk,nk,nk->np", exact, weights, residuals), **close)
     coupled, others = np.empty((5, 7, 2)), float32(rng, 5, 2, 300)
-    matrix_loops.couplings(jacobian, others, weights, coupled)
+    least_squares_loops.couplings(jacobian, others, weights, coupled)
     np.testing.assert_allclose(coupled, np.einsum("npk,nk,nqk->npq", exact, weights, others), **close)
     np.testing.assert_allclose(
-        matrix_loops.weighted_squares(residuals, weights),
+        least_squares_loops.weighted_squares(residuals, weights),
         (weights * residuals.astype(np.float64) ** 2).sum(axis=1),
         **close,
     )
     covariance = np.linalg.inv(normal)
     filled = np.empty_like(weights)
-    matrix_loops.leverages(jacobian, np.linalg.cholesky(covariance).astype(np.float32), weights, filled)
+    least_squares_loops.leverages(jacobian, np.linalg.cholesky(covariance).astype(np.float32), weights, filled)
     np.testing.assert_allclose(filled, weights * np.einsum("npk,npq,nqk->nk", exact, covariance, exact), rtol=1e-4)
     # A fit swallows as many pixels' worth of noise as it has parameters.
     np.testing.assert_allclose(filled.sum(axis=1), 7, rtol=1e-4)
@@ -54,12 +52,12 @@ def test_damped_steps_solve_their_systems():
     arms = rng.normal(size=(6, 9, 9))
     matrices, gradients, dampings = arms @ arms.transpose(0, 2, 1) + np.eye(9), rng.normal(size=(6, 9)), rng.random(6)
     scales = rng.uniform(0.1, 3, (6, 9))
-    steps = damped_steps.damped_steps(matrices, scales, gradients, dampings)
+    steps = least_squares_loops.damped_steps(matrices, scales, gradients, dampings)
     # What is added to a scaled diagonal is the more in the matrix's own units, the smaller the scale is.
     damped = matrices + (dampings[:, None] / scales**2)[:, None] * np.eye(9)
     np.testing.assert_allclose(steps, np.linalg.solve(damped, gradients[..., None])[..., 0], rtol=1e-9)
     matrices[0] *= -1
-    steps = damped_steps.damped_steps(matrices, scales, gradients, 0 * dampings)
+    steps = least_squares_loops.damped_steps(matrices, scales, gradients, 0 * dampings)
     assert np.isnan(steps).any(axis=1).tolist() == [True] + 5 * [False]
 
 
@@ -68,7 +66,7 @@ def test_pixels_that_see_no_edge_get_no_picture_whatever_the_outline_is():
     pictures, inside = np.zeros((2, 3, 50), np.float32), np.full((2, 50), np.nan, np.float32)
     inside[1] = 1.0
     ellipses = np.array([5 * [np.nan], [0.0, 0.0, np.nan, 0.1, 0.0]], np.float32)
-    edge_pictures.add_box_pictures(ellipses, x, y, np.ones_like(x), inside, ones, pictures)
+    blurred_edges.add_box_pictures(ellipses, x, y, np.ones_like(x), inside, ones, pictures)
     assert not pictures.any()
 
 
@@ -168,12 +166,8 @@ def test_an_outline_over_the_edge_of_the_image_is_cut():
 def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile():
     code = """
 from datasets_manifest.recipe.recipe import load_recipe
-from nav.numerics import damped_steps
-from nav.numerics import damped_steps
-import nav.centroids.edge_pictures as edge_pictures
-import nav.centroids.pixel_sums as pixel_sums
-import nav.centroids.window_cells as window_cells
-from nav.numerics import matrix_loops
+from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
+from nav.numerics import least_squares_loops
 from nav.realtime.warm_up import fit_once
 from nav.navigator import Navigator
 from nav.pose import adjustment_loops
@@ -182,7 +176,7 @@ from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 
 def compiled():
-    loops = (adjustment_loops, damped_steps, edge_pictures, matrix_loops, pixel_sums, window_cells)
+    loops = (adjustment_loops, blurred_edges, centroid_uncertainty, least_squares_loops, outline_pixels)
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
@@ -204,7 +198,8 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
 
 
 @pytest.mark.parametrize(
-    "loops", [adjustment_loops, damped_steps, edge_pictures, matrix_loops, pixel_sums, window_cells]
+    "loops",
+    [adjustment_loops, blurred_edges, centroid_uncertainty, least_squares_loops, outline_pixels],
 )
 def test_loops_can_be_cached_beside_their_file_or_at_home(loops):
     found = [loop for loop in vars(loops).values() if hasattr(loop, "signatures")]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from nav.centroids.edge_profile import blurred_step
+from nav.centroids.blurred_edges import blurred_step
 from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
 from nav.numerics.levenberg_marquardt import evaluate, minimise
 

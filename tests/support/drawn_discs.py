@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nav.centroids.edge_model import fit_discs
+from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
 from studies.acceptance.rendered.centroid_bounds import PixelLight, outline_coverage

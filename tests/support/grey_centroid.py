@@ -9,7 +9,7 @@ import numpy as np
 from geometry.se3 import Array
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
-from nav.centroids.patches import disc_pixels, edge_distances
+from nav.centroids.outline_pixels import disc_pixels, edge_distances
 
 # Pixels this far outside the outline see background only. [px]
 _CLEAR_PX = 1.5

@@ -10,7 +10,7 @@ from drogue_models.presets import PRESETS
 from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
-from nav.centroids.binary_chain import Centroids, quantisation_variance_px2
+from nav.centroids.binary_centroids import Centroids, quantisation_variance_px2
 from nav.matching.blobs import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
 from nav.pose.pose_method import NoFixReason

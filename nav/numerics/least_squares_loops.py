@@ -1,4 +1,4 @@
-"""The loops of least squares over many small problems, compiled; see `nav.numerics.levenberg_marquardt`."""
+"""Loops of least squares over many small problems, compiled."""
 
 from __future__ import annotations
 
@@ -6,7 +6,30 @@ import numpy as np
 
 from geometry.se3 import Array
 from nav.numerics.compiled import Array32, compiled
-from nav.numerics.rows import add_row, dot, multiply_rows
+
+
+@compiled
+def multiply_rows(left: Array32, right: Array32, factor: np.float32, product: Array32) -> None:
+    """Fill `product` with the factor times left times right."""
+    for k in range(len(left)):
+        product[k] = factor * left[k] * right[k]
+
+
+@compiled
+def add_row(values: Array32, factor: np.float32, total: Array32) -> None:
+    """Add the factor times the values to a total."""
+    for k in range(len(values)):
+        total[k] += factor * values[k]
+
+
+@compiled
+def dot(left: Array32, right: Array32) -> np.float32:
+    """Sum of products."""
+    total = np.float32(0)
+    for k in range(len(left)):
+        total += left[k] * right[k]
+    return total
+
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -84,3 +107,42 @@ def tie_rows(jacobian: Array32, ties: Array32, tied: Array32) -> None:
                     add_row(jacobian[n, p], ties[n, q, p], tied[n, q])
         for p in range(followers, jacobian.shape[1]):
             tied[n, count + p - followers] = jacobian[n, p]
+
+
+@compiled
+def solve_damped(matrix: Array, scale: Array, gradient: Array, damping: float, root: Array, step: Array) -> None:
+    """Fill the solution (P,) of a system with a matrix (P, P) and a right side (P,), by Cholesky.
+
+    Rows and columns are scaled (P,), and then the damping added to the diagonal. What a matrix that is not positive
+    would give is no number. (P, P) numbers of `root` are overwritten.
+    """
+    size = len(gradient)
+    for i in range(size):
+        for j in range(i + 1):
+            rest = matrix[i, j] * scale[i] * scale[j] + (damping if i == j else 0.0)
+            for m in range(j):
+                rest -= root[i, m] * root[j, m]
+            root[i, j] = np.sqrt(rest) if i == j else rest / root[j, j]
+    for i in range(size):
+        rest = gradient[i] * scale[i]
+        for m in range(i):
+            rest -= root[i, m] * step[m]
+        step[i] = rest / root[i, i]
+    for back in range(size):
+        i = size - 1 - back
+        rest = step[i]
+        for m in range(i + 1, size):
+            rest -= root[m, i] * step[m]
+        step[i] = rest / root[i, i]
+    for i in range(size):
+        step[i] *= scale[i]
+
+
+@compiled
+def damped_steps(matrices: Array, scales: Array, gradients: Array, dampings: Array) -> Array:
+    """Solutions (N, P) of systems with matrices (N, P, P), scales and right sides (N, P) and dampings (N,)."""
+    count, size = gradients.shape
+    steps, root = np.empty((count, size)), np.empty((size, size))
+    for n in range(count):
+        solve_damped(matrices[n], scales[n], gradients[n], dampings[n], root, steps[n])
+    return steps

@@ -14,7 +14,7 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
-from nav.centroids.binary_chain import window_centroids
+from nav.centroids.binary_centroids import window_centroids
 from nav.navigator import DETECTOR, Navigator
 from nav.pair_measurement import regions_of
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason

@@ -14,7 +14,7 @@ from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, StereoRig, paper_rig
-from nav.centroids.binary_chain import binary_centroids, quantisation_variance_px2
+from nav.centroids.binary_centroids import binary_centroids, quantisation_variance_px2
 from nav.detector.color_blob import ColorBlobDetector
 from nav.matching.marker_channel import marker_channel, marker_color
 

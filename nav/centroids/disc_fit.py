@@ -1,13 +1,16 @@
-"""Reference centroids of discs: an edge model fitted to the light of all markers of both eyes at once."""
+"""Reference centroids."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
-from nav.centroids.centroid_quality import (
+from geometry.se3 import Array
+from nav.centroids.blurred_edges import DISC_BACKGROUND, DISC_LEVEL, DISC_WIDTH, START_WIDTH_PX, parameter_shapes
+from nav.centroids.centroid_uncertainty import (
     SECTORS,
     NoiseModel,
     beyond_linear,
@@ -15,22 +18,76 @@ from nav.centroids.centroid_quality import (
     measure_noise,
     residual_spread,
 )
-from nav.centroids.disc_fits import DiscFits, merged, unfitted
-from nav.centroids.disc_location import located
-from nav.centroids.disc_model import contrasts, disc_model, disc_start
-from nav.centroids.disc_places import DISC_BACKGROUND, DISC_LEVEL, DISC_WIDTH
-from nav.centroids.disc_rejection import rejection_reasons
-from nav.centroids.edge_profile import START_WIDTH_PX, parameter_shapes
+from nav.centroids.discs import (
+    DiscFits,
+    contrasts,
+    disc_model,
+    disc_start,
+    located,
+    merged,
+    rejection_reasons,
+    unfitted,
+)
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.face_background import Surroundings, on_the_face, seen_beside_px, shares_beyond
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import Travel, fit_travel, moving, seen_travel
-from nav.centroids.patches import PixelSet, disc_pixels
+from nav.centroids.outline_pixels import PixelSet, disc_pixels
 from nav.centroids.pixel_response import without_pixel_response
-from nav.centroids.single_color import with_even_others
-from nav.centroids.working_memory import keep_freed_memory
 from nav.numerics.compiled import Array32
 from nav.numerics.levenberg_marquardt import Minimum, Model, evaluate, minimise
+
+_KEPT_BYTES = 16 * 2**20
+
+
+@cache
+def keep_freed_memory() -> None:
+    """Let the C library keep freed memory for the next array, from the first call on.
+
+    GNU's hands the end of its heap back to the system after each larger array, and the system maps and clears the same
+    pages anew for the next one, which took a fifth to a third of the time of a fit. It keeps up to twice the largest
+    block that was ever freed: one that nobody writes to costs nothing. Other libraries are left as they are.
+    """
+    np.empty(_KEPT_BYTES, np.uint8)
+
+
+# Square of a centre's move over its variance, of two coordinates: even light exceeds it once in a hundred discs.
+_MOST_MOVED = 9.2
+# The others' variance beside a marker is at most that of their difference from the colour, of which it is a part; and
+# where that is above this share of the variance on the marker, it is more than noise.
+_MOST_DARK_SHARE = 0.6
+
+
+def with_even_others(fit: Minimum, pixels: PixelSet, noise: NoiseModel, contrast: Array) -> tuple[Minimum, PixelSet]:
+    """Put back what the difference of colours took off, where that was nothing but noise.
+
+    The difference keeps sky and shadows out, at the price of the other colours' noise. Near by, a disc's window holds
+    little but paint and dark face, both even in the other colours; whether they are, the others themselves tell: they
+    must not move the centre by more than their own noise does. Overlooked unevenness so moves it by less than what
+    leaving the noise in would.
+
+    Args:
+        fit: to the difference.
+        pixels: of it.
+        noise: of it.
+        contrast: (N,) light of the discs above that beside them. [DN]
+
+    Returns:
+        The fit after one linear step, and the pixels, where the others are even those of the one colour.
+    """
+    bright_dn2 = noise.dark_dn2 + noise.per_signal_dn * np.median(contrast)
+    if pixels.others is None or noise.dark_dn2 > _MOST_DARK_SHARE * bright_dn2:
+        return fit, pixels
+    weights = pixels.present
+    shift = replace(fit, parameters=np.zeros_like(fit.parameters)).given(pixels.others, weights)
+    freedom = np.maximum(weights.sum(axis=1) - fit.parameters.shape[1], 1)
+    variance = (shift.residuals**2 * weights).sum(axis=1) / freedom
+    unit_cov = fit.covariance()[:, :2, :2]
+    moved: Array = np.einsum("ni,nij,nj->n", shift.parameters[:, :2], np.linalg.inv(unit_cov), shift.parameters[:, :2])
+    even = (moved < _MOST_MOVED * variance) & (variance < noise.dark_dn2)
+    back = pixels.others * even[:, None]
+    return fit.given(fit.residuals + back, weights), replace(pixels, values=pixels.values + back)
+
 
 # Shading of a smaller disc can hardly be told from a shift of it: fitting it adds 30 % of noise here, 100 % at 4 px.
 _LEAST_RADIUS_FOR_SHADING_PX = 7.5

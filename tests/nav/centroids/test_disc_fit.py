@@ -10,16 +10,16 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
-from nav.centroids.disc_model import disc_model
-from nav.centroids.edge_model import fit_discs
-from nav.centroids.edge_profile import START_WIDTH_PX, ellipse_parameters
+from nav.centroids.blurred_edges import START_WIDTH_PX, ellipse_parameters
+from nav.centroids.disc_fit import fit_discs
+from nav.centroids.discs import disc_model
 from nav.centroids.ellipses import circles
 from nav.centroids.face_background import Surroundings, shares_beyond
-from tests.support.grey_centroid import grey_centroids
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
-from nav.centroids.patches import disc_pixels
+from nav.centroids.outline_pixels import disc_pixels
 from studies.acceptance.rendered.centroid_bounds import center_bound_px
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
+from tests.support.grey_centroid import grey_centroids
 
 
 @pytest.mark.parametrize("light", [DAY, DUSK], ids=["day", "dusk"])

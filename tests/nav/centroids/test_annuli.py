@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import shapely
 
-from nav.centroids.annulus_edges import AnnulusFits, fit_annuli
-from nav.centroids.annulus_model import annulus_model, annulus_start, azimuth_basis
-from nav.centroids.centroid_quality import NoiseModel
+from nav.centroids.annuli import AnnulusFits, annulus_model, annulus_start, azimuth_basis, fit_annuli
+from nav.centroids.centroid_uncertainty import NoiseModel
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import Travel
-from nav.centroids.patches import annulus_pixels
+from nav.centroids.outline_pixels import annulus_pixels
 from render.analytic_engine.pixel_coverage import pixel_coverage
 from render.camera.optics import blur
 from studies.acceptance.rendered.centroid_bounds import PixelLight, outline_coverage

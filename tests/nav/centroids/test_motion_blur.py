@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nav.centroids import edge_model
-from nav.centroids.disc_model import disc_model, disc_start
-from nav.centroids.edge_model import fit_discs
+from nav.centroids import disc_fit
+from nav.centroids.disc_fit import fit_discs
+from nav.centroids.discs import disc_model, disc_start
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import moving
-from nav.centroids.patches import disc_pixels
+from nav.centroids.outline_pixels import disc_pixels
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, rough_start
 
 PARTS = 32
@@ -60,7 +60,7 @@ def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, rad
         errors.append(error)
         normalized.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.cov_px2), error) / 2)
         with monkeypatch.context() as context:
-            context.setattr(edge_model, "seen_travel", lambda *_: None)
+            context.setattr(disc_fit, "seen_travel", lambda *_: None)
             unaware.append(fit_discs(signals, start).ellipses.centers_px - truth.centers_px)
     # 64 squared errors: standard deviation 0.18.
     assert 0.5 < np.mean(normalized) < 1.6

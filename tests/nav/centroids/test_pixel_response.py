@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from nav.centroids.edge_model import fit_discs
+from nav.centroids.disc_fit import fit_discs
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
 from render.analytic_engine.pixel_coverage import pixel_coverage

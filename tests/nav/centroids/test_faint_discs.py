@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nav.centroids.centroid_quality import SECTORS, NoiseModel, residual_spread
-from nav.centroids.disc_model import contrasts, disc_model, disc_start
-from nav.centroids.disc_places import DISC_LEVEL
-from nav.centroids.disc_rejection import rejection_reasons
-from nav.centroids.edge_model import fit_discs
-from nav.centroids.patches import disc_pixels
+from nav.centroids.blurred_edges import DISC_LEVEL
+from nav.centroids.centroid_uncertainty import SECTORS, NoiseModel, residual_spread
+from nav.centroids.disc_fit import fit_discs
+from nav.centroids.discs import contrasts, disc_model, disc_start, rejection_reasons
+from nav.centroids.outline_pixels import disc_pixels
 from nav.numerics.levenberg_marquardt import evaluate
 from studies.acceptance.rendered.centroid_bounds import center_bound_px
 from tests.support.drawn_discs import DAY, DUSK, draw_discs, fit_many, rough_start

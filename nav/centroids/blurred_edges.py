@@ -1,26 +1,34 @@
-"""The pictures of blurred edges and their derivatives, pixel by pixel, compiled.
-
-An edge at the distance D inwards shows `S = (1 + erf(D / (sqrt2 s))) / 2`, with `D = (1 - q) / |grad q|` and
-`q = |L (x - c)|`. Each inner loop reads and writes few arrays, and calls nothing that cannot be done for many pixels at
-once: only then does the compiler do so. Numbers are single precision throughout; a literal without `_F` would make them
-double.
-"""
+"""Intensities of blurred elliptic edges and their derivatives, pixel by pixel, compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from nav.centroids.annulus_places import (
-    ANNULUS_AMPLITUDE,
-    ANNULUS_BACKGROUND,
-    ANNULUS_HOLE,
-    ANNULUS_SURROUND,
-    ANNULUS_SURROUND_COUNT,
-    ANNULUS_WIDTH,
-)
-from nav.centroids.disc_places import DISC_BACKGROUND, DISC_FIXED_COUNT, DISC_LEVEL, DISC_WIDTH, ELLIPSE_PARAMETER_COUNT
+from geometry.se3 import Array
+from nav.centroids.ellipses import shape_inverses
 from nav.numerics.compiled import Array32, compiled, float_of_bits
-from nav.numerics.rows import add_row, multiply_rows
+from nav.numerics.least_squares_loops import add_row, multiply_rows
+
+# Centre x, y; elements xx, yy, xy of the inverse shape: an ellipse's own, which come first.
+ELLIPSE_PARAMETER_COUNT = 5
+DISC_WIDTH, DISC_BACKGROUND, DISC_LEVEL = (
+    ELLIPSE_PARAMETER_COUNT,
+    ELLIPSE_PARAMETER_COUNT + 1,
+    ELLIPSE_PARAMETER_COUNT + 2,
+)
+# Slopes of light outside and inside, if there are any, then lights of other backgrounds.
+DISC_FIXED_COUNT = DISC_LEVEL + 1
+
+
+ANNULUS_OUTER = slice(0, ELLIPSE_PARAMETER_COUNT)
+ANNULUS_INNER = slice(ELLIPSE_PARAMETER_COUNT, 2 * ELLIPSE_PARAMETER_COUNT)
+ANNULUS_CENTERS = np.array([0, 1, ELLIPSE_PARAMETER_COUNT, ELLIPSE_PARAMETER_COUNT + 1])
+ANNULUS_WIDTH, ANNULUS_BACKGROUND, ANNULUS_HOLE = (2 * ELLIPSE_PARAMETER_COUNT + i for i in range(3))
+# What lies beyond is lighter towards one side than towards another: a constant and the first two orders of the azimuth.
+ANNULUS_SURROUND, ANNULUS_SURROUND_COUNT = ANNULUS_HOLE + 1, 5
+# Light on the annulus by the azimuth, the constant first.
+ANNULUS_AMPLITUDE = ANNULUS_SURROUND + ANNULUS_SURROUND_COUNT
+
 
 _F = np.float32
 _ONE, _HALF = _F(1), _F(0.5)
@@ -171,7 +179,7 @@ def draw_discs(
     picture: Array32,
     jacobian: Array32,
 ) -> None:
-    """Fill pictures and derivatives of N discs; see `nav.centroids.disc_model.disc_model`.
+    """Fill pictures and derivatives of N discs; see `nav.centroids.discs.disc_model`.
 
     Args:
         parameters: (N, P) as `disc_places` says: slopes of those lights that have any, lights of other backgrounds.
@@ -219,7 +227,7 @@ def draw_annuli(
     picture: Array32,
     jacobian: Array32,
 ) -> None:
-    """Fill pictures and derivatives of N annuli; see `nav.centroids.annulus_model.annulus_model`.
+    """Fill pictures and derivatives of N annuli; see `nav.centroids.annuli.annulus_model`.
 
     Args:
         parameters: (N, P) as `annulus_places` says, lights beyond and on the annulus by the azimuth.
@@ -344,3 +352,39 @@ def add_box_pictures(
     for n in range(len(x)):
         e = ellipses[n]
         _add_box_row(x[n], y[n], (e[0], e[1], e[2], e[3], e[4]), present[n], inside[n], steps[n], pictures[n])
+
+
+# Blur of the pixel's box (1/12 px^2) and of a lens and sensor with a Gaussian of 0.5 px: where the fit starts. [px]
+START_WIDTH_PX = float(np.sqrt(0.25 + 1 / 12))
+# Below this an edge lies within one pixel and its width says nothing. [px]
+_SMALLEST_WIDTH_PX = 0.2
+
+
+def edge_widths(width_px: Array) -> Array32:
+    """(N,) widths as an edge is drawn with them: within one pixel it says nothing. [px]"""
+    return np.maximum(width_px, _SMALLEST_WIDTH_PX).astype(np.float32)
+
+
+def blurred_step(z: Array32) -> tuple[Array32, Array32]:
+    """`(1 + erf(z)) / 2` to 2.5e-7, single precision's rounding included, and `exp(-z^2)`, which it is made of.
+
+    The latter is zero where it is smaller than 2.4e-16.
+
+    Both sides of the step are alike.
+
+    Source: M. Abramowitz and I. Stegun, Handbook of Mathematical Functions, 7.1.26.
+    """
+    step, bell = np.empty_like(z), np.empty_like(z)
+    blurred_steps(z.ravel(), np.float32(1), step.ravel(), bell.ravel())
+    return step, bell
+
+
+def ellipse_parameters(offsets_px: Array, shapes_px: Array) -> Array:
+    """(N, 5) parameters of ellipses with centres (N, 2) and shapes (N, 2, 2)."""
+    inverse = shape_inverses(shapes_px)
+    return np.column_stack([offsets_px, inverse[:, 0, 0], inverse[:, 1, 1], inverse[:, 0, 1]])
+
+
+def parameter_shapes(ellipse: Array) -> Array:
+    """(N, 2, 2) shapes of ellipses with parameters (N, 5)."""
+    return shape_inverses(np.stack([ellipse[:, [2, 4]], ellipse[:, [4, 3]]], axis=1))

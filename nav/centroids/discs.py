@@ -1,0 +1,209 @@
+"""Discs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geometry.se3 import Array
+from nav.centroids.blurred_edges import (
+    DISC_BACKGROUND,
+    DISC_FIXED_COUNT,
+    DISC_LEVEL,
+    DISC_WIDTH,
+    ELLIPSE_PARAMETER_COUNT,
+    START_WIDTH_PX,
+    draw_discs,
+    edge_widths,
+    ellipse_parameters,
+    parameter_shapes,
+)
+from nav.centroids.centroid_uncertainty import NoiseModel, ResidualSpread
+from nav.centroids.ellipses import Ellipses, are_positive, moment_shapes, shape_radii
+from nav.centroids.marker_signal import MarkerSignal
+from nav.centroids.motion_blur import Travel
+from nav.centroids.outline_pixels import WHOLE_RADIUS_PX, PixelSet, coarse_pixels, edge_distances
+from nav.numerics.compiled import Array32
+from nav.numerics.levenberg_marquardt import Minimum, Model
+
+# An initial outline may be this far off; pixels this far from it show one side only. [px]
+_CLEAR_PX = 1.0
+
+
+def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, further: Array32 | None = None) -> Model:
+    """`I = (b + g.x) (1 - S) + (A + h.x) S + k.F`.
+
+    Args:
+        pixels: where.
+        slope_outside: whether the background's plane g is fitted.
+        slope_inside: whether the disc's plane h is fitted.
+        further: (N, E, K) shares F of other backgrounds, whose lights k above b are fitted, the last parameters.
+    """
+    x, y = pixels.x_px, pixels.y_px
+    if further is None:
+        further = np.zeros((len(x), 0, x.shape[1]), np.float32)
+    count = DISC_FIXED_COUNT + 2 * slope_outside + 2 * slope_inside + further.shape[1]
+
+    def model(parameters: Array) -> tuple[Array32, Array32]:
+        picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
+        given, widths = parameters.astype(np.float32), edge_widths(parameters[:, DISC_WIDTH])
+        draw_discs(given, widths, (slope_outside, slope_inside), x, y, further, picture, jacobian)
+        return picture, jacobian
+
+    return model
+
+
+def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
+    """(N, P) parameters of the initial outlines with the mean levels on either side of them, all further ones zero."""
+    parameters = np.zeros((len(shapes_px), DISC_FIXED_COUNT + further_count))
+    parameters[:, :ELLIPSE_PARAMETER_COUNT] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
+    parameters[:, DISC_WIDTH] = START_WIDTH_PX
+    distance = edge_distances(shapes_px, pixels.x_px, pixels.y_px)
+    for column, side in ((DISC_BACKGROUND, distance < -_CLEAR_PX), (DISC_LEVEL, distance > _CLEAR_PX)):
+        weight = pixels.present * side
+        parameters[:, column] = (weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
+    return parameters
+
+
+def contrasts(fit: Minimum) -> Array:
+    """(N,) light of fitted discs above that beside them. [DN]"""
+    contrast: Array = fit.parameters[:, DISC_LEVEL] - fit.parameters[:, DISC_BACKGROUND]
+    return contrast
+
+
+@dataclass(frozen=True, eq=False)
+class DiscFits:
+    """Refined discs, in the order of the initial ones.
+
+    Attributes:
+        ellipses: fitted outlines; the initial ones where a fit was rejected.
+        cov_px2: (M, 2, 2) covariances of the centres.
+        contrast_dn, background_dn: (M,) light of the disc above that beside it, and the latter. [DN]
+        edge_width_px: (M,) Gaussian width of the edge, pixel's box included.
+        chi2_per_dof: (M,) of the residuals against the frame's own noise.
+        inflation: (M,) factor in `cov_px2` for residuals that hang together.
+        reasons: why a disc was rejected, or None.
+        noise: of the frame's pixels, None without any disc.
+        travel: how the discs moved while the shutter was open, None where they stood still.
+    """
+
+    ellipses: Ellipses
+    cov_px2: Array
+    contrast_dn: Array
+    background_dn: Array
+    edge_width_px: Array
+    chi2_per_dof: Array
+    inflation: Array
+    reasons: tuple[str | None, ...]
+    noise: NoiseModel | None
+    travel: Travel | None = None
+
+    @property
+    def accepted(self) -> NDArray[np.bool_]:
+        """(M,) which discs were not rejected."""
+        return np.array([reason is None for reason in self.reasons], dtype=np.bool_)
+
+
+def unfitted(discs: Ellipses) -> DiscFits:
+    """Discs as they were, to be replaced by `merged`."""
+    count = len(discs)
+    nothing = np.zeros(count)
+    return DiscFits(discs, np.zeros((count, 2, 2)), nothing, nothing, nothing, nothing, nothing, (None,) * count, None)
+
+
+def merged(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscFits:
+    """`fits` with those of `index` replaced."""
+
+    def put(old: Array, new: Array) -> Array:
+        merged = old.copy()
+        merged[index] = new
+        return merged
+
+    reasons = list(fits.reasons)
+    for place, reason in zip(index, part.reasons, strict=True):
+        reasons[place] = reason
+    centers = put(fits.ellipses.centers_px, part.ellipses.centers_px)
+    shapes = put(fits.ellipses.shapes_px, part.ellipses.shapes_px)
+    return DiscFits(
+        Ellipses(fits.ellipses.eyes, centers, shapes),
+        put(fits.cov_px2, part.cov_px2),
+        put(fits.contrast_dn, part.contrast_dn),
+        put(fits.background_dn, part.background_dn),
+        put(fits.edge_width_px, part.edge_width_px),
+        put(fits.chi2_per_dof, part.chi2_per_dof),
+        put(fits.inflation, part.inflation),
+        tuple(reasons),
+        part.noise,
+        fits.travel if part.travel is None else part.travel,
+    )
+
+
+# Of a pixel's noise: fainter discs start from noise and end anywhere. Small ones are told by so few pixels that their
+# centre's own deviation [px] says when they are too faint.
+_LEAST_CONTRAST_SIGMA = 2.5
+_LARGEST_SIGMA_PX = 0.2
+# Of a disc's own pixels; a wholly clipped disc keeps its middle, one clipped in part does not.
+_MOST_CLIPPED_FRACTION = 0.05
+# Residuals of twice the frame's noise and of more than this share of the contrast are those of another thing.
+_LARGEST_CHI2, _ROUGH_SHARE = 4.0, 0.04
+# An outline that ends this far from its start, as a share of its radius, is another thing's.
+_LARGEST_MOVE_FRACTION = 0.5
+LARGEST_SCALE = 1.6
+
+
+def rejection_reasons(
+    discs: Ellipses,
+    pixels: PixelSet,
+    fit: Minimum,
+    inside: Array32,
+    cov_px2: Array,
+    noise: NoiseModel,
+    spread: ResidualSpread,
+) -> tuple[str | None, ...]:
+    """Why each disc is rejected, the plainest reason first."""
+    contrast, own = contrasts(fit), pixels.present * (inside > 0.5)
+    clipped = (own * pixels.clipped).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
+    bright = noise.dark_dn2 + noise.per_signal_dn * np.maximum(contrast, 0)
+    moved = np.hypot(*(fit.parameters[:, :2] + pixels.origins_px - discs.centers_px).T)
+    shapes = parameter_shapes(fit.parameters)
+    scale = shape_radii(shapes) / discs.radii_px
+    rough = (spread.chi2_per_dof > _LARGEST_CHI2) & (spread.chi2_per_dof * bright > (_ROUGH_SHARE * contrast) ** 2)
+    lost = ~np.isfinite(fit.parameters).all(axis=1) | ~np.isfinite(cov_px2).all(axis=(1, 2)) | ~are_positive(shapes)
+    placed = np.einsum("nii->n", cov_px2) < 2 * _LARGEST_SIGMA_PX**2
+    astray = (moved > 1 + _LARGEST_MOVE_FRACTION * discs.radii_px) | ~(
+        (scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE)
+    )
+    tests = (
+        (pixels.truncated, "cut by the edge of the image"),
+        (clipped > _MOST_CLIPPED_FRACTION, "clipped: brighter than the sensor's range"),
+        (~(contrast > _LEAST_CONTRAST_SIGMA * np.sqrt(bright)), "no contrast"),
+        (lost | astray, "the fit left the disc"),
+        (spread.uneven | rough, "uneven: cut by a shadow or hidden in part"),
+        (~placed, "too faint to be placed"),
+    )
+    return tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
+
+
+def located(signals: Sequence[MarkerSignal], discs: Ellipses) -> Ellipses:
+    """Initial outlines of large discs from second moments, since a circle misses a tilted disc's edge by pixels."""
+    if discs.radii_px.max() <= WHOLE_RADIUS_PX:
+        return discs
+    pixels = coarse_pixels(signals, discs)
+    distance = edge_distances(discs.shapes_px, pixels.x_px, pixels.y_px)
+    levels = []
+    for side in (distance < 0, distance > 0):
+        weight = pixels.present * side
+        levels.append((weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1))
+    bright = pixels.present * (pixels.values > ((levels[0] + levels[1]) / 2)[:, None])
+    places = np.stack([pixels.x_px, pixels.y_px], axis=-1).astype(np.float64)
+    total = np.maximum(bright.sum(axis=1), 1)
+    center = np.einsum("nk,nki->ni", bright, places) / total[:, None]
+    arms = places - center[:, None]
+    shapes = moment_shapes(np.einsum("nk,nki,nkj->nij", bright, arms, arms) / total[:, None, None])
+    scale = shape_radii(shapes) / discs.radii_px
+    good = (scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE)
+    centers = np.where(good[:, None], discs.centers_px + center, discs.centers_px)
+    return Ellipses(discs.eyes, centers, np.where(good[:, None, None], shapes, discs.shapes_px))
