@@ -1,7 +1,8 @@
-"""Files that appear whole or not at all."""
+"""Files and folders that appear whole or not at all, and locks between processes."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import uuid
@@ -119,3 +120,18 @@ def new_folder(out: Path) -> Iterator[Path]:
         raise OSError(error.errno, f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def takes_lock(file: IO[str]) -> bool:
+    """Whether an open file was nobody's and is now this process's, until it is closed.
+
+    The kernel frees the lock when the process ends, however it ends.
+
+    Raises:
+        OSError: the file system knows no locks.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -2,19 +2,137 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import sys
+from pathlib import Path
+
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
-from drogue_models.body_mesh import load_body_mesh
-from drogue_models.bystanders import SECTIONS, BystanderShape
-from drogue_models.hose import hose_mesh
-from drogue_models.parameters import DrogueParameters, HubParameters
+from drogue_models.obstacles import OBSTACLE_SECTIONS, BystanderShape
+from drogue_models.parameters import BodyMesh, DrogueParameters, HubParameters
 from drogue_models.parts import Part, marker_id
-from drogue_models.solids import area_radius_m, bar, circle_m, plate, pocketed_plate, revolve
-from drogue_models.tanker import tanker_mesh
+from drogue_models.solids import area_radius_m, bar, circle_m, loft, plate, pocketed_plate, revolve
 from geometry.se3 import Array
 
-__all__ = ["bystander_mesh", "drogue_meshes", "hose_mesh", "tanker_mesh"]
+# A drogue's body; anything else was most likely drawn in millimetres or inches.
+SMALLEST_M, LARGEST_M = 0.05, 10.0
+# float32 files round a front at z = 0 by this much for bodies of a few metres.
+_FRONT_TOLERANCE_M = 1e-6
+
+
+def load_body_mesh(body: BodyMesh) -> trimesh.Trimesh:
+    """The body in the drogue frame: metres, z from the mouth to the hose, nothing before z = 0.
+
+    Raises:
+        ValueError: the file is missing, is not the one the drogue was loaded with, cannot be read as a mesh, or is not
+            a closed body of a sane size behind the rim plane.
+    """
+    file = body.file
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise ValueError(
+            f"body_mesh: {file} cannot be read: {error.strerror}; a drogue from a dataset looks for its mesh in the "
+            "working directory"
+        ) from error
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 != body.sha256:
+        raise ValueError(
+            f"body_mesh: {file} has changed since the drogue was loaded; restore the file with sha256 {body.sha256}, "
+            f"got {sha256}"
+        )
+    mesh = _parse(data, file.suffix.lower().removeprefix("."), str(file))
+    fault = _fault(mesh)
+    if fault:
+        raise ValueError(f"body_mesh: {file} {fault}")
+    return mesh
+
+
+def _parse(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
+    readable = sorted(trimesh.available_formats())
+    if file_type not in readable:
+        raise ValueError(f"body_mesh: {name} is of a kind that cannot be read; use one of {', '.join(readable)}")
+    try:
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type=file_type, process=False)
+    except Exception as error:  # each of trimesh's readers fails in its own way
+        raise ValueError(f"body_mesh: {name} cannot be read as {file_type}: {error}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise ValueError(f"body_mesh: {name} holds no triangles; export one mesh of triangles")
+    return mesh
+
+
+def _fault(mesh: trimesh.Trimesh) -> str | None:
+    """Why the mesh cannot be used and what to do, or None."""
+    if not np.isfinite(mesh.vertices).all():
+        return "has vertices that are not finite; export it again"
+    # Formats with normals or texture repeat the vertices along their seams.
+    mesh.merge_vertices(merge_norm=True, merge_tex=True)
+    low, high = mesh.bounds
+    size_m = float((high - low).max())
+    if not SMALLEST_M <= size_m <= LARGEST_M:
+        return f"must be {SMALLEST_M:g} to {LARGEST_M:g} m in size, with coordinates in metres, got {size_m:g}"
+    if low[2] < -_FRONT_TOLERANCE_M:
+        return f"must lie behind the rim plane (z >= 0, z from the mouth to the hose), got z down to {low[2]:g} m"
+    if not mesh.is_watertight:
+        return "must be closed (watertight); close its holes and export it again"
+    if not mesh.is_winding_consistent or mesh.volume <= 0:
+        return "must have its normals outwards everywhere; recalculate them and export it again"
+    return None
+
+
+HOSE_RINGS_PER_SEGMENT = 6
+HOSE_SECTIONS = 32
+HOSE_END_FRACTION = 0.005
+
+
+def hose_mesh(nodes_m: ArrayLike, radius_m: float) -> trimesh.Trimesh:
+    """A closed tube along a smooth curve through nodes.
+
+    Vertices and faces depend on the number of nodes only, so that a renderer can move the vertices of a loaded mesh.
+
+    Args:
+        nodes_m: (K, 3) centre line, K >= 2, no node twice in a row. [m]
+        radius_m: > 0. [m]
+
+    Raises:
+        ValueError: nodes of another shape, or two equal neighbours.
+    """
+    nodes = np.asarray(nodes_m, dtype=np.float64)
+    if nodes.ndim != 2 or nodes.shape[0] < 2 or nodes.shape[1] != 3:
+        raise ValueError(f"nodes_m: must have shape (K, 3) with K >= 2, got {nodes.shape}")
+    if not radius_m > 0:
+        raise ValueError(f"radius_m: must be positive, got {radius_m}")
+    chord_m = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
+    if not chord_m.min() > 0:
+        raise ValueError("nodes_m: must be finite and neighbours must differ")
+    knots = np.concatenate([[0.0], np.cumsum(chord_m)])
+    curve = CubicSpline(knots, nodes, bc_type="natural")
+    between = np.arange(HOSE_RINGS_PER_SEGMENT) / HOSE_RINGS_PER_SEGMENT
+    inner = (knots[:-1, None] + chord_m[:, None] * between).ravel()[1:]
+    # A ring close to either end keeps the cap's direction out of the tube's interpolated normals.
+    ends_m = HOSE_END_FRACTION * chord_m[[0, -1]]
+    at = np.concatenate([[0.0, ends_m[0]], inner, [knots[-1] - ends_m[1], knots[-1]]])
+    tangents = curve(at, 1)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    side, up = _carried_frame(tangents)
+    angle = 2 * np.pi * np.arange(HOSE_SECTIONS) / HOSE_SECTIONS
+    around = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * up[:, None]
+    return loft(curve(at)[:, None] + radius_m * around)
+
+
+def _carried_frame(tangents: Array) -> tuple[Array, Array]:
+    """Two (S, 3) unit vectors across the curve that turn with it as little as they can, `side x up = tangent`."""
+    side = np.empty_like(tangents)
+    seed = np.eye(3)[np.argmin(np.abs(tangents[0]))]
+    for index, tangent in enumerate(tangents):
+        across = seed - (seed @ tangent) * tangent
+        seed = side[index] = across / np.linalg.norm(across)
+    return side, np.cross(tangents, side)
+
 
 # Markers and hub: outlines within 10 um of the circle.
 MARKER_SECTIONS = 128
@@ -71,7 +189,7 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
 
 def bystander_mesh(shape: BystanderShape) -> trimesh.Trimesh:
     """A closed mesh of a bystander in its own frame. [m]"""
-    return revolve(shape.profile_m(), SECTIONS)
+    return revolve(shape.profile_m(), OBSTACLE_SECTIONS)
 
 
 def _marker_outline_m(drogue: DrogueParameters, index: int) -> Array:
@@ -167,3 +285,26 @@ def _hub(drogue: DrogueParameters, hub: HubParameters) -> trimesh.Trimesh:
     thickness_m = _hub_thickness_m(drogue)
     profile = [(inner_m, 0.0), (outer_m, 0.0), (outer_m, thickness_m), (inner_m, thickness_m)]
     return revolve(np.array(profile) + np.array([0.0, hub.depth_m]), MARKER_SECTIONS)
+
+
+_EXAMPLE_SECTIONS = 48
+
+
+def example_body() -> trimesh.Trimesh:
+    """A closed funnel of moulded plastic with a coupling at its end, for a rim of 0.30 m and a hub 0.22 m deep. [m]"""
+    depth_m, mouth_m = 0.22, 0.04
+    share = np.linspace(0.0, 1.0, 9)
+    # A trumpet: steep near the rim, slender at the coupling.
+    inside_m = 0.285 - (0.285 - 0.085) * share**0.6
+    inside = np.stack([inside_m, 0.012 + (depth_m - 0.012) * share], axis=-1)
+    outside = np.stack([inside_m + 0.006, inside[:, 1]], axis=-1)
+    # The seat of the hub lies 3 mm behind the hub's face.
+    seat = [(0.0, depth_m + 0.09), (mouth_m, depth_m + 0.09), (mouth_m, depth_m + 0.003), (0.085, depth_m + 0.003)]
+    end = [(0.091, depth_m + 0.05), (0.06, depth_m + 0.08), (0.045, depth_m + 0.16), (0.0, depth_m + 0.16)]
+    return revolve(np.vstack([seat, inside[::-1], outside, end]), _EXAMPLE_SECTIONS)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m drogue_models.meshes FILE.ply")
+    example_body().export(Path(sys.argv[1]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.recipe.exposure_law import ExposureLaw
+from datasets_manifest.recipe.rigs import ExposureLaw
 from datasets_manifest.types.frame import Environment, Exposure, Sensor
 from drogue_models.parameters import WHITE_PAINT
 from geometry.pinhole import PinholeCamera

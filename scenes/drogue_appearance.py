@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.appearance_ranges import TargetRanges
+from datasets_manifest.recipe.drogue_ranges import TargetRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import Bystander, DrogueCondition, SurfaceCondition
-from drogue_models.bystanders import BystanderShape
+from drogue_models.obstacles import BystanderShape
 from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters, ReflectanceRgb
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig

@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
-from datasets_manifest.recipe.weather_ranges import Clouds, MistRanges, MoonRanges
-from datasets_manifest.types.environment_map import EnvironmentMap, MapRanges
+from datasets_manifest.recipe.environment_ranges import Clouds, EnvironmentRanges, MistRanges, MoonRanges
+from datasets_manifest.types.environment import CloudLayer, EnvironmentMap, GroundKind, MapRanges, Mist, Moon
+from datasets_manifest.types.field_types import Range
 from datasets_manifest.types.frame import Environment
-from datasets_manifest.types.ground import GroundKind
-from datasets_manifest.types.ranges import Range
-from datasets_manifest.types.weather import CloudLayer, Mist, Moon
 from drogue_models.parameters import ReflectanceRgb
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE
 from scenes.sky.equirectangular_sky import load_map

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.rangefinder import Rangefinder
 from datasets_manifest.recipe.recipe import Family, Recipe
-from datasets_manifest.types.calibration_board import PlacedBoard
+from datasets_manifest.recipe.rigs import Rangefinder
+from datasets_manifest.types.appearance import PlacedBoard
 from datasets_manifest.types.frame import Environment, FrameSpec
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform

@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 import cv2
 import numpy as np
 
-from datasets_manifest.importers.pair_source import SourcePair
+from datasets_manifest.importers.imported_pairs import SourcePair
 from datasets_manifest.types.images import Pixels
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")

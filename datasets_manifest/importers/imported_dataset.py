@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.calibration.calibration import calibration_files
-from datasets_manifest.importers.given_boxes import boxes_of_pair
-from datasets_manifest.importers.pair_source import PairSource, SourcePair
+from datasets_manifest.calibration.calibration_files import calibration_files
+from datasets_manifest.importers.image_folder import image_key
+from datasets_manifest.importers.imported_pairs import PairSource, SourcePair
 from datasets_manifest.recipe.rigs import SENSORS
 from datasets_manifest.storage.blind import BlindIndex
+from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.layout import (
     ANNOTATIONS_FOLDER,
     BLIND_FILE,
@@ -24,13 +26,74 @@ from datasets_manifest.storage.layout import (
     frame_folder,
     image_file,
 )
-from datasets_manifest.storage.png import encode_png
 from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import Pixels
 from datasets_manifest.types.records import PixelBox
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, StereoRig
+
+
+def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:
+    """The boxes of each image, by `image_key`, in pixel-centre coordinates.
+
+    Raises:
+        ValueError: it cannot be read or is not COCO; names the file.
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        names = {_number(image["id"]): image_key(PurePosixPath(str(image["file_name"]))) for image in table["images"]}
+        boxes: dict[str, list[PixelBox]] = {}
+        for annotation in table["annotations"]:
+            boxes.setdefault(names[_number(annotation["image_id"])], []).append(_box(annotation["bbox"]))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: is no COCO file of boxes: {type(error).__name__} {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    return boxes
+
+
+def boxes_of_pair(
+    boxes: Mapping[str, list[PixelBox]], names: tuple[str, str], width_px: int
+) -> tuple[PixelBox | None, PixelBox | None]:
+    """The left and the right view's box.
+
+    Args:
+        boxes: as `read_boxes` gives them.
+        names: of the left and the right image; equal where both views stand side by side in one.
+        width_px: of one view.
+
+    Raises:
+        ValueError: a view with two boxes, though one drogue is looked for.
+    """
+    if names[0] == names[1]:
+        both = boxes.get(names[0], [])
+        left = [box for box in both if box[0] + box[2] / 2 < width_px - 0.5]
+        views = [left, [(x - width_px, y, w, h) for x, y, w, h in both if (x, y, w, h) not in left]]
+    else:
+        views = [boxes.get(name, []) for name in names]
+    for name, found in zip(names, views, strict=True):
+        if len(found) > 1:
+            raise ValueError(f"boxes: {name} has {len(found)} in one view, and one drogue is looked for")
+    first, second = (found[0] if found else None for found in views)
+    return first, second
+
+
+def _number(value: Any) -> int:
+    if type(value) is not int:
+        raise ValueError(f"ids must be whole numbers, got {value!r}")
+    return value
+
+
+def _box(value: Any) -> PixelBox:
+    """COCO counts from the image's corner, half a pixel before the first pixel's centre."""
+    x, y, width, height = (float(number) for number in value)
+    if not (abs(x) < 1e6 and abs(y) < 1e6 and 0 < width < 1e6 and 0 < height < 1e6):
+        raise ValueError(f"a bbox must be x, y, width, height in pixels, got {value}")
+    return (x - 0.5, y - 0.5, width, height)
+
 
 # What deep images are kept in.
 _KEPT_BITS: Final = 12

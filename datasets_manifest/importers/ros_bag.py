@@ -15,7 +15,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from datasets_manifest.calibration.stereo_calibration import StereoCalibration
-from datasets_manifest.importers.pair_source import SourcePair
+from datasets_manifest.importers.imported_pairs import SourcePair
 from datasets_manifest.types.images import Pixels
 from geometry.se3 import Array
 from geometry.stereo import EYES

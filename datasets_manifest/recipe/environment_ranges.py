@@ -1,4 +1,4 @@
-"""From what the environments of a recipe's scenes are drawn."""
+"""The `[environment]` section of a recipe: the ranges that each scene's sky, weather and ground are drawn from."""
 
 from __future__ import annotations
 
@@ -6,11 +6,84 @@ from typing import Self
 
 from pydantic import Field, field_validator, model_validator
 
-from datasets_manifest.recipe.weather_ranges import Clouds, MistRanges, MoonRanges
-from datasets_manifest.types.environment_map import MapRanges
-from datasets_manifest.types.ground import GroundKind
-from datasets_manifest.types.ranges import Range
+from datasets_manifest.types.environment import CloudKind, GroundKind, MapRanges
+from datasets_manifest.types.field_types import Fraction, Range
 from drogue_models.frozen_model import FrozenModel
+
+
+class Clouds(FrozenModel):
+    """A cloud layer, where a scene has it.
+
+    Attributes:
+        kind: see `CloudLayer`.
+        scene_fraction: share of scenes with this layer.
+        cover_fraction, feature_size_m, optical_depth, thickness_m, heading_deg: see `CloudLayer`.
+        height_above_camera_m: see `CloudLayer`.
+    """
+
+    kind: CloudKind = "cumulus"
+    scene_fraction: Fraction = 0.0
+    cover_fraction: Range = Range(low=0.15, high=0.55)
+    height_above_camera_m: Range = Range(low=800, high=3000)
+    thickness_m: Range = Range(low=300, high=900)
+    feature_size_m: Range = Range(low=1500, high=4000)
+    optical_depth: Range = Range(low=4, high=14)
+    heading_deg: Range = Range(low=-180, high=180)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        height = self.height_above_camera_m
+        height.within(-15000, 15000, "height_above_camera_m")
+        if height.low < 100 and height.high > -100:
+            raise ValueError("height_above_camera_m: the whole range must lie above 100 m or below -100 m")
+        self.cover_fraction.within(0, 1, "cover_fraction")
+        self.thickness_m.within(10, 5000, "thickness_m")
+        self.feature_size_m.within(10, 1e5, "feature_size_m")
+        self.optical_depth.within(0.01, 200, "optical_depth")
+        self.heading_deg.within(-360, 360, "heading_deg")
+        return self
+
+
+class MistRanges(FrozenModel):
+    """Mist around the camera, where a scene has it.
+
+    Attributes:
+        scene_fraction: share of scenes in mist.
+        visibility_m, above_m, below_m: see `Mist`.
+    """
+
+    scene_fraction: Fraction = 0.0
+    visibility_m: Range = Range(low=80, high=600)
+    above_m: Range = Range(low=50, high=400)
+    below_m: Range = Range(low=50, high=400)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        self.visibility_m.within(10, 100_000, "visibility_m")
+        self.above_m.within(0.1, 10_000, "above_m")
+        self.below_m.within(0.1, 10_000, "below_m")
+        return self
+
+
+class MoonRanges(FrozenModel):
+    """The moon, where a scene has one.
+
+    Attributes:
+        scene_fraction: share of scenes with a moon.
+        elevation_deg, azimuth_deg, phase_angle_deg: see `Moon`.
+    """
+
+    scene_fraction: Fraction = 0.0
+    elevation_deg: Range = Range(low=10, high=60)
+    azimuth_deg: Range = Range(low=-180, high=180)
+    phase_angle_deg: Range = Range(low=0, high=90)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        self.elevation_deg.within(-90, 90, "elevation_deg")
+        self.azimuth_deg.within(-360, 360, "azimuth_deg")
+        self.phase_angle_deg.within(0, 180, "phase_angle_deg")
+        return self
 
 
 class EnvironmentRanges(FrozenModel):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from copy import deepcopy
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -10,22 +11,36 @@ from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from datasets_manifest.recipe.appearance_ranges import DrogueVariant, TargetRanges
+from datasets_manifest.recipe.drogue_ranges import DistanceLaw, DrogueVariant, Pose, TargetRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
-from datasets_manifest.recipe.exposure_law import ExposureLaw
-from datasets_manifest.recipe.families import fill_families
-from datasets_manifest.recipe.pose_ranges import DistanceLaw, Pose
-from datasets_manifest.recipe.rangefinder import Rangefinder
-from datasets_manifest.recipe.rigs import resolve_rig
+from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, resolve_rig
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_singles, fill_distance
-from datasets_manifest.types.calibration_board import CalibrationBoard
-from datasets_manifest.types.environment_map import pin_map
+from datasets_manifest.types.appearance import CalibrationBoard
+from datasets_manifest.types.environment import pin_map
+from datasets_manifest.types.field_types import Fraction, Rig
 from datasets_manifest.types.frame import Sensor
-from datasets_manifest.types.json_types import Rig
-from datasets_manifest.types.ranges import Fraction
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
+
+SECTIONS = ("pose", "target", "environment", "exposure")
+
+
+def fill_families(table: dict[str, Any]) -> None:
+    """Complete each of a recipe's `[[families]]`, in place, with the keys of the recipe's sections that it leaves out.
+
+    Raises:
+        ValueError: they are not an array of tables.
+    """
+    families = table.get("families", [])
+    if not isinstance(families, list) or not all(isinstance(family, dict) for family in families):
+        raise ValueError("families: must be tables, each begun by [[families]]")
+    for family in families:
+        for section in SECTIONS:
+            common, own = table.get(section, {}), family.get(section, {})
+            if isinstance(common, dict) and isinstance(own, dict):
+                family[section] = {**deepcopy(common), **own}
+
 
 MAX_SEED = 2**63 - 1
 _ENGINES_WITH_LENSES = ("analytic", "mitsuba", "blender")

@@ -1,15 +1,18 @@
-"""The rigs that ship: the paper's geometry with three sensors, ideal or real eyes, and the table that adapts one."""
+"""The `[rig]` and `[exposure]` sections of a recipe: shipped rigs, changes to them, lenses, exposure and rangefinder.
+
+The shipped rigs have the seed paper's geometry with three sensors, and ideal or real lenses.
+"""
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from datasets_manifest.random_streams import seeded_generator
+from datasets_manifest.types.field_types import Range
 from datasets_manifest.types.frame import Optics, Sensor
-from datasets_manifest.types.ranges import Range
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 from geometry.distortion import BrownConrady, Lens
@@ -156,3 +159,48 @@ def _draw_lenses(eyes: Eyes, camera: PinholeCamera, seed: int) -> tuple[Lens, Le
         rotation = exp_twist(np.concatenate([np.zeros(3), turn])).rotation
         lenses.append(Lens(real, BrownConrady(*map(float, shape)), rotation))
     return lenses[0], lenses[1]
+
+
+class ExposureLaw(FrozenModel):
+    """How the exposure is set: by the meter, first with the time, then, when that is at its limit, with the gain.
+
+    Attributes:
+        time_s: fixed exposure time; without it the meter chooses within `auto_time_s`. [s]
+        auto_gain: what the meter may amplify by; a single number is a fixed gain.
+        auto_meter: what the meter looks at: `view`, the brighter of the view's mean and a white plate that faces the
+            camera; or `plate`, the plate alone, as one that looks at the drogue and not at the sky behind it.
+        auto_level_fraction: where the meter puts that, as a share of the full well, or at other gains of what fills the
+            converter.
+    """
+
+    time_s: float | None = Field(default=None, gt=0, le=1)
+    auto_time_s: Range = Range(low=20e-6, high=20e-3)
+    auto_gain: Range = Range(low=1, high=1)
+    auto_meter: Literal["view", "plate"] = Field(default="view", exclude_if=lambda meter: meter == "view")
+    auto_level_fraction: float = Field(default=0.7, gt=0, le=2)
+    f_number: float = Field(default=2.8, ge=0.5, le=64)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        self.auto_time_s.within(1e-6, 1, "auto_time_s")
+        self.auto_gain.within(0.1, 64, "auto_gain")
+        return self
+
+
+class Rangefinder(FrozenModel):
+    """A rangefinder beside the left camera that measures the distance of the rim centre along the optical axis.
+
+    A reading is the distance, plus an offset, plus noise, rounded. The defaults are those of a hand-held meter for
+    building sites, whose data sheets give +-2 mm at two standard deviations (ISO 16331-1) and a last digit of 1 mm; the
+    offset is our assumption for a zero mark set by hand.
+
+    Attributes:
+        offset_m: largest distance, either way, between the rangefinder's zero and the camera's; drawn once a dataset.
+            [m]
+        noise_m: standard deviation of a reading. [m]
+        resolution_m: step of its last digit, 0 for none. [m]
+    """
+
+    offset_m: float = Field(default=0.003, ge=0, le=1)
+    noise_m: float = Field(default=0.001, ge=0, le=1)
+    resolution_m: float = Field(default=0.001, ge=0, le=1)

@@ -3,18 +3,194 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
-from datasets_manifest.recipe.appearance_ranges import TargetRanges
-from datasets_manifest.recipe.dropout_ranges import LossRanges
-from datasets_manifest.recipe.hose import Hose
-from datasets_manifest.recipe.pose_ranges import Pose
-from datasets_manifest.types.ranges import Range
-from datasets_manifest.types.turbulence import SLOWEST_M_S, Turbulence
+from datasets_manifest.recipe.drogue_ranges import Pose, TargetRanges
+from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
+from datasets_manifest.types.environment import SLOWEST_M_S, Turbulence
+from datasets_manifest.types.field_types import Range
+from datasets_manifest.types.frame import Loss
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import StereoRig
+
+
+class HoseParameters(FrozenModel):
+    """A hose, the drogue at its end, and the air that both are dragged through.
+
+    Attributes:
+        name: of the preset that it comes from.
+        length_m: from the pod's exit to the drogue's coupling. [m]
+        diameter_m: outer. [m]
+        mass_per_length_kg_m: of the hose, with the fuel in it. [kg/m]
+        drogue_mass_kg: [kg]
+        drogue_diameter_m: of the disc that its drag coefficient is meant for. [m]
+        drogue_drag_coefficient: of the drogue.
+        crossflow_drag_coefficient, skin_drag_coefficient: of the hose, for the air across and along it.
+        airspeed_m_s: of tanker and receiver. [m/s]
+        air_density_kg_m3: [kg/m3]
+        turbulence_altitude_m: above ground, which sets scale and shape of the turbulence. [m]
+    """
+
+    name: str = Field(default="own", min_length=1, max_length=40)
+    length_m: float = Field(gt=0.5, le=100)
+    diameter_m: float = Field(gt=0, le=0.5)
+    mass_per_length_kg_m: float = Field(gt=0, le=100)
+    drogue_mass_kg: float = Field(gt=0, le=1000)
+    drogue_diameter_m: float = Field(gt=0, le=5)
+    drogue_drag_coefficient: float = Field(gt=0, le=3)
+    crossflow_drag_coefficient: float = Field(default=1.1, ge=0, le=3)
+    skin_drag_coefficient: float = Field(default=0.0035, ge=0, le=1)
+    airspeed_m_s: float = Field(ge=0, le=300)
+    air_density_kg_m3: float = Field(ge=0.05, le=1.5)
+    turbulence_altitude_m: float = Field(ge=3, le=20_000)
+
+
+# Values of a probe-and-drogue system of the fifty-foot class; from memory of the literature, not from a datasheet.
+_FULL_SIZE = HoseParameters(
+    name="full-size",
+    length_m=15.0,
+    diameter_m=0.067,
+    mass_per_length_kg_m=4.1,
+    drogue_mass_kg=29.5,
+    drogue_diameter_m=0.61,
+    drogue_drag_coefficient=0.8,
+    airspeed_m_s=120.0,
+    air_density_kg_m3=0.59,  # standard atmosphere at 6.9 km
+    turbulence_altitude_m=6900.0,
+)
+# A pair of small rotorcraft as in the seed paper; the drogue's size is the paper's, hose and drag are our assumption.
+_SMALL_UAV = HoseParameters(
+    name="small-uav",
+    length_m=4.0,
+    diameter_m=0.02,
+    mass_per_length_kg_m=0.25,
+    drogue_mass_kg=3.0,
+    drogue_diameter_m=0.66,
+    drogue_drag_coefficient=0.8,
+    airspeed_m_s=20.0,
+    air_density_kg_m3=1.2,
+    turbulence_altitude_m=100.0,
+)
+
+HOSES: dict[str, HoseParameters] = {hose.name: hose for hose in (_FULL_SIZE, _SMALL_UAV)}
+
+
+def _resolve(value: Any) -> Any:
+    """A preset's name, or a table that changes one, in full."""
+    table = {"preset": value} if isinstance(value, str) else value
+    if not isinstance(table, dict) or "preset" not in table:
+        return value
+    changes = {key: change for key, change in table.items() if key != "preset"}
+    if not isinstance(table["preset"], str) or table["preset"] not in HOSES:
+        raise ValueError(f"preset: no hose named {table['preset']!r}; there are {', '.join(HOSES)}")
+    return {**HOSES[table["preset"]].model_dump(), **changes}
+
+
+Hose = Annotated[HoseParameters, BeforeValidator(_resolve)]
+"""In TOML the name of a preset, a table with `preset` and what differs from it, or all parameters."""
+
+
+LossOrNone = Loss | Literal["none"]
+
+# The sun stands where the receiver looks, which its slow changes of attitude and the swing of the drogue lower. [deg]
+_LOWEST_LOOK_DEG = 4.0
+# Share of its offset by which the sun may stand below the drogue: sin 45 degrees, rounded up.
+_MOST_DOWNWARDS = 0.71
+
+
+class LossRanges(FrozenModel):
+    """A stretch in each sequence over which the cameras do not see the drogue, or hardly; draws are by sequence.
+
+    Attributes:
+        kinds: sequence by sequence in turn. `occlusion` puts a bar before both cameras that hides all of the drogue;
+            `out-of-view` turns the receiver aside until neither eye has any of it; `glare` has the formation turn until
+            the sun stands beside the drogue; `none` leaves a sequence as it is.
+        begins_s: from the sequence's start until the drogue is lost. [s]
+        lasts_s: how long it is. [s]
+        onset_s: how long the bar takes to come before the drogue, or the turn, and as long again to go. [s]
+        obstacle_distance_m: of the bar's axis from the cameras. [m]
+        turn_deg: of the receiver, to the left or to the right, for `out-of-view`. [deg]
+        sun_offset_deg: of the sun from the drogue's edge as the receiver sees it, in the middle of the stretch, for
+            `glare`. [deg]
+        sweep_deg: heading of the formation before and after it, to either side, for `glare`. [deg]
+    """
+
+    kinds: tuple[LossOrNone, ...] = Field(min_length=1, max_length=40)
+    begins_s: Range = Range(low=2, high=2)
+    lasts_s: Range = Range(low=2, high=2)
+    onset_s: Range = Range(low=1, high=1)
+    obstacle_distance_m: Range = Range(low=0.8, high=1.2)
+    turn_deg: Range = Range(low=28, high=32)
+    sun_offset_deg: Range = Range(low=0.3, high=0.8)
+    sweep_deg: Range = Range(low=12, high=16)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        for name, low, high in (
+            ("begins_s", 0, 36_000),
+            ("lasts_s", 0, 36_000),
+            ("onset_s", 0.02, 60),
+            ("obstacle_distance_m", 0.3, 10),
+            ("turn_deg", 5, 55),
+            ("sun_offset_deg", 0, 30),
+            ("sweep_deg", 1, 60),
+        ):
+            getattr(self, name).within(low, high, name)
+        if self.begins_s.low < self.onset_s.high:
+            raise ValueError(
+                f"begins_s: must be at least onset_s, {self.onset_s.high:g} s, so that a sequence begins with the "
+                f"drogue in sight, got {self.begins_s.low:g}"
+            )
+        return self
+
+    @property
+    def end_s(self) -> float:
+        """When the drogue is in sight again at the latest. [s]"""
+        return self.begins_s.high + self.lasts_s.high + self.onset_s.high
+
+    def check_turn(self, rig: StereoRig, rim_radius_m: float, distance_m: float, beside_m: float) -> None:
+        """Check that a turned receiver has lost the drogue.
+
+        Args:
+            rig: the cameras.
+            rim_radius_m: of the drogue. [m]
+            distance_m: of the drogue. [m]
+            beside_m: of the drogue from the axis midway between the eyes, to the left or to the right. [m]
+
+        Raises:
+            ValueError: it still has part of it in view.
+        """
+        if "out-of-view" not in self.kinds:
+            return
+        half_field_deg = math.degrees(math.atan((rig.camera.width_px / 2) / rig.camera.fx_px))
+        beside_deg = math.degrees(math.atan((beside_m + rim_radius_m + rig.baseline_m) / distance_m))
+        needed_deg = half_field_deg + beside_deg
+        if self.turn_deg.low < needed_deg:
+            raise ValueError(
+                f"sequence.losses.turn_deg: {self.turn_deg.low:g} degrees leave part of the drogue in view at "
+                f"{distance_m:g} m; turn by at least {needed_deg:.1f}, and more where it swings"
+            )
+
+    def check_sun(self, pose: Pose, environment: EnvironmentRanges) -> None:
+        """Check that the sun can stand beside the drogue.
+
+        Raises:
+            ValueError: the receiver looks at the ground, or a map has a sun of its own.
+        """
+        if "glare" not in self.kinds:
+            return
+        if environment.map is not None:
+            raise ValueError("sequence.losses.kinds: glare moves the sun, and that of environment.map cannot be moved")
+        needed_deg = _LOWEST_LOOK_DEG + _MOST_DOWNWARDS * self.sun_offset_deg.high
+        if pose.camera_pitch_deg.low < needed_deg:
+            raise ValueError(
+                "pose.camera_pitch_deg: glare needs the receiver to look up at the drogue by at least "
+                f"{needed_deg:.3g} degrees, or the sun beside it would be below the horizon, got "
+                f"{pose.camera_pitch_deg.low:g}"
+            )
+
 
 Manoeuvre = Literal["docking", "station", "missed-approach"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from datasets_manifest.recipe.pose_ranges import DistanceLaw
+from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.storage.layout import CARD_FILE
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.storage import Location, join, open_storage

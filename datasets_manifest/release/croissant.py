@@ -9,6 +9,7 @@ import json
 from typing import Any
 
 from datasets_manifest.release.card import citation
+from datasets_manifest.storage.frame_store import read_pairs_per_tar, sha256_of
 from datasets_manifest.storage.layout import (
     ANNOTATIONS_FOLDER,
     CROISSANT_FILE,
@@ -20,7 +21,6 @@ from datasets_manifest.storage.layout import (
     parts_file,
 )
 from datasets_manifest.storage.manifest import Manifest
-from datasets_manifest.storage.shard_index import read_pairs_per_tar, sha256_of
 from datasets_manifest.storage.storage import Location, Storage, join, open_storage
 from geometry.stereo import EYES
 

@@ -13,9 +13,9 @@ from datasets_manifest.storage.layout import BLIND_FILE
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.reader import read_images, read_shutter, read_sought
 from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.types.field_types import Rig
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import StereoImages
-from datasets_manifest.types.json_types import Rig
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain

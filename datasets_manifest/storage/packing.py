@@ -16,19 +16,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import BinaryIO
 
-from datasets_manifest.storage.frame_store import FrameStore
-from datasets_manifest.storage.layout import (
-    FRAMES_FOLDER,
-    RECORD_FILE,
-    SHARDS_FILE,
-    SHARDS_FOLDER,
-    frame_name,
-    is_plain_name,
-    shard_file,
-    shard_index_file,
-)
-from datasets_manifest.storage.shard_index import (
+from datasets_manifest.storage.frame_store import (
     MAX_PAIRS_PER_TAR,
+    FrameStore,
     PackedFile,
     ShardIndex,
     ShardLayout,
@@ -39,6 +29,16 @@ from datasets_manifest.storage.shard_index import (
     read_shard_index,
     sha256_of,
     shard_numbers,
+)
+from datasets_manifest.storage.layout import (
+    FRAMES_FOLDER,
+    RECORD_FILE,
+    SHARDS_FILE,
+    SHARDS_FOLDER,
+    frame_name,
+    is_plain_name,
+    shard_file,
+    shard_index_file,
 )
 from datasets_manifest.storage.storage import Location, Storage, in_order, open_storage
 

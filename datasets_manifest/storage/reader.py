@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.image_codecs import decode_png
 from datasets_manifest.storage.layout import RECORD_FILE, image_file, is_plain_name, mosaic_file, parts_file
 from datasets_manifest.storage.manifest import Manifest, read_manifest
-from datasets_manifest.storage.png import decode_png
 from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.field_types import write_rig
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import Pixels, StereoImages
-from datasets_manifest.types.json_types import write_rig
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.layout import (
     FRAMES_FOLDER,
     RECORD_FILE,
@@ -19,7 +20,6 @@ from datasets_manifest.storage.layout import (
     mosaic_file,
     parts_file,
 )
-from datasets_manifest.storage.png import encode_png
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.images import Pixels, StereoImages
 from datasets_manifest.types.records import PairRecord

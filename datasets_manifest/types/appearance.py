@@ -1,15 +1,17 @@
-"""What a frame's target looks like besides its dimensions: the state of its surfaces, and what else is in the air."""
+"""What else a frame shows: the state of the drogue's surfaces, obstacles, or a calibration board in its place."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, model_validator
 
-from datasets_manifest.types.json_types import Transform
-from drogue_models.bystanders import BystanderShape
+from datasets_manifest.types.field_types import Transform
 from drogue_models.frozen_model import FrozenModel
-from drogue_models.parameters import ReflectanceRgb
+from drogue_models.obstacles import BystanderShape
+from drogue_models.parameters import Reflectance, ReflectanceRgb
+from geometry.se3 import Array
 
 
 class SurfaceCondition(FrozenModel):
@@ -71,3 +73,68 @@ class Bystander(FrozenModel):
     shape: BystanderShape
     left_from_object: Transform
     reflectance_rgb: ReflectanceRgb
+
+
+class CalibrationBoard(FrozenModel):
+    """A checkerboard printed on a flat white plate.
+
+    Board frame: origin in the middle of the squares, x along a row, y down a column, z into the plate. The square in
+    the low corner of x and y is black.
+
+    Attributes:
+        columns, rows: squares, not corners. One count must be even and the other odd, so that the board looks
+            different after half a turn.
+        square_m: side of a square. [m]
+        margin_m: width of the white rim around the squares. [m]
+        white_reflectance, black_reflectance: diffuse, the same for all colours. Office paper reflects 0.8 and toner
+            0.04 in the visible.
+    """
+
+    columns: int = Field(default=11, ge=4, le=60)
+    rows: int = Field(default=8, ge=4, le=60)
+    square_m: float = Field(default=0.06, gt=0, le=10)
+    margin_m: float = Field(default=0.04, ge=0, le=10)
+    white_reflectance: Reflectance = 0.8
+    black_reflectance: Reflectance = 0.04
+
+    @model_validator(mode="after")
+    def _one_way_up(self) -> Self:
+        if (self.columns + self.rows) % 2 == 0:
+            raise ValueError(f"columns, rows: one must be even and the other odd, got {self.columns} and {self.rows}")
+        return self
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the plate. [m]"""
+        return (
+            self.columns * self.square_m + 2 * self.margin_m,
+            self.rows * self.square_m + 2 * self.margin_m,
+        )
+
+    def grid_m(self) -> Array:
+        """(rows + 1, columns + 1, 3) corners of all squares in the board frame. [m]"""
+        x = (np.arange(self.columns + 1) - self.columns / 2) * self.square_m
+        y = (np.arange(self.rows + 1) - self.rows / 2) * self.square_m
+        return np.stack([*np.meshgrid(x, y), np.zeros((self.rows + 1, self.columns + 1))], axis=-1)
+
+    def corners_m(self) -> Array:
+        """((rows - 1) (columns - 1), 3) inner corners, row by row, in the board frame: what finders find. [m]"""
+        return self.grid_m()[1:-1, 1:-1].reshape(-1, 3)
+
+    def outline_m(self) -> Array:
+        """(4, 3) corners of the plate in the board frame, around it. [m]"""
+        around = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+        outline: Array = around * (self.size_m[0] / 2, self.size_m[1] / 2, 0.0)
+        return outline
+
+
+class PlacedBoard(FrozenModel):
+    """A board in a frame; it stands still while the shutter is open.
+
+    Attributes:
+        shape: what it measures.
+        left_from_board: where it is.
+    """
+
+    shape: CalibrationBoard
+    left_from_board: Transform

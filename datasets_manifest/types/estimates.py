@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from datasets_manifest.atomic import open_text_atomic
-from datasets_manifest.types.json_types import Matrix6, Transform
+from datasets_manifest.types.field_types import Matrix6, Transform
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import Eye
 

@@ -7,16 +7,15 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from datasets_manifest.types.appearance import Bystander, DrogueCondition
-from datasets_manifest.types.calibration_board import PlacedBoard
-from datasets_manifest.types.dropout import Loss
-from datasets_manifest.types.environment_map import EnvironmentMap
-from datasets_manifest.types.ground import GroundKind
-from datasets_manifest.types.json_types import Points3, Rig, Transform, Vector6
-from datasets_manifest.types.weather import CloudLayer, Mist, Moon
+from datasets_manifest.types.appearance import Bystander, DrogueCondition, PlacedBoard
+from datasets_manifest.types.environment import CloudLayer, EnvironmentMap, GroundKind, Mist, Moon
+from datasets_manifest.types.field_types import Points3, Rig, Transform, Vector6
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters, ReflectanceRgb
 from geometry.se3 import RigidTransform, exp_twist
+
+Loss = Literal["occlusion", "out-of-view", "glare"]
+
 
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 

@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
+from datasets_manifest.types.field_types import Transform
 from datasets_manifest.types.frame import FrameSpec
-from datasets_manifest.types.json_types import Transform
 from drogue_models.frozen_model import FrozenModel
 
 PixelPoint = tuple[float, float]

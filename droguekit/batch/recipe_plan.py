@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from datasets_manifest.recipe.pose_ranges import DistanceLaw
+from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import Drop
 from drogue_models.parameters import DrogueParameters
@@ -21,7 +21,7 @@ from droguekit.batch.failure_policy import FIRST_FRAMES, drop_of
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
-from labelgen.boxes import full_box
+from labelgen.part_pixels import full_box
 from scenes.drogue_appearance import drogue_of_scene
 from scenes.sampler import family_of_scene, recipe_of_scene, sample_left_from_drogue, scene_of_frame, split_of_scenes
 

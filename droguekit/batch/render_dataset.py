@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import Any, TextIO
 
-from datasets_manifest.calibration.calibration import write_calibration
+from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.release.card import write_card
 from datasets_manifest.release.croissant import write_croissant

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from datasets_manifest.atomic import takes_lock
 from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
-from datasets_manifest.storage.frame_store import FrameStore
-from datasets_manifest.storage.locking import takes_lock
+from datasets_manifest.storage.frame_store import FrameStore, shard_numbers
 from datasets_manifest.storage.manifest import Manifest, build_manifest, read_manifest, write_manifest
 from datasets_manifest.storage.packing import check_pairs_per_tar, choose_packing, mend_shards, pack_all
-from datasets_manifest.storage.shard_index import shard_numbers
 from datasets_manifest.storage.storage import Location, in_order, open_storage
 from datasets_manifest.storage.writer import remove_leftovers
 from datasets_manifest.types.records import PairRecord

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.calibration.calibration import calibration_files
+from datasets_manifest.calibration.calibration_files import calibration_files
 from datasets_manifest.storage.blind import read_blind_index
 from datasets_manifest.storage.layout import (
     BLIND_FILE,

@@ -5,9 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from datasets_manifest.atomic import write_text_atomic
-from datasets_manifest.calibration.calibration import OPENCV_STEREO_FILE, opencv_stereo
-from datasets_manifest.calibration.kalibr import KALIBR_FILE, kalibr_camchain
-from datasets_manifest.calibration.ros import camera_info, camera_info_file
+from datasets_manifest.calibration.calibration_files import (
+    KALIBR_FILE,
+    OPENCV_STEREO_FILE,
+    camera_info,
+    camera_info_file,
+    kalibr_camchain,
+    opencv_stereo,
+)
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.storage import Location
 from geometry.stereo import EYES

@@ -1,24 +1,362 @@
-"""COCO annotation files: all pairs in one, and one for each split. Both eyes are images of their own."""
+"""COCO annotation files: all pairs in one, and one for each split. Both eyes are images of their own.
+
+COCO counts pixels from the corner of the image: boxes and keypoints stand 0.5 px higher than in the records. Masks are
+compressed run lengths.
+"""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
 
-from datasets_manifest.storage.layout import parts_file
+from datasets_manifest.storage.layout import FRAMES_FOLDER, image_file, parts_file
+from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, Storage, join, open_storage
 from datasets_manifest.storage.writer import canonical_json
-from datasets_manifest.types.records import PairRecord
+from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, PixelPoint
+from drogue_models.parts import Part, marker_id
+from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
-from labelgen.export.coco_entries import coco_annotation, coco_features, coco_header, coco_image
 from labelgen.export.export_log import ExportLog
-from labelgen.export.keypoints import count_absent_keypoints, count_cuts, keypoint_count, view_keypoints, view_of
+from labelgen.export.keypoints import (
+    CORNER_FROM_CENTER_PX,
+    clockwise_order,
+    count_absent_keypoints,
+    count_cuts,
+    equal_orders,
+    keypoint_count,
+    view_keypoints,
+    view_of,
+)
+from labelgen.part_pixels import FeaturePixels, visible_mask
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelSet:
+    """Pixels of an image in COCO's order, column by column.
+
+    Attributes:
+        columns, rows: (N,) of each pixel. [px]
+        size_px: (width, height) of the image. [px]
+    """
+
+    columns: Indices
+    rows: Indices
+    size_px: tuple[int, int]
+
+    def segmentation(self) -> dict[str, Any]:
+        """COCO's compressed run lengths, the first of them outside the set.
+
+        Source: the mask format of the COCO API (runs of the column-major image, beginning with zeros).
+        """
+        width, height = self.size_px
+        flat = self.columns * height + self.rows
+        breaks = np.flatnonzero(np.diff(flat) != 1)
+        starts, ends = flat[np.r_[0, breaks + 1]], flat[np.r_[breaks, len(flat) - 1]] + 1
+        edges = np.stack([starts, ends], axis=1).ravel()
+        counts = np.diff(np.concatenate([[0], edges, [width * height]]))
+        runs = counts[:-1] if counts[-1] == 0 else counts
+        packed = coco_mask.frPyObjects({"size": [height, width], "counts": runs.tolist()}, height, width)
+        return {"size": [height, width], "counts": packed["counts"].decode("ascii")}
+
+    def corner_box(self) -> list[float]:
+        """x, y, width and height of the box around the pixels' areas, counted from the image's corner. [px]"""
+        low_u, low_v = int(self.columns.min()), int(self.rows.min())
+        return [
+            float(low_u),
+            float(low_v),
+            float(int(self.columns.max()) - low_u + 1),
+            float(int(self.rows.max()) - low_v + 1),
+        ]
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+
+class DroguePixels:
+    """Where one eye sees the drogue and its features; only the drogue's visible box is looked at."""
+
+    def __init__(self, part_id: NDArray[np.uint8], box: PixelBox, marker_count: int) -> None:
+        """Crop the part ids.
+
+        Args:
+            part_id: (H, W) of the whole image.
+            box: `box_visible_xywh_px` of the view.
+            marker_count: of the drogue.
+        """
+        u, v = round(box[0] + 0.5), round(box[1] + 0.5)
+        crop = part_id[v : v + round(box[3]), u : u + round(box[2])]
+        # Transposed, rows come in the order of the image's columns, which is COCO's.
+        self._turned = np.ascontiguousarray(crop.T)
+        self._low = u, v
+        self._size_px = part_id.shape[1], part_id.shape[0]
+        self._marker_count = marker_count
+        self._features = FeaturePixels(self._turned)
+
+    def drogue(self) -> PixelSet:
+        """All that belongs to the drogue's box."""
+        return self._set(*np.nonzero(visible_mask(self._turned, self._marker_count)))
+
+    def feature(self, part: int) -> PixelSet:
+        """One marker, or the hub."""
+        return self._set(*self._features.places(part))
+
+    def _set(self, columns: Indices, rows: Indices) -> PixelSet:
+        return PixelSet(columns + self._low[0], rows + self._low[1], self._size_px)
+
+
+DROGUE, MARKER, HUB = 1, 2, 3
+"""Ids of the categories."""
+NAMESPACE = "droguekit"
+# Ids of markers and hubs: the feature's number in the upper bits, the image's id in the lower ones.
+_FEATURE_ID_STEP = 2**32
+# COCO's OKS is exp(-d^2 / (2 area (2 sigma)^2)). Ours falls to exp(-1/2) where d is half a marker's radius, 0.025 m,
+# of a disc of the drogue's radius, whose area is pi (0.33 m)^2: sigma = 0.025 / (sqrt(pi) 0.33) / 2.
+KEYPOINT_SIGMA = 0.0214
+"""COCO's `kpt_oks_sigmas` for every keypoint of a drogue."""
+
+
+def coco_image_id(frame_index: int, eye: Eye) -> int:
+    """Id of an image, the same in every file and after any merge; it is the drogue's annotation's id too."""
+    return 2 * frame_index + EYES.index(eye) + 1
+
+
+def coco_header(manifest: Manifest, with_features: bool) -> dict[str, Any]:
+    """The file's `info`, `licenses` and `categories`.
+
+    Args:
+        manifest: of the dataset.
+        with_features: markers and hub are annotated too.
+    """
+    count = keypoint_count(manifest)
+    drogue = {
+        "id": DROGUE,
+        "name": "drogue",
+        "supercategory": "refuelling",
+        "keypoints": [f"marker_{index}" for index in range(count)],
+        "skeleton": [[index + 1, (index + 1) % count + 1] for index in range(count)],
+    }
+    features = [
+        {"id": MARKER, "name": "marker", "supercategory": "refuelling"},
+        {"id": HUB, "name": "hub", "supercategory": "refuelling"},
+    ]
+    return {
+        "info": {
+            "description": f"droguekit dataset {manifest.name}: stereo pairs of a refuelling drogue",
+            "version": str(manifest.schema_version),
+            NAMESPACE: {
+                "dataset_sha256": manifest.dataset_sha256,
+                "pixels": "bbox and keypoints count from the image's corner: pixel centres are at 0.5",
+                "keypoints": "images of the markers' 3-D centres, in the drogue's own order",
+                "keypoint_flags": "0 outside the image or no such marker, 1 less than half visible, 2 visible",
+                "kpt_oks_sigmas": [KEYPOINT_SIGMA] * count,
+                "transforms": manifest.conventions["transforms"],
+            },
+        },
+        "licenses": [
+            {"id": 1, "name": manifest.data_licence, "url": f"https://spdx.org/licenses/{manifest.data_licence}"}
+        ],
+        "categories": [drogue, *(features if with_features else [])],
+    }
+
+
+def coco_image(record: PairRecord, eye: Eye, split: str) -> dict[str, Any]:
+    """The entry of one eye's image."""
+    camera = record.frame.rig.camera
+    other: Eye = "right" if eye == "left" else "left"
+    return {
+        "id": coco_image_id(record.frame_index, eye),
+        "file_name": f"{FRAMES_FOLDER}/{record.frame_index:06d}/{image_file(eye)}",
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "license": 1,
+        NAMESPACE: {
+            "frame_index": record.frame_index,
+            "view": eye,
+            "stereo_image_id": coco_image_id(record.frame_index, other),
+            "scene_id": record.scene_id,
+            "sequence_id": record.sequence_id,
+            "split": split,
+            "time_s": record.time_s,
+            "conditions": record.conditions.model_dump(mode="json"),
+        },
+    }
+
+
+def coco_annotation(
+    record: PairRecord, eye: Eye, part_id: NDArray[np.uint8] | None, count: int
+) -> dict[str, Any] | None:
+    """The entry of the drogue in one eye's image, or None where no pixel shows it.
+
+    Args:
+        record: the truth.
+        eye: which image.
+        part_id: (H, W) its part ids; without them the entry has no `segmentation`.
+        count: of keypoints.
+
+    Raises:
+        ValueError: the part ids show no drogue where the record does.
+    """
+    view, drogue = view_of(record, eye), record.frame.drogue
+    box = view.box_visible_xywh_px
+    if box is None or view.box_full_xywh_px is None or record.left_from_drogue is None or drogue is None:
+        return None
+    points = view_keypoints(view, record.frame.rig.camera, count)
+    image_id = coco_image_id(record.frame_index, eye)
+    mask = {} if part_id is None else {"segmentation": _drogue_mask(record, eye, part_id)}
+    return {
+        # One drogue an image: the image's id is as unique and as stable.
+        "id": image_id,
+        "image_id": image_id,
+        "category_id": DROGUE,
+        "iscrowd": 0,
+        "bbox": _corner_box(box),
+        "area": view.visible_drogue_px,
+        **mask,
+        "keypoints": [number for point in points for number in point],
+        "num_keypoints": sum(point.flag > 0 for point in points),
+        NAMESPACE: {
+            "bbox_full": _corner_box(view.box_full_xywh_px),
+            "truncated": view.truncated,
+            "drogue": drogue.name,
+            "keypoint_order_in_image": clockwise_order(view),
+            "equal_keypoint_orders": equal_orders(drogue),
+            "visible_fraction": [marker.visible_fraction for marker in view.markers],
+            "left_from_drogue": record.left_from_drogue.as_matrix().tolist(),
+            "eye_offset_m": record.frame.rig.eye_offset_m(eye).tolist(),
+            "pitch_deg": record.pitch_deg,
+            "yaw_deg": record.yaw_deg,
+            "roll_deg": record.roll_deg,
+            "roll_modulo_deg": record.roll_modulo_deg,
+        },
+    }
+
+
+def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], count: int) -> list[dict[str, Any]]:
+    """The entries of hub and markers in one eye's image, without those of which no pixel is seen.
+
+    Arguments as those of `coco_annotation`. The entries have `count` absent keypoints, so that COCO's evaluation of
+    keypoints, which asks every annotation for them, passes them over.
+    """
+    view = view_of(record, eye)
+    if view.box_visible_xywh_px is None:
+        return []
+    pixels = _drogue_pixels(record, eye, part_id)
+    hub = [] if view.hub is None else [(HUB, int(Part.HUB), 1, view.hub)]
+    markers = [(MARKER, marker_id(index), 2 + index, marker) for index, marker in enumerate(view.markers)]
+    image_id = coco_image_id(record.frame_index, eye)
+    entries = []
+    feature: FeatureView
+    for category, part, number, feature in [*hub, *markers]:
+        seen = pixels.feature(part)
+        if not len(seen):
+            continue
+        entries.append(
+            {
+                "id": number * _FEATURE_ID_STEP + image_id,
+                "image_id": image_id,
+                "category_id": category,
+                "iscrowd": 0,
+                "bbox": seen.corner_box(),
+                "area": len(seen),
+                "segmentation": seen.segmentation(),
+                "keypoints": [0] * (3 * count),
+                "num_keypoints": 0,
+                NAMESPACE: {
+                    "drogue_annotation_id": image_id,
+                    "marker_index": None if category == HUB else number - 2,
+                    "center_proj": _corner_point(feature.center_proj_px),
+                    "center_ellipse": _corner_point(feature.center_ellipse_px),
+                    "visible_fraction": feature.visible_fraction,
+                    "in_image": feature.in_image,
+                    "signal_to_noise": feature.signal_to_noise,
+                },
+            }
+        )
+    return entries
+
+
+def _drogue_mask(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> dict[str, Any]:
+    """Run lengths of the drogue's pixels.
+
+    Raises:
+        ValueError: there are none, where the record has a box around some.
+    """
+    pixels = _drogue_pixels(record, eye, part_id).drogue()
+    if not len(pixels):
+        path = f"{FRAMES_FOLDER}/{record.frame_index:06d}/{parts_file(eye)}"
+        raise ValueError(f"{path}: no pixel is the drogue's in the visible box of the record; run droguekit validate")
+    return pixels.segmentation()
+
+
+def _drogue_pixels(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> DroguePixels:
+    view = view_of(record, eye)
+    assert view.box_visible_xywh_px is not None
+    return DroguePixels(part_id, view.box_visible_xywh_px, len(view.markers))
+
+
+def _corner_point(point: PixelPoint) -> list[float]:
+    return [point[0] + CORNER_FROM_CENTER_PX, point[1] + CORNER_FROM_CENTER_PX]
+
+
+def _corner_box(box: PixelBox) -> list[float]:
+    return [*_corner_point((box[0], box[1])), box[2], box[3]]
+
+
+def rolled_to_truth(truth: COCO, results: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Keypoint results in that one of the equal orders which fits the truth best; `COCOeval` then scores them as usual.
+
+    An even ring of eight looks the same after each of eight turns, so a detector may begin with any marker. Its result
+    counts as the best of the turns, the minimum of the squared distances over them; orders that are not a turn of the
+    drogue, such as the mirrored one, stay wrong.
+
+    Args:
+        truth: a file of `write_coco` or a dataset's `annotations`.
+        results: as for `COCO.loadRes`, with `keypoints` in any of the equal orders, that in the image among them.
+
+    Returns:
+        Copies of the results. Those on images without a drogue are as they were.
+
+    Raises:
+        ValueError: a result with another number of keypoints than the truth has.
+    """
+    return [
+        _best_roll(result, [entry for entry in truth.imgToAnns[result["image_id"]] if entry["category_id"] == DROGUE])
+        for result in results
+    ]
+
+
+def _best_roll(result: dict[str, Any], drogues: list[dict[str, Any]]) -> dict[str, Any]:
+    points = np.array(result["keypoints"], dtype=np.float64).reshape(-1, 3)
+    best, least = points, np.inf
+    for drogue in drogues:
+        want = np.array(drogue["keypoints"], dtype=np.float64).reshape(-1, 3)
+        if want.shape != points.shape:
+            raise ValueError(f"keypoints: must be {len(want)} in every result, got {len(points)}")
+        for order in drogue[NAMESPACE]["equal_keypoint_orders"]:
+            rolled = points.copy()
+            rolled[list(order)] = points[: len(order)]
+            error = _squared_distance_px2(rolled, want)
+            if error < least:
+                best, least = rolled, error
+    return {**result, "keypoints": best.ravel().tolist()}
+
+
+def _squared_distance_px2(points: Array, want: Array) -> float:
+    shown = want[:, 2] > 0
+    return float(((points[shown, :2] - want[shown, :2]) ** 2).sum())
 
 
 def write_annotations(dataset: Location, out: Location) -> list[Location]:

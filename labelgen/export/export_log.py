@@ -1,4 +1,4 @@
-"""What an export tells while it runs: how far it is, and what its format cannot hold."""
+"""What every export shares: progress, the log of what a format cannot hold, consistency of records, order in time."""
 
 from __future__ import annotations
 
@@ -7,12 +7,61 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Protocol
 
 from datasets_manifest.storage.layout import RECORD_FILE
-from labelgen.export.record_consistency import record_fault
 
 if TYPE_CHECKING:
     # The command's help lists the formats without loading what reads a dataset.
     from datasets_manifest.storage.reader import Dataset
-    from datasets_manifest.types.records import PairRecord
+    from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
+    from geometry.pinhole import PinholeCamera
+
+
+_LARGEST_ID = 2**63 - 1
+
+
+def record_fault(record: PairRecord) -> str | None:
+    """What in a record contradicts the rest of it, or None; `droguekit validate` looks closer, and at the pixels."""
+    if max(record.scene_id, record.sequence_id or 0) > _LARGEST_ID:
+        return f"scene_id, sequence_id: must be at most {_LARGEST_ID}"
+    angles = (record.pitch_deg, record.yaw_deg, record.roll_deg, record.roll_modulo_deg)
+    for value in (record.left_from_drogue, *angles):
+        if (value is None) != (record.frame.drogue is None):
+            return "left_from_drogue, angles: must be given exactly when the frame has a drogue"
+    for eye, view in (("left", record.views.left), ("right", record.views.right)):
+        fault = _view_fault(record, view)
+        if fault is not None:
+            return f"views.{eye}.{fault}"
+    return None
+
+
+def _view_fault(record: PairRecord, view: ViewRecord) -> str | None:
+    drogue, camera = record.frame.drogue, record.frame.rig.camera
+    count = 0 if drogue is None else drogue.marker_count
+    if len(view.markers) != count:
+        return f"markers: must be {count} as the frame's drogue has, got {len(view.markers)}"
+    if (view.hub is None) != (drogue is None or drogue.hub is None):
+        return "hub: must be given exactly when the frame's drogue has one"
+    if (view.box_full_xywh_px is None) != (drogue is None):
+        return "box_full_xywh_px: must be given exactly when the frame has a drogue"
+    if (view.box_visible_xywh_px is None) != (view.visible_drogue_px == 0) or (
+        drogue is None and view.visible_drogue_px
+    ):
+        return "box_visible_xywh_px: must be given exactly when pixels of a drogue are visible"
+    if view.box_visible_xywh_px is not None and not _is_pixels(view.box_visible_xywh_px, camera):
+        return f"box_visible_xywh_px: must be around whole pixels of the image, got {view.box_visible_xywh_px}"
+    if view.visible_drogue_px > camera.width_px * camera.height_px:
+        return f"visible_drogue_px: is more than the image has, got {view.visible_drogue_px}"
+    return None
+
+
+def _is_pixels(box: PixelBox, camera: PinholeCamera) -> bool:
+    u, v, width, height = box[0] + 0.5, box[1] + 0.5, box[2], box[3]
+    return (
+        all(number.is_integer() for number in (u, v, width, height))
+        and min(u, v) >= 0
+        and min(width, height) >= 1
+        and u + width <= camera.width_px
+        and v + height <= camera.height_px
+    )
 
 
 class Progress(Protocol):
@@ -69,3 +118,45 @@ class ExportLog:
     def losses(self) -> dict[str, int]:
         """How many of what, by name."""
         return dict(sorted(self._losses.items()))
+
+
+_LATEST_S = 2.0**31
+
+
+def sequence_name(sequence_id: int | None) -> str:
+    """Name of a sequence's file or folder; single pairs, which belong to none, share one."""
+    return "single_pairs" if sequence_id is None else f"sequence_{sequence_id:04d}"
+
+
+class SequenceOrder:
+    """Checks, pair by pair, that times ascend and that no sequence comes back after another one began.
+
+    Attributes:
+        is_first: whether the last pair began a sequence.
+    """
+
+    def __init__(self) -> None:
+        self.is_first = True
+        self._ended: set[int | None] = set()
+        self._last: tuple[int | None, int] | None = None
+
+    def stamp_ns(self, record: PairRecord) -> int:
+        """Mid-exposure of the next pair. [ns]
+
+        Raises:
+            ValueError: it is not later than the last one of its sequence, or its sequence had ended.
+        """
+        name = f"frame {record.frame_index}"
+        if not 0 <= record.time_s < _LATEST_S:
+            raise ValueError(f"{name}: time_s: must be in [0, 2^31) for a time stamp, got {record.time_s:g}")
+        stamp_ns = round(record.time_s * 1e9)
+        self.is_first = self._last is None or record.sequence_id != self._last[0]
+        if self._last is not None:
+            if self.is_first:
+                self._ended.add(self._last[0])
+            elif stamp_ns <= self._last[1]:
+                raise ValueError(f"{name}: time_s: must be later than the pair's before it, got {record.time_s:g}")
+        if record.sequence_id in self._ended:
+            raise ValueError(f"{name}: sequence_id: {record.sequence_id} had ended before; pairs are out of order")
+        self._last = record.sequence_id, stamp_ns
+        return stamp_ns

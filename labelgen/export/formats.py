@@ -47,7 +47,7 @@ FORMATS: dict[str, ExportFormat] = {
     "yolo-detect": ExportFormat(
         "ultralytics boxes of drogue, markers and hub", "labelgen.export.yolo:write_yolo_detect"
     ),
-    "speed": ExportFormat("SPEED+ pose lists and camera, a folder an eye", "labelgen.export.speed_plus:write_speed"),
+    "speed": ExportFormat("SPEED+ pose lists and camera, a folder an eye", "labelgen.export.pose_lists:write_speed"),
     "kitti": ExportFormat("KITTI calibration, boxes and images", "labelgen.export.kitti:write_kitti"),
     "webdataset": ExportFormat(
         "tar shards of images, part ids and records", "labelgen.export.tar_shards:write_webdataset"
@@ -56,7 +56,7 @@ FORMATS: dict[str, ExportFormat] = {
     "rosbag": ExportFormat(
         "ROS 2 bags (MCAP): images, CameraInfo, TF, true pose", "labelgen.export.rosbag:write_rosbag", "exports"
     ),
-    "tum": ExportFormat("true trajectories as TUM text", "labelgen.export.tum:write_tum"),
+    "tum": ExportFormat("true trajectories as TUM text", "labelgen.export.pose_lists:write_tum"),
     "bop": ExportFormat(
         "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.bop:write_bop"
     ),

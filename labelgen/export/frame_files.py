@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from datasets_manifest.storage.image_codecs import decode_png, encode_png
 from datasets_manifest.storage.layout import image_file
-from datasets_manifest.storage.png import decode_png, encode_png
 from datasets_manifest.storage.reader import Dataset
 from geometry.stereo import Eye
 from labelgen.export.export_log import ExportLog

@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.calibration.calibration import opencv_stereo_matrices
+from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from labelgen.boxes import drogue_hull_m
 from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import place_image
 from labelgen.export.keypoints import count_cuts, view_of
+from labelgen.part_pixels import drogue_hull_m
 
 _NUMBER_OF_EYE: dict[Eye, int] = {"left": 2, "right": 3}
 # KITTI's own levels have no numbers; of the markers' area that should be seen, these shares divide ours.

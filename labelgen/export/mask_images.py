@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from datasets_manifest.atomic import new_folder
-from datasets_manifest.storage.png import encode_png
+from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
-from labelgen.part_masks import Mask, amodal_masks, joined, mask_parts, visible_mask_of
+from labelgen.segmentation_masks import Mask, amodal_masks, joined, mask_parts, visible_mask_of
 
 
 def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from datasets_manifest.calibration.calibration import opencv_stereo_matrices
+from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from geometry.stereo import EYES

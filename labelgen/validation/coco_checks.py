@@ -17,7 +17,7 @@ from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES, Eye
-from labelgen.export.coco_entries import DROGUE, coco_image_id
+from labelgen.export.coco import DROGUE, coco_image_id
 from labelgen.export.keypoints import view_of
 
 # COCO's boxes and keypoints are the records' numbers plus a half, rounded at most once.

@@ -3,32 +3,120 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.storage.frame_store import FrameStore
-from datasets_manifest.storage.layout import RECORD_FILE, parts_file
+from datasets_manifest.calibration.calibration_files import (
+    OPENCV_STEREO_FILE,
+    calibration_files,
+    opencv_stereo_matrices,
+)
+from datasets_manifest.storage.frame_store import (
+    FrameStore,
+    index_of_archive,
+    read_pairs_per_tar,
+    read_shard_index,
+    shard_numbers,
+)
+from datasets_manifest.storage.image_codecs import png_fault
+from datasets_manifest.storage.layout import CALIBRATION_FOLDER, RECORD_FILE, parts_file, shard_file, shard_index_file
 from datasets_manifest.storage.manifest import FrameEntry, Manifest, count_pairs
-from datasets_manifest.storage.png import png_fault
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.storage.storage import Location, Storage, open_storage
 from datasets_manifest.storage.writer import leftovers
 from datasets_manifest.types.records import PairRecord
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import drogue_part_ids
-from geometry.stereo import EYES, Eye
+from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.part_pixels import FeaturePixels, is_one_of
 from labelgen.validation.bag_checks import bag_faults, bag_files
-from labelgen.validation.calibration_checks import calibration_faults
 from labelgen.validation.coco_checks import CocoFiles
 from labelgen.validation.exr_checks import passes_faults
-from labelgen.validation.label_checks import check_boxes, check_empty, check_unoccluded_marker, named_features
-from labelgen.validation.projection_checks import box_faults, projection_faults
-from labelgen.validation.shard_checks import shard_faults
+from labelgen.validation.label_checks import (
+    box_faults,
+    check_boxes,
+    check_empty,
+    check_unoccluded_marker,
+    named_features,
+    projection_faults,
+)
+
+# The files hold 16 digits.
+_TOLERANCE = 1e-14
+
+
+def calibration_faults(dataset: Location, rig: StereoRig) -> list[str]:
+    """What is wrong with the files that are there; OpenCV's must be."""
+    storage, faults = open_storage(dataset), []
+    for name, text in calibration_files(rig).items():
+        path = storage.where(f"{CALIBRATION_FOLDER}/{name}")
+        try:
+            found = storage.read(f"{CALIBRATION_FOLDER}/{name}")
+        except FileNotFoundError:
+            if name == OPENCV_STEREO_FILE:
+                faults.append(f"{path}: is missing")
+            continue
+        except OSError as error:
+            faults.append(f"{path}: cannot be read: {error.strerror}")
+            continue
+        if found != text.encode():
+            faults.append(f"{path}: is not that of the manifest's rig")
+        elif name == OPENCV_STEREO_FILE:
+            # Only what is known not to be damaged is given to OpenCV's parser.
+            faults += _opencv_faults(path, text, rig)
+    return faults
+
+
+def _opencv_faults(path: str, text: str, rig: StereoRig) -> list[str]:
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    faults = []
+    for name, want in opencv_stereo_matrices(rig).items():
+        found = storage.getNode(name).mat()
+        if found is None or found.shape != want.shape or not np.allclose(found, want, rtol=_TOLERANCE, atol=1e-300):
+            faults.append(f"{path}: {name}: OpenCV reads {None if found is None else found.tolist()}")
+    return faults
+
+
+def shard_faults(storage: Storage) -> Iterator[tuple[str, list[str]]]:
+    """What is wrong with each tar file of a dataset, under the name of the check; nothing where it has none.
+
+    That the files in them are those of the records is checked frame by frame.
+    """
+    try:
+        pairs_per_tar = read_pairs_per_tar(storage)
+    except ValueError as error:
+        yield "tar files", [str(error)]
+        return
+    if pairs_per_tar is None:
+        return
+    for number in shard_numbers(storage):
+        yield "tar files", _faults(storage, number, pairs_per_tar)
+
+
+def _faults(storage: Storage, number: int, pairs_per_tar: int) -> list[str]:
+    where = storage.where(shard_file(number))
+    try:
+        listed = read_shard_index(storage, number)
+    except ValueError as error:
+        return [str(error)]
+    try:
+        with storage.open(shard_file(number)) as stream:
+            found = index_of_archive(stream)
+    except ValueError as error:
+        return [f"{where}: {error}"]
+    except OSError as error:
+        return [f"{where}: cannot be read: {error.strerror}"]
+    faults = []
+    if found != listed:
+        faults.append(f"{storage.where(shard_index_file(number))}: is not the list of {where}, which was changed")
+    stray = sorted(index for index in found.frames if index // pairs_per_tar != number)
+    if stray:
+        faults.append(f"{where}: frame {stray[0]} belongs to another tar file")
+    return faults
 
 
 class Check(FrozenModel):

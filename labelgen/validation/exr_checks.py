@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.storage.exr_passes import read_passes
+from datasets_manifest.storage.image_codecs import read_passes
 from datasets_manifest.storage.layout import passes_file
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PairRecord

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from datasets_manifest.atomic import PART_SUFFIX, new_folder
-from datasets_manifest.storage.locking import takes_lock
+from datasets_manifest.atomic import PART_SUFFIX, new_folder, takes_lock
 from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location

@@ -9,8 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from datasets_manifest.atomic import write_text_atomic
-from datasets_manifest.storage.locking import takes_lock
+from datasets_manifest.atomic import takes_lock, write_text_atomic
 from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.storage import Location
 from nav.detector.model_metadata import ModelMetadata

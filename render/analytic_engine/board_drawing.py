@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from datasets_manifest.types.calibration_board import CalibrationBoard, PlacedBoard
+from datasets_manifest.types.appearance import CalibrationBoard, PlacedBoard
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
 from geometry.se3 import Array

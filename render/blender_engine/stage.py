@@ -7,10 +7,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.materials import part_satin
-from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
-from drogue_models.parts import FIRST_MARKER_ID, Part, part_name
+from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh
+from drogue_models.parts import FIRST_MARKER_ID, Part, part_name, part_satin
 from drogue_models.solids import with_creases
+from drogue_models.tanker import tanker_mesh
 from render.blender_engine.messages import FrameSetup, Light, Look, PartMesh, StageThings
 from render.surfaces import (
     SMOOTH_PARTS,

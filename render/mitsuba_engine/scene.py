@@ -19,11 +19,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.materials import part_satin
-from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh, tanker_mesh
+from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh
 from drogue_models.parameters import SatinPaint
-from drogue_models.parts import FIRST_MARKER_ID, Part
+from drogue_models.parts import FIRST_MARKER_ID, Part, part_satin
 from drogue_models.solids import with_creases
+from drogue_models.tanker import tanker_mesh
 from geometry.se3 import RigidTransform
 from render.mitsuba_engine.jit_arrays import jit_array, jit_tensor
 from render.surfaces import (

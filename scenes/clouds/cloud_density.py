@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.types.weather import CloudLayer
+from datasets_manifest.types.environment import CloudLayer
 
 _SIZE_PX = 1024
 # Periods of the texture held by one repeat: the largest blobs are 1/8 of it, so repeats are not seen at once.

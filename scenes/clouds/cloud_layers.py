@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.weather import CloudLayer
+from datasets_manifest.types.environment import CloudLayer
 from scenes.clouds.cloud_density import CloudDensity
 from scenes.clouds.ray_march import march
 from scenes.ground_view import pixel_angle_rad

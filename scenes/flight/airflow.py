@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from datasets_manifest.types.turbulence import SLOWEST_M_S, Turbulence
+from datasets_manifest.types.environment import SLOWEST_M_S, Turbulence
 from geometry.se3 import Array
 
 GUST_PERIOD_S = 0.02

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.recipe.dropout_ranges import LossRanges
+from datasets_manifest.recipe.sequence_ranges import LossRanges
 from datasets_manifest.types.appearance import Bystander
-from datasets_manifest.types.dropout import Loss
-from drogue_models.bystanders import BystanderShape
+from datasets_manifest.types.frame import Loss
+from drogue_models.obstacles import BystanderShape
 from drogue_models.parameters import ReflectanceRgb
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets_manifest.types.appearance import Bystander
-from datasets_manifest.types.dropout import Loss
+from datasets_manifest.types.frame import Loss
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 

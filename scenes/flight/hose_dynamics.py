@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg.lapack import dgtsv
 from scipy.optimize import brentq
 
-from datasets_manifest.recipe.hose import HoseParameters
+from datasets_manifest.recipe.sequence_ranges import HoseParameters
 from geometry.se3 import Array, angles_from_axis, rotation_from_angles
 
 LINKS = 16

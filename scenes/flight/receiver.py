@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from datasets_manifest.recipe.pose_ranges import Pose
+from datasets_manifest.recipe.drogue_ranges import Pose
 from datasets_manifest.recipe.sequence_ranges import (
     CLOSURE_ACCELERATION_M_S2,
     Follower,

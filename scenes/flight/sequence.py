@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.pose_ranges import Pose
+from datasets_manifest.recipe.drogue_ranges import Pose
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges
 from drogue_models.parameters import DrogueParameters

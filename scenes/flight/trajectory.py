@@ -13,8 +13,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq
 
-from datasets_manifest.recipe.hose import HoseParameters
-from datasets_manifest.recipe.sequence_ranges import Follower
+from datasets_manifest.recipe.sequence_ranges import Follower, HoseParameters
 from geometry.se3 import Array
 from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
 from scenes.flight.hose_dynamics import LINKS, TIME_STEP_S, HoseModel, HoseState, mouth_directions

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.storage.exr_passes import decode_exr
-from datasets_manifest.types.environment_map import EnvironmentMap, read_map_file
+from datasets_manifest.storage.image_codecs import decode_exr
+from datasets_manifest.types.environment import EnvironmentMap, read_map_file
 from scenes.sky.light import Radiance, luminance
 
 _SMALLEST_PX = 16

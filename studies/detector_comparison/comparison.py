@@ -11,9 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from datasets_manifest.atomic import write_text_atomic
+from datasets_manifest.atomic import takes_lock, write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset
-from datasets_manifest.storage.locking import takes_lock
 from datasets_manifest.storage.reader import Dataset
 from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
 from droguekit.benchmark.results.detection_result import write_detections

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from datasets_manifest.atomic import new_folder, write_text_atomic
+from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.manifest import SplitName
-from datasets_manifest.storage.png import encode_png
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PixelBox
 from geometry.stereo import EYES

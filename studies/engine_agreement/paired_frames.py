@@ -11,7 +11,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from datasets_manifest.atomic import write_text_atomic
-from datasets_manifest.recipe.pose_ranges import DistanceLaw
+from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import FrameCounts, Recipe, RenderSettings, load_recipe, recipe_names
 from datasets_manifest.types.frame import FrameSpec
 from render.engine import RenderEngine, StereoRadiance

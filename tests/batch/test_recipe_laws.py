@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare, kstest
 
-from datasets_manifest.recipe.pose_ranges import DistanceLaw
+from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe, load_recipe, parse_recipe
 from droguekit.batch.recipe_plan import check_places, check_sizes, chi_square, distance_share, draw_frames, plan_recipe
 from scenes.framing import sample_distance_m

@@ -11,7 +11,7 @@ from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from droguekit.batch.recipe_plan import draw_frames, plan_recipe
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
-from labelgen.boxes import full_box
+from labelgen.part_pixels import full_box
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
 RECIPE = """

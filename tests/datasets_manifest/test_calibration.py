@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from datasets_manifest.calibration.calibration import opencv_stereo_matrices, write_calibration
+from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices, write_calibration
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import StereoRig, paper_rig
 

@@ -5,10 +5,13 @@ import numpy as np
 import pytest
 import yaml
 
-from datasets_manifest.calibration.calibration import calibration_files, write_calibration
-from datasets_manifest.calibration.kalibr import kalibr_camchain
-from datasets_manifest.calibration.ros import camera_info
-from datasets_manifest.calibration.yaml_text import yaml_number
+from datasets_manifest.calibration.calibration_files import (
+    calibration_files,
+    camera_info,
+    kalibr_camchain,
+    write_calibration,
+    yaml_number,
+)
 from datasets_manifest.recipe.rigs import resolve_rig
 from geometry.stereo import EYES, paper_rig
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.storage.png import decode_png, encode_png
+from datasets_manifest.storage.image_codecs import decode_png, encode_png
 
 
 @pytest.mark.parametrize(("shape", "dtype", "high"), [((5, 7, 3), np.uint8, 256), ((5, 7), np.uint8, 256)])

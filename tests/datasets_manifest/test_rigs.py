@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration.calibration import opencv_stereo_matrices, write_calibration
+from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices, write_calibration
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from datasets_manifest.recipe.rigs import resolve_rig
-from datasets_manifest.types.json_types import write_rig
+from datasets_manifest.types.field_types import write_rig
 from geometry.stereo import EYES
 
 TABLE = """

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drogue_models.bystanders import SECTIONS, BystanderShape
 from drogue_models.meshes import bystander_mesh
+from drogue_models.obstacles import OBSTACLE_SECTIONS, BystanderShape
 from drogue_models.solids import with_creases
 
 SHAPES = [
@@ -68,7 +68,7 @@ def test_normals_of_a_tube_are_not_tilted_by_its_ends():
     vertices, normals = probe.vertices, probe.vertex_normals
     # Past the nozzle's last corner there is nothing but the tube, and its end cap.
     tube = (vertices[:, 2] > 0.04 * 6.0 - 1e-9) & (np.abs(normals[:, 2]) < 0.9)
-    assert tube.sum() >= 2 * SECTIONS
+    assert tube.sum() >= 2 * OBSTACLE_SECTIONS
     on_nozzle = tube & (np.abs(normals[:, 2]) > 0.3)
     assert np.abs(normals[tube & ~on_nozzle, 2]).max() < 1e-6
     assert (vertices[on_nozzle, 2] < 0.04 * 6.0 + 1e-9).all()

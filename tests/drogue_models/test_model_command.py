@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from drogue_models.materials import part_reflectance_rgb
 from drogue_models.meshes import drogue_meshes
-from drogue_models.parts import part_name
+from drogue_models.parts import part_name, part_reflectance_rgb
 from drogue_models.presets import PRESETS
 from droguekit.cli.main import run
 

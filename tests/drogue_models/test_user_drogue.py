@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from drogue_models.example_body import example_body
-from drogue_models.meshes import drogue_meshes
+from drogue_models.meshes import drogue_meshes, example_body
 from drogue_models.parameters import DrogueParameters, even_ring
 from drogue_models.parts import Part
 from drogue_models.presets import load_drogue

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datasets_manifest.storage.blind import BlindDataset
-from datasets_manifest.storage.exr_passes import read_passes
+from datasets_manifest.storage.image_codecs import read_passes
 from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import canonical_json

@@ -14,15 +14,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datasets_manifest.calibration.calibration import opencv_stereo
+from datasets_manifest.calibration.calibration_files import opencv_stereo
 from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo, rig_of_calibration
 from datasets_manifest.importers.ros_bag import RosBag
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
 from datasets_manifest.recipe.rigs import resolve_rig
-from datasets_manifest.storage.exr_passes import decode_exr, read_passes
+from datasets_manifest.storage.image_codecs import decode_exr, decode_png, read_passes
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.manifest import read_manifest
-from datasets_manifest.storage.png import decode_png
 from datasets_manifest.types.estimates import read_estimates
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export

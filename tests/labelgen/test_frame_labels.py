@@ -8,8 +8,8 @@ from drogue_models.meshes import drogue_meshes
 from drogue_models.parts import drogue_part_ids
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from labelgen.boxes import drogue_hull_m, full_box, visible_box
 from labelgen.frame_labels import label_frame
+from labelgen.part_pixels import drogue_hull_m, full_box, visible_box
 
 
 def views_of(pair):

@@ -4,8 +4,8 @@ import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.appearance import Bystander
-from drogue_models.bystanders import BystanderShape
 from drogue_models.marker_layout import marker_layout
+from drogue_models.obstacles import BystanderShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
@@ -13,8 +13,7 @@ from labelgen.discs import marker_discs
 from labelgen.export.export_log import ExportLog
 from labelgen.export.mask_images import write_masks
 from labelgen.frame_labels import label_frame
-from labelgen.part_masks import OCCLUDERS, amodal_masks, joined, mask_parts, visible_mask_of
-from labelgen.part_meshes import part_triangles
+from labelgen.segmentation_masks import OCCLUDERS, amodal_masks, joined, mask_parts, part_triangles, visible_mask_of
 from labelgen.silhouettes import silhouette
 from render.analytic_engine.engine import AnalyticEngine
 from render.camera.sensor import expose

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.storage.exr_passes import read_passes
+from datasets_manifest.storage.image_codecs import read_passes
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.manifest import Drop, build_manifest, read_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame

@@ -13,7 +13,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from datasets_manifest.importers.imported_dataset import ImportSettings, write_imported
-from datasets_manifest.importers.pair_source import SourcePair
+from datasets_manifest.importers.imported_pairs import SourcePair
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, read_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, WRONG_INPUT, run

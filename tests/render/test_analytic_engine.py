@@ -12,7 +12,7 @@ import shapely
 from scipy.special import j1
 
 from datasets_manifest.recipe.recipe import RecipeSource, load_recipe
-from datasets_manifest.types.ranges import Range
+from datasets_manifest.types.field_types import Range
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from droguekit.batch.progress import PlainProgress

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.types.weather import CloudLayer
+from datasets_manifest.types.environment import CloudLayer
 from geometry.se3 import RigidTransform
 from render.background import add_stars, background
 from scenes.environment_radiance import surroundings

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.appearance import Bystander
-from drogue_models.bystanders import BystanderShape
 from drogue_models.marker_layout import marker_layout
+from drogue_models.obstacles import BystanderShape
 from drogue_models.parameters import SatinPaint
 from drogue_models.parts import Part, drogue_part_ids
 from geometry.circles import disc_area_px2, project_disc_centers

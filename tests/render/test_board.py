@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration.calibration import opencv_stereo_matrices
+from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
-from datasets_manifest.storage.png import encode_png
-from datasets_manifest.types.calibration_board import CalibrationBoard
+from datasets_manifest.storage.image_codecs import encode_png
+from datasets_manifest.types.appearance import CalibrationBoard
 from drogue_models.parts import Part
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.types.weather import CloudLayer
+from datasets_manifest.types.environment import CloudLayer
 from render.camera.optics import glare_spread_per_sr, sun_glare
 from render.engine import EyeRadiance
 from scenes.clouds.cloud_layers import opacity_towards

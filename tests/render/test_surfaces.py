@@ -7,7 +7,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.appearance import Bystander, DrogueCondition, SurfaceCondition
-from drogue_models.bystanders import BystanderShape
+from drogue_models.obstacles import BystanderShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from render.engine import load_engine

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.dropout_ranges import LossRanges
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.sequence_ranges import LossRanges
 from drogue_models.parts import Part
 from geometry.se3 import log_twist
 from geometry.stereo import EYES
-from labelgen.boxes import drogue_hull_m
+from labelgen.part_pixels import drogue_hull_m
 from scenes.flight.dropouts import LossEvent, flown_m, sample_loss
 from scenes.sampler import sample_frame
 from scenes.sky.light import direction_from_angles

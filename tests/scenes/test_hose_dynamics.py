@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.hose import HOSES
-from datasets_manifest.recipe.sequence_ranges import Follower
+from datasets_manifest.recipe.sequence_ranges import HOSES, Follower
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.hose_dynamics import GRAVITY_M_S2, LINKS, TIME_STEP_S, HoseModel, HoseState
 from scenes.flight.trajectory import Surroundings, simulate

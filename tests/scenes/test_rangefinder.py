@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.recipe.rangefinder import Rangefinder
 from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.rigs import Rangefinder
 from scenes.sampler import sample_frame, sample_reading_m
 
 RECIPE = """

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from datasets_manifest.calibration.calibration import write_calibration
+from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datasets_manifest.calibration.calibration import write_calibration
+from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import write_frame

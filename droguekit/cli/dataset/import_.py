@@ -11,7 +11,7 @@ from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import output_option
 
 if TYPE_CHECKING:
-    from datasets_manifest.importers.pair_source import PairSource
+    from datasets_manifest.importers.imported_pairs import PairSource
     from geometry.stereo import StereoRig
 
 EXAMPLES = (
@@ -54,8 +54,7 @@ def import_(
     Pixels stay as they are: the rig's eyes get the calibration's distortion and rotation, and navigation rectifies what
     it measures.
     """
-    from datasets_manifest.importers.given_boxes import read_boxes
-    from datasets_manifest.importers.imported_dataset import ImportSettings, write_imported
+    from datasets_manifest.importers.imported_dataset import ImportSettings, read_boxes, write_imported
     from drogue_models.presets import load_drogue
 
     if encoding not in (None, "linear", "gamma"):

@@ -53,7 +53,7 @@ def _encode(drogue: DrogueParameters, parts: dict[str, tuple[int, Any]], suffix:
     """The file's contents."""
     import trimesh
 
-    from drogue_models.materials import part_reflectance_rgb
+    from drogue_models.parts import part_reflectance_rgb
 
     scene = trimesh.Scene()
     colored = []

@@ -18,8 +18,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from datasets_manifest.atomic import PART_SUFFIX, write_text_atomic
-from datasets_manifest.storage.locking import takes_lock
+from datasets_manifest.atomic import PART_SUFFIX, takes_lock, write_text_atomic
 from datasets_manifest.storage.storage import Location, absolute
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
 from droguekit.batch.progress import ProgressReport

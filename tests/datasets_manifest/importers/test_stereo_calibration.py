@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.calibration.calibration import calibration_files
+from datasets_manifest.calibration.calibration_files import calibration_files
 from datasets_manifest.calibration.stereo_calibration import StereoCalibration, read_opencv_stereo, rig_of_calibration
 from datasets_manifest.recipe.rigs import resolve_rig
 from geometry.stereo import EYES, StereoRig

@@ -14,9 +14,7 @@ from datasets_manifest.storage.reader import Dataset
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
-from labelgen.export.coco import write_coco
-from labelgen.export.coco_entries import DROGUE, HUB, MARKER, coco_image_id
-from labelgen.export.coco_symmetry import rolled_to_truth
+from labelgen.export.coco import DROGUE, HUB, MARKER, coco_image_id, rolled_to_truth, write_coco
 from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import equal_orders
 

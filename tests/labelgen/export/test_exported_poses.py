@@ -13,11 +13,11 @@ from datasets_manifest.storage.reader import Dataset
 from drogue_models.marker_layout import marker_layout
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from labelgen.boxes import drogue_hull_m
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
 from labelgen.export.kitti import kitti_label
+from labelgen.part_pixels import drogue_hull_m
 
 
 def rotation_of_scalar_first(quaternion: list[float]) -> np.ndarray:

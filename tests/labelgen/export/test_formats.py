@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
-from datasets_manifest.storage.png import encode_png
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PairRecord
-from labelgen.export.export_log import ExportLog
+from labelgen.export.export_log import ExportLog, SequenceOrder
 from labelgen.export.formats import write_export
-from labelgen.export.sequences import SequenceOrder
 
 
 def stamped(record: PairRecord, sequence_id: int | None, time_s: float) -> PairRecord:

@@ -29,7 +29,7 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import RunSummary, render_dataset
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.stereo import EYES
-from labelgen.boxes import full_box
+from labelgen.part_pixels import full_box
 from render.version import RENDER_VERSION
 from scenes.sampler import sample_left_from_drogue, split_of_scenes
 from studies.publish.__main__ import PUBLISHED, publish

@@ -11,7 +11,7 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import Metres
 from geometry.se3 import Array
 
-SECTIONS = 64
+OBSTACLE_SECTIONS = 64
 # (radius, z) of a probe's nozzle per radius of its tube: a bulb, then a waist (our choice of proportions).
 PROBE_PROFILE = ((0.55, 0.0), (0.80, 0.12), (0.95, 0.35), (0.95, 1.6), (0.62, 2.2), (0.62, 5.2), (1.0, 6.0))
 
@@ -45,12 +45,12 @@ class BystanderShape(FrozenModel):
                 high_m = low_m + self.length_m
                 profile = np.array([[0.0, low_m], [self.radius_m, low_m], [self.radius_m, high_m], [0.0, high_m]])
             case "ball":
-                angle = np.linspace(-np.pi / 2, np.pi / 2, SECTIONS // 2 + 1)
+                angle = np.linspace(-np.pi / 2, np.pi / 2, OBSTACLE_SECTIONS // 2 + 1)
                 profile = self.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
                 # The cosine of a right angle is not exactly 0.
                 profile[[0, -1], 0] = 0.0
             case "ring":
-                angle = 2 * np.pi * np.arange(SECTIONS // 2) / (SECTIONS // 2)
+                angle = 2 * np.pi * np.arange(OBSTACLE_SECTIONS // 2) / (OBSTACLE_SECTIONS // 2)
                 tube = self.tube_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
                 profile = np.array([self.radius_m, 0.0]) + tube
         return profile
