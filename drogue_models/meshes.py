@@ -12,7 +12,7 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from drogue_models.obstacles import OBSTACLE_SECTIONS, BystanderShape
+from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
 from drogue_models.parameters import BodyMesh, DrogueParameters, HubParameters
 from drogue_models.parts import Part, marker_id
 from drogue_models.solids import area_radius_m, bar, circle_m, loft, plate, pocketed_plate, revolve
@@ -187,7 +187,7 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
     return meshes
 
 
-def bystander_mesh(shape: BystanderShape) -> trimesh.Trimesh:
+def obstacle_mesh(shape: ObstacleShape) -> trimesh.Trimesh:
     """A closed mesh of a bystander in its own frame. [m]"""
     return revolve(shape.profile_m(), OBSTACLE_SECTIONS)
 

@@ -16,7 +16,7 @@ OBSTACLE_SECTIONS = 64
 PROBE_PROFILE = ((0.55, 0.0), (0.80, 0.12), (0.95, 0.35), (0.95, 1.6), (0.62, 2.2), (0.62, 5.2), (1.0, 6.0))
 
 
-class BystanderShape(FrozenModel):
+class ObstacleShape(FrozenModel):
     """A body of revolution about its own z axis.
 
     Attributes:

@@ -115,7 +115,7 @@ def hub_discs(
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class PixelWindow:
     """A rectangle of pixels.
 
     Attributes:
@@ -128,7 +128,7 @@ class Window:
     pixels_px: Array
 
 
-def window_around(disc: DiscInEye, factor: float) -> Window | None:
+def window_around(disc: DiscInEye, factor: float) -> PixelWindow | None:
     """The pixels of the image near a disc, or None where its surroundings lie outside.
 
     Args:
@@ -141,7 +141,7 @@ def window_around(disc: DiscInEye, factor: float) -> Window | None:
     if not columns or not rows:
         return None
     u, v = np.meshgrid(np.array(columns, dtype=np.float64), np.array(rows, dtype=np.float64))
-    return Window(slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1), np.stack([u, v], axis=-1))
+    return PixelWindow(slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1), np.stack([u, v], axis=-1))
 
 
 def _within(middle_px: float, reach_px: float, size_px: int) -> range:

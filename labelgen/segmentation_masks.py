@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.records import PairRecord
-from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh
+from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids, part_name
 from drogue_models.tanker import tanker_mesh
 from geometry.se3 import Array, RigidTransform
@@ -40,7 +40,7 @@ def part_triangles(frame: FrameSpec, eye: Eye) -> dict[int, Array]:
             meshes.append((int(Part.TANKER), tanker_mesh(), frame.left_from_tanker))
     for bystander in frame.bystanders:
         part = int(Part[bystander.kind.upper()])
-        meshes.append((part, bystander_mesh(bystander.shape), bystander.left_from_object))
+        meshes.append((part, obstacle_mesh(bystander.shape), bystander.left_from_object))
     offset_m = frame.rig.eye_offset_m(eye)
     found: dict[int, list[Array]] = {}
     for part, mesh, left_from_mesh in meshes:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.environment import CloudLayer
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import BACK_SCATTER, CloudLight, diffuse_transmission, opacity_towards
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.light import Radiance, hemisphere, henyey_greenstein

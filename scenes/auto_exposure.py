@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.recipe.rigs import ExposureLaw
-from datasets_manifest.types.frame import Environment, Exposure, Sensor
+from datasets_manifest.types.environment import Environment
+from datasets_manifest.types.frame import Exposure, Sensor
 from drogue_models.parameters import WHITE_PAINT
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.drogue_ranges import TargetRanges
+from datasets_manifest.recipe.drogue_ranges import AppearanceRanges
 from datasets_manifest.recipe.recipe import Recipe
-from datasets_manifest.types.appearance import Bystander, DrogueCondition, SurfaceCondition
-from drogue_models.obstacles import BystanderShape
+from datasets_manifest.types.appearance import DrogueCondition, Obstacle, SurfaceCondition
+from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters, ReflectanceRgb
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
@@ -51,7 +51,7 @@ def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) 
     return None if condition == as_new else condition
 
 
-def _sample_surface(rng: np.random.Generator, ranges: TargetRanges, missing: bool) -> SurfaceCondition:
+def _sample_surface(rng: np.random.Generator, ranges: AppearanceRanges, missing: bool) -> SurfaceCondition:
     dirty, failed = rng.random(2) < (ranges.dirty_marker_fraction, ranges.failed_lamp_fraction)
     dirt, lamp = draw(rng, ranges.dirt_fraction), draw(rng, ranges.lamp_fraction)
     seed, reflectance = int(rng.integers(2**31)), draw(rng, ranges.marker_reflectance_fraction)
@@ -66,7 +66,7 @@ def _sample_surface(rng: np.random.Generator, ranges: TargetRanges, missing: boo
 
 def sample_bystanders(
     rng: np.random.Generator, recipe: Recipe, left_from_drogue: RigidTransform | None
-) -> tuple[Bystander, ...]:
+) -> tuple[Obstacle, ...]:
     """Probe, obstacle and distractors of one frame.
 
     Args:
@@ -88,26 +88,26 @@ def sample_bystanders(
     return (*found, *(distractors if distracted else ()))
 
 
-def _probe(recipe: Recipe) -> Bystander:
+def _probe(recipe: Recipe) -> Obstacle:
     """The receiver's probe: its tip where the rig has it, its tube backwards along the body's axis."""
     left_from_body = recipe.rig.body_from_left.inverse()
     tip_m = left_from_body.apply(recipe.rig.probe_tip_body_m)
     backwards = left_from_body.rotate(np.array([-1.0, 0.0, 0.0]))
-    return Bystander(
+    return Obstacle(
         kind="probe",
-        shape=BystanderShape(form="probe", radius_m=recipe.target.probe_radius_m, length_m=_PROBE_LENGTH_M),
+        shape=ObstacleShape(form="probe", radius_m=recipe.target.probe_radius_m, length_m=_PROBE_LENGTH_M),
         left_from_object=RigidTransform(rotation_with_z(backwards), tip_m),
         reflectance_rgb=_PROBE_GREY,
     )
 
 
-def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Bystander:
+def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Obstacle:
     """A thin rod across the view half a metre or so before the cameras, like a pitot tube or a frame of the canopy."""
     depth_m, turn = rng.uniform(0.5, 1.3), rng.uniform(0.0, np.pi)
     place = _point_in_view(rng, rig, depth_m)
     along = np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)])
-    shape = BystanderShape(form="bar", radius_m=rng.uniform(0.003, 0.008), length_m=3.0)
-    return Bystander(
+    shape = ObstacleShape(form="bar", radius_m=rng.uniform(0.003, 0.008), length_m=3.0)
+    return Obstacle(
         kind="obstacle",
         shape=shape,
         left_from_object=RigidTransform(rotation_with_z(along / np.linalg.norm(along)), place),
@@ -115,17 +115,17 @@ def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Bystander:
     )
 
 
-def _sample_distractor(rng: np.random.Generator, recipe: Recipe, nearest_m: float) -> Bystander:
+def _sample_distractor(rng: np.random.Generator, recipe: Recipe, nearest_m: float) -> Obstacle:
     """Something round beyond a distance: a ball, a plate or a ring, about as large in the image as a drogue."""
     depth_m = nearest_m + 40.0 * rng.random() ** 2
     size_m = float(rng.uniform(0.1, 0.45)) * max(1.0, depth_m / 12.0)
     forms = recipe.target.distractor_forms
     form = forms[int(rng.integers(len(forms)))]
-    shape = BystanderShape(form=form, radius_m=size_m, length_m=0.02, tube_radius_m=size_m * rng.uniform(0.08, 0.3))
+    shape = ObstacleShape(form=form, radius_m=size_m, length_m=0.02, tube_radius_m=size_m * rng.uniform(0.08, 0.3))
     pitch, yaw, roll = np.radians(rng.uniform(-1.0, 1.0, 3) * (40.0, 40.0, 180.0))
     attitude = rotation_from_angles(pitch, yaw, roll)
     paint = _DISTRACTOR_PAINTS[int(rng.integers(len(_DISTRACTOR_PAINTS)))]
-    return Bystander(
+    return Obstacle(
         kind="distractor",
         shape=shape,
         left_from_object=RigidTransform(attitude, _point_in_view(rng, recipe.rig, depth_m)),

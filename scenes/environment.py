@@ -5,10 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.environment_ranges import Clouds, EnvironmentRanges, MistRanges, MoonRanges
-from datasets_manifest.types.environment import CloudLayer, EnvironmentMap, GroundKind, MapRanges, Mist, Moon
+from datasets_manifest.recipe.environment_ranges import (
+    Clouds,
+    EnvironmentMapRanges,
+    EnvironmentRanges,
+    MistRanges,
+    MoonRanges,
+)
+from datasets_manifest.types.environment import CloudLayer, Environment, EnvironmentMap, GroundKind, Mist, Moon
 from datasets_manifest.types.field_types import Range
-from datasets_manifest.types.frame import Environment
 from drogue_models.parameters import ReflectanceRgb
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE
 from scenes.sky.equirectangular_sky import load_map
@@ -61,7 +66,7 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
     )
 
 
-def _mapped(environment: Environment, ranges: MapRanges, rng: np.random.Generator) -> Environment:
+def _mapped(environment: Environment, ranges: EnvironmentMapRanges, rng: np.random.Generator) -> Environment:
     """The environment with a map for its sky and ground; the sun, if the map has one, is where it is in the map."""
     environment_map = EnvironmentMap(
         path=ranges.path,

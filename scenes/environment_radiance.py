@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.environment import CloudLayer
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.air_light import HORIZON_ELEVATION_RAD, LayeredAir
 from scenes.clouds.cloud_layers import band_limited, see_cloud
 from scenes.clouds.ray_march import enlarge

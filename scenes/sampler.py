@@ -10,7 +10,8 @@ from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.recipe import Family, Recipe
 from datasets_manifest.recipe.rigs import Rangefinder
 from datasets_manifest.types.appearance import PlacedBoard
-from datasets_manifest.types.frame import Environment, FrameSpec
+from datasets_manifest.types.environment import Environment
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from scenes.auto_exposure import meter

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from datasets_manifest.importers.imported_pairs import SourcePair
+from datasets_manifest.importers.imported_dataset import VIEW_FOLDERS, ImportedPair, image_key
 from datasets_manifest.types.images import Pixels
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
-# Two folders of equal names, in the order in which they are looked for.
-_FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("L", "R"))
 # What tells the views apart in a file's name, at its beginning or its end.
 _SIDE = re.compile(
     r"^(?:(?P<first>left|right|l[-_. ]|r[-_. ])[-_. ]?)?(?P<rest>.*?)(?:[-_. ]?(?P<last>left|right|[-_. ][lr]))?$", re.I
 )
-
-
-_VIEW_FOLDERS = {name for names in _FOLDERS for name in names}
 
 
 class ImageFolder:
@@ -57,7 +52,7 @@ class ImageFolder:
         self._pairs = pairs
         self.count = len(pairs)
 
-    def __iter__(self) -> Iterator[SourcePair]:
+    def __iter__(self) -> Iterator[ImportedPair]:
         for place, (left, right) in enumerate(self._pairs):
             time_s = place / self._rate_hz
             if self._is_side_by_side:
@@ -67,14 +62,9 @@ class ImageFolder:
                         f"{left}: must be two views of {self._width_px} px side by side, or have a partner named "
                         f"left or right, got a width of {both.shape[1]} px"
                     )
-                yield SourcePair((left.name, left.name), time_s, both[:, : self._width_px], both[:, self._width_px :])
+                yield ImportedPair((left.name, left.name), time_s, both[:, : self._width_px], both[:, self._width_px :])
             else:
-                yield SourcePair((image_key(left), image_key(right)), time_s, read_image(left), read_image(right))
-
-
-def image_key(path: PurePath) -> str:
-    """An image's own name, with its folder where that tells the views apart."""
-    return f"{path.parent.name}/{path.name}" if path.parent.name in _VIEW_FOLDERS else path.name
+                yield ImportedPair((image_key(left), image_key(right)), time_s, read_image(left), read_image(right))
 
 
 def read_image(path: Path) -> Pixels:
@@ -104,7 +94,7 @@ def _images(folder: Path) -> list[Path]:
 def _pairs(folder: Path) -> tuple[list[tuple[Path, Path]], tuple[str, ...]]:
     """Pairs of two files, in the order of their names, and files without a partner."""
     views: tuple[dict[str, Path], dict[str, Path]] = ({}, {})
-    for names in _FOLDERS:
+    for names in VIEW_FOLDERS:
         if all((folder / name).is_dir() for name in names):
             for view, name in zip(views, names, strict=True):
                 for path in _images(folder / name):

@@ -1,19 +1,17 @@
-"""Imported pairs as a dataset without truth, but for boxes that somebody drew."""
+"""Imported stereo pairs as a dataset without truth, but for boxes that somebody drew."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
-from typing import Any, Final, Literal
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 
 from datasets_manifest.atomic import new_folder
 from datasets_manifest.calibration.calibration_files import calibration_files
-from datasets_manifest.importers.image_folder import image_key
-from datasets_manifest.importers.imported_pairs import PairSource, SourcePair
 from datasets_manifest.recipe.rigs import SENSORS
 from datasets_manifest.storage.blind import BlindIndex
 from datasets_manifest.storage.image_codecs import encode_png
@@ -32,6 +30,200 @@ from datasets_manifest.types.images import Pixels
 from datasets_manifest.types.records import PixelBox
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, StereoRig
+
+VIEW_FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("L", "R"))
+"""Names of the two folders of a dataset with a folder a view, in the order in which they are looked for."""
+
+# What deep images are kept in.
+_KEPT_BITS: Final = 12
+
+_DEEPEST_BITS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedPair:
+    """One stereo pair of somebody's camera.
+
+    Attributes:
+        names: of the left and the right image where it came from.
+        time_s: mid-exposure, or what its source has for it. [s]
+        left, right: (H, W, 3) red, green, blue, or (H, W) grey.
+    """
+
+    names: tuple[str, str]
+    time_s: float
+    left: Pixels
+    right: Pixels
+
+
+class ImportedPairs(Protocol):
+    """Stereo pairs in the order of time.
+
+    Attributes:
+        count: how many there are.
+        left_out: what has no partner or is nothing to import, and why.
+    """
+
+    count: int
+    left_out: tuple[str, ...]
+
+    def __iter__(self) -> Iterator[ImportedPair]:
+        """The pairs, each read when it is asked for.
+
+        Raises:
+            ValueError: one that cannot be read; names it.
+        """
+        ...
+
+
+def image_key(path: PurePath) -> str:
+    """An image's own name, with its folder where that tells the views apart."""
+    is_view = any(path.parent.name in names for names in VIEW_FOLDERS)
+    return f"{path.parent.name}/{path.name}" if is_view else path.name
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """What the images themselves do not tell.
+
+    Attributes:
+        name: of the dataset.
+        rig: that took them.
+        drogue: what to look for.
+        encoding: of the numbers; by default `gamma` for 8 bit and `linear` for deeper images.
+        black_level_dn: number that no light gives, in the source's numbers. [DN]
+        bits: how many bits of deep images are used; by default what the first pair needs.
+        exposure_s: how long the shutter was open; 0 where nobody knows. [s]
+        boxes: around the drogue, by image name.
+    """
+
+    name: str
+    rig: StereoRig
+    drogue: DrogueParameters
+    encoding: Literal["linear", "gamma"] | None = None
+    black_level_dn: float = 0.0
+    bits: int | None = None
+    exposure_s: float = 0.0
+    boxes: Mapping[str, list[PixelBox]] | None = None
+
+
+def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, advance: Callable[[], None]) -> int:
+    """Write the pairs of a source as a dataset without truth.
+
+    Args:
+        source: the pairs.
+        settings: what else is to be known.
+        out: the dataset's folder; must not be there yet.
+        advance: called after each pair.
+
+    Returns:
+        How many of the boxes found their image.
+
+    Raises:
+        ValueError: an image that cannot be read, or of another size, depth or colour than rig and first pair.
+        OSError: it cannot be written; nothing is left behind.
+    """
+    depth: _Depth | None = None
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    with new_folder(out) as folder:
+        for frame_index, pair in enumerate(source):
+            depth = depth or _Depth(pair, settings.bits)
+            target = frame_folder(folder, frame_index)
+            target.mkdir(parents=True)
+            for eye, name, image in zip(EYES, pair.names, (pair.left, pair.right), strict=True):
+                pixels = depth.checked(image, name, settings.rig)
+                (target / image_file(eye)).write_bytes(encode_png(pixels))
+            _write(target / RECORD_FILE, _record(pair, settings, depth.kept_level_dn(settings.black_level_dn)))
+            boxes = boxes_of_pair(settings.boxes or {}, pair.names, settings.rig.camera.width_px)
+            for view, box in enumerate(boxes):
+                image_id = 2 * frame_index + view + 1
+                images.append(_coco_image(image_id, frame_index, view, settings.rig))
+                if box is not None:
+                    annotations.append(_coco_box(image_id, box))
+            advance()
+        assert depth is not None  # a source without pairs was refused
+        _write(folder / BLIND_FILE, _index(settings, depth, source.count).model_dump(mode="json"))
+        for name, text in calibration_files(settings.rig).items():
+            (folder / CALIBRATION_FOLDER).mkdir(exist_ok=True)
+            (folder / CALIBRATION_FOLDER / name).write_text(text, encoding="utf-8")
+        if settings.boxes is not None:
+            categories = [{"id": 1, "name": "drogue", "supercategory": "target"}]
+            table = {"images": images, "annotations": annotations, "categories": categories}
+            (folder / ANNOTATIONS_FOLDER).mkdir()
+            _write(folder / ANNOTATIONS_FOLDER / "all.json", table)
+    return len(annotations)
+
+
+class _Depth:
+    """Colour and depth of all images, as the first pair's are."""
+
+    def __init__(self, pair: ImportedPair, bits: int | None) -> None:
+        image = pair.left
+        self.color: Literal["rgb", "mono"] = "rgb" if image.ndim == 3 else "mono"
+        self._dtype = image.dtype
+        self.output_bits: Literal[8, 12] = 8 if image.dtype == np.uint8 else _KEPT_BITS
+        if bits is not None and self.output_bits == 8:
+            raise ValueError(f"{pair.names[0]}: has 8 bits; leave the number of bits out")
+        is_deep = max(int(pair.left.max()), int(pair.right.max())) >= 2**_KEPT_BITS
+        self._bits = bits or (_DEEPEST_BITS if is_deep else _KEPT_BITS)
+
+    def kept_level_dn(self, level_dn: float) -> float:
+        """A level of the source's numbers, in the numbers that are kept.
+
+        Raises:
+            ValueError: the images have no such numbers.
+        """
+        kept = level_dn if self.output_bits == 8 else level_dn * 2.0 ** (_KEPT_BITS - self._bits)
+        if not 0 <= kept < 2**self.output_bits - 1:
+            raise ValueError(f"black level: must be below the images' largest number, got {level_dn:g}")
+        return kept
+
+    def checked(self, image: Pixels, name: str, rig: StereoRig) -> Pixels:
+        """The image in the depth in which it is kept.
+
+        Raises:
+            ValueError: of another size than the rig's, or of another depth or colour than the first pair.
+        """
+        size = (rig.camera.width_px, rig.camera.height_px)
+        if (image.shape[1], image.shape[0]) != size:
+            raise ValueError(
+                f"{name}: must be {size[0]}x{size[1]} px as calibrated, got {image.shape[1]}x{image.shape[0]}"
+            )
+        if image.dtype != self._dtype or (image.ndim == 3) != (self.color == "rgb"):
+            raise ValueError(f"{name}: must have the depth and colours of the first pair")
+        if self.output_bits == 8:
+            return image
+        if int(image.max()) >= 2**self._bits:
+            raise ValueError(f"{name}: has values beyond {self._bits} bits; name the camera's bits")
+        shift = self._bits - _KEPT_BITS
+        return np.asarray(image >> shift if shift >= 0 else image << -shift, dtype=np.uint16)
+
+
+def _record(pair: ImportedPair, settings: ImportSettings, black_level_dn: float) -> dict[str, Any]:
+    """What a pair's record says besides the truth."""
+    return {
+        "time_s": pair.time_s,
+        "image_black_level_dn": black_level_dn,
+        "frame": {"exposure": {"time_s": settings.exposure_s}},
+    }
+
+
+def _index(settings: ImportSettings, depth: _Depth, count: int) -> BlindIndex:
+    """Electrons and noise are those of a sensor of that kind: nobody measured this one's."""
+    usual = SENSORS["rgb-ideal"].model_dump()
+    encoding = settings.encoding or ("gamma" if depth.output_bits == 8 else "linear")
+    sensor = Sensor.model_validate(
+        {**usual, "name": "imported", "color": depth.color, "output_bits": depth.output_bits, "encoding": encoding}
+    )
+    return BlindIndex(
+        name=settings.name,
+        rig=settings.rig,
+        sensor=sensor,
+        drogue=settings.drogue,
+        drogues_differ=False,
+        frames=tuple(range(count)),
+    )
 
 
 def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:
@@ -93,155 +285,6 @@ def _box(value: Any) -> PixelBox:
     if not (abs(x) < 1e6 and abs(y) < 1e6 and 0 < width < 1e6 and 0 < height < 1e6):
         raise ValueError(f"a bbox must be x, y, width, height in pixels, got {value}")
     return (x - 0.5, y - 0.5, width, height)
-
-
-# What deep images are kept in.
-_KEPT_BITS: Final = 12
-_DEEPEST_BITS = 16
-
-
-@dataclass(frozen=True)
-class ImportSettings:
-    """What the images themselves do not tell.
-
-    Attributes:
-        name: of the dataset.
-        rig: that took them.
-        drogue: what to look for.
-        encoding: of the numbers; by default `gamma` for 8 bit and `linear` for deeper images.
-        black_level_dn: number that no light gives, in the source's numbers. [DN]
-        bits: how many bits of deep images are used; by default what the first pair needs.
-        exposure_s: how long the shutter was open; 0 where nobody knows. [s]
-        boxes: around the drogue, by image name.
-    """
-
-    name: str
-    rig: StereoRig
-    drogue: DrogueParameters
-    encoding: Literal["linear", "gamma"] | None = None
-    black_level_dn: float = 0.0
-    bits: int | None = None
-    exposure_s: float = 0.0
-    boxes: Mapping[str, list[PixelBox]] | None = None
-
-
-def write_imported(source: PairSource, settings: ImportSettings, out: Path, advance: Callable[[], None]) -> int:
-    """Write the pairs of a source as a dataset without truth.
-
-    Args:
-        source: the pairs.
-        settings: what else is to be known.
-        out: the dataset's folder; must not be there yet.
-        advance: called after each pair.
-
-    Returns:
-        How many of the boxes found their image.
-
-    Raises:
-        ValueError: an image that cannot be read, or of another size, depth or colour than rig and first pair.
-        OSError: it cannot be written; nothing is left behind.
-    """
-    depth: _Depth | None = None
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    with new_folder(out) as folder:
-        for frame_index, pair in enumerate(source):
-            depth = depth or _Depth(pair, settings.bits)
-            target = frame_folder(folder, frame_index)
-            target.mkdir(parents=True)
-            for eye, name, image in zip(EYES, pair.names, (pair.left, pair.right), strict=True):
-                pixels = depth.checked(image, name, settings.rig)
-                (target / image_file(eye)).write_bytes(encode_png(pixels))
-            _write(target / RECORD_FILE, _record(pair, settings, depth.kept_level_dn(settings.black_level_dn)))
-            boxes = boxes_of_pair(settings.boxes or {}, pair.names, settings.rig.camera.width_px)
-            for view, box in enumerate(boxes):
-                image_id = 2 * frame_index + view + 1
-                images.append(_coco_image(image_id, frame_index, view, settings.rig))
-                if box is not None:
-                    annotations.append(_coco_box(image_id, box))
-            advance()
-        assert depth is not None  # a source without pairs was refused
-        _write(folder / BLIND_FILE, _index(settings, depth, source.count).model_dump(mode="json"))
-        for name, text in calibration_files(settings.rig).items():
-            (folder / CALIBRATION_FOLDER).mkdir(exist_ok=True)
-            (folder / CALIBRATION_FOLDER / name).write_text(text, encoding="utf-8")
-        if settings.boxes is not None:
-            categories = [{"id": 1, "name": "drogue", "supercategory": "target"}]
-            table = {"images": images, "annotations": annotations, "categories": categories}
-            (folder / ANNOTATIONS_FOLDER).mkdir()
-            _write(folder / ANNOTATIONS_FOLDER / "all.json", table)
-    return len(annotations)
-
-
-class _Depth:
-    """Colour and depth of all images, as the first pair's are."""
-
-    def __init__(self, pair: SourcePair, bits: int | None) -> None:
-        image = pair.left
-        self.color: Literal["rgb", "mono"] = "rgb" if image.ndim == 3 else "mono"
-        self._dtype = image.dtype
-        self.output_bits: Literal[8, 12] = 8 if image.dtype == np.uint8 else _KEPT_BITS
-        if bits is not None and self.output_bits == 8:
-            raise ValueError(f"{pair.names[0]}: has 8 bits; leave the number of bits out")
-        is_deep = max(int(pair.left.max()), int(pair.right.max())) >= 2**_KEPT_BITS
-        self._bits = bits or (_DEEPEST_BITS if is_deep else _KEPT_BITS)
-
-    def kept_level_dn(self, level_dn: float) -> float:
-        """A level of the source's numbers, in the numbers that are kept.
-
-        Raises:
-            ValueError: the images have no such numbers.
-        """
-        kept = level_dn if self.output_bits == 8 else level_dn * 2.0 ** (_KEPT_BITS - self._bits)
-        if not 0 <= kept < 2**self.output_bits - 1:
-            raise ValueError(f"black level: must be below the images' largest number, got {level_dn:g}")
-        return kept
-
-    def checked(self, image: Pixels, name: str, rig: StereoRig) -> Pixels:
-        """The image in the depth in which it is kept.
-
-        Raises:
-            ValueError: of another size than the rig's, or of another depth or colour than the first pair.
-        """
-        size = (rig.camera.width_px, rig.camera.height_px)
-        if (image.shape[1], image.shape[0]) != size:
-            raise ValueError(
-                f"{name}: must be {size[0]}x{size[1]} px as calibrated, got {image.shape[1]}x{image.shape[0]}"
-            )
-        if image.dtype != self._dtype or (image.ndim == 3) != (self.color == "rgb"):
-            raise ValueError(f"{name}: must have the depth and colours of the first pair")
-        if self.output_bits == 8:
-            return image
-        if int(image.max()) >= 2**self._bits:
-            raise ValueError(f"{name}: has values beyond {self._bits} bits; name the camera's bits")
-        shift = self._bits - _KEPT_BITS
-        return np.asarray(image >> shift if shift >= 0 else image << -shift, dtype=np.uint16)
-
-
-def _record(pair: SourcePair, settings: ImportSettings, black_level_dn: float) -> dict[str, Any]:
-    """What a pair's record says besides the truth."""
-    return {
-        "time_s": pair.time_s,
-        "image_black_level_dn": black_level_dn,
-        "frame": {"exposure": {"time_s": settings.exposure_s}},
-    }
-
-
-def _index(settings: ImportSettings, depth: _Depth, count: int) -> BlindIndex:
-    """Electrons and noise are those of a sensor of that kind: nobody measured this one's."""
-    usual = SENSORS["rgb-ideal"].model_dump()
-    encoding = settings.encoding or ("gamma" if depth.output_bits == 8 else "linear")
-    sensor = Sensor.model_validate(
-        {**usual, "name": "imported", "color": depth.color, "output_bits": depth.output_bits, "encoding": encoding}
-    )
-    return BlindIndex(
-        name=settings.name,
-        rig=settings.rig,
-        sensor=sensor,
-        drogue=settings.drogue,
-        drogues_differ=False,
-        frames=tuple(range(count)),
-    )
 
 
 def _coco_image(image_id: int, frame_index: int, view: int, rig: StereoRig) -> dict[str, Any]:

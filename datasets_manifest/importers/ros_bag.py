@@ -15,7 +15,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from datasets_manifest.calibration.stereo_calibration import StereoCalibration
-from datasets_manifest.importers.imported_pairs import SourcePair
+from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.types.images import Pixels
 from geometry.se3 import Array
 from geometry.stereo import EYES
@@ -78,7 +78,7 @@ class RosBag:
         if not self.count:
             raise ValueError(f"{path}: no images on {' and '.join(self._topics)} have equal time stamps")
 
-    def __iter__(self) -> Iterator[SourcePair]:
+    def __iter__(self) -> Iterator[ImportedPair]:
         waiting: dict[int, dict[str, Any]] = {}
         with self._open() as reader:
             for connection, _, message in _messages(reader, self._topics, self._path):
@@ -91,7 +91,7 @@ class RosBag:
                     name = f"{self._path}: at {stamp_ns} ns"
                     left, right = (decode_image(views[topic], name) for topic in self._topics)
                     del waiting[stamp_ns]
-                    yield SourcePair(self._topics, 1e-9 * stamp_ns, left, right)
+                    yield ImportedPair(self._topics, 1e-9 * stamp_ns, left, right)
 
     def calibration(self) -> StereoCalibration:
         """The calibration in the bag: both CameraInfo beside the images.

@@ -41,7 +41,7 @@ class DistanceLaw(FrozenModel):
         return min(self.stations_m) if self.stations_m is not None else float(self.low_m or 0.0)
 
 
-class Pose(FrozenModel):
+class PoseRanges(FrozenModel):
     """Attitude of drogue and receiver, and the motion that blurs.
 
     Attributes:
@@ -89,7 +89,7 @@ class DrogueVariant(FrozenModel):
     weight: float = Field(default=1.0, gt=0, le=1e6)
 
 
-class TargetRanges(FrozenModel):
+class AppearanceRanges(FrozenModel):
     """From what each scene's target is drawn; the defaults give a drogue as new that is alone in the picture.
 
     Attributes:

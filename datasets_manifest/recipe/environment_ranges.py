@@ -6,7 +6,7 @@ from typing import Self
 
 from pydantic import Field, field_validator, model_validator
 
-from datasets_manifest.types.environment import CloudKind, GroundKind, MapRanges
+from datasets_manifest.types.environment import CloudKind, EnvironmentMapFile, GroundKind
 from datasets_manifest.types.field_types import Fraction, Range
 from drogue_models.frozen_model import FrozenModel
 
@@ -86,6 +86,21 @@ class MoonRanges(FrozenModel):
         return self
 
 
+class EnvironmentMapRanges(EnvironmentMapFile):
+    """From what the map of a scene is drawn.
+
+    Attributes:
+        rotation_deg: see `EnvironmentMap`.
+    """
+
+    rotation_deg: Range = Range(low=0, high=0)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        self.rotation_deg.within(-360, 360, "rotation_deg")
+        return self
+
+
 class EnvironmentRanges(FrozenModel):
     """From what each scene's environment is drawn; units and meaning as in `Environment`.
 
@@ -107,7 +122,7 @@ class EnvironmentRanges(FrozenModel):
     clouds: tuple[Clouds, ...] = Field(default=(Clouds(),), max_length=6)
     mist: MistRanges = MistRanges()
     moon: MoonRanges = MoonRanges()
-    map: MapRanges | None = None
+    map: EnvironmentMapRanges | None = None
 
     @field_validator("ground", mode="before")
     @classmethod

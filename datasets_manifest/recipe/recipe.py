@@ -11,12 +11,12 @@ from typing import Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from datasets_manifest.recipe.drogue_ranges import DistanceLaw, DrogueVariant, Pose, TargetRanges
+from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, DistanceLaw, DrogueVariant, PoseRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
 from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, resolve_rig
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_singles, fill_distance
 from datasets_manifest.types.appearance import CalibrationBoard
-from datasets_manifest.types.environment import pin_map
+from datasets_manifest.types.environment import pin_environment_map
 from datasets_manifest.types.field_types import Fraction, Rig
 from datasets_manifest.types.frame import Sensor
 from drogue_models.frozen_model import FrozenModel
@@ -125,8 +125,8 @@ class Family(FrozenModel):
 
     name: str = Field(min_length=1, max_length=40, pattern=r"^[a-z0-9][a-z0-9-]*$")
     weight: float = Field(default=1.0, gt=0, le=1e6)
-    pose: Pose = Pose()
-    target: TargetRanges = TargetRanges()
+    pose: PoseRanges = PoseRanges()
+    target: AppearanceRanges = AppearanceRanges()
     environment: EnvironmentRanges = EnvironmentRanges()
     exposure: ExposureLaw = ExposureLaw()
 
@@ -155,8 +155,8 @@ class Recipe(FrozenModel):
     rig: Rig
     sensor: Sensor
     distance: DistanceLaw
-    pose: Pose = Pose()
-    target: TargetRanges = TargetRanges()
+    pose: PoseRanges = PoseRanges()
+    target: AppearanceRanges = AppearanceRanges()
     environment: EnvironmentRanges = EnvironmentRanges()
     exposure: ExposureLaw = ExposureLaw()
     render: RenderSettings = RenderSettings()
@@ -322,7 +322,7 @@ def parse_recipe(text: str, base: Path | None = None, seed: int | None = None) -
     for part in (table, *table.get("families", ())):
         _load_variants(part.get("target"), base)
         if isinstance(part.get("environment"), dict):
-            pin_map(part["environment"], base or Path())
+            pin_environment_map(part["environment"], base or Path())
     if "sensor" in table:
         raise ValueError("sensor: unknown key; it belongs to rig")
     table["rig"], table["sensor"] = resolve_rig(table.get("rig", "rgb-ideal"), _seed(table))

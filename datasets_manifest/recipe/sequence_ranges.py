@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
-from datasets_manifest.recipe.drogue_ranges import Pose, TargetRanges
+from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, PoseRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
 from datasets_manifest.types.environment import SLOWEST_M_S, Turbulence
 from datasets_manifest.types.field_types import Range
-from datasets_manifest.types.frame import Loss
+from datasets_manifest.types.frame import DropoutKind
 from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import StereoRig
 
@@ -92,7 +92,7 @@ Hose = Annotated[HoseParameters, BeforeValidator(_resolve)]
 """In TOML the name of a preset, a table with `preset` and what differs from it, or all parameters."""
 
 
-LossOrNone = Loss | Literal["none"]
+DropoutKindOrNone = DropoutKind | Literal["none"]
 
 # The sun stands where the receiver looks, which its slow changes of attitude and the swing of the drogue lower. [deg]
 _LOWEST_LOOK_DEG = 4.0
@@ -100,7 +100,7 @@ _LOWEST_LOOK_DEG = 4.0
 _MOST_DOWNWARDS = 0.71
 
 
-class LossRanges(FrozenModel):
+class DropoutRanges(FrozenModel):
     """A stretch in each sequence over which the cameras do not see the drogue, or hardly; draws are by sequence.
 
     Attributes:
@@ -117,7 +117,7 @@ class LossRanges(FrozenModel):
         sweep_deg: heading of the formation before and after it, to either side, for `glare`. [deg]
     """
 
-    kinds: tuple[LossOrNone, ...] = Field(min_length=1, max_length=40)
+    kinds: tuple[DropoutKindOrNone, ...] = Field(min_length=1, max_length=40)
     begins_s: Range = Range(low=2, high=2)
     lasts_s: Range = Range(low=2, high=2)
     onset_s: Range = Range(low=1, high=1)
@@ -173,7 +173,7 @@ class LossRanges(FrozenModel):
                 f"{distance_m:g} m; turn by at least {needed_deg:.1f}, and more where it swings"
             )
 
-    def check_sun(self, pose: Pose, environment: EnvironmentRanges) -> None:
+    def check_sun(self, pose: PoseRanges, environment: EnvironmentRanges) -> None:
         """Check that the sun can stand beside the drogue.
 
         Raises:
@@ -297,7 +297,7 @@ class SequenceRanges(FrozenModel):
     release_m: tuple[float, float, float] | None = None
     receiver: Receiver = Receiver()
     # Left out where there is none, so that the hashes of other recipes do not know of it.
-    losses: LossRanges | None = Field(default=None, exclude_if=lambda losses: losses is None)
+    losses: DropoutRanges | None = Field(default=None, exclude_if=lambda losses: losses is None)
 
     @field_validator("turbulence", mode="before")
     @classmethod
@@ -366,13 +366,13 @@ class SequenceRanges(FrozenModel):
                     )
 
 
-def check_singles(pose: Pose, target: TargetRanges) -> None:
+def check_singles(pose: PoseRanges, target: AppearanceRanges) -> None:
     """Check that nothing is asked for that only single frames have.
 
     Raises:
         ValueError: something is.
     """
-    plain = Pose()
+    plain = PoseRanges()
     for name in _POSE_OF_SINGLES:
         if getattr(pose, name) != getattr(plain, name):
             raise ValueError(f"pose.{name}: in a recipe with [sequence] the motion decides; leave it out")

@@ -63,7 +63,7 @@ class Publication(FrozenModel):
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PublishedComparison:
     """A dataset against what was published.
 
     Attributes:
@@ -156,7 +156,7 @@ def _centers(feature: FeatureView) -> tuple[float, ...]:
     return (*feature.center_proj_px, *feature.center_ellipse_px, *inner)
 
 
-def compare_with_published(dataset: Location, published: Publication) -> Comparison:
+def compare_with_published(dataset: Location, published: Publication) -> PublishedComparison:
     """Compare a dataset with what was published of its recipe, pair by pair.
 
     The dataset's files are taken to be those of its manifest, which `validate` checks.
@@ -170,7 +170,7 @@ def compare_with_published(dataset: Location, published: Publication) -> Compari
     differing = _differing(theirs.recipe.model_dump(mode="json"), mine.recipe.model_dump(mode="json"))
     if differing:
         fault = f"{dataset}: its recipe is not the published {theirs.name}: {', '.join(differing[:_SHOWN])}"
-        return Comparison(0, 0, (fault,), ())
+        return PublishedComparison(0, 0, (fault,), ())
     known = {entry.frame_index: entry.record_sha256 for entry in theirs.frames}
     labels = {entry.frame_index: entry for entry in published.labels}
     common = [entry for entry in mine.frames if entry.frame_index in known]
@@ -184,7 +184,7 @@ def compare_with_published(dataset: Location, published: Publication) -> Compari
         )
     if not common:
         faults.append(f"{dataset}: has none of the {len(known)} published pairs")
-    return Comparison(len(common), len(common) - len(other), tuple(faults), _elsewhere(theirs, mine))
+    return PublishedComparison(len(common), len(common) - len(other), tuple(faults), _elsewhere(theirs, mine))
 
 
 def differing_labels(there: FrameLabels, here: FrameLabels) -> list[str]:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from datasets_manifest.types.field_types import Transform
 from drogue_models.frozen_model import FrozenModel
-from drogue_models.obstacles import BystanderShape
+from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import Reflectance, ReflectanceRgb
 from geometry.se3 import Array
 
@@ -59,7 +59,7 @@ class DrogueCondition(FrozenModel):
         return self.markers[index] if self.markers else AS_NEW
 
 
-class Bystander(FrozenModel):
+class Obstacle(FrozenModel):
     """Something else that stands in the picture; it moves with the drogue while the shutter is open.
 
     Attributes:
@@ -70,7 +70,7 @@ class Bystander(FrozenModel):
     """
 
     kind: Literal["probe", "obstacle", "distractor"]
-    shape: BystanderShape
+    shape: ObstacleShape
     left_from_object: Transform
     reflectance_rgb: ReflectanceRgb
 

@@ -8,10 +8,21 @@ from typing import Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from datasets_manifest.types.field_types import Range
 from drogue_models.frozen_model import FrozenModel
+from drogue_models.parameters import ReflectanceRgb
 
 CloudKind = Literal["cumulus", "stratus", "cirrus"]
+
+GroundKind = Literal["sea", "forest", "fields", "dry", "coast", "town"]
+
+GROUND_KINDS: tuple[GroundKind, ...] = get_args(GroundKind)
+
+Turbulence = Literal["none", "light", "moderate", "severe"]
+
+SLOWEST_M_S = 5.0
+"""Airspeed from which on there can be turbulence: a frozen field needs to be flown through. [m/s]"""
+
+MAP_SUFFIXES = (".exr", ".hdr")
 
 
 class CloudLayer(FrozenModel):
@@ -80,21 +91,7 @@ class Moon(FrozenModel):
     phase_angle_deg: float = Field(default=0.0, ge=0, le=180)
 
 
-GroundKind = Literal["sea", "forest", "fields", "dry", "coast", "town"]
-
-GROUND_KINDS: tuple[GroundKind, ...] = get_args(GroundKind)
-
-
-Turbulence = Literal["none", "light", "moderate", "severe"]
-
-SLOWEST_M_S = 5.0
-"""Airspeed from which on there can be turbulence: a frozen field needs to be flown through. [m/s]"""
-
-
-MAP_SUFFIXES = (".exr", ".hdr")
-
-
-class _MapFile(FrozenModel):
+class EnvironmentMapFile(FrozenModel):
     """A file that is pinned by its contents, and the level of its light; one of the two levels must be given.
 
     Attributes:
@@ -125,7 +122,7 @@ class _MapFile(FrozenModel):
         return self.folder / self.path
 
 
-class EnvironmentMap(_MapFile):
+class EnvironmentMap(EnvironmentMapFile):
     """The map of one scene.
 
     Attributes:
@@ -136,22 +133,51 @@ class EnvironmentMap(_MapFile):
     rotation_deg: float = Field(default=0.0, ge=-360, le=360)
 
 
-class MapRanges(_MapFile):
-    """From what the map of a scene is drawn.
+class Environment(FrozenModel):
+    """Sky, sun, air and ground of one scene, in world axes (x east, y north, z up).
 
     Attributes:
-        rotation_deg: see `EnvironmentMap`.
+        sun_elevation_deg, sun_azimuth_deg: direction to the sun; azimuth from east towards north. Below the horizon
+            there is twilight, then night. [deg]
+        turbidity: Linke-like turbidity of Preetham's model, 2 very clear to 6 hazy.
+        visibility_m: meteorological range (2 % contrast), which sets the extinction of the air. [m]
+        altitude_m: of the camera above ground. [m]
+        camera_offset_m: east and north of the place about which ground and clouds are laid out; only a sequence flies
+            away from it. [m]
+        ground: what lies below; `town` runs out into fields.
+        ground_reflectance_rgb: mean diffuse reflectance of the ground, of a coast's land, or of the water under the
+            surface of the sea.
+        ground_texture_seed: of its pattern, shoreline and ships.
+        wind_speed_m_s: over the sea, which sets waves, glint and foam. [m/s]
+        clouds: cloud layers, in any order.
+        mist: thin cloud around the camera, or none.
+        moon: or none.
+        map: a picture of sky and ground that takes the place of all the others but the visibility, or none.
     """
 
-    rotation_deg: Range = Range(low=0, high=0)
+    sun_elevation_deg: float = Field(ge=-90, le=90)
+    sun_azimuth_deg: float = Field(ge=-360, le=360)
+    turbidity: float = Field(ge=1.9, le=10)
+    visibility_m: float = Field(ge=500, le=400_000)
+    altitude_m: float = Field(ge=10, le=20_000)
+    # Left out where it says nothing, so that the hashes of single pairs do not know of it.
+    camera_offset_m: tuple[float, float] = Field(default=(0.0, 0.0), exclude_if=lambda offset_m: offset_m == (0.0, 0.0))
+    ground: GroundKind = "fields"
+    ground_reflectance_rgb: ReflectanceRgb
+    ground_texture_seed: int = Field(ge=0)
+    wind_speed_m_s: float = Field(default=7.0, ge=0, le=40)
+    clouds: tuple[CloudLayer, ...] = Field(default=(), max_length=6)
+    mist: Mist | None = None
+    moon: Moon | None = None
+    map: EnvironmentMap | None = None
 
-    @model_validator(mode="after")
-    def _ranges(self) -> Self:
-        self.rotation_deg.within(-360, 360, "rotation_deg")
-        return self
+    @property
+    def extinction_per_m(self) -> float:
+        """Extinction coefficient of the clear air, without mist (Koschmieder, contrast 2 %). [1/m]"""
+        return 3.912 / self.visibility_m
 
 
-def pin_map(table: dict[str, Any], folder: Path) -> None:
+def pin_environment_map(table: dict[str, Any], folder: Path) -> None:
     """Replace the name of the map's file in an `[environment]` table, if it has one, by path, hash and folder.
 
     Raises:
@@ -174,7 +200,7 @@ def pin_map(table: dict[str, Any], folder: Path) -> None:
     table["map"] = {"path": path, "sha256": _sha256(folder / path), "folder": folder, **rest}
 
 
-def read_map_file(environment_map: _MapFile) -> bytes:
+def read_environment_map(environment_map: EnvironmentMapFile) -> bytes:
     """The contents of a map's file.
 
     Raises:

@@ -3,65 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from datasets_manifest.types.appearance import Bystander, DrogueCondition, PlacedBoard
-from datasets_manifest.types.environment import CloudLayer, EnvironmentMap, GroundKind, Mist, Moon
+from datasets_manifest.types.appearance import DrogueCondition, Obstacle, PlacedBoard
+from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.field_types import Points3, Rig, Transform, Vector6
 from drogue_models.frozen_model import FrozenModel
-from drogue_models.parameters import DrogueParameters, ReflectanceRgb
+from drogue_models.parameters import DrogueParameters
 from geometry.se3 import RigidTransform, exp_twist
 
-Loss = Literal["occlusion", "out-of-view", "glare"]
-
-
-Elevation = Annotated[float, Field(ge=-90, le=90)]
-
-
-class Environment(FrozenModel):
-    """Sky, sun, air and ground of one scene, in world axes (x east, y north, z up).
-
-    Attributes:
-        sun_elevation_deg, sun_azimuth_deg: direction to the sun; azimuth from east towards north. Below the horizon
-            there is twilight, then night. [deg]
-        turbidity: Linke-like turbidity of Preetham's model, 2 very clear to 6 hazy.
-        visibility_m: meteorological range (2 % contrast), which sets the extinction of the air. [m]
-        altitude_m: of the camera above ground. [m]
-        camera_offset_m: east and north of the place about which ground and clouds are laid out; only a sequence flies
-            away from it. [m]
-        ground: what lies below; `town` runs out into fields.
-        ground_reflectance_rgb: mean diffuse reflectance of the ground, of a coast's land, or of the water under the
-            surface of the sea.
-        ground_texture_seed: of its pattern, shoreline and ships.
-        wind_speed_m_s: over the sea, which sets waves, glint and foam. [m/s]
-        clouds: cloud layers, in any order.
-        mist: thin cloud around the camera, or none.
-        moon: or none.
-        map: a picture of sky and ground that takes the place of all the others but the visibility, or none.
-    """
-
-    sun_elevation_deg: float = Field(ge=-90, le=90)
-    sun_azimuth_deg: float = Field(ge=-360, le=360)
-    turbidity: float = Field(ge=1.9, le=10)
-    visibility_m: float = Field(ge=500, le=400_000)
-    altitude_m: float = Field(ge=10, le=20_000)
-    # Left out where it says nothing, so that the hashes of single pairs do not know of it.
-    camera_offset_m: tuple[float, float] = Field(default=(0.0, 0.0), exclude_if=lambda offset_m: offset_m == (0.0, 0.0))
-    ground: GroundKind = "fields"
-    ground_reflectance_rgb: ReflectanceRgb
-    ground_texture_seed: int = Field(ge=0)
-    wind_speed_m_s: float = Field(default=7.0, ge=0, le=40)
-    clouds: tuple[CloudLayer, ...] = Field(default=(), max_length=6)
-    mist: Mist | None = None
-    moon: Moon | None = None
-    map: EnvironmentMap | None = None
-
-    @property
-    def extinction_per_m(self) -> float:
-        """Extinction coefficient of the clear air, without mist (Koschmieder, contrast 2 %). [1/m]"""
-        return 3.912 / self.visibility_m
+DropoutKind = Literal["occlusion", "out-of-view", "glare"]
 
 
 class Exposure(FrozenModel):
@@ -176,7 +129,7 @@ class FrameSpec(FrozenModel):
     drogue: DrogueParameters | None
     sought: DrogueParameters | None = None
     condition: DrogueCondition | None = None
-    bystanders: tuple[Bystander, ...] = ()
+    bystanders: tuple[Obstacle, ...] = ()
     # Left out where there is none, so that the hashes of other datasets do not know of boards.
     board: PlacedBoard | None = Field(default=None, exclude_if=lambda board: board is None)
     left_from_drogue: Transform | None
@@ -190,7 +143,7 @@ class FrameSpec(FrozenModel):
     exposure: Exposure
     environment: Environment
     rangefinder_reading_m: float | None = Field(default=None, exclude_if=lambda reading_m: reading_m is None)
-    loss: Loss | None = Field(default=None, exclude_if=lambda loss: loss is None)
+    loss: DropoutKind | None = Field(default=None, exclude_if=lambda loss: loss is None)
 
     @model_validator(mode="after")
     def _drogue_has_a_pose(self) -> Self:

@@ -44,7 +44,7 @@ Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class PixelSet:
+class MaskPixels:
     """Pixels of an image in COCO's order, column by column.
 
     Attributes:
@@ -105,16 +105,16 @@ class DroguePixels:
         self._marker_count = marker_count
         self._features = FeaturePixels(self._turned)
 
-    def drogue(self) -> PixelSet:
+    def drogue(self) -> MaskPixels:
         """All that belongs to the drogue's box."""
         return self._set(*np.nonzero(visible_mask(self._turned, self._marker_count)))
 
-    def feature(self, part: int) -> PixelSet:
+    def feature(self, part: int) -> MaskPixels:
         """One marker, or the hub."""
         return self._set(*self._features.places(part))
 
-    def _set(self, columns: Indices, rows: Indices) -> PixelSet:
-        return PixelSet(columns + self._low[0], rows + self._low[1], self._size_px)
+    def _set(self, columns: Indices, rows: Indices) -> MaskPixels:
+        return MaskPixels(columns + self._low[0], rows + self._low[1], self._size_px)
 
 
 DROGUE, MARKER, HUB = 1, 2, 3

@@ -7,7 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh
+from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name, part_satin
 from drogue_models.solids import with_creases
 from drogue_models.tanker import tanker_mesh
@@ -79,7 +79,7 @@ def _moved_meshes(frame: FrameSpec) -> _Meshes:
         meshes["tanker"] = int(Part.TANKER), with_creases(tanker_mesh())
         meshes["tanker"][1].apply_transform((stage_from_left @ frame.left_from_tanker).as_matrix())
     for index, bystander in enumerate(frame.bystanders):
-        mesh = with_creases(bystander_mesh(bystander.shape))
+        mesh = with_creases(obstacle_mesh(bystander.shape))
         mesh.apply_transform((stage_from_left @ bystander.left_from_object).as_matrix())
         meshes[f"bystander_{index}"] = int(Part[bystander.kind.upper()]), mesh
     return meshes

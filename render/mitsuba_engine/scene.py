@@ -19,7 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.meshes import bystander_mesh, drogue_meshes, hose_mesh
+from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parameters import SatinPaint
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_satin
 from drogue_models.solids import with_creases
@@ -115,7 +115,7 @@ def bystander_shapes(frame: FrameSpec) -> dict[str, Any]:
             part = int(Part[bystander.kind.upper()])
             name = bystander_name(index, part)
             look = _even(np.array(bystander.reflectance_rgb))
-            shapes[name] = _shape(with_creases(bystander_mesh(bystander.shape)), part, Path(folder), look)
+            shapes[name] = _shape(with_creases(obstacle_mesh(bystander.shape)), part, Path(folder), look)
             shapes[name].set_id(name)
     return shapes
 
@@ -197,7 +197,7 @@ class DrogueScene:
         for index, bystander in enumerate(frame.bystanders):
             name = bystander_name(index, int(Part[bystander.kind.upper()]))
             stage_from_object = stage_from_left @ bystander.left_from_object
-            self._set_moved(name, stage_from_object, with_creases(bystander_mesh(bystander.shape)))
+            self._set_moved(name, stage_from_object, with_creases(obstacle_mesh(bystander.shape)))
             self._parameters[f"{name}.bsdf.reflectance.value"] = mi.Color3f(list(bystander.reflectance_rgb))
 
     def _set_looks(self, frame: FrameSpec) -> None:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.recipe.sequence_ranges import LossRanges
-from datasets_manifest.types.appearance import Bystander
-from datasets_manifest.types.frame import Loss
-from drogue_models.obstacles import BystanderShape
+from datasets_manifest.recipe.sequence_ranges import DropoutRanges
+from datasets_manifest.types.appearance import Obstacle
+from datasets_manifest.types.frame import DropoutKind
+from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import ReflectanceRgb
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
@@ -39,7 +39,7 @@ class LossEvent:
         sweep_rad: of the formation's heading. [rad]
     """
 
-    kind: Loss
+    kind: DropoutKind
     begin_s: float
     end_s: float
     onset_s: float
@@ -85,7 +85,7 @@ class LossEvent:
         return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def sample_loss(rng: np.random.Generator, ranges: LossRanges | None, sequence_id: int) -> LossEvent | None:
+def sample_loss(rng: np.random.Generator, ranges: DropoutRanges | None, sequence_id: int) -> LossEvent | None:
     """What happens in a sequence, or None where nothing does; the draws do not depend on what it is."""
     if ranges is None:
         return None
@@ -120,7 +120,7 @@ class HidingBar:
     middle_m: float
     radius_m: float
 
-    def at(self, time_s: float, camera: PinholeCamera) -> Bystander | None:
+    def at(self, time_s: float, camera: PinholeCamera) -> Obstacle | None:
         """The bar at a time of the sequence, or None while it is out of sight of both eyes."""
         away, depth_m = self.event.away(time_s), self.event.obstacle_distance_m
         if abs(away) == 1:
@@ -130,9 +130,9 @@ class HidingBar:
         far_m = depth_m * corner + self.radius_m * float(np.hypot(1.0, corner)) + self.baseline_m + abs(self.middle_m)
         x_m, y_m = self.across * (self.middle_m + self.event.side * away * far_m)
         along = np.array([self.across[1], -self.across[0], 0.0])
-        return Bystander(
+        return Obstacle(
             kind="obstacle",
-            shape=BystanderShape(form="bar", radius_m=self.radius_m, length_m=min(4 * far_m, 50.0)),
+            shape=ObstacleShape(form="bar", radius_m=self.radius_m, length_m=min(4 * far_m, 50.0)),
             left_from_object=RigidTransform(
                 rotation_with_z(along), np.array([self.baseline_m / 2 + x_m, y_m, depth_m])
             ),

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets_manifest.types.appearance import Bystander
-from datasets_manifest.types.frame import Loss
+from datasets_manifest.types.appearance import Obstacle
+from datasets_manifest.types.frame import DropoutKind
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 
@@ -38,8 +38,8 @@ class Moment:
     drogue_twist_per_s: Array
     hose_nodes_left_m: Array | None
     camera_offset_m: tuple[float, float] = (0.0, 0.0)
-    loss: Loss | None = None
-    obstacle: Bystander | None = None
+    loss: DropoutKind | None = None
+    obstacle: Obstacle | None = None
     sun_deg: tuple[float, float] | None = None
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from datasets_manifest.recipe.drogue_ranges import Pose
+from datasets_manifest.recipe.drogue_ranges import PoseRanges
 from datasets_manifest.recipe.sequence_ranges import (
     CLOSURE_ACCELERATION_M_S2,
     Follower,
@@ -23,7 +23,7 @@ _WORLD_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1
 _DAMPING = 0.8
 
 
-def sample_attitude(rng: np.random.Generator, pose: Pose) -> Array:
+def sample_attitude(rng: np.random.Generator, pose: PoseRanges) -> Array:
     """(3, 3) rotation `world_from_left` of a receiver that flies east, pitched and banked."""
     pitch, bank = np.radians([draw(rng, pose.camera_pitch_deg), draw(rng, pose.camera_bank_deg)])
     about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])

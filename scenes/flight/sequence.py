@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.drogue_ranges import Pose
+from datasets_manifest.recipe.drogue_ranges import PoseRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges
 from drogue_models.parameters import DrogueParameters
@@ -100,7 +100,7 @@ def moment_of_sequence(recipe: Recipe, sequence: SequenceRanges, drogue: DrogueP
 # A recipe's frames come in order, more or less: the last sequences that were flown are enough.
 @lru_cache(maxsize=2)
 def _flight(
-    seed: int, sequence_id: int, sequence: SequenceRanges, drogue: DrogueParameters, pose: Pose, baseline_m: float
+    seed: int, sequence_id: int, sequence: SequenceRanges, drogue: DrogueParameters, pose: PoseRanges, baseline_m: float
 ) -> Flight:
     return Flight(seed, sequence_id, sequence, drogue, pose, baseline_m)
 
@@ -114,7 +114,7 @@ class Flight:
         sequence_id: int,
         sequence: SequenceRanges,
         drogue: DrogueParameters,
-        pose: Pose,
+        pose: PoseRanges,
         baseline_m: float,
     ) -> None:
         """Simulate it; every draw is keyed by the dataset's seed and the sequence.

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.types.environment import GroundKind
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import Environment, GroundKind
 from drogue_models.parameters import ReflectanceRgb
 from scenes.clouds.ray_march import enlarge
 from scenes.ground.coast import Coast

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import Environment
 from scenes.sky.daylight import DaylightSky
 from scenes.sky.light import (
     REC709_LUMINANCE,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.storage.image_codecs import decode_exr
-from datasets_manifest.types.environment import EnvironmentMap, read_map_file
+from datasets_manifest.types.environment import EnvironmentMap, read_environment_map
 from scenes.sky.light import Radiance, luminance
 
 _SMALLEST_PX = 16
@@ -62,7 +62,7 @@ class MappedLight:
 
 @lru_cache(maxsize=4)
 def _read_cached(sha256: str, suffix: str, file: Path, environment_map: EnvironmentMap) -> Radiance:
-    data = read_map_file(environment_map)
+    data = read_environment_map(environment_map)
     picture = _decode_hdr(data) if suffix == ".hdr" else _decode_exr(data, file)
     height, width = picture.shape[:2]
     if width != 2 * height or height < _SMALLEST_PX:

@@ -14,8 +14,9 @@ from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.recipe.rigs import SENSORS
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame
+from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate
-from datasets_manifest.types.frame import Environment, Exposure, FrameSpec
+from datasets_manifest.types.frame import Exposure, FrameSpec
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import Conditions, FeatureView, HubView, PairRecord, StereoViews, ViewRecord
 from drogue_models.marker_layout import marker_layout

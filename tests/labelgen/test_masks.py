@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
-from datasets_manifest.types.appearance import Bystander
+from datasets_manifest.types.appearance import Obstacle
 from drogue_models.marker_layout import marker_layout
-from drogue_models.obstacles import BystanderShape
+from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
@@ -76,9 +76,9 @@ def test_silhouettes_are_what_rays_meet(eyes):
 
 def test_what_reaches_behind_the_camera_is_cut():
     _, frame = small_frame(LENSES)
-    probe = Bystander(
+    probe = Obstacle(
         kind="probe",
-        shape=BystanderShape(form="probe", radius_m=0.04, length_m=6.0),
+        shape=ObstacleShape(form="probe", radius_m=0.04, length_m=6.0),
         left_from_object=RigidTransform(np.diag([1.0, -1.0, -1.0]), np.array([0.1, 0.1, 1.0])),
         reflectance_rgb=(0.5, 0.5, 0.5),
     )

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from datasets_manifest.importers.imported_dataset import ImportSettings, write_imported
-from datasets_manifest.importers.imported_pairs import SourcePair
+from datasets_manifest.importers.imported_dataset import ImportedPair, ImportSettings, write_imported
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, read_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, WRONG_INPUT, run
@@ -34,7 +33,7 @@ class Flight:
     def __iter__(self):
         for pair in self._pairs:
             name = f"{pair.frame_index}.png"
-            yield SourcePair((name, name), pair.images.time_s, pair.images.left, pair.images.right)
+            yield ImportedPair((name, name), pair.images.time_s, pair.images.left, pair.images.right)
 
 
 @pytest.fixture(scope="module")

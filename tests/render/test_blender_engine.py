@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.types.appearance import Bystander
+from datasets_manifest.types.appearance import Obstacle
 from drogue_models.marker_layout import marker_layout
-from drogue_models.obstacles import BystanderShape
+from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import SatinPaint
 from drogue_models.parts import Part, drogue_part_ids
 from geometry.circles import disc_area_px2, project_disc_centers
@@ -233,9 +233,9 @@ def test_frames_without_a_drogue(blender, make_recipe):
     )
     empty = blender.render(frame, recipe.render)
     assert not empty.left.part_id.any() and not empty.right.coverage.any()
-    ball = Bystander(
+    ball = Obstacle(
         kind="distractor",
-        shape=BystanderShape(form="ball", radius_m=0.5),
+        shape=ObstacleShape(form="ball", radius_m=0.5),
         left_from_object=RigidTransform(np.eye(3), np.array([0.0, 0.0, 10.0])),
         reflectance_rgb=(0.5, 0.5, 0.5),
     )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.types.environment import Mist
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import Environment, Mist
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
-from datasets_manifest.types.appearance import Bystander, DrogueCondition, SurfaceCondition
-from drogue_models.obstacles import BystanderShape
+from datasets_manifest.types.appearance import DrogueCondition, Obstacle, SurfaceCondition
+from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from render.engine import load_engine
@@ -106,9 +106,9 @@ def test_lamps_shine_in_their_share(engine, recipe, frame):
 
 def test_bystanders_hide_what_is_behind_them(engine, recipe, frame):
     center = frame.left_from_drogue.translation_m
-    ball = Bystander(
+    ball = Obstacle(
         kind="distractor",
-        shape=BystanderShape(form="ball", radius_m=0.05),
+        shape=ObstacleShape(form="ball", radius_m=0.05),
         left_from_object=RigidTransform(np.eye(3), center * 0.5),
         reflectance_rgb=(0.8, 0.8, 0.8),
     )
@@ -121,9 +121,9 @@ def test_bystanders_hide_what_is_behind_them(engine, recipe, frame):
 
 
 def test_a_frame_without_a_drogue_shows_its_bystanders(engine, recipe, frame):
-    ball = Bystander(
+    ball = Obstacle(
         kind="distractor",
-        shape=BystanderShape(form="ball", radius_m=0.3),
+        shape=ObstacleShape(form="ball", radius_m=0.3),
         left_from_object=RigidTransform(np.eye(3), np.array([0.05, 0.1, 4.0])),
         reflectance_rgb=(0.6, 0.02, 0.02),
     )

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
-from datasets_manifest.types.environment import CloudLayer, Mist
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import CloudLayer, Environment, Mist
 from scenes.clouds.cloud_density import CloudDensity
 from scenes.clouds.cloud_layers import CloudLight, diffuse_transmission, opacity_towards, see_cloud
 from scenes.environment import environment_of_scene

@@ -7,7 +7,7 @@ import pytest
 
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
-from datasets_manifest.recipe.sequence_ranges import LossRanges
+from datasets_manifest.recipe.sequence_ranges import DropoutRanges
 from drogue_models.parts import Part
 from geometry.se3 import log_twist
 from geometry.stereo import EYES
@@ -181,7 +181,7 @@ def test_the_sun_comes_beside_the_drogue_and_goes(seed):
 
 
 def test_a_formation_that_turns_flies_where_it_heads():
-    happens = sample_loss(np.random.default_rng(1), LossRanges(kinds=("glare",)), 0)
+    happens = sample_loss(np.random.default_rng(1), DropoutRanges(kinds=("glare",)), 0)
     time_s, step_s = 2.3, 1e-3
     moved = (flown_m(happens, 120.0, time_s + step_s) - flown_m(happens, 120.0, time_s - step_s)) / (2 * step_s)
     heading = happens.heading_rad(time_s)
@@ -202,10 +202,10 @@ def test_it_comes_lasts_and_goes_smoothly():
 
 
 def test_kinds_come_in_turn_and_draws_do_not_depend_on_them():
-    ranges = LossRanges(kinds=("occlusion", "none", "glare"))
+    ranges = DropoutRanges(kinds=("occlusion", "none", "glare"))
     drawn = [sample_loss(frame_generator(1, k, "loss"), ranges, k) for k in range(6)]
     assert [None if one is None else one.kind for one in drawn] == ["occlusion", None, "glare"] * 2
-    other = sample_loss(frame_generator(1, 0, "loss"), LossRanges(kinds=("glare",)), 0)
+    other = sample_loss(frame_generator(1, 0, "loss"), DropoutRanges(kinds=("glare",)), 0)
     assert (other.tilt_rad, other.side) == (drawn[0].tilt_rad, drawn[0].side)
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.types.environment import CloudLayer
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import CloudLight, opacity_towards, see_cloud
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.sea import GroundLight

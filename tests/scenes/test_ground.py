@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.types.environment import GROUND_KINDS
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import GROUND_KINDS, Environment
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
 from scenes.ground.land_tiles import land_tile
 from scenes.ground.sea import Sea, fresnel, slope_variances

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
-from datasets_manifest.types.environment import CloudLayer
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import CloudLight, see_cloud
 from scenes.environment_radiance import surroundings
 from scenes.flight.frame_kinematics import WORLD_FROM_TANKER

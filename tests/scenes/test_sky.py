@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.types.environment import CloudLayer, Moon
-from datasets_manifest.types.frame import Environment
+from datasets_manifest.types.environment import CloudLayer, Environment, Moon
 from scenes.clouds.cloud_density import sample_texture
 from scenes.environment_radiance import Surroundings
 from scenes.sky.clear_sky import ClearSky, direction_from_angles

@@ -11,7 +11,7 @@ from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import output_option
 
 if TYPE_CHECKING:
-    from datasets_manifest.importers.imported_pairs import PairSource
+    from datasets_manifest.importers.imported_dataset import ImportedPairs
     from geometry.stereo import StereoRig
 
 EXAMPLES = (
@@ -96,7 +96,7 @@ def import_(
 
 def _open_source(
     source: Path, calibration: Path | None, unit_m: float, topics: str | None, rate_hz: float
-) -> tuple[PairSource, StereoRig]:
+) -> tuple[ImportedPairs, StereoRig]:
     """The pairs and the rig that took them."""
     from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo, rig_of_calibration
     from datasets_manifest.importers.image_folder import ImageFolder

@@ -10,7 +10,7 @@ from droguekit.cli.arguments import DatasetArgument
 from droguekit.cli.main import FAULT
 
 if TYPE_CHECKING:
-    from datasets_manifest.release.publication import Comparison
+    from datasets_manifest.release.publication import PublishedComparison
 
 EXAMPLES = (
     "droguekit validate data/demo",
@@ -50,7 +50,7 @@ def validate(
             raise typer.Exit(FAULT)
 
 
-def _show(comparison: Comparison) -> None:
+def _show(comparison: PublishedComparison) -> None:
     for difference in comparison.elsewhere:
         typer.echo(f"not the build that was published: {difference}")
     for fault in comparison.label_faults:

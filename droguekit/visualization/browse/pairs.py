@@ -18,8 +18,9 @@ from datasets_manifest.storage.layout import BLIND_FILE, image_file
 from datasets_manifest.storage.manifest import FrameEntry as ManifestEntry
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
-from datasets_manifest.types.frame import Environment, FrameSpec
+from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, ViewRecord
 from drogue_models.parameters import DrogueParameters

@@ -12,8 +12,8 @@ import pytest
 
 from datasets_manifest.recipe.recipe import RecipeSource, load_recipe, parse_recipe
 from datasets_manifest.release.publication import (
-    Comparison,
     Publication,
+    PublishedComparison,
     build_publication,
     compare_with_published,
     publication_names,
@@ -64,7 +64,7 @@ def relit(dataset: Path, out: Path, features: tuple[str, ...] | None = None) -> 
     return out
 
 
-def verdicts(comparison: Comparison) -> tuple[str, int, int]:
+def verdicts(comparison: PublishedComparison) -> tuple[str, int, int]:
     return comparison.verdict, comparison.compared, comparison.identical
 
 
