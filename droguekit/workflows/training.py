@@ -85,12 +85,12 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     network = None if start is None or start.network is None else start.network.to_dict()
     settings = build_settings(options.settings_file, {**options.changes, **parsed}, network)
     found = [_find(source) for source in options.sources]
-    from nav.training.training_run import check_before, train
+    from nav.training.training_run import check_training, train
 
     # Rendering takes hours: what would stop the training afterwards is looked for first.
     if not any(not isinstance(each, RecipeSource) or each.recipe.split.train > 0 for each in found):
         raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
-    check_before(out, settings, start)
+    check_training(out, settings, start)
     datasets = [
         _render(each, out, options.workers, report) if isinstance(each, RecipeSource) else each for each in found
     ]

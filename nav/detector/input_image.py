@@ -83,10 +83,10 @@ def input_image(images: StereoImages, eye: Eye, input_size_px: tuple[int, int]) 
     Raises:
         ValueError: an input size that no network takes.
     """
-    return fit_picture(_display_encoded(images.left if eye == "left" else images.right, images), input_size_px)
+    return letterbox_image(_display_encoded(images.left if eye == "left" else images.right, images), input_size_px)
 
 
-def fit_picture(picture: NDArray[np.uint8], input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
+def letterbox_image(picture: NDArray[np.uint8], input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
     """A display-encoded picture (H, W, 3) or (H, W) in a network's input; the second half of `input_image`."""
     height, width = picture.shape[:2]
     place = letterbox((width, height), input_size_px)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.detector.input_image import Letterbox, fit_picture
-from nav.detector.output_maps import SIZE_STEP_PX, decode, non_maximum_suppression
+from nav.detector.input_image import Letterbox, letterbox_image
+from nav.detector.output_maps import SIZE_STEP_PX, decode_maps, non_maximum_suppression
 
-Found = tuple[Array, Array]
+ScoredBoxes = tuple[Array, Array]
 """(n, 4) boxes x, y, width, height in corner coordinates of the input [px], and (n,) scores, the best first."""
 
 # Around the limit both passes answer, so that no drogue falls between them.
@@ -31,13 +31,13 @@ def half_size_px(input_size_px: tuple[int, int]) -> tuple[int, int]:
     return width, height
 
 
-def find_at_scales(
+def detect_multiscale(
     pictures: Sequence[NDArray[np.uint8]],
     run: Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[Any]]],
     large_from_px: float,
     least_score: float,
     most: int,
-) -> list[Found]:
+) -> list[ScoredBoxes]:
     """What a network finds in pictures of one size, with a second pass where it asks for one.
 
     Args:
@@ -47,23 +47,23 @@ def find_at_scales(
         least_score: what scores lower is left out.
         most: how many boxes a picture has at most.
     """
-    full = decode(run(pictures), least_score)
+    full = decode_maps(run(pictures), least_score)
     if large_from_px == 0:
         return [(boxes[:most], scores[:most]) for boxes, scores in full]
     height, width = pictures[0].shape[:2]
-    halves, places = zip(*(fit_picture(each, half_size_px((width, height))) for each in pictures), strict=True)
-    half = map(at_full_size, decode(run(halves), least_score), places)
-    return [joined(*both, large_from_px, most) for both in zip(full, half, strict=True)]
+    halves, places = zip(*(letterbox_image(each, half_size_px((width, height))) for each in pictures), strict=True)
+    half = map(to_full_size, decode_maps(run(halves), least_score), places)
+    return [merge_scales(*both, large_from_px, most) for both in zip(full, half, strict=True)]
 
 
-def at_full_size(found: Found, place: Letterbox) -> Found:
+def to_full_size(found: ScoredBoxes, place: Letterbox) -> ScoredBoxes:
     """What was found in a reduced picture, in corner coordinates of the whole one, which lies in it as `place` says."""
     boxes, scores = found
     # Pixel-centre to corner coordinates.
     return place.to_image(boxes) + np.array([0.5, 0.5, 0.0, 0.0]), scores
 
 
-def joined(full: Found, half: Found, large_from_px: float, most: int) -> Found:
+def merge_scales(full: ScoredBoxes, half: ScoredBoxes, large_from_px: float, most: int) -> ScoredBoxes:
     """The boxes of both passes, each of the sizes that it is for, without those that overlap a better one.
 
     Args:

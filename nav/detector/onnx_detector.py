@@ -16,7 +16,7 @@ from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import input_image, letterbox, network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
-from nav.detector.multiscale_inference import Found, find_at_scales, half_size_px
+from nav.detector.multiscale_inference import ScoredBoxes, detect_multiscale, half_size_px
 from nav.detector.output_maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 
 _FAULTS = (
@@ -91,9 +91,9 @@ class OnnxDetector:
             )
         return answers
 
-    def _found(self, pictures: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[Found]:
+    def _found(self, pictures: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[ScoredBoxes]:
         """Of each picture the boxes in corner coordinates of the input, and scores."""
-        return find_at_scales(
+        return detect_multiscale(
             pictures, lambda some: self._run(network_input(some)), self.metadata.large_from_px, least_score, most
         )
 

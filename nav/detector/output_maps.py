@@ -39,7 +39,9 @@ _MOST_OVERLAP = 0.5
 _MOST_CELLS = 1000
 
 
-def decode(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, most: int = 20) -> list[tuple[Array, Array]]:
+def decode_maps(
+    maps: Sequence[NDArray[np.floating[Any]]], least_score: float, most: int = 20
+) -> list[tuple[Array, Array]]:
     """Boxes and scores of every image, the best first, without those that overlap a better one.
 
     Args:

@@ -18,17 +18,17 @@ from nav.training.corpus import Corpus, EyeIndex
 from nav.training.geometric_augmentation import (
     TILES,
     Boxes,
+    CanvasWindow,
     Image,
     ImageView,
     ViewRanges,
-    Window,
+    paint_view,
     sample_mosaic,
     sample_view,
-    show,
     whole_view,
 )
-from nav.training.photometric_augmentation import distract, occlude, vary_light
-from nav.training.prefetch_map import in_order
+from nav.training.photometric_augmentation import color_jitter, cutout, paint_distractors
+from nav.training.prefetch_map import prefetch_map
 from nav.training.training_settings import SizePx, TrainingSettings
 
 _MOSAIC_FRACTION = 0.8  # of the images while mosaic is on
@@ -78,7 +78,7 @@ class BatchMaker:
 
     def batches(self, steps: range, threads: int) -> Generator[Batch]:
         """The batches of steps, in their order, made ahead by threads."""
-        return in_order(self.batch, steps, threads, threads + _AHEAD_BATCHES)
+        return prefetch_map(self.batch, steps, threads, threads + _AHEAD_BATCHES)
 
     def _sample(self, step: int, epoch: int, position: int) -> Iterator[tuple[Image, Boxes]]:
         """Images and boxes of one eye, or of both."""
@@ -117,17 +117,17 @@ class BatchMaker:
         if rng.random() < _WHOLE_FRACTION:
             return [whole_view(source_wh, canvas_wh)]
         ranges = _SINGLE_RANGES.on_canvas(source_wh, canvas_wh)
-        return [sample_view(rng, source_wh, boxes[0], Window(0, 0, *canvas_wh), ranges)]
+        return [sample_view(rng, source_wh, boxes[0], CanvasWindow(0, 0, *canvas_wh), ranges)]
 
     def _paint(
         self, rng: np.random.Generator, members: list[tuple[int, EyeIndex]], views: list[ImageView], size: SizePx
     ) -> tuple[Image, Boxes]:
         canvas = np.full((*size, 3), PADDING_DN, dtype=np.uint8)
         shown = [
-            show(canvas, self._corpus.image(*member), self._corpus.boxes(*member), view)
+            paint_view(canvas, self._corpus.image(*member), self._corpus.boxes(*member), view)
             for member, view in zip(members, views, strict=True)
         ]
         boxes = np.vstack(shown)
-        distract(rng, canvas, boxes)
-        boxes = occlude(rng, canvas, boxes)
-        return vary_light(rng, canvas), boxes
+        paint_distractors(rng, canvas, boxes)
+        boxes = cutout(rng, canvas, boxes)
+        return color_jitter(rng, canvas), boxes

@@ -29,8 +29,8 @@ from drogue_models.frozen_model import FrozenModel
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.training.geometric_augmentation import Boxes, Image
-from nav.training.prefetch_map import in_order
-from nav.training.training_progress import Observer
+from nav.training.prefetch_map import prefetch_map
+from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import SizePx, size_text
 
 _VERSION = 1  # grows with every change of what stands in a cache
@@ -76,12 +76,12 @@ class _ReadPair(NamedTuple):
     entry: CachedPair
 
 
-def open_cache(
+def open_image_cache(
     dataset: Dataset,
     folder: Path,
     size_px: SizePx,
     threads: int,
-    observer: Observer,
+    observer: TrainingObserver,
     should_stop: Callable[[], bool],
 ) -> ImageCache:
     """The dataset's cache, made if it is not there: every image is decoded, and all hashes are checked.
@@ -122,7 +122,7 @@ def open_cache(
 
 
 @contextmanager
-def _locked(folder: Path, observer: Observer, should_stop: Callable[[], bool]) -> Iterator[None]:
+def _locked(folder: Path, observer: TrainingObserver, should_stop: Callable[[], bool]) -> Iterator[None]:
     """Let others who want the same caches wait; the kernel frees the lock when the process ends, however it ends."""
     with (folder / _LOCK_FILE).open("a") as lock:
         said = False
@@ -158,7 +158,7 @@ def _write(part: Path, dataset: Dataset, size_px: SizePx, threads: int, advance:
     pairs: list[CachedPair] = []
     with (part / _IMAGES_FILE).open("wb") as stream:
         _write_header(stream, (len(dataset.frame_indices), 2, *size_px, 3))
-        for pair in in_order(read, dataset.frame_indices, threads, 2 * threads):
+        for pair in prefetch_map(read, dataset.frame_indices, threads, 2 * threads):
             # Written, not mapped: a full disk is an error here, and would end the process there.
             for image in pair.images:
                 stream.write(np.ascontiguousarray(image).data)
@@ -247,7 +247,7 @@ def open_corpus(
     cache: Path,
     size_px: SizePx,
     threads: int,
-    observer: Observer,
+    observer: TrainingObserver,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Corpus:
     """Open datasets to learn from; whatever could stop the training later is looked for here.
@@ -271,7 +271,7 @@ def open_corpus(
     for dataset in datasets:
         observer.begin(f"images of {dataset.path} at {size_text(size_px)}", len(dataset.frame_indices))
         try:
-            caches.append(open_cache(dataset, cache, size_px, threads, observer, should_stop))
+            caches.append(open_image_cache(dataset, cache, size_px, threads, observer, should_stop))
         finally:
             observer.end()
         if not any(box is not None for pair in caches[-1].pairs for box in pair.boxes):

@@ -24,19 +24,19 @@ from torch import Tensor, nn
 from datasets_manifest.storage.manifest import SplitName
 from geometry.boxes import intersection_over_union
 from nav.detector.input_image import PADDING_DN
-from nav.detector.multiscale_inference import find_at_scales
+from nav.detector.multiscale_inference import detect_multiscale
 from nav.training.corpus import Corpus
-from nav.training.geometric_augmentation import Boxes, Image, show, whole_view
-from nav.training.prefetch_map import in_order
+from nav.training.geometric_augmentation import Boxes, Image, paint_view, whole_view
+from nav.training.prefetch_map import prefetch_map
 from nav.training.training_settings import SizePx
-from nav.training.training_state import Computing
+from nav.training.training_state import ComputeDevice
 
 MOST_BOXES = 10
 """Answers of an image that count, the best first."""
 
 
 @dataclass(frozen=True)
-class AveragePrecision:
+class ValidationScores:
     """Fractions, 0 to 1.
 
     Attributes:
@@ -51,7 +51,7 @@ class AveragePrecision:
     recall50: float
 
 
-def average_precision(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]]) -> AveragePrecision | None:
+def average_precision(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]]) -> ValidationScores | None:
     """Compare answers with the truth.
 
     Args:
@@ -81,7 +81,7 @@ def average_precision(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes
             for box, score in zip(own.tolist(), scores.tolist(), strict=True)
         ]
         if not answers:
-            return AveragePrecision(0.0, 0.0, 0.0, 0.0)
+            return ValidationScores(0.0, 0.0, 0.0, 0.0)
         evaluation = COCOeval(coco, coco.loadRes(np.array(answers, dtype=np.float64)), "bbox")
         evaluation.params.maxDets = [1, MOST_BOXES, MOST_BOXES]
         evaluation.params.areaRng = [[0, 1e10]]
@@ -91,20 +91,20 @@ def average_precision(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes
     # (overlap, recall, class, area, most): overlaps are 0.5, 0.55 to 0.95.
     precision = evaluation.eval["precision"][:, :, 0, 0, -1]
     ap50, ap75 = (float(precision[index].mean()) for index in (0, 5))
-    return AveragePrecision(float(precision.mean()), ap50, ap75, float(evaluation.eval["recall"][0, 0, 0, -1]))
+    return ValidationScores(float(precision.mean()), ap50, ap75, float(evaluation.eval["recall"][0, 0, 0, -1]))
 
 
 _LEAST_SCORE = 0.01  # average precision asks for all answers, down to where they no longer count
 
 
-def to_tensor(images: NDArray[np.uint8], computing: Computing) -> Tensor:
+def to_tensor(images: NDArray[np.uint8], computing: ComputeDevice) -> Tensor:
     """(B, 3, H, W) from 0 to 1, on the device that computes, of (B, H, W, 3)."""
     # Red, green and blue stay beside each other in memory: channels last, as convolutions like it.
     return torch.from_numpy(images).to(computing.device, non_blocking=True).permute(0, 3, 1, 2).float().div_(255)
 
 
 @dataclass(frozen=True, eq=False)
-class Answers:
+class Predictions:
     """Of N images, in corner coordinates of the network's input.
 
     Attributes:
@@ -116,15 +116,15 @@ class Answers:
     found: list[tuple[Boxes, Boxes]]
 
 
-def answer(
+def predict(
     network: nn.Module,
     corpus: Corpus,
     split: SplitName,
     size_px: SizePx,
     batch_images: int,
     large_from_px: float,
-    computing: Computing,
-) -> Answers:
+    computing: ComputeDevice,
+) -> Predictions:
     """What a network finds on both eyes' images of a split, which are shown as they are.
 
     Args:
@@ -149,17 +149,17 @@ def answer(
             maps = network(to_tensor(np.stack(images), computing))
         return [each.float().cpu().numpy() for each in maps]
 
-    for group in in_order(read, groups, threads=1, ahead=2):
-        found += find_at_scales([image for image, _ in group], run, large_from_px, _LEAST_SCORE, MOST_BOXES)
+    for group in prefetch_map(read, groups, threads=1, ahead=2):
+        found += detect_multiscale([image for image, _ in group], run, large_from_px, _LEAST_SCORE, MOST_BOXES)
         truth += [boxes for _, boxes in group]
-    return Answers(truth, found)
+    return Predictions(truth, found)
 
 
 def whole_image(corpus: Corpus, pair: int, eye: int, size_px: SizePx) -> tuple[Image, Boxes]:
     """An image as the detector sees it, not augmented, and its boxes."""
     canvas = np.full((*size_px, 3), PADDING_DN, dtype=np.uint8)
     view = whole_view(corpus.size_px[::-1], size_px[::-1])
-    return canvas, show(canvas, corpus.image(pair, eye), corpus.boxes(pair, eye), view)
+    return canvas, paint_view(canvas, corpus.image(pair, eye), corpus.boxes(pair, eye), view)
 
 
 _LEAST_OVERLAP = 0.5
@@ -185,7 +185,7 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
         for own, (boxes, scores) in zip(truth, found, strict=True)
         if len(scores)
     ]
-    best.sort(key=lambda answer: -answer[0])
+    best.sort(key=lambda prediction: -prediction[0])
     right = np.cumsum([is_right for _, _, is_right in best])
     if not len(right) or right[-1] == 0:
         return otherwise
@@ -205,7 +205,7 @@ _MOST_IMAGES = 192  # a mean over as many is known to a twentieth of what images
 _BATCH_IMAGES = 16
 
 
-def measure_batch_statistics(network: nn.Module, corpus: Corpus, size_px: SizePx, computing: Computing) -> None:
+def measure_batch_statistics(network: nn.Module, corpus: Corpus, size_px: SizePx, computing: ComputeDevice) -> None:
     """Replace a network's running means and variances by those over images of the split train.
 
     Args:
@@ -230,7 +230,7 @@ def measure_batch_statistics(network: nn.Module, corpus: Corpus, size_px: SizePx
             layer.eval()
 
 
-def statistics_batches(corpus: Corpus, size_px: SizePx, computing: Computing) -> Iterator[Tensor]:
+def statistics_batches(corpus: Corpus, size_px: SizePx, computing: ComputeDevice) -> Iterator[Tensor]:
     """(B, 3, H, W) images of the split train, evenly over all datasets and scenes."""
     members = [(int(pair), eye) for pair in corpus.split("train") for eye in (0, 1)]
     chosen = np.linspace(0, len(members) - 1, min(_MOST_IMAGES, len(members))).astype(int)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nav.detector.input_image import PADDING_DN, fit_picture, letterbox
+from nav.detector.input_image import PADDING_DN, letterbox, letterbox_image
 
 Boxes = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -29,7 +29,7 @@ _SHIFT_SHARE = 0.9  # how much of the freedom to move the crop is used while the
 
 
 @dataclass(frozen=True)
-class Window:
+class CanvasWindow:
     """A rectangle of the canvas that a view fills: low corner and size, in whole pixels. [px]"""
 
     x: int
@@ -73,7 +73,7 @@ class ImageView:
 
     linear: NDArray[np.float64]
     shift: NDArray[np.float64]
-    window: Window
+    window: CanvasWindow
     is_whole: bool = False
 
 
@@ -81,11 +81,11 @@ def whole_view(source_wh: tuple[int, int], canvas_wh: tuple[int, int]) -> ImageV
     """The whole image in the middle of the canvas: what is not augmented."""
     place = letterbox(source_wh, canvas_wh)
     shift = np.array(place.offset_px, dtype=np.float64)
-    return ImageView(np.diag(place.scale), shift, Window(0, 0, *canvas_wh), is_whole=True)
+    return ImageView(np.diag(place.scale), shift, CanvasWindow(0, 0, *canvas_wh), is_whole=True)
 
 
 def sample_view(
-    rng: np.random.Generator, source_wh: tuple[int, int], boxes: Boxes, window: Window, ranges: ViewRanges
+    rng: np.random.Generator, source_wh: tuple[int, int], boxes: Boxes, window: CanvasWindow, ranges: ViewRanges
 ) -> ImageView:
     """A view whose crop shows the first box's centre, and is anywhere in an image without boxes.
 
@@ -116,11 +116,11 @@ def sample_view(
     return ImageView(linear, middle - linear @ rng.uniform(low, high), window)
 
 
-def draw_view(canvas: Image, image: Image, view: ImageView) -> None:
+def warp_view(canvas: Image, image: Image, view: ImageView) -> None:
     """Paint the view into its window of the canvas, grey where the image ends."""
     window = view.window
     if view.is_whole:
-        canvas[:] = fit_picture(image, (window.width, window.height))[0]
+        canvas[:] = letterbox_image(image, (window.width, window.height))[0]
         return
     source = image
     # Averaging before a strong reduction, which interpolation would alias.
@@ -142,7 +142,7 @@ def draw_view(canvas: Image, image: Image, view: ImageView) -> None:
     )
 
 
-def moved_boxes(boxes: Boxes, view: ImageView) -> Boxes:
+def transform_boxes(boxes: Boxes, view: ImageView) -> Boxes:
     """Where the boxes lie on the canvas, also outside the window."""
     if not len(boxes):
         return boxes.reshape(0, 4)
@@ -152,7 +152,7 @@ def moved_boxes(boxes: Boxes, view: ImageView) -> Boxes:
     return np.hstack([centers - halves, 2 * halves])
 
 
-def clipped_boxes(boxes: Boxes, window: Window) -> tuple[Boxes, NDArray[np.float64]]:
+def clip_boxes(boxes: Boxes, window: CanvasWindow) -> tuple[Boxes, NDArray[np.float64]]:
     """The parts of boxes in a window, and the share of each box's area that they are.
 
     Returns:
@@ -169,15 +169,15 @@ def clipped_boxes(boxes: Boxes, window: Window) -> tuple[Boxes, NDArray[np.float
     return np.hstack([low, high - low]), shares
 
 
-def show(canvas: Image, image: Image, boxes: Boxes, view: ImageView) -> Boxes:
+def paint_view(canvas: Image, image: Image, boxes: Boxes, view: ImageView) -> Boxes:
     """Paint a view and tell which boxes it shows.
 
     Returns:
         (m, 4) visible parts of the drogues that are visible enough. Of the others, what is visible is painted grey, so
         that no drogue stands on the canvas without a box.
     """
-    draw_view(canvas, image, view)
-    visible, shares = clipped_boxes(moved_boxes(boxes, view), view.window)
+    warp_view(canvas, image, view)
+    visible, shares = clip_boxes(transform_boxes(boxes, view), view.window)
     kept = shares >= LEAST_VISIBLE_FRACTION
     for x, y, width, height in visible[~kept & (shares > 0)]:
         canvas[int(y) : int(np.ceil(y + height)), int(x) : int(np.ceil(x + width))] = PADDING_DN
@@ -188,15 +188,15 @@ TILES = 4
 _CROSSING_RANGE = (0.3, 0.7)  # where the four meet, as shares of width and height; nearer to an edge one is a sliver
 
 
-def sample_windows(rng: np.random.Generator, canvas_wh: tuple[int, int]) -> list[Window]:
+def sample_mosaic_windows(rng: np.random.Generator, canvas_wh: tuple[int, int]) -> list[CanvasWindow]:
     """Four rectangles that fill a canvas and meet in one point."""
     x, y = (round(rng.uniform(*_CROSSING_RANGE) * side) for side in canvas_wh)
     width, height = canvas_wh
     return [
-        Window(0, 0, x, y),
-        Window(x, 0, width - x, y),
-        Window(0, y, x, height - y),
-        Window(x, y, width - x, height - y),
+        CanvasWindow(0, 0, x, y),
+        CanvasWindow(x, 0, width - x, y),
+        CanvasWindow(0, y, x, height - y),
+        CanvasWindow(x, y, width - x, height - y),
     ]
 
 
@@ -208,7 +208,7 @@ def sample_mosaic(
     ranges: ViewRanges,
 ) -> list[ImageView]:
     """A view of each of four images, one for each rectangle."""
-    windows = sample_windows(rng, canvas_wh)
+    windows = sample_mosaic_windows(rng, canvas_wh)
     return [
         sample_view(rng, source_wh, own, window, ranges)
         for source_wh, own, window in zip(source_whs, boxes, windows, strict=True)

@@ -117,7 +117,7 @@ def import_onnx(content: bytes) -> DetectorNetwork:
     return network
 
 
-def normalise_anew(network: DetectorNetwork, batches: Iterable[Tensor]) -> None:
+def recalibrate_batch_norm(network: DetectorNetwork, batches: Iterable[Tensor]) -> None:
     """Let batch normalisation work on what the convolutions give, without a change of any answer.
 
     Means and variances become those over the images; scales and offsets undo them. Filters get the length of new ones.

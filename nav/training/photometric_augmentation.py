@@ -27,7 +27,7 @@ _NOISE_FRACTION, _NOISE_DN = 0.35, (0.5, 6.0)
 _LOW_LIGHT_NOISE_DN = (2.0, 8.0)
 
 
-def vary_light(rng: np.random.Generator, image: Image) -> Image:
+def color_jitter(rng: np.random.Generator, image: Image) -> Image:
     """The image in other light, by another camera. (H, W, 3) to a new (H, W, 3)."""
     is_dark = rng.random() < _LOW_LIGHT_FRACTION
     image = cv2.LUT(_mix_colors(rng, image), _tone_curves(rng))
@@ -107,7 +107,7 @@ _COLORS = ((200, 30, 30), (225, 95, 35), (150, 20, 30), (235, 235, 235), (35, 35
 _COLOR_SPREAD = 20
 
 
-def occlude(rng: np.random.Generator, image: Image, boxes: Boxes) -> Boxes:
+def cutout(rng: np.random.Generator, image: Image, boxes: Boxes) -> Boxes:
     """Paint a bar or a polygon before some of the drogues.
 
     Args:
@@ -177,7 +177,7 @@ def _visible_box(hidden: NDArray[np.uint8], box: NDArray[np.float64]) -> NDArray
     return np.array([x_low, y_low, x_high - x_low, y_high - y_low])
 
 
-def distract(rng: np.random.Generator, image: Image, boxes: Boxes) -> None:
+def paint_distractors(rng: np.random.Generator, image: Image, boxes: Boxes) -> None:
     """Paint discs, rings and bars beside the drogues, in their colours; they get no boxes."""
     if rng.random() >= _DISTRACTED_FRACTION:
         return

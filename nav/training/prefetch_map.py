@@ -11,7 +11,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def in_order(do: Callable[[Task], Result], tasks: Iterable[Task], threads: int, ahead: int) -> Generator[Result]:
+def prefetch_map(do: Callable[[Task], Result], tasks: Iterable[Task], threads: int, ahead: int) -> Generator[Result]:
     """The results of tasks in the order of the tasks, of which at most `ahead` are begun before they are asked for.
 
     Raises:

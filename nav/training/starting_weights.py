@@ -14,7 +14,7 @@ from nav.detector.detector_registry import network_file
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
 from nav.training.onnx_conversion import import_onnx
 from nav.training.training_settings import TrainingSettings
-from nav.training.training_state import load, new_network
+from nav.training.training_state import load_checkpoint, new_network
 
 _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training's folder"
 
@@ -83,7 +83,7 @@ def _from_onnx(path: Path) -> StartingWeights:
 
 
 def _from_checkpoint(path: Path) -> StartingWeights:
-    content: dict[str, Any] | None = load(path, _ADVICE)
+    content: dict[str, Any] | None = load_checkpoint(path, _ADVICE)
     if content is None:
         raise ValueError(f"{path}: is missing; {_ADVICE}")
     values = content.get("average", content.get("network"))

@@ -15,10 +15,10 @@ import torch
 from nav.detector.network.detection_loss import DetectionLoss, detection_loss
 from nav.training.batches import Batch, BatchMaker
 from nav.training.corpus import Corpus
-from nav.training.evaluation import AveragePrecision, answer, average_precision, measure_batch_statistics, to_tensor
-from nav.training.training_progress import VALIDATED, Curves, EpochRow, Observer, write_tables
+from nav.training.evaluation import ValidationScores, average_precision, measure_batch_statistics, predict, to_tensor
+from nav.training.training_progress import VALIDATED, EpochRow, TensorBoardCurves, TrainingObserver, write_tables
 from nav.training.training_settings import SizePx, TrainingSettings
-from nav.training.training_state import BEST_FILE, Computing, TrainingState, save, save_state
+from nav.training.training_state import BEST_FILE, ComputeDevice, TrainingState, save_checkpoint, save_state
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
@@ -49,9 +49,9 @@ class Trainer:
 
     corpus: Corpus
     settings: TrainingSettings
-    computing: Computing
+    computing: ComputeDevice
     out: Path
-    observer: Observer
+    observer: TrainingObserver
     should_stop: Callable[[], bool]
 
     def run(self, state: TrainingState) -> None:
@@ -70,7 +70,7 @@ class Trainer:
 
     def _run(self, state: TrainingState) -> None:
         settings, maker = self.settings, BatchMaker(self.corpus, self.settings)
-        curves = Curves(self.out, state.step * settings.batch_images)
+        curves = TensorBoardCurves(self.out, state.step * settings.batch_images)
         batches = maker.batches(range(state.step, settings.steps), settings.loader_threads)
         saved_s = began_s = time.monotonic()
         with closing(curves), closing(batches):
@@ -90,7 +90,7 @@ class Trainer:
                     raise KeyboardInterrupt
                 began_s = time.monotonic()
 
-    def _step(self, state: TrainingState, batch: Batch, curves: Curves) -> None:
+    def _step(self, state: TrainingState, batch: Batch, curves: TensorBoardCurves) -> None:
         rate = learning_rate(self.settings, state.step)
         loss = self._learn(state, batch, rate)
         total, score, box = (float(part.detach()) for part in loss)
@@ -120,7 +120,7 @@ class Trainer:
         state.optimizer.step()
         return loss
 
-    def _end_epoch(self, state: TrainingState, epoch: int, curves: Curves) -> None:
+    def _end_epoch(self, state: TrainingState, epoch: int, curves: TensorBoardCurves) -> None:
         """Validate, tell, keep the best, save."""
         settings, size = self.settings, self.settings.size_at(state.step - 1)
         began_s = time.monotonic()
@@ -131,7 +131,7 @@ class Trainer:
         state.rows.append(row)
         if validation is not None and (stage, validation.ap) > state.best:
             state.best = (stage, validation.ap)
-            save(self.out / BEST_FILE, {"network": state.average.network.state_dict(), "step": state.step})
+            save_checkpoint(self.out / BEST_FILE, {"network": state.average.network.state_dict(), "step": state.step})
         per_step_s = (state.row_seconds + time.monotonic() - began_s) / len(state.parts)
         state.parts, state.row_seconds = [], 0.0
         curves.add_epoch(row)
@@ -139,16 +139,16 @@ class Trainer:
         left_s = (settings.steps - state.step) * per_step_s
         self.observer.say(row.to_line(settings.steps * settings.batch_images, left_s))
 
-    def _validate(self, state: TrainingState, size: SizePx) -> AveragePrecision | None:
+    def _validate(self, state: TrainingState, size: SizePx) -> ValidationScores | None:
         network = state.average.network
         measure_batch_statistics(network, self.corpus, size, self.computing)
         settings = self.settings
-        answers = answer(
+        answers = predict(
             network, self.corpus, "val", size, settings.batch_images, settings.large_from_px, self.computing
         )
         return average_precision(answers.truth, answers.found)
 
-    def _row(self, state: TrainingState, epoch: int, validation: AveragePrecision | None) -> EpochRow:
+    def _row(self, state: TrainingState, epoch: int, validation: ValidationScores | None) -> EpochRow:
         settings = self.settings
         height_px, width_px = settings.size_at(state.step - 1)
         count = len(state.parts)

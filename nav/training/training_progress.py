@@ -82,7 +82,7 @@ def write_tables(out: Path, rows: Sequence[EpochRow], losses: Sequence[float], b
     write_text_atomic(out / LOSSES_FILE, "".join(["image_passes,loss\n", *lines]))
 
 
-class Curves:
+class TensorBoardCurves:
     """TensorBoard's log of a training."""
 
     def __init__(self, out: Path, image_passes: int) -> None:
@@ -110,7 +110,7 @@ class Curves:
         self._writer.close()
 
 
-class Observer(Protocol):
+class TrainingObserver(Protocol):
     """What long work tells while it runs."""
 
     def begin(self, what: str, total: int) -> None:

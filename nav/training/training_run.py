@@ -16,31 +16,31 @@ from nav.detector.model_metadata import ModelMetadata
 from nav.detector.network.network import DetectorNetwork
 from nav.training.corpus import Corpus, open_corpus
 from nav.training.evaluation import (
-    Answers,
-    AveragePrecision,
-    answer,
+    Predictions,
+    ValidationScores,
     average_precision,
     best_threshold,
     measure_batch_statistics,
+    predict,
     statistics_batches,
 )
-from nav.training.onnx_conversion import export_onnx, normalise_anew
+from nav.training.onnx_conversion import export_onnx, recalibrate_batch_norm
 from nav.training.starting_weights import StartingWeights, settings_from_start, starting_network
 from nav.training.trainer import Trainer
-from nav.training.training_progress import Observer
+from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import TrainingSettings
 from nav.training.training_state import (
     BEST_FILE,
-    Computing,
+    ComputeDevice,
     MovingAverage,
     TrainingState,
     check_settings,
-    load,
+    limit_threads,
+    load_checkpoint,
     new_network,
     new_state,
-    open_computing,
-    own_threads,
-    remove_leftovers,
+    open_compute_device,
+    remove_partial_files,
     restore_state,
 )
 
@@ -62,8 +62,8 @@ class TrainingResult:
 
     file: Path
     best_step: int
-    validation: AveragePrecision | None
-    test: AveragePrecision | None
+    validation: ValidationScores | None
+    test: ValidationScores | None
     score_threshold: float
 
 
@@ -71,7 +71,7 @@ def train(
     datasets: Sequence[Location],
     out: Path,
     settings: TrainingSettings,
-    observer: Observer,
+    observer: TrainingObserver,
     cache: Path | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     start: StartingWeights | None = None,
@@ -94,11 +94,11 @@ def train(
         KeyboardInterrupt: it was told to stop, and what was done is saved; the same call goes on.
     """
     settings = settings_from_start(settings, start)
-    computing = open_computing(settings)
+    computing = open_compute_device(settings)
     _check_place(out)
     out.mkdir(parents=True, exist_ok=True)
-    with _locked(out), own_threads(settings.threads):
-        remove_leftovers(out)
+    with _locked(out), limit_threads(settings.threads):
+        remove_partial_files(out)
         size, threads = settings.largest_size_px, settings.loader_threads
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
         state = new_state(starting_network(settings, start), settings, computing)
@@ -112,7 +112,7 @@ def train(
         return _finish(out, corpus, settings, computing, state)
 
 
-def check_before(out: Path, settings: TrainingSettings, start: StartingWeights | None = None) -> None:
+def check_training(out: Path, settings: TrainingSettings, start: StartingWeights | None = None) -> None:
     """What can be known of a training before its datasets are there.
 
     Raises:
@@ -120,7 +120,7 @@ def check_before(out: Path, settings: TrainingSettings, start: StartingWeights |
             another run is at work.
     """
     settings = settings_from_start(settings, start)
-    computing = open_computing(settings)
+    computing = open_compute_device(settings)
     new_state(starting_network(settings, start), settings, computing)
     _check_place(out)
     if out.exists():
@@ -141,14 +141,14 @@ def _locked(out: Path) -> Iterator[None]:
         yield
 
 
-def _measure_start(state: TrainingState, corpus: Corpus, settings: TrainingSettings, computing: Computing) -> None:
+def _measure_start(state: TrainingState, corpus: Corpus, settings: TrainingSettings, computing: ComputeDevice) -> None:
     """Normalisation for weights of an exported file, before the first step."""
-    exact = Computing(computing.device, bf16=False)
-    normalise_anew(state.network, statistics_batches(corpus, settings.size_at(0), exact))
+    exact = ComputeDevice(computing.device, bf16=False)
+    recalibrate_batch_norm(state.network, statistics_batches(corpus, settings.size_at(0), exact))
     state.average = MovingAverage(state.network, settings.ema_decay)
 
 
-def _summary(corpus: Corpus, settings: TrainingSettings, computing: Computing, state: TrainingState) -> str:
+def _summary(corpus: Corpus, settings: TrainingSettings, computing: ComputeDevice, state: TrainingState) -> str:
     pairs = {split: len(corpus.split(split)) for split in ("train", "val", "test")}
     weights = sum(each.numel() for each in state.network.parameters())
     done = f", going on after {state.step * settings.batch_images:,}" if state.step else ""
@@ -160,19 +160,19 @@ def _summary(corpus: Corpus, settings: TrainingSettings, computing: Computing, s
 
 
 def _finish(
-    out: Path, corpus: Corpus, settings: TrainingSettings, computing: Computing, state: TrainingState
+    out: Path, corpus: Corpus, settings: TrainingSettings, computing: ComputeDevice, state: TrainingState
 ) -> TrainingResult:
     """Evaluate and export the best weights, and the last."""
     best_step, network = _best(out, settings, state)
     network.to(computing.device)
     size = settings.size_at(settings.steps - 1)
     # The files are used in float32, so that is how they are measured.
-    exact = Computing(computing.device, bf16=False)
+    exact = ComputeDevice(computing.device, bf16=False)
     for each in (network, state.average.network):
         measure_batch_statistics(each, corpus, size, exact)
 
-    def answers(split: SplitName) -> Answers:
-        return answer(network, corpus, split, size, settings.batch_images, settings.large_from_px, exact)
+    def answers(split: SplitName) -> Predictions:
+        return predict(network, corpus, split, size, settings.batch_images, settings.large_from_px, exact)
 
     validation, test = answers("val"), answers("test")
     threshold = best_threshold(validation.truth, validation.found, _USUAL_THRESHOLD)
@@ -221,7 +221,7 @@ def _load_best(out: Path, state: TrainingState) -> dict[str, Any] | None:
     """
     if state.best[0] < 0:
         return None
-    saved = load(out / BEST_FILE)
+    saved = load_checkpoint(out / BEST_FILE)
     if saved is None:
         raise ValueError(
             f"{out / BEST_FILE}: is missing, the best weights so far; put it back, or train anew elsewhere"

@@ -26,7 +26,7 @@ from nav.training.training_settings import TrainingSettings, differing_settings
 CHECKPOINT_FILE, BEST_FILE = "checkpoint.pt", "best.pt"
 
 
-def save(path: Path, state: dict[str, Any]) -> None:
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     """Write or replace a file of tensors and plain values by one rename.
 
     Raises:
@@ -39,7 +39,7 @@ def save(path: Path, state: dict[str, Any]) -> None:
         file.write(stream.getbuffer())
 
 
-def load(path: Path, advice: str = "delete it, or train into another folder") -> dict[str, Any] | None:
+def load_checkpoint(path: Path, advice: str = "delete it, or train into another folder") -> dict[str, Any] | None:
     """What `save` wrote; None where there is no such file.
 
     Args:
@@ -65,7 +65,7 @@ def load(path: Path, advice: str = "delete it, or train into another folder") ->
     return state
 
 
-def remove_leftovers(folder: Path) -> None:
+def remove_partial_files(folder: Path) -> None:
     """Delete what a killed training left half-written."""
     for leftover in folder.glob(f".*{PART_SUFFIX}"):
         if leftover.is_file():
@@ -102,7 +102,7 @@ class MovingAverage:
 
 
 @dataclass(frozen=True)
-class Computing:
+class ComputeDevice:
     """A device, and whether most of it is computed in bfloat16 there."""
 
     device: torch.device
@@ -113,7 +113,7 @@ class Computing:
         return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16)
 
 
-def open_computing(settings: TrainingSettings) -> Computing:
+def open_compute_device(settings: TrainingSettings) -> ComputeDevice:
     """The device that the settings name.
 
     Raises:
@@ -123,14 +123,14 @@ def open_computing(settings: TrainingSettings) -> Computing:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError("device: torch sees no CUDA device here; take cpu, or install torch with CUDA")
     if settings.precision != "auto":
-        return Computing(device, settings.precision == "bf16")
+        return ComputeDevice(device, settings.precision == "bf16")
     # Without such instructions bfloat16 is emulated and slower than float32.
     has_bf16 = torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.cpu._is_avx512_bf16_supported()
-    return Computing(device, bool(has_bf16))
+    return ComputeDevice(device, bool(has_bf16))
 
 
 @contextmanager
-def own_threads(threads: int) -> Iterator[None]:
+def limit_threads(threads: int) -> Iterator[None]:
     """Compute with so many threads meanwhile, all cores that it may use by 0; images are prepared by others."""
     before = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(threads or len(os.sched_getaffinity(0)))
@@ -179,7 +179,7 @@ def new_network(settings: TrainingSettings) -> DetectorNetwork:
         return DetectorNetwork(config)
 
 
-def new_state(network: DetectorNetwork, settings: TrainingSettings, computing: Computing) -> TrainingState:
+def new_state(network: DetectorNetwork, settings: TrainingSettings, computing: ComputeDevice) -> TrainingState:
     """The state of a network before the first step."""
     network.to(computing.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return TrainingState(network, MovingAverage(network, settings.ema_decay), _new_optimizer(network, settings))
@@ -215,7 +215,7 @@ def save_state(out: Path, state: TrainingState, settings: TrainingSettings, data
         "row_seconds": state.row_seconds,
         "best": state.best,
     }
-    save(out / CHECKPOINT_FILE, content)
+    save_checkpoint(out / CHECKPOINT_FILE, content)
 
 
 def check_settings(out: Path, settings: TrainingSettings) -> None:
@@ -224,7 +224,7 @@ def check_settings(out: Path, settings: TrainingSettings) -> None:
     Raises:
         ValueError: as `restore_state`, but for the datasets.
     """
-    content = load(out / CHECKPOINT_FILE)
+    content = load_checkpoint(out / CHECKPOINT_FILE)
     if content is not None:
         _check_same(out / CHECKPOINT_FILE, content, settings, None)
 
@@ -253,7 +253,7 @@ def restore_state(
             keys.
     """
     path = out / CHECKPOINT_FILE
-    content = load(path)
+    content = load_checkpoint(path)
     if content is None:
         return False
     _check_same(path, content, settings, datasets)

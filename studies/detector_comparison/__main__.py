@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.detector_comparison.comparison import PeerOrder, compare_peers, comparison_lines
+from studies.detector_comparison.comparison import ComparisonOptions, compare_peers, comparison_lines
 from studies.detector_comparison.options import (
     CorpusOption,
     DeviceOption,
@@ -17,7 +17,7 @@ from studies.detector_comparison.options import (
     TestOption,
     ThreadsOption,
     input_size_px,
-    tell,
+    print_status,
 )
 
 _EXAMPLES = """Examples:
@@ -52,7 +52,7 @@ def main(
     With 0 image passes nothing is trained or scored: only parameters, operations and times are told.
     """
     try:
-        order = PeerOrder(
+        order = ComparisonOptions(
             corpus=corpus,
             test=test or corpus,
             ours=tuple(ours or ()),
@@ -65,7 +65,7 @@ def main(
             seed=seed,
             environment=environment or out / "environment",
         )
-        rows = compare_peers(order, out, tell)
+        rows = compare_peers(order, out, print_status)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error

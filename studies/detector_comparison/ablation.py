@@ -26,7 +26,7 @@ from nav.detector.onnx_detector import OnnxDetector
 from studies.detector_comparison.latency import measure_latency
 
 
-class OneViewDetector(OnnxDetector):
+class SingleViewDetector(OnnxDetector):
     """The same network and boxes, but each eye in passes of its own."""
 
     def detect(self, images: StereoImages) -> StereoDetection:
@@ -62,7 +62,7 @@ _TIMED_PAIRS = 4
 
 
 @dataclass(frozen=True)
-class AblationOrder:
+class AblationOptions:
     """What is trained.
 
     Attributes:
@@ -90,7 +90,7 @@ class AblationOrder:
             raise ValueError(f"--image-passes: must be at least 1, got {self.image_passes}")
 
 
-def ablate(order: AblationOrder, out: Path, say: Callable[[str], None]) -> list[str]:
+def ablate(order: AblationOptions, out: Path, say: Callable[[str], None]) -> list[str]:
     """Train what is not trained yet, time all in turns, and make the table.
 
     Args:
@@ -114,7 +114,7 @@ def ablate(order: AblationOrder, out: Path, say: Callable[[str], None]) -> list[
 
 
 def measured_networks(
-    order: AblationOrder, files: dict[str, Path], say: Callable[[str], None]
+    order: AblationOptions, files: dict[str, Path], say: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
     """Accuracy on the test split as `benchmark` scores it, time in turns, and cost of networks.
 
@@ -127,7 +127,7 @@ def measured_networks(
         ValueError: a network or the test dataset cannot be read.
     """
     detectors: dict[str, Detector] = {
-        name: (OneViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, order.threads, order.size_px)
+        name: (SingleViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, order.threads, order.size_px)
         for name, file in files.items()
     }
     source = BlindDataset(order.test)
@@ -168,7 +168,7 @@ def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _train(order: AblationOrder, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]) -> None:
+def _train(order: AblationOptions, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]) -> None:
     """Begin a training, or go on with it, unless it is over."""
     width, height = order.size_px
     options = {

@@ -24,9 +24,9 @@ from studies.detector_comparison.yolo_detector import YoloDetector
 from studies.detector_comparison.yolo_training import (
     check_corpus,
     export_corpus,
-    images_to_train_on,
-    peer_python,
-    peer_variables,
+    training_image_count,
+    yolo_environment_variables,
+    yolo_python,
 )
 
 PEERS = ("yolov8s", "yolov8n")
@@ -39,7 +39,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class PeerOrder:
+class ComparisonOptions:
     """What is compared.
 
     Attributes:
@@ -78,7 +78,7 @@ class PeerOrder:
             raise ValueError(f"size: must be multiples of 32 px, got {self.size_px[1]}x{self.size_px[0]}")
 
 
-def compare_peers(order: PeerOrder, out: Path, say: Say) -> dict[str, Any]:
+def compare_peers(order: ComparisonOptions, out: Path, say: Say) -> dict[str, Any]:
     """Run every stage that is not over yet.
 
     Args:
@@ -101,7 +101,7 @@ def compare_peers(order: PeerOrder, out: Path, say: Say) -> dict[str, Any]:
         return _compare(order, out, ours, say)
 
 
-def _compare(order: PeerOrder, out: Path, ours: Mapping[str, Detector], say: Say) -> dict[str, Any]:
+def _compare(order: ComparisonOptions, out: Path, ours: Mapping[str, Detector], say: Say) -> dict[str, Any]:
     networks = {name: _peer_network(order, out, name, say) for name in PEERS}
     detectors: dict[str, Detector] = {name: YoloDetector(file, order.threads) for name, file in networks.items()}
     detectors |= ours
@@ -116,7 +116,7 @@ def _compare(order: PeerOrder, out: Path, ours: Mapping[str, Detector], say: Say
         rows = {name: row | scores[name] for name, row in rows.items()}
     told = {name: str(value) for name, value in asdict(order).items()}
     if order.image_passes:
-        length = training_length(order.image_passes, images_to_train_on(order.corpus))
+        length = training_length(order.image_passes, training_image_count(order.corpus))
         told["peer_image_passes"] = str(length.image_passes)
     write_text_atomic(
         out / "comparison.json", json.dumps({"schema": 1, "order": told, "detectors": rows}, indent=1) + "\n"
@@ -177,7 +177,7 @@ def training_length(image_passes: int, images: int) -> TrainingLength:
     return TrainingLength(epochs, fraction, epochs * round(fraction * images))
 
 
-def _our_detectors(order: PeerOrder) -> dict[str, Detector]:
+def _our_detectors(order: ComparisonOptions) -> dict[str, Detector]:
     """Ours by name, opened and found countable."""
     detectors: dict[str, Detector] = {}
     for file in order.ours:
@@ -189,7 +189,7 @@ def _our_detectors(order: PeerOrder) -> dict[str, Detector]:
 
 
 @contextmanager
-def _own_folder(order: PeerOrder, out: Path) -> Iterator[None]:
+def _own_folder(order: ComparisonOptions, out: Path) -> Iterator[None]:
     """Claim a new folder, or go on in the one of this comparison, if nobody else does."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / ".lock").open("a") as lock:
@@ -199,7 +199,7 @@ def _own_folder(order: PeerOrder, out: Path) -> Iterator[None]:
         yield
 
 
-def _check_folder(order: PeerOrder, out: Path) -> None:
+def _check_folder(order: ComparisonOptions, out: Path) -> None:
     """Refuse a folder of another comparison, and write down what a new one is of."""
     settings = {name: str(value) for name, value in asdict(order).items() if name not in _FREE_TO_CHANGE}
     for name, dataset in (("corpus", order.corpus), ("test", order.test)):
@@ -218,21 +218,21 @@ def _check_folder(order: PeerOrder, out: Path) -> None:
     write_text_atomic(file, json.dumps(settings, indent=1) + "\n")
 
 
-def _peer_network(order: PeerOrder, out: Path, name: str, say: Say) -> Path:
+def _peer_network(order: ComparisonOptions, out: Path, name: str, say: Say) -> Path:
     """A peer's ONNX file, trained and exported where that has not been done."""
     file = (out / f"{name}.onnx").resolve()
     if file.exists():
         return file
-    python = peer_python(order.environment, say)
+    python = yolo_python(order.environment, say)
     folder = (out / name).resolve()
-    variables = peer_variables(out / "ultralytics", order.threads)
+    variables = yolo_environment_variables(out / "ultralytics", order.threads)
     weights = f"{name}.yaml"
     if order.image_passes:
         weights = str(folder / "train" / "weights" / "best.pt")
         over = folder / "trained"
         if not over.exists():
             data = export_corpus(order.corpus, out / "pictures", order.size_px).resolve()
-            length = training_length(order.image_passes, images_to_train_on(order.corpus))
+            length = training_length(order.image_passes, training_image_count(order.corpus))
             training = {
                 "do": "train",
                 "config": f"{name}.yaml",
@@ -258,13 +258,15 @@ def _peer_network(order: PeerOrder, out: Path, name: str, say: Say) -> Path:
     return file
 
 
-def _latencies(order: PeerOrder, detectors: Mapping[str, Detector]) -> list[dict[str, Any]]:
+def _latencies(order: ComparisonOptions, detectors: Mapping[str, Detector]) -> list[dict[str, Any]]:
     source = BlindDataset(order.test)
     pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
     return [latency._asdict() for latency in measure_latency(detectors, pairs, order.rounds).values()]
 
 
-def _scores(order: PeerOrder, out: Path, detectors: Mapping[str, Detector], say: Say) -> dict[str, dict[str, Any]]:
+def _scores(
+    order: ComparisonOptions, out: Path, detectors: Mapping[str, Detector], say: Say
+) -> dict[str, dict[str, Any]]:
     """Overall scores by our own benchmark, of the boxes of every detector; those found before stand."""
     files = []
     for name, detector in detectors.items():

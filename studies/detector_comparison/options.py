@@ -31,6 +31,6 @@ def input_size_px(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def tell(line: str) -> None:
+def print_status(line: str) -> None:
     """Say what goes on beside the results."""
     typer.echo(line, err=True)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.detector_comparison.ablation import AblationOrder, ablate
+from studies.detector_comparison.ablation import AblationOptions, ablate
 from studies.detector_comparison.options import (
     CorpusOption,
     DeviceOption,
@@ -17,7 +17,7 @@ from studies.detector_comparison.options import (
     TestOption,
     ThreadsOption,
     input_size_px,
-    tell,
+    print_status,
 )
 
 _EXAMPLES = """Examples:
@@ -40,10 +40,10 @@ def main(
 ) -> None:
     """Train our network with one thing changed at a time, on the same budget: accuracy and time of each."""
     try:
-        order = AblationOrder(
+        order = AblationOptions(
             corpus, test or corpus, variant, image_passes, input_size_px(size), threads, seed, device, rounds
         )
-        lines = ablate(order, out, tell)
+        lines = ablate(order, out, print_status)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error

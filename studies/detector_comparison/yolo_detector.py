@@ -21,7 +21,7 @@ _MOST_BOXES = 300
 _USUAL_THRESHOLD = 0.25
 
 
-def quiet_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
+def open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
     """A network whose idle threads do not spin, so that what is timed beside it is not slowed.
 
     Raises:
@@ -54,7 +54,7 @@ class YoloDetector:
             ValueError: the file is missing, or no network of two images with one class; names it.
         """
         self.name = file.stem
-        self._session = quiet_session(file, threads)
+        self._session = open_session(file, threads)
         (entry,), (answer,) = self._session.get_inputs(), self._session.get_outputs()
         shape, rows = entry.shape, answer.shape
         if len(shape) != 4 or shape[:2] != [len(EYES), 3] or len(rows) != 3:

@@ -40,7 +40,7 @@ _ALONE = ("ultralytics==8.4.190", "ultralytics-thop==2.2.3", "ultralytics-platfo
 _DONE = ".detector-peers"
 
 
-def peer_python(folder: Path, say: Callable[[str], None]) -> Path:
+def yolo_python(folder: Path, say: Callable[[str], None]) -> Path:
     """The interpreter of the environment in a folder, which is made where it is missing.
 
     Args:
@@ -70,7 +70,7 @@ def peer_python(folder: Path, say: Callable[[str], None]) -> Path:
     return python
 
 
-def peer_variables(folder: Path, threads: int) -> dict[str, str]:
+def yolo_environment_variables(folder: Path, threads: int) -> dict[str, str]:
     """Environment variables under which ultralytics stays by itself: no downloads, no settings elsewhere.
 
     Args:
@@ -156,7 +156,7 @@ def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
     return data
 
 
-def images_to_train_on(corpus: Path) -> int:
+def training_image_count(corpus: Path) -> int:
     """How many images an epoch has: both eyes of every pair of the split `train`.
 
     Raises:

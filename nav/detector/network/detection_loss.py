@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils.rnn import pad_sequence
 
-from nav.detector.network.head import boxes_of, cells_of, in_one_row
+from nav.detector.network.head import anchor_points, decode_boxes, flatten_maps
 
 _LEAST_AREA_PX2 = 1e-6
 
@@ -82,7 +82,9 @@ class Assignment(NamedTuple):
 
 
 @torch.no_grad()
-def assign(scores: Tensor, boxes_px: Tensor, centers_px: Tensor, truth_px: Tensor, present: Tensor) -> Assignment:
+def assign_anchors(
+    scores: Tensor, boxes_px: Tensor, centers_px: Tensor, truth_px: Tensor, present: Tensor
+) -> Assignment:
     """Give every box its cells.
 
     Cells within a box claim it; a box too small to have any goes to the nearest cell. A cell that is among the best of
@@ -158,11 +160,11 @@ def detection_loss(maps: Sequence[Tensor], boxes_xywh_px: Sequence[Tensor]) -> D
         if boxes.ndim != 2 or boxes.shape[1] != 4:
             raise ValueError(f"boxes_xywh_px: must be (n, 4), got {tuple(boxes.shape)}")
     with torch.autocast(device.type, enabled=False):
-        cells = cells_of(maps)
-        row = in_one_row(maps)
-        logits, answered_px = row[..., 0], boxes_of(row[..., 1:], cells)
+        cells = anchor_points(maps)
+        row = flatten_maps(maps)
+        logits, answered_px = row[..., 0], decode_boxes(row[..., 1:], cells)
         truth_px, present = _padded(boxes_xywh_px, device)
-        assigned = assign(logits.sigmoid(), answered_px, cells.centers_px, truth_px, present)
+        assigned = assign_anchors(logits.sigmoid(), answered_px, cells.centers_px, truth_px, present)
         share = assigned.scores.sum().clamp(min=1.0)
         score = _quality_focal(logits, assigned.scores).sum() / share
         wanted_px = truth_px.gather(1, assigned.box_index[..., None].expand(-1, -1, 4))

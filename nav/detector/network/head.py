@@ -49,7 +49,7 @@ class DetectionHead(nn.Module):
             return torch.cat((self.score(score_features.float()), self.box(box_features.float())), dim=1)
 
 
-class Cells(NamedTuple):
+class AnchorPoints(NamedTuple):
     """N cells of all maps.
 
     Attributes:
@@ -61,7 +61,7 @@ class Cells(NamedTuple):
     strides_px: Tensor
 
 
-def cells_of(maps: Sequence[Tensor]) -> Cells:
+def anchor_points(maps: Sequence[Tensor]) -> AnchorPoints:
     """Places of the cells of maps (B, 5, H, W), the finest map first, row by row."""
     centers, strides = [], []
     for stride, each in zip(STRIDES, maps, strict=True):
@@ -71,15 +71,15 @@ def cells_of(maps: Sequence[Tensor]) -> Cells:
         y, x = torch.meshgrid(rows, columns, indexing="ij")
         centers.append(torch.stack((x.flatten(), y.flatten()), dim=1))
         strides.append(torch.full((x.numel(), 1), float(stride), device=each.device))
-    return Cells(torch.cat(centers), torch.cat(strides))
+    return AnchorPoints(torch.cat(centers), torch.cat(strides))
 
 
-def in_one_row(maps: Sequence[Tensor]) -> Tensor:
-    """(B, N, 5) of float32 from maps (B, 5, H, W), in the order of `cells_of`."""
+def flatten_maps(maps: Sequence[Tensor]) -> Tensor:
+    """(B, N, 5) of float32 from maps (B, 5, H, W), in the order of `anchor_points`."""
     return torch.cat([each.float().flatten(2) for each in maps], dim=2).transpose(1, 2)
 
 
-def boxes_of(log_distances: Tensor, cells: Cells) -> Tensor:
+def decode_boxes(log_distances: Tensor, cells: AnchorPoints) -> Tensor:
     """Boxes of all cells.
 
     Args:

@@ -5,10 +5,10 @@ import pytest
 import torch
 from pycocotools import mask
 
-from nav.detector.network.detection_loss import assign, complete_iou, intersection_over_union
-from nav.detector.network.head import boxes_of, cells_of
+from nav.detector.network.detection_loss import assign_anchors, complete_iou, intersection_over_union
+from nav.detector.network.head import anchor_points, decode_boxes
 
-CELLS = cells_of([torch.zeros(1, 5, 128 // stride, 160 // stride) for stride in (8, 16, 32)])
+CELLS = anchor_points([torch.zeros(1, 5, 128 // stride, 160 // stride) for stride in (8, 16, 32)])
 MOST_CELLS = 10
 
 
@@ -20,7 +20,7 @@ def corners(xywh: list[tuple[float, float, float, float]]) -> torch.Tensor:
 def random_answers(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     count = len(CELLS.centers_px)
-    boxes = boxes_of(torch.randn(1, count, 4, generator=generator), CELLS)
+    boxes = decode_boxes(torch.randn(1, count, 4, generator=generator), CELLS)
     return torch.rand(1, count, generator=generator), boxes
 
 
@@ -63,7 +63,7 @@ def test_cells_answer_for_boxes_that_they_lie_in(seed):
     scores, boxes = random_answers(seed)
     present = torch.tensor([[True, True, True, False]])
     filled = torch.cat((truth, torch.tensor([[0.0, 0, 160, 128]])))[None]
-    assigned = assign(scores, boxes, CELLS.centers_px, filled, present)
+    assigned = assign_anchors(scores, boxes, CELLS.centers_px, filled, present)
     overlap = intersection_over_union(filled[0][:, None], boxes[0][None])
     for index in range(3):
         cells = torch.nonzero(assigned.answers[0] & (assigned.box_index[0] == index))[:, 0]
@@ -82,8 +82,8 @@ def test_order_of_boxes_does_not_matter(seed):
     scores, boxes = random_answers(seed)
     present = torch.ones(1, 3, dtype=torch.bool)
     order = torch.tensor([2, 0, 1])
-    plain = assign(scores, boxes, CELLS.centers_px, truth[None], present)
-    turned = assign(scores, boxes, CELLS.centers_px, truth[order][None], present)
+    plain = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], present)
+    turned = assign_anchors(scores, boxes, CELLS.centers_px, truth[order][None], present)
     assert torch.equal(plain.answers, turned.answers)
     torch.testing.assert_close(plain.scores, turned.scores)
     assert torch.equal(plain.box_index[plain.answers], order[turned.box_index[turned.answers]])
@@ -92,7 +92,7 @@ def test_order_of_boxes_does_not_matter(seed):
 def test_a_box_between_cells_goes_to_the_nearest():
     scores, boxes = random_answers(3)
     truth = corners([(45.0, 53.0, 2.0, 2.0)])
-    assigned = assign(scores, boxes, CELLS.centers_px, truth[None], torch.ones(1, 1, dtype=torch.bool))
+    assigned = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], torch.ones(1, 1, dtype=torch.bool))
     (cell,) = torch.nonzero(assigned.answers[0])[:, 0].tolist()
     # The finest map's cell of row 6, column 5.
     assert CELLS.centers_px[cell].tolist() == [44.0, 52.0]
@@ -103,7 +103,7 @@ def test_a_cell_in_two_boxes_answers_for_the_one_it_overlaps_more():
     scores, boxes = random_answers(4)
     outer, inner = (0.0, 0.0, 100.0, 100.0), (20.0, 20.0, 60.0, 60.0)
     boxes = corners([outer])[None].repeat(1, boxes.shape[1], 1)
-    assigned = assign(
+    assigned = assign_anchors(
         scores, boxes, CELLS.centers_px, corners([inner, outer])[None], torch.ones(1, 2, dtype=torch.bool)
     )
     both = assigned.answers[0]

@@ -5,7 +5,7 @@ from math import exp
 import numpy as np
 import pytest
 
-from nav.detector.output_maps import STRIDES, decode
+from nav.detector.output_maps import STRIDES, decode_maps
 
 HEIGHT, WIDTH = 64, 96
 
@@ -47,7 +47,7 @@ def decode_slowly(maps: list[np.ndarray], image: int, least_score: float, most: 
 @pytest.mark.parametrize(("least_score", "most"), [(0.01, 20), (0.8, 20), (0.3, 3)])
 def test_agrees_with_a_slow_reference(seed, least_score, most):
     maps = random_maps(seed)
-    for image, (boxes, scores) in enumerate(decode(maps, least_score, most)):
+    for image, (boxes, scores) in enumerate(decode_maps(maps, least_score, most)):
         expected = decode_slowly(maps, image, least_score, most)
         # float64 of the same float32 numbers.
         np.testing.assert_allclose(scores, [score for score, _ in expected], rtol=1e-9)
@@ -56,7 +56,7 @@ def test_agrees_with_a_slow_reference(seed, least_score, most):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_answers_are_ordered_apart_and_good_enough(seed):
-    for boxes, scores in decode(random_maps(seed), 0.2):
+    for boxes, scores in decode_maps(random_maps(seed), 0.2):
         assert len(boxes) <= 20
         assert (np.diff(scores) <= 0).all()
         assert (scores >= 0.2).all() and (scores <= 1).all()
@@ -66,7 +66,7 @@ def test_answers_are_ordered_apart_and_good_enough(seed):
 
 
 def test_nothing_scores_enough():
-    for boxes, scores in decode([each * 0 - 20 for each in random_maps(0)], 0.01):
+    for boxes, scores in decode_maps([each * 0 - 20 for each in random_maps(0)], 0.01):
         assert boxes.shape == (0, 4) and scores.shape == (0,)
 
 
@@ -75,7 +75,7 @@ def test_numbers_that_are_none_never_become_boxes(value):
     maps = random_maps(1)
     for each in maps:
         each[:, :, ::2] = value
-    for boxes, scores in decode(maps, 0.01):
+    for boxes, scores in decode_maps(maps, 0.01):
         assert np.isfinite(boxes).all() and np.isfinite(scores).all()
 
 
@@ -83,5 +83,5 @@ def test_many_good_cells_are_decoded():
     maps = random_maps(2, images=1)
     for each in maps:
         each[:, 0] = 9.0
-    ((boxes, scores),) = decode(maps, 0.5)
+    ((boxes, scores),) = decode_maps(maps, 0.5)
     assert 1 <= len(boxes) <= 20 and (scores > 0.99).all()

@@ -6,7 +6,7 @@ from pycocotools import mask
 
 from nav.detector.network.detection_loss import detection_loss
 from nav.detector.network.network import NetworkConfig
-from nav.detector.output_maps import STRIDES, decode
+from nav.detector.output_maps import STRIDES, decode_maps
 
 HEIGHT, WIDTH = 128, 160
 NONE = torch.zeros(0, 4)
@@ -75,7 +75,7 @@ def test_making_the_loss_small_makes_the_answer_right():
         optimiser.zero_grad()
         loss.total.backward()
         optimiser.step()
-    found, empty = decode([each.detach().numpy() for each in maps], least_score=0.1)
+    found, empty = decode_maps([each.detach().numpy() for each in maps], least_score=0.1)
     assert len(empty[1]) == 0
     assert len(found[1]) == 2
     assert (found[1] > 0.8).all()

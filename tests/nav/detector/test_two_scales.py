@@ -8,7 +8,7 @@ import pytest
 from datasets_manifest.types.images import StereoImages
 from nav.detector.input_image import letterbox
 from nav.detector.model_metadata import ModelMetadata
-from nav.detector.multiscale_inference import at_full_size, half_size_px, joined
+from nav.detector.multiscale_inference import half_size_px, merge_scales, to_full_size
 from nav.detector.onnx_detector import OnnxDetector
 
 LARGE_PX = 160.0
@@ -22,7 +22,7 @@ def found(*rows):
 
 @pytest.mark.parametrize("side_px", [20.0, 127.0, 129.0, 160.0, 199.0, 201.0, 400.0])
 def test_every_size_is_answered_once_where_both_passes_find_it(side_px):
-    boxes, scores = joined(found((10, 10, side_px, 0.8)), found((11, 10, side_px, 0.7)), LARGE_PX, 20)
+    boxes, scores = merge_scales(found((10, 10, side_px, 0.8)), found((11, 10, side_px, 0.7)), LARGE_PX, 20)
     assert len(boxes) == 1
     # Well below the limit by the full size, well above by half of it, between by the better one.
     assert scores[0] == (0.7 if side_px > 1.25 * LARGE_PX else 0.8)
@@ -31,22 +31,22 @@ def test_every_size_is_answered_once_where_both_passes_find_it(side_px):
 @pytest.mark.parametrize("side_px", [150.0, 170.0])
 def test_near_the_limit_either_pass_is_enough(side_px):
     only = found((10, 10, side_px, 0.6))
-    assert len(joined(only, NONE, LARGE_PX, 20)[0]) == len(joined(NONE, only, LARGE_PX, 20)[0]) == 1
+    assert len(merge_scales(only, NONE, LARGE_PX, 20)[0]) == len(merge_scales(NONE, only, LARGE_PX, 20)[0]) == 1
 
 
 def test_parts_of_a_large_drogue_are_none_themselves():
     large, marker, aside = (100, 100, 300, 0.8), (150, 150, 40, 0.7), (500, 20, 40, 0.6)
-    boxes, scores = joined(found(marker, aside), found(large), LARGE_PX, 20)
+    boxes, scores = merge_scales(found(marker, aside), found(large), LARGE_PX, 20)
     assert scores.tolist() == [0.8, 0.6] and boxes[1, 0] == 500
     # A large box that is worse than what lies in it takes nothing away.
-    boxes, _ = joined(found((150, 150, 40, 0.9)), found(large), LARGE_PX, 20)
+    boxes, _ = merge_scales(found((150, 150, 40, 0.9)), found(large), LARGE_PX, 20)
     assert len(boxes) == 2
 
 
 def test_no_more_boxes_than_asked_for_and_none_of_nothing():
     many = found(*((50 * index, 0, 30, 0.9 - 0.1 * index) for index in range(6)))
-    assert joined(many, NONE, LARGE_PX, 2)[1].tolist() == pytest.approx([0.9, 0.8])
-    assert len(joined(NONE, NONE, LARGE_PX, 20)[0]) == 0
+    assert merge_scales(many, NONE, LARGE_PX, 2)[1].tolist() == pytest.approx([0.9, 0.8])
+    assert len(merge_scales(NONE, NONE, LARGE_PX, 20)[0]) == 0
 
 
 def test_half_a_size_is_one_that_networks_take():
@@ -57,7 +57,7 @@ def test_half_a_size_is_one_that_networks_take():
 def test_boxes_come_back_from_half_the_size():
     # 640 x 480 lies in the middle of 320 x 256, eight pixels of grey above and below it.
     place = letterbox((640, 480), (320, 256))
-    boxes, _ = at_full_size((np.array([[10.0, 28.0, 50.0, 60.0]]), np.array([0.5])), place)
+    boxes, _ = to_full_size((np.array([[10.0, 28.0, 50.0, 60.0]]), np.array([0.5])), place)
     np.testing.assert_allclose(boxes, [[20.0, 40.0, 100.0, 120.0]], atol=1e-9)
 
 

@@ -7,7 +7,7 @@ import pytest
 from datasets_manifest.random_streams import sample_generator
 from nav.training.batches import BatchMaker
 from nav.training.corpus import Corpus
-from nav.training.photometric_augmentation import distract, occlude, paint_ring, vary_light
+from nav.training.photometric_augmentation import color_jitter, cutout, paint_distractors, paint_ring
 from nav.training.training_settings import build_settings
 
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])
@@ -25,7 +25,7 @@ def test_occluded_boxes_go_around_what_is_left() -> None:
     for seed in range(400):
         image = white_ellipse()
         before = image.copy()
-        (box,) = occlude(np.random.default_rng(seed), image, BOX)
+        (box,) = cutout(np.random.default_rng(seed), image, BOX)
         if (image == before).all():
             np.testing.assert_array_equal(box, BOX[0])
             continue
@@ -46,7 +46,7 @@ def test_no_drogue_disappears_behind_the_occluder_of_another() -> None:
     covered = 0
     for seed in range(600):
         image = np.full((120, 160, 3), 255, np.uint8)
-        boxes = occlude(np.random.default_rng(seed), image, np.array([large, small]))
+        boxes = cutout(np.random.default_rng(seed), image, np.array([large, small]))
         assert boxes.shape == (2, 4)
         left = (image == 255).all(axis=2)
         for box, (x, y, width, height) in zip(boxes, (large, small), strict=True):
@@ -66,7 +66,7 @@ def test_distractors_never_touch_a_drogue() -> None:
     painted = 0
     for seed in range(300):
         image = white_ellipse()
-        distract(np.random.default_rng(seed), image, BOX)
+        paint_distractors(np.random.default_rng(seed), image, BOX)
         assert (image[40:76, 60:110] == white_ellipse()[40:76, 60:110]).all()
         painted += (image != white_ellipse()).any()
     assert painted > 30
@@ -122,16 +122,16 @@ def test_rings_that_the_edge_cuts_are_painted_as_far_as_they_reach() -> None:
 
 def test_light_varies_and_the_image_given_stays() -> None:
     image = np.full((32, 48, 3), 128, np.uint8)
-    varied = [vary_light(np.random.default_rng(seed), image) for seed in range(200)]
+    varied = [color_jitter(np.random.default_rng(seed), image) for seed in range(200)]
     assert (image == 128).all()
     assert all(each.shape == image.shape and each.dtype == np.uint8 for each in varied)
     means = np.array([each.mean() for each in varied])
     assert means.min() < 40 and means.max() > 180  # low light, and nearly twice the exposure
     assert means.min() > 18  # 20, less what blur, rounding and cut-off noise change
-    dim = [vary_light(np.random.default_rng(seed), image // 6).mean() for seed in range(200)]
+    dim = [color_jitter(np.random.default_rng(seed), image // 6).mean() for seed in range(200)]
     # What is dark already is exposed, cast and curved as all images are, by 0.55, 0.7 and a gamma of 1.45 at worst.
     assert min(dim) > 255 * (21 / 255) ** 1.45 * 0.55 * 0.7
-    again = vary_light(np.random.default_rng(7), image)
+    again = color_jitter(np.random.default_rng(7), image)
     np.testing.assert_array_equal(again, varied[7])
 
 

@@ -11,18 +11,18 @@ from nav.training.corpus import CachedPair, Corpus, ImageCache
 from nav.training.evaluation import to_tensor, whole_image
 from nav.training.geometric_augmentation import (
     LEAST_VISIBLE_FRACTION,
+    CanvasWindow,
     ImageView,
     ViewRanges,
-    Window,
-    clipped_boxes,
-    draw_view,
-    moved_boxes,
+    clip_boxes,
+    paint_view,
+    sample_mosaic_windows,
     sample_view,
-    sample_windows,
-    show,
+    transform_boxes,
+    warp_view,
     whole_view,
 )
-from nav.training.training_state import Computing
+from nav.training.training_state import ComputeDevice
 
 SOURCE_WH = (160, 120)
 BOX = np.array([[60.0, 40.0, 50.0, 36.0]])
@@ -51,12 +51,12 @@ def center_of(canvas: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def test_boxes_go_where_the_pixels_go() -> None:
-    window, compared = Window(20, 10, 200, 170), 0
+    window, compared = CanvasWindow(20, 10, 200, 170), 0
     for seed in range(30):
         view = sample_view(np.random.default_rng(seed), SOURCE_WH, BOX, window, ViewRanges((0.4, 1.6), 8, 0.5))
-        visible, shares = clipped_boxes(moved_boxes(BOX, view), window)
+        visible, shares = clip_boxes(transform_boxes(BOX, view), window)
         canvas = np.zeros((200, 240, 3), np.uint8)
-        draw_view(canvas, ellipse_image(), view)
+        warp_view(canvas, ellipse_image(), view)
         # What is cut off is not round any more. A whole box's share may miss one by its rounding.
         if shares[0] > 1 - 1e-9:
             # Interpolation blurs an edge by about a pixel of the coarser of the two images, of up to 1.6 px here.
@@ -69,12 +69,12 @@ def test_boxes_go_where_the_pixels_go() -> None:
 
 def test_a_mirrored_view_is_the_mirrored_image() -> None:
     image = np.random.default_rng(1).integers(0, 256, (SOURCE_WH[1], SOURCE_WH[0], 3), dtype=np.uint8)
-    mirrored = ImageView(np.diag([-1.0, 1.0]), np.array([SOURCE_WH[0], 0.0]), Window(0, 0, *SOURCE_WH))
+    mirrored = ImageView(np.diag([-1.0, 1.0]), np.array([SOURCE_WH[0], 0.0]), CanvasWindow(0, 0, *SOURCE_WH))
     canvas = np.zeros_like(image)
-    draw_view(canvas, image, mirrored)
+    warp_view(canvas, image, mirrored)
     np.testing.assert_array_equal(canvas, image[:, ::-1])
     # 160 - 60 - 50
-    np.testing.assert_array_equal(moved_boxes(BOX, mirrored), [[50.0, 40.0, 50.0, 36.0]])
+    np.testing.assert_array_equal(transform_boxes(BOX, mirrored), [[50.0, 40.0, 50.0, 36.0]])
 
 
 def test_no_view_makes_a_drogue_smaller_than_any_in_use() -> None:
@@ -82,16 +82,16 @@ def test_no_view_makes_a_drogue_smaller_than_any_in_use() -> None:
     ranges = ViewRanges((0.1, 2.0), 0, 0.5).on_canvas(canvas_wh, canvas_wh)
     heights = []
     for seed in range(200):
-        view = sample_view(np.random.default_rng(seed), canvas_wh, box, Window(100, 50, 200, 180), ranges)
-        heights.append(moved_boxes(box, view)[0, 3])
+        view = sample_view(np.random.default_rng(seed), canvas_wh, box, CanvasWindow(100, 50, 200, 180), ranges)
+        heights.append(transform_boxes(box, view)[0, 3])
     # The paper's drogue at 40 m has 17.5 px of 480; three quarters of its share are the limit.
     assert min(heights) == pytest.approx(0.75 * 17.5 / 480 * 320, rel=0.05)
 
 
 def test_the_rest_of_the_canvas_stays() -> None:
     canvas = np.full((100, 120, 3), 7, np.uint8)
-    window = Window(30, 20, 40, 50)
-    draw_view(canvas, ellipse_image(), ImageView(np.eye(2), np.zeros(2), window))
+    window = CanvasWindow(30, 20, 40, 50)
+    warp_view(canvas, ellipse_image(), ImageView(np.eye(2), np.zeros(2), window))
     inside = np.zeros((100, 120), bool)
     inside[20:70, 30:70] = True
     assert (canvas[~inside] == 7).all()
@@ -100,19 +100,19 @@ def test_the_rest_of_the_canvas_stays() -> None:
 
 
 def test_a_drogue_of_which_too_little_shows_leaves_no_trace() -> None:
-    window = Window(0, 0, 120, 120)
+    window = CanvasWindow(0, 0, 120, 120)
     cut = ImageView(np.eye(2), np.array([120 - 60 - 0.2 * 50, 0.0]), window)
     canvas = np.zeros((120, 120, 3), np.uint8)
-    kept = show(canvas, ellipse_image(), BOX, cut)
+    kept = paint_view(canvas, ellipse_image(), BOX, cut)
     assert len(kept) == 0
     assert not (canvas > PADDING_DN).any()
 
 
 def test_a_drogue_at_the_edge_keeps_what_shows() -> None:
-    window = Window(0, 0, 120, 120)
+    window = CanvasWindow(0, 0, 120, 120)
     share = LEAST_VISIBLE_FRACTION + 0.1
     cut = ImageView(np.eye(2), np.array([120 - 60 - share * 50, 0.0]), window)
-    kept = show(np.zeros((120, 120, 3), np.uint8), ellipse_image(), BOX, cut)
+    kept = paint_view(np.zeros((120, 120, 3), np.uint8), ellipse_image(), BOX, cut)
     np.testing.assert_allclose(kept, [[100.0, 40.0, 20.0, 36.0]], atol=1e-9)  # sums of a few numbers
 
 
@@ -120,13 +120,13 @@ def test_a_drogue_at_the_edge_keeps_what_shows() -> None:
 def test_turning_an_ellipse_against_its_outline(flip: float) -> None:
     angle = np.radians(23)
     linear = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag([flip, 1.0])
-    view = ImageView(linear, np.array([50.0, -10.0]), Window(0, 0, 10, 10))
+    view = ImageView(linear, np.array([50.0, -10.0]), CanvasWindow(0, 0, 10, 10))
     t = np.linspace(0, 2 * np.pi, 100_001)
     outline = BOX[0, :2] + BOX[0, 2:] / 2 + np.column_stack([np.cos(t), np.sin(t)]) * BOX[0, 2:] / 2
     moved = outline @ linear.T + view.shift
     expected = [*moved.min(axis=0), *np.ptp(moved, axis=0)]
     # The outline's points are so close that the extremes lie within radius * step^2 / 8 < 1e-8 px.
-    np.testing.assert_allclose(moved_boxes(BOX, view)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(transform_boxes(BOX, view)[0], expected, atol=1e-6)
 
 
 def test_the_whole_view_is_what_the_detector_sees() -> None:
@@ -136,7 +136,7 @@ def test_the_whole_view_is_what_the_detector_sees() -> None:
     boxes = np.array([[30.0, 50.0, 100.0, 80.0]])
     cached, cached_place = input_image(stereo, "left", (256, 192))
     canvas = np.full((96, 128, 3), PADDING_DN, np.uint8)
-    shown = show(canvas, cached, cached_place.to_input(boxes), whole_view((256, 192), (128, 96)))
+    shown = paint_view(canvas, cached, cached_place.to_input(boxes), whole_view((256, 192), (128, 96)))
     np.testing.assert_allclose(shown, place.to_input(boxes), atol=1e-9)  # sums of a few numbers
     np.testing.assert_array_equal(canvas, at_once)
 
@@ -149,7 +149,7 @@ def test_validation_sees_what_the_network_is_given_in_use() -> None:
     pairs = (CachedPair(frame_index=0, split="val", boxes=((31.0, 50.0, 100.0, 81.0), None)),)
     corpus = Corpus((), (480, 640), (ImageCache(np.stack([picture, picture])[None], pairs),), np.array([[0, 0]]))
     image, boxes = whole_image(corpus, 0, 0, (320, 416))
-    given = to_tensor(image[None], Computing(torch.device("cpu"), bf16=False))
+    given = to_tensor(image[None], ComputeDevice(torch.device("cpu"), bf16=False))
     np.testing.assert_allclose(given.numpy(), network_input([in_use]), atol=1e-7)  # division or product in float32
     # Records count from pixel centres, a corpus from corners.
     np.testing.assert_allclose(boxes, place.to_input(np.array([[30.5, 49.5, 100, 81]])), atol=1e-9)
@@ -158,6 +158,6 @@ def test_validation_sees_what_the_network_is_given_in_use() -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_four_windows_cover_the_canvas_once(seed: int) -> None:
     covered = np.zeros((96, 128), int)
-    for window in sample_windows(np.random.default_rng(seed), (128, 96)):
+    for window in sample_mosaic_windows(np.random.default_rng(seed), (128, 96)):
         covered[window.y : window.y + window.height, window.x : window.x + window.width] += 1
     assert (covered == 1).all()

@@ -13,7 +13,7 @@ from nav.training.corpus import Corpus
 from nav.training.evaluation import average_precision, best_threshold, measure_batch_statistics, to_tensor, whole_image
 from nav.training.trainer import learning_rate
 from nav.training.training_settings import TrainingSettings, build_settings, parse_size
-from nav.training.training_state import Computing, MovingAverage, load, new_network, save
+from nav.training.training_state import ComputeDevice, MovingAverage, load_checkpoint, new_network, save_checkpoint
 
 NONE = (np.zeros((0, 4)), np.zeros(0))
 BOX = np.array([[10.0, 10.0, 20.0, 20.0]])
@@ -91,7 +91,7 @@ def test_the_moving_average_takes_in_weights_and_running_means() -> None:
 
 
 def test_batch_statistics_are_those_of_one_pass_over_all_images(ellipse_corpus: Corpus) -> None:
-    size_px, computing = (64, 96), Computing(torch.device("cpu"), bf16=False)
+    size_px, computing = (64, 96), ComputeDevice(torch.device("cpu"), bf16=False)
     network = new_network(TrainingSettings(variant="s")).eval()
     weights = {name: value.clone() for name, value in network.named_parameters()}
     momenta = [layer.momentum for layer in normalizations(network)]
@@ -137,17 +137,17 @@ def test_weights_follow_from_the_seed_and_torchs_generator_is_left_alone() -> No
 
 def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pt"
-    save(path, {"step": 1})
+    save_checkpoint(path, {"step": 1})
     limits, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
         with pytest.raises(OSError, match=r"checkpoint\.pt: cannot be written") as caught:
-            save(path, {"step": 2, "weights": torch.zeros(10_000)})
+            save_checkpoint(path, {"step": 2, "weights": torch.zeros(10_000)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
     assert caught.value.errno == errno.EFBIG
-    assert load(path) == {"step": 1} and [each.name for each in tmp_path.iterdir()] == ["checkpoint.pt"]
+    assert load_checkpoint(path) == {"step": 1} and [each.name for each in tmp_path.iterdir()] == ["checkpoint.pt"]
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04"])
@@ -155,12 +155,12 @@ def test_a_damaged_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or no checkpoint"):
-        load(path)
+        load_checkpoint(path)
     whole = tmp_path / "whole.pt"
-    save(whole, {"weights": torch.zeros(1000)})
+    save_checkpoint(whole, {"weights": torch.zeros(1000)})
     path.write_bytes(whole.read_bytes()[:-500])
     with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or no checkpoint"):
-        load(path)
+        load_checkpoint(path)
 
 
 @pytest.mark.parametrize(

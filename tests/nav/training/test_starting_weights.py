@@ -18,11 +18,11 @@ from nav.detector.detector_registry import network_file
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.network import DetectorNetwork, NetworkConfig
-from nav.training.onnx_conversion import export_onnx, import_onnx, normalise_anew
+from nav.training.onnx_conversion import export_onnx, import_onnx, recalibrate_batch_norm
 from nav.training.starting_weights import read_starting_weights
-from nav.training.training_run import check_before, train
+from nav.training.training_run import check_training, train
 from nav.training.training_settings import build_settings
-from nav.training.training_state import save
+from nav.training.training_state import save_checkpoint
 
 NETWORKS = [NetworkConfig("l", "eca", "asff"), NetworkConfig("s", "se", "concat")]
 
@@ -70,7 +70,7 @@ def test_an_exported_network_comes_back_and_can_be_normalised_anew(config: Netwo
     for mine, theirs in zip(maps_of(back, images), wanted, strict=True):
         torch.testing.assert_close(mine, theirs, **close)
     measured = [some_images(seed) for seed in range(20, 26)]
-    normalise_anew(back, measured)
+    recalibrate_batch_norm(back, measured)
     assert not back.training
     for mine, theirs in zip(maps_of(back, images), wanted, strict=True):
         torch.testing.assert_close(mine, theirs, **close)
@@ -130,7 +130,7 @@ def test_a_training_starts_from_a_shipped_network(split_dataset: Path, tmp_path:
     with pytest.raises(
         ValueError, match=r"mobile-s\.onnx: holds weights of another network, s, eca, asff; give variant"
     ):
-        check_before(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
+        check_training(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
 
 
 def test_settings_go_before_the_network_of_the_weights(tmp_path: Path) -> None:
@@ -201,7 +201,7 @@ _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training'
 def test_weights_to_start_from_that_cannot_be_used(name: str, content: Any, message: str, tmp_path: Path) -> None:
     path = tmp_path / name
     if isinstance(content, dict):
-        save(path, content)
+        save_checkpoint(path, content)
     elif content is not None:
         path.write_bytes(model_with(content) if isinstance(content, str) else content)
     with pytest.raises(ValueError) as caught:
@@ -217,6 +217,6 @@ def test_a_folder_is_no_file_of_weights(tmp_path: Path) -> None:
 
 def test_checkpoints_need_no_statistics(tmp_path: Path) -> None:
     network = worn_network(NetworkConfig("s"))
-    save(tmp_path / "best.pt", {"network": network.state_dict(), "step": 1})
+    save_checkpoint(tmp_path / "best.pt", {"network": network.state_dict(), "step": 1})
     start = read_starting_weights(str(tmp_path / "best.pt"))
     assert not start.lack_statistics

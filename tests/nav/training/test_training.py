@@ -22,19 +22,19 @@ from droguekit.batch.progress import PlainProgress
 from nav.detector.input_image import network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.training.corpus import open_corpus
-from nav.training.evaluation import answer, average_precision, measure_batch_statistics, to_tensor, whole_image
+from nav.training.evaluation import average_precision, measure_batch_statistics, predict, to_tensor, whole_image
 from nav.training.starting_weights import read_starting_weights
-from nav.training.training_run import TrainingResult, check_before, train
+from nav.training.training_run import TrainingResult, check_training, train
 from nav.training.training_settings import build_settings
 from nav.training.training_state import (
     BEST_FILE,
     CHECKPOINT_FILE,
-    Computing,
-    load,
+    ComputeDevice,
+    limit_threads,
+    load_checkpoint,
     new_network,
     new_state,
-    open_computing,
-    own_threads,
+    open_compute_device,
     restore_state,
 )
 
@@ -110,7 +110,7 @@ def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset
         train([split_dataset], tmp_path, settings, PlainProgress(told), tmp_path / "cache", Calls(11))
     assert "stopped after 12 images, which are saved" in told.getvalue()
     assert len(step_losses(tmp_path)) == 3
-    assert load(tmp_path / CHECKPOINT_FILE)["step"] == 3
+    assert load_checkpoint(tmp_path / CHECKPOINT_FILE)["step"] == 3
     for changes, keys in (({"learning_rate": 0.5, "mosaic": False}, "mosaic, learning_rate"), ({"seed": 3}, "seed")):
         other = settings.model_copy(update=changes)
         with pytest.raises(ValueError, match=rf"checkpoint\.pt: belongs to a training that differs in {keys};"):
@@ -161,8 +161,8 @@ def test_a_training_in_bf16_exports_what_float32_computes(split_dataset: Path, t
     result, _ = run(split_dataset, tmp_path, image_passes=4, precision="bf16")
     settings = build_settings(None, SMALL)
     corpus = open_corpus([split_dataset], tmp_path / "cache", settings.size_px, 1, PlainProgress(io.StringIO()))
-    network, exact = new_network(settings).eval(), Computing(torch.device("cpu"), bf16=False)
-    network.load_state_dict(load(tmp_path / BEST_FILE)["network"])
+    network, exact = new_network(settings).eval(), ComputeDevice(torch.device("cpu"), bf16=False)
+    network.load_state_dict(load_checkpoint(tmp_path / BEST_FILE)["network"])
     measure_batch_statistics(network, corpus, settings.size_px, exact)
     image, _ = whole_image(corpus, 0, 0, settings.size_px)
     with torch.no_grad():
@@ -188,20 +188,20 @@ def test_several_datasets_have_no_hash_of_one(
 
 def test_what_stops_a_training_is_seen_before_there_is_data(split_dataset: Path, tmp_path: Path) -> None:
     settings = build_settings(None, {**SMALL, "image_passes": 4})
-    check_before(tmp_path / "none", settings)
+    check_training(tmp_path / "none", settings)
     assert not (tmp_path / "none").exists()
     out = tmp_path / "out"
     run(split_dataset, out, image_passes=4)
-    check_before(out, settings)
+    check_training(out, settings)
     with pytest.raises(ValueError, match="differs in seed;"):
-        check_before(out, settings.model_copy(update={"seed": 3}))
+        check_training(out, settings.model_copy(update={"seed": 3}))
     with (out / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(ValueError, match="another training is at work"):
-            check_before(out, settings)
+            check_training(out, settings)
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="file: is a file"):
-        check_before(tmp_path / "file", settings)
+        check_training(tmp_path / "file", settings)
 
 
 def test_a_training_starts_from_the_weights_of_another(split_dataset: Path, tmp_path: Path) -> None:
@@ -224,7 +224,7 @@ def test_a_training_starts_from_the_weights_of_another(split_dataset: Path, tmp_
     with pytest.raises(ValueError, match=r"start_sha256: 0{64} is not that of the weights given"):
         train([split_dataset], second, settings.model_copy(update={"start_sha256": "0" * 64}), told, start=start)
     with pytest.raises(ValueError, match=r"best\.pt: holds weights of another network;"):
-        check_before(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
+        check_training(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
 
 
 def test_a_device_that_is_not_there_is_refused(split_dataset: Path, tmp_path: Path) -> None:
@@ -250,10 +250,12 @@ def test_forty_pairs_are_learned_by_heart(toy_dataset: Path, tmp_path: Path) -> 
     settings = build_settings(None, {**SMALL, **TOY})
     train([toy_dataset], tmp_path, settings, PlainProgress(io.StringIO()))
     corpus = open_corpus([toy_dataset], tmp_path / "cache", settings.size_px, 1, PlainProgress(io.StringIO()))
-    computing = open_computing(settings)
+    computing = open_compute_device(settings)
     state = new_state(new_network(settings), settings, computing)
     restore_state(tmp_path, state, settings, corpus.datasets)
-    with own_threads(1):
-        answers = answer(state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, computing)
+    with limit_threads(1):
+        answers = predict(
+            state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, computing
+        )
     reached = average_precision(answers.truth, answers.found)
     assert reached is not None and reached.ap50 >= 0.95

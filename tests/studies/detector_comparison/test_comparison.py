@@ -28,22 +28,22 @@ from nav.detector.onnx_detector import OnnxDetector
 from studies.detector_comparison.ablation import (
     CHANGES,
     ONE_VIEW,
-    AblationOrder,
-    OneViewDetector,
+    AblationOptions,
+    SingleViewDetector,
     ablate,
     ablation_lines,
     measured_networks,
 )
 from studies.detector_comparison.comparison import (
     PEERS,
-    PeerOrder,
+    ComparisonOptions,
     compare_peers,
     comparison_lines,
     run_script,
     training_length,
 )
 from studies.detector_comparison.options import input_size_px
-from studies.detector_comparison.yolo_training import check_corpus, export_corpus, images_to_train_on
+from studies.detector_comparison.yolo_training import check_corpus, export_corpus, training_image_count
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def screen_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def order(corpus: Path, folder: Path, **changes: object) -> PeerOrder:
+def order(corpus: Path, folder: Path, **changes: object) -> ComparisonOptions:
     values: dict[str, object] = {
         "corpus": corpus,
         "test": corpus,
@@ -75,7 +75,7 @@ def order(corpus: Path, folder: Path, **changes: object) -> PeerOrder:
         "seed": 0,
         "environment": folder / "environment",
     }
-    return PeerOrder(**{**values, **changes})  # type: ignore[arg-type]
+    return ComparisonOptions(**{**values, **changes})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("size_px", [(160, 96), (320, 256)])
@@ -92,7 +92,7 @@ def test_the_corpus_of_the_peers_has_one_class_and_what_our_networks_see(
     scale, offset = (0.4, (16, 0)) if size_px == (160, 96) else (1.0, (0, 8))
     assert (camera.width_px, camera.height_px) == (320, 240)
     labels = sorted((data.parent / "labels").rglob("*.txt"))
-    assert len(labels) == 12 and images_to_train_on(screen_dataset) == 4
+    assert len(labels) == 12 and training_image_count(screen_dataset) == 4
     for label in labels:
         frame, eye = label.stem.split("_")
         rows = [[float(number) for number in row.split()] for row in label.read_text().splitlines()]
@@ -267,7 +267,7 @@ def test_ablations_are_scored_like_everything_and_one_view_finds_the_same_boxes(
 ) -> None:
     file = maps_network(tmp_path / "detector.onnx")
     nowhere = tmp_path / "nowhere"
-    ablation = AblationOrder(nowhere, screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
+    ablation = AblationOptions(nowhere, screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
     rows = measured_networks(ablation, {"eca-asff": file, ONE_VIEW: file}, lambda line: None)
     truth = read_detection_truth(screen_dataset)
     boxes = list(DetectorPass(screen_dataset, lambda drogue: OnnxDetector(file)).boxes(LEAST_SCORE, lambda: None))
@@ -278,7 +278,7 @@ def test_ablations_are_scored_like_everything_and_one_view_finds_the_same_boxes(
         assert row["test"] == pytest.approx({key: getattr(overall, key) for key in ("ap", "ap50", "ap75")}, abs=1e-6)
         assert row["ratio"] > 0 and row["parameters"] > 0
     images = Dataset(screen_dataset).images(0)
-    one, both = (kind(file).candidates(images, 0.0) for kind in (OneViewDetector, OnnxDetector))
+    one, both = (kind(file).candidates(images, 0.0) for kind in (SingleViewDetector, OnnxDetector))
     for eye in EYES:
         assert len(one[eye]) == len(both[eye]) > 0
         for single, paired in zip(one[eye], both[eye], strict=True):
@@ -326,11 +326,11 @@ def test_tables_have_a_line_for_each_network() -> None:
     ablation = ablation_lines({name: row | {"test": None} for name in CHANGES})
     assert len(ablation) == 1 + len(CHANGES)
     with pytest.raises(ValueError, match="--image-passes: must be at least 1, got 0"):
-        AblationOrder(Path(), Path(), "s", 0, (64, 64), 1, 0, "cpu", 1)
+        AblationOptions(Path(), Path(), "s", 0, (64, 64), 1, 0, "cpu", 1)
 
 
 def test_a_test_that_is_not_there_is_found_before_training(screen_dataset: Path, tmp_path: Path) -> None:
-    ablation = AblationOrder(screen_dataset, tmp_path / "nowhere", "s", 8, (64, 64), 1, 0, "cpu", 1)
+    ablation = AblationOptions(screen_dataset, tmp_path / "nowhere", "s", 8, (64, 64), 1, 0, "cpu", 1)
     with pytest.raises(ValueError, match="nowhere"):
         ablate(ablation, tmp_path / "out", lambda line: None)
     assert not (tmp_path / "out").exists()
