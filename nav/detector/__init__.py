@@ -1,1 +1,1 @@
-"""Where in an image the drogue is."""
+"""Detectors: the bounding box of the drogue in each image."""

@@ -1,4 +1,4 @@
-"""A detector without training: blobs of the markers' colour that form the drogue's ring."""
+"""A detector that needs no training: it looks for blobs of the markers' colour that form the drogue's ring."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from nav.matching.blobs import disc_like_blobs
 from nav.matching.marker_channel import OTHERS_WEIGHTS, marker_channel, marker_color
 from nav.matching.ring_matching import RingMatch, match_ring
 
-# A marker of 5 px diameter covers about 20 pixels; half of them stay above half its contrast after blurring.
+# A marker of 5 px diameter covers about 20 pixels; after blurring, half of them stay above half its contrast.
 _LEAST_AREA_PX2 = 7.0
-# So many pixels must be as bright as the brightest level tried: what the smallest ring of markers has.
+# The peak is the level that at least this many pixels reach: the pixels of the smallest ring of markers.
 _PEAK_PIXELS = 30
-# Levels tried, as shares of that peak: markers in shade reach a tenth of what something sunlit and red does.
+# Thresholds, as fractions of that peak: markers in shade reach a tenth of the level of a sunlit red object.
 _LEVELS = tuple(0.8 * 0.75**step for step in range(11))
-# Below this many levels of the picture there is only quantisation noise.
+# Below this level there is only quantisation noise.
 _LEAST_LEVEL_DN = 2.0
 _MOST_BLOBS = 150
 
 
 class ColorBlobDetector:
-    """Finds the ring of markers at the brightness level that shows most of it.
+    """Finds the ring of markers at the brightness threshold that shows most of them.
 
     Attributes:
         name: `color-blob`.
@@ -46,7 +46,7 @@ class ColorBlobDetector:
         return StereoDetection(self._detect_eye(images, "left"), self._detect_eye(images, "right"))
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
-        """At most one an eye: the ring that shows most of the markers."""
+        """At most one box in each image: the ring with the most markers."""
         found = {eye: self._detect_eye(images, eye) for eye in EYES}
         return {eye: (one,) if one is not None and one.score >= least_score else () for eye, one in found.items()}
 
@@ -62,7 +62,7 @@ class ColorBlobDetector:
         return Detection(_circle_box(best.affine, self._rim_radius_m), score)
 
     def _best_ring(self, channel: Pixels, best: RingMatch | None) -> RingMatch | None:
-        """The ring with the most markers over all thresholds of a channel, or the one that is known already."""
+        """The ring with the most markers over all thresholds of a channel, or `best` where none has more."""
         smooth = cv2.blur(channel, (3, 3))
         for level in _levels(smooth):
             mask: NDArray[np.uint8] = (smooth > level).view(np.uint8)
@@ -75,7 +75,7 @@ class ColorBlobDetector:
 
 
 def _levels(channel: Pixels) -> list[float]:
-    """Thresholds to try, the highest first."""
+    """Brightness thresholds, the highest first."""
     top = int(np.iinfo(channel.dtype).max) + 1
     histogram = cv2.calcHist([channel], [0], None, [top], [0, top]).ravel()
     at_least = np.cumsum(histogram[::-1])[::-1]
@@ -84,7 +84,7 @@ def _levels(channel: Pixels) -> list[float]:
 
 
 def _circle_box(affine: Array, radius_m: float) -> tuple[float, float, float, float]:
-    """x, y, width, height of the image of a circle about the layout's origin. [px]"""
+    """Bounding box x, y, width, height of the image of a circle around the layout's origin. [px]"""
     half_width, half_height = radius_m * np.hypot(affine[:, 0], affine[:, 1])
     x, y = affine[:, 2]
     return float(x - half_width), float(y - half_height), float(2 * half_width), float(2 * half_height)

@@ -1,4 +1,4 @@
-"""What every detector of the drogue answers."""
+"""The interface of all detectors, and the boxes that they return."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Detection:
     """The drogue in one image.
 
     Attributes:
-        box_xywh_px: x, y of the low corner, width, height in pixel-centre coordinates; may reach over the image's edge.
+        box_xywh_px: x, y of the low corner, width, height in pixel-centre coordinates; may extend beyond the image.
         score: 0 to 1.
     """
 
@@ -35,7 +35,7 @@ class StereoDetection:
 
 
 class Detector(Protocol):
-    """Finds one known drogue."""
+    """Finds a drogue of known geometry."""
 
     name: str
 
@@ -44,13 +44,13 @@ class Detector(Protocol):
         ...
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
-        """Everything in either image that may be the drogue, from which average precision is computed.
+        """All boxes in either image that may be the drogue; average precision is computed from them.
 
         Args:
             images: the pair.
-            least_score: what scores lower is left out.
+            least_score: boxes with a lower score are left out.
 
         Returns:
-            Of each eye its candidates, the best first.
+            The candidates of each eye, the best first.
         """
         ...

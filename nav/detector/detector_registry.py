@@ -1,4 +1,4 @@
-"""Detectors by name."""
+"""Registry of detectors: opens one by its name, or from a network file."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from nav.detector.detector import Detector
 
 COLOR_BLOB = "color-blob"
 DEFAULT_DETECTOR = "mobile-s"
-# Networks that belong to the package lie here, each under its name.
+# The networks that ship with the package, one file for each name.
 _WEIGHTS = Path(__file__).parent / "weights"
 _SUFFIX = ".onnx"
 
 
 def detector_names() -> tuple[str, ...]:
-    """Names that `open_detector` knows."""
+    """Names that `open_detector` accepts."""
     return (COLOR_BLOB, *sorted(file.stem for file in _WEIGHTS.glob(f"*{_SUFFIX}")))
 
 
 def network_file(name_or_file: str) -> Path | None:
-    """Where the network of a name of `detector_factory` lies; None for a name without one."""
+    """The network file of a detector; None for a detector that is not a network, or an unknown name."""
     if name_or_file.endswith(_SUFFIX):
         return Path(name_or_file)
     return _WEIGHTS / f"{name_or_file}{_SUFFIX}" if name_or_file in detector_names()[1:] else None
 
 
 def open_detector(name_or_file: str, drogue: DrogueParameters, threads: int = 1) -> Detector:
-    """A detector of one drogue, see `detector_factory`."""
+    """The detector of one drogue; see `detector_factory`."""
     return detector_factory(name_or_file, threads)(drogue)
 
 
 def detector_factory(name_or_file: str, threads: int = 1) -> Callable[[DrogueParameters], Detector]:
-    """What makes detectors of the drogue that it is told; a network is opened once, and is the same for all.
+    """A function that returns the detector of a drogue; a network is opened once and shared by all drogues.
 
     Args:
         name_or_file: one of `detector_names`, or a file `*.onnx` with the contract of docs/reference/detectors.md.
-        threads: of a network.
+        threads: that a network computes with.
 
     Raises:
-        ValueError: no such name, or a file that is missing or no such network; names it.
+        ValueError: an unknown name, or a file that is missing or not such a network; the message names it.
     """
     if name_or_file == COLOR_BLOB:
         from nav.detector.color_blob import ColorBlobDetector

@@ -1,6 +1,6 @@
-"""What a detector network sees of an image, and its boxes' way back.
+"""The input image of a detector network, and the map between its coordinates and those of the camera image.
 
-Training and use both go through here, so that they see the same pixels.
+Training and inference both use this module, so that they see the same pixels.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from geometry.stereo import Eye
 from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 PADDING_DN = 114
-"""Grey of what the image leaves of the input: between sky and ground, so that its edge is no strong one."""
+"""Grey of the padding: between the brightness of sky and ground, so that its edge has little contrast."""
 
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Where an image lies in a network's input.
+    """Where an image lies in a network's padded input.
 
     Attributes:
-        scale: (2,) input pixels an image pixel, in x and y; they differ by rounding to whole pixels.
+        scale: (2,) input pixels per image pixel, in x and y; they differ because sizes are rounded to whole pixels.
         offset_px: (2,) low corner of the image in the input. [px]
     """
 
@@ -34,25 +34,25 @@ class Letterbox:
     offset_px: tuple[int, int]
 
     def to_input(self, boxes_xywh_px: Array) -> Array:
-        """(n, 4) boxes in pixel-centre coordinates of the image, as in records, to corner coordinates of the input."""
+        """Map (n, 4) boxes from pixel-centre coordinates of the image, as in records, to corner ones of the input."""
         boxes = np.asarray(boxes_xywh_px, dtype=np.float64).reshape(-1, 4)
         return np.hstack(((boxes[:, :2] + 0.5) * self.scale + self.offset_px, boxes[:, 2:] * self.scale))
 
     def to_image(self, boxes_xywh_px: Array) -> Array:
-        """(n, 4) boxes in corner coordinates of the input to pixel-centre coordinates of the image."""
+        """Map (n, 4) boxes from corner coordinates of the input to pixel-centre ones of the image."""
         boxes = np.asarray(boxes_xywh_px, dtype=np.float64).reshape(-1, 4)
         return np.hstack(((boxes[:, :2] - self.offset_px) / self.scale - 0.5, boxes[:, 2:] / self.scale))
 
 
 def letterbox(image_size_px: tuple[int, int], input_size_px: tuple[int, int]) -> Letterbox:
-    """The image as large as it fits, in the middle.
+    """The image as large as it fits, centred.
 
     Args:
         image_size_px: width, height.
         input_size_px: width, height; multiples of 32.
 
     Raises:
-        ValueError: an input size that no network takes.
+        ValueError: an input size that no network accepts.
     """
     if min(input_size_px) < SIZE_STEP_PX or any(side % SIZE_STEP_PX for side in input_size_px):
         width, height = input_size_px
@@ -67,27 +67,27 @@ def letterbox(image_size_px: tuple[int, int], input_size_px: tuple[int, int]) ->
 
 
 def input_image(images: StereoImages, eye: Eye, input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
-    """One eye's picture as a network sees it: 8 bit, display-encoded, of the network's size.
+    """The image of one eye as a network's input: 8 bit, display-encoded, at the network's size.
 
-    Light above the black level is encoded by the sRGB curve whatever the sensor's encoding and depth, then reduced by
-    averaging over areas, and padded with grey. A mono picture has three equal channels.
+    Light above the black level is encoded by the sRGB curve, whatever the sensor's encoding and bit depth. The image is
+    then resized by area averaging and padded with grey. A mono image becomes three equal channels.
 
     Args:
         images: the pair.
-        eye: which of the two.
+        eye: which image.
         input_size_px: width, height; multiples of 32.
 
     Returns:
         (height, width, 3) red, green, blue, and where the image lies in it.
 
     Raises:
-        ValueError: an input size that no network takes.
+        ValueError: an input size that no network accepts.
     """
     return letterbox_image(_display_encoded(images.left if eye == "left" else images.right, images), input_size_px)
 
 
 def letterbox_image(picture: NDArray[np.uint8], input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
-    """A display-encoded picture (H, W, 3) or (H, W) in a network's input; the second half of `input_image`."""
+    """Resize and pad a display-encoded image (H, W, 3) or (H, W) to a network's input; see `input_image`."""
     height, width = picture.shape[:2]
     place = letterbox((width, height), input_size_px)
     size = round(width * place.scale[0]), round(height * place.scale[1])
@@ -104,11 +104,11 @@ def letterbox_image(picture: NDArray[np.uint8], input_size_px: tuple[int, int]) 
 
 
 def network_input(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
-    """(B, 3, H, W) from 0 to 1 of B pictures (H, W, 3)."""
+    """(B, 3, H, W) from 0 to 1, of B images (H, W, 3)."""
     height, width = pictures[0].shape[:2]
     batch = np.empty((len(pictures), 3, height, width), np.float32)
     for picture, planes in zip(pictures, batch, strict=True):
-        # OpenCV takes half the time of numpy's walk with steps of three.
+        # OpenCV takes half the time of a strided copy in numpy.
         for channel, plane in enumerate(cv2.split(picture)):
             planes[channel] = plane
     batch *= np.float32(1 / 255)
@@ -116,7 +116,7 @@ def network_input(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
 
 
 def _display_encoded(image: Pixels, images: StereoImages) -> NDArray[np.uint8]:
-    """The picture in 8 bits of the sRGB curve (IEC 61966-2-1), 0 at the black level."""
+    """The image in 8 bits, encoded by the sRGB curve (IEC 61966-2-1), 0 at the black level."""
     if images.encoding == "gamma" and images.bits == 8 and images.black_level_dn == 0:
         return image.astype(np.uint8, copy=False)
     codes = np.arange(2**images.bits) / (2**images.bits - 1)

@@ -1,4 +1,4 @@
-"""What a network file says of itself, in its own metadata."""
+"""The metadata that a detector's ONNX file carries."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from typing import Any
 from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
 
 METADATA_KEY = "droguekit_detector"
-"""Under this key an ONNX file has the JSON text of `ModelMetadata`."""
+"""Key of the ONNX metadata under which the JSON of `ModelMetadata` is stored."""
 
 _JSON_NAME: dict[type, str] = {str: "a text", Mapping: "an object"}
 
 
 @dataclass(frozen=True)
 class ModelMetadata:
-    """Everything that is needed to use a network, and where it comes from.
+    """Everything needed to use a network, and its provenance.
 
     Attributes:
-        input_size_px: width and height that it was made for; multiples of 32.
-        score_threshold: what scores lower is no drogue.
-        large_from_px: boxes whose longer side is as long in the input come from a second pass at half the size; 0 for a
-            single pass. [px]
-        classes: names, one.
+        input_size_px: width and height of its input; multiples of 32.
+        score_threshold: a box with a lower score is not a drogue.
+        large_from_px: boxes whose longer side in the input is at least this come from a second pass at half the size;
+            0 for a single pass. [px]
+        classes: exactly one name.
         licence: of the weights.
-        manifest_sha256: of the dataset that it was trained on; empty where it was none of ours, or several, which
-            `training` tells.
-        network: its `NetworkConfig` as a dict; empty where it is none of ours.
-        training: what else is told of the training: plain JSON.
+        manifest_sha256: of the dataset that it was trained on; empty for a dataset not made by droguekit, and for
+            several, which `training` lists.
+        network: its `NetworkConfig` as a dict; empty for a network that is not droguekit's.
+        training: other facts of the training, as plain JSON.
     """
 
     input_size_px: tuple[int, int] = (640, 480)
@@ -47,7 +47,7 @@ class ModelMetadata:
             raise ValueError(f"input_size_px: must be two multiples of {SIZE_STEP_PX}, got {sides!r}")
         if max(sides) > MOST_SIDE_PX:
             raise ValueError(f"input_size_px: must be at most {MOST_SIDE_PX} a side, got {sides!r}")
-        # A bool is an int to Python.
+        # In Python a bool is an int.
         if type(self.score_threshold) not in (int, float) or not 0 <= self.score_threshold <= 1:
             raise ValueError(f"score_threshold: must be 0 to 1, got {self.score_threshold!r}")
         if type(self.large_from_px) not in (int, float) or not 0 <= self.large_from_px <= MOST_SIDE_PX:
@@ -59,15 +59,15 @@ class ModelMetadata:
                 raise ValueError(f"{name}: must be {_JSON_NAME[kind]}, got {getattr(self, name)!r}")
 
     def to_json(self) -> str:
-        """What `from_json` reads."""
+        """The JSON text that `from_json` reads."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> ModelMetadata:
-        """The metadata in a text.
+        """The metadata in a JSON text.
 
         Raises:
-            ValueError: it is not the JSON of an object with these keys, or a value is not allowed.
+            ValueError: it is not a JSON object with these keys, or a value is not allowed.
         """
         try:
             values = json.loads(text)

@@ -1,7 +1,7 @@
-"""Boxes of one picture at two scales: large drogues from a pass at half the size, all others from that at full size.
+"""Inference at two scales: large drogues from a pass at half the size, all others from the pass at full size.
 
-Drogues nearer than those of most training pictures are larger than a network has learned to box; at half the size they
-are as large as those that it knows best.
+A drogue that is nearer than in most training images is larger than the network has learned to detect. At half the size
+it is as large as those that the network detects best.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from nav.detector.output_maps import SIZE_STEP_PX, decode_maps, non_maximum_supp
 ScoredBoxes = tuple[Array, Array]
 """(n, 4) boxes x, y, width, height in corner coordinates of the input [px], and (n,) scores, the best first."""
 
-# Around the limit both passes answer, so that no drogue falls between them.
+# Near the limit the boxes of both passes count, so that no drogue is lost between them.
 _SHARED_FACTOR = 1.25
-# What lies in a large drogue's box by more than this is a part of the drogue, such as a marker.
+# A box of which more than this lies in a large drogue's box is a part of that drogue, such as a marker.
 _MOST_INSIDE = 0.5
 
 
 def half_size_px(input_size_px: tuple[int, int]) -> tuple[int, int]:
-    """Half of a width and height, rounded up to sizes that networks take."""
+    """Half of a width and height, rounded up to a size that networks accept."""
     width, height = (-(-side // (2 * SIZE_STEP_PX)) * SIZE_STEP_PX for side in input_size_px)
     return width, height
 
@@ -38,14 +38,14 @@ def detect_multiscale(
     least_score: float,
     most: int,
 ) -> list[ScoredBoxes]:
-    """What a network finds in pictures of one size, with a second pass where it asks for one.
+    """Detect drogues in images of one size, with a second pass at half the size where it is asked for.
 
     Args:
-        pictures: (H, W, 3) each, as `nav.detector.input_image` makes them.
-        run: the network, from pictures of one size to maps, see `nav.detector.output_maps`.
-        large_from_px: see `joined`; 0 for a single pass.
-        least_score: what scores lower is left out.
-        most: how many boxes a picture has at most.
+        pictures: (H, W, 3) each, from `nav.detector.input_image`.
+        run: the network, from images of one size to output maps; see `nav.detector.output_maps`.
+        large_from_px: see `merge_scales`; 0 for a single pass.
+        least_score: boxes with a lower score are left out.
+        most: largest number of boxes of an image.
     """
     full = decode_maps(run(pictures), least_score)
     if large_from_px == 0:
@@ -57,19 +57,19 @@ def detect_multiscale(
 
 
 def to_full_size(found: ScoredBoxes, place: Letterbox) -> ScoredBoxes:
-    """What was found in a reduced picture, in corner coordinates of the whole one, which lies in it as `place` says."""
+    """Map boxes found in a reduced image to corner coordinates of the full-size one."""
     boxes, scores = found
-    # Pixel-centre to corner coordinates.
+    # From pixel-centre to corner coordinates.
     return place.to_image(boxes) + np.array([0.5, 0.5, 0.0, 0.0]), scores
 
 
 def merge_scales(full: ScoredBoxes, half: ScoredBoxes, large_from_px: float, most: int) -> ScoredBoxes:
-    """The boxes of both passes, each of the sizes that it is for, without those that overlap a better one.
+    """Merge the boxes of both passes: large ones from the half-size pass, others from the full-size pass, after NMS.
 
     Args:
-        full, half: of the two passes, both in coordinates of the full size.
-        large_from_px: longer side from which on a box is large.
-        most: how many boxes at most.
+        full, half: boxes of the two passes, both in coordinates of the full size.
+        large_from_px: a box whose longer side is at least this is large.
+        most: largest number of boxes.
     """
     small = full[0][:, 2:].max(axis=1, initial=0) < large_from_px * _SHARED_FACTOR
     large = half[0][:, 2:].max(axis=1, initial=0) >= large_from_px / _SHARED_FACTOR
@@ -85,7 +85,7 @@ def merge_scales(full: ScoredBoxes, half: ScoredBoxes, large_from_px: float, mos
 
 
 def _is_part(boxes: Array, is_large: Array) -> Array:
-    """(n,) which of the boxes, best first, lie mostly in a better large one."""
+    """(n,) whether each box, best first, lies mostly within a large box with a better score."""
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
     sides = np.maximum(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0)
     inside = sides.prod(axis=2) > _MOST_INSIDE * boxes[:, 2:].prod(axis=1)[:, None]

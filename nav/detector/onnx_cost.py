@@ -1,4 +1,4 @@
-"""Parameters and operations of a network, counted in its ONNX file: in the same way for everybody's."""
+"""Parameters and operations of a network, counted in its ONNX file, so that any network is counted the same way."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 
 class NetworkCost(NamedTuple):
-    """What a network is made of.
+    """Size and computation of a network.
 
     Attributes:
-        parameters: weights and biases of its layers.
+        parameters: number of weights and biases of its layers.
         gflops_per_image: multiplications and additions of convolutions and matrix products, in 10^9.
     """
 
@@ -20,14 +20,14 @@ class NetworkCost(NamedTuple):
 
 
 def network_cost(file: Path, size_px: tuple[int, int]) -> NetworkCost:
-    """Count a network.
+    """Count the parameters and operations of a network.
 
     Args:
-        file: ONNX, of one input (B, 3, H, W).
-        size_px: width and height of its input.
+        file: an ONNX file with one input (B, 3, H, W).
+        size_px: width and height of the input.
 
     Raises:
-        ValueError: no such file, no network, or an operation whose shape cannot be told.
+        ValueError: no such file, not a network, or an operation whose shape cannot be inferred.
     """
     import onnx
 
@@ -35,19 +35,19 @@ def network_cost(file: Path, size_px: tuple[int, int]) -> NetworkCost:
         model = onnx.load(str(file))
     except OSError as error:
         raise ValueError(f"{file}: cannot be read: {error.strerror}") from error
-    except Exception as error:  # protobuf's faults differ by its implementation
-        raise ValueError(f"{file}: is no ONNX network: {error}") from error
+    except Exception as error:  # protobuf's exceptions differ by its implementation
+        raise ValueError(f"{file}: is not an ONNX network: {error}") from error
     for dimension, value in zip(model.graph.input[0].type.tensor_type.shape.dim, (2, 3, *size_px[::-1]), strict=True):
         dimension.ClearField("dim_param")
         dimension.dim_value = value
-    # Shapes that were told for another size would contradict those of this one.
+    # Stored shapes for another input size would contradict the inferred ones.
     del model.graph.value_info[:]
     for output in model.graph.output:
         output.type.tensor_type.ClearField("shape")
     try:
         graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
     except onnx.shape_inference.InferenceError as error:
-        raise ValueError(f"{file}: its shapes cannot be told: {str(error).strip().splitlines()[0]}") from error
+        raise ValueError(f"{file}: its shapes cannot be inferred: {str(error).strip().splitlines()[0]}") from error
     shapes = {
         each.name: [d.dim_value for d in each.type.tensor_type.shape.dim] for each in (*graph.value_info, *graph.output)
     }
@@ -61,15 +61,15 @@ _LAYERS = ("Conv", "ConvTranspose", "Gemm", "MatMul", "BatchNormalization")
 
 
 def _products(node: Any, shapes: dict[str, list[int]], weights: dict[str, list[int]]) -> int:
-    """Multiplications of a node for a batch of two."""
+    """Number of multiplications of a node for a batch of two."""
     if node.op_type not in ("Conv", "Gemm", "MatMul"):
         return 0
     out = shapes.get(node.output[0], [])
     weight = weights.get(node.input[1], shapes.get(node.input[1], []))
     if not out or not weight or 0 in out or 0 in weight:
-        raise ValueError(f"{node.op_type} {node.name!r}: its shape cannot be told, got {out} with weights {weight}")
+        raise ValueError(f"{node.op_type} {node.name!r}: its shape cannot be inferred, got {out} with weights {weight}")
     if node.op_type == "Conv":
-        # Weights are (out, in / groups, kernel...): everything but the first is summed over.
+        # Weights are (out, in / groups, kernel...): the sum runs over all axes but the first.
         return math.prod(out) * math.prod(weight[1:])
     transposed = any(attribute.name == "transB" and attribute.i for attribute in node.attribute)
     return math.prod(out) * (weight[-1] if transposed else weight[-2])

@@ -23,18 +23,18 @@ _FAULTS = (
     faults.EPFail, faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf,
     faults.NotImplemented, faults.RuntimeException, RuntimeError,
 )  # fmt: skip
-# Only errors: a file that cannot be used is reported by the exception, once.
+# Errors only: the exception reports a file that cannot be used.
 _LOG_ERRORS = 4
 
 
 class OnnxDetector:
-    """Both eyes in one batch through a network.
+    """Runs a network on both images of a pair in one batch.
 
     Attributes:
         name: how it is called in results.
-        metadata: what the file says of itself.
-        input_size_px: width, height of what the network is given. [px]
-        pass_sizes_px: those of all passes for a pair: also half the size where the file asks for it.
+        metadata: of the file.
+        input_size_px: width, height of the network's input. [px]
+        pass_sizes_px: input sizes of all passes for a pair; the second, where the file asks for it, has half the size.
     """
 
     def __init__(
@@ -44,12 +44,12 @@ class OnnxDetector:
 
         Args:
             file: the network, with all its weights inside.
-            name: the file's own by default.
-            threads: of onnxruntime within one pass.
-            input_size_px: width, height, multiples of 32; by default what the file was made for.
+            name: by default the file's name.
+            threads: of onnxruntime in one pass.
+            input_size_px: width, height, multiples of 32; by default the size that the file states.
 
         Raises:
-            ValueError: the file is missing, truncated, or no network of this kind; names the file.
+            ValueError: the file is missing, truncated, or not a network of this kind; the message names the file.
         """
         if threads < 1:
             raise ValueError(f"threads: must be at least 1, got {threads}")
@@ -73,12 +73,12 @@ class OnnxDetector:
         self._check_maps(self._run(np.zeros((len(EYES), 3, probe[1], probe[0]), np.float32)), probe)
 
     def detect(self, images: StereoImages) -> StereoDetection:
-        """The best box in each image, where it scores as much as the file asks for."""
+        """The best box in each image, if it reaches the score threshold of the file."""
         found = self._candidates(images, self.metadata.score_threshold, most=1)
         return StereoDetection(*(next(iter(found[eye]), None) for eye in EYES))
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
-        """Boxes of each image, the best first, without those that overlap a better one."""
+        """The boxes of each image after non-maximum suppression, the best first."""
         return self._candidates(images, least_score, most=20)
 
     def _candidates(self, images: StereoImages, least_score: float, most: int) -> dict[Eye, tuple[Detection, ...]]:
@@ -92,7 +92,7 @@ class OnnxDetector:
         return answers
 
     def _found(self, pictures: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[ScoredBoxes]:
-        """Of each picture the boxes in corner coordinates of the input, and scores."""
+        """For each image the boxes in corner coordinates of the input, and their scores."""
         return detect_multiscale(
             pictures, lambda some: self._run(network_input(some)), self.metadata.large_from_px, least_score, most
         )
@@ -122,17 +122,17 @@ def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = _LOG_ERRORS
-    # Threads that wait must not burn the cores that rendering or another measurement runs on.
+    # Waiting threads must not occupy the cores that rendering or another measurement uses.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        # From memory, so that a file cannot name others to be read.
+        # From memory, so that a file cannot refer to other files.
         return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except _FAULTS as error:
         raise ValueError(f"{file}: is truncated or not an ONNX network: {_first_line(error)}") from error
 
 
 def _checked_input(file: Path, session: onnxruntime.InferenceSession) -> tuple[str, tuple[int, int] | None]:
-    """Name of the only input, and (width, height) where they are fixed."""
+    """Name of the only input, and its (width, height) where they are fixed."""
     inputs = session.get_inputs()
     shape = list(inputs[0].shape) if len(inputs) == 1 else []
     if len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":

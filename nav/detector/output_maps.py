@@ -18,40 +18,40 @@ from geometry.boxes import intersection_area
 from geometry.se3 import Array
 
 STRIDES = (8, 16, 32)
-"""Pixels of the input image between cells, by map. [px]"""
+"""Distance between neighbouring cells in the input image, for each map. [px]"""
 
 MAP_CHANNELS = 5
 """Logit of the score, then left, top, right, bottom."""
 
 SIZE_STEP_PX = STRIDES[-1]
-"""Width and height of an input image are multiples of it. [px]"""
+"""Width and height of an input image are multiples of this. [px]"""
 
 MOST_SIDE_PX = 4096
-"""Width and height of an input image are at most this: a wrong number is refused before it asks for memory. [px]"""
+"""Largest width and height of an input image: a wrong size is refused before memory is allocated for it. [px]"""
 
 LOG_DISTANCE_RANGE = (-6.0, 6.0)
-"""Beyond it a logarithm of a distance is cut: from a 400th of a stride to 400 strides."""
+"""The logarithm of a distance is clipped to this range: from a 400th of a stride to 400 strides."""
 
 
-# Two drogues cannot overlap more than this; cells of one drogue answer boxes that nearly coincide.
-_MOST_OVERLAP = 0.5
-# Best cells that are looked at: a drogue over the whole image takes a few hundred.
-_MOST_CELLS = 1000
+# Boxes of two drogues do not overlap more than this; boxes that cells predict for one drogue nearly coincide.
+_MAX_IOU = 0.5
+# Number of best cells that are decoded: a drogue over the whole image takes a few hundred.
+_MAX_CELLS = 1000
 
 
 def decode_maps(
     maps: Sequence[NDArray[np.floating[Any]]], least_score: float, most: int = 20
 ) -> list[tuple[Array, Array]]:
-    """Boxes and scores of every image, the best first, without those that overlap a better one.
+    """Decode the boxes and scores of every image, the best first, with non-maximum suppression.
 
     Args:
-        maps: three times (B, 5, H, W), see `nav.detector.output_maps`.
-        least_score: what scores lower is left out.
-        most: how many boxes an image has at most.
+        maps: three times (B, 5, H, W); see the docstring of this module.
+        least_score: boxes with a lower score are left out.
+        most: largest number of boxes of an image.
 
     Returns:
-        Of each image (n, 4) boxes x, y, width, height in corner coordinates of the network's input, and (n,) scores.
-        [px]
+        For each image (n, 4) boxes x, y, width, height in corner coordinates of the network's input [px], and (n,)
+        scores.
     """
     return [_decode_one([each[index] for each in maps], least_score, most) for index in range(maps[0].shape[0])]
 
@@ -60,7 +60,7 @@ def _decode_one(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, m
     scores, boxes = [], []
     for stride, each in zip(STRIDES, maps, strict=True):
         score = _sigmoid(each[0].astype(np.float64))
-        # Not a number compares as false, so it never becomes a box.
+        # NaN compares as false, so it never becomes a box.
         rows, columns = np.nonzero(score >= least_score)
         centers = (np.stack((columns, rows), axis=1) + 0.5) * stride
         distances = np.exp(np.clip(each[1:, rows, columns].T.astype(np.float64), *LOG_DISTANCE_RANGE)) * stride
@@ -69,28 +69,28 @@ def _decode_one(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, m
     all_scores, all_boxes = np.concatenate(scores), np.concatenate(boxes)
     finite = np.isfinite(all_boxes).all(axis=1)
     all_scores, all_boxes = all_scores[finite], all_boxes[finite]
-    order = np.argsort(-all_scores, kind="stable")[:_MOST_CELLS]
+    order = np.argsort(-all_scores, kind="stable")[:_MAX_CELLS]
     kept = non_maximum_suppression(all_boxes[order], most)
     return all_boxes[order][kept], all_scores[order][kept]
 
 
 def non_maximum_suppression(boxes: Array, most: int) -> list[int]:
-    """Indices of the boxes, best first, that overlap no better one (non-maximum suppression)."""
+    """Indices of the boxes, sorted best first, whose IoU with every better box that is kept is small."""
     area = boxes[:, 2] * boxes[:, 3]
-    open_ = np.ones(len(boxes), dtype=bool)
+    is_open = np.ones(len(boxes), dtype=bool)
     kept: list[int] = []
     for index in range(len(boxes)):
-        if not open_[index]:
+        if not is_open[index]:
             continue
         kept.append(index)
         if len(kept) == most:
             break
         shared = intersection_area(boxes[index], boxes)
-        open_ &= shared <= _MOST_OVERLAP * (area[index] + area - shared)
+        is_open &= shared <= _MAX_IOU * (area[index] + area - shared)
     return kept
 
 
 def _sigmoid(logits: Array) -> Array:
-    """Without overflow for any number."""
+    """Logistic function without overflow for any number."""
     scores: Array = 0.5 * (1 + np.tanh(0.5 * logits))
     return scores

@@ -113,7 +113,7 @@ def import_onnx(content: bytes) -> DetectorNetwork:
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError("does not have the layers of the network that it says it is") from error
     with torch.no_grad():
-        network.backbone.first_weights.div_(network.gain)
+        network.backbone.stem_weights.div_(network.gain)
     return network
 
 
@@ -207,7 +207,7 @@ def _normalised_convolutions(network: DetectorNetwork) -> Iterator[tuple[Convolu
     network.eval()
     try:
         with torch.inference_mode():
-            network(torch.zeros(1, 3, SIZE_STEP_PX, SIZE_STEP_PX, device=network.backbone.first_weights.device))
+            network(torch.zeros(1, 3, SIZE_STEP_PX, SIZE_STEP_PX, device=network.backbone.stem_weights.device))
     finally:
         network.train(was_training)
         for hook in hooks:

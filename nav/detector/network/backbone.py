@@ -17,71 +17,18 @@ from torch.nn import functional
 Variant = Literal["l", "s"]
 Attention = Literal["eca", "se"]
 
-# MobileNetV3 (arXiv:1905.02244) squeezes to a quarter of the channels, as a multiple of 8 that is no tenth less.
-_REDUCTION, _CHANNEL_STEP, _LEAST_SHARE = 4, 8, 0.9
-
-
-def eca_kernel_size(channels: int) -> int:
-    """How many neighbouring channels ECA looks at: |log2(C) / 2 + 1/2|, made odd (arXiv:1910.03151, eq. 12)."""
-    size = int(abs(log2(channels) / 2 + 0.5))
-    return size if size % 2 else size + 1
-
-
-class EfficientChannelAttention(nn.Module):
-    """Each channel's weight from the means of itself and its neighbours (ECA-Net, arXiv:1910.03151)."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        size = eca_kernel_size(channels)
-        self.across_channels = nn.Conv1d(1, 1, size, padding=size // 2, bias=False)
-        self.gate = nn.Sigmoid()
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, C, H, W)."""
-        means = features.mean(dim=(2, 3)).unsqueeze(1)
-        weights: Tensor = self.gate(self.across_channels(means))
-        return features * weights.squeeze(1)[:, :, None, None].to(features.dtype)
-
-
-def squeezed_channels(channels: int) -> int:
-    """Width of the bottleneck of squeeze and excitation."""
-    quarter = channels // _REDUCTION
-    nearest = max((quarter + _CHANNEL_STEP // 2) // _CHANNEL_STEP, 1) * _CHANNEL_STEP
-    return nearest if nearest >= _LEAST_SHARE * quarter else nearest + _CHANNEL_STEP
-
-
-class SqueezeExcitation(nn.Module):
-    """Each channel's weight from all means through a bottleneck (arXiv:1709.01507), as in MobileNetV3."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        squeezed = squeezed_channels(channels)
-        self.squeeze = nn.Conv2d(channels, squeezed, 1)
-        self.excite = nn.Conv2d(squeezed, channels, 1)
-        self.activation, self.gate = nn.ReLU(), nn.Hardsigmoid()
-
-    def forward(self, features: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, C, H, W)."""
-        means = features.mean(dim=(2, 3), keepdim=True)
-        weights: Tensor = self.gate(self.excite(self.activation(self.squeeze(means))))
-        return features * weights
-
-
-def channel_attention(kind: Attention, channels: int) -> nn.Module:
-    """The attention of that kind."""
-    return EfficientChannelAttention(channels) if kind == "eca" else SqueezeExcitation(channels)
-
-
-# A running mean over about 10 batches: weights move fast in a short training, and old means do not fit them.
+_STEM_CHANNELS = 16
+# MobileNetV3 squeezes to a quarter of the channels, rounded to a multiple of 8 that is at most a tenth below it.
+_REDUCTION, _CHANNEL_STEP, _LEAST_FRACTION = 4, 8, 0.9
+# A running mean over about 10 batches: in a short training weights change fast, and old means do not fit them.
 _NORM_MOMENTUM, _NORM_EPSILON = 0.1, 1e-3
 
 
 class DepthwiseConv(nn.Conv2d):
-    """One filter a channel, without bias, padded to keep its place.
+    """Depthwise convolution without bias, padded to keep the size.
 
-    In bf16 autocast on a CPU the slow kinds leave autocast and compute in float32: the bf16 kernels of depthwise
-    filters of 5x5 or of stride 2 are several times slower than the float32 ones, so that autocast would win nothing.
-    The answer has the type that autocast would have given it.
+    In bf16 autocast on a CPU, filters of 5x5 or of stride 2 are computed in float32: their bf16 kernels are several
+    times slower than the float32 ones. The output has the dtype that autocast would have given it.
     """
 
     def __init__(self, channels: int, kernel: int, stride: int = 1) -> None:
@@ -111,21 +58,69 @@ def pointwise(inputs: int, outputs: int, activation: type[nn.Module] = nn.ReLU) 
 
 
 def separable(channels: int, stride: int = 1) -> nn.Sequential:
-    """3x3 depthwise convolution, then 1x1, each with normalisation and ReLU (MobileNet, arXiv:1704.04861)."""
+    """3x3 depthwise and 1x1 convolution, each with normalisation and ReLU (MobileNet, arXiv:1704.04861)."""
     depthwise = (DepthwiseConv(channels, 3, stride), batch_norm(channels), nn.ReLU())
     return nn.Sequential(*depthwise, *pointwise(channels, channels))
 
 
-_STEM_CHANNELS = 16
+def eca_kernel_size(channels: int) -> int:
+    """Kernel size of ECA in channels: |log2(C) / 2 + 1/2|, rounded to an odd number (arXiv:1910.03151, eq. 12)."""
+    size = int(abs(log2(channels) / 2 + 0.5))
+    return size if size % 2 else size + 1
+
+
+class EfficientChannelAttention(nn.Module):
+    """ECA: weights each channel by the means of itself and its neighbours (arXiv:1910.03151)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        size = eca_kernel_size(channels)
+        self.across_channels = nn.Conv1d(1, 1, size, padding=size // 2, bias=False)
+        self.gate = nn.Sigmoid()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, C, H, W) -> (B, C, H, W)."""
+        means = features.mean(dim=(2, 3)).unsqueeze(1)
+        weights: Tensor = self.gate(self.across_channels(means))
+        return features * weights.squeeze(1)[:, :, None, None].to(features.dtype)
+
+
+def squeezed_channels(channels: int) -> int:
+    """Width of the bottleneck of squeeze and excitation."""
+    quarter = channels // _REDUCTION
+    nearest = max((quarter + _CHANNEL_STEP // 2) // _CHANNEL_STEP, 1) * _CHANNEL_STEP
+    return nearest if nearest >= _LEAST_FRACTION * quarter else nearest + _CHANNEL_STEP
+
+
+class SqueezeExcitation(nn.Module):
+    """Weights each channel by the means of all channels, through a bottleneck (arXiv:1709.01507), as in MobileNetV3."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        squeezed = squeezed_channels(channels)
+        self.squeeze = nn.Conv2d(channels, squeezed, 1)
+        self.excite = nn.Conv2d(squeezed, channels, 1)
+        self.activation, self.gate = nn.ReLU(), nn.Hardsigmoid()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, C, H, W) -> (B, C, H, W)."""
+        means = features.mean(dim=(2, 3), keepdim=True)
+        weights: Tensor = self.gate(self.excite(self.activation(self.squeeze(means))))
+        return features * weights
+
+
+def channel_attention(kind: Attention, channels: int) -> nn.Module:
+    """A channel attention module of the given kind."""
+    return EfficientChannelAttention(channels) if kind == "eca" else SqueezeExcitation(channels)
 
 
 class Block(NamedTuple):
-    """One row of the paper's tables 1 and 2: kernel, expanded and output channels, attention, hard swish, stride."""
+    """One row of tables 1 and 2 of the MobileNetV3 paper."""
 
     kernel: int
     expanded: int
     outputs: int
-    attends: bool
+    has_attention: bool
     hard_swish: bool
     stride: int
 
@@ -164,7 +159,7 @@ BLOCKS: dict[Variant, tuple[Block, ...]] = {"l": _LARGE, "s": _SMALL}
 
 
 class InvertedResidual(nn.Module):
-    """Expansion, depthwise convolution, attention, projection, and a shortcut where sizes allow it."""
+    """Expansion, depthwise convolution, attention, projection, and a shortcut between equal sizes."""
 
     def __init__(self, inputs: int, block: Block, attention: Attention) -> None:
         super().__init__()
@@ -173,7 +168,7 @@ class InvertedResidual(nn.Module):
         if block.expanded != inputs:
             layers.append(pointwise(inputs, block.expanded, activation))
         layers += [DepthwiseConv(block.expanded, block.kernel, block.stride), batch_norm(block.expanded), activation()]
-        if block.attends:
+        if block.has_attention:
             layers.append(channel_attention(attention, block.expanded))
         layers.append(pointwise(block.expanded, block.outputs, nn.Identity))
         self.layers = nn.Sequential(*layers)
@@ -189,7 +184,7 @@ class MobileNetV3(nn.Module):
     """Features at strides 8, 16 and 32.
 
     Attributes:
-        channels: of the three.
+        channels: number of channels of each of the three.
     """
 
     def __init__(self, variant: Variant, attention: Attention) -> None:
@@ -200,7 +195,7 @@ class MobileNetV3(nn.Module):
         )
         inputs = (_STEM_CHANNELS, *(block.outputs for block in blocks[:-1]))
         built = [InvertedResidual(count, block, attention) for count, block in zip(inputs, blocks, strict=True)]
-        # A stage ends before the next block that halves the size; the last three stages are the ones that are used.
+        # A stage ends before the next block that halves the size; the outputs of the last three stages are used.
         starts = [index for index, block in enumerate(blocks) if block.stride == 2]
         *_, to_16, to_32 = starts
         bounds = (0, to_16, to_32, len(blocks))
@@ -208,7 +203,7 @@ class MobileNetV3(nn.Module):
         self.channels = tuple(blocks[high - 1].outputs for high in bounds[1:])
 
     @property
-    def first_weights(self) -> Tensor:
+    def stem_weights(self) -> Tensor:
         """(16, 3, 3, 3) of the first convolution, which has no bias."""
         convolution = self.stem[0]
         assert isinstance(convolution, nn.Conv2d)

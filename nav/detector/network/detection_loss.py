@@ -19,7 +19,16 @@ from torch.nn.utils.rnn import pad_sequence
 
 from nav.detector.network.head import anchor_points, decode_boxes, flatten_maps
 
-_LEAST_AREA_PX2 = 1e-6
+_LEAST_AREA_PX2 = 1e-6  # keeps quotients finite where a box is empty
+# The alignment of a cell with a box is score^a IoU^b; this many of the best aligned cells are assigned to the box.
+_SCORE_POWER, _IOU_POWER = 0.5, 6.0
+_CELLS_PER_BOX = 10
+_TINY = 1e-12
+# Exponent by which cells whose score is nearly right are weighted down (quality focal loss, arXiv:2006.04388, eq. 3).
+# The paper has 2, with which scores rose later in short trainings on few images; 0 is plain cross entropy, in which the
+# few cells of a box have little weight beside the many others. Long trainings were not compared.
+_FOCUS_POWER = 1.0
+_BOX_WEIGHT = 2.0
 
 
 def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
@@ -30,12 +39,13 @@ def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
 
 
 def complete_iou(a: Tensor, b: Tensor) -> Tensor:
-    """IoU less the distance of the centres and the difference of the shapes (CIoU, arXiv:1911.08287, eq. 10).
+    """IoU minus penalties for the distance of the centres and the difference of aspect ratios (CIoU).
 
-    Differentiable, -1.5 to 1, and still telling where boxes do not touch.
+    It is differentiable, lies between -1.5 and 1, and has a useful gradient also where boxes do not touch.
+    Source: arXiv:1911.08287, eq. 10.
 
     Args:
-        a: (N, 4) answers.
+        a: (N, 4) predictions.
         b: (N, 4) truth.
 
     Returns:
@@ -43,12 +53,12 @@ def complete_iou(a: Tensor, b: Tensor) -> Tensor:
     """
     iou = intersection_over_union(a, b)
     hull = torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])
-    between = (a[:, :2] + a[:, 2:] - b[:, :2] - b[:, 2:]) / 2
-    apart = between.square().sum(dim=1) / hull.square().sum(dim=1).clamp(min=_LEAST_AREA_PX2)
-    shape = (4 / pi**2) * (_diagonal_angle(a) - _diagonal_angle(b)).square()
+    center_offset = (a[:, :2] + a[:, 2:] - b[:, :2] - b[:, 2:]) / 2
+    distance = center_offset.square().sum(dim=1) / hull.square().sum(dim=1).clamp(min=_LEAST_AREA_PX2)
+    aspect = (4 / pi**2) * (_diagonal_angle(a) - _diagonal_angle(b)).square()
     with torch.no_grad():
-        weight = shape / (1 - iou + shape).clamp(min=_LEAST_AREA_PX2)
-    return iou - apart - weight * shape
+        weight = aspect / (1 - iou + aspect).clamp(min=_LEAST_AREA_PX2)
+    return iou - distance - weight * aspect
 
 
 def _area(boxes: Tensor) -> Tensor:
@@ -61,81 +71,69 @@ def _diagonal_angle(boxes: Tensor) -> Tensor:
     return torch.atan2(sides[:, 0], sides[:, 1])
 
 
-# A cell's claim to a box is score^a IoU^b; so many of the cells with the best claims answer for it.
-_SCORE_POWER, _OVERLAP_POWER = 0.5, 6.0
-_CELLS_A_BOX = 10
-_TINY = 1e-12
-
-
 class Assignment(NamedTuple):
-    """What the cells of a batch should answer.
+    """The targets of the cells of a batch.
 
     Attributes:
-        scores: (B, N) 0 to 1; 0 for cells that answer for no box.
-        box_index: (B, N) which box of its image a cell answers for; 0 where it answers for none.
-        answers: (B, N) bool: the cell answers for a box.
+        scores: (B, N) target scores, 0 to 1; 0 for background cells.
+        box_index: (B, N) index of the box of its image that a cell is assigned to; 0 for background cells.
+        foreground: (B, N) bool: the cell is assigned to a box.
     """
 
     scores: Tensor
     box_index: Tensor
-    answers: Tensor
+    foreground: Tensor
 
 
 @torch.no_grad()
 def assign_anchors(
-    scores: Tensor, boxes_px: Tensor, centers_px: Tensor, truth_px: Tensor, present: Tensor
+    scores: Tensor, boxes_px: Tensor, centers_px: Tensor, truth_px: Tensor, is_box: Tensor
 ) -> Assignment:
-    """Give every box its cells.
+    """Assign cells to every true box (task-aligned assignment).
 
-    Cells within a box claim it; a box too small to have any goes to the nearest cell. A cell that is among the best of
-    several boxes answers for the one that it overlaps most. The score asked of a cell is its claim relative to the best
-    claim, times the best overlap, so that a score also says how good its box is.
+    The candidates of a box are the cells whose centre lies in it; a box that is too small to have any gets the nearest
+    cell. A cell that is among the best of several boxes is assigned to the one with the highest IoU. The target score
+    of a cell is its alignment relative to the best alignment of the box, times the best IoU, so that a score also
+    measures the quality of the box.
 
     Args:
-        scores: (B, N) of the cells, 0 to 1.
-        boxes_px: (B, N, 4) of the cells: left, top, right, bottom.
-        centers_px: (N, 2) of the cells, finer maps first.
-        truth_px: (B, M, 4) true boxes, left, top, right, bottom; M at least 1.
-        present: (B, M) bool: false for rows of `truth_px` that only fill up.
+        scores: (B, N) predicted scores, 0 to 1.
+        boxes_px: (B, N, 4) predicted boxes: left, top, right, bottom.
+        centers_px: (N, 2) centres of the cells, finer maps first.
+        truth_px: (B, M, 4) true boxes: left, top, right, bottom; M at least 1.
+        is_box: (B, M) bool: false for rows of `truth_px` that are padding.
     """
-    may_claim = _within(centers_px, truth_px) & present[:, :, None]
-    overlap = intersection_over_union(truth_px[:, :, None], boxes_px[:, None])
-    claim = (scores[:, None].pow(_SCORE_POWER) * overlap.pow(_OVERLAP_POWER)).clamp(min=_TINY) * may_claim
-    best = claim.topk(min(_CELLS_A_BOX, claim.shape[2]), dim=2).indices
-    chosen = torch.zeros_like(may_claim).scatter_(2, best, True) & may_claim
-    box_index = torch.where(chosen, overlap, -1.0).argmax(dim=1)
-    chosen &= functional.one_hot(box_index, chosen.shape[1]).transpose(1, 2).bool()
-    claim, overlap = claim * chosen, overlap * chosen
-    quality = claim / claim.amax(dim=2, keepdim=True).clamp(min=_TINY) * overlap.amax(dim=2, keepdim=True)
-    return Assignment(quality.amax(dim=1), box_index, chosen.any(dim=1))
+    is_candidate = _candidate_cells(centers_px, truth_px) & is_box[:, :, None]
+    iou = intersection_over_union(truth_px[:, :, None], boxes_px[:, None])
+    alignment = (scores[:, None].pow(_SCORE_POWER) * iou.pow(_IOU_POWER)).clamp(min=_TINY) * is_candidate
+    best = alignment.topk(min(_CELLS_PER_BOX, alignment.shape[2]), dim=2).indices
+    assigned = torch.zeros_like(is_candidate).scatter_(2, best, True) & is_candidate
+    box_index = torch.where(assigned, iou, -1.0).argmax(dim=1)
+    assigned &= functional.one_hot(box_index, assigned.shape[1]).transpose(1, 2).bool()
+    alignment, iou = alignment * assigned, iou * assigned
+    quality = alignment / alignment.amax(dim=2, keepdim=True).clamp(min=_TINY) * iou.amax(dim=2, keepdim=True)
+    return Assignment(quality.amax(dim=1), box_index, assigned.any(dim=1))
 
 
-def _within(centers_px: Tensor, truth_px: Tensor) -> Tensor:
-    """(B, M, N) whether a cell's centre lies within a box, or is the nearest to a box that holds none."""
+def _candidate_cells(centers_px: Tensor, truth_px: Tensor) -> Tensor:
+    """(B, M, N) whether a cell's centre lies within a box, or is the nearest to a box that contains none."""
     low = centers_px - truth_px[:, :, None, :2]
     high = truth_px[:, :, None, 2:] - centers_px
     inside = torch.cat((low, high), dim=3).amin(dim=3) > 0
     middle_px = (truth_px[..., :2] + truth_px[..., 2:]) / 2
-    # The first of equally near ones is that of the finest map.
+    # Of equally near cells the first is taken, that of the finest map.
     nearest = (centers_px - middle_px[:, :, None]).square().sum(dim=3).argmin(dim=2)
     only = functional.one_hot(nearest, centers_px.shape[0]).bool()
     return torch.where(inside.any(dim=2, keepdim=True), inside, only)
 
 
-# How much less a cell counts whose score is nearly right (quality focal loss, arXiv:2006.04388, eq. 3). It is between
-# the 2 of that paper, with which scores rose later in short trainings on few images, and 0, plain cross entropy, in
-# which the few cells of a box weigh little beside the many others. Long trainings were not compared.
-_FOCUS_POWER = 1.0
-_BOX_WEIGHT = 2.0
-
-
 class DetectionLoss(NamedTuple):
-    """Scalars of float32.
+    """Losses of a batch, float32 scalars.
 
     Attributes:
-        total: what is differentiated: `score` and a multiple of `box`.
-        score: of scores that should be the quality of the cell's box.
-        box: of boxes, 1 - CIoU.
+        total: the loss that is minimised: `score` plus a multiple of `box`.
+        score: quality focal loss of the scores; the target is the quality of the cell's box.
+        box: 1 - CIoU of the boxes, weighted by the target scores.
     """
 
     total: Tensor
@@ -144,14 +142,14 @@ class DetectionLoss(NamedTuple):
 
 
 def detection_loss(maps: Sequence[Tensor], boxes_xywh_px: Sequence[Tensor]) -> DetectionLoss:
-    """Loss of a batch, in float32 whatever the maps are.
+    """Loss of a batch, computed in float32 whatever the dtype of the maps.
 
     Args:
-        maps: the network's answer, three times (B, 5, H, W).
-        boxes_xywh_px: of each image (n, 4) true boxes in corner coordinates of the input; n may be 0.
+        maps: the network's output, three times (B, 5, H, W).
+        boxes_xywh_px: for each image (n, 4) true boxes in corner coordinates of the input; n may be 0.
 
     Raises:
-        ValueError: not as many lists of boxes as images, or boxes that are not (n, 4).
+        ValueError: another number of box arrays than images, or boxes that are not (n, 4).
     """
     images, device = maps[0].shape[0], maps[0].device
     if len(boxes_xywh_px) != images:
@@ -160,30 +158,30 @@ def detection_loss(maps: Sequence[Tensor], boxes_xywh_px: Sequence[Tensor]) -> D
         if boxes.ndim != 2 or boxes.shape[1] != 4:
             raise ValueError(f"boxes_xywh_px: must be (n, 4), got {tuple(boxes.shape)}")
     with torch.autocast(device.type, enabled=False):
-        cells = anchor_points(maps)
-        row = flatten_maps(maps)
-        logits, answered_px = row[..., 0], decode_boxes(row[..., 1:], cells)
-        truth_px, present = _padded(boxes_xywh_px, device)
-        assigned = assign_anchors(logits.sigmoid(), answered_px, cells.centers_px, truth_px, present)
-        share = assigned.scores.sum().clamp(min=1.0)
-        score = _quality_focal(logits, assigned.scores).sum() / share
-        wanted_px = truth_px.gather(1, assigned.box_index[..., None].expand(-1, -1, 4))
-        mine = assigned.answers
-        box = ((1 - complete_iou(answered_px[mine], wanted_px[mine])) * assigned.scores[mine]).sum() / share
+        anchors = anchor_points(maps)
+        cells = flatten_maps(maps)
+        logits, predicted_px = cells[..., 0], decode_boxes(cells[..., 1:], anchors)
+        truth_px, is_box = _pad_boxes(boxes_xywh_px, device)
+        targets = assign_anchors(logits.sigmoid(), predicted_px, anchors.centers_px, truth_px, is_box)
+        normalizer = targets.scores.sum().clamp(min=1.0)
+        score = _quality_focal_loss(logits, targets.scores).sum() / normalizer
+        target_px = truth_px.gather(1, targets.box_index[..., None].expand(-1, -1, 4))
+        on = targets.foreground
+        box = ((1 - complete_iou(predicted_px[on], target_px[on])) * targets.scores[on]).sum() / normalizer
     return DetectionLoss(score + _BOX_WEIGHT * box, score, box)
 
 
-def _padded(boxes_xywh_px: Sequence[Tensor], device: torch.device) -> tuple[Tensor, Tensor]:
-    """(B, M, 4) left, top, right, bottom, and (B, M) which are boxes and which fill up; M at least 1."""
+def _pad_boxes(boxes_xywh_px: Sequence[Tensor], device: torch.device) -> tuple[Tensor, Tensor]:
+    """(B, M, 4) left, top, right, bottom, and (B, M) which rows are boxes and not padding; M at least 1."""
     most = max(1, *(len(boxes) for boxes in boxes_xywh_px))
     rows = [boxes.to(device, torch.float32) for boxes in boxes_xywh_px]
     xywh = pad_sequence([*rows, torch.zeros((most, 4), device=device)], batch_first=True)[:-1]
     counts = torch.tensor([len(boxes) for boxes in boxes_xywh_px], device=device)
-    present = torch.arange(most, device=device) < counts[:, None]
-    return torch.cat((xywh[..., :2], xywh[..., :2] + xywh[..., 2:]), dim=-1), present
+    is_box = torch.arange(most, device=device) < counts[:, None]
+    return torch.cat((xywh[..., :2], xywh[..., :2] + xywh[..., 2:]), dim=-1), is_box
 
 
-def _quality_focal(logits: Tensor, wanted: Tensor) -> Tensor:
-    """Cross entropy to a quality between 0 and 1, weighted by how far the score is from it."""
-    distance = (wanted - logits.sigmoid()).abs().pow(_FOCUS_POWER)
-    return distance * functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+def _quality_focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
+    """Cross entropy with targets between 0 and 1, weighted by the distance of the score from its target."""
+    distance = (targets - logits.sigmoid()).abs().pow(_FOCUS_POWER)
+    return distance * functional.binary_cross_entropy_with_logits(logits, targets, reduction="none")

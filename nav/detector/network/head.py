@@ -12,16 +12,19 @@ from torch import Tensor, nn
 from nav.detector.network.backbone import separable
 from nav.detector.output_maps import LOG_DISTANCE_RANGE, MAP_CHANNELS, STRIDES
 
-# Before training a cell holds the drogue with this chance, so that the many empty cells don't drown the few others
-# (RetinaNet, arXiv:1708.02002, section 4.1) ...
+# Initial score of every cell, so that the many empty cells do not dominate the loss (RetinaNet, arXiv:1708.02002,
+# section 4.1).
 _PRIOR_SCORE = 0.01
-# ... and sides are two strides away: 32, 64 and 128 px boxes on the three levels, where the drogue has 17 to 340 px.
+# Initial distance of the sides in strides: boxes of 32, 64 and 128 px on the three levels; drogues have 17 to 340 px.
 _PRIOR_DISTANCE = 2.0
 _PREDICTION_SD = 0.01
 
 
 class DetectionHead(nn.Module):
-    """Score and box have convolutions of their own, since they ask for different features (YOLOX, arXiv:2107.08430)."""
+    """One-stage, anchor-free head of one level, decoupled: score and box have convolutions of their own.
+
+    Source: YOLOX, arXiv:2107.08430.
+    """
 
     def __init__(self, channels: int, depth: int) -> None:
         super().__init__()
@@ -30,31 +33,31 @@ class DetectionHead(nn.Module):
         self.score = nn.Conv2d(channels, 1, 1)
         self.box = nn.Conv2d(channels, MAP_CHANNELS - 1, 1)
 
-    def start_from_priors(self) -> None:
-        """Set the last layers to answer nearly the same everywhere."""
+    def initialize_priors(self) -> None:
+        """Set the last layers so that all cells predict nearly the prior score and distances."""
         for layer, bias in ((self.score, log(_PRIOR_SCORE / (1 - _PRIOR_SCORE))), (self.box, log(_PRIOR_DISTANCE))):
             assert layer.bias is not None
             nn.init.normal_(layer.weight, std=_PREDICTION_SD)
             nn.init.constant_(layer.bias, bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, 5, H, W), see `nav.detector.output_maps`; float32 in autocast too."""
+        """(B, C, H, W) -> (B, 5, H, W), see `nav.detector.output_maps`; always float32, also in autocast."""
         score_features: Tensor = self.score_features(features)
         box_features: Tensor = self.box_features(features)
         device = features.device.type
         if not torch.is_autocast_enabled(device):
             return torch.cat((self.score(score_features), self.box(box_features)), dim=1)
-        # bf16 has 8 bits: logarithms of distances would be rounded to half a percent of the box.
+        # bf16 has 8 significant bits: it would round distances to half a percent of the box.
         with torch.autocast(device, enabled=False):
             return torch.cat((self.score(score_features.float()), self.box(box_features.float())), dim=1)
 
 
 class AnchorPoints(NamedTuple):
-    """N cells of all maps.
+    """The anchor points of N cells, of all maps.
 
     Attributes:
-        centers_px: (N, 2) x, y from the corner of the input.
-        strides_px: (N, 1)
+        centers_px: (N, 2) x, y from the corner of the input. [px]
+        strides_px: (N, 1) stride of each cell's map. [px]
     """
 
     centers_px: Tensor
@@ -62,7 +65,7 @@ class AnchorPoints(NamedTuple):
 
 
 def anchor_points(maps: Sequence[Tensor]) -> AnchorPoints:
-    """Places of the cells of maps (B, 5, H, W), the finest map first, row by row."""
+    """The anchor points of maps (B, 5, H, W), the finest map first, row by row."""
     centers, strides = [], []
     for stride, each in zip(STRIDES, maps, strict=True):
         rows, columns = (
@@ -79,16 +82,16 @@ def flatten_maps(maps: Sequence[Tensor]) -> Tensor:
     return torch.cat([each.float().flatten(2) for each in maps], dim=2).transpose(1, 2)
 
 
-def decode_boxes(log_distances: Tensor, cells: AnchorPoints) -> Tensor:
-    """Boxes of all cells.
+def decode_boxes(log_distances: Tensor, anchors: AnchorPoints) -> Tensor:
+    """Decode the boxes of all cells.
 
     Args:
-        log_distances: (B, N, 4) logarithms of the distances to left, top, right, bottom in strides.
-        cells: where they are.
+        log_distances: (B, N, 4) logarithms of the distances to left, top, right, bottom, in strides.
+        anchors: the cells' anchor points.
 
     Returns:
         (B, N, 4) left, top, right, bottom. [px]
     """
-    distances_px = log_distances.clamp(*LOG_DISTANCE_RANGE).exp() * cells.strides_px
-    low_px = cells.centers_px - distances_px[..., :2]
-    return torch.cat((low_px, cells.centers_px + distances_px[..., 2:]), dim=-1)
+    distances_px = log_distances.clamp(*LOG_DISTANCE_RANGE).exp() * anchors.strides_px
+    low_px = anchors.centers_px - distances_px[..., :2]
+    return torch.cat((low_px, anchors.centers_px + distances_px[..., 2:]), dim=-1)

@@ -1,4 +1,4 @@
-"""Fusion of the three scales: adaptively spatial (ASFF, Liu et al. 2019, arXiv:1911.09516), or by concatenation."""
+"""Feature fusion of three levels: adaptively spatial (ASFF, Liu et al. 2019, arXiv:1911.09516), or concatenation."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from nav.detector.output_maps import STRIDES
 
 Fusion = Literal["asff", "concat"]
 
-# Channels from which the fusion weights of a level are computed (ASFF's reference has 8 or 16).
+# Number of channels from which the fusion weights of a level are computed (8 or 16 in the ASFF reference code).
 _WEIGHT_CHANNELS = 8
 
 
 class LevelResize(nn.Module):
-    """Features of one level at the size of another: nearest cells upwards, convolutions of stride 2 downwards."""
+    """Resizes features of one level to another: nearest neighbour upwards, convolutions of stride 2 downwards."""
 
     def __init__(self, channels: int, stride: int, target_stride: int) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class LevelResize(nn.Module):
 
 
 class AdaptiveFusion(nn.Module):
-    """Every place takes its own weighted mean of the three levels (ASFF)."""
+    """Takes a weighted mean of the three levels, with weights of its own at each location (ASFF)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class AdaptiveFusion(nn.Module):
         self.expand = separable(channels)
 
     def level_weights(self, levels: Sequence[Tensor]) -> Tensor:
-        """(B, 3, H, W) share of each level at each place; they sum to one."""
+        """(B, 3, H, W) weight of each level at each location; the weights sum to one."""
         compressed = [compress(level) for compress, level in zip(self.compress, levels, strict=True)]
         return torch.softmax(self.weigh(torch.cat(compressed, dim=1)), dim=1)
 
@@ -59,7 +59,7 @@ class AdaptiveFusion(nn.Module):
 
 
 class ConcatFusion(nn.Module):
-    """The three levels side by side, brought back to one width."""
+    """Concatenates the three levels and reduces them to the channels of one."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ class ConcatFusion(nn.Module):
 
 
 class Neck(nn.Module):
-    """Brings the trunk's levels to one width and gives each what the others know."""
+    """Brings the backbone's levels to the same number of channels, and fuses all of them into each."""
 
     def __init__(self, inputs: Sequence[int], channels: int, fusion: Fusion) -> None:
         super().__init__()
@@ -85,12 +85,12 @@ class Neck(nn.Module):
         self.fuse = nn.ModuleList(fuse(channels) for _ in STRIDES)
 
     def resized(self, features: Sequence[Tensor], level: int) -> list[Tensor]:
-        """All levels, (B, C, H, W) each, at the size of one."""
+        """All levels, resized to one of them: (B, C, H, W) each."""
         to_level = self.resize[level]
         assert isinstance(to_level, nn.ModuleList)
         return [resize(each) for resize, each in zip(to_level, features, strict=True)]
 
     def forward(self, features: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """The trunk's three levels -> three of one width at the same strides."""
+        """The backbone's three levels -> three fused levels at the same strides, with equal numbers of channels."""
         levels = [lateral(each) for lateral, each in zip(self.lateral, features, strict=True)]
         return tuple(fuse(self.resized(levels, level)) for level, fuse in enumerate(self.fuse))

@@ -18,22 +18,23 @@ from nav.detector.network.head import DetectionHead
 from nav.detector.network.neck import Fusion, Neck
 from nav.detector.output_maps import STRIDES
 
-# Channels of neck and head, and how many convolutions the head has before its answer.
+# Channels of neck and head, and number of convolutions of the head before its prediction.
 _WIDTH: dict[Variant, int] = {"l": 96, "s": 64}
 _HEAD_DEPTH: dict[Variant, int] = {"l": 2, "s": 2}
-# Of images from 0 to 1, so that the first layer needs no offset to learn and its weights start at a common size.
+# Images from 0 to 1 are centred and scaled: the first layer need not learn an offset, and its weights start at the
+# usual scale.
 _CENTRE = 0.5
 _GAIN = 4.0
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The network's variant and the switches of its ablations.
+    """The network's variant, and what its ablations change.
 
     Attributes:
-        variant: trunk of MobileNetV3-Large or -Small.
-        attention: of channels in the trunk: ECA, or the squeeze and excitation of the original MobileNetV3.
-        fusion: of the three scales: ASFF, or concatenation.
+        variant: `l` or `s`, a backbone of MobileNetV3-Large or -Small.
+        attention: channel attention of the backbone: `eca`, or `se` as in the original MobileNetV3.
+        fusion: of the three levels: `asff`, or `concat`.
     """
 
     variant: Variant = "l"
@@ -47,7 +48,7 @@ class NetworkConfig:
                 raise ValueError(f"{name}: must be one of {allowed}, got {getattr(self, name)!r}")
 
     def to_dict(self) -> dict[str, str]:
-        """What `from_dict` reads; plain JSON."""
+        """Plain JSON that `from_dict` reads."""
         return asdict(self)
 
     @classmethod
@@ -55,7 +56,7 @@ class NetworkConfig:
         """The configuration that `to_dict` wrote.
 
         Raises:
-            ValueError: a key that does not exist, or a value that is not allowed.
+            ValueError: an unknown key, or a value that is not allowed.
         """
         unknown = sorted(set(values) - {field.name for field in fields(cls)})
         if unknown:
@@ -64,15 +65,15 @@ class NetworkConfig:
 
 
 class DetectorNetwork(nn.Module):
-    """Finds drogues in images.
+    """Predicts scores and boxes of drogues in images.
 
     Attributes:
-        config: which variant it is.
-        gain: of centred images, before the first layer.
+        config: its variant, attention and fusion.
+        gain: factor that scales centred images before the first layer.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
-        """A network with random weights, from torch's generator."""
+        """Build a network with random weights, drawn from torch's generator."""
         super().__init__()
         self.config = config
         self.gain = _GAIN
@@ -90,22 +91,22 @@ class DetectorNetwork(nn.Module):
                     nn.init.zeros_(module.bias)
         for head in self.heads:
             assert isinstance(head, DetectionHead)
-            head.start_from_priors()
+            head.initialize_priors()
 
     def fold_gain(self) -> None:
-        """Put the images' gain into the first layer's weights: the same answers for a product of images less."""
+        """Fold the gain into the first layer's weights: the same outputs with one multiplication of the image less."""
         with torch.no_grad():
-            self.backbone.first_weights.mul_(self.gain)
+            self.backbone.stem_weights.mul_(self.gain)
         self.gain = 1.0
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Maps of scores and boxes.
+        """Compute the output maps of scores and boxes.
 
         Args:
             images: (B, 3, H, W) red, green, blue, 0 to 1, display-encoded; H and W multiples of 32.
 
         Returns:
-            (B, 5, H/s, W/s) for the strides s = 8, 16, 32, see `nav.detector.output_maps`.
+            (B, 5, H/s, W/s) for the strides s = 8, 16, 32; see `nav.detector.output_maps`.
         """
         centred = images - _CENTRE
         levels = self.neck(self.backbone(centred if self.gain == 1 else self.gain * centred))
@@ -114,12 +115,12 @@ class DetectorNetwork(nn.Module):
 
 
 class Complexity(NamedTuple):
-    """Size and work of a network.
+    """Size and computation of a network.
 
     Attributes:
-        parameters: numbers that are trained.
-        multiply_adds: of all convolutions and linear layers, for one image. Normalisation (folded into the convolutions
-            when exported), activations, means and resizing are not counted, as usual.
+        parameters: number of trainable parameters.
+        multiply_adds: of all convolutions and linear layers, for one image. As usual, normalisation (folded into the
+            convolutions on export), activations, means and resizing are not counted.
     """
 
     parameters: int
@@ -127,15 +128,15 @@ class Complexity(NamedTuple):
 
     @property
     def gflops(self) -> float:
-        """Operations in 10^9, a multiplication and an addition being two, as detectors' tables have it."""
+        """Operations in 10^9; a multiplication and an addition count as two, as is usual in tables of detectors."""
         return 2 * self.multiply_adds / 1e9
 
 
 def complexity(network: nn.Module, input_size_px: tuple[int, int]) -> Complexity:
-    """Count what a network is and does.
+    """Count the parameters and operations of a network.
 
     Args:
-        network: takes (1, 3, H, W); runs once.
+        network: takes (1, 3, H, W); it runs once.
         input_size_px: width, height of the image.
     """
     counts: list[int] = []

@@ -66,14 +66,14 @@ def test_cells_answer_for_boxes_that_they_lie_in(seed):
     assigned = assign_anchors(scores, boxes, CELLS.centers_px, filled, present)
     overlap = intersection_over_union(filled[0][:, None], boxes[0][None])
     for index in range(3):
-        cells = torch.nonzero(assigned.answers[0] & (assigned.box_index[0] == index))[:, 0]
+        cells = torch.nonzero(assigned.foreground[0] & (assigned.box_index[0] == index))[:, 0]
         assert 1 <= len(cells) <= MOST_CELLS
         places, box = CELLS.centers_px[cells], truth[index]
         assert bool(((places > box[:2]) & (places < box[2:])).all())
         # The best claim is asked for the best overlap, no other for more.
         assert assigned.scores[0, cells].max().item() == pytest.approx(overlap[index, cells].max().item(), rel=1e-5)
-    assert not bool((assigned.box_index[0][assigned.answers[0]] == 3).any())
-    assert bool((assigned.scores[0][~assigned.answers[0]] == 0).all())
+    assert not bool((assigned.box_index[0][assigned.foreground[0]] == 3).any())
+    assert bool((assigned.scores[0][~assigned.foreground[0]] == 0).all())
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -84,16 +84,16 @@ def test_order_of_boxes_does_not_matter(seed):
     order = torch.tensor([2, 0, 1])
     plain = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], present)
     turned = assign_anchors(scores, boxes, CELLS.centers_px, truth[order][None], present)
-    assert torch.equal(plain.answers, turned.answers)
+    assert torch.equal(plain.foreground, turned.foreground)
     torch.testing.assert_close(plain.scores, turned.scores)
-    assert torch.equal(plain.box_index[plain.answers], order[turned.box_index[turned.answers]])
+    assert torch.equal(plain.box_index[plain.foreground], order[turned.box_index[turned.foreground]])
 
 
 def test_a_box_between_cells_goes_to_the_nearest():
     scores, boxes = random_answers(3)
     truth = corners([(45.0, 53.0, 2.0, 2.0)])
     assigned = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], torch.ones(1, 1, dtype=torch.bool))
-    (cell,) = torch.nonzero(assigned.answers[0])[:, 0].tolist()
+    (cell,) = torch.nonzero(assigned.foreground[0])[:, 0].tolist()
     # The finest map's cell of row 6, column 5.
     assert CELLS.centers_px[cell].tolist() == [44.0, 52.0]
     assert CELLS.strides_px[cell].item() == 8
@@ -106,7 +106,7 @@ def test_a_cell_in_two_boxes_answers_for_the_one_it_overlaps_more():
     assigned = assign_anchors(
         scores, boxes, CELLS.centers_px, corners([inner, outer])[None], torch.ones(1, 2, dtype=torch.bool)
     )
-    both = assigned.answers[0]
+    both = assigned.foreground[0]
     shared = both & (CELLS.centers_px > 20).all(dim=1) & (CELLS.centers_px < 80).all(dim=1)
     taken = assigned.box_index[0][shared & (assigned.scores[0] > 0.5)]
     assert len(taken) and bool((taken == 1).all())

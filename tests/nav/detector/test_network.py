@@ -100,7 +100,7 @@ def test_trunk_is_the_published_one(variant, published, published_multiply_adds,
 @pytest.mark.parametrize("variant", ["l", "s"])
 def test_eca_replaces_every_squeeze_and_excitation(variant):
     kinds = {"eca": EfficientChannelAttention, "se": SqueezeExcitation}
-    wanted = sum(block.attends for block in BLOCKS[variant])
+    wanted = sum(block.has_attention for block in BLOCKS[variant])
     for name, kind in kinds.items():
         modules = list(MobileNetV3(variant, name).modules())
         assert sum(isinstance(each, kind) for each in modules) == wanted

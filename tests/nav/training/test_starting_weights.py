@@ -80,7 +80,7 @@ def test_an_exported_network_comes_back_and_can_be_normalised_anew(config: Netwo
     alone = maps_of(back, every)
     for mine, theirs in zip(maps_of(back.train(), every), alone, strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-2, atol=1e-2)
-    lengths = back.backbone.first_weights.flatten(1).norm(dim=1).tolist()
+    lengths = back.backbone.stem_weights.flatten(1).norm(dim=1).tolist()
     np.testing.assert_allclose(lengths, [0 if channel == 3 else 2**0.5 for channel in range(16)], rtol=1e-5)
 
 

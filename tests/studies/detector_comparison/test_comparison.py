@@ -214,7 +214,7 @@ def test_a_network_of_ours_that_cannot_be_counted_is_refused_before_anything_is_
     screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
 ) -> None:
     odd = maps_network(tmp_path / "odd.onnx", is_countable=False)
-    with pytest.raises(ValueError, match="its shape cannot be told"):
+    with pytest.raises(ValueError, match="its shape cannot be inferred"):
         compare_peers(order(screen_dataset, tmp_path, ours=(odd,)), tmp_path / "out", print)
     assert list(tmp_path.iterdir()) == [odd]
 

@@ -101,7 +101,7 @@ def test_what_is_no_network_has_no_cost(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"none\.onnx: cannot be read"):
         network_cost(tmp_path / "none.onnx", (64, 64))
     (tmp_path / "bad.onnx").write_bytes(b"no network at all")
-    with pytest.raises(ValueError, match=r"bad\.onnx: is no ONNX network"):
+    with pytest.raises(ValueError, match=r"bad\.onnx: is not an ONNX network"):
         network_cost(tmp_path / "bad.onnx", (64, 64))
 
 
@@ -116,7 +116,7 @@ def test_a_network_with_operations_of_somebody_else_has_no_cost(tmp_path: Path) 
         [weights],
     )
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)]), str(tmp_path / "odd.onnx"))
-    with pytest.raises(ValueError, match=r"odd\.onnx: its shapes cannot be told"):
+    with pytest.raises(ValueError, match=r"odd\.onnx: its shapes cannot be inferred"):
         network_cost(tmp_path / "odd.onnx", (64, 64))
 
 
