@@ -1,1 +1,1 @@
-"""Training the detector on datasets with truth."""
+"""Training of the detector network on datasets with ground truth."""

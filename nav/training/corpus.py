@@ -33,17 +33,19 @@ from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import SizePx, size_text
 
-_VERSION = 1  # grows with every change of what stands in a cache
+_VERSION = 1  # incremented with every change of a cache's contents
 _IMAGES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "index.json", ".lock"
 _ASK_AGAIN_S = 0.2
 
 
 class CachedPair(FrozenModel):
-    """What training knows of a stereo pair.
+    """The labels of a cached stereo pair.
 
     Attributes:
-        boxes: of the left and the right eye: the visible drogue on the cached image, x, y of the low corner, width,
-            height, counted from the corner; None where none is visible. [px]
+        frame_index: in its dataset.
+        split: that it belongs to.
+        boxes: of the left and the right eye: the visible part of the drogue in the cached image, x, y of the low
+            corner, width, height, counted from the image's corner; None where none is visible. [px]
     """
 
     frame_index: int
@@ -60,11 +62,11 @@ class _Index(FrozenModel):
 
 @dataclass(frozen=True, eq=False)
 class ImageCache:
-    """The pairs of a dataset.
+    """The images and labels of a dataset's pairs.
 
     Attributes:
-        images: (P, 2, H, W, 3) left and right, gamma-encoded red, green, blue; mapped from disk.
-        pairs: P entries.
+        images: (P, 2, H, W, 3) left and right, gamma-encoded red, green, blue; memory-mapped.
+        pairs: the labels of P pairs.
     """
 
     images: NDArray[np.uint8]
@@ -84,20 +86,20 @@ def open_image_cache(
     observer: TrainingObserver,
     should_stop: Callable[[], bool],
 ) -> ImageCache:
-    """The dataset's cache, made if it is not there: every image is decoded, and all hashes are checked.
+    """Open a dataset's cache; if there is none, make it: decode every image, and check all hashes.
 
     Args:
-        dataset: whose images.
+        dataset: with the images.
         folder: of all caches.
         size_px: (height, width) of the network's input.
-        threads: that decode.
-        observer: is told of each pair that is decoded, and if others at work on the caches are waited for.
-        should_stop: asked after each pair, and while waiting.
+        threads: number of decoding threads.
+        observer: is informed of each decoded pair, and when another process that makes caches is waited for.
+        should_stop: called after each pair, and while waiting.
 
     Raises:
-        ValueError: a file of the dataset is missing, damaged or changed; names it.
+        ValueError: a file of the dataset is missing, damaged or changed; the message names it.
         OSError: the cache cannot be written.
-        KeyboardInterrupt: it was told to stop.
+        KeyboardInterrupt: `should_stop` returned true.
     """
 
     def advance() -> None:
@@ -123,12 +125,12 @@ def open_image_cache(
 
 @contextmanager
 def _locked(folder: Path, observer: TrainingObserver, should_stop: Callable[[], bool]) -> Iterator[None]:
-    """Let others who want the same caches wait; the kernel frees the lock when the process ends, however it ends."""
+    """Hold the lock of a folder of caches; the kernel releases it when the process ends, however it ends."""
     with (folder / _LOCK_FILE).open("a") as lock:
         said = False
         while not takes_lock(lock):
             if not said:
-                observer.say(f"{folder}: waiting for another training that makes images there")
+                observer.say(f"{folder}: waiting for another training that caches images there")
                 said = True
             if should_stop():
                 raise KeyboardInterrupt
@@ -137,7 +139,7 @@ def _locked(folder: Path, observer: TrainingObserver, should_stop: Callable[[], 
 
 
 def _read(place: Path, dataset: Dataset, size_px: SizePx) -> ImageCache | None:
-    """The cache, or None where it is missing, truncated or of other contents."""
+    """The cache; None where it is missing, truncated or of other contents."""
     try:
         index = _Index.model_validate_json((place / _INDEX_FILE).read_bytes())
         images = np.load(place / _IMAGES_FILE, mmap_mode="r", allow_pickle=False)
@@ -159,7 +161,7 @@ def _write(part: Path, dataset: Dataset, size_px: SizePx, threads: int, advance:
     with (part / _IMAGES_FILE).open("wb") as stream:
         _write_header(stream, (len(dataset.frame_indices), 2, *size_px, 3))
         for pair in prefetch_map(read, dataset.frame_indices, threads, 2 * threads):
-            # Written, not mapped: a full disk is an error here, and would end the process there.
+            # Written, not memory-mapped: a full disk raises an error here, but would kill the process there.
             for image in pair.images:
                 stream.write(np.ascontiguousarray(image).data)
             pairs.append(pair.entry)
@@ -197,7 +199,7 @@ EyeIndex = int
 
 @dataclass(frozen=True)
 class DatasetStamp:
-    """Which dataset it was."""
+    """Name and hashes that identify a dataset."""
 
     name: str
     dataset_sha256: str
@@ -206,13 +208,13 @@ class DatasetStamp:
 
 @dataclass(frozen=True, eq=False)
 class Corpus:
-    """Pairs of all datasets, one after another.
+    """The pairs of all datasets, in one sequence.
 
     Attributes:
-        datasets: which they are, in the order given.
+        datasets: in the order given.
         size_px: (height, width) of the images.
         caches: one for each dataset.
-        places: (P, 2) the dataset and the pair in it of each pair.
+        places: (P, 2) for each pair the index of its dataset, and its index in that dataset.
     """
 
     datasets: tuple[DatasetStamp, ...]
@@ -221,23 +223,23 @@ class Corpus:
     places: NDArray[np.int64]
 
     def split(self, name: SplitName) -> NDArray[np.int64]:
-        """(n,) the pairs of a split."""
+        """(n,) indices of the pairs of a split."""
         return np.array([pair for pair in range(len(self.places)) if self.entry(pair).split == name], dtype=np.int64)
 
     def entry(self, pair: int) -> CachedPair:
-        """What is known of a pair."""
+        """The labels of a pair."""
         dataset, index = self.places[pair]
         entry: CachedPair = self.caches[dataset].pairs[index]
         return entry
 
     def image(self, pair: int, eye: EyeIndex) -> Image:
-        """(H, W, 3) of one eye, not to be written to."""
+        """(H, W, 3) image of one eye, read-only."""
         dataset, index = self.places[pair]
         image: Image = self.caches[dataset].images[index, eye]
         return image
 
     def boxes(self, pair: int, eye: EyeIndex) -> Boxes:
-        """(n, 4) of one eye, n at most 1."""
+        """(n, 4) boxes of one eye, n at most 1."""
         box = self.entry(pair).boxes[eye]
         return np.zeros((0, 4)) if box is None else np.array([box])
 
@@ -250,21 +252,21 @@ def open_corpus(
     observer: TrainingObserver,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Corpus:
-    """Open datasets to learn from; whatever could stop the training later is looked for here.
+    """Open the datasets of a training, and check everything in them that could stop it later.
 
     Args:
         paths: folders or URLs of the datasets.
-        cache: folder of their images at the size of the network's input.
-        size_px: (height, width) of that.
-        threads: that decode.
-        observer: is told how far it is.
-        should_stop: asked after every image.
+        cache: folder of the image caches.
+        size_px: (height, width) of the network's input.
+        threads: number of decoding threads.
+        observer: is informed of the progress.
+        should_stop: called after every pair.
 
     Raises:
         ValueError: no datasets, one twice, a missing, damaged or changed file, no drogue, images of different sizes, or
-            no split to train on; names the path.
+            no split to train on; the message names the path.
         OSError: the cache cannot be written.
-        KeyboardInterrupt: it was told to stop.
+        KeyboardInterrupt: `should_stop` returned true.
     """
     datasets = _open_datasets(paths)
     caches = []
@@ -288,7 +290,7 @@ def open_corpus(
 
 
 def _open_datasets(paths: Sequence[Location]) -> list[Dataset]:
-    """The datasets, after every check that needs no image."""
+    """Open the datasets, with all checks that need no image."""
     if not paths:
         raise ValueError("datasets: none given; name a recipe or a dataset's folder")
     datasets = [Dataset(path) for path in paths]
@@ -300,7 +302,7 @@ def _open_datasets(paths: Sequence[Location]) -> list[Dataset]:
         of_hash[manifest.dataset_sha256] = dataset.path
         if all(entry.empty for entry in manifest.frames):
             raise ValueError(f"{dataset.path}: has no pair with a drogue; there is nothing to learn from")
-        # Rigs may differ otherwise: a network sees pixels, and how large a drogue is in them, not focal lengths.
+        # Focal lengths may differ: a network sees only how large a drogue is in pixels.
         first, camera = datasets[0].manifest.recipe.rig.camera, manifest.recipe.rig.camera
         if (camera.width_px, camera.height_px) != (first.width_px, first.height_px):
             raise ValueError(

@@ -25,21 +25,21 @@ from nav.detector.output_maps import SIZE_STEP_PX, STRIDES
 
 INPUT_NAME = "images"
 OUTPUT_NAMES = tuple(f"maps_{stride}" for stride in STRIDES)
-# The first with every operator of the network (HardSwish came with 14); older run times know it too.
+# Has every operator of the network (HardSwish came with 14), and older runtimes support it.
 _OPSET = 17
 _DYNAMIC = {0: "batch", 2: "height", 3: "width"}
 
 
 def export_onnx(network: DetectorNetwork, path: Path, metadata: ModelMetadata) -> None:
-    """Write a network in float32, for any number and size of images, by one rename.
+    """Write a network in float32, for any number and size of images; the file appears by one rename.
 
     Args:
-        network: left as it is.
+        network: not changed.
         path: of the file.
-        metadata: written into the file.
+        metadata: stored in the file.
 
     Raises:
-        OSError: it cannot be written; one line that names the file. Nothing is left behind.
+        OSError: the file cannot be written; the message names it. No partial file is left.
     """
     model = onnx.load_from_string(_traced(network))
     model.producer_name, model.producer_version = "droguekit", ""
@@ -55,13 +55,12 @@ def _traced(network: DetectorNetwork) -> bytes:
     still.fold_gain()
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # The exporter by tracing is to go in a later torch than the one that is pinned; the new one takes eight times
-        # as long for the same graph.
+        # A later torch will drop the exporter by tracing; its successor takes eight times as long for the same graph.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             still,
             (torch.zeros(len(STRIDES), 3, SIZE_STEP_PX, 2 * SIZE_STEP_PX),),
-            buffer,  # type: ignore[arg-type]  # the exporter by tracing takes a stream, its annotation does not say so
+            buffer,  # type: ignore[arg-type]  # it takes a stream too, against its annotation
             input_names=[INPUT_NAME],
             output_names=list(OUTPUT_NAMES),
             dynamic_axes=dict.fromkeys((INPUT_NAME, *OUTPUT_NAMES), _DYNAMIC),
@@ -73,57 +72,58 @@ def _traced(network: DetectorNetwork) -> bytes:
 
 Convolution = nn.Conv1d | nn.Conv2d
 
-# Kaiming's draw for a fan-in n has filters of norm sqrt(n * 2/n). A step of AdamW changes a weight by the learning
-# rate, so that filters of this norm learn as quickly as new ones.
+# Kaiming initialization with fan-in n gives filters of norm sqrt(n * 2/n). A step of AdamW changes a weight by the
+# learning rate, so filters of this norm learn as fast as newly initialized ones.
 _FILTER_NORM = 2**0.5
 
 
 def import_onnx(content: bytes) -> DetectorNetwork:
-    """The network in a file, in evaluation mode, answering what the file answers.
+    """Read the network in a file, in evaluation mode, with the same outputs as the file.
 
-    Its normalisation leaves what it is given but for an offset, so that it must not train before `normalise_anew`.
+    Its batch normalisation only adds an offset, so it must not be trained before `recalibrate_batch_norm`.
 
     Raises:
-        ValueError: not a whole ONNX file, or none that droguekit exported; says what is wrong.
+        ValueError: not a complete ONNX file, or not one that droguekit exported; the message says what is wrong.
     """
     try:
         model = onnx.load_from_string(content)
-    except Exception as error:  # protobuf's faults differ by its implementation
-        raise ValueError("is truncated or no ONNX file") from error
+    except Exception as error:  # protobuf's exceptions differ by its implementation
+        raise ValueError("is truncated or not an ONNX file") from error
     text = {entry.key: entry.value for entry in model.metadata_props}.get(METADATA_KEY, "{}")
     stated = ModelMetadata.from_json(text).network
     if not stated:
         raise ValueError("does not say which of droguekit's networks it is")
     network = DetectorNetwork(NetworkConfig.from_dict(stated)).eval()
-    # A file of droguekit has its weights inside, and no file leads this program to others.
+    # droguekit writes the weights into the file; a file must not make this program read others.
     if any(uses_external_data(each) for each in model.graph.initializer):
         raise ValueError("keeps its weights in other files")
     arrays = {each.name: each for each in model.graph.initializer}
     for node in model.graph.node:
-        # The exporter writes equal values once.
+        # The exporter writes equal values only once.
         if node.op_type == "Identity" and node.input[0] in arrays:
             arrays[node.output[0]] = arrays[node.input[0]]
     nodes = [node for node in model.graph.node if node.op_type == "Conv"]
     layers = list(_normalised_convolutions(network))
     try:
-        # The file's order is that in which they run; strict, for another number of them is another network.
+        # The file lists them in the order in which they run; another number of them is another network.
         for node, (convolution, norm) in zip(nodes, layers, strict=True):
             values = [torch.tensor(numpy_helper.to_array(arrays[name])) for name in node.input[1:]]
-            _put_into(convolution, norm, *values)
+            _load_convolution(convolution, norm, *values)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError("does not have the layers of the network that it says it is") from error
+        raise ValueError("does not have the layers of the network that its metadata states") from error
     with torch.no_grad():
         network.backbone.stem_weights.div_(network.gain)
     return network
 
 
 def recalibrate_batch_norm(network: DetectorNetwork, batches: Iterable[Tensor]) -> None:
-    """Let batch normalisation work on what the convolutions give, without a change of any answer.
+    """Give batch normalisation the statistics of the convolutions' outputs, without a change of the network's outputs.
 
-    Means and variances become those over the images; scales and offsets undo them. Filters get the length of new ones.
+    Means and variances become those over the images; scales and offsets compensate for them. Filters are scaled to the
+    norm of newly initialized ones.
 
     Args:
-        network: of `import_onnx`; its mode is left as it is.
+        network: from `import_onnx`; its mode is not changed.
         batches: (B, 3, H, W) each, as for `DetectorNetwork.forward`.
     """
     layers = [(convolution, norm) for convolution, norm in _normalised_convolutions(network) if norm is not None]
@@ -148,15 +148,15 @@ def recalibrate_batch_norm(network: DetectorNetwork, batches: Iterable[Tensor]) 
             hook.remove()
     for convolution, norm in layers:
         mean, square = sums[norm] / max(count, 1)
-        _give_statistics(convolution, norm, mean, (square - mean.square()).clamp(min=0))
+        _set_statistics(convolution, norm, mean, (square - mean.square()).clamp(min=0))
 
 
 @torch.no_grad()
-def _give_statistics(convolution: Convolution, norm: nn.BatchNorm2d, mean: Tensor, variance: Tensor) -> None:
-    """Of what the convolution gives; the norm's own mean is 0 and its scale undoes its variance until now."""
+def _set_statistics(convolution: Convolution, norm: nn.BatchNorm2d, mean: Tensor, variance: Tensor) -> None:
+    """Set mean and variance of the convolution's output; before, the mean is 0 and the scale cancels the variance."""
     assert norm.running_mean is not None and norm.running_var is not None
     lengths = convolution.weight.flatten(1).norm(dim=1).double().cpu() / _FILTER_NORM
-    # A filter that is zero stays so.
+    # A zero filter stays zero.
     lengths[lengths == 0] = 1
     offset = norm.bias.double().cpu() + mean
     convolution.weight.div_(lengths.to(convolution.weight).reshape(-1, *[1] * (convolution.weight.ndim - 1)))
@@ -167,10 +167,10 @@ def _give_statistics(convolution: Convolution, norm: nn.BatchNorm2d, mean: Tenso
 
 
 @torch.no_grad()
-def _put_into(
+def _load_convolution(
     convolution: Convolution, norm: nn.BatchNorm2d | None, weight: Tensor, bias: Tensor | None = None
 ) -> None:
-    """A file's convolution; its bias into the normalisation where there is one, which otherwise changes nothing."""
+    """Copy a file's convolution; its bias goes into the batch normalisation, if there is one."""
     _copy(convolution.weight, weight)
     if norm is None:
         own = convolution.bias
@@ -181,7 +181,7 @@ def _put_into(
         return
     assert norm.running_mean is not None and norm.running_var is not None
     if bias is None:
-        raise ValueError("normalisation is not folded")
+        raise ValueError("batch normalisation is not folded")
     _copy(norm.bias, bias)
     norm.running_mean.zero_()
     norm.running_var.fill_(1)
@@ -195,7 +195,7 @@ def _copy(to: Tensor, values: Tensor) -> None:
 
 
 def _normalised_convolutions(network: DetectorNetwork) -> Iterator[tuple[Convolution, nn.BatchNorm2d | None]]:
-    """All convolutions in the order in which they run, each with the normalisation that follows it at once, if any."""
+    """All convolutions in the order in which they run, each with the batch normalisation right after it, if any."""
     run: list[nn.Module] = []
     kinds = (nn.Conv1d, nn.Conv2d, nn.BatchNorm2d)
     hooks = [

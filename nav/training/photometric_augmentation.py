@@ -14,29 +14,41 @@ from numpy.typing import NDArray
 
 from nav.training.geometric_augmentation import Boxes, Image
 
-# Shares of the images, and the ranges of what is drawn then.
+# Fractions of the images that are changed, and the ranges from which the change is drawn.
 _TONE_FRACTION, _EXPOSURE, _GAMMA, _BALANCE = 0.8, (0.55, 1.7), (0.7, 1.45), (0.85, 1.18)
 _CAST_FRACTION, _CAST = 0.2, (0.6, 1.5)
-_GREY_FRACTION = 0.08  # mono cameras; and colour must not be all that the network knows
+_GREY_FRACTION = 0.08  # for mono cameras, and so that the network does not rely on colour alone
 _SATURATION = (0.5, 1.4)
 _LOW_LIGHT_FRACTION, _LOW_LIGHT = 0.12, (0.15, 0.5)
-_LEAST_MEAN_DN = 20.0  # no image is made darker: a drogue that nobody sees would keep its box
+_LEAST_MEAN_DN = 20.0  # no image is made darker, or invisible drogues would keep their boxes
 _BLUR_FRACTION, _BLUR_SIGMA_PX = 0.15, (0.4, 1.6)
-_STREAK_FRACTION, _STREAK_PX = 0.08, (3, 9)
+_MOTION_FRACTION, _MOTION_PX = 0.08, (3, 9)
 _NOISE_FRACTION, _NOISE_DN = 0.35, (0.5, 6.0)
 _LOW_LIGHT_NOISE_DN = (2.0, 8.0)
 
+_OCCLUDED_FRACTION = 0.12  # of the drogues
+_MAX_HIDDEN_FRACTION = 0.45  # of a drogue's ellipse; an occluder that would hide more of any drogue is not painted
+_DISTRACTED_FRACTION = 0.3  # of the canvases
+_MAX_DISTRACTORS = 3
+_DISTRACTOR_SIZE = (0.02, 0.6)  # over the canvas's height
+_RING_TUBE_FRACTION = (0.08, 0.3)  # radius of a ring's tube over the radius of the ring
+_LEAST_TUBE_PX = 0.5
+_RING_AMBIENT_FRACTION = (0.2, 0.9)  # brightness of the side that faces away from the lamp, over that which faces it
+# Red and orange (paint, lamps), white, dark: the colours of drogues, markers, pods and probes.
+_COLORS = ((200, 30, 30), (225, 95, 35), (150, 20, 30), (235, 235, 235), (35, 35, 38), (120, 122, 125))
+_COLOR_SPREAD = 20
+
 
 def color_jitter(rng: np.random.Generator, image: Image) -> Image:
-    """The image in other light, by another camera. (H, W, 3) to a new (H, W, 3)."""
+    """Randomly change tone, colour, sharpness and noise, as other light and cameras do. (H, W, 3) -> (H, W, 3)."""
     is_dark = rng.random() < _LOW_LIGHT_FRACTION
     image = cv2.LUT(_mix_colors(rng, image), _tone_curves(rng))
     if is_dark:
         image = _darken(rng, image)
     if rng.random() < _BLUR_FRACTION:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), _log_uniform(rng, _BLUR_SIGMA_PX).item()), dtype=np.uint8)
-    if rng.random() < _STREAK_FRACTION:
-        image = _streak(rng, image)
+    if rng.random() < _MOTION_FRACTION:
+        image = _motion_blur(rng, image)
     if is_dark or rng.random() < _NOISE_FRACTION:
         image = _add_noise(rng, image, _log_uniform(rng, _LOW_LIGHT_NOISE_DN if is_dark else _NOISE_DN).item())
     return image
@@ -48,7 +60,7 @@ def _log_uniform(rng: np.random.Generator, limits: tuple[float, float], count: i
 
 
 def _mix_colors(rng: np.random.Generator, image: Image) -> Image:
-    """Less or more saturated; grey at times."""
+    """Change the saturation; some images become grey."""
     saturation = 0.0 if rng.random() < _GREY_FRACTION else rng.uniform(*_SATURATION)
     if abs(saturation - 1) < 0.1:
         return image
@@ -58,7 +70,7 @@ def _mix_colors(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _tone_curves(rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(256, 1, 3) new number for every old one and colour."""
+    """(256, 1, 3) lookup table of exposure, gamma and white balance for the three channels."""
     gain, gamma, balance = np.ones(1), np.ones(1), np.ones(3)
     if rng.random() < _TONE_FRACTION:
         gain, gamma = _log_uniform(rng, _EXPOSURE), _log_uniform(rng, _GAMMA)
@@ -71,14 +83,14 @@ def _tone_curves(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 
 def _darken(rng: np.random.Generator, image: Image) -> Image:
-    """In low light."""
+    """Scale the image down to low light."""
     gain = max(_log_uniform(rng, _LOW_LIGHT).item(), min(1.0, _LEAST_MEAN_DN / max(float(image.mean()), 1.0)))
     return np.asarray(cv2.LUT(image, np.rint(gain * np.arange(256)).astype(np.uint8)), dtype=np.uint8)
 
 
-def _streak(rng: np.random.Generator, image: Image) -> Image:
-    """Motion along a straight line."""
-    length_px = int(rng.integers(_STREAK_PX[0], _STREAK_PX[1] + 1))
+def _motion_blur(rng: np.random.Generator, image: Image) -> Image:
+    """Blur the image along a straight line, as motion does."""
+    length_px = int(rng.integers(_MOTION_PX[0], _MOTION_PX[1] + 1))
     kernel = np.zeros((length_px, length_px))
     middle, angle = (length_px - 1) / 2, rng.uniform(0, np.pi)
     for t in np.linspace(-middle, middle, 4 * length_px):
@@ -94,50 +106,37 @@ def _add_noise(rng: np.random.Generator, image: Image, sigma_dn: float) -> Image
     return np.clip(noise, 0, 255, out=noise).astype(np.uint8)
 
 
-_OCCLUDED_FRACTION = 0.12  # share of the drogues
-_MOST_HIDDEN = 0.45  # of a drogue's ellipse; an occluder with which more of any is hidden is not painted
-_DISTRACTED_FRACTION = 0.3  # share of the canvases
-_MOST_DISTRACTORS = 3
-_DISTRACTOR_SIZE = (0.02, 0.6)  # of the canvas's height
-_RING_TUBE_FRACTION = (0.08, 0.3)  # radius of a ring's tube over the ring's
-_LEAST_TUBE_PX = 0.5
-_RING_AMBIENT_FRACTION = (0.2, 0.9)  # of the brightness that a lamp before it would give
-# Red and orange (paint, lamps), white, dark: the colours of drogues, markers, pods and probes.
-_COLORS = ((200, 30, 30), (225, 95, 35), (150, 20, 30), (235, 235, 235), (35, 35, 38), (120, 122, 125))
-_COLOR_SPREAD = 20
-
-
 def cutout(rng: np.random.Generator, image: Image, boxes: Boxes) -> Boxes:
-    """Paint a bar or a polygon before some of the drogues.
+    """Paint a bar over some of the drogues, as an occluder.
 
     Args:
-        rng: the stream.
+        rng: random stream.
         image: (H, W, 3), changed in place.
-        boxes: (n, 4) of the drogues on it.
+        boxes: (n, 4) of the drogues in it.
 
     Returns:
-        (n, 4) the boxes of what remains visible.
+        (n, 4) boxes of the parts that remain visible.
     """
     remaining = boxes.copy()
     hidden = np.zeros(image.shape[:2], dtype=np.uint8)
     for box in boxes:
-        # All draws are made for every box, so that what follows does not depend on what is painted.
-        wanted, corners, color = rng.random() < _OCCLUDED_FRACTION, _sample_occluder(rng, box), _sample_color(rng)
-        if not wanted:
+        # All draws are made for every box, so that later draws do not depend on what is painted.
+        is_occluded, corners, color = rng.random() < _OCCLUDED_FRACTION, _sample_occluder(rng, box), _sample_color(rng)
+        if not is_occluded:
             continue
-        with_it = hidden.copy()
-        cv2.fillConvexPoly(with_it, corners, 1)
-        # It may stand before the others too, together with those painted before.
-        left = [_visible_box(with_it, each) for each in boxes]
+        hidden_with = hidden.copy()
+        cv2.fillConvexPoly(hidden_with, corners, 1)
+        # It may also hide other drogues, together with the occluders painted so far.
+        left = [_visible_box(hidden_with, each) for each in boxes]
         visible = [each for each in left if each is not None]
         if len(visible) == len(boxes):
-            image[with_it > hidden] = color
-            hidden, remaining = with_it, np.array(visible)
+            image[hidden_with > hidden] = color
+            hidden, remaining = hidden_with, np.array(visible)
     return remaining
 
 
 def _sample_occluder(rng: np.random.Generator, box: NDArray[np.float64]) -> NDArray[np.int32]:
-    """(4, 2) corners of a bar across the box, or of a shorter piece."""
+    """(4, 2) corners of a bar over the box; a short one hides a part of its width only."""
     center, size = box[:2] + box[2:] * rng.uniform(0, 1, 2), float(box[2:].max())
     angle, width, length = rng.uniform(0, np.pi), size * rng.uniform(0.08, 0.5), size * rng.uniform(0.4, 3)
     along = np.array([np.cos(angle), np.sin(angle)]) * length / 2
@@ -153,16 +152,16 @@ def _sample_color(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 
 def _visible_box(hidden: NDArray[np.uint8], box: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """The box of what occluders leave of the ellipse in a box; None where that is too little."""
+    """The box of the part of a box's ellipse that occluders leave visible; None where too little is left."""
     low = np.floor(box[:2]).astype(int)
     high = np.minimum(np.ceil(box[:2] + box[2:]).astype(int), hidden.shape[::-1])
     y, x = np.mgrid[low[1] : high[1], low[0] : high[0]] + 0.5
     center, halves = box[:2] + box[2:] / 2, box[2:] / 2
     ellipse = ((x - center[0]) / halves[0]) ** 2 + ((y - center[1]) / halves[1]) ** 2 <= 1
     visible = ellipse & (hidden[low[1] : high[1], low[0] : high[0]] == 0)
-    if visible.sum() < (1 - _MOST_HIDDEN) * ellipse.sum() or not visible.any():
+    if visible.sum() < (1 - _MAX_HIDDEN_FRACTION) * ellipse.sum() or not visible.any():
         return None
-    # What is hidden of rows and columns moves an edge; what is not leaves it where it was, between the pixels.
+    # An edge moves where its outermost rows or columns are hidden; otherwise it keeps its sub-pixel position.
     edges = []
     for axis in (0, 1):
         before, after = np.flatnonzero(ellipse.any(axis=axis)), np.flatnonzero(visible.any(axis=axis))
@@ -178,16 +177,16 @@ def _visible_box(hidden: NDArray[np.uint8], box: NDArray[np.float64]) -> NDArray
 
 
 def paint_distractors(rng: np.random.Generator, image: Image, boxes: Boxes) -> None:
-    """Paint discs, rings and bars beside the drogues, in their colours; they get no boxes."""
+    """Paint discs, rings and bars beside the drogues, in a drogue's colours; they get no boxes."""
     if rng.random() >= _DISTRACTED_FRACTION:
         return
     height, width = image.shape[:2]
-    for _ in range(int(rng.integers(1, _MOST_DISTRACTORS + 1))):
+    for _ in range(int(rng.integers(1, _MAX_DISTRACTORS + 1))):
         size = float(np.exp(rng.uniform(*np.log(_DISTRACTOR_SIZE)))) * height
         center, axes = rng.uniform(0, (width, height)), size / 2 * rng.uniform(0.5, 1, 2)
         turn_deg, kind, color = rng.uniform(0, 180), rng.integers(3), _sample_color(rng).tolist()
         tube, ambient, toward_lamp = _sample_ring(rng)
-        if _meets(center, size, boxes):
+        if _touches_drogue(center, size, boxes):
             continue
         at, halves = (round(center[0]), round(center[1])), (max(round(axes[0]), 1), max(round(axes[1]), 1))
         if kind == 0:
@@ -202,15 +201,15 @@ def paint_distractors(rng: np.random.Generator, image: Image, boxes: Boxes) -> N
 
 
 def _sample_ring(rng: np.random.Generator) -> tuple[float, float, NDArray[np.float64]]:
-    """Radius of the tube over the ring's, share of light from all around, direction to the lamp."""
+    """Radius of the tube over that of the ring, fraction of ambient light, direction to the lamp."""
     tube, ambient = float(rng.uniform(*_RING_TUBE_FRACTION)), float(rng.uniform(*_RING_AMBIENT_FRACTION))
     toward_lamp = rng.standard_normal(3)
     toward_lamp[2] = abs(toward_lamp[2])
     return tube, ambient, toward_lamp / np.linalg.norm(toward_lamp)
 
 
-def _meets(center: NDArray[np.float64], size: float, boxes: Boxes) -> bool:
-    """Whether a shape would stand before, or touch, a drogue."""
+def _touches_drogue(center: NDArray[np.float64], size: float, boxes: Boxes) -> bool:
+    """Whether a shape would cover or touch a drogue."""
     low, high = boxes[:, :2] - size, boxes[:, :2] + boxes[:, 2:] + size
     return bool(((center > low) & (center < high)).all(axis=1).any())
 
@@ -225,20 +224,20 @@ def paint_ring(
     ambient_fraction: float,
     toward_lamp: NDArray[np.float64],
 ) -> None:
-    """Paint a matt torus as seen from afar: the bare ring that looks most like a drogue.
+    """Paint a matt torus seen from a distance: of all plain shapes a ring looks most like a drogue.
 
-    Its tube is as wide all around: a tilted ring gets flatter, its tube does not. Distances to the ellipse are of
-    the first order, good near it (Sampson 1982, doi:10.1016/0146-664X(82)90101-0).
+    The tube has the same width all around: a tilted ring is flatter, its tube is not. Distances to the ellipse are a
+    first-order approximation, accurate near it (Sampson 1982, doi:10.1016/0146-664X(82)90101-0).
 
     Args:
         image: (H, W, 3), changed in place.
         center_px: (2,) x, y.
-        half_axes_px: (2,) of the ellipse along the tube's middle, above 0.
-        turn_deg: from the image's x to the first axis, towards y.
+        half_axes_px: (2,) of the ellipse along the middle of the tube, above 0.
+        turn_deg: angle from the image's x axis to the first half axis, towards y.
         tube_px: radius of the tube.
-        color: red, green, blue of what faces the lamp.
-        ambient_fraction: brightness of what faces away from it, 0 to 1.
-        toward_lamp: (3,) unit vector to it: x, y of the image and towards the camera.
+        color: red, green, blue of the side that faces the lamp.
+        ambient_fraction: relative brightness of the side that faces away from it, 0 to 1.
+        toward_lamp: (3,) unit vector to the lamp: x, y of the image, and towards the camera.
     """
     height, width = image.shape[:2]
     reach = float(half_axes_px.max()) + tube_px + 1

@@ -1,4 +1,4 @@
-"""Work done ahead by threads, handed over in order."""
+"""A map over tasks that threads compute ahead of their consumer."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def prefetch_map(do: Callable[[Task], Result], tasks: Iterable[Task], threads: int, ahead: int) -> Generator[Result]:
-    """The results of tasks in the order of the tasks, of which at most `ahead` are begun before they are asked for.
+def prefetch_map(
+    function: Callable[[Task], Result], tasks: Iterable[Task], threads: int, ahead: int
+) -> Generator[Result]:
+    """Yield the results of tasks in their order; threads begin at most `ahead` tasks before their results are needed.
 
     Raises:
-        Exception: that of a task, when its turn comes; those begun are finished, the others are not begun.
+        Exception: that of a task, at its turn; tasks that have begun are finished, others are not begun.
     """
     begun: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         try:
             for task in tasks:
-                begun.append(pool.submit(do, task))
+                begun.append(pool.submit(function, task))
                 if len(begun) > ahead:
                     yield begun.popleft().result()
             while begun:

@@ -1,4 +1,4 @@
-"""Weights that another training found, for one to start from instead of random ones."""
+"""Weights of another training, from which a training starts instead of from random ones."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training'
 
 @dataclass(frozen=True, eq=False)
 class StartingWeights:
-    """What a training starts from.
+    """The weights that a training starts from.
 
     Attributes:
         path: the file.
         sha256: of its bytes.
-        values: name and value of every parameter and running mean.
-        network: which one they are of; None where the file does not say.
+        values: every parameter and running mean by its name.
+        network: configuration of the network; None where the file does not state it.
     """
 
     path: Path
@@ -36,15 +36,15 @@ class StartingWeights:
     network: NetworkConfig | None = None
 
     @property
-    def lack_statistics(self) -> bool:
-        """Whether they are an exported file's, to be followed by `nav.training.onnx_conversion.normalise_anew`."""
+    def need_batch_statistics(self) -> bool:
+        """Whether they are from an exported file; `recalibrate_batch_norm` must then follow before training."""
         return self.network is not None
 
-    def put_into(self, network: nn.Module) -> None:
+    def load_into(self, network: nn.Module) -> None:
         """Replace all weights of a network.
 
         Raises:
-            ValueError: they are another network's; names the file.
+            ValueError: they are of another network; the message names the file.
         """
         try:
             network.load_state_dict(self.values)
@@ -57,12 +57,12 @@ class StartingWeights:
 
 
 def read_starting_weights(name_or_file: str) -> StartingWeights:
-    """The weights of a shipped network, in an exported `*.onnx`, or in a training's `best.pt`.
+    """Read the weights of a shipped network, an exported `*.onnx`, or a training's `best.pt` or `checkpoint.pt`.
 
-    A `checkpoint.pt` will do as well, of which the averaged ones are taken.
+    Of a `checkpoint.pt` the averaged weights are taken.
 
     Raises:
-        ValueError: missing, truncated, or a file of something else; names it.
+        ValueError: the file is missing, truncated, or holds something else; the message names it.
     """
     path = network_file(name_or_file)
     return _from_checkpoint(Path(name_or_file)) if path is None else _from_onnx(path)
@@ -100,15 +100,15 @@ def starting_network(settings: TrainingSettings, start: StartingWeights | None) 
     """
     network = new_network(settings)
     if start is not None:
-        start.put_into(network)
+        start.load_into(network)
     return network
 
 
 def settings_from_start(settings: TrainingSettings, start: StartingWeights | None) -> TrainingSettings:
-    """Settings that say which weights the training starts from.
+    """The settings, with the hash of the weights that the training starts from.
 
     Raises:
-        ValueError: they name others already.
+        ValueError: the settings have the hash of other weights.
     """
     given = "" if start is None else start.sha256
     if settings.start_sha256 not in ("", given):

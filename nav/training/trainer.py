@@ -20,9 +20,13 @@ from nav.training.training_progress import VALIDATED, EpochRow, TensorBoardCurve
 from nav.training.training_settings import SizePx, TrainingSettings
 from nav.training.training_state import BEST_FILE, ComputeDevice, TrainingState, save_checkpoint, save_state
 
+_STEPS_PER_CURVE_POINT = 10
+# Validation every third epoch before the last input size; the best weights are chosen among those at that size.
+_EPOCHS_PER_VALIDATION = 3
+
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
-    """The learning rate of a step, counted from 0."""
+    """The learning rate of a step, counted from 0: a linear warm-up, then half a cosine."""
     warmup = min(settings.warmup_passes // settings.batch_images, settings.steps // 2)
     if step < warmup:
         return settings.learning_rate * (step + 1) / (warmup + 1)
@@ -31,36 +35,32 @@ def learning_rate(settings: TrainingSettings, step: int) -> float:
     return settings.learning_rate * (floor + (1 - floor) * (1 + cos(pi * done)) / 2)
 
 
-_CURVE_EVERY_STEPS = 10
-_VALIDATED_EPOCHS = 3  # every so many, before the last input size: the best weights are chosen among those after it
-
-
 @dataclass(frozen=True, eq=False)
 class Trainer:
-    """A training in its folder.
+    """Runs a training in its folder.
 
     Attributes:
-        corpus, settings: what is learned, and how.
-        computing: where and how precisely.
+        corpus, settings: the data and the settings of the training.
+        compute: device and precision.
         out: folder of checkpoint, tables and curves.
-        observer: is told of every epoch.
-        should_stop: asked after every step.
+        observer: is informed of every step and epoch.
+        should_stop: called after every step.
     """
 
     corpus: Corpus
     settings: TrainingSettings
-    computing: ComputeDevice
+    compute: ComputeDevice
     out: Path
     observer: TrainingObserver
     should_stop: Callable[[], bool]
 
     def run(self, state: TrainingState) -> None:
-        """Go on from a state to the end.
+        """Train from a state to the end.
 
         Raises:
-            ValueError: the loss is no number any more.
-            OSError: a file cannot be written; the checkpoint before stays.
-            KeyboardInterrupt: it was told to stop, and what was done is saved.
+            ValueError: the loss is no longer finite.
+            OSError: a file cannot be written; the previous checkpoint stays.
+            KeyboardInterrupt: `should_stop` returned true; the state is saved.
         """
         self.observer.begin(f"steps of {self.settings.batch_images} images", self.settings.steps - state.step)
         try:
@@ -78,21 +78,23 @@ class Trainer:
                 self._step(state, batch, curves)
                 state.row_seconds += time.monotonic() - began_s
                 self.observer.advance()
-                stops = self.should_stop()
+                is_stopped = self.should_stop()
                 if maker.epoch_after(state.step) > maker.epoch_after(state.step - 1) or state.step == settings.steps:
                     self._end_epoch(state, maker.epoch_after(state.step), curves)
                     saved_s = time.monotonic()
-                elif stops or time.monotonic() - saved_s > 60 * settings.checkpoint_minutes:
+                elif is_stopped or time.monotonic() - saved_s > 60 * settings.checkpoint_minutes:
                     self._save(state)
                     saved_s = time.monotonic()
-                if stops and state.step < settings.steps:
-                    self.observer.say(f"stopped after {state.step * settings.batch_images:,} images, which are saved")
+                if is_stopped and state.step < settings.steps:
+                    self.observer.say(
+                        f"stopped after {state.step * settings.batch_images:,} images; the state is saved"
+                    )
                     raise KeyboardInterrupt
                 began_s = time.monotonic()
 
     def _step(self, state: TrainingState, batch: Batch, curves: TensorBoardCurves) -> None:
         rate = learning_rate(self.settings, state.step)
-        loss = self._learn(state, batch, rate)
+        loss = self._update_weights(state, batch, rate)
         total, score, box = (float(part.detach()) for part in loss)
         if not math.isfinite(total):
             raise ValueError(
@@ -103,16 +105,16 @@ class Trainer:
         state.step += 1
         state.losses.append(total)
         state.parts.append((score, box))
-        if state.step % _CURVE_EVERY_STEPS == 0:
+        if state.step % _STEPS_PER_CURVE_POINT == 0:
             curves.add_step(state.step * self.settings.batch_images, total, score, box, rate)
 
-    def _learn(self, state: TrainingState, batch: Batch, rate: float) -> DetectionLoss:
+    def _update_weights(self, state: TrainingState, batch: Batch, rate: float) -> DetectionLoss:
         for group in state.optimizer.param_groups:
             group["lr"] = rate
         state.network.train()
-        boxes = [torch.from_numpy(own).float().to(self.computing.device) for own in batch.boxes]
-        with self.computing.autocast():
-            maps = state.network(to_tensor(batch.images, self.computing))
+        boxes = [torch.from_numpy(own).float().to(self.compute.device) for own in batch.boxes]
+        with self.compute.autocast():
+            maps = state.network(to_tensor(batch.images, self.compute))
         loss = detection_loss(maps, boxes)
         state.optimizer.zero_grad(set_to_none=True)
         loss.total.backward()  # type: ignore[no-untyped-call]
@@ -121,12 +123,12 @@ class Trainer:
         return loss
 
     def _end_epoch(self, state: TrainingState, epoch: int, curves: TensorBoardCurves) -> None:
-        """Validate, tell, keep the best, save."""
+        """Validate, record and report the epoch, and save the state, and the weights if they are the best so far."""
         settings, size = self.settings, self.settings.size_at(state.step - 1)
         began_s = time.monotonic()
         stage = int(settings.final_size_px is not None and size == settings.final_size_px)
-        leads_to_another = settings.final_size_px is not None and stage == 0 and state.step < settings.steps
-        validation = None if leads_to_another and epoch % _VALIDATED_EPOCHS else self._validate(state, size)
+        is_before_final_size = settings.final_size_px is not None and stage == 0 and state.step < settings.steps
+        validation = None if is_before_final_size and epoch % _EPOCHS_PER_VALIDATION else self._validate(state, size)
         row = self._row(state, epoch, validation)
         state.rows.append(row)
         if validation is not None and (stage, validation.ap) > state.best:
@@ -141,12 +143,12 @@ class Trainer:
 
     def _validate(self, state: TrainingState, size: SizePx) -> ValidationScores | None:
         network = state.average.network
-        measure_batch_statistics(network, self.corpus, size, self.computing)
+        measure_batch_statistics(network, self.corpus, size, self.compute)
         settings = self.settings
-        answers = predict(
-            network, self.corpus, "val", size, settings.batch_images, settings.large_from_px, self.computing
+        predictions = predict(
+            network, self.corpus, "val", size, settings.batch_images, settings.large_from_px, self.compute
         )
-        return average_precision(answers.truth, answers.found)
+        return average_precision(predictions.truth, predictions.found)
 
     def _row(self, state: TrainingState, epoch: int, validation: ValidationScores | None) -> EpochRow:
         settings = self.settings

@@ -17,16 +17,16 @@ HISTORY_FILE, LOSSES_FILE, TENSORBOARD_FOLDER = "history.csv", "losses.csv", "te
 
 @dataclass(frozen=True)
 class EpochRow:
-    """One epoch.
+    """Results of one epoch.
 
     Attributes:
-        epoch: how many are complete with it; the last row may be of a part.
-        image_passes: images that went through the network so far.
+        epoch: number of complete epochs; the last row may be of a part of one.
+        image_passes: number of images that have passed through the network so far.
         height_px, width_px: of the network's input.
         loss, score_loss, box_loss: means over the epoch's steps.
         learning_rate: of its last step.
         images_per_s: of training, without validation.
-        ap, ap50, ap75, recall50: on the validation split with the averaged weights; None without one.
+        ap, ap50, ap75, recall50: on the validation split with the averaged weights; None where not measured.
     """
 
     epoch: int
@@ -44,11 +44,11 @@ class EpochRow:
     recall50: float | None
 
     def to_line(self, image_passes: int, time_left_s: float) -> str:
-        """For people.
+        """The row as a line of text.
 
         Args:
             image_passes: of the whole training.
-            time_left_s: until it ends. [s]
+            time_left_s: expected time until it ends. [s]
         """
         validation = (
             "no validation"
@@ -83,22 +83,22 @@ def write_tables(out: Path, rows: Sequence[EpochRow], losses: Sequence[float], b
 
 
 class TensorBoardCurves:
-    """TensorBoard's log of a training."""
+    """The curves of a training for TensorBoard."""
 
     def __init__(self, out: Path, image_passes: int) -> None:
-        """Go on after `image_passes` images; what stands there of later ones, of a run that was killed, is hidden."""
+        """Continue after `image_passes` images; later points, of a run that was killed, are hidden."""
         from torch.utils.tensorboard import SummaryWriter
 
         self._writer: Any = SummaryWriter(str(out / TENSORBOARD_FOLDER), purge_step=image_passes)
 
     def add_step(self, image_passes: int, loss: float, score: float, box: float, learning_rate: float) -> None:
-        """One step's point on each curve."""
+        """Add one step's point to each curve."""
         values = {"loss": loss, "score": score, "box": box, "learning_rate": learning_rate}
         for name, value in values.items():
             self._writer.add_scalar(f"train/{name}", value, image_passes)
 
     def add_epoch(self, row: EpochRow) -> None:
-        """One epoch's points."""
+        """Add one epoch's validation scores."""
         for name in VALIDATED:
             value = getattr(row, name)
             if value is not None:
@@ -106,25 +106,25 @@ class TensorBoardCurves:
         self._writer.flush()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write all remaining points."""
         self._writer.close()
 
 
 class TrainingObserver(Protocol):
-    """What long work tells while it runs."""
+    """Receives the progress of a training."""
 
     def begin(self, what: str, total: int) -> None:
-        """`total` pieces of work of the kind `what` are about to start."""
+        """A task of `total` steps, described by `what`, begins."""
         ...
 
     def advance(self) -> None:
-        """One piece is finished."""
+        """One step is finished."""
         ...
 
     def say(self, text: str) -> None:
-        """A line for the user."""
+        """Show a line to the user."""
         ...
 
     def end(self) -> None:
-        """The work that `begin` announced is over."""
+        """The task that `begin` announced has ended."""
         ...

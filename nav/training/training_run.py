@@ -1,4 +1,4 @@
-"""A training from datasets to an exported network, in a folder in which it can be stopped and taken up again."""
+"""A training from datasets to an exported network, in a folder in which it can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ from nav.training.training_state import (
 
 SETTINGS_FILE, RESULT_FILE, ONNX_FILE, LAST_ONNX_FILE = "settings.json", "result.json", "detector.onnx", "last.onnx"
 _LOCK_FILE = ".lock"
-_USUAL_THRESHOLD = 0.5
+_DEFAULT_THRESHOLD = 0.5
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What came of a training.
+    """The result of a training.
 
     Attributes:
         file: the exported network.
         best_step: the step whose averaged weights it has.
-        validation, test: on the splits; None for those without a drogue.
-        score_threshold: below which an answer is no drogue.
+        validation, test: scores on these splits; None for a split without a drogue.
+        score_threshold: a box with a lower score is not a drogue.
     """
 
     file: Path
@@ -76,59 +76,59 @@ def train(
     should_stop: Callable[[], bool] = lambda: False,
     start: StartingWeights | None = None,
 ) -> TrainingResult:
-    """Train, evaluate on the split `test` and export; what an earlier run in this folder did is kept.
+    """Train, evaluate on the split `test` and export; a training that was interrupted in this folder is resumed.
 
     Args:
         datasets: folders or URLs.
         out: folder; made if missing.
         settings: of the training.
-        observer: is told how far it is.
-        cache: folder for images at the network's size; `out / "cache"` by default.
-        should_stop: asked after every step.
+        observer: is informed of the progress.
+        cache: folder of the image caches; `out / "cache"` by default.
+        should_stop: called after every step.
         start: weights to start from instead of random ones.
 
     Raises:
-        ValueError: a dataset that cannot be used, a device that is not there, weights of another network, a folder of
-            another training, or one in which another run is at work; names the path.
+        ValueError: a dataset that cannot be used, a device that is not available, weights of another network, a folder
+            of another training, or one that another run uses; the message names the path.
         OSError: a file cannot be written.
-        KeyboardInterrupt: it was told to stop, and what was done is saved; the same call goes on.
+        KeyboardInterrupt: `should_stop` returned true; the state is saved, and the same call resumes the training.
     """
     settings = settings_from_start(settings, start)
-    computing = open_compute_device(settings)
-    _check_place(out)
+    compute = open_compute_device(settings)
+    _check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
     with _locked(out), limit_threads(settings.threads):
         remove_partial_files(out)
         size, threads = settings.largest_size_px, settings.loader_threads
         corpus = open_corpus(datasets, cache or out / "cache", size, threads, observer, should_stop)
-        state = new_state(starting_network(settings, start), settings, computing)
-        goes_on = restore_state(out, state, settings, corpus.datasets)
-        if start is not None and start.lack_statistics and not goes_on:
-            _measure_start(state, corpus, settings, computing)
+        state = new_state(starting_network(settings, start), settings, compute)
+        is_resumed = restore_state(out, state, settings, corpus.datasets)
+        if start is not None and start.need_batch_statistics and not is_resumed:
+            _recalibrate_start(state, corpus, settings, compute)
         _load_best(out, state)
         write_text_atomic(out / SETTINGS_FILE, json.dumps(settings.model_dump(mode="json"), indent=1) + "\n")
-        observer.say(_summary(corpus, settings, computing, state))
-        Trainer(corpus, settings, computing, out, observer, should_stop).run(state)
-        return _finish(out, corpus, settings, computing, state)
+        observer.say(_summary(corpus, settings, compute, state))
+        Trainer(corpus, settings, compute, out, observer, should_stop).run(state)
+        return _finish(out, corpus, settings, compute, state)
 
 
 def check_training(out: Path, settings: TrainingSettings, start: StartingWeights | None = None) -> None:
-    """What can be known of a training before its datasets are there.
+    """Check everything about a training that does not need its datasets.
 
     Raises:
-        ValueError: a device that is not there, weights of another network, a folder of other settings, or one in which
-            another run is at work.
+        ValueError: a device that is not available, weights of another network, a folder of a training with other
+            settings, or one that another run uses.
     """
     settings = settings_from_start(settings, start)
-    computing = open_compute_device(settings)
-    new_state(starting_network(settings, start), settings, computing)
-    _check_place(out)
+    compute = open_compute_device(settings)
+    new_state(starting_network(settings, start), settings, compute)
+    _check_folder(out)
     if out.exists():
         with _locked(out):
             check_settings(out, settings)
 
 
-def _check_place(out: Path) -> None:
+def _check_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file; give a folder for the training")
 
@@ -137,45 +137,47 @@ def _check_place(out: Path) -> None:
 def _locked(out: Path) -> Iterator[None]:
     with (out / _LOCK_FILE).open("a") as lock:
         if not takes_lock(lock):
-            raise ValueError(f"{out}: another training is at work in it; wait for its end, or give another folder")
+            raise ValueError(f"{out}: another training is running in it; wait for its end, or give another folder")
         yield
 
 
-def _measure_start(state: TrainingState, corpus: Corpus, settings: TrainingSettings, computing: ComputeDevice) -> None:
-    """Normalisation for weights of an exported file, before the first step."""
-    exact = ComputeDevice(computing.device, bf16=False)
+def _recalibrate_start(
+    state: TrainingState, corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice
+) -> None:
+    """Measure batch statistics for the weights of an exported file, before the first step."""
+    exact = ComputeDevice(compute.device, bf16=False)
     recalibrate_batch_norm(state.network, statistics_batches(corpus, settings.size_at(0), exact))
     state.average = MovingAverage(state.network, settings.ema_decay)
 
 
-def _summary(corpus: Corpus, settings: TrainingSettings, computing: ComputeDevice, state: TrainingState) -> str:
+def _summary(corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice, state: TrainingState) -> str:
     pairs = {split: len(corpus.split(split)) for split in ("train", "val", "test")}
     weights = sum(each.numel() for each in state.network.parameters())
-    done = f", going on after {state.step * settings.batch_images:,}" if state.step else ""
+    done = f", resumed after {state.step * settings.batch_images:,}" if state.step else ""
     return (
         f"{settings.variant}, {settings.attention}, {settings.fusion}: {weights / 1e6:.2f} million weights; "
         f"{pairs['train']} pairs to train on, {pairs['val']} to validate, {pairs['test']} to test; "
-        f"{settings.image_passes:,} images{done}; {computing.device.type}, {'bf16' if computing.bf16 else 'float32'}"
+        f"{settings.image_passes:,} images{done}; {compute.device.type}, {'bf16' if compute.bf16 else 'float32'}"
     )
 
 
 def _finish(
-    out: Path, corpus: Corpus, settings: TrainingSettings, computing: ComputeDevice, state: TrainingState
+    out: Path, corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice, state: TrainingState
 ) -> TrainingResult:
-    """Evaluate and export the best weights, and the last."""
+    """Evaluate and export the best weights, and export the last ones too."""
     best_step, network = _best(out, settings, state)
-    network.to(computing.device)
+    network.to(compute.device)
     size = settings.size_at(settings.steps - 1)
-    # The files are used in float32, so that is how they are measured.
-    exact = ComputeDevice(computing.device, bf16=False)
+    # The exported files compute in float32, so they are evaluated in float32.
+    exact = ComputeDevice(compute.device, bf16=False)
     for each in (network, state.average.network):
         measure_batch_statistics(each, corpus, size, exact)
 
-    def answers(split: SplitName) -> Predictions:
+    def predictions(split: SplitName) -> Predictions:
         return predict(network, corpus, split, size, settings.batch_images, settings.large_from_px, exact)
 
-    validation, test = answers("val"), answers("test")
-    threshold = best_threshold(validation.truth, validation.found, _USUAL_THRESHOLD)
+    validation, test = predictions("val"), predictions("test")
+    threshold = best_threshold(validation.truth, validation.found, _DEFAULT_THRESHOLD)
     result = TrainingResult(
         out / ONNX_FILE,
         best_step,
@@ -200,7 +202,7 @@ def _finish(
 
 
 def _best(out: Path, settings: TrainingSettings, state: TrainingState) -> tuple[int, DetectorNetwork]:
-    """The step and the averaged weights that were best on the validation split, or the last where there is none."""
+    """Step and network of the averaged weights that were best on the validation split; without one, of the last."""
     network = new_network(settings).eval()
     saved = _load_best(out, state)
     if saved is None:
@@ -214,23 +216,23 @@ def _best(out: Path, settings: TrainingSettings, state: TrainingState) -> tuple[
 
 
 def _load_best(out: Path, state: TrainingState) -> dict[str, Any] | None:
-    """The best weights so far; None where none were found yet.
+    """Read the best weights so far; None where no epoch was validated yet.
 
     Raises:
-        ValueError: they are missing or damaged.
+        ValueError: their file is missing or damaged.
     """
     if state.best[0] < 0:
         return None
     saved = load_checkpoint(out / BEST_FILE)
     if saved is None:
         raise ValueError(
-            f"{out / BEST_FILE}: is missing, the best weights so far; put it back, or train anew elsewhere"
+            f"{out / BEST_FILE}: is missing, with the best weights so far; restore it, or train into another folder"
         )
     return saved
 
 
 def _result_table(result: TrainingResult, corpus: Corpus, settings: TrainingSettings) -> dict[str, Any]:
-    """What the exported file and `result.json` say of the training; plain JSON."""
+    """Plain JSON about the training, for `result.json` and the metadata of the exported file."""
     return {
         "datasets": [asdict(stamp) for stamp in corpus.datasets],
         "settings": settings.model_dump(mode="json"),

@@ -1,4 +1,4 @@
-"""What a training is told: network, pictures, length and pace."""
+"""The settings of a training: network, images, duration, optimizer."""
 
 from __future__ import annotations
 
@@ -16,37 +16,38 @@ from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
 SizePx = tuple[int, int]
 """(height, width) of the network's input. [px]"""
 
-# They change where or how fast the work is done, floats in their last bits, or the file's label, but not what is
-# trained.
+# They may differ when a training is resumed: they change its device or speed, the last bits of floats, or the exported
+# file's metadata, but not what is trained.
 _FREE_TO_CHANGE = ("device", "threads", "loader_threads", "checkpoint_minutes", "large_from_px", "licence")
 
 
 class TrainingSettings(FrozenModel):
-    """A training, but for its datasets.
+    """The settings of a training.
 
     Attributes:
         variant, attention, fusion: of the network.
         views: `both` puts the two eyes of a pair into one batch, with the same geometric draw; `one` draws single eyes.
-        mosaic: put four images together, but not in the last `plain_fraction` of the training.
+        mosaic: combine four images into one, but not in the last `plain_fraction` of the training.
         size_px: (height, width) of the network's input.
         final_size_px: the same in the last `final_fraction` of the training; None to keep `size_px`.
-        image_passes: how many images go forwards and backwards through the network in all.
-        batch_images: in one step; even, for `both`.
-        optimizer, learning_rate, weight_decay: the learning rate is the highest of the schedule.
-        warmup_passes: images over which the learning rate rises from zero; a cosine falls to `floor_fraction` of it.
-        ema_decay: of the moving average of the weights, by step; it is what is evaluated and exported.
-        gradient_norm: longer gradients are shortened to it.
-        seed: of every draw.
-        precision: `bf16` computes most of it in bfloat16; `auto` does so where the processor has it in hardware.
+        image_passes: number of images that pass forwards and backwards through the network in the whole training.
+        batch_images: number of images in a step; even for `both` views.
+        optimizer, learning_rate, weight_decay: of the optimizer; the learning rate is the peak of the schedule.
+        warmup_passes: number of images over which the learning rate rises from zero; it then falls along a cosine to
+            `floor_fraction` of its peak.
+        ema_decay: per step, of the moving average of the weights, which is evaluated and exported.
+        gradient_norm: longer gradients are clipped to this norm.
+        seed: of all random draws.
+        precision: `bf16` computes most operations in bfloat16; `auto` does so where the hardware supports it.
         device: `cpu` or `cuda`.
-        threads: that compute; as many as cores by 0.
-        loader_threads: that prepare images meanwhile.
-        checkpoint_minutes: at least so often the state is saved, besides the end of every epoch.
-        large_from_px: longer side in the network's input from which on users of the file look for drogues at half the
-            size, by a second pass; 0 for a single one. [px]
-        start_sha256: of the file of weights that it starts from, as `settings_from_start` puts it in; empty for random
-            ones.
-        licence: of the weights, written into the files, such as an SPDX name; empty where nobody says.
+        threads: number of computing threads; 0 for all cores.
+        loader_threads: number of threads that prepare images.
+        checkpoint_minutes: longest time between two checkpoints; the end of every epoch is one too. [min]
+        large_from_px: the exported detector takes boxes whose longer side in the input is at least this from a second
+            pass at half the size; 0 for a single pass. [px]
+        start_sha256: hash of the file of weights that the training starts from, set by `settings_from_start`; empty
+            for random weights.
+        licence: of the weights, stored in the exported files, such as an SPDX identifier; empty if not stated.
     """
 
     variant: Literal["l", "s"] = "l"
@@ -78,7 +79,7 @@ class TrainingSettings(FrozenModel):
     licence: str = Field(default="", max_length=100)
 
     @model_validator(mode="after")
-    def _fits(self) -> Self:
+    def _check_sizes(self) -> Self:
         for name, size in (("size_px", self.size_px), ("final_size_px", self.final_size_px)):
             if size is not None and not all(side >= SIZE_STEP_PX and side % SIZE_STEP_PX == 0 for side in size):
                 raise ValueError(
@@ -92,13 +93,13 @@ class TrainingSettings(FrozenModel):
 
     @property
     def largest_size_px(self) -> SizePx:
-        """(height, width) at which images are kept."""
+        """(height, width) at which images are cached."""
         sizes = (self.size_px, self.final_size_px or self.size_px)
         return max(sizes, key=lambda size: size[0] * size[1])
 
     @property
     def steps(self) -> int:
-        """How often the weights change."""
+        """Number of optimizer steps."""
         return -(-self.image_passes // self.batch_images)
 
     def size_at(self, step: int) -> SizePx:
@@ -108,7 +109,7 @@ class TrainingSettings(FrozenModel):
         return self.size_px
 
     def mosaic_at(self, step: int) -> bool:
-        """Whether images are put together in a step."""
+        """Whether a step combines images into mosaics."""
         return self.mosaic and step < round(self.steps * (1 - self.plain_fraction))
 
 
@@ -118,10 +119,10 @@ def size_text(size_px: SizePx) -> str:
 
 
 def parse_size(text: str) -> SizePx:
-    """(height, width) of `480x640`.
+    """(height, width) from a text such as `480x640`.
 
     Raises:
-        ValueError: not of that form.
+        ValueError: the text is not of that form.
     """
     height, cross, width = text.partition("x")
     if not cross or not (height.isdecimal() and width.isdecimal()) or len(text) > 12:
@@ -132,15 +133,15 @@ def parse_size(text: str) -> SizePx:
 def build_settings(
     file: Path | None, changes: Mapping[str, Any], network: Mapping[str, Any] | None = None
 ) -> TrainingSettings:
-    """Settings from a TOML file, the defaults where it says nothing, and changes to both.
+    """Settings from changes, a TOML file, a network's configuration and the defaults, in this order of precedence.
 
     Args:
         file: of the settings, or None.
-        changes: by the settings' names.
-        network: variant, attention and fusion where neither of the two names them.
+        changes: values by the settings' names.
+        network: variant, attention and fusion of the network that the training starts from.
 
     Raises:
-        ValueError: no such file, not TOML, an unknown key or a wrong value; names the file.
+        ValueError: no such file, not TOML, an unknown key or a wrong value; the message names the file.
     """
     table: dict[str, Any] = {}
     if file is not None:
@@ -158,7 +159,7 @@ def build_settings(
 
 
 def differing_settings(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
-    """Keys that make another training of it, in order; those that change only where the work is done do not count."""
+    """Keys in which two settings differ, except those that may change when a training is resumed; in order."""
     keys = [*first, *(key for key in second if key not in first)]
     missing = object()
     return [key for key in keys if key not in _FREE_TO_CHANGE and first.get(key, missing) != second.get(key, missing)]

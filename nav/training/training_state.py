@@ -24,13 +24,16 @@ from nav.training.training_progress import EpochRow
 from nav.training.training_settings import TrainingSettings, differing_settings
 
 CHECKPOINT_FILE, BEST_FILE = "checkpoint.pt", "best.pt"
+_VERSION = 1  # incremented with every change of a checkpoint's contents
+# After n steps the average spans about the last n/10 of them, until the decay of the settings is reached.
+_RAMP_STEPS = 10
 
 
 def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write or replace a file of tensors and plain values by one rename.
+    """Write or replace a file of tensors and plain values, by one rename.
 
     Raises:
-        OSError: it cannot be written; what was there before stays.
+        OSError: the file cannot be written; the previous one stays.
     """
     # torch's own writer reports a full disk as an internal error.
     stream = io.BytesIO()
@@ -40,14 +43,14 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, advice: str = "delete it, or train into another folder") -> dict[str, Any] | None:
-    """What `save` wrote; None where there is no such file.
+    """Read a file of `save_checkpoint`; None where there is no such file.
 
     Args:
         path: of the file.
-        advice: what to do about a file that is damaged.
+        advice: what the user can do about a damaged file, for the error message.
 
     Raises:
-        ValueError: truncated, or another kind of file; names it.
+        ValueError: the file is truncated, or of another kind; the message names it.
     """
     try:
         content = path.read_bytes()
@@ -56,30 +59,29 @@ def load_checkpoint(path: Path, advice: str = "delete it, or train into another 
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     try:
-        # Nothing but tensors and plain values is accepted: a file runs no code.
+        # Only tensors and plain values are accepted, so that a file cannot run code.
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path}: is truncated or no checkpoint; {advice}") from error
+        raise ValueError(f"{path}: is truncated or not a checkpoint; {advice}") from error
     if not isinstance(state, dict):
-        raise ValueError(f"{path}: is no checkpoint; {advice}")
+        raise ValueError(f"{path}: is not a checkpoint; {advice}")
     return state
 
 
 def remove_partial_files(folder: Path) -> None:
-    """Delete what a killed training left half-written."""
+    """Delete the half-written files of a training that was killed."""
     for leftover in folder.glob(f".*{PART_SUFFIX}"):
         if leftover.is_file():
             leftover.unlink()
 
 
-_RAMP_STEPS = 10  # the average of the first n steps forgets about n/10 of them at a time
-
-
 class MovingAverage:
-    """Of weights; running means of batch normalization are measured for them, see `nav.training.evaluation`.
+    """Exponential moving average of a network's weights, which is better than the weights of any step.
+
+    Its batch statistics are measured separately, see `nav.training.evaluation`.
 
     Attributes:
-        network: that has the averages; never trained.
+        network: has the averaged weights; it is never trained.
     """
 
     def __init__(self, network: DetectorNetwork, decay: float) -> None:
@@ -88,7 +90,7 @@ class MovingAverage:
 
     @torch.no_grad()
     def update(self, network: DetectorNetwork, step: int) -> None:
-        """Take in the weights after a step, counted from 0."""
+        """Update the average with the weights after a step, counted from 0."""
         decay = min(self._decay, (1 + step) / (_RAMP_STEPS + step))
         averages: list[Tensor] = []
         currents: list[Tensor] = []
@@ -103,35 +105,35 @@ class MovingAverage:
 
 @dataclass(frozen=True)
 class ComputeDevice:
-    """A device, and whether most of it is computed in bfloat16 there."""
+    """A device, and whether most operations on it use bfloat16."""
 
     device: torch.device
     bf16: bool
 
     def autocast(self) -> AbstractContextManager[object]:
-        """Within it a network computes as precisely as this says."""
+        """Context manager in which a network computes with this precision."""
         return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.bf16)
 
 
 def open_compute_device(settings: TrainingSettings) -> ComputeDevice:
-    """The device that the settings name.
+    """The device and precision of the settings.
 
     Raises:
-        ValueError: it is not there.
+        ValueError: the device is not available.
     """
     device = torch.device(settings.device)
     if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device: torch sees no CUDA device here; take cpu, or install torch with CUDA")
+        raise ValueError("device: torch finds no CUDA device; use cpu, or install torch with CUDA")
     if settings.precision != "auto":
         return ComputeDevice(device, settings.precision == "bf16")
-    # Without such instructions bfloat16 is emulated and slower than float32.
+    # Without bfloat16 instructions it is emulated, and slower than float32.
     has_bf16 = torch.cuda.is_bf16_supported() if device.type == "cuda" else torch.cpu._is_avx512_bf16_supported()
     return ComputeDevice(device, bool(has_bf16))
 
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """Compute with so many threads meanwhile, all cores that it may use by 0; images are prepared by others."""
+    """Let torch compute with this number of threads, or with all available cores for 0, and OpenCV with one."""
     before = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(threads or len(os.sched_getaffinity(0)))
     cv2.setNumThreads(1)
@@ -142,20 +144,17 @@ def limit_threads(threads: int) -> Iterator[None]:
         cv2.setNumThreads(before[1])
 
 
-_VERSION = 1  # grows with every change of what stands in a checkpoint
-
-
 @dataclass(eq=False)
 class TrainingState:
-    """A training between two steps; draws need no state, for they are keyed by the number of the sample.
+    """A training between two steps. Random draws need no state, because they are keyed by the number of the sample.
 
     Attributes:
-        network, average, optimizer: what learns.
-        step: steps done.
+        network, average, optimizer: the network, its averaged weights, and its optimizer.
+        step: number of steps done.
         losses: total loss of every step.
         parts: (score, box) losses of the steps since the last row.
-        rows: of the epochs done.
-        row_seconds: time that the steps since the last row took. [s]
+        rows: results of the epochs done.
+        row_seconds: duration of the steps since the last row. [s]
         best: (stage, average precision) of the best weights so far; a stage is an input size.
     """
 
@@ -173,20 +172,20 @@ class TrainingState:
 def new_network(settings: TrainingSettings) -> DetectorNetwork:
     """A network whose random weights follow from the seed."""
     config = NetworkConfig(settings.variant, settings.attention, settings.fusion)
-    # torch initialises layers from its own generator, which is put back afterwards.
+    # torch initialises layers from its global generator, whose state is restored afterwards.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
         return DetectorNetwork(config)
 
 
-def new_state(network: DetectorNetwork, settings: TrainingSettings, computing: ComputeDevice) -> TrainingState:
+def new_state(network: DetectorNetwork, settings: TrainingSettings, compute: ComputeDevice) -> TrainingState:
     """The state of a network before the first step."""
-    network.to(computing.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network.to(compute.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     return TrainingState(network, MovingAverage(network, settings.ema_decay), _new_optimizer(network, settings))
 
 
 def _new_optimizer(network: nn.Module, settings: TrainingSettings) -> torch.optim.Optimizer:
-    """Weight decay pulls filters only: offsets and scales of normalization have one value a channel to learn."""
+    """The optimizer, with weight decay for filters only, not for biases, and offsets and scales of normalisation."""
     filters = [weights for weights in network.parameters() if weights.ndim > 1]
     others = [weights for weights in network.parameters() if weights.ndim <= 1]
     groups = [{"params": filters, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
@@ -196,10 +195,10 @@ def _new_optimizer(network: nn.Module, settings: TrainingSettings) -> torch.opti
 
 
 def save_state(out: Path, state: TrainingState, settings: TrainingSettings, datasets: Sequence[DatasetStamp]) -> None:
-    """Write `checkpoint.pt`, whole or not at all.
+    """Write `checkpoint.pt`, completely or not at all.
 
     Raises:
-        OSError: it cannot be written; the one before stays.
+        OSError: the file cannot be written; the previous one stays.
     """
     content: dict[str, Any] = {
         "version": _VERSION,
@@ -219,10 +218,10 @@ def save_state(out: Path, state: TrainingState, settings: TrainingSettings, data
 
 
 def check_settings(out: Path, settings: TrainingSettings) -> None:
-    """Whether a folder can be trained in with these settings.
+    """Check that a training in this folder can be resumed with these settings.
 
     Raises:
-        ValueError: as `restore_state`, but for the datasets.
+        ValueError: as in `restore_state`, except for the datasets.
     """
     content = load_checkpoint(out / CHECKPOINT_FILE)
     if content is not None:
@@ -233,7 +232,7 @@ def _check_same(
     path: Path, content: dict[str, Any], settings: TrainingSettings, datasets: Sequence[DatasetStamp] | None
 ) -> None:
     if content.get("version") != _VERSION:
-        raise ValueError(f"{path}: is of another version of droguekit; train into another folder")
+        raise ValueError(f"{path}: was written by another version of droguekit; train into another folder")
     differing = differing_settings(content.get("settings", {}), settings.model_dump(mode="json"))
     if datasets is not None and content.get("datasets") != [asdict(stamp) for stamp in datasets]:
         differing.append("datasets")
@@ -246,11 +245,14 @@ def _check_same(
 def restore_state(
     out: Path, state: TrainingState, settings: TrainingSettings, datasets: Sequence[DatasetStamp]
 ) -> bool:
-    """Put the state that `save_state` wrote into a new one; whether there was any.
+    """Load the state that `save_state` wrote into a new one.
+
+    Returns:
+        Whether there was a checkpoint.
 
     Raises:
-        ValueError: a file that is truncated or of another version, or of other settings or datasets; names it and the
-            keys.
+        ValueError: the checkpoint is truncated, of another version, or of other settings or datasets; the message
+            names the file and the differing keys.
     """
     path = out / CHECKPOINT_FILE
     content = load_checkpoint(path)

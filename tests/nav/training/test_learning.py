@@ -91,11 +91,11 @@ def test_the_moving_average_takes_in_weights_and_running_means() -> None:
 
 
 def test_batch_statistics_are_those_of_one_pass_over_all_images(ellipse_corpus: Corpus) -> None:
-    size_px, computing = (64, 96), ComputeDevice(torch.device("cpu"), bf16=False)
+    size_px, compute = (64, 96), ComputeDevice(torch.device("cpu"), bf16=False)
     network = new_network(TrainingSettings(variant="s")).eval()
     weights = {name: value.clone() for name, value in network.named_parameters()}
     momenta = [layer.momentum for layer in normalizations(network)]
-    measure_batch_statistics(network, ellipse_corpus, size_px, computing)
+    measure_batch_statistics(network, ellipse_corpus, size_px, compute)
     first = {name: value.clone() for name, value in network.state_dict().items()}
     # The input of the first one does not depend on any before it.
     images = np.stack([whole_image(ellipse_corpus, pair, eye, size_px)[0] for pair in range(12) for eye in (0, 1)])
@@ -105,7 +105,7 @@ def test_batch_statistics_are_those_of_one_pass_over_all_images(ellipse_corpus: 
         for layer in normalizations(network)
     ]
     with torch.no_grad():
-        network(to_tensor(images, computing))
+        network(to_tensor(images, compute))
     for hook in hooks:
         hook.remove()
     layer, values = seen[0]
@@ -114,7 +114,7 @@ def test_batch_statistics_are_those_of_one_pass_over_all_images(ellipse_corpus: 
     torch.testing.assert_close(layer.running_mean, values.mean(dim=(0, 2, 3)), rtol=1e-3, atol=1e-4)
     within = torch.stack([batch.var(dim=(0, 2, 3)) for batch in (values[::2], values[1::2])]).mean(dim=0)
     torch.testing.assert_close(layer.running_var, within, rtol=1e-3, atol=1e-4)
-    measure_batch_statistics(network, ellipse_corpus, size_px, computing)
+    measure_batch_statistics(network, ellipse_corpus, size_px, compute)
     for name, value in network.state_dict().items():
         torch.testing.assert_close(value, first[name], rtol=1e-5, atol=1e-6)
     assert all(torch.equal(value, weights[name]) for name, value in network.named_parameters())
@@ -154,12 +154,12 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path) -> None:
 def test_a_damaged_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or no checkpoint"):
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or not a checkpoint"):
         load_checkpoint(path)
     whole = tmp_path / "whole.pt"
     save_checkpoint(whole, {"weights": torch.zeros(1000)})
     path.write_bytes(whole.read_bytes()[:-500])
-    with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or no checkpoint"):
+    with pytest.raises(ValueError, match=r"checkpoint\.pt: is truncated or not a checkpoint"):
         load_checkpoint(path)
 
 

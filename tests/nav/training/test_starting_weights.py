@@ -88,7 +88,7 @@ def test_shipped_weights_are_what_onnxruntime_runs() -> None:
     start = read_starting_weights("mobile-s")
     assert start.path == network_file("mobile-s") and start.network == NetworkConfig("s", "eca", "asff")
     network = DetectorNetwork(start.network)
-    start.put_into(network)
+    start.load_into(network)
     images = np.random.default_rng(0).integers(0, 256, (2, 96, 128, 3), np.uint8)
     batch = network_input(list(images))
     session = onnxruntime.InferenceSession(str(start.path), providers=["CPUExecutionProvider"])
@@ -117,7 +117,7 @@ def test_a_training_starts_from_a_shipped_network(split_dataset: Path, tmp_path:
     learned = import_onnx(result.file.read_bytes())
     images = some_images(1)
     shipped = DetectorNetwork(NetworkConfig("s"))
-    start.put_into(shipped)
+    start.load_into(shipped)
     random = maps_of(DetectorNetwork(NetworkConfig("s")).eval(), images)
     for mine, theirs, other in zip(maps_of(learned, images), maps_of(shipped.eval(), images), random, strict=True):
         # Means and variances come from so few images here that they differ between the two sizes of the batches.
@@ -186,16 +186,16 @@ _ADVICE = "give mobile-s, mobile-l, or detector.onnx or best.pt from a training'
     ("name", "content", "message"),
     [
         ("best.pt", None, "is missing"),
-        ("best.pt", b"PK truncated", "is truncated or no checkpoint"),
+        ("best.pt", b"PK truncated", "is truncated or not a checkpoint"),
         ("best.pt", {"step": 3}, "holds no weights"),
         ("mine.onnx", None, "is missing"),
-        ("mine.onnx", b"\x08PK truncated", "is truncated or no ONNX file"),
+        ("mine.onnx", b"\x08PK truncated", "is truncated or not an ONNX file"),
         ("mine.onnx", b"", "does not say which of droguekit's networks it is"),
         ("mine.onnx", "unnamed", "does not say which of droguekit's networks it is"),
         ("mine.onnx", "unknown", "variant: must be one of l, s, got 'xl'"),
-        ("mine.onnx", "named l", "does not have the layers of the network that it says it is"),
+        ("mine.onnx", "named l", "does not have the layers of the network that its metadata states"),
         ("mine.onnx", "outside", "keeps its weights in other files"),
-        ("mine.onnx", "reshaped", "does not have the layers of the network that it says it is"),
+        ("mine.onnx", "reshaped", "does not have the layers of the network that its metadata states"),
     ],
 )
 def test_weights_to_start_from_that_cannot_be_used(name: str, content: Any, message: str, tmp_path: Path) -> None:
@@ -219,4 +219,4 @@ def test_checkpoints_need_no_statistics(tmp_path: Path) -> None:
     network = worn_network(NetworkConfig("s"))
     save_checkpoint(tmp_path / "best.pt", {"network": network.state_dict(), "step": 1})
     start = read_starting_weights(str(tmp_path / "best.pt"))
-    assert not start.lack_statistics
+    assert not start.need_batch_statistics

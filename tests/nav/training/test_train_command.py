@@ -44,7 +44,7 @@ def test_a_recipe_becomes_a_detector(tmp_path: Path, capsys: pytest.CaptureFixtu
     ("text", "options", "message"),
     [
         (RECIPE.replace("train = 0.5, val = 0.5", "train = 0.0, val = 1.0"), [], "has no split to train on"),
-        (RECIPE, ["--device", "cuda"], "torch sees no CUDA device"),
+        (RECIPE, ["--device", "cuda"], "torch finds no CUDA device"),
     ],
     ids=["no split", "no device"],
 )

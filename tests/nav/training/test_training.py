@@ -93,7 +93,7 @@ def test_a_killed_training_goes_on_with_the_same_curve(split_dataset: Path, tmp_
     done = len(step_losses(killed))
     assert 0 < done < settings.steps
     _, told = run(split_dataset, killed, image_passes=24)
-    assert f"going on after {4 * done}" in told
+    assert f"resumed after {4 * done}" in told
     # Equal sums in equal order; what is left is how another process's memory happens to be aligned.
     np.testing.assert_allclose(step_losses(killed), step_losses(whole), rtol=1e-4)
     result, expected = (json.loads((out / "result.json").read_text()) for out in (killed, whole))
@@ -108,7 +108,7 @@ def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset
     with pytest.raises(KeyboardInterrupt):
         # After the eight pairs that are decoded it is asked once a step.
         train([split_dataset], tmp_path, settings, PlainProgress(told), tmp_path / "cache", Calls(11))
-    assert "stopped after 12 images, which are saved" in told.getvalue()
+    assert "stopped after 12 images; the state is saved" in told.getvalue()
     assert len(step_losses(tmp_path)) == 3
     assert load_checkpoint(tmp_path / CHECKPOINT_FILE)["step"] == 3
     for changes, keys in (({"learning_rate": 0.5, "mosaic": False}, "mosaic, learning_rate"), ({"seed": 3}, "seed")):
@@ -197,7 +197,7 @@ def test_what_stops_a_training_is_seen_before_there_is_data(split_dataset: Path,
         check_training(out, settings.model_copy(update={"seed": 3}))
     with (out / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(ValueError, match="another training is at work"):
+        with pytest.raises(ValueError, match="another training is running"):
             check_training(out, settings)
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="file: is a file"):
@@ -230,14 +230,14 @@ def test_a_training_starts_from_the_weights_of_another(split_dataset: Path, tmp_
 def test_a_device_that_is_not_there_is_refused(split_dataset: Path, tmp_path: Path) -> None:
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
-    with pytest.raises(ValueError, match="device: torch sees no CUDA device"):
+    with pytest.raises(ValueError, match="device: torch finds no CUDA device"):
         run(split_dataset, tmp_path, device="cuda")
 
 
 def test_a_folder_in_use_is_refused(split_dataset: Path, tmp_path: Path) -> None:
     with (tmp_path / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(ValueError, match="another training is at work"):
+        with pytest.raises(ValueError, match="another training is running"):
             run(split_dataset, tmp_path)
 
 
@@ -250,12 +250,10 @@ def test_forty_pairs_are_learned_by_heart(toy_dataset: Path, tmp_path: Path) -> 
     settings = build_settings(None, {**SMALL, **TOY})
     train([toy_dataset], tmp_path, settings, PlainProgress(io.StringIO()))
     corpus = open_corpus([toy_dataset], tmp_path / "cache", settings.size_px, 1, PlainProgress(io.StringIO()))
-    computing = open_compute_device(settings)
-    state = new_state(new_network(settings), settings, computing)
+    compute = open_compute_device(settings)
+    state = new_state(new_network(settings), settings, compute)
     restore_state(tmp_path, state, settings, corpus.datasets)
     with limit_threads(1):
-        answers = predict(
-            state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, computing
-        )
+        answers = predict(state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, compute)
     reached = average_precision(answers.truth, answers.found)
     assert reached is not None and reached.ap50 >= 0.95
