@@ -151,7 +151,7 @@ def transform_boxes(boxes: Boxes, view: ImageView) -> Boxes:
     if not len(boxes):
         return boxes.reshape(0, 4)
     centers = (boxes[:, :2] + boxes[:, 2:] / 2) @ view.linear.T + view.shift
-    # The map m takes an ellipse with half axes (a, b) along x and y to one that reaches sqrt((m00 a)^2 + (m01 b)^2) in x.
+    # The map m takes an ellipse with half axes (a, b) along x and y to one reaching sqrt((m00 a)^2 + (m01 b)^2) in x.
     halves = np.sqrt((boxes[:, 2:] / 2) ** 2 @ (view.linear**2).T)
     return np.hstack([centers - halves, 2 * halves])
 

@@ -1,4 +1,4 @@
-"""`python -m studies.detector_comparison`: our detectors beside YOLOv8 on the same corpus."""
+"""`python -m studies.detector_comparison`: compares our detectors with YOLOv8 on the same corpus."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from studies.detector_comparison.comparison import ComparisonOptions, compare_peers, comparison_lines
 from studies.detector_comparison.options import (
     CorpusOption,
     DeviceOption,
@@ -19,6 +18,7 @@ from studies.detector_comparison.options import (
     input_size_px,
     print_status,
 )
+from studies.detector_comparison.yolo_comparison import ComparisonOptions, compare_peers, comparison_lines
 
 _EXAMPLES = """Examples:
 
@@ -31,28 +31,33 @@ _EXAMPLES = """Examples:
 
 def main(
     corpus: CorpusOption,
-    out: Annotated[Path, typer.Option("--out", help="Folder; stages found there stand.")] = Path("out/detector-peers"),
+    out: Annotated[Path, typer.Option("--out", help="Folder; stages that are complete there are skipped.")] = Path(
+        "out/detector-peers"
+    ),
     test: TestOption = None,
     ours: Annotated[
-        list[Path] | None, typer.Option("--ours", metavar="FILE.onnx", help="Of our own detectors. Repeatable.")
+        list[Path] | None, typer.Option("--ours", metavar="FILE.onnx", help="One of our detectors. Repeatable.")
     ] = None,
     image_passes: PassesOption = 40_000,
     size: SizeOption = "480x640",
     batch: Annotated[int, typer.Option("--batch", min=1, help="Images in a step of the peers' training.")] = 16,
     threads: ThreadsOption = 2,
-    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Of timing.")] = 50,
+    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Number of timing rounds.")] = 50,
     device: DeviceOption = "cpu",
     seed: SeedOption = 0,
     environment: Annotated[
-        Path | None, typer.Option("--environment", help="Of ultralytics; OUT/environment, made if missing.")
+        Path | None,
+        typer.Option(
+            "--environment", help="Virtual environment of ultralytics, made if missing; OUT/environment by default."
+        ),
     ] = None,
 ) -> None:
-    """Train YOLOv8s and YOLOv8n from scratch, time them in turns with ours, and score all by our benchmark.
+    """Train YOLOv8s and YOLOv8n from scratch, time them in turns with our detectors, and score all by our benchmark.
 
-    With 0 image passes nothing is trained or scored: only parameters, operations and times are told.
+    With 0 image passes nothing is trained or scored: only parameters, operations and times are measured.
     """
     try:
-        order = ComparisonOptions(
+        options = ComparisonOptions(
             corpus=corpus,
             test=test or corpus,
             ours=tuple(ours or ()),
@@ -65,12 +70,12 @@ def main(
             seed=seed,
             environment=environment or out / "environment",
         )
-        rows = compare_peers(order, out, print_status)
+        rows = compare_peers(options, out, print_status)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error
     typer.echo("\n".join(comparison_lines(rows)))
-    typer.echo(f"numbers are in {out / 'comparison.json'}")
+    typer.echo(f"the numbers are in {out / 'comparison.json'}")
 
 
 if __name__ == "__main__":

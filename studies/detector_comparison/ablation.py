@@ -27,15 +27,15 @@ from studies.detector_comparison.latency import measure_latency
 
 
 class SingleViewDetector(OnnxDetector):
-    """The same network and boxes, but each eye in passes of its own."""
+    """Our network with a pass for each eye, as a network that was trained on single eyes is timed."""
 
     def detect(self, images: StereoImages) -> StereoDetection:
-        """The best box in each image, where it scores as much as the file asks for."""
+        """The best box in each image, if it reaches the score threshold of the file."""
         found = self.candidates(images, self.metadata.score_threshold)
         return StereoDetection(*(next(iter(found[eye]), None) for eye in EYES))
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
-        """Boxes of each image, the best first, without those that overlap a better one."""
+        """The boxes of each image after non-maximum suppression, the best first."""
         answers: dict[Eye, tuple[Detection, ...]] = {}
         for eye in EYES:
             picture, place = input_image(images, eye, self.input_size_px)
@@ -48,8 +48,8 @@ class SingleViewDetector(OnnxDetector):
 
 
 ONE_VIEW = "one-view"
-"""Trained on single eyes, and timed with a pass for each: what do both eyes in one batch change?"""
-# The first is what we ship; the others are the seed paper's ablations, and one of views.
+"""Name of the network that is trained on single eyes and timed with a pass for each eye."""
+# Options of `droguekit train` by network. The first is what we ship; then the seed paper's ablations, and one of views.
 CHANGES: dict[str, tuple[str, ...]] = {
     "eca-asff": (),
     "se": ("--attention", "se"),
@@ -63,13 +63,13 @@ _TIMED_PAIRS = 4
 
 @dataclass(frozen=True)
 class AblationOptions:
-    """What is trained.
+    """Options of the ablations.
 
     Attributes:
         corpus: dataset to train on.
         test: dataset whose test split is scored.
         variant: of the network, `l` or `s`.
-        image_passes: through each network.
+        image_passes: of each network's training.
         size_px: width and height of its input.
         threads, seed, device: of training.
         rounds: of timing.
@@ -90,71 +90,71 @@ class AblationOptions:
             raise ValueError(f"--image-passes: must be at least 1, got {self.image_passes}")
 
 
-def ablate(order: AblationOptions, out: Path, say: Callable[[str], None]) -> list[str]:
-    """Train what is not trained yet, time all in turns, and make the table.
+def ablate(options: AblationOptions, out: Path, say: Callable[[str], None]) -> list[str]:
+    """Train every network that is not trained yet, time all of them in turns, and make the table.
 
     Args:
-        order: what to train.
-        out: folder, with one for each training.
-        say: takes a line about what goes on.
+        options: of the ablations.
+        out: folder, with a folder for each training.
+        say: receives lines about the progress.
 
     Returns:
         The table's lines; `ablation.json` has the numbers.
 
     Raises:
-        ValueError: a wrong number, or a network or the test dataset that cannot be read.
-        OSError: a training failed; says what it said last.
+        ValueError: a wrong option, or a network or the test dataset that cannot be read.
+        OSError: a training failed; the message has the last line of its output.
     """
-    read_blind_index(order.test)  # before hours of training
+    read_blind_index(options.test)  # before hours of training
     for name, changes in CHANGES.items():
-        _train(order, out / name, changes, say)
-    rows = measured_networks(order, {name: out / name / "detector.onnx" for name in CHANGES}, say)
+        _train(options, out / name, changes, say)
+    rows = measured_networks(options, {name: out / name / "detector.onnx" for name in CHANGES}, say)
     write_text_atomic(out / "ablation.json", json.dumps({"schema": 1, "networks": rows}, indent=1) + "\n")
     return ablation_lines(rows)
 
 
 def measured_networks(
-    order: AblationOptions, files: dict[str, Path], say: Callable[[str], None]
+    options: AblationOptions, files: dict[str, Path], say: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
-    """Accuracy on the test split as `benchmark` scores it, time in turns, and cost of networks.
+    """Scores on the test split by our benchmark, times measured in turns, and cost of networks.
 
     Args:
-        order: what was trained.
-        files: by name; the one of `ONE_VIEW` gets a pass for each eye.
-        say: takes a line about what goes on.
+        options: of the ablations.
+        files: by name; the one of `ONE_VIEW` is run with a pass for each eye.
+        say: receives lines about the progress.
 
     Raises:
         ValueError: a network or the test dataset cannot be read.
     """
     detectors: dict[str, Detector] = {
-        name: (SingleViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, order.threads, order.size_px)
+        name: (SingleViewDetector if name == ONE_VIEW else OnnxDetector)(file, name, options.threads, options.size_px)
         for name, file in files.items()
     }
-    source = BlindDataset(order.test)
+    source = BlindDataset(options.test)
     pairs = [source.pair(index).images for index in source.frame_indices[:_TIMED_PAIRS]]
     say("timing in turns")
-    latencies = measure_latency(detectors, pairs, order.rounds)
-    say("looking for the drogue in the test split")
-    images = [image for image in read_detection_truth(order.test).images if image.split == "test"]
+    latencies = measure_latency(detectors, pairs, options.rounds)
+    say("detecting the drogue in the test split")
+    images = [image for image in read_detection_truth(options.test).images if image.split == "test"]
     return {
-        name: {"test": _test_precision(order.test, detector, images)}
+        name: {"test": _test_precision(options.test, detector, images)}
         | latencies[name]._asdict()
-        | network_cost(files[name], order.size_px)._asdict()
+        | network_cost(files[name], options.size_px)._asdict()
         for name, detector in detectors.items()
     }
 
 
 def _test_precision(dataset: Path, detector: Detector, images: Sequence[ImageTruth]) -> dict[str, float | None] | None:
-    """Average precision on some images by the rules of `benchmark`; None without images."""
+    """Average precision on some images by the rules of our benchmark; None without images."""
     if not images:
         return None
-    looking = DetectorPass(dataset, lambda drogue: detector, sorted({image.frame_index for image in images}))
-    boxes = list(looking.boxes(LEAST_SCORE, lambda: None))
+    detecting = DetectorPass(dataset, lambda drogue: detector, sorted({image.frame_index for image in images}))
+    boxes = list(detecting.boxes(LEAST_SCORE, lambda: None))
     return Evaluation(images, boxes).average_precision(images)._asdict()
 
 
 def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
-    """A line a network: accuracy on the test split, and time."""
+    """A table with one line per network: cost, scores on the test split, and times."""
     lines = [
         f"{'network':<12} {'parameters':>11} {'GFLOPs':>7} {'AP50':>8} {'AP':>8} {'wall [ms]':>10} {'CPU [ms]':>9}"
     ]
@@ -168,33 +168,33 @@ def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
     return lines
 
 
-def _train(order: AblationOptions, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]) -> None:
-    """Begin a training, or go on with it, unless it is over."""
-    width, height = order.size_px
-    options = {
+def _train(options: AblationOptions, folder: Path, changes: tuple[str, ...], say: Callable[[str], None]) -> None:
+    """Start a training, or resume it, unless it is complete."""
+    width, height = options.size_px
+    arguments = {
         "--out": folder,
         "--cache": folder.parent / "cache",
-        "--variant": order.variant,
-        "--image-passes": order.image_passes,
+        "--variant": options.variant,
+        "--image-passes": options.image_passes,
         "--size": f"{height}x{width}",
-        "--seed": order.seed,
-        "--device": order.device,
-        "--threads": order.threads,
+        "--seed": options.seed,
+        "--device": options.device,
+        "--threads": options.threads,
     }
-    say(f"{folder.name}: training, unless it is over; {folder / 'train.log'}")
+    say(f"{folder.name}: training, unless it is complete; {folder / 'train.log'}")
     folder.mkdir(parents=True, exist_ok=True)
-    words = [str(word) for option in options.items() for word in option]
+    words = [str(word) for argument in arguments.items() for word in argument]
     with (folder / "train.log").open("a", encoding="utf-8") as log:
         ended = subprocess.run(
-            # -P: a file that lies where the user works must not stand in for a module of ours.
-            [sys.executable, "-P", "-m", "droguekit.cli.main", "train", str(order.corpus), *words, *changes],
+            # -P: a file in the working folder must not replace a module of ours.
+            [sys.executable, "-P", "-m", "droguekit.cli.main", "train", str(options.corpus), *words, *changes],
             stdout=log,
             stderr=subprocess.STDOUT,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
             check=False,
         )
     if ended.returncode == _INTERRUPTED:
-        raise OSError(f"{folder}: the training was interrupted; the same command goes on with it")
+        raise OSError(f"{folder}: the training was interrupted; the same command resumes it")
     if ended.returncode != 0:
         said = (folder / "train.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         raise OSError(f"{folder / 'train.log'}: {said[-1] if said else 'the training failed silently'}")

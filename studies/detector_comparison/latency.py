@@ -1,4 +1,4 @@
-"""Time of a stereo pair through several detectors, in turns, so that a busy moment of the machine meets all alike."""
+"""Latency of a stereo pair in several detectors, measured in turns, so that other load affects all of them equally."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from nav.detector.detector import Detector
 
 _WARM_UP_ROUNDS = 3
 _PERCENTILES = (50.0, 90.0, 99.0)
-# What is kept of a pair besides the best box costs little, and both sides are asked for the same.
+# Boxes besides the best one cost little, and the threshold is the same for all detectors.
 _LEAST_SCORE = 0.25
 
 
 class PairLatency(NamedTuple):
-    """Times of one detector. [ms]
+    """Latency of one detector. [ms]
 
     Attributes:
-        wall_ms, cpu_ms: at percentiles 50, 90 and 99; CPU time is that of all threads.
+        wall_ms, cpu_ms: percentiles 50, 90 and 99; CPU time is that of all threads.
         mean_cpu_ms: mean CPU time.
-        ratio: median over rounds of its CPU time over that of the first detector.
+        ratio: median over rounds of its CPU time divided by that of the first detector.
     """
 
     wall_ms: tuple[float, float, float]
@@ -38,13 +38,13 @@ def measure_latency(
     rounds: int,
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, PairLatency]:
-    """Time all detectors on the same pairs; each round takes them in an order of its own.
+    """Measure the latency of all detectors on the same pairs; each round has a random order of its own.
 
     Args:
         detectors: by name; ratios are to the first.
-        pairs: full-size images; from these to boxes is what is timed.
-        rounds: that count, after a few that do not.
-        advance: called after each round, of which there are `rounds`.
+        pairs: full-size images; the time from these to boxes is measured.
+        rounds: number of measured rounds, after a few rounds of warm-up.
+        advance: called after each measured round.
 
     Returns:
         By name, in the order of `detectors`.
@@ -71,7 +71,7 @@ def measure_latency(
 
 
 def _shuffled(names: Sequence[str], number: int) -> list[str]:
-    """Another order in every round: where one always follows the same other, it always finds that one's caches."""
+    """A random order for each round, so that no detector always runs with the caches of the same predecessor."""
     order = np.random.Generator(np.random.Philox(key=number)).permutation(len(names))
     return [names[k] for k in order.tolist()]
 
@@ -81,6 +81,6 @@ def _latency(
     first_ms: np.ndarray[tuple[int, int], np.dtype[np.float64]],
 ) -> PairLatency:
     wall, cpu = (tuple(np.percentile(times_ms[:, k], _PERCENTILES).tolist()) for k in (0, 1))
-    # A clock that ticks coarsely may count a quick detector as nothing.
+    # A coarse clock may measure zero for a fast detector.
     ratio = float(np.median(times_ms[:, 1] / np.maximum(first_ms[:, 1], 1e-6)))
     return PairLatency(wall, cpu, float(times_ms[:, 1].mean()), ratio)

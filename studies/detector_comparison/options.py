@@ -1,4 +1,4 @@
-"""Options that the comparison and the ablations share."""
+"""Command-line options that the comparison and the ablations share."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ DeviceOption = Annotated[str, typer.Option("--device", help="To train on: cpu, o
 
 
 def input_size_px(text: str) -> tuple[int, int]:
-    """(width, height) of `480x640`, in which the height stands first.
+    """(width, height) from a text such as `480x640`, in which the height comes first.
 
     Raises:
-        ValueError: not of that form.
+        ValueError: the text is not of that form.
     """
     height, cross, width = text.partition("x")
     if not cross or not (height.isdecimal() and width.isdecimal()) or len(text) > 12:
@@ -32,5 +32,5 @@ def input_size_px(text: str) -> tuple[int, int]:
 
 
 def print_status(line: str) -> None:
-    """Say what goes on beside the results."""
+    """Print a line about the progress to standard error."""
     typer.echo(line, err=True)

@@ -1,4 +1,4 @@
-"""`python -m studies.detector_comparison.run_ablation`: our network with one thing changed at a time."""
+"""`python -m studies.detector_comparison.run_ablation`: ablations of our network."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ _EXAMPLES = """Examples:
 
 def main(
     corpus: CorpusOption,
-    out: Annotated[Path, typer.Option("--out", help="Folder; trainings found there go on.")] = Path("out/ablation"),
+    out: Annotated[Path, typer.Option("--out", help="Folder; trainings that are found there are resumed.")] = Path(
+        "out/ablation"
+    ),
     test: TestOption = None,
     variant: Annotated[str, typer.Option("--variant", help="Of the network: l or s.")] = "s",
     image_passes: PassesOption = 5_000,
@@ -36,14 +38,14 @@ def main(
     threads: ThreadsOption = 2,
     seed: SeedOption = 0,
     device: DeviceOption = "cpu",
-    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Of timing.")] = 30,
+    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Number of timing rounds.")] = 30,
 ) -> None:
-    """Train our network with one thing changed at a time, on the same budget: accuracy and time of each."""
+    """Train variants of our network that differ in one thing, for the same image passes; measure scores and times."""
     try:
-        order = AblationOptions(
+        options = AblationOptions(
             corpus, test or corpus, variant, image_passes, input_size_px(size), threads, seed, device, rounds
         )
-        lines = ablate(order, out, print_status)
+        lines = ablate(options, out, print_status)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error

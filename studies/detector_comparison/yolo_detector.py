@@ -1,4 +1,4 @@
-"""A YOLOv8 network as ultralytics exports it, run like our own: same picture, same run time, both eyes in one pass."""
+"""A YOLOv8 network as ultralytics exports it, run like ours: same input image, same runtime, both eyes in one batch."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import input_image, network_input
 
-# ultralytics' own: boxes that overlap a better one by more are dropped, and no more than so many stay.
-_MOST_OVERLAP = 0.7
-_MOST_BOXES = 300
-_USUAL_THRESHOLD = 0.25
+# Defaults of ultralytics: IoU of its non-maximum suppression, largest number of boxes, and score threshold.
+_MAX_IOU = 0.7
+_MAX_BOXES = 300
+_DEFAULT_THRESHOLD = 0.25
 
 
 def open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
-    """A network whose idle threads do not spin, so that what is timed beside it is not slowed.
+    """Open a network whose idle threads do not spin, so that other detectors are not slowed while they are timed.
 
     Raises:
-        ValueError: the file is missing or no ONNX network; names it.
+        ValueError: the file is missing or not an ONNX network; the message names it.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
@@ -35,12 +35,12 @@ def open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
         return onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
     except OSError as error:
         raise ValueError(f"{file}: cannot be read: {error.strerror}") from error
-    except Exception as error:  # onnxruntime's faults have no common base but this one
-        raise ValueError(f"{file}: is no ONNX network: {str(error).splitlines()[0]}") from error
+    except Exception as error:  # onnxruntime's exceptions have no other common base
+        raise ValueError(f"{file}: is not an ONNX network: {str(error).splitlines()[0]}") from error
 
 
 class YoloDetector:
-    """Both eyes in one pass.
+    """Runs a YOLOv8 network on both images of a pair in one batch.
 
     Attributes:
         name: how it is called in results.
@@ -51,7 +51,7 @@ class YoloDetector:
         """Open a network of two images.
 
         Raises:
-            ValueError: the file is missing, or no network of two images with one class; names it.
+            ValueError: the file is missing, or not a network of two images with one class; the message names it.
         """
         self.name = file.stem
         self._session = open_session(file, threads)
@@ -63,12 +63,12 @@ class YoloDetector:
         self.input_size_px = (int(shape[3]), int(shape[2]))
 
     def detect(self, images: StereoImages) -> StereoDetection:
-        """The best box in each image, where it scores as much as ultralytics asks for."""
-        found = self.candidates(images, _USUAL_THRESHOLD)
+        """The best box in each image, if it reaches the default threshold of ultralytics."""
+        found = self.candidates(images, _DEFAULT_THRESHOLD)
         return StereoDetection(*(next(iter(found[eye]), None) for eye in EYES))
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
-        """Boxes of each image, the best first, without those that overlap a better one."""
+        """The boxes of each image after non-maximum suppression, the best first."""
         pictures, places = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
         (answer,) = self._session.run(None, {self._input_name: network_input(pictures)})
         found: dict[Eye, tuple[Detection, ...]] = {}
@@ -82,22 +82,22 @@ class YoloDetector:
 
 
 def decode_rows(rows: NDArray[np.float32], least_score: float) -> tuple[Array, Array]:
-    """Boxes and scores of one image's answer.
+    """Decode the boxes and scores of one image.
 
     Args:
-        rows: (4 + classes, n) middle x, y, width, height in corner coordinates of the input, and the scores of the
+        rows: (4 + classes, n) centre x, y, width, height in corner coordinates of the input, and the scores of the
             classes, of which the first is the drogue.
-        least_score: what scores lower is left out.
+        least_score: boxes with a lower score are left out.
 
     Returns:
         (m, 4) low corner, width, height, and (m,) scores, descending.
     """
     scores = rows[4].astype(np.float64)
     keep = np.flatnonzero(scores >= least_score)
-    middle, size = rows[:2, keep].T.astype(np.float64), rows[2:4, keep].T.astype(np.float64)
-    boxes, scores = np.hstack((middle - size / 2, size)), scores[keep]
+    center, size = rows[:2, keep].T.astype(np.float64), rows[2:4, keep].T.astype(np.float64)
+    boxes, scores = np.hstack((center - size / 2, size)), scores[keep]
     if len(boxes):
-        stay = np.asarray(cv2.dnn.NMSBoxes(boxes.tolist(), scores.tolist(), 0.0, _MOST_OVERLAP), dtype=np.intp)
-        stay = stay[np.argsort(-scores[stay], kind="stable")][:_MOST_BOXES]
+        stay = np.asarray(cv2.dnn.NMSBoxes(boxes.tolist(), scores.tolist(), 0.0, _MAX_IOU), dtype=np.intp)
+        stay = stay[np.argsort(-scores[stay], kind="stable")][:_MAX_BOXES]
         boxes, scores = boxes[stay], scores[stay]
     return boxes, scores

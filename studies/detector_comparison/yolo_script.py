@@ -1,6 +1,6 @@
-"""Trains and exports YOLOv8, in the peers' own environment; run as a file, with its order as JSON on standard input.
+"""Trains and exports YOLOv8 in the peers' own environment; run as a file, with its task as JSON on standard input.
 
-Orders: `{"do": "train", "config", "data", "folder", "epochs", "fraction", "side_px", "batch", "threads", "device",
+Tasks: `{"do": "train", "config", "data", "folder", "epochs", "fraction", "side_px", "batch", "threads", "device",
 "seed"}` and `{"do": "export", "weights", "file", "size_px"}`. `weights` may be a configuration: an untrained network.
 """
 
@@ -15,44 +15,44 @@ from pathlib import Path
 from typing import Any
 
 
-def train(yolo: Any, order: dict[str, Any]) -> None:
-    """Train from scratch with ultralytics' own settings; goes on from its last checkpoint if there is one."""
-    last = Path(order["folder"]) / "train" / "weights" / "last.pt"
+def train(yolo: Any, task: dict[str, Any]) -> None:
+    """Train from scratch with the default settings of ultralytics, or resume from the last checkpoint."""
+    last = Path(task["folder"]) / "train" / "weights" / "last.pt"
     if last.exists():
         torch = importlib.import_module("torch")
-        # A training that is over leaves no epoch to go on from; it may have been stopped while it looked back.
+        # A complete training has no epoch to resume from; it may have been stopped in its final evaluation.
         if torch.load(last, map_location="cpu", weights_only=False)["epoch"] >= 0:
             yolo(str(last)).train(resume=True)
         return
-    epochs = order["epochs"]
-    yolo(order["config"]).train(
-        data=order["data"],
-        project=order["folder"],
+    epochs = task["epochs"]
+    yolo(task["config"]).train(
+        data=task["data"],
+        project=task["folder"],
         name="train",
         exist_ok=True,
         epochs=epochs,
-        fraction=order["fraction"],
-        imgsz=order["side_px"],
-        batch=order["batch"],
-        device=order["device"],
-        seed=order["seed"],
-        workers=min(2, order["threads"]),
-        # Ten of a hundred epochs by default: the same share of fewer.
+        fraction=task["fraction"],
+        imgsz=task["side_px"],
+        batch=task["batch"],
+        device=task["device"],
+        seed=task["seed"],
+        workers=min(2, task["threads"]),
+        # The default is ten of a hundred epochs: the same fraction of fewer.
         close_mosaic=max(1, epochs // 10) if epochs > 1 else 0,
         warmup_epochs=min(3.0, 0.1 * epochs),
         patience=0,
         cache="ram",
         pretrained=False,
-        # Its check of half precision wants to download a network.
+        # The check of mixed precision would download a network.
         amp=False,
         plots=False,
     )
 
 
-def export(yolo: Any, order: dict[str, Any]) -> None:
-    """Write a network for a pair as ONNX, under a name of ours."""
-    width, height = order["size_px"]
-    weights = order["weights"]
+def export(yolo: Any, task: dict[str, Any]) -> None:
+    """Export a network for two images to an ONNX file."""
+    width, height = task["size_px"]
+    weights = task["weights"]
     network = yolo(weights)
     if weights.endswith(".yaml"):
         tasks = importlib.import_module("ultralytics.nn.tasks")
@@ -61,14 +61,14 @@ def export(yolo: Any, order: dict[str, Any]) -> None:
         plain.args, plain.task = network.model.args, network.model.task
         network.model = plain
     made = network.export(format="onnx", imgsz=(height, width), batch=2, opset=17, simplify=False, dynamic=False)
-    shutil.move(made, order["file"])
+    shutil.move(made, task["file"])
 
 
 def replace_torchvision() -> None:
-    """Where torchvision does not load, put a stand-in that has what ultralytics takes of it to detect.
+    """Where torchvision cannot be loaded, replace the function of it that ultralytics uses in detection.
 
-    Its usual builds want CUDA's libraries beside torch. ultralytics drops overlapping boxes by torchvision's function
-    where that is loaded, and has one of its own that gives the same.
+    The usual builds of torchvision need CUDA libraries beside torch. ultralytics uses torchvision's non-maximum
+    suppression if the module is loaded, and has an equivalent function of its own.
     """
     try:
         importlib.import_module("torchvision")
@@ -82,12 +82,12 @@ def replace_torchvision() -> None:
 
 
 def main() -> None:
-    """Do what standard input says."""
-    order = json.load(sys.stdin)
+    """Run the task on standard input."""
+    task = json.load(sys.stdin)
     ultralytics = importlib.import_module("ultralytics")
     replace_torchvision()
     ultralytics.settings.update({"sync": False})
-    {"train": train, "export": export}[order["do"]](ultralytics.YOLO, order)
+    {"train": train, "export": export}[task["do"]](ultralytics.YOLO, task)
 
 
 if __name__ == "__main__":

@@ -6,11 +6,13 @@ networks see, with the drogue as the only class.
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +24,8 @@ from datasets_manifest.types.records import PixelBox
 from geometry.stereo import EYES
 from nav.detector.input_image import Letterbox, input_image
 
-# torch as in our own environment. ultralytics is installed without what it asks for: opencv-python needs a display's
-# libraries, and torchvision need not even load, see `yolo_script`.
+# torch as in our own environment. ultralytics is installed without its dependencies: opencv-python would need the
+# libraries of a display, and torchvision need not even load, see `yolo_script`.
 _TORCH = ("torch==2.13.0", "numpy>=1.26,<2", "onnx>=1.17")
 _LIGHT = (
     *(
@@ -36,71 +38,75 @@ _LIGHT = (
     ),
     "polars>=1.0",
 )
-_ALONE = ("ultralytics==8.4.190", "ultralytics-thop==2.2.3", "ultralytics-platform==0.1.99", "torchvision==0.28.0")
+_WITHOUT_DEPENDENCIES = (
+    "ultralytics==8.4.190",
+    "ultralytics-thop==2.2.3",
+    "ultralytics-platform==0.1.99",
+    "torchvision==0.28.0",
+)
 _DONE = ".detector-peers"
+SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
+_SCRIPT = Path(__file__).with_name("yolo_script.py")
 
 
 def yolo_python(folder: Path, say: Callable[[str], None]) -> Path:
-    """The interpreter of the environment in a folder, which is made where it is missing.
+    """The Python interpreter of the environment in a folder; the environment is made if it is missing.
 
     Args:
         folder: of the environment.
-        say: takes a line about what goes on.
+        say: receives lines about the progress.
 
     Raises:
-        OSError: no environment can be made, or the package index cannot be reached; names the log.
+        OSError: no environment can be made, or the package index cannot be reached; the message names the log.
     """
-    # Other programs start in folders of their own.
+    # Absolute, because other programs start in other folders.
     python = folder.resolve() / "bin" / "python"
-    stamp, wanted = folder / _DONE, "\n".join((*_TORCH, *_LIGHT, *_ALONE)) + "\n"
+    stamp, wanted = folder / _DONE, "\n".join((*_TORCH, *_LIGHT, *_WITHOUT_DEPENDENCIES)) + "\n"
     if stamp.exists() and stamp.read_text(encoding="utf-8") == wanted and python.exists():
         return python
     say(f"installing ultralytics into {folder}")
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "install.log"
     log.unlink(missing_ok=True)
-    _logged(
+    _run_logged(
         [sys.executable, "-m", "venv", str(folder)], log, "no virtual environment can be made; install python3-venv"
     )
     install = [str(python), "-m", "pip", "install", "--no-input", "--disable-pip-version-check"]
     fault = "pip could not install it; is the package index within reach?"
-    _logged([*install, *_TORCH, *_LIGHT], log, fault)
-    _logged([*install, "--no-deps", *_ALONE], log, fault)
+    _run_logged([*install, *_TORCH, *_LIGHT], log, fault)
+    _run_logged([*install, "--no-deps", *_WITHOUT_DEPENDENCIES], log, fault)
     write_text_atomic(stamp, wanted)
     return python
 
 
 def yolo_environment_variables(folder: Path, threads: int) -> dict[str, str]:
-    """Environment variables under which ultralytics stays by itself: no downloads, no settings elsewhere.
+    """Environment variables that keep ultralytics from downloading, and from writing settings elsewhere.
 
     Args:
-        folder: gets its settings.
-        threads: that it may compute with.
+        folder: for its settings.
+        threads: number of threads that it may use.
     """
     quiet = {"YOLO_CONFIG_DIR": str(folder.resolve()), "YOLO_AUTOINSTALL": "false", "YOLO_OFFLINE": "true"}
     counts = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(threads))
     return {**os.environ, **quiet, **counts, "PYTHONUNBUFFERED": "1"}
 
 
-def _logged(command: list[str], log: Path, fault: str) -> None:
+def _run_logged(command: list[str], log: Path, fault: str) -> None:
     with log.open("a", encoding="utf-8") as stream:
         ended = subprocess.run(command, stdout=stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, check=False)
     if ended.returncode != 0:
         raise OSError(f"{log.parent}: {fault} The whole output is in {log}")
 
 
-SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
-
-
 def check_corpus(corpus: Path, test: Path) -> None:
-    """Refuse datasets without pairs to train on, to choose by or to score, and two of the same scenes.
+    """Check that datasets have the pairs to train, validate and score with, and share no scenes.
 
     Args:
-        corpus: needs pairs to train on and to choose by.
+        corpus: needs pairs to train on and to validate with.
         test: needs pairs to score; may be the corpus.
 
     Raises:
-        ValueError: a dataset cannot be read or lacks a split, or two have the same seed, from which scenes follow.
+        ValueError: a dataset cannot be read or lacks a split, or both have the same seed and so the same scenes.
     """
     needed: dict[Path, tuple[SplitName, ...]] = {corpus: ("train", "val")}
     needed[test] = (*needed.get(test, ()), "test")
@@ -118,20 +124,20 @@ def check_corpus(corpus: Path, test: Path) -> None:
 
 
 def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
-    """Write images and boxes, unless they are there already.
+    """Write images and boxes, unless they exist already.
 
     Args:
         corpus: a dataset.
         out: folder.
-        size_px: width and height of the pictures, which are made like our networks' input: the peers would shrink the
-            images in another way than ours do.
+        size_px: width and height of the images. They are made like our networks' input, because ultralytics would
+            resize them in another way.
 
     Returns:
         The file `data.yaml`.
 
     Raises:
         ValueError: the corpus cannot be read.
-        OSError: the folder cannot be written; it is then not there.
+        OSError: the folder cannot be written; no partial folder is left.
     """
     data = out / "data.yaml"
     if data.exists():
@@ -157,7 +163,7 @@ def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
 
 
 def training_image_count(corpus: Path) -> int:
-    """How many images an epoch has: both eyes of every pair of the split `train`.
+    """Number of images of an epoch: both eyes of every pair of the split `train`.
 
     Raises:
         ValueError: the corpus cannot be read.
@@ -166,7 +172,60 @@ def training_image_count(corpus: Path) -> int:
 
 
 def _row(box_px: PixelBox, place: Letterbox, size_px: tuple[int, int]) -> str:
-    """Class, middle and size of an image's box, as shares of the picture."""
+    """Class, centre and size of an image's box, as fractions of the image's size."""
     x, y, width, height = place.to_input(np.array([box_px]))[0].tolist()
-    shares = [(x + width / 2) / size_px[0], (y + height / 2) / size_px[1], width / size_px[0], height / size_px[1]]
-    return f"0 {' '.join(map(repr, shares))}\n"
+    fractions = [(x + width / 2) / size_px[0], (y + height / 2) / size_px[1], width / size_px[0], height / size_px[1]]
+    return f"0 {' '.join(map(repr, fractions))}\n"
+
+
+def run_script(python: Path, task: Mapping[str, Any], log: Path, variables: Mapping[str, str]) -> None:
+    """Run a task of `yolo_script` in the peers' environment, with its output in a log.
+
+    Raises:
+        OSError: it failed; the message has the last line of the output, and names the log.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a", encoding="utf-8") as stream:
+        ended = subprocess.run(
+            # -P: a file in the working folder must not replace a module of ultralytics.
+            [str(python), "-P", str(_SCRIPT)],
+            input=json.dumps(task),
+            text=True,
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            env=dict(variables),
+            cwd=log.parent,
+            check=False,
+        )
+    if ended.returncode != 0:
+        lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        raise OSError(f"{log}: ultralytics ended with status {ended.returncode}: {lines[-1] if lines else 'silently'}")
+
+
+class TrainingLength(NamedTuple):
+    """The length of a training by ultralytics.
+
+    Attributes:
+        epochs: number of epochs.
+        fraction: of the images, in each epoch.
+        image_passes: number of image passes that result.
+    """
+
+    epochs: int
+    fraction: float
+    image_passes: int
+
+
+def training_length(image_passes: int, images: int) -> TrainingLength:
+    """The length whose number of image passes is nearest to the given one.
+
+    ultralytics trains whole epochs, and a fraction of the images would be the same images in every epoch. So passes are
+    rounded to whole epochs of all images; only a training of less than one epoch leaves images out.
+
+    Raises:
+        ValueError: no images.
+    """
+    if images < 1:
+        raise ValueError("corpus: has no images to train on")
+    epochs, fraction = max(1, round(image_passes / images)), min(1.0, image_passes / images)
+    return TrainingLength(epochs, fraction, epochs * round(fraction * images))

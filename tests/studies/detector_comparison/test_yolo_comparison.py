@@ -34,16 +34,20 @@ from studies.detector_comparison.ablation import (
     ablation_lines,
     measured_networks,
 )
-from studies.detector_comparison.comparison import (
+from studies.detector_comparison.options import input_size_px
+from studies.detector_comparison.yolo_comparison import (
     PEERS,
     ComparisonOptions,
     compare_peers,
     comparison_lines,
+)
+from studies.detector_comparison.yolo_training import (
+    check_corpus,
+    export_corpus,
     run_script,
+    training_image_count,
     training_length,
 )
-from studies.detector_comparison.options import input_size_px
-from studies.detector_comparison.yolo_training import check_corpus, export_corpus, training_image_count
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +147,7 @@ def test_a_folder_in_which_another_comparison_is_at_work_is_refused(screen_datas
     out.mkdir()
     with (out / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(ValueError, match="out: another comparison is at work in it; wait for its end"):
+        with pytest.raises(ValueError, match="out: another comparison is running in it; wait for its end"):
             compare_peers(order(screen_dataset, tmp_path), out, print)
     assert [file.name for file in out.iterdir()] == [".lock"]
 
