@@ -1,1 +1,1 @@
-"""Poses of single pairs to motion: a filter as they come, a smoother for a sequence that is over."""
+"""Motion from the poses of single pairs: a filter for pairs as they arrive, a smoother for finished sequences."""

@@ -9,16 +9,17 @@ import numpy as np
 
 from datasets_manifest.types.estimates import Estimate, Mode, Motion, PoseEstimate
 from geometry.se3 import Array, RigidTransform, read_only
-from nav.filtering.hypotheses import Bank, Hypothesis, advance_bank, bank_covariance, correct_bank, first_bank
-from nav.filtering.measurement_update import Fix, fix_of, pose_difference
+from nav.filtering.hypotheses import Bank, Hypothesis, bank_covariance, correct_bank, initial_bank, propagate_bank
+from nav.filtering.measurement_update import PoseMeasurement, measurement_from_estimate, pose_difference
 from nav.filtering.motion_model import FilterSettings
 from nav.pose.pose_method import NoFixReason
 
+FILTER_SUFFIX = "+filter"
 _POSE = 6
-# Chi-square below which two poses are one fix of the same mode; six degrees of freedom, beyond it one of a million.
-_SAME_POSE = 38.3
-# What of a measured estimate does not change when it is filtered.
-_MEASURED = ("features", "stage_s", "regions", "latency_s")
+# Chi-square with 6 degrees of freedom that chance exceeds once in a million; below it two poses of one mode are equal.
+_SAME_POSE_CHI2 = 38.3
+# Fields of a measured estimate that its filtered estimate takes over.
+_MEASURED_FIELDS = ("features", "stage_s", "regions", "latency_s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +27,14 @@ class FilterState:
     """Pose and motion of the drogue against the left camera.
 
     Attributes:
-        time_s: when. [s]
-        left_from_drogue: pose as the camera sees it; of the equivalent rolls one that goes on from fix to fix.
-        velocity_m_s: (3,) of the drogue's origin in the left camera's axes, without its vibration. [m/s]
-        rate_rad_s: (3,) of its attitude, `R' = [rate]x R`, without its vibration. [rad/s]
+        time_s: time of the state. [s]
+        left_from_drogue: pose as the camera sees it; of the equivalent rolls one that is continuous in time.
+        velocity_m_s: (3,) of the drogue's origin in the left camera's axes, without vibration. [m/s]
+        rate_rad_s: (3,) of its attitude, `R' = [rate]x R`, without vibration. [rad/s]
         covariance: (12, 12) of pose, velocity and rate in this order, in the tangent of
             `datasets_manifest.types.estimates`. [m, rad, m/s, rad/s]
-        modes: the poses of all explanations that live, the best first.
-        coasted_s: since the last fix. [s]
+        modes: the poses of all hypotheses, the most likely first.
+        coasted_s: time since the last measurement. [s]
     """
 
     time_s: float
@@ -50,12 +51,12 @@ class FilterState:
         object.__setattr__(self, "covariance", read_only(self.covariance, (12, 12), "covariance"))
 
     def to_estimate(self, frame_index: int, method: str, measured: Estimate | None = None) -> PoseEstimate:
-        """As an ordinary estimate.
+        """The state as an estimate of a pair.
 
         Args:
-            frame_index: of the pair that it is for.
+            frame_index: of the pair.
             method: full name, such as `joint-hub+filter`.
-            measured: what was measured in that pair; its features, regions and times go along.
+            measured: the measured estimate of that pair; its features, regions and times are copied.
         """
         estimate = PoseEstimate(
             frame_index=frame_index,
@@ -71,11 +72,11 @@ class FilterState:
         )
         if measured is None:
             return estimate
-        return estimate.model_copy(update={name: getattr(measured, name) for name in _MEASURED})
+        return estimate.model_copy(update={name: getattr(measured, name) for name in _MEASURED_FIELDS})
 
 
-def state_of(bank: Bank, time_s: float, coasted_s: float) -> FilterState:
-    """The best hypothesis, with a covariance that covers all."""
+def summarize_bank(bank: Bank, time_s: float, coasted_s: float) -> FilterState:
+    """The most likely hypothesis; its covariance is the mixture's second moment about it."""
     best = bank[0].state
     return FilterState(
         time_s=time_s,
@@ -89,48 +90,50 @@ def state_of(bank: Bank, time_s: float, coasted_s: float) -> FilterState:
 
 
 def _modes(bank: Bank) -> tuple[Mode, ...]:
-    """The poses of all explanations; those of one mode of the last fix that differ in their motion alone share one."""
+    """The poses of all hypotheses; those of one measured mode that differ in their motion only share one pose."""
     different: list[tuple[Hypothesis, float]] = []
-    for one in bank:
-        same = next((at for at, (other, _) in enumerate(different) if _is_same_pose(other, one)), None)
+    for hypothesis in bank:
+        same = next((i for i, (other, _) in enumerate(different) if _is_same_pose(other, hypothesis)), None)
         if same is None:
-            different.append((one, one.weight))
+            different.append((hypothesis, hypothesis.weight))
         else:
-            different[same] = (different[same][0], different[same][1] + one.weight)
+            different[same] = (different[same][0], different[same][1] + hypothesis.weight)
     ordered = [different[0], *sorted(different[1:], key=lambda each: -each[1])]
-    return tuple(Mode(left_from_drogue=one.state.pose, weight=min(weight, 1.0)) for one, weight in ordered)
+    return tuple(
+        Mode(left_from_drogue=hypothesis.state.pose, weight=min(weight, 1.0)) for hypothesis, weight in ordered
+    )
 
 
 def _is_same_pose(one: Hypothesis, other: Hypothesis) -> bool:
     if one.mode != other.mode:
         return False
-    covariance = sum(each.state.told_covariance[:_POSE, :_POSE] for each in (one, other))
-    away = pose_difference(one.state.pose, other.state.pose)
-    return float(away @ np.linalg.solve(covariance, away)) < _SAME_POSE
+    covariance = sum(each.state.reported_covariance[:_POSE, :_POSE] for each in (one, other))
+    difference = pose_difference(one.state.pose, other.state.pose)
+    return float(difference @ np.linalg.solve(covariance, difference)) < _SAME_POSE_CHI2
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One motion.
+    """One motion that measurements agree on.
 
     Attributes:
-        bank: its explanations at `time_s`, the time of its last fix.
-        time_s: [s]
-        fixes: how many it rests on.
+        bank: its hypotheses at `time_s`.
+        time_s: time of its last measurement. [s]
+        measurements: number of measurements in it.
     """
 
     bank: Bank
     time_s: float
-    fixes: int
+    measurements: int
 
 
 @dataclass(frozen=True, eq=False)
-class Memory:
-    """All that a filter knows after some fixes; it never changes.
+class TrackerState:
+    """All that the filter knows after some measurements.
 
     Attributes:
-        track: the motion that is told; None before the first fix.
-        rival: what the last rejected fixes agree on; None when the last fix was accepted.
+        track: the motion that is reported; None before the first measurement.
+        rival: a second motion, of the last rejected measurements; None when the last measurement was accepted.
     """
 
     track: Track | None = None
@@ -138,89 +141,99 @@ class Memory:
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
-    """What became of a fix.
+class UpdateResult:
+    """Result of updating a `TrackerState` by one measurement.
 
     Attributes:
-        memory: afterwards.
-        accepted: whether the told motion rests on it.
-        starts: whether a motion is told from here on that does not go on from the one before; its first
-            `memory.track.fixes` fixes are this one and those just before it.
-        nis: its chi-square against the motion so far; None for a first fix.
-        reason: why it was not simply taken; empty when it was.
+        tracker_state: afterwards.
+        accepted: whether the measurement belongs to the reported motion.
+        starts: whether the reported motion is a new one, which does not continue the one before; its first
+            `tracker_state.track.measurements` measurements are this one and those just before it.
+        nis: normalised innovation squared against the motion before; None for a first measurement.
+        reason: why the measurement did not simply continue the motion; empty when it did.
     """
 
-    memory: Memory
+    tracker_state: TrackerState
     accepted: bool
     starts: bool
     nis: float | None
     reason: str
 
 
-def take(memory: Memory, time_s: float, fix: Fix, settings: FilterSettings, symmetry_order: int) -> Taken:
-    """Take one fix that is no older than the last one.
+def update(
+    tracker_state: TrackerState,
+    time_s: float,
+    measurement: PoseMeasurement,
+    settings: FilterSettings,
+    symmetry_order: int,
+) -> UpdateResult:
+    """Process one measurement that is not older than the last one.
+
+    A rejected measurement starts a rival motion, or continues it. The rival replaces the reported motion when enough
+    consecutive measurements agree with it.
 
     Args:
-        memory: so far.
-        time_s: of the fix's images. [s]
-        fix: what was measured.
+        tracker_state: before.
+        time_s: of the measurement's images. [s]
+        measurement: the measured pose.
         settings: of the filter.
         symmetry_order: of the drogue's markers.
     """
-    track = memory.track
+    track = tracker_state.track
     if track is None or time_s - track.time_s > settings.max_coast_s:
         reason = "first fix" if track is None else f"first fix after a gap of {time_s - track.time_s:.3g} s"
-        return Taken(Memory(_started(time_s, fix, settings)), True, True, None, reason)
-    followed, nis = _followed(track, time_s, fix, settings, symmetry_order)
-    if followed is not None:
-        return Taken(Memory(followed), True, False, nis, "")
+        started = TrackerState(_start_track(time_s, measurement, settings))
+        return UpdateResult(started, accepted=True, starts=True, nis=None, reason=reason)
+    continued, nis = _continue_track(track, time_s, measurement, settings, symmetry_order)
+    if continued is not None:
+        return UpdateResult(TrackerState(continued), accepted=True, starts=False, nis=nis, reason="")
     rival = None
-    if memory.rival is not None:
-        rival, _ = _followed(memory.rival, time_s, fix, settings, symmetry_order)
-    rival = rival or _started(time_s, fix, settings)
-    if rival.fixes >= settings.restart_fixes:
-        reason = f"{rival.fixes} rejected fixes in a row agree: started anew with them"
-        return Taken(Memory(rival), True, True, nis, reason)
+    if tracker_state.rival is not None:
+        rival, _ = _continue_track(tracker_state.rival, time_s, measurement, settings, symmetry_order)
+    rival = rival or _start_track(time_s, measurement, settings)
+    if rival.measurements >= settings.restart_fixes:
+        reason = f"{rival.measurements} rejected fixes in a row agree: started anew with them"
+        return UpdateResult(TrackerState(rival), accepted=True, starts=True, nis=nis, reason=reason)
     reason = f"outside the gate: {nis:.4g} for 6 degrees of freedom"
-    return Taken(replace(memory, rival=rival), False, False, nis, reason)
+    rejected = replace(tracker_state, rival=rival)
+    return UpdateResult(rejected, accepted=False, starts=False, nis=nis, reason=reason)
 
 
-def told(memory: Memory, time_s: float, settings: FilterSettings) -> FilterState | None:
-    """The motion at a time; None before the first fix, and when the last one is too old."""
-    track = memory.track
+def predict(tracker_state: TrackerState, time_s: float, settings: FilterSettings) -> FilterState | None:
+    """The motion at a time; None before the first measurement, and when the last one is too old."""
+    track = tracker_state.track
     coasted_s = -1.0 if track is None else time_s - track.time_s
     if track is None or not 0 <= coasted_s <= settings.max_coast_s:
         return None
-    # Right after a fix, which is when most ask, there is nowhere to go on to.
-    bank = advance_bank(track.bank, coasted_s, settings) if coasted_s > 0 else track.bank
-    return state_of(bank, time_s, coasted_s)
+    # Most calls ask for the time of the last measurement, which needs no propagation.
+    bank = propagate_bank(track.bank, coasted_s, settings) if coasted_s > 0 else track.bank
+    return summarize_bank(bank, time_s, coasted_s)
 
 
-def _started(time_s: float, fix: Fix, settings: FilterSettings) -> Track:
-    return Track(first_bank(fix, settings), time_s, 1)
+def _start_track(time_s: float, measurement: PoseMeasurement, settings: FilterSettings) -> Track:
+    return Track(initial_bank(measurement, settings), time_s, measurements=1)
 
 
-def _followed(
-    track: Track, time_s: float, fix: Fix, settings: FilterSettings, symmetry_order: int
+def _continue_track(
+    track: Track, time_s: float, measurement: PoseMeasurement, settings: FilterSettings, symmetry_order: int
 ) -> tuple[Track | None, float]:
-    """The track with one more fix, None where the fix does not fit; and its chi-square."""
-    predicted = advance_bank(track.bank, time_s - track.time_s, settings, branches=True)
-    update = correct_bank(predicted, fix, settings, symmetry_order)
-    return (None if update.bank is None else Track(update.bank, time_s, track.fixes + 1)), update.nis
-
-
-FILTER_SUFFIX = "+filter"
+    """The track with one more measurement, None where that is outside the gate; and its chi-square."""
+    predicted = propagate_bank(track.bank, time_s - track.time_s, settings, branches=True)
+    corrected = correct_bank(predicted, measurement, settings, symmetry_order)
+    if corrected.bank is None:
+        return None, corrected.nis
+    return Track(corrected.bank, time_s, track.measurements + 1), corrected.nis
 
 
 @dataclass(frozen=True, eq=False)
 class FilterUpdate:
-    """What became of an estimate.
+    """Result of updating the filter by an estimate.
 
     Attributes:
-        state: at the time of its images, whether it was accepted or not; None where nothing is known.
-        accepted: whether the state rests on it.
-        nis: its normalised innovation squared, chi-square with 6 degrees of freedom; None where nothing was predicted.
-        reason: why it was not simply taken; empty when it was.
+        state: at the time of the estimate's images, whether it was accepted or not; None where nothing is known.
+        accepted: whether the state uses the estimate.
+        nis: normalised innovation squared, chi-square with 6 degrees of freedom; None without a prediction.
+        reason: why the estimate did not simply continue the motion; empty when it did.
     """
 
     state: FilterState | None
@@ -231,22 +244,22 @@ class FilterUpdate:
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
-    """A fix, and the memory after it."""
+    """A remembered measurement, and the result of its update."""
 
     time_s: float
-    fix: Fix
-    taken: Taken
+    measurement: PoseMeasurement
+    result: UpdateResult
 
 
 class PoseFilter:
     """Error-state Kalman filter of one drogue's motion against the left camera; see docs/explanation/filtering.md."""
 
     def __init__(self, settings: FilterSettings, symmetry_order: int) -> None:
-        """Begin with nothing.
+        """Create a filter without measurements.
 
         Args:
             settings: of motion and limits.
-            symmetry_order: how many turns about its axis map the drogue's markers onto themselves.
+            symmetry_order: how many rolls map the drogue's markers onto themselves.
 
         Raises:
             ValueError: an order below 1.
@@ -258,32 +271,31 @@ class PoseFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all fixes."""
-        self._base = Memory()
+        """Forget all measurements."""
+        self._base = TrackerState()
         self._entries: list[_Entry] = []
         self._too_late = 0
 
     def predict(self, time_s: float) -> FilterState | None:
-        """The state at a time; the filter's memory does not change.
+        """The state at a time; does not change the filter.
 
         Args:
-            time_s: any; a past one is answered from the fixes up to it, as far as they are remembered. [s]
+            time_s: any time; a past one is answered from the measurements up to it, as far as they are remembered. [s]
 
         Returns:
-            None before the first fix, and where the last one is older than `max_coast_s`.
+            None before the first measurement, and where the last one is older than `max_coast_s`.
 
         Raises:
             ValueError: a time that is not finite.
         """
         _check_time(time_s)
-        return told(self._memory_before(self._place(time_s)), time_s, self._settings)
+        return predict(self._tracker_state_at(self._count_until(time_s)), time_s, self._settings)
 
     def update(self, time_s: float, estimate: PoseEstimate) -> FilterUpdate:
-        """Learn from an estimate.
+        """Update the filter by an estimate.
 
-        One that is older than others is put in its place, and the later ones are taken again after it; one that is
-        older than the newest by more than `max_delay_s` is refused, and so is another one of the same time: what comes
-        twice would count twice.
+        A late estimate is inserted at its time, and the updates after it are repeated. One that is older than the
+        newest by more than `max_delay_s` is refused, and so is a second one of the same time, which would count twice.
 
         Args:
             time_s: when its images were taken. [s]
@@ -293,30 +305,33 @@ class PoseFilter:
             ValueError: a time that is not finite.
         """
         _check_time(time_s)
-        fix = fix_of(estimate, self._symmetry_order, self._settings.least_weight)
-        if isinstance(fix, NoFixReason):
-            return FilterUpdate(self.predict(time_s), False, None, fix.reason)
-        reason = self._refusal(time_s)
+        measurement = measurement_from_estimate(estimate, self._symmetry_order, self._settings.least_weight)
+        if isinstance(measurement, NoFixReason):
+            return self._refused(time_s, measurement.reason)
+        reason = self._lateness_fault(time_s)
         if reason:
-            return FilterUpdate(self.predict(time_s), False, None, reason)
-        place = self._place(time_s)
-        if place and self._entries[place - 1].time_s == time_s:
-            return FilterUpdate(self.predict(time_s), False, None, f"there is a fix of {time_s:.6g} s already")
-        later = [(entry.time_s, entry.fix) for entry in self._entries[place:]]
-        del self._entries[place:]
-        for fix_time_s, each in [(time_s, fix), *later]:
-            before = self._memory_before(len(self._entries))
-            taken = take(before, fix_time_s, each, self._settings, self._symmetry_order)
-            self._entries.append(_Entry(fix_time_s, each, taken))
-        taken = self._entries[place].taken
-        state = told(taken.memory, time_s, self._settings)
+            return self._refused(time_s, reason)
+        index = self._count_until(time_s)
+        if index and self._entries[index - 1].time_s == time_s:
+            return self._refused(time_s, f"there is a fix of {time_s:.6g} s already")
+        later = [(entry.time_s, entry.measurement) for entry in self._entries[index:]]
+        del self._entries[index:]
+        for entry_time_s, each in [(time_s, measurement), *later]:
+            before = self._tracker_state_at(len(self._entries))
+            result = update(before, entry_time_s, each, self._settings, self._symmetry_order)
+            self._entries.append(_Entry(entry_time_s, each, result))
+        result = self._entries[index].result
+        state = predict(result.tracker_state, time_s, self._settings)
         self._forget()
-        return FilterUpdate(state, taken.accepted, taken.nis, taken.reason)
+        return FilterUpdate(state, result.accepted, result.nis, result.reason)
 
-    def _refusal(self, time_s: float) -> str:
-        """Why a fix comes too late; empty where it does not.
+    def _refused(self, time_s: float, reason: str) -> FilterUpdate:
+        return FilterUpdate(self.predict(time_s), accepted=False, nis=None, reason=reason)
 
-        Several in a row that do are of a clock that was set back, or set right: then all before is forgotten.
+    def _lateness_fault(self, time_s: float) -> str:
+        """Why a measurement is too late; empty where it is not.
+
+        Several late ones in a row mean that the clock was set back, or set right: the filter then starts anew.
         """
         late_s = self._entries[-1].time_s - time_s if self._entries else 0.0
         if late_s <= self._settings.max_delay_s:
@@ -328,20 +343,21 @@ class PoseFilter:
         self.reset()
         return ""
 
-    def _place(self, time_s: float) -> int:
-        """How many remembered fixes are not later than a time."""
+    def _count_until(self, time_s: float) -> int:
+        """How many remembered measurements are not later than a time."""
         return bisect_right(self._entries, time_s, key=lambda entry: entry.time_s)
 
-    def _memory_before(self, place: int) -> Memory:
-        return self._entries[place - 1].taken.memory if place else self._base
+    def _tracker_state_at(self, count: int) -> TrackerState:
+        """State after the first remembered measurements."""
+        return self._entries[count - 1].result.tracker_state if count else self._base
 
     def _forget(self) -> None:
-        """Keep the fixes that a late one may still come before."""
+        """Drop the measurements that no late one can precede."""
         oldest_s = self._entries[-1].time_s - self._settings.max_delay_s
-        gone = max(self._place(oldest_s) - 1, 0)
-        if gone:
-            self._base = self._entries[gone - 1].taken.memory
-            del self._entries[:gone]
+        dropped = max(self._count_until(oldest_s) - 1, 0)
+        if dropped:
+            self._base = self._entries[dropped - 1].result.tracker_state
+            del self._entries[:dropped]
 
 
 def _check_time(time_s: float) -> None:

@@ -1,4 +1,4 @@
-"""Motion from all fixes of a sequence that is over, those after a time as well as those before it."""
+"""Smoother: motion from all measurements of a finished sequence, those after a time as well as those before it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate
-from nav.filtering.hypotheses import Bank, Hypothesis, advance_bank, correct_bank, first_bank
-from nav.filtering.measurement_update import Fix, fix_of
-from nav.filtering.motion_model import SIZE, FilterSettings, MotionState, Step
-from nav.filtering.pose_filter import Memory, state_of, take
+from nav.filtering.hypotheses import Bank, Hypothesis, correct_bank, initial_bank, propagate_bank
+from nav.filtering.measurement_update import PoseMeasurement, measurement_from_estimate
+from nav.filtering.motion_model import SIZE, FilterSettings, MotionState, PredictionStep
+from nav.filtering.pose_filter import TrackerState, summarize_bank, update
 from nav.pose.pose_method import NoFixReason
 
 SMOOTHER_SUFFIX = "+smoother"
@@ -23,13 +23,13 @@ def smooth(
 ) -> list[Estimate]:
     """Smoothed estimates of one sequence.
 
-    Pairs without a fix get one where fixes stand on both sides, no more than `max_coast_s` apart; fixes that the filter
-    rejects count as none.
+    A pair without a measurement gets a pose where there are measurements on both sides, no more than `max_coast_s`
+    apart. Measurements that the filter rejects are ignored.
 
     Args:
-        times_s: (N,) of the pairs, each later than the one before. [s]
+        times_s: (N,) of the pairs, ascending. [s]
         estimates: (N,) of one method.
-        settings: as of the filter.
+        settings: those of the filter.
         symmetry_order: of the drogue's markers.
 
     Returns:
@@ -45,36 +45,40 @@ def smooth(
         raise ValueError(f"times_s: must be one for each of {len(estimates)} estimates, got shape {times.shape}")
     if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise ValueError("times_s: must be finite and ascend")
-    fixes = [_usable(estimate, settings, symmetry_order) for estimate in estimates]
-    answers: list[Estimate] = [_without(estimate, fix) for estimate, fix in zip(estimates, fixes, strict=True)]
-    for members in _motions(times, fixes, settings, symmetry_order):
+    measurements = [_measurement(estimate, settings, symmetry_order) for estimate in estimates]
+    smoothed: list[Estimate] = [_no_fix(*each) for each in zip(estimates, measurements, strict=True)]
+    for members in _segments(times, measurements, settings, symmetry_order):
         first, last = members[0], members[-1]
-        taken = {place - first: fix for place in members if isinstance(fix := fixes[place], Fix)}
-        banks = _forward(times[first : last + 1], taken, settings, symmetry_order)
-        for place, bank in enumerate(_backward(banks), start=first):
-            coasted_s = float(np.abs(times[members] - times[place]).min())
-            state, measured = state_of(bank, float(times[place]), coasted_s), estimates[place]
-            answers[place] = state.to_estimate(measured.frame_index, _name(measured), measured)
-    return answers
+        accepted = {
+            index - first: measurement
+            for index in members
+            if isinstance(measurement := measurements[index], PoseMeasurement)
+        }
+        banks = _forward_pass(times[first : last + 1], accepted, settings, symmetry_order)
+        for index, bank in enumerate(_backward_pass(banks), start=first):
+            coasted_s = float(np.abs(times[members] - times[index]).min())
+            state, estimate = summarize_bank(bank, float(times[index]), coasted_s), estimates[index]
+            smoothed[index] = state.to_estimate(estimate.frame_index, _name(estimate), estimate)
+    return smoothed
 
 
 def _name(estimate: Estimate) -> str:
     return estimate.method + SMOOTHER_SUFFIX
 
 
-def _usable(estimate: Estimate, settings: FilterSettings, symmetry_order: int) -> Fix | NoFixReason:
+def _measurement(estimate: Estimate, settings: FilterSettings, symmetry_order: int) -> PoseMeasurement | NoFixReason:
     if isinstance(estimate, PoseEstimate):
-        return fix_of(estimate, symmetry_order, settings.least_weight)
+        return measurement_from_estimate(estimate, symmetry_order, settings.least_weight)
     return NoFixReason(estimate.reason)
 
 
-def _without(estimate: Estimate, fix: Fix | NoFixReason) -> NoFix:
-    """The answer where no motion reaches."""
-    reason = fix.reason if isinstance(fix, NoFixReason) else "outside the gate of the motion before and after"
+def _no_fix(estimate: Estimate, measurement: PoseMeasurement | NoFixReason) -> NoFix:
+    """The estimate of a pair outside all segments."""
+    rejected = "outside the gate of the motion before and after"
     return NoFix(
         frame_index=estimate.frame_index,
         method=_name(estimate),
-        reason=reason,
+        reason=measurement.reason if isinstance(measurement, NoFixReason) else rejected,
         features=estimate.features,
         stage_s=estimate.stage_s,
         regions=estimate.regions,
@@ -82,64 +86,68 @@ def _without(estimate: Estimate, fix: Fix | NoFixReason) -> NoFix:
     )
 
 
-def _motions(
-    times: Times, fixes: Sequence[Fix | NoFixReason], settings: FilterSettings, symmetry_order: int
+def _segments(
+    times: Times, measurements: Sequence[PoseMeasurement | NoFixReason], settings: FilterSettings, symmetry_order: int
 ) -> list[list[int]]:
-    """Places of the fixes that belong to each of the motions which the filter tells one after the other."""
-    memory, motions, tried = Memory(), list[list[int]](), list[int]()
-    for place, fix in enumerate(fixes):
-        if isinstance(fix, NoFixReason):
+    """Indices of the accepted measurements of each motion that the filter reports, one motion after the other."""
+    tracker_state, segments, processed = TrackerState(), list[list[int]](), list[int]()
+    for index, measurement in enumerate(measurements):
+        if isinstance(measurement, NoFixReason):
             continue
-        tried.append(place)
-        taken = take(memory, float(times[place]), fix, settings, symmetry_order)
-        memory = taken.memory
-        if taken.starts and memory.track is not None:
-            motions.append(tried[-memory.track.fixes :])
-        elif taken.accepted:
-            motions[-1].append(place)
-    return motions
+        processed.append(index)
+        result = update(tracker_state, float(times[index]), measurement, settings, symmetry_order)
+        tracker_state = result.tracker_state
+        if result.starts and tracker_state.track is not None:
+            segments.append(processed[-tracker_state.track.measurements :])
+        elif result.accepted:
+            segments[-1].append(index)
+    return segments
 
 
-def _forward(times: Times, fixes: Mapping[int, Fix], settings: FilterSettings, symmetry_order: int) -> list[Bank]:
-    """The filter over one motion: the bank at each time, after its fix if any; the first place has one."""
-    banks, with_fix = [first_bank(fixes[0], settings)], times[sorted(fixes)]
+def _forward_pass(
+    times: Times, measurements: Mapping[int, PoseMeasurement], settings: FilterSettings, symmetry_order: int
+) -> list[Bank]:
+    """Filter one segment: the bank at each time, after its measurement if any; there is one at the first time."""
+    banks, measured_times = [initial_bank(measurements[0], settings)], times[sorted(measurements)]
     branches = True
-    for place in range(1, len(times)):
-        later = int(np.searchsorted(with_fix, times[place]))
-        span_s = float(with_fix[later] - with_fix[later - 1])
-        # Whether the receiver turns is settled anew after each fix, as in the filter.
-        bank = advance_bank(banks[-1], float(times[place] - times[place - 1]), settings, span_s, branches)
-        corrected = correct_bank(bank, fixes[place], settings, symmetry_order).bank if place in fixes else None
+    for index in range(1, len(times)):
+        later = int(np.searchsorted(measured_times, times[index]))
+        span_s = float(measured_times[later] - measured_times[later - 1])
+        # As in the filter, turns of the receiver branch once after each measurement.
+        bank = propagate_bank(banks[-1], float(times[index] - times[index - 1]), settings, span_s, branches)
+        corrected = None
+        if index in measurements:
+            corrected = correct_bank(bank, measurements[index], settings, symmetry_order).bank
         branches = corrected is not None
         banks.append(corrected or bank)
     return banks
 
 
-def _backward(banks: Sequence[Bank]) -> list[Bank]:
-    """Smoothed banks: every explanation that lives at the end, each followed back through its parents."""
+def _backward_pass(banks: Sequence[Bank]) -> list[Bank]:
+    """Smoothed banks: every hypothesis at the end, followed back through its parents."""
     last = banks[-1]
-    told, lines, smoothed = [last], list(last), [one.state for one in last]
-    for before in reversed(banks[:-1]):
-        parents = [before[one.parent] for one in lines]
-        smoothed = [
-            _smoothed(parent.state, one.step, state)
-            for parent, one, state in zip(parents, lines, smoothed, strict=True)
-            if one.step is not None
+    smoothed_banks, hypotheses, states = [last], list(last), [hypothesis.state for hypothesis in last]
+    for earlier in reversed(banks[:-1]):
+        parents = [earlier[hypothesis.parent] for hypothesis in hypotheses]
+        states = [
+            _smooth_step(parent.state, hypothesis.step, state)
+            for parent, hypothesis, state in zip(parents, hypotheses, states, strict=True)
+            if hypothesis.step is not None
         ]
-        lines = parents
-        told.append(tuple(Hypothesis(state, one.weight) for state, one in zip(smoothed, last, strict=True)))
-    return told[::-1]
+        hypotheses = parents
+        smoothed_banks.append(tuple(Hypothesis(state, end.weight) for state, end in zip(states, last, strict=True)))
+    return smoothed_banks[::-1]
 
 
-def _smoothed(filtered: MotionState, step: Step, later: MotionState) -> MotionState:
-    """A filtered state with what a smoothed one after the next step tells.
+def _smooth_step(filtered: MotionState, step: PredictionStep, later: MotionState) -> MotionState:
+    """Correct a filtered state by the smoothed state after the next step.
 
-    The covariance is in the form that is a sum of squares, so that rounding leaves it positive definite.
+    The covariance is computed as a sum of squares, which rounding leaves positive definite.
     """
     predicted = step.state.covariance
     scale = np.sqrt(np.diag(predicted))
     factor = cho_factor(predicted / np.outer(scale, scale), lower=True)
     gain = cho_solve(factor, step.transition @ filtered.covariance / scale[:, None]).T / scale
-    kept = np.eye(SIZE) - gain @ step.transition
-    covariance = kept @ filtered.covariance @ kept.T + gain @ (step.noise + later.covariance) @ gain.T
-    return filtered.moved(gain @ step.state.error_of(later), covariance)
+    error_factor = np.eye(SIZE) - gain @ step.transition
+    covariance = error_factor @ filtered.covariance @ error_factor.T + gain @ (step.noise + later.covariance) @ gain.T
+    return filtered.with_error(gain @ step.state.error_to(later), covariance)

@@ -16,12 +16,12 @@ from nav.filtering.pose_filter import FilterState, PoseFilter
 
 Measure = Callable[..., PoseEstimate]
 PERIOD_S = 0.04
-STEADY_AIR = FilterSettings(agitation_per_s=0)
+STEADY_AIR = FilterSettings(noise_scale_variance_per_s=0)
 
 
 def test_the_steady_state_is_that_of_the_riccati_equation(measure: Measure) -> None:
     settings = FilterSettings(
-        acceleration_m2_s3=0.3, lasting=0, vibration_m=0.004, vibration_s=0.001, agitation_per_s=0
+        acceleration_m2_s3=0.3, long_term_excess=0, vibration_m=0.004, vibration_s=0.001, noise_scale_variance_per_s=0
     )
     sd_m = 0.01
     pose = RigidTransform(np.eye(3), np.array([0.0, 0.0, 5.0]))
@@ -79,7 +79,7 @@ def _within(values: list[float], degrees: int) -> None:
 def test_errors_and_innovations_are_as_large_as_their_covariances(
     rng: np.random.Generator, measure: Measure, covariance: Array, learns: bool
 ) -> None:
-    settings = FilterSettings(lasting=0, start_speed_m_s=0.5, agitation_per_s=0.05 if learns else 0)
+    settings = FilterSettings(long_term_excess=0, start_speed_m_s=0.5, noise_scale_variance_per_s=0.05 if learns else 0)
     runs, pairs = 20, 30
     seen, velocities, rates = _flown(rng, settings, runs, pairs)
     nees, nis = [], []
@@ -105,19 +105,21 @@ def test_errors_and_innovations_are_as_large_as_their_covariances(
 def test_rougher_and_calmer_air_is_learned(
     rng: np.random.Generator, measure: Measure, covariance: Array, factor: float
 ) -> None:
-    assumed = FilterSettings(lasting=0, start_speed_m_s=0.5)
+    assumed = FilterSettings(long_term_excess=0, start_speed_m_s=0.5)
     flown = FilterSettings(
         acceleration_m2_s3=factor * assumed.acceleration_m2_s3,
         swing_rad2_s3=factor * assumed.swing_rad2_s3,
         camera_rad2_s3=factor * assumed.camera_rad2_s3,
-        lasting=0,
+        long_term_excess=0,
         start_speed_m_s=0.5,
     )
     seen, _, _ = _flown(rng, flown, 6, 80)
     means = []
     for settings in (
         assumed,
-        FilterSettings(lasting=0, start_speed_m_s=0.5, agitation_per_s=0, gate_probability=1 - 1e-15),
+        FilterSettings(
+            long_term_excess=0, start_speed_m_s=0.5, noise_scale_variance_per_s=0, gate_probability=1 - 1e-15
+        ),
     ):
         nis = []
         for run in range(6):

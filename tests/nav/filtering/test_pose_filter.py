@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.estimates import Mode, NoFix, PoseEstimate
 from geometry.se3 import Array, RigidTransform
-from nav.filtering.measurement_update import Fix, fix_of, pose_difference
+from nav.filtering.measurement_update import PoseMeasurement, measurement_from_estimate, pose_difference
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FilterState, PoseFilter
 
@@ -190,8 +190,8 @@ def _ambiguous(time_s: float, share: float, covariance: Array) -> PoseEstimate:
 
 
 def test_a_mode_gets_its_own_covariance_back(covariance: Array) -> None:
-    fix = fix_of(_ambiguous(0.0, 0.4, covariance), ORDER, 1e-3)
-    assert isinstance(fix, Fix) and fix.weights == pytest.approx((0.6, 0.4))
+    fix = measurement_from_estimate(_ambiguous(0.0, 0.4, covariance), ORDER, 1e-3)
+    assert isinstance(fix, PoseMeasurement) and fix.weights == pytest.approx((0.6, 0.4))
     # Rounding of a spread that is 1000 times the covariance.
     np.testing.assert_allclose(fix.covariance, covariance, atol=1e-12)
 

@@ -67,7 +67,7 @@ def _batch(times: Array, depths: Array, sd_m: float, settings: FilterSettings) -
 
 
 def test_it_is_batch_least_squares_on_a_line(rng: np.random.Generator, measure: Measure) -> None:
-    settings = FilterSettings(lasting=0, vibration_m=0.004, vibration_s=0.05, agitation_per_s=0)
+    settings = FilterSettings(long_term_excess=0, vibration_m=0.004, vibration_s=0.05, noise_scale_variance_per_s=0)
     sd_m = 0.01
     times = np.cumsum(rng.choice([0.03, 0.04, 0.11], 25))
     depths = 6 - 0.7 * times + 0.2 * np.sin(times) + rng.normal(size=25) * sd_m
@@ -171,8 +171,10 @@ def test_in_a_gap_accelerations_last(measure: Measure, covariance: Array) -> Non
         for index, time in enumerate(times)
     ]
     variances = []
-    for lasting in (0.0, 3.0):
-        middle = smooth(times, estimates, FilterSettings(lasting=lasting, agitation_per_s=0), 8)[14]
+    for long_term_excess in (0.0, 3.0):
+        middle = smooth(
+            times, estimates, FilterSettings(long_term_excess=long_term_excess, noise_scale_variance_per_s=0), 8
+        )[14]
         assert isinstance(middle, PoseEstimate) and middle.covariance is not None
         variances.append(middle.covariance[0, 0])
     # Over 0.36 s the density is 1 + 3 (1 - exp(-1.8)) = 3.5 times as large, over single periods 1.5 times; the fixes
