@@ -257,13 +257,13 @@ def _answers(
 ) -> Generator[PairAnswers | LatePair]:
     """Answers to all pairs, as fast as can be or as they come."""
     from nav.detector.detector_registry import DEFAULT_DETECTOR
-    from nav.realtime.pipeline import MonotonicClock, play
+    from nav.realtime.pipeline import MonotonicClock, replay
     from nav.runner import answers_of, open_navigator
 
     navigator = open_navigator(settings, DEFAULT_DETECTOR if options.detector is None else options.detector)
     if options.rate_hz is None:
         return answers_of(blind, navigator)
-    return play(blind, navigator, options.rate_hz, MonotonicClock())
+    return replay(blind, navigator, options.rate_hz, MonotonicClock())
 
 
 def _told(

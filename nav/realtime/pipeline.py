@@ -19,17 +19,20 @@ from time import monotonic
 from typing import Generic, Protocol, TypeVar
 
 from datasets_manifest.storage.blind import BlindPair
-from nav.realtime.warm_up import fit_once
+from nav.realtime.warm_up import warm_up_jit
 from nav.sequence_navigator import LatePair, PairAnswers, SequenceNavigator, SoughtPair
 
 Item = TypeVar("Item")
+# Capacity of the queue of answers; when it is full the stages block, and pairs become late.
+_WAITING_ANSWERS = 32
+_POLL_S = 0.1
 
 
-class NewestFirst(Generic[Item]):
-    """A place for one numbered thing; a newer one takes the place of what waits there, which then is late."""
+class LatestItemQueue(Generic[Item]):
+    """A queue of one numbered item; a newer item replaces one that still waits, which is then late."""
 
     def __init__(self) -> None:
-        """Empty and open."""
+        """Create an empty, open queue."""
         self._changed = Condition()
         self._late: list[int] = []
         self._late_after: list[int] = []
@@ -37,7 +40,7 @@ class NewestFirst(Generic[Item]):
         self._is_closed = False
 
     def put(self, number: int, item: Item) -> None:
-        """Bring the newest thing."""
+        """Put the newest item, in place of one that waits."""
         with self._changed:
             if self._waiting is not None:
                 self._late.append(self._waiting[0])
@@ -47,16 +50,16 @@ class NewestFirst(Generic[Item]):
             self._changed.notify_all()
 
     def skip(self, number: int) -> None:
-        """Name one, newer than all before, that is not brought: the next one came too early for it."""
+        """Report as late an item, newer than all before, that is never put."""
         with self._changed:
             (self._late if self._waiting is None else self._late_after).append(number)
 
     def take(self) -> tuple[tuple[int, ...], Item] | None:
-        """Wait for a thing.
+        """Wait for an item.
 
         Returns:
-            Numbers of those that are late and older than it, ascending and each told once, and the newest; None when
-            there will be no more.
+            The numbers of late items older than it, ascending and each reported once, and the newest item; None when
+            the queue is closed and empty.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._waiting is not None or self._is_closed)
@@ -67,35 +70,35 @@ class NewestFirst(Generic[Item]):
             return late, item
 
     def close(self) -> None:
-        """Nothing more is brought."""
+        """Accept no more items."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
 
 
-class Handover(Generic[Item]):
-    """A place for one thing; whoever brings the next one waits until it is free."""
+class SingleItemQueue(Generic[Item]):
+    """A queue of one item; the producer waits until it is empty before the work on the next item begins."""
 
     def __init__(self) -> None:
-        """Empty and open."""
+        """Create an empty, open queue."""
         self._changed = Condition()
         self._waiting: list[Item] = []
         self._is_closed = False
 
     def wait_free(self) -> bool:
-        """Wait until there is room; False when it is closed."""
+        """Wait until the queue is empty; False when it is closed."""
         with self._changed:
             self._changed.wait_for(lambda: not self._waiting or self._is_closed)
             return not self._is_closed
 
     def put(self, item: Item) -> None:
-        """Bring a thing, once the place is free."""
+        """Put an item, once the queue is empty."""
         with self._changed:
             self._waiting.append(item)
             self._changed.notify_all()
 
     def take(self) -> Item | None:
-        """Wait for a thing; None when there will be no more."""
+        """Wait for an item; None when the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_closed)
             item = self._waiting.pop() if self._waiting else None
@@ -103,31 +106,26 @@ class Handover(Generic[Item]):
             return item
 
     def close(self) -> None:
-        """Nothing more is brought."""
+        """Accept no more items."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
 
 
-# Answers that wait to be written; more hold up the stages, and pairs become late.
-_WAITING_ANSWERS = 32
-_LOOK_EVERY_S = 0.1
-
-
 class Clock(Protocol):
-    """Tells the time and waits; a test has its own."""
+    """A clock that can wait; tests have their own."""
 
     def now_s(self) -> float:
-        """Seconds from any beginning, never backwards. [s]"""
+        """Monotonic time since an arbitrary moment. [s]"""
         ...
 
     def wait_until(self, time_s: float, stop: threading.Event) -> None:
-        """Come back at a time, or earlier where `stop` is set."""
+        """Return at a time, or earlier when `stop` is set."""
         ...
 
 
 class MonotonicClock:
-    """The machine's clock that nobody sets."""
+    """The machine's monotonic clock."""
 
     def now_s(self) -> float:
         """See `Clock`."""
@@ -138,8 +136,8 @@ class MonotonicClock:
         stop.wait(max(0.0, time_s - monotonic()))
 
 
-class PairSource(Protocol):
-    """Pairs that can be read one by one, such as a `BlindDataset`."""
+class PairStream(Protocol):
+    """Stereo pairs that can be read one by one, such as a `BlindDataset`."""
 
     frame_indices: tuple[int, ...]
 
@@ -153,149 +151,153 @@ class PairSource(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class _Arrived:
-    """A pair, when it came, and how long it took to read it."""
+class _ArrivedPair:
+    """A pair, its arrival time, and how long reading it took."""
 
     pair: BlindPair
-    came_s: float
+    arrived_s: float
     read_s: float
 
 
 @dataclass(frozen=True, eq=False)
-class _Sought:
-    """A pair between the stages, and which ones before it are late."""
+class _MeasuredPair:
+    """A pair between measurement and pose estimation, and the frame indices of late pairs before it."""
 
     late: tuple[int, ...]
-    arrived: _Arrived
-    found: SoughtPair
-    taken_s: float
-    done_s: float
+    arrival: _ArrivedPair
+    pair: SoughtPair
+    started_s: float
+    finished_s: float
 
 
-def play(
-    source: PairSource, navigator: SequenceNavigator, rate_hz: float, clock: Clock
+def replay(
+    source: PairStream, navigator: SequenceNavigator, rate_hz: float, clock: Clock
 ) -> Generator[PairAnswers | LatePair]:
-    """Answers to all pairs of a source, which come one after the other at a rate.
+    """Replay stereo pairs at a rate, and yield the answers to all of them.
 
     Args:
         source: the pairs, in the order of their indices.
         navigator: before its first pair.
         rate_hz: of the pairs, from the first one on; gaps between sequences are left out. [Hz]
-        clock: tells when pairs come.
+        clock: for arrival times and waiting.
 
     Yields:
-        In the order of the pairs.
+        Answers in the order of the pairs.
 
     Raises:
         ValueError: a rate that is not positive, or a pair that cannot be read.
     """
     if not 0 < rate_hz < float("inf"):
         raise ValueError(f"rate_hz: must be positive and finite, got {rate_hz:g}")
-    fit_once()
-    return _Player(source, navigator, rate_hz, clock).answers()
+    warm_up_jit()
+    return _Replay(source, navigator, rate_hz, clock).answers()
 
 
-class _Player:
-    """The threads of one play."""
+class _Replay:
+    """Threads and queues of one replay."""
 
-    def __init__(self, source: PairSource, navigator: SequenceNavigator, rate_hz: float, clock: Clock) -> None:
+    def __init__(self, source: PairStream, navigator: SequenceNavigator, rate_hz: float, clock: Clock) -> None:
         self._source, self._navigator, self._rate_hz, self._clock = source, navigator, rate_hz, clock
         self._stop = threading.Event()
-        self._arrived: NewestFirst[_Arrived] = NewestFirst()
-        self._sought: Handover[_Sought] = Handover()
-        self._done: Queue[PairAnswers | LatePair | BaseException | None] = Queue(_WAITING_ANSWERS)
+        self._arrived_pairs: LatestItemQueue[_ArrivedPair] = LatestItemQueue()
+        self._measured_pairs: SingleItemQueue[_MeasuredPair] = SingleItemQueue()
+        self._answers: Queue[PairAnswers | LatePair | BaseException | None] = Queue(_WAITING_ANSWERS)
 
     def answers(self) -> Generator[PairAnswers | LatePair]:
-        """See `play`."""
-        apart = (self._seek, self._solve) if self._navigator.seeks_by_detector else (self._seek_and_solve,)
-        stages = (self._read, *apart)
-        threads = [threading.Thread(target=self._guarded, args=(stage,), name=stage.__name__) for stage in stages]
+        """See `replay`."""
+        workers = (
+            (self._measure_stage, self._estimate_stage)
+            if self._navigator.seeks_by_detector
+            else (self._combined_stage,)
+        )
+        stages = (self._read_stage, *workers)
+        threads = [threading.Thread(target=self._run_stage, args=(stage,), name=stage.__name__) for stage in stages]
         try:
             for thread in threads:
                 thread.start()
-            while (done := self._done.get()) is not None:
-                if isinstance(done, BaseException):
-                    raise done
-                yield done
+            while (answer := self._answers.get()) is not None:
+                if isinstance(answer, BaseException):
+                    raise answer
+                yield answer
         finally:
             self._stop.set()
-            self._arrived.close()
-            self._sought.close()
+            self._arrived_pairs.close()
+            self._measured_pairs.close()
             for thread in threads:
                 if thread.ident is not None:
                     thread.join()
 
-    def _guarded(self, stage: Callable[[], None]) -> None:
-        """A stage whose fault goes to whoever waits for answers."""
+    def _run_stage(self, stage: Callable[[], None]) -> None:
+        """Run a stage; its exception is passed to the caller's thread."""
         try:
             stage()
         except BaseException as error:
-            self._tell(error)
+            self._emit(error)
 
-    def _tell(self, done: PairAnswers | LatePair | BaseException | None) -> None:
+    def _emit(self, answer: PairAnswers | LatePair | BaseException | None) -> None:
         while not self._stop.is_set():
             with contextlib.suppress(Full):
-                self._done.put(done, timeout=_LOOK_EVERY_S)
+                self._answers.put(answer, timeout=_POLL_S)
                 return
 
-    def _read(self) -> None:
-        """Read each pair before it comes; after one that took too long, go on with the newest that is in time."""
-        indices, start_s, place = self._source.frame_indices, None, 0
-        while place < len(indices) and not self._stop.is_set():
-            began_s = self._clock.now_s()
-            pair = self._source.pair(indices[place])
-            read_s = self._clock.now_s() - began_s
+    def _read_stage(self) -> None:
+        """Read each pair before its arrival time; after a slow read, skip to the newest pair that is in time."""
+        indices, start_s, index = self._source.frame_indices, None, 0
+        while index < len(indices) and not self._stop.is_set():
+            read_start_s = self._clock.now_s()
+            pair = self._source.pair(indices[index])
+            read_s = self._clock.now_s() - read_start_s
             start_s = self._clock.now_s() if start_s is None else start_s
-            came_s = start_s + place / self._rate_hz
-            self._clock.wait_until(came_s, self._stop)
-            self._arrived.put(indices[place], _Arrived(pair, came_s, read_s))
-            next_place = max(place + 1, min(self._next_place(start_s, read_s), len(indices) - 1))
-            for late in indices[place + 1 : next_place]:
-                self._arrived.skip(late)
-            place = next_place
-        self._arrived.close()
+            arrived_s = start_s + index / self._rate_hz
+            self._clock.wait_until(arrived_s, self._stop)
+            self._arrived_pairs.put(indices[index], _ArrivedPair(pair, arrived_s, read_s))
+            next_index = max(index + 1, min(self._next_index(start_s, read_s), len(indices) - 1))
+            for late in indices[index + 1 : next_index]:
+                self._arrived_pairs.skip(late)
+            index = next_index
+        self._arrived_pairs.close()
 
-    def _next_place(self, start_s: float, read_s: float) -> int:
-        """Of the newest pair that has come, if it can be read before another one comes; else of that one."""
-        since = (self._clock.now_s() - start_s) * self._rate_hz
-        newest = int(since)
-        return newest if since + read_s * self._rate_hz <= newest + 1 else newest + 1
+    def _next_index(self, start_s: float, read_s: float) -> int:
+        """Index of the newest pair that has arrived if it can be read before the next arrival, else of the next one."""
+        elapsed_pairs = (self._clock.now_s() - start_s) * self._rate_hz
+        newest = int(elapsed_pairs)
+        return newest if elapsed_pairs + read_s * self._rate_hz <= newest + 1 else newest + 1
 
-    def _seek(self) -> None:
-        # A pair is taken when the next stage has room, so that none grows old between the stages.
-        while self._sought.wait_free() and (taken := self._arrived.take()) is not None:
-            self._sought.put(self._found(*taken))
-        self._sought.close()
+    def _measure_stage(self) -> None:
+        # A pair is taken only when the next stage is free, so that none ages between the stages.
+        while self._measured_pairs.wait_free() and (newest_pair := self._arrived_pairs.take()) is not None:
+            self._measured_pairs.put(self._measure(*newest_pair))
+        self._measured_pairs.close()
 
-    def _solve(self) -> None:
-        while not self._stop.is_set() and (sought := self._sought.take()) is not None:
-            self._report(sought)
-        self._tell(None)
+    def _estimate_stage(self) -> None:
+        while not self._stop.is_set() and (measured := self._measured_pairs.take()) is not None:
+            self._emit_with_late(measured)
+        self._emit(None)
 
-    def _seek_and_solve(self) -> None:
-        while not self._stop.is_set() and (taken := self._arrived.take()) is not None:
-            self._report(self._found(*taken))
-        self._tell(None)
+    def _combined_stage(self) -> None:
+        while not self._stop.is_set() and (newest_pair := self._arrived_pairs.take()) is not None:
+            self._emit_with_late(self._measure(*newest_pair))
+        self._emit(None)
 
-    def _found(self, late: tuple[int, ...], arrived: _Arrived) -> _Sought:
-        taken_s = self._clock.now_s()
-        found = self._navigator.seek(arrived.pair)
-        return _Sought(late, arrived, found, taken_s, self._clock.now_s())
+    def _measure(self, late: tuple[int, ...], arrival: _ArrivedPair) -> _MeasuredPair:
+        started_s = self._clock.now_s()
+        pair = self._navigator.seek(arrival.pair)
+        return _MeasuredPair(late, arrival, pair, started_s, finished_s=self._clock.now_s())
 
-    def _report(self, sought: _Sought) -> None:
-        for frame_index in sought.late:
-            self._tell(LatePair(frame_index))
-        self._tell(self._answered(sought))
+    def _emit_with_late(self, measured: _MeasuredPair) -> None:
+        for frame_index in measured.late:
+            self._emit(LatePair(frame_index))
+        self._emit(self._estimate(measured))
 
-    def _answered(self, sought: _Sought) -> PairAnswers:
-        arrived, solving_s = sought.arrived, self._clock.now_s()
-        answers = self._navigator.solve(sought.found)
+    def _estimate(self, measured: _MeasuredPair) -> PairAnswers:
+        arrival, taken_s = measured.arrival, self._clock.now_s()
+        answers = self._navigator.solve(measured.pair)
         around_s = {
-            "read": arrived.read_s,
-            "wait": sought.taken_s - arrived.came_s,
-            "handover": solving_s - sought.done_s,
+            "read": arrival.read_s,
+            "wait": measured.started_s - arrival.arrived_s,
+            "handover": taken_s - measured.finished_s,
         }
-        latency_s = self._clock.now_s() - arrived.came_s
+        latency_s = self._clock.now_s() - arrival.arrived_s
         estimates = tuple(
             estimate.model_copy(update={"latency_s": latency_s, "stage_s": around_s | estimate.stage_s})
             for estimate in answers.estimates

@@ -1,4 +1,4 @@
-"""What is compiled, or loaded, at the first fit of a process, done before anybody waits for an answer."""
+"""Compile the numba loops before the first pair arrives."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _DISTANCE_M = 5.0
 
 
 @cache
-def fit_once() -> None:
-    """Fit a drawn disc and a drawn annulus in each eye, and a pose.
+def warm_up_jit() -> None:
+    """Run the compiled loops once: fit a drawn disc and a drawn annulus in each eye, and a pose.
 
-    The loops take seconds to compile when they are first used on a machine, and tenths of a second to load
-    in every other process. In real time the pairs that come meanwhile would be late.
+    The loops take seconds to compile at their first use on a machine, and tenths of a second to load in every later
+    process. In real time, pairs that arrive meanwhile would be late.
     """
     _fit_edges()
     rig, layout = paper_rig(), marker_layout(PRESETS["red-8"])
@@ -50,7 +50,7 @@ def _fit_edges() -> None:
         MarkerSignal(light.astype(np.float32), light < 0, (0.0, 0.0), 1, True)
         for light in (_LIGHT_DN * (1 - outside), _LIGHT_DN * (1 - outside - hole))
     )
-    # Small markers' surroundings are drawn with the step by itself.
+    # The background of small markers is drawn by this function directly.
     blurred_step(disc.values)
     fits = fit_discs([disc, disc], outer)
     if fits.noise is not None:

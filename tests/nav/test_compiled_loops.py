@@ -168,7 +168,7 @@ def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile():
 from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
 from nav.numerics import least_squares_loops
-from nav.realtime.warm_up import fit_once
+from nav.realtime.warm_up import warm_up_jit
 from nav.navigator import Navigator
 from nav.pose import adjustment_loops
 from render.engine import load_engine
@@ -180,7 +180,7 @@ def compiled():
     return {(name, kind) for room in loops for name, loop in vars(room).items()
             for kind in map(str, getattr(loop, "signatures", ()))}
 
-fit_once()
+warm_up_jit()
 before = compiled()
 recipe = load_recipe("pose-tier-a").recipe
 for index in (1, 4):

@@ -11,7 +11,7 @@ from datasets_manifest.types.estimates import NoFix, PoseEstimate
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from nav.detector.color_blob import ColorBlobDetector
-from nav.realtime.pipeline import Handover, MonotonicClock, NewestFirst, play
+from nav.realtime.pipeline import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
 from nav.runner import LATE, open_navigator, with_smoothed
 from nav.sequence_navigator import LatePair, SequenceNavigator, SequenceSettings
 
@@ -92,7 +92,7 @@ def stepped(pairs, settings, read_s=None):
     clock = SteppedClock()
     answers = []
     navigator = open_navigator(settings, "color-blob")
-    for each in play(DatasetInMemory(pairs, clock, read_s), navigator, RATE_HZ, clock):
+    for each in replay(DatasetInMemory(pairs, clock, read_s), navigator, RATE_HZ, clock):
         answers.append(each)
         if not isinstance(each, LatePair):
             clock.answered()
@@ -164,7 +164,7 @@ def test_a_pair_that_waits_while_a_newer_one_comes_is_late(pairs):
 
     settings = SequenceSettings(("constant",), filtered=True, smoothed=True)
     navigator = SequenceNavigator(settings, lambda drogue: HeldDetector(drogue, came))
-    answers = list(play(Source(pairs[:5]), navigator, RATE_HZ, SteppedClock(in_turn=False)))
+    answers = list(replay(Source(pairs[:5]), navigator, RATE_HZ, SteppedClock(in_turn=False)))
     late = [each.frame_index for each in answers if isinstance(each, LatePair)]
     assert [each.frame_index for each in answers] == list(range(5))
     # Whichever the detector held: when it was done, all but the newest of the others had waited, or pair 3 was it.
@@ -183,7 +183,7 @@ def test_a_pair_that_cannot_be_read_ends_the_play_with_its_reason(pairs):
     source = DatasetInMemory(pairs, damaged={2})
     answers = []
     with pytest.raises(ValueError, match=r"frames/000002/left\.png: the PNG is truncated"):
-        for each in play(source, open_navigator(SequenceSettings(("constant",)), "color-blob"), RATE_HZ, clock):
+        for each in replay(source, open_navigator(SequenceSettings(("constant",)), "color-blob"), RATE_HZ, clock):
             answers.append(each)
             clock.answered()
     # The pair is read ahead, while the one before may still be worked on.
@@ -205,13 +205,13 @@ def test_a_fault_in_a_stage_ends_the_play_and_all_threads(pairs, tracker):
     settings = SequenceSettings(("constant",), tracker=tracker, redetect_every=1)
     navigator = SequenceNavigator(settings, FaultyDetector)
     with pytest.raises(RuntimeError, match="the run time of the network failed"):
-        list(play(DatasetInMemory(pairs), navigator, RATE_HZ, clock))
+        list(replay(DatasetInMemory(pairs), navigator, RATE_HZ, clock))
 
 
 def test_whoever_stops_listening_stops_the_threads(pairs):
     clock = MonotonicClock()
     # The second pair would come after an hour.
-    answers = play(
+    answers = replay(
         DatasetInMemory(pairs), open_navigator(SequenceSettings(("constant",)), "color-blob"), 1 / 3600, clock
     )
     assert next(answers).frame_index == 0
@@ -220,18 +220,18 @@ def test_whoever_stops_listening_stops_the_threads(pairs):
 
 def test_no_pairs_have_no_answers():
     navigator = open_navigator(SequenceSettings(("constant",)), "color-blob")
-    assert list(play(DatasetInMemory([]), navigator, RATE_HZ, SteppedClock())) == []
+    assert list(replay(DatasetInMemory([]), navigator, RATE_HZ, SteppedClock())) == []
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -25.0, float("inf"), float("nan")])
 def test_a_rate_that_is_none_is_refused(rate_hz):
     navigator = SequenceNavigator(SequenceSettings(("constant",)), lambda drogue: ColorBlobDetector(PRESETS["red-8"]))
     with pytest.raises(ValueError, match="rate_hz: must be positive and finite"):
-        play(DatasetInMemory([]), navigator, rate_hz, SteppedClock())
+        replay(DatasetInMemory([]), navigator, rate_hz, SteppedClock())
 
 
 def test_the_newest_thing_takes_the_place_of_older_ones():
-    place = NewestFirst()
+    place = LatestItemQueue()
     place.put(0, "thing 0")
     place.skip(1)
     assert place.take() == ((), "thing 0")
@@ -248,7 +248,7 @@ def test_the_newest_thing_takes_the_place_of_older_ones():
 
 
 def test_a_handover_gives_what_it_holds_before_it_says_that_there_is_no_more():
-    place = Handover()
+    place = SingleItemQueue()
     assert place.wait_free()
     place.put("last")
     place.close()
@@ -258,7 +258,7 @@ def test_a_handover_gives_what_it_holds_before_it_says_that_there_is_no_more():
 
 
 def test_whoever_brings_the_next_thing_waits_until_the_place_is_free():
-    place, brought = Handover(), []
+    place, brought = SingleItemQueue(), []
 
     def bring():
         for number in range(20):
