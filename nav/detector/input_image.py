@@ -86,30 +86,30 @@ def input_image(images: StereoImages, eye: Eye, input_size_px: tuple[int, int]) 
     return letterbox_image(_display_encoded(images.left if eye == "left" else images.right, images), input_size_px)
 
 
-def letterbox_image(picture: NDArray[np.uint8], input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
+def letterbox_image(image: NDArray[np.uint8], input_size_px: tuple[int, int]) -> tuple[NDArray[np.uint8], Letterbox]:
     """Resize and pad a display-encoded image (H, W, 3) or (H, W) to a network's input; see `input_image`."""
-    height, width = picture.shape[:2]
-    place = letterbox((width, height), input_size_px)
-    size = round(width * place.scale[0]), round(height * place.scale[1])
-    enlarges = place.scale[0] > 1
-    resized = cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if enlarges else cv2.INTER_AREA)
+    height, width = image.shape[:2]
+    placement = letterbox((width, height), input_size_px)
+    size = round(width * placement.scale[0]), round(height * placement.scale[1])
+    enlarges = placement.scale[0] > 1
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR if enlarges else cv2.INTER_AREA)
     if resized.ndim == 2:
         resized = cv2.cvtColor(resized, cv2.COLOR_GRAY2RGB)
     if size == input_size_px:
-        return np.asarray(resized), place
+        return np.asarray(resized), placement
     padded = np.full((input_size_px[1], input_size_px[0], 3), PADDING_DN, np.uint8)
-    left, top = place.offset_px
+    left, top = placement.offset_px
     padded[top : top + size[1], left : left + size[0]] = resized
-    return padded, place
+    return padded, placement
 
 
-def network_input(pictures: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+def network_input(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
     """(B, 3, H, W) from 0 to 1, of B images (H, W, 3)."""
-    height, width = pictures[0].shape[:2]
-    batch = np.empty((len(pictures), 3, height, width), np.float32)
-    for picture, planes in zip(pictures, batch, strict=True):
+    height, width = images[0].shape[:2]
+    batch = np.empty((len(images), 3, height, width), np.float32)
+    for image, planes in zip(images, batch, strict=True):
         # OpenCV takes half the time of a strided copy in numpy.
-        for channel, plane in enumerate(cv2.split(picture)):
+        for channel, plane in enumerate(cv2.split(image)):
             planes[channel] = plane
     batch *= np.float32(1 / 255)
     return batch

@@ -32,7 +32,7 @@ def half_size_px(input_size_px: tuple[int, int]) -> tuple[int, int]:
 
 
 def detect_multiscale(
-    pictures: Sequence[NDArray[np.uint8]],
+    images: Sequence[NDArray[np.uint8]],
     run: Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[Any]]],
     large_from_px: float,
     least_score: float,
@@ -41,26 +41,26 @@ def detect_multiscale(
     """Detect drogues in images of one size, with a second pass at half the size where it is asked for.
 
     Args:
-        pictures: (H, W, 3) each, from `nav.detector.input_image`.
+        images: (H, W, 3) each, from `nav.detector.input_image`.
         run: the network, from images of one size to output maps; see `nav.detector.output_maps`.
         large_from_px: see `merge_scales`; 0 for a single pass.
         least_score: boxes with a lower score are left out.
         most: largest number of boxes of an image.
     """
-    full = decode_maps(run(pictures), least_score)
+    full = decode_maps(run(images), least_score)
     if large_from_px == 0:
         return [(boxes[:most], scores[:most]) for boxes, scores in full]
-    height, width = pictures[0].shape[:2]
-    halves, places = zip(*(letterbox_image(each, half_size_px((width, height))) for each in pictures), strict=True)
-    half = map(to_full_size, decode_maps(run(halves), least_score), places)
+    height, width = images[0].shape[:2]
+    halves, placements = zip(*(letterbox_image(each, half_size_px((width, height))) for each in images), strict=True)
+    half = map(to_full_size, decode_maps(run(halves), least_score), placements)
     return [merge_scales(*both, large_from_px, most) for both in zip(full, half, strict=True)]
 
 
-def to_full_size(found: ScoredBoxes, place: Letterbox) -> ScoredBoxes:
+def to_full_size(found: ScoredBoxes, placement: Letterbox) -> ScoredBoxes:
     """Map boxes found in a reduced image to corner coordinates of the full-size one."""
     boxes, scores = found
     # From pixel-centre to corner coordinates.
-    return place.to_image(boxes) + np.array([0.5, 0.5, 0.0, 0.0]), scores
+    return placement.to_image(boxes) + np.array([0.5, 0.5, 0.0, 0.0]), scores
 
 
 def merge_scales(full: ScoredBoxes, half: ScoredBoxes, large_from_px: float, most: int) -> ScoredBoxes:

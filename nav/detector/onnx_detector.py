@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as faults
+from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
 from datasets_manifest.types.images import StereoImages
 from geometry.stereo import EYES, Eye
@@ -19,9 +19,9 @@ from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.multiscale_inference import ScoredBoxes, detect_multiscale, half_size_px
 from nav.detector.output_maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
 
-_FAULTS = (
-    faults.EPFail, faults.Fail, faults.InvalidArgument, faults.InvalidGraph, faults.InvalidProtobuf,
-    faults.NotImplemented, faults.RuntimeException, RuntimeError,
+_ORT_ERRORS = (
+    ort_errors.EPFail, ort_errors.Fail, ort_errors.InvalidArgument, ort_errors.InvalidGraph, ort_errors.InvalidProtobuf,
+    ort_errors.NotImplemented, ort_errors.RuntimeException, RuntimeError,
 )  # fmt: skip
 # Errors only: the exception reports a file that cannot be used.
 _LOG_ERRORS = 4
@@ -82,25 +82,29 @@ class OnnxDetector:
         return self._candidates(images, least_score, most=20)
 
     def _candidates(self, images: StereoImages, least_score: float, most: int) -> dict[Eye, tuple[Detection, ...]]:
-        pictures, places = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
-        answers: dict[Eye, tuple[Detection, ...]] = {}
-        for eye, place, (boxes, scores) in zip(EYES, places, self._found(pictures, least_score, most), strict=True):
-            answers[eye] = tuple(
+        inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
+        candidates: dict[Eye, tuple[Detection, ...]] = {}
+        for eye, placement, (boxes, scores) in zip(
+            EYES, placements, self._detect(inputs, least_score, most), strict=True
+        ):
+            candidates[eye] = tuple(
                 Detection((x, y, width, height), score)
-                for (x, y, width, height), score in zip(place.to_image(boxes).tolist(), scores.tolist(), strict=True)
+                for (x, y, width, height), score in zip(
+                    placement.to_image(boxes).tolist(), scores.tolist(), strict=True
+                )
             )
-        return answers
+        return candidates
 
-    def _found(self, pictures: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[ScoredBoxes]:
+    def _detect(self, inputs: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[ScoredBoxes]:
         """For each image the boxes in corner coordinates of the input, and their scores."""
         return detect_multiscale(
-            pictures, lambda some: self._run(network_input(some)), self.metadata.large_from_px, least_score, most
+            inputs, lambda batch: self._run(network_input(batch)), self.metadata.large_from_px, least_score, most
         )
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
         try:
             maps: list[NDArray[Any]] = self._session.run(None, {self._input_name: batch})
-        except _FAULTS as error:
+        except _ORT_ERRORS as error:
             raise ValueError(f"{self._file}: does not run on {batch.shape}: {_first_line(error)}") from error
         return maps
 
@@ -127,7 +131,7 @@ def _open_session(file: Path, threads: int) -> onnxruntime.InferenceSession:
     try:
         # From memory, so that a file cannot refer to other files.
         return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except _FAULTS as error:
+    except _ORT_ERRORS as error:
         raise ValueError(f"{file}: is truncated or not an ONNX network: {_first_line(error)}") from error
 
 

@@ -107,19 +107,19 @@ def open_image_cache(
         if should_stop():
             raise KeyboardInterrupt
 
-    place = folder / f"{dataset.manifest.dataset_sha256[:20]}-{size_text(size_px)}"
+    cache_folder = folder / f"{dataset.manifest.dataset_sha256[:20]}-{size_text(size_px)}"
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder, observer, should_stop):
-        cache = _read(place, dataset, size_px)
+        cache = _read(cache_folder, dataset, size_px)
         if cache is None:
-            shutil.rmtree(place, ignore_errors=True)
+            shutil.rmtree(cache_folder, ignore_errors=True)
             for leftover in folder.glob(f".*{PART_SUFFIX}"):
                 shutil.rmtree(leftover, ignore_errors=True)
-            with new_folder(place) as part:
+            with new_folder(cache_folder) as part:
                 _write(part, dataset, size_px, threads, advance)
-            cache = _read(place, dataset, size_px)
+            cache = _read(cache_folder, dataset, size_px)
     if cache is None:
-        raise ValueError(f"{place}: cannot be read again after it was written; is the disk sound?")
+        raise ValueError(f"{cache_folder}: cannot be read back after it was written; check the disk")
     return cache
 
 
@@ -138,11 +138,11 @@ def _locked(folder: Path, observer: TrainingObserver, should_stop: Callable[[], 
         yield
 
 
-def _read(place: Path, dataset: Dataset, size_px: SizePx) -> ImageCache | None:
+def _read(cache_folder: Path, dataset: Dataset, size_px: SizePx) -> ImageCache | None:
     """The cache; None where it is missing, truncated or of other contents."""
     try:
-        index = _Index.model_validate_json((place / _INDEX_FILE).read_bytes())
-        images = np.load(place / _IMAGES_FILE, mmap_mode="r", allow_pickle=False)
+        index = _Index.model_validate_json((cache_folder / _INDEX_FILE).read_bytes())
+        images = np.load(cache_folder / _IMAGES_FILE, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError):
         return None
     wanted = (_VERSION, dataset.manifest.dataset_sha256, size_px)
@@ -186,10 +186,10 @@ def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: Si
     record, stereo = dataset.record(frame_index), dataset.images(frame_index)
     images, boxes = [], []
     for eye in EYES:
-        image, place = input_image(stereo, eye, (size_px[1], size_px[0]))
+        image, placement = input_image(stereo, eye, (size_px[1], size_px[0]))
         images.append(image)
         box = getattr(record.views, eye).box_visible_xywh_px
-        boxes.append(None if box is None else tuple(place.to_input(box)[0].tolist()))
+        boxes.append(None if box is None else tuple(placement.to_input(box)[0].tolist()))
     return _ReadPair(images, CachedPair(frame_index=frame_index, split=split, boxes=(boxes[0], boxes[1])))
 
 

@@ -82,9 +82,9 @@ class ImageView:
 
 def whole_view(source_wh: tuple[int, int], canvas_wh: tuple[int, int]) -> ImageView:
     """The view without augmentation: the whole image, centred on the canvas."""
-    place = letterbox(source_wh, canvas_wh)
-    shift = np.array(place.offset_px, dtype=np.float64)
-    return ImageView(np.diag(place.scale), shift, CanvasWindow(0, 0, *canvas_wh), is_whole=True)
+    placement = letterbox(source_wh, canvas_wh)
+    shift = np.array(placement.offset_px, dtype=np.float64)
+    return ImageView(np.diag(placement.scale), shift, CanvasWindow(0, 0, *canvas_wh), is_whole=True)
 
 
 def sample_view(

@@ -36,15 +36,17 @@ class SingleViewDetector(OnnxDetector):
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes of each image after non-maximum suppression, the best first."""
-        answers: dict[Eye, tuple[Detection, ...]] = {}
+        candidates: dict[Eye, tuple[Detection, ...]] = {}
         for eye in EYES:
-            picture, place = input_image(images, eye, self.input_size_px)
-            ((boxes, scores),) = self._found([picture], least_score, most=20)
-            answers[eye] = tuple(
+            image, placement = input_image(images, eye, self.input_size_px)
+            ((boxes, scores),) = self._detect([image], least_score, most=20)
+            candidates[eye] = tuple(
                 Detection((x, y, width, height), score)
-                for (x, y, width, height), score in zip(place.to_image(boxes).tolist(), scores.tolist(), strict=True)
+                for (x, y, width, height), score in zip(
+                    placement.to_image(boxes).tolist(), scores.tolist(), strict=True
+                )
             )
-        return answers
+        return candidates
 
 
 ONE_VIEW = "one-view"

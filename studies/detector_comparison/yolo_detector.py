@@ -55,8 +55,8 @@ class YoloDetector:
         """
         self.name = file.stem
         self._session = open_session(file, threads)
-        (entry,), (answer,) = self._session.get_inputs(), self._session.get_outputs()
-        shape, rows = entry.shape, answer.shape
+        (entry,), (output,) = self._session.get_inputs(), self._session.get_outputs()
+        shape, rows = entry.shape, output.shape
         if len(shape) != 4 or shape[:2] != [len(EYES), 3] or len(rows) != 3:
             raise ValueError(f"{file}: must take two images and give rows of boxes, got {shape} and {rows}")
         self._input_name = entry.name
@@ -69,14 +69,16 @@ class YoloDetector:
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes of each image after non-maximum suppression, the best first."""
-        pictures, places = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
-        (answer,) = self._session.run(None, {self._input_name: network_input(pictures)})
+        inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
+        (output,) = self._session.run(None, {self._input_name: network_input(inputs)})
         found: dict[Eye, tuple[Detection, ...]] = {}
-        for eye, place, rows in zip(EYES, places, answer, strict=True):
+        for eye, placement, rows in zip(EYES, placements, output, strict=True):
             boxes, scores = decode_rows(rows, least_score)
             found[eye] = tuple(
                 Detection((x, y, width, height), score)
-                for (x, y, width, height), score in zip(place.to_image(boxes).tolist(), scores.tolist(), strict=True)
+                for (x, y, width, height), score in zip(
+                    placement.to_image(boxes).tolist(), scores.tolist(), strict=True
+                )
             )
         return found
 

@@ -151,11 +151,11 @@ def export_corpus(corpus: Path, out: Path, size_px: tuple[int, int]) -> Path:
         for index in source.frame_indices:
             record, images = source.record(index), source.images(index)
             for eye in EYES:
-                picture, place = input_image(images, eye, size_px)
+                image, placement = input_image(images, eye, size_px)
                 name = f"{splits[index]}/{index:06d}_{eye}"
-                (folder / "images" / f"{name}.png").write_bytes(encode_png(picture))
+                (folder / "images" / f"{name}.png").write_bytes(encode_png(image))
                 box = (record.views.left if eye == "left" else record.views.right).box_visible_xywh_px
-                row = "" if box is None else _row(box, place, size_px)
+                row = "" if box is None else _row(box, placement, size_px)
                 (folder / "labels" / f"{name}.txt").write_text(row, encoding="utf-8")
         lines = "".join(f"{split}: images/{split}\n" for split in SPLITS)
         (folder / "data.yaml").write_text(f'path: ""\n{lines}names:\n  0: drogue\n', encoding="utf-8")
@@ -171,9 +171,9 @@ def training_image_count(corpus: Path) -> int:
     return 2 * Dataset(corpus).manifest.counts.by_split.get("train", 0)
 
 
-def _row(box_px: PixelBox, place: Letterbox, size_px: tuple[int, int]) -> str:
+def _row(box_px: PixelBox, placement: Letterbox, size_px: tuple[int, int]) -> str:
     """Class, centre and size of an image's box, as fractions of the image's size."""
-    x, y, width, height = place.to_input(np.array([box_px]))[0].tolist()
+    x, y, width, height = placement.to_input(np.array([box_px]))[0].tolist()
     fractions = [(x + width / 2) / size_px[0], (y + height / 2) / size_px[1], width / size_px[0], height / size_px[1]]
     return f"0 {' '.join(map(repr, fractions))}\n"
 
