@@ -33,9 +33,11 @@ from nav.training.prefetch_map import prefetch_map
 from nav.training.training_progress import TrainingObserver
 from nav.training.training_settings import SizePx, size_text
 
+EyeIndex = int
+"""0 the left eye, 1 the right."""
 _VERSION = 1  # incremented with every change of a cache's contents
 _IMAGES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "index.json", ".lock"
-_ASK_AGAIN_S = 0.2
+_LOCK_POLL_S = 0.2
 
 
 class CachedPair(FrozenModel):
@@ -127,14 +129,14 @@ def open_image_cache(
 def _locked(folder: Path, observer: TrainingObserver, should_stop: Callable[[], bool]) -> Iterator[None]:
     """Hold the lock of a folder of caches; the kernel releases it when the process ends, however it ends."""
     with (folder / _LOCK_FILE).open("a") as lock:
-        said = False
+        is_reported = False
         while not takes_lock(lock):
-            if not said:
+            if not is_reported:
                 observer.say(f"{folder}: waiting for another training that caches images there")
-                said = True
+                is_reported = True
             if should_stop():
                 raise KeyboardInterrupt
-            time.sleep(_ASK_AGAIN_S)
+            time.sleep(_LOCK_POLL_S)
         yield
 
 
@@ -191,10 +193,6 @@ def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: Si
         box = getattr(record.views, eye).box_visible_xywh_px
         boxes.append(None if box is None else tuple(placement.to_input(box)[0].tolist()))
     return _ReadPair(images, CachedPair(frame_index=frame_index, split=split, boxes=(boxes[0], boxes[1])))
-
-
-EyeIndex = int
-"""0 the left eye, 1 the right."""
 
 
 @dataclass(frozen=True)
