@@ -65,7 +65,7 @@ def red_squares(tmp_path: Path) -> Callable[..., Path]:
 
 
 def make_network(config: NetworkConfig, seed: int = 0) -> DetectorNetwork:
-    """A network in use, with statistics and weights that let the images through to the answers."""
+    """A network in use, with statistics and weights that let the images influence the outputs."""
     generator = torch.Generator().manual_seed(seed)
     state = torch.random.get_rng_state()
     try:

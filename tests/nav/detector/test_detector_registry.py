@@ -36,12 +36,12 @@ def test_a_name_that_does_not_exist_lists_those_that_do(name):
         open_detector(name, DROGUE)
 
 
-def test_networks_have_a_file_that_others_may_look_at():
+def test_networks_have_a_file():
     assert network_file("color-blob") is None
     assert str(network_file("other/mine.onnx")) == "other/mine.onnx"
 
 
-def test_networks_of_the_package_are_known_by_name_and_only_where_they_are(red_squares, monkeypatch):
+def test_networks_of_the_package_are_known_by_name(red_squares, monkeypatch):
     file = red_squares(metadata=ModelMetadata(input_size_px=(320, 256)))
     assert network_file("squares") is None
     monkeypatch.setattr(registry, "_WEIGHTS", file.parent)
@@ -73,9 +73,9 @@ def test_color_blob_has_the_detection_as_its_only_candidate(draw, make_pose):
         assert detector.candidates(images, min(1.0, detection.score + 1e-6))[eye] == () or detection.score == 1
 
 
-def test_navigation_asks_the_detector_that_is_named(smoke_dataset, red_squares):
+def test_navigation_uses_the_detector_that_is_named(smoke_dataset, red_squares):
     dataset = BlindDataset(smoke_dataset)
-    # A network that wants more red than there is.
+    # A network whose threshold no score reaches.
     blind = str(red_squares(metadata=ModelMetadata(input_size_px=(640, 480), score_threshold=1.0)))
     estimates = list(navigate(dataset, ["joint"], detector=blind))
     assert estimates and all(isinstance(each, NoFix) and "no drogue detected" in each.reason for each in estimates)

@@ -1,4 +1,4 @@
-"""Boxes of a pass at full size and one at half: which pass answers for which drogue."""
+"""Boxes of a pass at full size and one at half: which pass finds which drogue."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def found(*rows):
 
 
 @pytest.mark.parametrize("side_px", [20.0, 127.0, 129.0, 160.0, 199.0, 201.0, 400.0])
-def test_every_size_is_answered_once_where_both_passes_find_it(side_px):
+def test_a_drogue_found_by_both_passes_has_one_box(side_px):
     boxes, scores = merge_scales(found((10, 10, side_px, 0.8)), found((11, 10, side_px, 0.7)), LARGE_PX, 20)
     assert len(boxes) == 1
-    # Well below the limit by the full size, well above by half of it, between by the better one.
+    # From the full size well below the limit, from half the size well above it, near it the better one.
     assert scores[0] == (0.7 if side_px > 1.25 * LARGE_PX else 0.8)
 
 
@@ -34,35 +34,35 @@ def test_near_the_limit_either_pass_is_enough(side_px):
     assert len(merge_scales(only, NONE, LARGE_PX, 20)[0]) == len(merge_scales(NONE, only, LARGE_PX, 20)[0]) == 1
 
 
-def test_parts_of_a_large_drogue_are_none_themselves():
+def test_parts_of_a_large_drogue_get_no_boxes():
     large, marker, aside = (100, 100, 300, 0.8), (150, 150, 40, 0.7), (500, 20, 40, 0.6)
     boxes, scores = merge_scales(found(marker, aside), found(large), LARGE_PX, 20)
     assert scores.tolist() == [0.8, 0.6] and boxes[1, 0] == 500
-    # A large box that is worse than what lies in it takes nothing away.
+    # A large box removes no better box within it.
     boxes, _ = merge_scales(found((150, 150, 40, 0.9)), found(large), LARGE_PX, 20)
     assert len(boxes) == 2
 
 
-def test_no_more_boxes_than_asked_for_and_none_of_nothing():
+def test_the_number_of_boxes_is_limited():
     many = found(*((50 * index, 0, 30, 0.9 - 0.1 * index) for index in range(6)))
     assert merge_scales(many, NONE, LARGE_PX, 2)[1].tolist() == pytest.approx([0.9, 0.8])
     assert len(merge_scales(NONE, NONE, LARGE_PX, 20)[0]) == 0
 
 
-def test_half_a_size_is_one_that_networks_take():
+def test_half_a_size_is_a_multiple_of_32():
     assert half_size_px((640, 480)) == (320, 256)
     assert half_size_px((64, 32)) == (32, 32)
 
 
 def test_boxes_come_back_from_half_the_size():
-    # 640 x 480 lies in the middle of 320 x 256, eight pixels of grey above and below it.
-    place = letterbox((640, 480), (320, 256))
-    boxes, _ = to_full_size((np.array([[10.0, 28.0, 50.0, 60.0]]), np.array([0.5])), place)
+    # 640 x 480 is centred in 320 x 256, with eight pixels of grey above and below.
+    placement = letterbox((640, 480), (320, 256))
+    boxes, _ = to_full_size((np.array([[10.0, 28.0, 50.0, 60.0]]), np.array([0.5])), placement)
     np.testing.assert_allclose(boxes, [[20.0, 40.0, 100.0, 120.0]], atol=1e-9)
 
 
 def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares):
-    # The network of these tests answers boxes of two cells, of 8 px and more, around red cells.
+    # The network of these tests predicts boxes of two cells, of 8 px or more, around red cells.
     image = np.full((256, 320, 3), 90, np.uint8)
     image[64:192, 64:192] = (255, 0, 0)
     images = StereoImages(image, image, time_s=0.0, exposure_s=1e-3, encoding="gamma")
@@ -72,7 +72,7 @@ def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares):
         detector = OnnxDetector(red_squares(metadata=metadata))
         assert len(detector.pass_sizes_px) == 1 + (large_from_px > 0)
         sides[large_from_px] = min(box.box_xywh_px[2] for box in detector.candidates(images, 0.6)["left"])
-    # At full size boxes of 16 px are too large to be answered from 12 px on.
+    # With a limit of 12 px, boxes of 16 px at full size are not taken from the full-size pass.
     assert sides[0.0] == pytest.approx(16) and sides[12.0] == pytest.approx(32)
 
 

@@ -25,13 +25,13 @@ IMAGE_PX = (640, 512)
 
 def red_squares_pair(times: int = 1) -> StereoImages:
     """Grey images with a red square of 16 `times` px each, that fills cells of 8 px after halving."""
-    pictures = []
+    images = []
     for eye in EYES:
         column, row = PLACES[eye]
-        picture = np.full((IMAGE_PX[1], IMAGE_PX[0], 3), 120, np.uint8)
-        picture[16 * row : 16 * (row + times), 16 * column : 16 * (column + times)] = (255, 0, 0)
-        pictures.append(picture)
-    return StereoImages(pictures[0], pictures[1], 0.0, 0.0, encoding="gamma")
+        image = np.full((IMAGE_PX[1], IMAGE_PX[0], 3), 120, np.uint8)
+        image[16 * row : 16 * (row + times), 16 * column : 16 * (column + times)] = (255, 0, 0)
+        images.append(image)
+    return StereoImages(images[0], images[1], 0.0, 0.0, encoding="gamma")
 
 
 def one_line(error: pytest.ExceptionInfo[ValueError], file: Path) -> None:
@@ -39,7 +39,7 @@ def one_line(error: pytest.ExceptionInfo[ValueError], file: Path) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_finds_what_a_hand_made_network_answers(red_squares):
+def test_finds_the_boxes_of_a_hand_made_network(red_squares):
     detector = OnnxDetector(red_squares(metadata=METADATA))
     found = detector.detect(red_squares_pair())
     for eye in EYES:
@@ -53,7 +53,7 @@ def test_finds_what_a_hand_made_network_answers(red_squares):
         assert detection.score == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
 
 
-def test_candidates_are_ordered_and_as_good_as_asked(red_squares):
+def test_candidates_are_sorted_and_above_the_least_score(red_squares):
     detector = OnnxDetector(red_squares(metadata=METADATA))
     found = detector.candidates(red_squares_pair(times=3), least_score=0.2)
     for eye in EYES:
@@ -71,7 +71,7 @@ def test_no_drogue_is_none_and_not_an_error(red_squares):
     assert detector.candidates(pair, 0.5) == {"left": (), "right": ()}
 
 
-def test_one_eye_may_be_blind(red_squares):
+def test_one_eye_may_see_no_drogue(red_squares):
     pair = red_squares_pair()
     pair = replace(pair, right=np.full_like(pair.right, 120))
     found = OnnxDetector(red_squares(metadata=METADATA)).detect(pair)
@@ -85,7 +85,7 @@ def test_the_threshold_is_that_of_the_file(red_squares):
         assert (detector.detect(red_squares_pair()).left is not None) == sees
 
 
-def test_input_size_is_the_files_or_as_asked(red_squares):
+def test_input_size_is_that_of_the_file_or_the_given_one(red_squares):
     file = red_squares(metadata=METADATA)
     assert OnnxDetector(file).input_size_px == (320, 256)
     larger = OnnxDetector(file, input_size_px=(640, 512))
@@ -202,7 +202,7 @@ def test_threads_must_be_positive(red_squares):
     [NetworkConfig("l"), NetworkConfig("s", "se", "concat")],
     ids=lambda config: "-".join(config.to_dict().values()),
 )
-def test_exported_network_answers_as_torch_does(network, tmp_path, config):
+def test_exported_network_has_the_outputs_of_torch(network, tmp_path, config):
     trained, file = network(config), tmp_path / "net" / "network.onnx"
     metadata = replace(METADATA, network=config.to_dict(), manifest_sha256="ab" * 32, training={"passes": 7})
     before = {name: value.clone() for name, value in trained.state_dict().items()}
@@ -218,9 +218,9 @@ def test_exported_network_answers_as_torch_does(network, tmp_path, config):
         images = np.random.default_rng(5).random(shape, dtype=np.float32)
         with torch.no_grad():
             expected = [each.numpy() for each in trained(torch.from_numpy(images))]
-        for answer, reference in zip(session.run(list(OUTPUT_NAMES), {INPUT_NAME: images}), expected, strict=True):
+        for output, reference in zip(session.run(list(OUTPUT_NAMES), {INPUT_NAME: images}), expected, strict=True):
             # Some 60 float32 layers summed in another order, with normalisation folded into the weights.
-            np.testing.assert_allclose(answer, reference, atol=2e-4 * max(1.0, float(np.abs(reference).max())))
+            np.testing.assert_allclose(output, reference, atol=2e-4 * max(1.0, float(np.abs(reference).max())))
 
 
 def test_an_export_that_fails_leaves_nothing_behind(network, tmp_path):

@@ -17,7 +17,7 @@ def random_maps(seed: int, images: int = 2) -> list[np.ndarray]:
     ]
 
 
-def overlap(a: list[float], b: list[float]) -> float:
+def iou(a: list[float], b: list[float]) -> float:
     width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
     height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
     shared = max(width, 0.0) * max(height, 0.0)
@@ -38,7 +38,7 @@ def decode_slowly(maps: list[np.ndarray], image: int, least_score: float, most: 
                     boxes.append((score, [u - left, v - top, left + right, top + bottom]))
     kept: list[tuple[float, list[float]]] = []
     for score, box in sorted(boxes, reverse=True):
-        if len(kept) < most and all(overlap(box, other) <= 0.5 for _, other in kept):
+        if len(kept) < most and all(iou(box, other) <= 0.5 for _, other in kept):
             kept.append((score, box))
     return kept
 
@@ -55,14 +55,14 @@ def test_agrees_with_a_slow_reference(seed, least_score, most):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_answers_are_ordered_apart_and_good_enough(seed):
+def test_boxes_are_sorted_apart_and_above_the_least_score(seed):
     for boxes, scores in decode_maps(random_maps(seed), 0.2):
         assert len(boxes) <= 20
         assert (np.diff(scores) <= 0).all()
         assert (scores >= 0.2).all() and (scores <= 1).all()
         assert (boxes[:, 2:] > 0).all()
         for index, box in enumerate(boxes):
-            assert all(overlap(list(box), list(other)) <= 0.5 for other in boxes[:index])
+            assert all(iou(list(box), list(other)) <= 0.5 for other in boxes[:index])
 
 
 def test_nothing_scores_enough():
@@ -71,7 +71,7 @@ def test_nothing_scores_enough():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
-def test_numbers_that_are_none_never_become_boxes(value):
+def test_values_that_are_not_finite_never_become_boxes(value):
     maps = random_maps(1)
     for each in maps:
         each[:, :, ::2] = value

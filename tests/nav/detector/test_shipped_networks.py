@@ -15,7 +15,7 @@ from nav.detector.detector_registry import COLOR_BLOB, DEFAULT_DETECTOR, detecto
 from nav.detector.onnx_detector import OnnxDetector
 
 NETWORKS = [name for name in detector_names() if name != COLOR_BLOB]
-CARD = Path(__file__).parents[3] / "docs/reference/detectors.md"
+PAGE = Path(__file__).parents[3] / "docs/reference/detectors.md"
 
 
 def shipped(name: str) -> OnnxDetector:
@@ -37,9 +37,9 @@ def test_a_network_says_where_it_comes_from(name):
     corpora = metadata.training["datasets"]
     assert corpora[0]["name"] == "detector-train"
     assert metadata.manifest_sha256 == (corpora[0]["manifest_sha256"] if len(corpora) == 1 else "")
-    # Who reads the card finds the corpora.
-    card = CARD.read_text(encoding="utf-8")
-    assert all(corpus["name"] in card and corpus["dataset_sha256"] in card for corpus in corpora)
+    # The page about the detectors names the corpora.
+    page = PAGE.read_text(encoding="utf-8")
+    assert all(corpus["name"] in page and corpus["dataset_sha256"] in page for corpus in corpora)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -52,8 +52,8 @@ def test_no_test_scene_is_one_that_was_learned(name):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_network_finds_all_drogues_of_rendered_pairs(name, smoke_dataset, tmp_path):
     scores = tmp_path / "scores.json"
-    told = ["--detector", name, "--split", "all", "--json", str(scores)]
-    assert run(["benchmark", str(smoke_dataset), *told]) == DONE
+    options = ["--detector", name, "--split", "all", "--json", str(scores)]
+    assert run(["benchmark", str(smoke_dataset), *options]) == DONE
     (result,) = json.loads(scores.read_text())["detectors"].values()
     assert result["overall"]["boxes"] >= 8
     assert result["overall"]["recall"] == 1 and result["overall"]["precision"] == 1

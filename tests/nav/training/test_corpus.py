@@ -29,7 +29,7 @@ def first_frame(dataset: Path) -> Path:
     return min((dataset / "frames").iterdir())
 
 
-def test_cached_images_are_what_the_detector_sees_and_boxes_are_cocos(split_dataset: Path, tmp_path: Path) -> None:
+def test_cached_images_are_the_detectors_input_and_boxes_are_those_of_coco(split_dataset: Path, tmp_path: Path) -> None:
     corpus, dataset = open_small([split_dataset], tmp_path), Dataset(split_dataset)
     coco = json.loads((split_dataset / "annotations" / "all.json").read_text())
     of_image = {entry["image_id"]: entry["bbox"] for entry in coco["annotations"]}
@@ -73,7 +73,7 @@ def test_a_full_disk_leaves_no_cache(split_dataset: Path, tmp_path: Path) -> Non
     assert [each.name for each in tmp_path.iterdir()] == [".lock"]
 
 
-def test_waiting_for_anothers_cache_is_told_once_and_can_be_stopped(split_dataset: Path, tmp_path: Path) -> None:
+def test_waiting_for_another_cache_is_reported_once_and_can_be_stopped(split_dataset: Path, tmp_path: Path) -> None:
     told, asked = io.StringIO(), []
 
     def stops_at_the_third_time() -> bool:
@@ -120,7 +120,9 @@ def test_damage_is_named_before_training(
     assert str(place) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_datasets_that_cannot_teach(split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path) -> None:
+def test_datasets_without_anything_to_learn_from_are_refused(
+    split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path
+) -> None:
     rig = '{preset = "rgb-ideal", width_px = 160, height_px = 120, focal_px = 150.0}'
     two = "{count = 2, scenes = 1}"
     other = render_toy(tmp_path / "other", frames=two, rig=rig)
@@ -138,7 +140,7 @@ def test_datasets_that_cannot_teach(split_dataset: Path, render_toy: Callable[..
         open_small([], tmp_path / "cache")
 
 
-def test_several_datasets_stand_one_after_another(
+def test_several_datasets_form_one_sequence_of_pairs(
     split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path
 ) -> None:
     # Another rig, whose images have the same size.

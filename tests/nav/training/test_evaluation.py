@@ -26,7 +26,7 @@ def test_average_precision_of_cases_that_are_worked_by_hand() -> None:
     assert half is not None and half.ap50 == pytest.approx(51 / 101) and half.recall50 == 0.5
     alarm = average_precision([BOX, empty], [found(0.5), found(0.9)])
     assert alarm is not None and alarm.ap50 == pytest.approx(0.5)  # every level at a precision of 1 in 2
-    # Shifted by 4 of 20 px the overlap is 16 / 24 = 0.67: right at 0.5, 0.55, 0.6 and 0.65.
+    # Shifted by 4 of 20 px the IoU is 16 / 24 = 0.67: right at 0.5, 0.55, 0.6 and 0.65.
     shifted = average_precision([BOX], [found(0.9, 4.0)])
     assert shifted is not None and (shifted.ap50, shifted.ap75, shifted.ap) == pytest.approx((1.0, 0.0, 0.4))
     nothing = average_precision([BOX], [NONE])
@@ -34,28 +34,28 @@ def test_average_precision_of_cases_that_are_worked_by_hand() -> None:
     assert average_precision([empty], [found(0.9)]) is None
 
 
-def test_the_threshold_parts_right_answers_from_wrong_ones() -> None:
+def test_the_threshold_separates_right_boxes_from_wrong_ones() -> None:
     empty = np.zeros((0, 4))
     truth = [BOX, BOX, empty, empty]
     assert best_threshold(truth, [found(0.9), found(0.7), found(0.5), NONE], 0.1) == pytest.approx(0.6)
-    # An answer beside the drogue is wrong.
+    # A box beside the drogue is wrong.
     assert best_threshold(truth, [found(0.9), found(0.7, 15.0), NONE, NONE], 0.1) == pytest.approx(0.8)
     assert best_threshold(truth, [NONE] * 4, 0.1) == 0.1
 
 
-def test_the_threshold_lies_in_the_middle_of_those_that_chance_does_not_tell_apart() -> None:
+def test_the_threshold_is_the_middle_of_those_that_differ_by_chance() -> None:
     empty = np.zeros((0, 4))
-    # Nine drogues are found, then wrong and right answers come in turns, and one drogue is missed. From the eighth
-    # answer on, four or five of all are wrong or missing.
+    # Nine drogues are found, then wrong and right boxes alternate, and one drogue is missed. From the eighth box on,
+    # four or five of all are wrong or missing.
     right = [0.99 - 0.01 * k for k in range(9)]
     mixed = [(0.8, False), (0.7, True), (0.6, False), (0.5, True), (0.4, False), (0.3, True), (0.2, False)]
     truth = [BOX] * 9 + [BOX if is_right else empty for _, is_right in mixed] + [BOX]
-    answers = [found(score) for score in right] + [found(score) for score, _ in mixed] + [NONE]
+    predictions = [found(score) for score in right] + [found(score) for score, _ in mixed] + [NONE]
     # As many images without a drogue as with one, thirteen each.
-    even = truth + [empty] * 9, answers + [NONE] * 9
+    even = truth + [empty] * 9, predictions + [NONE] * 9
     assert best_threshold(*even, 0.1) == pytest.approx(right[7] / 2)
-    # With four, each answer in one of them counts for 13 / 4: those from the first on are worse than but for chance.
-    assert best_threshold(truth, answers, 0.1) == pytest.approx((right[7] + 0.8) / 2)
+    # With four, a box in one of them has the weight 13 / 4: lower thresholds are worse by more than chance.
+    assert best_threshold(truth, predictions, 0.1) == pytest.approx((right[7] + 0.8) / 2)
 
 
 def test_batch_statistics_are_those_of_one_pass_over_all_images(ellipse_corpus: Corpus) -> None:

@@ -50,7 +50,7 @@ def center_of(canvas: np.ndarray, box: np.ndarray) -> np.ndarray:
     return np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
 
 
-def test_boxes_go_where_the_pixels_go() -> None:
+def test_boxes_move_with_the_pixels() -> None:
     window, compared = CanvasWindow(20, 10, 200, 170), 0
     for seed in range(30):
         view = sample_view(np.random.default_rng(seed), SOURCE_WH, BOX, window, ViewRanges((0.4, 1.6), 8, 0.5))
@@ -99,7 +99,7 @@ def test_the_rest_of_the_canvas_stays() -> None:
     np.testing.assert_array_equal(canvas[inside], ellipse_image()[20:70, 30:70].reshape(-1, 3))
 
 
-def test_a_drogue_of_which_too_little_shows_leaves_no_trace() -> None:
+def test_a_drogue_of_which_too_little_is_visible_is_painted_over() -> None:
     window = CanvasWindow(0, 0, 120, 120)
     cut = ImageView(np.eye(2), np.array([120 - 60 - 0.2 * 50, 0.0]), window)
     canvas = np.zeros((120, 120, 3), np.uint8)
@@ -108,7 +108,7 @@ def test_a_drogue_of_which_too_little_shows_leaves_no_trace() -> None:
     assert not (canvas > PADDING_DN).any()
 
 
-def test_a_drogue_at_the_edge_keeps_what_shows() -> None:
+def test_a_drogue_at_the_edge_keeps_its_visible_part() -> None:
     window = CanvasWindow(0, 0, 120, 120)
     share = LEAST_VISIBLE_FRACTION + 0.1
     cut = ImageView(np.eye(2), np.array([120 - 60 - share * 50, 0.0]), window)
@@ -129,7 +129,7 @@ def test_turning_an_ellipse_against_its_outline(flip: float) -> None:
     np.testing.assert_allclose(transform_boxes(BOX, view)[0], expected, atol=1e-6)
 
 
-def test_the_whole_view_is_what_the_detector_sees() -> None:
+def test_the_whole_view_is_the_detectors_input() -> None:
     picture = np.zeros((240, 320, 3), np.uint8)
     stereo = StereoImages(picture, picture, 0.0, 1e-3, encoding="gamma")
     at_once, place = input_image(stereo, "left", (128, 96))
@@ -141,7 +141,7 @@ def test_the_whole_view_is_what_the_detector_sees() -> None:
     np.testing.assert_array_equal(canvas, at_once)
 
 
-def test_validation_sees_what_the_network_is_given_in_use() -> None:
+def test_validation_uses_the_detectors_input() -> None:
     picture = np.random.default_rng(2).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     stereo = StereoImages(picture, picture, 0.0, 1e-3, encoding="gamma")
     in_use, place = input_image(stereo, "left", (416, 320))

@@ -16,7 +16,7 @@ def white_ellipse() -> np.ndarray:
     return np.repeat(np.where(inside, 255, 0).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def test_occluded_boxes_go_around_what_is_left() -> None:
+def test_occluded_boxes_bound_the_visible_part() -> None:
     changed = 0
     for seed in range(400):
         image = white_ellipse()
@@ -106,7 +106,7 @@ def test_a_painted_ring_is_lit_from_one_side() -> None:
     np.testing.assert_allclose(image[..., 1], image[..., 0] / 2, atol=1)
 
 
-def test_rings_that_the_edge_cuts_are_painted_as_far_as_they_reach() -> None:
+def test_rings_are_clipped_at_the_edge() -> None:
     whole, cut = np.zeros((200, 200, 3), np.uint8), np.zeros((100, 100, 3), np.uint8)
     for image in (whole, cut):
         lamp = np.array([0.0, 0.0, 1.0])
@@ -116,7 +116,7 @@ def test_rings_that_the_edge_cuts_are_painted_as_far_as_they_reach() -> None:
     np.testing.assert_array_equal(cut, whole[:100, :100])
 
 
-def test_light_varies_and_the_image_given_stays() -> None:
+def test_color_jitter_varies_and_does_not_change_its_input() -> None:
     image = np.full((32, 48, 3), 128, np.uint8)
     varied = [color_jitter(np.random.default_rng(seed), image) for seed in range(200)]
     assert (image == 128).all()

@@ -35,7 +35,7 @@ def worn_network(config: NetworkConfig) -> DetectorNetwork:
     """A network whose normalisation and last layers are as different between channels as after a training."""
     torch.manual_seed(2)
     network = DetectorNetwork(config)
-    # A channel that answers nothing must not become one that divides by zero.
+    # A channel whose output is zero must not lead to a division by zero.
     dead = next(module for module in network.modules() if isinstance(module, nn.Conv2d))
     with torch.no_grad():
         dead.weight[3] = 0
@@ -60,7 +60,9 @@ def exported(network: DetectorNetwork, path: Path) -> bytes:
 
 
 @pytest.mark.parametrize("config", NETWORKS, ids=str)
-def test_an_exported_network_comes_back_and_can_be_normalised_anew(config: NetworkConfig, tmp_path: Path) -> None:
+def test_an_imported_network_keeps_its_outputs_when_batch_norm_is_recalibrated(
+    config: NetworkConfig, tmp_path: Path
+) -> None:
     network, images = worn_network(config), some_images(9)
     back = import_onnx(exported(network, tmp_path / "detector.onnx"))
     assert back.config == config
@@ -111,7 +113,7 @@ SMALL = {
 
 def test_a_training_starts_from_a_shipped_network(split_dataset: Path, tmp_path: Path) -> None:
     start, told = read_starting_weights("mobile-s"), io.StringIO()
-    # A rate at which nothing is learned leaves what the shipped network answers, but for statistics of this corpus.
+    # At a negligible learning rate the outputs are those of the shipped network, but for the statistics of this corpus.
     settings = build_settings(None, {**SMALL, "learning_rate": 1e-12})
     result = train([split_dataset], tmp_path / "out", settings, PlainProgress(told), start=start)
     learned = import_onnx(result.file.read_bytes())
@@ -133,7 +135,7 @@ def test_a_training_starts_from_a_shipped_network(split_dataset: Path, tmp_path:
         check_training(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
 
 
-def test_settings_go_before_the_network_of_the_weights(tmp_path: Path) -> None:
+def test_settings_precede_the_network_of_the_weights(tmp_path: Path) -> None:
     file, shipped = tmp_path / "mine.toml", {"variant": "s", "attention": "se", "fusion": "concat"}
     file.write_text('attention = "eca"\n')
     settings = build_settings(file, {"fusion": "asff"}, shipped)
@@ -209,7 +211,7 @@ def test_weights_to_start_from_that_cannot_be_used(name: str, content: Any, mess
     assert str(caught.value) == f"{path}: {message}; {_ADVICE}"
 
 
-def test_a_folder_is_no_file_of_weights(tmp_path: Path) -> None:
+def test_a_folder_is_not_a_file_of_weights(tmp_path: Path) -> None:
     (tmp_path / "mine.onnx").mkdir()
     with pytest.raises(ValueError, match=r"mine\.onnx: cannot be read: Is a directory"):
         read_starting_weights(str(tmp_path / "mine.onnx"))

@@ -80,7 +80,7 @@ if __name__ == "__main__":
 """
 
 
-def test_a_killed_training_goes_on_with_the_same_curve(split_dataset: Path, tmp_path: Path) -> None:
+def test_a_killed_training_resumes_with_the_same_losses(split_dataset: Path, tmp_path: Path) -> None:
     settings = build_settings(None, {**SMALL, "image_passes": 24})
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     run(split_dataset, whole, image_passes=24)
@@ -132,7 +132,7 @@ class Calls:
         return self.left <= 0
 
 
-def test_what_a_training_leaves(split_dataset: Path, tmp_path: Path) -> None:
+def test_the_files_of_a_training(split_dataset: Path, tmp_path: Path) -> None:
     changes = {"image_passes": 16, "views": "one", "attention": "se", "fusion": "concat", "licence": "CC-BY-4.0"}
     result, told = run(split_dataset, tmp_path, **changes)
     assert result.validation is not None and result.test is not None
@@ -186,7 +186,7 @@ def test_several_datasets_have_no_hash_of_one(
     assert len({each["manifest_sha256"] for each in stated.training["datasets"]}) == 2
 
 
-def test_what_stops_a_training_is_seen_before_there_is_data(split_dataset: Path, tmp_path: Path) -> None:
+def test_errors_of_a_training_are_found_before_there_is_data(split_dataset: Path, tmp_path: Path) -> None:
     settings = build_settings(None, {**SMALL, "image_passes": 4})
     check_training(tmp_path / "none", settings)
     assert not (tmp_path / "none").exists()
@@ -227,7 +227,7 @@ def test_a_training_starts_from_the_weights_of_another(split_dataset: Path, tmp_
         check_training(tmp_path / "third", settings.model_copy(update={"variant": "l"}), start)
 
 
-def test_a_device_that_is_not_there_is_refused(split_dataset: Path, tmp_path: Path) -> None:
+def test_a_device_that_is_not_available_is_refused(split_dataset: Path, tmp_path: Path) -> None:
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
     with pytest.raises(ValueError, match="device: torch finds no CUDA device"):
@@ -246,7 +246,7 @@ TOY = {"image_passes": 1400, "warmup_passes": 160, "learning_rate": 0.005, "mosa
 
 
 @pytest.mark.slow
-def test_forty_pairs_are_learned_by_heart(toy_dataset: Path, tmp_path: Path) -> None:
+def test_forty_pairs_are_memorised(toy_dataset: Path, tmp_path: Path) -> None:
     settings = build_settings(None, {**SMALL, **TOY})
     train([toy_dataset], tmp_path, settings, PlainProgress(io.StringIO()))
     corpus = open_corpus([toy_dataset], tmp_path / "cache", settings.size_px, 1, PlainProgress(io.StringIO()))
@@ -254,6 +254,8 @@ def test_forty_pairs_are_learned_by_heart(toy_dataset: Path, tmp_path: Path) -> 
     state = new_state(new_network(settings), settings, compute)
     restore_state(tmp_path, state, settings, corpus.datasets)
     with limit_threads(1):
-        answers = predict(state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, compute)
-    reached = average_precision(answers.truth, answers.found)
+        predictions = predict(
+            state.average.network, corpus, "train", settings.size_px, 8, settings.large_from_px, compute
+        )
+    reached = average_precision(predictions.truth, predictions.found)
     assert reached is not None and reached.ap50 >= 0.95

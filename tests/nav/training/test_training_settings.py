@@ -29,7 +29,7 @@ def test_wrong_settings_are_one_line(changes: dict[str, object], message: str) -
     assert "\n" not in str(caught.value)
 
 
-def test_settings_come_from_a_file_and_changes_go_before_it(tmp_path: Path) -> None:
+def test_settings_come_from_a_file_and_changes_precede_it(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     file.write_text('variant = "s"\nlearning_rate = 0.002\nsize_px = [320, 416]\n')
     settings = build_settings(file, {"learning_rate": 0.004})

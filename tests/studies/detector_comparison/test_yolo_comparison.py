@@ -83,7 +83,7 @@ def order(corpus: Path, folder: Path, **changes: object) -> ComparisonOptions:
 
 
 @pytest.mark.parametrize("size_px", [(160, 96), (320, 256)])
-def test_the_corpus_of_the_peers_has_one_class_and_what_our_networks_see(
+def test_the_exported_corpus_has_one_class_and_our_networks_input(
     screen_dataset: Path, tmp_path: Path, size_px: tuple[int, int]
 ) -> None:
     data = export_corpus(screen_dataset, tmp_path / "corpus", size_px)
@@ -117,7 +117,7 @@ def test_the_corpus_of_the_peers_has_one_class_and_what_our_networks_see(
     assert label.read_text() == ""
 
 
-def test_a_corpus_that_would_be_scored_on_what_was_trained_on_is_refused(smoke_dataset: Path, tmp_path: Path) -> None:
+def test_a_corpus_that_lacks_a_split_is_refused(smoke_dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="needs pairs in the splits train, val, test, got"):
         compare_peers(order(smoke_dataset, tmp_path), tmp_path / "out", print)
     assert list(tmp_path.iterdir()) == []
@@ -134,7 +134,7 @@ def test_a_corpus_without_a_test_split_is_scored_on_another_dataset(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_scenes_that_were_trained_on_are_not_scored(screen_dataset: Path, tmp_path: Path) -> None:
+def test_a_test_dataset_of_training_scenes_is_refused(screen_dataset: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     shutil.copytree(screen_dataset, again)
     with pytest.raises(ValueError, match=r"again: has scenes of .*, for both have the seed 8; render one with"):
@@ -142,7 +142,7 @@ def test_scenes_that_were_trained_on_are_not_scored(screen_dataset: Path, tmp_pa
     assert list(tmp_path.iterdir()) == [again]
 
 
-def test_a_folder_in_which_another_comparison_is_at_work_is_refused(screen_dataset: Path, tmp_path: Path) -> None:
+def test_a_folder_in_which_another_comparison_runs_is_refused(screen_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     with (out / ".lock").open("a") as lock:
@@ -174,7 +174,7 @@ def test_a_training_without_images_is_refused() -> None:
         training_length(100, 0)
 
 
-def test_a_fault_of_the_peers_names_the_log_and_what_was_said_last(tmp_path: Path) -> None:
+def test_an_error_of_ultralytics_names_the_log_and_its_last_line(tmp_path: Path) -> None:
     # Our own interpreter has no ultralytics.
     with pytest.raises(OSError, match=r"export\.log: ultralytics ended with status 1: ModuleNotFoundError"):
         run_script(Path(sys.executable), {"do": "export"}, tmp_path / "new" / "export.log", {})
@@ -206,7 +206,7 @@ def test_a_folder_of_another_comparison_is_refused(screen_dataset: Path, tmp_pat
 @pytest.mark.parametrize(
     ("name", "message"), [("ours.onnx", "cannot be read"), ("yolov8s.onnx", "another detector is named 'yolov8s'")]
 )
-def test_what_is_wrong_with_ours_is_said_before_anything_is_trained(
+def test_errors_of_our_detectors_are_found_before_anything_is_trained(
     screen_dataset: Path, tmp_path: Path, name: str, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
@@ -223,7 +223,7 @@ def test_a_network_of_ours_that_cannot_be_counted_is_refused_before_anything_is_
     assert list(tmp_path.iterdir()) == [odd]
 
 
-def test_what_is_trained_already_is_timed_and_scored_as_benchmark_scores_it(
+def test_trained_peers_are_timed_and_scored_by_the_benchmark(
     screen_dataset: Path, rows_network: Callable[..., Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -255,7 +255,7 @@ def test_what_is_trained_already_is_timed_and_scored_as_benchmark_scores_it(
     assert table["detectors"]["yolov8n"]["ap50"] == 0.0 < table["detectors"]["yolov8s"]["ap50"] < 1.0
 
 
-def test_scored_are_the_pairs_of_the_test_dataset(
+def test_the_pairs_of_the_test_dataset_are_scored(
     screen_dataset: Path, smoke_dataset: Path, rows_network: Callable[..., Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -266,7 +266,7 @@ def test_scored_are_the_pairs_of_the_test_dataset(
     assert scored["sha256"] == Dataset(smoke_dataset).manifest.dataset_sha256
 
 
-def test_ablations_are_scored_like_everything_and_one_view_finds_the_same_boxes(
+def test_ablations_are_scored_by_the_benchmark_and_one_view_finds_the_same_boxes(
     screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
 ) -> None:
     file = maps_network(tmp_path / "detector.onnx")
@@ -289,7 +289,7 @@ def test_ablations_are_scored_like_everything_and_one_view_finds_the_same_boxes(
             assert single.box_xywh_px == pytest.approx(paired.box_xywh_px, abs=1e-3)
 
 
-def test_a_run_is_not_lost_for_operations_that_nobody_can_count(
+def test_a_benchmark_accepts_networks_whose_operations_cannot_be_counted(
     screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
 ) -> None:
     plain, odd = (maps_network(tmp_path / f"{name}.onnx", name == "plain") for name in ("plain", "odd"))
@@ -304,7 +304,7 @@ def test_a_run_is_not_lost_for_operations_that_nobody_can_count(
 
 
 @pytest.mark.parametrize("changes", [{"image_passes": -1}, {"batch": 0}, {"threads": 0}, {"rounds": 0}])
-def test_absurd_numbers_are_refused(tmp_path: Path, changes: dict[str, object]) -> None:
+def test_options_out_of_range_are_refused(tmp_path: Path, changes: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="must be positive, got"):
         order(tmp_path, tmp_path, **changes)
 

@@ -17,14 +17,14 @@ def corners(xywh: list[tuple[float, float, float, float]]) -> torch.Tensor:
     return torch.cat((boxes[:, :2], boxes[:, :2] + boxes[:, 2:]), dim=1)
 
 
-def random_answers(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+def random_predictions(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     count = len(CELLS.centers_px)
     boxes = decode_boxes(torch.randn(1, count, 4, generator=generator), CELLS)
     return torch.rand(1, count, generator=generator), boxes
 
 
-def test_cells_lie_in_the_middle_of_their_squares():
+def test_anchor_points_are_the_centres_of_their_cells():
     for stride, offset, shape in ((8, 0, (16, 20)), (16, 320, (8, 10)), (32, 400, (4, 5))):
         for row, column in ((0, 0), (1, 2), (shape[0] - 1, shape[1] - 1)):
             index = offset + row * shape[1] + column
@@ -32,7 +32,7 @@ def test_cells_lie_in_the_middle_of_their_squares():
             assert CELLS.strides_px[index].item() == stride
 
 
-def test_overlap_agrees_with_pycocotools():
+def test_iou_agrees_with_pycocotools():
     rng = np.random.default_rng(1)
     a, b = (np.hstack((rng.uniform(0, 60, (7, 2)), rng.uniform(5, 60, (7, 2)))) for _ in range(2))
     ours = intersection_over_union(corners(a.tolist())[:, None], corners(b.tolist())[None])
@@ -49,7 +49,7 @@ def test_complete_iou_in_closed_form():
     torch.testing.assert_close(got, torch.tensor([1.0, 0.25, -(100**2) / (140**2 + 40**2)]), rtol=1e-5, atol=1e-6)
 
 
-def test_complete_iou_pulls_boxes_together_that_do_not_touch():
+def test_complete_iou_has_a_gradient_for_boxes_that_do_not_touch():
     box = corners([(100.0, 0.0, 10.0, 10.0)]).requires_grad_()
     complete_iou(box, corners([(0.0, 0.0, 10.0, 10.0)])).sum().backward()
     assert box.grad is not None
@@ -58,28 +58,28 @@ def test_complete_iou_pulls_boxes_together_that_do_not_touch():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_cells_answer_for_boxes_that_they_lie_in(seed):
+def test_cells_are_assigned_to_boxes_that_contain_them(seed):
     truth = corners([(5, 9, 17, 17), (60, 10, 70, 90), (3, 60, 40, 50)])
-    scores, boxes = random_answers(seed)
+    scores, boxes = random_predictions(seed)
     present = torch.tensor([[True, True, True, False]])
     filled = torch.cat((truth, torch.tensor([[0.0, 0, 160, 128]])))[None]
     assigned = assign_anchors(scores, boxes, CELLS.centers_px, filled, present)
-    overlap = intersection_over_union(filled[0][:, None], boxes[0][None])
+    iou = intersection_over_union(filled[0][:, None], boxes[0][None])
     for index in range(3):
         cells = torch.nonzero(assigned.foreground[0] & (assigned.box_index[0] == index))[:, 0]
         assert 1 <= len(cells) <= MOST_CELLS
         places, box = CELLS.centers_px[cells], truth[index]
         assert bool(((places > box[:2]) & (places < box[2:])).all())
-        # The best claim is asked for the best overlap, no other for more.
-        assert assigned.scores[0, cells].max().item() == pytest.approx(overlap[index, cells].max().item(), rel=1e-5)
+        # The target score of the best aligned cell is the best IoU, and no other is higher.
+        assert assigned.scores[0, cells].max().item() == pytest.approx(iou[index, cells].max().item(), rel=1e-5)
     assert not bool((assigned.box_index[0][assigned.foreground[0]] == 3).any())
     assert bool((assigned.scores[0][~assigned.foreground[0]] == 0).all())
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_order_of_boxes_does_not_matter(seed):
+def test_the_order_of_boxes_does_not_matter(seed):
     truth = corners([(5, 9, 60, 50), (30, 20, 70, 90), (3, 60, 40, 50)])
-    scores, boxes = random_answers(seed)
+    scores, boxes = random_predictions(seed)
     present = torch.ones(1, 3, dtype=torch.bool)
     order = torch.tensor([2, 0, 1])
     plain = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], present)
@@ -89,8 +89,8 @@ def test_order_of_boxes_does_not_matter(seed):
     assert torch.equal(plain.box_index[plain.foreground], order[turned.box_index[turned.foreground]])
 
 
-def test_a_box_between_cells_goes_to_the_nearest():
-    scores, boxes = random_answers(3)
+def test_a_box_without_cells_gets_the_nearest_one():
+    scores, boxes = random_predictions(3)
     truth = corners([(45.0, 53.0, 2.0, 2.0)])
     assigned = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], torch.ones(1, 1, dtype=torch.bool))
     (cell,) = torch.nonzero(assigned.foreground[0])[:, 0].tolist()
@@ -99,8 +99,8 @@ def test_a_box_between_cells_goes_to_the_nearest():
     assert CELLS.strides_px[cell].item() == 8
 
 
-def test_a_cell_in_two_boxes_answers_for_the_one_it_overlaps_more():
-    scores, boxes = random_answers(4)
+def test_a_cell_in_two_boxes_is_assigned_to_the_one_with_the_higher_iou():
+    scores, boxes = random_predictions(4)
     outer, inner = (0.0, 0.0, 100.0, 100.0), (20.0, 20.0, 60.0, 60.0)
     boxes = corners([outer])[None].repeat(1, boxes.shape[1], 1)
     assigned = assign_anchors(

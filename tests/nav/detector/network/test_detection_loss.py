@@ -14,7 +14,7 @@ BOXES = [torch.tensor([[20.0, 30.0, 17.0, 18.0], [60.0, 20.0, 90.0, 95.0]]), NON
 
 
 def blank_maps(images: int, logit: float = -4.6) -> list[torch.Tensor]:
-    """Maps that expect nothing and boxes of four strides."""
+    """Maps that predict no drogue and boxes of four strides."""
     maps = []
     for stride in STRIDES:
         each = torch.full((images, 5, HEIGHT // stride, WIDTH // stride), 0.7)
@@ -24,7 +24,7 @@ def blank_maps(images: int, logit: float = -4.6) -> list[torch.Tensor]:
 
 
 def perfect_maps(box: tuple[float, float, float, float], shift_px: float = 0.0) -> list[torch.Tensor]:
-    """Maps whose every cell within the box answers it, moved to the right."""
+    """Maps in which every cell within a box predicts it, shifted to the right."""
     x, y, width, height = box
     maps = blank_maps(1)
     for stride, each in zip(STRIDES, maps, strict=True):
@@ -37,7 +37,7 @@ def perfect_maps(box: tuple[float, float, float, float], shift_px: float = 0.0) 
     return maps
 
 
-def test_loss_of_right_boxes_is_nothing_and_grows_as_they_move():
+def test_loss_of_right_boxes_is_zero_and_grows_with_their_shift():
     box = (40.0, 30.0, 61.0, 53.0)
     losses = [
         detection_loss(perfect_maps(box, shift_px), [torch.tensor([box])]).box.item() for shift_px in (0, 1, 2, 4, 8)
@@ -66,8 +66,8 @@ def test_an_image_without_boxes_does_not_disturb_its_neighbours():
     assert both.score.item() >= alone.score.item()
 
 
-def test_making_the_loss_small_makes_the_answer_right():
-    """Free maps instead of a network: assignment, loss and the decoding in numpy mean the same by their numbers."""
+def test_minimising_the_loss_makes_the_predictions_right():
+    """Maps are optimised without a network: assignment, loss and decoding in numpy use the same box coordinates."""
     maps = [each.requires_grad_() for each in blank_maps(2)]
     optimiser = torch.optim.Adam(maps, lr=0.1)
     for _ in range(120):
@@ -80,7 +80,7 @@ def test_making_the_loss_small_makes_the_answer_right():
     assert len(found[1]) == 2
     assert (found[1] > 0.8).all()
     for box in BOXES[0].numpy():
-        # What so few steps reach: half a pixel on each side of 17.
+        # The accuracy that so few steps reach: half a pixel on each side of 17.
         assert mask.iou(found[0], box[None], [0]).max() > 0.9
 
 
@@ -97,7 +97,7 @@ def test_gradients_in_autocast_are_float32_and_finite(network, boxes):
         assert bool(weight.grad.isfinite().all()), name
 
 
-def test_extreme_answers_keep_the_loss_finite():
+def test_extreme_predictions_keep_the_loss_finite():
     for logit, log_distance in ((80.0, 50.0), (-80.0, -50.0)):
         maps = [torch.full_like(each, log_distance) for each in blank_maps(2)]
         for each in maps:

@@ -28,7 +28,7 @@ MOST_WEIGHTS_BYTES = 12e6
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: "-".join(config.to_dict().values()))
-def test_answers_one_map_a_stride(network, config):
+def test_there_is_one_output_map_per_stride(network, config):
     height, width = 64, 96
     with torch.no_grad():
         maps = network(config)(torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(1)))
@@ -82,19 +82,19 @@ def test_squeezed_channels(channels, squeezed):
 
 
 # torchvision's mobilenet_v3_large and _small have 5,483,032 and 2,542,856 parameters and, by its tables, 0.217 and
-# 0.057 10^9 multiply-adds at 224x224. Their last convolution and classifier, worked by hand, are what the trunk leaves
-# out.
+# 0.057 10^9 multiply-adds at 224x224. Their last convolution and classifier, worked by hand, are not part of the
+# backbone.
 @pytest.mark.parametrize(
     ("variant", "published", "published_multiply_adds", "last", "hidden"),
     [("l", 5_483_032, 0.217e9, (160, 960), 1280), ("s", 2_542_856, 0.057e9, (96, 576), 1024)],
 )
-def test_trunk_is_the_published_one(variant, published, published_multiply_adds, last, hidden):
-    trunk = complexity(MobileNetV3(variant, "se"), (224, 224))
+def test_backbone_has_the_published_size(variant, published, published_multiply_adds, last, hidden):
+    backbone = complexity(MobileNetV3(variant, "se"), (224, 224))
     classifier = (last[1] + 1) * hidden + (hidden + 1) * 1000
-    assert trunk.parameters + last[0] * last[1] + 2 * last[1] + classifier == published
+    assert backbone.parameters + last[0] * last[1] + 2 * last[1] + classifier == published
     end = last[0] * last[1] * 7 * 7 + last[1] * hidden + hidden * 1000
     # The published figures are rounded to 10^6.
-    assert abs(trunk.multiply_adds + end - published_multiply_adds) < 0.6e6
+    assert abs(backbone.multiply_adds + end - published_multiply_adds) < 0.6e6
 
 
 @pytest.mark.parametrize("variant", ["l", "s"])
@@ -112,7 +112,7 @@ def test_weights_fit_into_the_package(variant):
     assert 4 * complexity(DetectorNetwork(NetworkConfig(variant)), (64, 64)).parameters < MOST_WEIGHTS_BYTES
 
 
-def test_fusion_weights_of_each_place_sum_to_one():
+def test_fusion_weights_of_each_location_sum_to_one():
     generator = torch.Generator().manual_seed(3)
     levels = [3 * torch.randn(2, 8, 4, 6, generator=generator) for _ in STRIDES]
     weights = AdaptiveFusion(8).level_weights(levels)
@@ -140,7 +140,7 @@ def test_levels_are_resized_to_each_other(stride, target):
 
 
 @pytest.mark.parametrize("variant", ["l", "s"])
-def test_an_untrained_network_expects_no_drogue_and_a_box_of_four_strides(variant):
+def test_an_untrained_network_predicts_no_drogue_and_boxes_of_four_strides(variant):
     torch_network = DetectorNetwork(NetworkConfig(variant)).train()
     images = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(6))
     with torch.no_grad():
@@ -156,23 +156,23 @@ def test_depthwise_convolution_in_autocast_is_the_float32_one_where_bf16_is_slow
     for kernel, stride in ((5, 1), (3, 2), (5, 2)):
         layer = DepthwiseConv(16, kernel, stride)
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            answer = layer(features)
-        assert answer.dtype == torch.bfloat16
+            output = layer(features)
+        assert output.dtype == torch.bfloat16
         # Rounded once, after sums in float32: half a step of 8 bits, 2^-9 of the number.
-        torch.testing.assert_close(answer.float(), layer(features), rtol=2**-8, atol=1e-5)
+        torch.testing.assert_close(output.float(), layer(features), rtol=2**-8, atol=1e-5)
 
 
-def test_autocast_answers_float32_and_nearly_the_same(network):
+def test_autocast_outputs_are_float32_and_nearly_the_same(network):
     torch_network = network(NetworkConfig("s"))
     images = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(8))
     with torch.no_grad():
         exact = torch_network(images)
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            answers = torch_network(images)
-    for answer, reference in zip(answers, exact, strict=True):
-        assert answer.dtype == torch.float32
-        # Some 60 layers that round to 2^-9 each, on answers whose spread is their scale.
-        assert float((answer - reference).abs().mean() / reference.std()) < 0.1
+            outputs = torch_network(images)
+    for output, reference in zip(outputs, exact, strict=True):
+        assert output.dtype == torch.float32
+        # Some 60 layers that round to 2^-9 each, relative to the spread of the outputs.
+        assert float((output - reference).abs().mean() / reference.std()) < 0.1
 
 
 def test_complexity_of_layers_worked_by_hand():
@@ -187,7 +187,7 @@ def test_complexity_of_layers_worked_by_hand():
     assert found.gflops == pytest.approx(2 * found.multiply_adds / 1e9)
 
 
-def test_the_page_states_sizes_as_they_are():
+def test_the_documented_sizes_are_right():
     page = (Path(__file__).resolve().parents[4] / "docs/reference/detectors.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([ls])` (\w+) (\w+) \| ([\d,]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.MULTILINE)
     assert rows
@@ -196,17 +196,17 @@ def test_the_page_states_sizes_as_they_are():
         built = DetectorNetwork(config)
         small, large = complexity(built, (64, 64)), complexity(built, (128, 64))
         assert f"{small.parameters:,}" == parameters
-        # Attention has a constant part; all else grows with the area, so two small pictures tell of any other.
-        a_pixel = (large.gflops - small.gflops) / (64 * 64)
+        # Attention has a constant part; all else grows with the area, so two small images determine any other.
+        per_pixel = (large.gflops - small.gflops) / (64 * 64)
         for area, stated in zip((640 * 480, 640 * 640), gflops, strict=True):
-            assert f"{small.gflops + a_pixel * (area - 64 * 64):.2f}" == stated
+            assert f"{small.gflops + per_pixel * (area - 64 * 64):.2f}" == stated
 
 
-def test_complexity_leaves_the_network_as_it_was():
+def test_complexity_does_not_change_the_network():
     torch_network = DetectorNetwork(NetworkConfig("s")).train()
     before = {name: value.clone() for name, value in torch_network.state_dict().items()}
     small, large = (complexity(torch_network, size).multiply_adds for size in ((96, 64), (192, 128)))
-    # Everything but the attention's convolution over channels (17 numbers in all) grows with the picture.
+    # Everything but the attention's convolution over channels (17 numbers in all) grows with the image.
     assert large == pytest.approx(4 * small, rel=1e-3)
     assert torch_network.training
     assert all(torch.equal(value, before[name]) for name, value in torch_network.state_dict().items())
