@@ -109,7 +109,7 @@ def train(
         write_text_atomic(out / SETTINGS_FILE, json.dumps(settings.model_dump(mode="json"), indent=1) + "\n")
         observer.say(_summary(corpus, settings, compute, state))
         Trainer(corpus, settings, compute, out, observer, should_stop).run(state)
-        return _finish(out, corpus, settings, compute, state)
+        return _evaluate_and_export(out, corpus, settings, compute, state)
 
 
 def check_training(out: Path, settings: TrainingSettings, start: StartingWeights | None = None) -> None:
@@ -161,11 +161,11 @@ def _summary(corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice,
     )
 
 
-def _finish(
+def _evaluate_and_export(
     out: Path, corpus: Corpus, settings: TrainingSettings, compute: ComputeDevice, state: TrainingState
 ) -> TrainingResult:
     """Evaluate and export the best weights, and export the last ones too."""
-    best_step, network = _best(out, settings, state)
+    best_step, network = _best_network(out, settings, state)
     network.to(compute.device)
     size = settings.size_at(settings.steps - 1)
     # The exported files compute in float32, so they are evaluated in float32.
@@ -201,7 +201,7 @@ def _finish(
     return result
 
 
-def _best(out: Path, settings: TrainingSettings, state: TrainingState) -> tuple[int, DetectorNetwork]:
+def _best_network(out: Path, settings: TrainingSettings, state: TrainingState) -> tuple[int, DetectorNetwork]:
     """Step and network of the averaged weights that were best on the validation split; without one, of the last."""
     network = new_network(settings).eval()
     saved = _load_best(out, state)
