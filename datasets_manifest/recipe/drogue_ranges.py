@@ -12,11 +12,11 @@ from drogue_models.parameters import DrogueParameters
 
 
 class DistanceLaw(FrozenModel):
-    """How the distance of the rim centre along the optical axis is drawn.
+    """Distribution of the distance of the rim centre along the optical axis.
 
     Attributes:
-        law: `uniform`, `log-uniform`, `uniform-image-size` (uniform in 1/distance) between `low_m` and `high_m`, or
-            `stations`, which frame by frame go through `stations_m`.
+        law: `uniform`, `log-uniform` or `uniform-image-size` (uniform in 1/distance) between `low_m` and `high_m`; or
+            `stations`, which takes the values of `stations_m` in turn, frame by frame.
     """
 
     law: Literal["uniform", "log-uniform", "uniform-image-size", "stations"]
@@ -37,12 +37,12 @@ class DistanceLaw(FrozenModel):
 
     @property
     def nearest_m(self) -> float:
-        """Nearest distance that can be drawn. [m]"""
+        """Smallest distance that can be drawn. [m]"""
         return min(self.stations_m) if self.stations_m is not None else float(self.low_m or 0.0)
 
 
 class PoseRanges(FrozenModel):
-    """Attitude of drogue and receiver, and the motion that blurs.
+    """Distribution of the attitudes of drogue and receiver, and of the motion that blurs the images.
 
     Attributes:
         pitch_deg, yaw_deg, roll_deg: of the drogue in the camera.
@@ -82,7 +82,7 @@ class DrogueVariant(FrozenModel):
 
     Attributes:
         drogue: in TOML the name of a preset or a TOML file.
-        weight: its share of the scenes, against the other variants' weights.
+        weight: its share of the scenes, relative to the other variants' weights.
     """
 
     drogue: DrogueParameters
@@ -90,23 +90,23 @@ class DrogueVariant(FrozenModel):
 
 
 class AppearanceRanges(FrozenModel):
-    """From what each scene's target is drawn; the defaults give a drogue as new that is alone in the picture.
+    """Distribution of each scene's drogue, its condition and the obstacles; by default a new drogue without obstacles.
 
     Attributes:
         variants: drogues to choose from by scene; empty for the recipe's own.
-        missing_marker_fraction: chance of each marker to have come off; three always stay.
-        marker_reflectance_fraction: what is left of each marker's and the hub's paint, see `SurfaceCondition`.
-        dirty_marker_fraction: chance of each marker and of the hub to be dirty.
+        missing_marker_fraction: probability that a marker has come off; at least three always stay.
+        marker_reflectance_fraction: of each marker and the hub, see `SurfaceCondition`.
+        dirty_marker_fraction: probability that a marker, or the hub, is dirty.
         dirt_fraction: share of a dirty surface under dirt.
-        failed_lamp_fraction: chance of each self-lit marker to be out.
-        lamp_fraction: luminance of the others, as a share of the drogue's.
+        failed_lamp_fraction: probability that a self-lit marker is out.
+        lamp_fraction: luminance of the other lamps, as a share of the drogue's.
         body_reflectance_fraction: see `DrogueCondition`.
-        probe: whether the receiver's probe is drawn, with its tip where the rig says.
+        probe: whether the receiver's probe is drawn, with its tip at the rig's `probe_tip_body_m`.
         probe_radius_m: of its tube. [m]
         obstacle_frame_fraction: share of frames in which a bar close to the cameras may hide part of the drogue.
-        distractor_frame_fraction: share of frames with other round things; in frames without a drogue they are the
+        distractor_frame_fraction: share of frames with other round objects; in frames without a drogue they are the
             hard negatives.
-        distractor_forms: from which each is chosen with equal chances; a form may stand in it several times.
+        distractor_forms: forms to choose from with equal probability; a form may be listed several times.
     """
 
     variants: tuple[DrogueVariant, ...] = ()

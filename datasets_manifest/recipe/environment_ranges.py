@@ -12,7 +12,7 @@ from drogue_models.frozen_model import FrozenModel
 
 
 class Clouds(FrozenModel):
-    """A cloud layer, where a scene has it.
+    """Distribution of one cloud layer.
 
     Attributes:
         kind: see `CloudLayer`.
@@ -45,7 +45,7 @@ class Clouds(FrozenModel):
 
 
 class MistRanges(FrozenModel):
-    """Mist around the camera, where a scene has it.
+    """Distribution of mist around the camera.
 
     Attributes:
         scene_fraction: share of scenes in mist.
@@ -66,7 +66,7 @@ class MistRanges(FrozenModel):
 
 
 class MoonRanges(FrozenModel):
-    """The moon, where a scene has one.
+    """Distribution of the moon.
 
     Attributes:
         scene_fraction: share of scenes with a moon.
@@ -87,7 +87,7 @@ class MoonRanges(FrozenModel):
 
 
 class EnvironmentMapRanges(EnvironmentMapFile):
-    """From what the map of a scene is drawn.
+    """Distribution of a scene's environment map.
 
     Attributes:
         rotation_deg: see `EnvironmentMap`.
@@ -102,14 +102,14 @@ class EnvironmentMapRanges(EnvironmentMapFile):
 
 
 class EnvironmentRanges(FrozenModel):
-    """From what each scene's environment is drawn; units and meaning as in `Environment`.
+    """Distribution of each scene's environment; units and meaning as in `Environment`.
 
     Attributes:
-        ground: kinds that are drawn from, each as often as it is named; in TOML also a single name.
-        clouds: layers, each drawn for itself; in TOML one table or an array of them.
-        mist, moon: where a scene has them.
-        map: a picture of sky and ground, which takes the place of all the others but the visibility; in TOML the path
-            of a file in absolute units, or a table with `file` and the other keys of `MapRanges`.
+        ground: kinds to choose from; a kind that is listed twice is twice as likely. TOML also takes a single name.
+        clouds: layers, each drawn independently; in TOML one table or an array of them.
+        mist, moon: with the share of the scenes that have them.
+        map: an image of sky and ground, which replaces all of the above but the visibility; in TOML the path of a file
+            in absolute units, or a table with `file` and the other keys of `EnvironmentMapRanges`.
     """
 
     sun_elevation_deg: Range = Range(low=15, high=65)

@@ -1,4 +1,4 @@
-"""A recipe: what dataset to make. Read from TOML; every wrong key is named."""
+"""A recipe, which describes the dataset to make; read from TOML, with errors that name every wrong key."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError, model_validator
 from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, DistanceLaw, DrogueVariant, PoseRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
 from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, resolve_rig
-from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_singles, fill_distance
+from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_single_frame_keys, fill_distance
 from datasets_manifest.types.appearance import CalibrationBoard
 from datasets_manifest.types.environment import pin_environment_map
 from datasets_manifest.types.field_types import Fraction, Rig
@@ -23,11 +23,11 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 
-SECTIONS = ("pose", "target", "environment", "exposure")
+_FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
 
 
 def fill_families(table: dict[str, Any]) -> None:
-    """Complete each of a recipe's `[[families]]`, in place, with the keys of the recipe's sections that it leaves out.
+    """Complete each of a recipe's `[[families]]`, in place, with the recipe's values for the keys that it leaves out.
 
     Raises:
         ValueError: they are not an array of tables.
@@ -36,7 +36,7 @@ def fill_families(table: dict[str, Any]) -> None:
     if not isinstance(families, list) or not all(isinstance(family, dict) for family in families):
         raise ValueError("families: must be tables, each begun by [[families]]")
     for family in families:
-        for section in SECTIONS:
+        for section in _FAMILY_SECTIONS:
             common, own = table.get(section, {}), family.get(section, {})
             if isinstance(common, dict) and isinstance(own, dict):
                 family[section] = {**deepcopy(common), **own}
@@ -50,37 +50,36 @@ class FrameCounts(FrozenModel):
     """How many pairs, over how many scenes, how many without a drogue.
 
     Attributes:
-        in_turn: scenes, families and drogue variants follow each other in the order in which they are given, the family
-            changing from scene to scene and the variant when all families had a scene; else in a drawn order. So a
-            few sequences have every combination.
+        in_turn: whether scenes go through families and drogue variants in the given order, so that a few sequences have
+            every combination: the family changes from scene to scene, the variant after a round of families. Otherwise
+            they are drawn at random.
     """
 
     count: int = Field(ge=1, le=10_000_000)
     scenes: int = Field(default=1, ge=1, le=1_000_000)
     empty_fraction: Fraction = 0.0
-    # Left out where it says nothing, so that the hashes of other recipes do not know of it.
+    # Left out at its default, so that the hashes of other recipes stay those of earlier versions.
     in_turn: bool = Field(default=False, exclude_if=lambda in_turn: not in_turn)
 
 
 class RenderSettings(FrozenModel):
-    """How the engine works.
+    """Settings of the rendering engine.
 
     Attributes:
         engine: its name.
-        samples_per_px: paths through each pixel of the drogue, but for those of the next two.
-        open_samples_per_px: the same inside markers, face and rim, where hardly anything hides the sky.
-        edge_samples_per_px: rays to the surfaces in each pixel where parts or shadows meet, and paths through each
-            pixel on hub and coupling; `samples_per_px` if that is more.
-        surround_samples_per_px: the same for hose and tanker.
+        samples_per_px: paths through each pixel of the drogue, except where the next two apply.
+        open_samples_per_px: the same inside markers, face and rim, where little hides the sky.
+        edge_samples_per_px: rays to the surfaces in each pixel with an edge of a part or shadow, and paths through each
+            pixel of hub and coupling; at least `samples_per_px`.
+        surround_samples_per_px: paths through each pixel of hose and tanker.
         max_depth: longest path, counted in segments.
-        denoise: whether light that reaches a matt drogue, and what stands around it, by way of other surfaces is
-            smoothed over each surface (engine mitsuba). Paths then start from pixel centres, `samples_per_px` where the
-            smoothing is wide and up to `edge_samples_per_px` where the drogue is far away; insides take
-            `open_samples_per_px` rays, and edges 16 to `edge_samples_per_px` on average, fewer the more pixels are
-            inside, and more the larger their contrast.
-        noise_over_sensor: what is aimed at if `denoise` is set: the renderer's noise on the drogue over the sensor's
-            own. Edges take no more rays than that needs, and light by way of other surfaces up to 16 times the paths
-            where it alone would take three quarters of it, squared.
+        denoise: whether indirect light on a matt drogue and its surroundings is smoothed over each surface (engine
+            mitsuba). Paths then start from pixel centres: `samples_per_px` where the smoothing is wide, up to
+            `edge_samples_per_px` where the drogue is far away. Interiors take `open_samples_per_px` rays, edges 16 to
+            `edge_samples_per_px` on average: fewer with more interior pixels, more with higher contrast.
+        noise_over_sensor: target of `denoise`: the renderer's noise on the drogue over the sensor's own. Edges take no
+            more rays than it needs. Indirect light takes up to 16 times the paths where its variance alone would reach
+            three quarters of the target's.
     """
 
     engine: str = Field(default="mitsuba", min_length=1, max_length=40)
@@ -94,7 +93,7 @@ class RenderSettings(FrozenModel):
 
 
 class Outputs(FrozenModel):
-    """What is stored besides images, part ids and records."""
+    """Optional files besides images, part ids and records."""
 
     exr: bool = False
 
@@ -115,11 +114,11 @@ class Split(FrozenModel):
 
 
 class Family(FrozenModel):
-    """Conditions of a share of a recipe's scenes.
+    """A family of conditions, which a share of a recipe's scenes has.
 
     Attributes:
-        name: written into the scenes' frames.
-        weight: its share of the scenes, against the other families' weights.
+        name: stored in the frames of its scenes.
+        weight: its share of the scenes, relative to the other families' weights.
         pose, target, environment, exposure: as in `Recipe`; in TOML only the keys that differ from the recipe's.
     """
 
@@ -132,18 +131,18 @@ class Family(FrozenModel):
 
 
 class Recipe(FrozenModel):
-    """What dataset to make, with every reference to presets and files replaced by its contents.
+    """A dataset to make, with every reference to presets and files replaced by its contents.
 
     Attributes:
         name: of the dataset.
-        family: what kind of conditions, for tables; of recipes without `families`.
-        seed: of everything random.
+        family: name of the conditions, for tables, in recipes without `families`.
+        seed: of all random streams.
         drogue, rig, sensor: in TOML names of presets (`drogue` also a TOML file).
-        board: a calibration board that every frame shows instead of a drogue, or none; `distance` and `pose` are then
-            those of its middle.
-        rangefinder: whose readings the records hold, or none.
-        families: over which the scenes are spread, each with its own conditions; or none.
-        sequence: how pairs follow each other in time; without it each stands alone.
+        board: a calibration board that every frame shows instead of a drogue, or none; `distance` and `pose` then apply
+            to its centre.
+        rangefinder: simulated rangefinder with readings in the records, or none.
+        families: of conditions, over which the scenes are distributed; or none.
+        sequence: motion of the sequences; without it all pairs are independent.
     """
 
     name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -169,7 +168,7 @@ class Recipe(FrozenModel):
 
     @property
     def variants(self) -> tuple[DrogueVariant, ...]:
-        """All drogues of all families that scenes may have instead of the recipe's own."""
+        """The drogue variants of all families; empty where every scene has the recipe's own drogue."""
         targets = [family.target for family in self.families] or [self.target]
         return tuple(variant for target in targets for variant in target.variants)
 
@@ -212,15 +211,15 @@ class Recipe(FrozenModel):
             return self
         if self.frames.empty_fraction > 0:
             raise ValueError("frames.empty_fraction: must be 0 with [sequence], where every pair has the drogue")
-        losses = self.sequence.losses
-        if losses is not None and "occlusion" in losses.kinds and self.render.engine == "analytic":
+        dropouts = self.sequence.losses
+        if dropouts is not None and "occlusion" in dropouts.kinds and self.render.engine == "analytic":
             raise ValueError(
                 "render.engine: analytic draws no obstacles, and sequence.losses has occlusion; use mitsuba"
             )
         for part in self.families or (self,):
-            check_singles(part.pose, part.target)
-            if losses is not None:
-                losses.check_sun(part.pose, part.environment)
+            check_single_frame_keys(part.pose, part.target)
+            if dropouts is not None:
+                dropouts.check_sun(part.pose, part.environment)
             longest_s = part.exposure.auto_time_s.high if part.exposure.time_s is None else part.exposure.time_s
             period_s = 1 / self.sequence.frame_rate_hz
             if longest_s > period_s:
@@ -266,7 +265,7 @@ class RecipeSource:
 
 
 def recipe_names() -> list[str]:
-    """Names of the recipes that ship."""
+    """Names of the shipped recipes."""
     folder = files("datasets_manifest") / "recipes"
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
@@ -341,6 +340,6 @@ def _load_variants(target: object, base: Path | None) -> None:
 
 
 def _seed(table: dict[str, Any]) -> int:
-    """The seed of a recipe's table; a wrong one, which the schema will name, counts as none."""
+    """The seed of a recipe's table; 0 in place of a wrong one, which the schema then reports."""
     seed = table.get("seed", Recipe.model_fields["seed"].default)
     return seed if type(seed) is int and 0 <= seed <= MAX_SEED else 0

@@ -45,13 +45,13 @@ SENSORS["paper-real"] = SENSORS["rgb-ideal"].model_copy(
 
 
 class Eyes(FrozenModel):
-    """How far the eyes of a rig are from ideal; ranges are drawn once for the whole dataset, for each eye anew.
+    """Deviations of the eyes of a rig from ideal ones, drawn once for the whole dataset, independently for each eye.
 
     Attributes:
         k1, k2, p1, p2, k3: Brown-Conrady coefficients of both lenses.
-        principal_point_px: largest shift of the principal points along either axis, either way. [px]
-        focal_fraction: largest difference of either focal length from the ideal one, as a share of it.
-        right_rotation_deg: largest turn of the right eye about each of its axes, either way. [deg]
+        principal_point_px: largest shift of the principal points along each axis, in either direction. [px]
+        focal_fraction: largest relative error of each focal length.
+        right_rotation_deg: largest rotation of the right eye about each of its axes, in either direction. [deg]
     """
 
     k1: Range = Range(low=0, high=0)
@@ -83,7 +83,7 @@ _REAL_EYES = Eyes(
 
 
 class _RigTable(FrozenModel):
-    """A shipped rig with changes."""
+    """The table of a shipped rig with changes."""
 
     preset: str
     width_px: int | None = Field(default=None, ge=16, le=16384)
@@ -104,7 +104,7 @@ def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:
 
     Args:
         value: name or table.
-        seed: of the dataset, for what is drawn.
+        seed: of the dataset, for the real lenses.
 
     Raises:
         ValueError: unknown preset or key.
@@ -139,8 +139,8 @@ def resolve_rig(value: object, seed: int = 0) -> tuple[StereoRig, Sensor]:
 
 
 def _draw_lenses(eyes: Eyes, camera: PinholeCamera, seed: int) -> tuple[Lens, Lens]:
-    """The left and the right eye; the left one's axes are the rig's."""
-    # Apart from all streams of frames and scenes, whose keys are longer.
+    """The left and the right lens; the left eye's axes are the rig's."""
+    # Differs from all streams of frames and scenes, whose keys are longer.
     rng = seeded_generator(seed)
     lenses = []
     for is_right in (False, True):
@@ -162,15 +162,15 @@ def _draw_lenses(eyes: Eyes, camera: PinholeCamera, seed: int) -> tuple[Lens, Le
 
 
 class ExposureLaw(FrozenModel):
-    """How the exposure is set: by the meter, first with the time, then, when that is at its limit, with the gain.
+    """How the meter sets the exposure: with the time first and, once that is at its limit, with the gain.
 
     Attributes:
         time_s: fixed exposure time; without it the meter chooses within `auto_time_s`. [s]
-        auto_gain: what the meter may amplify by; a single number is a fixed gain.
-        auto_meter: what the meter looks at: `view`, the brighter of the view's mean and a white plate that faces the
-            camera; or `plate`, the plate alone, as one that looks at the drogue and not at the sky behind it.
-        auto_level_fraction: where the meter puts that, as a share of the full well, or at other gains of what fills the
-            converter.
+        auto_gain: range of the gain; a single number is a fixed gain.
+        auto_meter: what the meter measures: `view`, the brighter of the view's mean and a white plate that faces the
+            camera; or `plate`, the plate alone, as a meter that measures the drogue and not the sky behind it.
+        auto_level_fraction: level at which the meter puts that, as a share of the full well or, at gains other than 1,
+            of the signal that saturates the converter.
     """
 
     time_s: float | None = Field(default=None, gt=0, le=1)
@@ -188,17 +188,17 @@ class ExposureLaw(FrozenModel):
 
 
 class Rangefinder(FrozenModel):
-    """A rangefinder beside the left camera that measures the distance of the rim centre along the optical axis.
+    """A laser rangefinder beside the left camera, which a bench experiment takes for the truth.
 
-    A reading is the distance, plus an offset, plus noise, rounded. The defaults are those of a hand-held meter for
-    building sites, whose data sheets give +-2 mm at two standard deviations (ISO 16331-1) and a last digit of 1 mm; the
-    offset is our assumption for a zero mark set by hand.
+    A reading is the distance of the rim centre along the optical axis, plus an offset and noise, rounded. The defaults
+    are those of a hand-held meter for building sites, whose data sheets give +-2 mm at two standard deviations
+    (ISO 16331-1) and a last digit of 1 mm; the offset is our assumption for a zero mark set by hand.
 
     Attributes:
-        offset_m: largest distance, either way, between the rangefinder's zero and the camera's; drawn once a dataset.
-            [m]
+        offset_m: largest distance, in either direction, between the rangefinder's zero and the camera's; drawn once a
+            dataset. [m]
         noise_m: standard deviation of a reading. [m]
-        resolution_m: step of its last digit, 0 for none. [m]
+        resolution_m: step of its last digit; 0 for no rounding. [m]
     """
 
     offset_m: float = Field(default=0.003, ge=0, le=1)

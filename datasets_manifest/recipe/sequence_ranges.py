@@ -1,4 +1,4 @@
-"""The `[sequence]` section of a recipe: pairs that follow each other in time, moved by hose, air and receiver."""
+"""The `[sequence]` section of a recipe: how hose, air and receiver move, and when the cameras lose the drogue."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 
 from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, PoseRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
-from datasets_manifest.types.environment import SLOWEST_M_S, Turbulence
+from datasets_manifest.types.environment import MIN_AIRSPEED_M_S, Turbulence
 from datasets_manifest.types.field_types import Range
 from datasets_manifest.types.frame import DropoutKind
 from drogue_models.frozen_model import FrozenModel
@@ -17,7 +17,7 @@ from geometry.stereo import StereoRig
 
 
 class HoseParameters(FrozenModel):
-    """A hose, the drogue at its end, and the air that both are dragged through.
+    """A hose with the drogue at its end, and the air stream around them.
 
     Attributes:
         name: of the preset that it comes from.
@@ -25,12 +25,12 @@ class HoseParameters(FrozenModel):
         diameter_m: outer. [m]
         mass_per_length_kg_m: of the hose, with the fuel in it. [kg/m]
         drogue_mass_kg: [kg]
-        drogue_diameter_m: of the disc that its drag coefficient is meant for. [m]
+        drogue_diameter_m: of the disc to which its drag coefficient refers. [m]
         drogue_drag_coefficient: of the drogue.
-        crossflow_drag_coefficient, skin_drag_coefficient: of the hose, for the air across and along it.
+        crossflow_drag_coefficient, skin_drag_coefficient: of the hose, for flow across and along it.
         airspeed_m_s: of tanker and receiver. [m/s]
         air_density_kg_m3: [kg/m3]
-        turbulence_altitude_m: above ground, which sets scale and shape of the turbulence. [m]
+        turbulence_altitude_m: above ground; sets the scale and shape of the turbulence. [m]
     """
 
     name: str = Field(default="own", min_length=1, max_length=40)
@@ -78,7 +78,7 @@ HOSES: dict[str, HoseParameters] = {hose.name: hose for hose in (_FULL_SIZE, _SM
 
 
 def _resolve(value: Any) -> Any:
-    """A preset's name, or a table that changes one, in full."""
+    """All parameters, from a preset's name or from a table that changes a preset."""
     table = {"preset": value} if isinstance(value, str) else value
     if not isinstance(table, dict) or "preset" not in table:
         return value
@@ -94,27 +94,28 @@ Hose = Annotated[HoseParameters, BeforeValidator(_resolve)]
 
 DropoutKindOrNone = DropoutKind | Literal["none"]
 
-# The sun stands where the receiver looks, which its slow changes of attitude and the swing of the drogue lower. [deg]
-_LOWEST_LOOK_DEG = 4.0
-# Share of its offset by which the sun may stand below the drogue: sin 45 degrees, rounded up.
-_MOST_DOWNWARDS = 0.71
+# The sun stands near the receiver's line of sight to the drogue; slow attitude changes and the swinging drogue lower
+# that line by up to this. [deg]
+_LINE_OF_SIGHT_DROP_DEG = 4.0
+# Largest share of its offset by which the sun stands below the drogue: sin 45 degrees, rounded up.
+_LARGEST_SUN_DROP_FRACTION = 0.71
 
 
 class DropoutRanges(FrozenModel):
-    """A stretch in each sequence over which the cameras do not see the drogue, or hardly; draws are by sequence.
+    """Distribution of the dropouts: one period in each sequence in which the cameras hardly see the drogue, or not.
 
     Attributes:
-        kinds: sequence by sequence in turn. `occlusion` puts a bar before both cameras that hides all of the drogue;
-            `out-of-view` turns the receiver aside until neither eye has any of it; `glare` has the formation turn until
-            the sun stands beside the drogue; `none` leaves a sequence as it is.
+        kinds: used in turn, sequence by sequence. `occlusion` moves a bar before both cameras that hides all of the
+            drogue; `out-of-view` turns the receiver until neither eye sees any of it; `glare` turns the formation until
+            the sun stands beside the drogue; `none` leaves a sequence unchanged.
         begins_s: from the sequence's start until the drogue is lost. [s]
-        lasts_s: how long it is. [s]
-        onset_s: how long the bar takes to come before the drogue, or the turn, and as long again to go. [s]
+        lasts_s: duration. [s]
+        onset_s: duration of the bar's, or the turn's, approach, and again of its return. [s]
         obstacle_distance_m: of the bar's axis from the cameras. [m]
         turn_deg: of the receiver, to the left or to the right, for `out-of-view`. [deg]
-        sun_offset_deg: of the sun from the drogue's edge as the receiver sees it, in the middle of the stretch, for
-            `glare`. [deg]
-        sweep_deg: heading of the formation before and after it, to either side, for `glare`. [deg]
+        sun_offset_deg: angle from the drogue's edge to the sun, seen from the receiver, in the middle of the dropout,
+            for `glare`. [deg]
+        sweep_deg: heading offset of the formation before and after the dropout, to either side, for `glare`. [deg]
     """
 
     kinds: tuple[DropoutKindOrNone, ...] = Field(min_length=1, max_length=40)
@@ -147,20 +148,20 @@ class DropoutRanges(FrozenModel):
 
     @property
     def end_s(self) -> float:
-        """When the drogue is in sight again at the latest. [s]"""
+        """Latest time at which the drogue is in sight again. [s]"""
         return self.begins_s.high + self.lasts_s.high + self.onset_s.high
 
     def check_turn(self, rig: StereoRig, rim_radius_m: float, distance_m: float, beside_m: float) -> None:
-        """Check that a turned receiver has lost the drogue.
+        """Check that the turn takes the drogue out of both views.
 
         Args:
             rig: the cameras.
             rim_radius_m: of the drogue. [m]
             distance_m: of the drogue. [m]
-            beside_m: of the drogue from the axis midway between the eyes, to the left or to the right. [m]
+            beside_m: lateral distance of the drogue from the axis midway between the eyes. [m]
 
         Raises:
-            ValueError: it still has part of it in view.
+            ValueError: part of it stays in view.
         """
         if "out-of-view" not in self.kinds:
             return
@@ -177,13 +178,13 @@ class DropoutRanges(FrozenModel):
         """Check that the sun can stand beside the drogue.
 
         Raises:
-            ValueError: the receiver looks at the ground, or a map has a sun of its own.
+            ValueError: the sun would stand below the horizon, or an environment map fixes it.
         """
         if "glare" not in self.kinds:
             return
         if environment.map is not None:
             raise ValueError("sequence.losses.kinds: glare moves the sun, and that of environment.map cannot be moved")
-        needed_deg = _LOWEST_LOOK_DEG + _MOST_DOWNWARDS * self.sun_offset_deg.high
+        needed_deg = _LINE_OF_SIGHT_DROP_DEG + _LARGEST_SUN_DROP_FRACTION * self.sun_offset_deg.high
         if pose.camera_pitch_deg.low < needed_deg:
             raise ValueError(
                 "pose.camera_pitch_deg: glare needs the receiver to look up at the drogue by at least "
@@ -194,20 +195,20 @@ class DropoutRanges(FrozenModel):
 
 Manoeuvre = Literal["docking", "station", "missed-approach"]
 
-# How a receiver gets to its closure speed and out of it. [m/s2]
+# Acceleration of a receiver to its closure speed, and its deceleration. [m/s2]
 CLOSURE_ACCELERATION_M_S2 = 0.5
 _NOTHING = Range(low=0, high=0)
-# What moves a sequence takes the place of these keys of `[pose]`.
+# In a sequence the flight dynamics replace these keys of `[pose]`.
 _POSE_OF_SINGLES = ("pitch_deg", "yaw_deg", "on_axis", "speed_m_s", "rate_deg_s")
 
 
 class Follower(FrozenModel):
-    """Guidance that keeps the drogue near the axis of the rig, as a law of second order.
+    """Second-order guidance law that keeps the drogue near the axis of the rig.
 
     Attributes:
-        bandwidth_hz: natural frequency; 0 flies to where the drogue hangs in still air, whatever it does. [Hz]
-        delay_s: age of what it knows of the drogue, whose place it carries on over this time by the velocity. [s]
-        acceleration_limit_m_s2: of the receiver against the tanker. [m/s2]
+        bandwidth_hz: natural frequency; 0 flies to the drogue's equilibrium position in still air. [Hz]
+        delay_s: age of its measurement of the drogue, which it extrapolates at constant velocity. [s]
+        acceleration_limit_m_s2: of the receiver relative to the tanker. [m/s2]
     """
 
     bandwidth_hz: float = Field(default=0.8, ge=0, le=5)
@@ -216,21 +217,21 @@ class Follower(FrozenModel):
 
 
 class Receiver(FrozenModel):
-    """What the receiver does and how it shakes; distances are those of the rim's centre along the optical axis.
+    """Manoeuvres and vibration of the receiver; distances are those of the rim's centre along the optical axis.
 
     Attributes:
-        manoeuvres: sequence by sequence in turn. `docking` closes from `start_m` to `end_m` and stays there; `station`
-            stays at `start_m`; `missed-approach` closes to `abort_m` and backs off to `start_m` again.
+        manoeuvres: used in turn, sequence by sequence. `docking` closes from `start_m` to `end_m` and stays there;
+            `station` stays at `start_m`; `missed-approach` closes to `abort_m` and returns to `start_m`.
         start_m, end_m, abort_m: [m]
         closure_m_s: [m/s]
-        hold_s: at `start_m` before it closes. [s]
-        offset_right_m, offset_down_m: of the drogue from the rig's axis; drawn by sequence. Docking takes them out in
-            proportion to the distance still to go. [m]
+        hold_s: time at `start_m` before it closes. [s]
+        offset_right_m, offset_down_m: of the drogue from the rig's axis; drawn by sequence. Docking reduces them in
+            proportion to the remaining distance. [m]
         follower: its guidance.
         body_radius_m: of its nose, far behind the tip, for the bow wave; 0 for none. [m]
         nose_body_m: the tip of its nose from the left eye: forward, right, down. [m]
-        attitude_sd_deg: standard deviation of each angle about its mean, slowly (0.05 to 0.6 Hz). [deg]
-        vibration_deg, vibration_m: the same of each axis, fast (8 to 40 Hz). [deg, m]
+        attitude_sd_deg: standard deviation of each angle at low frequencies (0.05 to 0.6 Hz). [deg]
+        vibration_deg, vibration_m: standard deviation of each axis at high frequencies (8 to 40 Hz). [deg, m]
     """
 
     manoeuvres: tuple[Manoeuvre, ...] = Field(default=("docking",), min_length=1, max_length=40)
@@ -261,7 +262,7 @@ class Receiver(FrozenModel):
         return {"docking": self.end_m, "station": self.start_m, "missed-approach": self.abort_m}[manoeuvre]
 
     def duration_s(self, manoeuvre: Manoeuvre) -> float:
-        """How long a manoeuvre takes; 0 for one that has no end. [s]"""
+        """Duration of a manoeuvre; 0 for one without an end. [s]"""
         if manoeuvre == "station":
             return 0.0
         leg_s = run_time_s(self.start_m - self.nearest_m(manoeuvre), self.closure_m_s)
@@ -269,24 +270,24 @@ class Receiver(FrozenModel):
 
 
 def run_time_s(length_m: float, speed_m_s: float) -> float:
-    """How long a run over a length takes, from rest to rest. [s]"""
+    """Duration of a run over a length, from rest to rest. [s]"""
     peak_m_s = min(speed_m_s, math.sqrt(length_m * CLOSURE_ACCELERATION_M_S2))
     return length_m / peak_m_s + peak_m_s / CLOSURE_ACCELERATION_M_S2
 
 
 class SequenceRanges(FrozenModel):
-    """How the sequences of a recipe move; each has a scene, a hose, and air that is its own.
+    """Distribution of the sequences of a recipe; each has a scene, a hose motion and turbulence of its own.
 
     Attributes:
-        frames_per_sequence: pairs in each; frame k is number k modulo this of sequence k over this.
-        frame_rate_hz: the middles of the exposures are evenly spaced. [Hz]
+        frames_per_sequence: number of pairs N in each; frame k is pair k modulo N of sequence k // N.
+        frame_rate_hz: rate of the exposures' middles, which are evenly spaced. [Hz]
         hose: preset, table or all parameters.
-        turbulence: severities, sequence by sequence in turn; in TOML also a single name.
-        tanker_motion_m: standard deviation of the pod about its mean place, along each axis (0.05 to 0.2 Hz). [m]
-        release_m: where the drogue's coupling is let go at the beginning, at rest: aft, right, up of the pod; without
-            it the hose has moved with the air for a while. [m]
-        receiver: what it does.
-        losses: stretches over which the cameras lose the drogue, or none.
+        turbulence: severities, used in turn, sequence by sequence; TOML also takes a single name.
+        tanker_motion_m: standard deviation of the pod about its mean position, along each axis (0.05 to 0.2 Hz). [m]
+        release_m: position at which the drogue's coupling is released from rest at the beginning: aft, right, up of the
+            pod; without it the hose already moves with the air. [m]
+        receiver: its manoeuvres.
+        losses: dropouts, or none.
     """
 
     frames_per_sequence: int = Field(ge=1, le=100_000)
@@ -296,7 +297,7 @@ class SequenceRanges(FrozenModel):
     tanker_motion_m: float = Field(default=0.05, ge=0, le=5)
     release_m: tuple[float, float, float] | None = None
     receiver: Receiver = Receiver()
-    # Left out where there is none, so that the hashes of other recipes do not know of it.
+    # Left out where there is none, so that the hashes of other recipes stay those of earlier versions.
     losses: DropoutRanges | None = Field(default=None, exclude_if=lambda losses: losses is None)
 
     @field_validator("turbulence", mode="before")
@@ -313,9 +314,9 @@ class SequenceRanges(FrozenModel):
                     f"hose.length_m: a hose of {self.hose.length_m:g} m is shorter than the {away_m:.3g} m from the "
                     "pod to release_m; lengthen it or release the drogue nearer to the pod"
                 )
-        if self.hose.airspeed_m_s < SLOWEST_M_S and set(self.turbulence) != {"none"}:
+        if self.hose.airspeed_m_s < MIN_AIRSPEED_M_S and set(self.turbulence) != {"none"}:
             raise ValueError(
-                f"turbulence: needs an airspeed of at least {SLOWEST_M_S:g} m/s, got {self.hose.airspeed_m_s:g}; "
+                f"turbulence: needs an airspeed of at least {MIN_AIRSPEED_M_S:g} m/s, got {self.hose.airspeed_m_s:g}; "
                 "use 'none'"
             )
         span_s = (self.frames_per_sequence - 1) / self.frame_rate_hz
@@ -335,14 +336,14 @@ class SequenceRanges(FrozenModel):
 
     @property
     def nearest_m(self) -> float:
-        """Smallest distance that is flown to. [m]"""
+        """Smallest distance of all manoeuvres. [m]"""
         return min(self.receiver.nearest_m(manoeuvre) for manoeuvre in self.receiver.manoeuvres)
 
     def check_view(self, rig: StereoRig, rim_radius_m: float) -> None:
-        """Check that both eyes see the whole drogue along the intended path, but for what `losses` asks for.
+        """Check that both eyes see the whole drogue along the intended path, outside dropouts.
 
         Raises:
-            ValueError: they do not, or a turn that is to lose the drogue does not.
+            ValueError: they do not, or the turn of a dropout leaves part of the drogue in view.
         """
         receiver = self.receiver
         for manoeuvre in receiver.manoeuvres:
@@ -366,11 +367,11 @@ class SequenceRanges(FrozenModel):
                     )
 
 
-def check_singles(pose: PoseRanges, target: AppearanceRanges) -> None:
-    """Check that nothing is asked for that only single frames have.
+def check_single_frame_keys(pose: PoseRanges, target: AppearanceRanges) -> None:
+    """Check that a recipe with sequences sets no keys that apply to single frames only.
 
     Raises:
-        ValueError: something is.
+        ValueError: it sets one; names it.
     """
     plain = PoseRanges()
     for name in _POSE_OF_SINGLES:
@@ -381,10 +382,10 @@ def check_singles(pose: PoseRanges, target: AppearanceRanges) -> None:
 
 
 def fill_distance(table: dict[str, Any]) -> None:
-    """Give a recipe's table with a `[sequence]` the `[distance]` that follows from it, in place.
+    """Add the `[distance]` that follows from a recipe table's `[sequence]`, if it has one, in place.
 
     Raises:
-        ValueError: it has one of its own.
+        ValueError: the table has a `[distance]` of its own.
     """
     given = table.get("sequence")
     if given is None:

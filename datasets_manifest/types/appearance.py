@@ -1,4 +1,4 @@
-"""What else a frame shows: the state of the drogue's surfaces, obstacles, or a calibration board in its place."""
+"""What a frame shows besides a new drogue: aged surfaces, obstacles, or a calibration board in its place."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class SurfaceCondition(FrozenModel):
 
     Attributes:
         missing: it has come off; the dark face shows in its place.
-        reflectance_fraction: what age has left of the paint's reflectance.
+        reflectance_fraction: share of the new paint's reflectance that is left.
         dirt_fraction: share of its area under dirt.
-        dirt_seed: of the pattern of the dirt.
-        lamp_fraction: what a self-lit marker still gives of its luminance; 0 has failed.
+        dirt_seed: seed of the dirt's pattern.
+        lamp_fraction: share of a self-lit marker's luminance that is left; 0 for a failed lamp.
     """
 
     missing: bool = False
@@ -41,13 +41,13 @@ AS_NEW = SurfaceCondition()
 
 
 class DrogueCondition(FrozenModel):
-    """State of a drogue in one frame; navigation is never told.
+    """Condition of a drogue's surfaces in one frame; navigation never sees it.
 
     Attributes:
         markers: in the drogue's order; empty when all are as new.
         hub: of the hub annulus.
-        body_reflectance_fraction: what age has left of (below 1) or soot and bleaching have done to face, canopy, ribs,
-            coupling and hose (above 1).
+        body_reflectance_fraction: factor on the reflectance of face, canopy, ribs, coupling and hose: below 1 for soot,
+            above 1 for bleaching.
     """
 
     markers: tuple[SurfaceCondition, ...] = ()
@@ -55,16 +55,16 @@ class DrogueCondition(FrozenModel):
     body_reflectance_fraction: float = Field(default=1.0, ge=0.1, le=3)
 
     def of_marker(self, index: int) -> SurfaceCondition:
-        """State of one marker."""
+        """Condition of one marker."""
         return self.markers[index] if self.markers else AS_NEW
 
 
 class Obstacle(FrozenModel):
-    """Something else that stands in the picture; it moves with the drogue while the shutter is open.
+    """A body in the picture that is neither drogue, hose nor tanker; during the exposure it moves with the drogue.
 
     Attributes:
-        kind: `probe` of the receiver, `obstacle` close to the cameras, or `distractor`: one may take it for a drogue.
-        shape: what it looks like, in its own frame.
+        kind: `probe` of the receiver, `obstacle` close to the cameras, or `distractor` that resembles a drogue.
+        shape: dimensions, in its own frame.
         left_from_object: pose at mid-exposure.
         reflectance_rgb: diffuse reflectance in linear Rec. 709.
     """
@@ -118,7 +118,7 @@ class CalibrationBoard(FrozenModel):
         return np.stack([*np.meshgrid(x, y), np.zeros((self.rows + 1, self.columns + 1))], axis=-1)
 
     def corners_m(self) -> Array:
-        """((rows - 1) (columns - 1), 3) inner corners, row by row, in the board frame: what finders find. [m]"""
+        """((rows - 1) (columns - 1), 3) inner corners, row by row, in the board frame, which detectors find. [m]"""
         return self.grid_m()[1:-1, 1:-1].reshape(-1, 3)
 
     def outline_m(self) -> Array:
@@ -129,11 +129,11 @@ class CalibrationBoard(FrozenModel):
 
 
 class PlacedBoard(FrozenModel):
-    """A board in a frame; it stands still while the shutter is open.
+    """A board in a frame; it does not move during the exposure.
 
     Attributes:
-        shape: what it measures.
-        left_from_board: where it is.
+        shape: its dimensions.
+        left_from_board: its pose.
     """
 
     shape: CalibrationBoard

@@ -19,8 +19,8 @@ GROUND_KINDS: tuple[GroundKind, ...] = get_args(GroundKind)
 
 Turbulence = Literal["none", "light", "moderate", "severe"]
 
-SLOWEST_M_S = 5.0
-"""Airspeed from which on there can be turbulence: a frozen field needs to be flown through. [m/s]"""
+MIN_AIRSPEED_M_S = 5.0
+"""Lowest airspeed with turbulence: the frozen gust field moves past the aircraft at its airspeed. [m/s]"""
 
 MAP_SUFFIXES = (".exr", ".hdr")
 
@@ -31,12 +31,12 @@ class CloudLayer(FrozenModel):
     Attributes:
         kind: `cumulus` heaps with a flat base, `stratus` a mottled sheet, `cirrus` thin streaks of ice.
         height_above_camera_m: of the side that faces the camera: the base above it, or, negative, the top below. [m]
-        thickness_m: from base to the highest tops; nothing for cirrus, which has none. [m]
+        thickness_m: from base to the highest tops; cirrus ignores it. [m]
         cover_fraction: share of the layer's plan that is cloud.
         feature_size_m: size of the largest clouds. [m]
         optical_depth: in the thick parts, vertically.
-        heading_deg: along which cirrus is drawn out; from east towards north. [deg]
-        texture_seed: of its pattern.
+        heading_deg: direction of cirrus streaks, from east towards north. [deg]
+        texture_seed: seed of its pattern.
     """
 
     kind: CloudKind = "cumulus"
@@ -56,16 +56,16 @@ class CloudLayer(FrozenModel):
 
     @property
     def is_above(self) -> bool:
-        """Whether the camera flies under it."""
+        """Whether it lies above the camera."""
         return self.height_above_camera_m > 0
 
 
 class Mist(FrozenModel):
-    """Thin cloud that the camera flies in: even droplets between two levels.
+    """Homogeneous thin cloud around the camera, between two levels.
 
     Attributes:
         visibility_m: meteorological range in it (2 % contrast). [m]
-        above_m, below_m: how far it reaches above and below the camera. [m]
+        above_m, below_m: extent above and below the camera. [m]
     """
 
     visibility_m: float = Field(ge=10, le=100_000)
@@ -92,16 +92,16 @@ class Moon(FrozenModel):
 
 
 class EnvironmentMapFile(FrozenModel):
-    """A file that is pinned by its contents, and the level of its light; one of the two levels must be given.
+    """An image file, pinned by its hash, and its absolute light level, of which exactly one form is given.
 
     Attributes:
-        path: of an equirectangular picture, `.exr` or Radiance `.hdr`, as the user wrote it; relative to `folder`
+        path: of an equirectangular image, `.exr` or Radiance `.hdr`, as the user wrote it; relative to `folder`
             unless absolute.
         sha256: of the file.
-        folder: where the recipe lies. It is not stored with a dataset, which must not depend on where it was made; a
-            frame that is read back looks in the working directory.
-        cd_m2_per_unit: luminance of the picture's value 1. [cd/m2]
-        horizontal_illuminance_lux: what the picture's upper half gives level ground, sun included. [lux]
+        folder: the recipe's folder. It is not stored with a dataset, whose contents must not depend on the place where
+            it was made; a frame that is read back looks in the working directory.
+        cd_m2_per_unit: luminance of pixel value 1. [cd/m2]
+        horizontal_illuminance_lux: illuminance of level ground by the image's upper half, sun included. [lux]
     """
 
     path: str = Field(min_length=1, max_length=1000)
@@ -118,16 +118,16 @@ class EnvironmentMapFile(FrozenModel):
 
     @property
     def file(self) -> Path:
-        """Where the picture lies."""
+        """Path of the image."""
         return self.folder / self.path
 
 
 class EnvironmentMap(EnvironmentMapFile):
-    """The map of one scene.
+    """A user's image of sky and ground all around, which replaces the modelled ones in one scene.
 
     Attributes:
-        rotation_deg: azimuth, from east towards north, of the middle of the picture; what stands right of it in the
-            picture stands right of it in the world. [deg]
+        rotation_deg: azimuth of the image's centre, from east towards north; the image is not mirrored: what is right
+            of the centre in the image is right of it in the world. [deg]
     """
 
     rotation_deg: float = Field(default=0.0, ge=-360, le=360)
@@ -142,17 +142,17 @@ class Environment(FrozenModel):
         turbidity: Linke-like turbidity of Preetham's model, 2 very clear to 6 hazy.
         visibility_m: meteorological range (2 % contrast), which sets the extinction of the air. [m]
         altitude_m: of the camera above ground. [m]
-        camera_offset_m: east and north of the place about which ground and clouds are laid out; only a sequence flies
-            away from it. [m]
-        ground: what lies below; `town` runs out into fields.
+        camera_offset_m: east and north, from the origin of ground and cloud patterns; only sequences move away from
+            it. [m]
+        ground: kind of ground; `town` is surrounded by fields.
         ground_reflectance_rgb: mean diffuse reflectance of the ground, of a coast's land, or of the water under the
             surface of the sea.
-        ground_texture_seed: of its pattern, shoreline and ships.
-        wind_speed_m_s: over the sea, which sets waves, glint and foam. [m/s]
+        ground_texture_seed: seed of its pattern, shoreline and ships.
+        wind_speed_m_s: over the sea; sets waves, glint and foam. [m/s]
         clouds: cloud layers, in any order.
         mist: thin cloud around the camera, or none.
         moon: or none.
-        map: a picture of sky and ground that takes the place of all the others but the visibility, or none.
+        map: an image of sky and ground that replaces all of the above but the visibility, or none.
     """
 
     sun_elevation_deg: float = Field(ge=-90, le=90)
@@ -160,7 +160,7 @@ class Environment(FrozenModel):
     turbidity: float = Field(ge=1.9, le=10)
     visibility_m: float = Field(ge=500, le=400_000)
     altitude_m: float = Field(ge=10, le=20_000)
-    # Left out where it says nothing, so that the hashes of single pairs do not know of it.
+    # Left out at its default, so that the hashes of single pairs stay those of earlier versions.
     camera_offset_m: tuple[float, float] = Field(default=(0.0, 0.0), exclude_if=lambda offset_m: offset_m == (0.0, 0.0))
     ground: GroundKind = "fields"
     ground_reflectance_rgb: ReflectanceRgb
@@ -178,10 +178,10 @@ class Environment(FrozenModel):
 
 
 def pin_environment_map(table: dict[str, Any], folder: Path) -> None:
-    """Replace the name of the map's file in an `[environment]` table, if it has one, by path, hash and folder.
+    """Replace the map's file name in an `[environment]` table, if it has one, by path, hash and folder, in place.
 
     Raises:
-        ValueError: not a name, or a file that cannot be read.
+        ValueError: not a file name, or a file that cannot be read.
     """
     given = table.get("map")
     if isinstance(given, str):
@@ -201,10 +201,10 @@ def pin_environment_map(table: dict[str, Any], folder: Path) -> None:
 
 
 def read_environment_map(environment_map: EnvironmentMapFile) -> bytes:
-    """The contents of a map's file.
+    """Contents of an environment map's file.
 
     Raises:
-        ValueError: it is missing, or is not the file that it was when the recipe was read.
+        ValueError: it is missing, or its hash is not that of the file when the recipe was read.
     """
     data = _read(environment_map.file)
     sha256 = hashlib.sha256(data).hexdigest()

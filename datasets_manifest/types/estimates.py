@@ -1,4 +1,4 @@
-"""What a pose estimator says about one frame, and the JSON-lines file that holds many."""
+"""Results of pose estimators, one for each frame, and the JSON-lines file that holds them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Feature(FrozenModel):
         index: of the marker in the drogue's order; `hub` for the hub.
         center_px: measured centre.
         cov_px2: (2, 2) covariance of the centre, row-major. [px^2]
-        used: whether the pose rests on it.
+        used: whether the pose was computed from it.
     """
 
     eye: Eye
@@ -43,13 +43,13 @@ class Mode(FrozenModel):
 
 
 class Region(FrozenModel):
-    """Where in one image the drogue was looked for.
+    """The search region of the drogue in one image.
 
     Attributes:
         eye: which image.
         box_xywh_px: x, y of the low corner, width, height in pixel-centre coordinates; may reach over the image's edge.
-        source: `detector`, the name of the tracker that followed it, or `other eye` where that one alone had found it.
-        score: 0 to 1.
+        source: `detector`, the name of the tracker, or `other eye` where only that one had a detection.
+        score: confidence, 0 to 1.
     """
 
     eye: Eye
@@ -59,7 +59,7 @@ class Region(FrozenModel):
 
 
 class Motion(FrozenModel):
-    """How the drogue moves against the left camera, at the time of the images.
+    """Motion of the drogue relative to the left camera, at the time of the images.
 
     Attributes:
         velocity_m_s: of the drogue's origin, in the left camera's axes. [m/s]
@@ -73,18 +73,18 @@ class Motion(FrozenModel):
 
 
 class Docking(FrozenModel):
-    """The drogue as the probe sees it, in the receiver's body axes: forward, right, down.
+    """The drogue relative to the probe, in the receiver's body axes: forward, right, down.
 
     Attributes:
         mouth_from_tip_m: (3,) centre of the drogue's rim from the probe's tip. [m]
-        mouth_sd_m: (3,) standard deviations of that. [m]
-        closure_m_s: how fast the forward part shrinks; null where the motion is not known. [m/s]
-        miss_m: distance of the tip from the drogue's axis when it comes to the plane of the rim, if both go on as they
-            move now; null unless they close. [m]
-        miss_sd_m: standard deviation of that. [m]
-        contact_s: until then; null unless they close. [s]
+        mouth_sd_m: (3,) standard deviations of `mouth_from_tip_m`. [m]
+        closure_m_s: rate at which the forward component shrinks; null where the motion is not known. [m/s]
+        miss_m: predicted distance of the tip from the drogue's axis when it reaches the plane of the rim, at constant
+            velocities; null unless they close. [m]
+        miss_sd_m: standard deviation of `miss_m`. [m]
+        contact_s: predicted time until then; null unless they close. [s]
         captured: whether `miss_m` lies within the capture radius; null where there is no `miss_m`.
-        capture_radius_m: that radius; null for the drogue's own. [m]
+        capture_radius_m: null for the drogue's own. [m]
     """
 
     mouth_from_tip_m: tuple[float, float, float]
@@ -102,14 +102,14 @@ class PoseEstimate(FrozenModel):
 
     Attributes:
         left_from_drogue: modulo the markers' symmetry.
-        covariance: (6, 6) in the tangent that `tangent` names; None where a method knows none.
+        covariance: (6, 6) in the tangent space that `tangent` names; None where the method gives none.
         modes: every pose that explains the images, the best first; weights sum to 1.
-        features: what was measured.
-        stage_s: seconds by stage. [s]
-        regions: where the drogue was looked for, at most one an eye.
-        motion: where a filter knows it.
-        docking: where it was asked for.
-        latency_s: from the arrival of the images to this answer, where they came at a rate. [s]
+        features: the measured image points.
+        stage_s: computing time by stage. [s]
+        regions: search regions, at most one an eye.
+        motion: as estimated by a filter, or None.
+        docking: where it was requested.
+        latency_s: from the arrival of the images to this result, where they arrived at a rate. [s]
     """
 
     status: Literal["fix"] = "fix"
@@ -128,7 +128,7 @@ class PoseEstimate(FrozenModel):
 
 
 class NoFix(FrozenModel):
-    """No pose, and why."""
+    """No pose, with the reason."""
 
     status: Literal["no_fix"] = "no_fix"
     frame_index: int = Field(ge=0)
@@ -148,10 +148,10 @@ def write_estimates(path: Path, estimates: Iterable[Estimate]) -> int:
     """Write one JSON object a line, replacing `path` only once all are written.
 
     Returns:
-        How many were written.
+        The number of estimates.
 
     Raises:
-        OSError: the file cannot be written; names it. What was there stays.
+        OSError: the file cannot be written; names it. An existing file stays as it was.
     """
     count = 0
     with open_text_atomic(path) as stream:
@@ -162,7 +162,7 @@ def write_estimates(path: Path, estimates: Iterable[Estimate]) -> int:
 
 
 def read_estimates(path: Path) -> Iterator[Estimate]:
-    """Estimates of a JSON-lines file, ours or anybody's.
+    """Estimates from a JSON-lines file, by droguekit or by any other program.
 
     Raises:
         ValueError: the file cannot be read, or a line is not an estimate; names file and line.

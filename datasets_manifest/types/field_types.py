@@ -101,7 +101,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Range(FrozenModel):
-    """A uniform draw between `low` and `high`; equal ends give a constant. In TOML also `[low, high]` or a number."""
+    """A uniform distribution between `low` and `high`, or a constant; in TOML also `[low, high]` or a number."""
 
     low: float
     high: float
@@ -125,7 +125,7 @@ class Range(FrozenModel):
         """Check that the whole range lies in [low, high].
 
         Raises:
-            ValueError: it does not.
+            ValueError: it does not; names the field.
         """
         if not (low <= self.low and self.high <= high):
             raise ValueError(f"{name}: must lie in [{low:g}, {high:g}], got [{self.low:g}, {self.high:g}]")

@@ -1,4 +1,4 @@
-"""One frame to be rendered, complete: everything that the picture and its truth depend on."""
+"""The complete specification of one stereo pair: everything that its images and its truth depend on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Exposure(FrozenModel):
     Attributes:
         time_s: how long the shutter is open. [s]
         f_number: focal length over aperture.
-        gain: of the amplifier before the converter; at 1 a full well is the highest number.
+        gain: of the amplifier before the converter; at 1 a full well gives the highest number.
     """
 
     time_s: float = Field(gt=0, le=1)
@@ -32,7 +32,7 @@ class Exposure(FrozenModel):
 
     @property
     def lux_per_cd_m2(self) -> float:
-        """Illuminance of the sensor per luminance of the scene, for a lens without loss, focused far away. [lux m2/cd]
+        """Illuminance of the sensor per luminance of the scene, for a lossless lens focused at infinity. [lux m2/cd]
 
         Source: camera equation E = pi L / (4 N^2), EMVA Standard 1288.
         """
@@ -40,28 +40,28 @@ class Exposure(FrozenModel):
 
 
 class Optics(FrozenModel):
-    """What the lens does besides its point spread; as given here it does nothing.
+    """Effects of the lens besides its point spread; the defaults switch all but scattered light off.
 
     Attributes:
         natural_vignetting: light falls off with the fourth power of the cosine of the angle from the axis.
-        mechanical_falloff_fraction: of the light that the lens barrel takes besides in the corners of the image; it
+        mechanical_falloff_fraction: share of the light that the lens barrel blocks in the corners of the image; it
             grows with the fourth power of the distance from the principal point.
-        focus_distance_m: planar depth that is sharp; without it everything is. [m]
-        pixel_pitch_um: with the focal length in pixels it gives the one in metres, and so the aperture. [um]
-        scattered_fraction: of the light of sun or moon on the lens, spread over the picture as glare; 0.01 is
-            a clean lens, a fogged one may have a tenth (our choice).
+        focus_distance_m: planar depth in focus; without it everything is sharp. [m]
+        pixel_pitch_um: converts the focal length to metres, which gives the aperture. [um]
+        scattered_fraction: share of the sun's or moon's light on the lens that is spread over the image as glare:
+            0.01 for a clean lens, about a tenth for a fogged one (our choice).
     """
 
     natural_vignetting: bool = False
     mechanical_falloff_fraction: float = Field(default=0.0, ge=0, lt=1)
     focus_distance_m: float | None = Field(default=None, gt=0.05, le=1e6)
     pixel_pitch_um: float = Field(default=3.75, ge=0.5, le=100)
-    # Left out where the lens is clean, so that the hashes of other datasets do not know of it.
+    # Left out for a clean lens, so that the hashes of other datasets stay those of earlier versions.
     scattered_fraction: float = Field(default=0.01, ge=0, le=0.5, exclude_if=lambda fraction: fraction == 0.01)
 
 
 class Sensor(FrozenModel):
-    """What turns radiance into numbers, with the lens before it.
+    """An image sensor and the lens before it.
 
     Attributes:
         name: the preset's name.
@@ -95,29 +95,29 @@ class Sensor(FrozenModel):
 
 
 class FrameSpec(FrozenModel):
-    """One stereo pair to make. Truth in all that it holds; navigation never sees it.
+    """Specification of one stereo pair. All of it is truth, which navigation never sees.
 
     Attributes:
         seed: of the dataset; with `frame_index` it keys every random stream.
-        frame_index: place in the dataset.
+        frame_index: index in the dataset.
         family: the recipe's name for these conditions, for tables.
         scene_id: which drawn environment; splits are by scene.
         sequence_id: which sequence, or None for single frames.
         time_s: mid-exposure. [s]
-        drogue: what hangs there, or None for an empty frame.
-        sought: in an empty frame of a dataset with several drogues, the one that navigation is told to look for.
-        condition: state of the drogue's surfaces, or None when it is as new.
-        bystanders: what else stands in the picture.
+        drogue: the drogue, or None for an empty frame.
+        sought: in an empty frame of a dataset with several drogues, the one that navigation is to look for.
+        condition: of the drogue's surfaces, or None when it is as new.
+        bystanders: obstacles: the probe, bars close to the cameras, distractors.
         board: a calibration board instead of a drogue, or none.
         left_from_drogue: pose at mid-exposure, or None for an empty frame.
         world_from_left: world axes are x east, y north, z up; origin at the left eye.
         left_twist_per_s, drogue_twist_per_s: (6,) body twists over the exposure, each in its own frame, relative to
             axes that fly along with the tanker: velocity [m/s], then angular velocity [rad/s].
-        left_from_tanker: tanker frame x aft, y right wing, z up at the pod's hose exit, or None.
+        left_from_tanker: pose of the tanker (x aft, y right wing, z up, origin at the pod's hose exit), or None.
         hose_nodes_left_m: (K, 3) centre line from coupling to pod in the left camera at mid-exposure, or None. [m]
         rig, sensor, exposure, environment: as named.
-        rangefinder_reading_m: of the distance of the rim centre along the optical axis, or None without one. [m]
-        loss: what is coming to keep the cameras from seeing the drogue, keeps them, or is going; or None.
+        rangefinder_reading_m: measured distance of the rim centre along the optical axis, or None without one. [m]
+        loss: kind of the dropout whose onset, middle or end this frame is in, or None.
     """
 
     seed: int = Field(ge=0)
@@ -130,7 +130,7 @@ class FrameSpec(FrozenModel):
     sought: DrogueParameters | None = None
     condition: DrogueCondition | None = None
     bystanders: tuple[Obstacle, ...] = ()
-    # Left out where there is none, so that the hashes of other datasets do not know of boards.
+    # Left out where there is none, so that the hashes of other datasets stay those of earlier versions.
     board: PlacedBoard | None = Field(default=None, exclude_if=lambda board: board is None)
     left_from_drogue: Transform | None
     world_from_left: Transform
@@ -172,9 +172,9 @@ class FrameSpec(FrozenModel):
         return pose
 
     def left_from_stage_at(self, offset_s: float) -> RigidTransform:
-        """Pose of the axes in which everything that is drawn stands still, `offset_s` after mid-exposure.
+        """Pose of the axes in which everything that is drawn is at rest, `offset_s` after mid-exposure.
 
-        They are the drogue's; without one the left camera's own at mid-exposure, flying along with the tanker.
+        These are the drogue's axes; without a drogue the left camera's own at mid-exposure, moving with the tanker.
         """
         if self.left_from_drogue is not None:
             return self.left_from_drogue_at(offset_s)

@@ -1,4 +1,4 @@
-"""What the cameras of the rig deliver: the only pictures that navigation sees."""
+"""The images that the cameras of the rig deliver, and all that navigation sees of a scene."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class StereoImages:
     Attributes:
         left, right: (H, W, 3) in the order red, green, blue, or (H, W) for a mono sensor.
         left_mosaic, right_mosaic: (H, W) raw RGGB mosaic of a Bayer sensor, else None.
-        bits: how many bits of the integers are used: 8 in uint8, 12 in uint16.
+        bits: significant bits: 8 in uint8, 12 in uint16.
         encoding: `linear`, or `gamma` (the sRGB curve); a mosaic is always linear.
-        black_level_dn: number that no light gives. [DN]
+        black_level_dn: pixel value without light. [DN]
         time_s: mid-exposure. [s]
-        exposure_s: [s]
+        exposure_s: exposure time. [s]
     """
 
     left: Pixels

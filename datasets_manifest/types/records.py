@@ -1,4 +1,4 @@
-"""The truth of one stereo pair as it stands on disk: a function of the recipe and the frame, nothing else."""
+"""The truth of one stereo pair, as stored on disk: a function of the recipe and the frame alone."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ PixelBox = tuple[float, float, float, float]
 
 
 class FeatureView(FrozenModel):
-    """How one marker, or one more thing with a centre, stands in one image.
+    """Labels of one marker, or of the hub, in one image.
 
     Attributes:
         center_proj_px: image of the 3-D centre.
-        center_ellipse_px: centre of the image ellipse; what a centroid is compared with.
-        visible_fraction: visible over amodal pixel centres on the image's grid; 1 unoccluded, 0 when outside.
+        center_ellipse_px: centre of the image ellipse, the reference for centroids.
+        visible_fraction: visible over amodal pixel centres on the image's grid; 1 unoccluded, 0 outside the image.
         in_image: whether the whole feature lies on the image.
-        signal_to_noise: contrast against its surroundings over the sensor's noise at one pixel.
+        signal_to_noise: contrast against its background over the sensor's noise at one pixel.
     """
 
     center_proj_px: PixelPoint
@@ -69,11 +69,11 @@ class StereoViews(FrozenModel):
 
 
 class Conditions(FrozenModel):
-    """What the frame is sorted by in reports.
+    """Conditions by which reports group frames.
 
     Attributes:
-        markers_in_view, hub_in_view: of a sequence's pair, by eye: how many markers lie wholly on the image, and
-            whether the hub does; occlusion does not count.
+        markers_in_view, hub_in_view: of a sequence's pair, by eye: number of markers wholly inside the image, and
+            whether the hub is, regardless of occlusion.
     """
 
     family: str
@@ -87,7 +87,7 @@ class Conditions(FrozenModel):
 
 
 class PairRecord(FrozenModel):
-    """Everything known of one stereo pair.
+    """All labels of one stereo pair.
 
     Attributes:
         left_from_drogue: at mid-exposure; None in an empty frame.
@@ -95,8 +95,8 @@ class PairRecord(FrozenModel):
         pitch_deg, yaw_deg, roll_deg: of `left_from_drogue`.
         roll_modulo_deg: roll modulo the markers' symmetry, in [0, 360/order).
         file_sha256: of every other file of the frame, by name.
-        engine, engine_version: what made the radiance.
-        image_black_level_dn: number in the stored images that no light gives. [DN]
+        engine, engine_version: renderer of the radiance.
+        image_black_level_dn: pixel value of the stored images without light. [DN]
         frame: the specification that it was made from.
     """
 

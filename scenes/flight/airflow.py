@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from datasets_manifest.types.environment import SLOWEST_M_S, Turbulence
+from datasets_manifest.types.environment import MIN_AIRSPEED_M_S, Turbulence
 from geometry.se3 import Array
 
 GUST_PERIOD_S = 0.02
@@ -84,9 +84,9 @@ def sample_gusts(rng: np.random.Generator, turbulence: Dryden, airspeed_m_s: flo
     """
     if not any(turbulence.sd_m_s):
         return np.zeros((shape[0], 3, shape[1]))
-    if airspeed_m_s < SLOWEST_M_S:
+    if airspeed_m_s < MIN_AIRSPEED_M_S:
         raise ValueError(
-            f"turbulence: needs an airspeed of at least {SLOWEST_M_S:g} m/s, got {airspeed_m_s:g}; use 'none'"
+            f"turbulence: needs an airspeed of at least {MIN_AIRSPEED_M_S:g} m/s, got {airspeed_m_s:g}; use 'none'"
         )
     noise = rng.standard_normal((5, *shape))
     periods = [GUST_PERIOD_S * airspeed_m_s / scale for scale in turbulence.scale_m]
