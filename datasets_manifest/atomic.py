@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, TextIO, cast
 
 PART_SUFFIX = ".part"
-"""Ends the name of everything that is still being written; such names also begin with a dot."""
+"""Suffix of everything that is still being written; such names also begin with a dot."""
 
 
 def sync_folder(folder: Path) -> None:
@@ -25,7 +25,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def part_path(target: Path) -> Path:
-    """A name beside `target` that nobody else uses, for what is still being written."""
+    """A unique path beside `target`, for what is still being written."""
     return target.with_name(f".{target.name}-{uuid.uuid4().hex}{PART_SUFFIX}")
 
 
@@ -36,26 +36,26 @@ def open_text_atomic(path: Path) -> Iterator[TextIO]:
     Raises:
         OSError: it cannot be written; one line that names the file. Nothing is left behind.
     """
-    with _taking_name(path) as part, part.open("x", encoding="utf-8", newline="\n") as stream:
+    with _renamed_on_success(path) as part, part.open("x", encoding="utf-8", newline="\n") as stream:
         yield stream
         _sync(stream)
 
 
 @contextmanager
 def open_bytes_atomic(path: Path) -> Iterator[BinaryIO]:
-    """The same for bytes; the stream can be read too.
+    """A readable stream of bytes whose file takes its name when the block ends without an error.
 
     Raises:
         OSError: it cannot be written; one line that names the file. Nothing is left behind.
     """
-    with _taking_name(path) as part, part.open("x+b") as stream:
+    with _renamed_on_success(path) as part, part.open("x+b") as stream:
         yield cast(BinaryIO, stream)
         _sync(stream)
 
 
 @contextmanager
-def _taking_name(path: Path) -> Iterator[Path]:
-    """A name to write under, which is changed to `path` when the block ends without an error."""
+def _renamed_on_success(path: Path) -> Iterator[Path]:
+    """A temporary path, which is renamed to `path` when the block ends without an error."""
     part = part_path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -99,10 +99,10 @@ def new_folder(out: Path) -> Iterator[Path]:
     """A folder beside `out` to write into, which takes that name when the block ends without an error.
 
     Args:
-        out: must not be there yet, or be empty.
+        out: must not exist yet, or be empty.
 
     Raises:
-        ValueError: something is there already.
+        ValueError: it exists and is not empty.
         OSError: it cannot be written; one line that names it. Nothing is left behind.
     """
     target = out.resolve()
@@ -122,13 +122,16 @@ def new_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def takes_lock(file: IO[str]) -> bool:
-    """Whether an open file was nobody's and is now this process's, until it is closed.
+def try_lock(file: IO[str]) -> bool:
+    """Lock an open file for this process until it is closed, unless another process holds the lock.
 
-    The kernel frees the lock when the process ends, however it ends.
+    The kernel releases the lock when the process ends, in whatever way.
+
+    Returns:
+        Whether this process now holds the lock.
 
     Raises:
-        OSError: the file system knows no locks.
+        OSError: the file system does not support locks.
     """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

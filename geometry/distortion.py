@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, read_only
 
-_MOST_STEPS = 30
-_EXACT = 1e-13
+_MAX_STEPS = 30
+_TOLERANCE = 1e-13
 _BORDER_POINTS = 32
 
 
@@ -56,10 +56,10 @@ class BrownConrady:
         """
         wanted = np.asarray(places, dtype=np.float64)
         ideal = wanted.copy()
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             seen, j_xx, j_xy, j_yy = self._distort(ideal)
             error = wanted - seen
-            if np.abs(error).max(initial=0.0) < _EXACT:
+            if np.abs(error).max(initial=0.0) < _TOLERANCE:
                 return ideal
             determinant = j_xx * j_yy - j_xy**2
             if not (determinant > 0).all():

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 # float64 products of a few rotations stay far within this; a typing slip in a file does not.
 _ORTHONORMAL_TOLERANCE = 1e-6
-_MOST_COSINE = 2.0
+_MAX_COSINE = 2.0
 
 
 def read_only(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
@@ -51,7 +51,7 @@ class RigidTransform:
     def __post_init__(self) -> None:
         rotation = read_only(self.rotation, (3, 3), "rotation")
         # Absurd numbers, which would overflow in the product, are no cosines.
-        fits = np.abs(rotation).max() < _MOST_COSINE
+        fits = np.abs(rotation).max() < _MAX_COSINE
         fits = fits and np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ORTHONORMAL_TOLERANCE
         if not fits or np.linalg.det(rotation) < 0:
             raise ValueError(f"rotation: must be orthonormal with determinant +1, got {rotation.tolist()}")

@@ -1,4 +1,4 @@
-"""The rig's calibration as other programs read it: OpenCV, Kalibr, ROS."""
+"""The rig's calibration in the files of OpenCV, Kalibr and ROS."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from geometry.stereo import EYES, Eye, StereoRig
 
 
 def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
-    """A rig in the names and conventions of `cv2.stereoRectify`: the truth, which no calibration would find exactly.
+    """A rig in the names and conventions of `cv2.stereoRectify`; the true values, without calibration errors.
 
     Returns:
         M1, M2: (3, 3) intrinsics of the delivered images [px]; D1, D2: (1, 5) their distortion; R, T: right from left
@@ -56,7 +56,7 @@ def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
 def yaml_number(value: float) -> str:
     """Shortest digits that read back the same.
 
-    YAML 1.1, which ROS and Kalibr read, takes `1e-05` for a word: a number needs its point before the exponent.
+    YAML 1.1, which ROS and Kalibr read, takes `1e-05` for text: a number needs a point before the exponent.
     """
     digits = repr(float(value))
     mantissa, sign, exponent = digits.partition("e")
@@ -69,14 +69,14 @@ def yaml_list(values: ArrayLike) -> str:
 
 
 def camera_info_file(eye: Eye) -> str:
-    """The file of one eye."""
+    """Name of one eye's `camera_info` file."""
     return f"ros_{eye}.yaml"
 
 
 def camera_info(rig: StereoRig, eye: Eye) -> str:
-    """The text of one eye's file.
+    """Text of one eye's `camera_info` file, as ROS camera drivers read it.
 
-    Matrix and distortion are those of the delivered images, rectification and projection lead to the rectified pair:
+    Matrix and distortion are those of the delivered images; rectification and projection map to the rectified pair:
     `P[0, 3]` of the right eye is `-fx * baseline`. [px m]
 
     Source: the definition of `sensor_msgs/CameraInfo`; file format of the package `camera_calibration_parsers`.
@@ -104,19 +104,19 @@ KALIBR_FILE = "kalibr_camchain.yaml"
 
 
 def kalibr_fault(rig: StereoRig) -> str | None:
-    """Why a rig has no Kalibr camera chain, or None."""
+    """The reason why Kalibr cannot describe a rig, or None."""
     if any(lens.distortion.k3 != 0 for lens in rig.lenses or ()):
         return "Kalibr's radtan model has no k3, which the rig's lenses have"
     return None
 
 
 def kalibr_camchain(rig: StereoRig) -> str:
-    """The text of `camchain.yaml`, of the images as they are delivered.
+    """Text of Kalibr's `camchain.yaml`, for the delivered images.
 
     `T_cn_cnm1` takes points from the camera before (cam0, the left) to this one (cam1, the right). [m]
 
     Raises:
-        ValueError: the rig's distortion is not one of Kalibr's.
+        ValueError: Kalibr's distortion model cannot describe the rig's lenses.
 
     Source: Kalibr's documentation of its YAML formats; models `pinhole` (fu, fv, pu, pv) and `radtan` (k1, k2, p1, p2).
     """
@@ -158,7 +158,7 @@ def opencv_stereo(rig: StereoRig) -> str:
 
 
 def calibration_files(rig: StereoRig) -> dict[str, str]:
-    """Every calibration file of a rig by its name; without Kalibr's where that cannot describe the lenses."""
+    """All calibration files of a rig by name; without Kalibr's where it cannot describe the lenses."""
     files = {OPENCV_STEREO_FILE: opencv_stereo(rig)}
     if kalibr_fault(rig) is None:
         files[KALIBR_FILE] = kalibr_camchain(rig)
@@ -166,10 +166,10 @@ def calibration_files(rig: StereoRig) -> dict[str, str]:
 
 
 def write_calibration(dataset: Location, rig: StereoRig) -> list[Location]:
-    """Write the rig into the dataset's calibration folder.
+    """Write all calibration files into the dataset's calibration folder.
 
     Returns:
-        Where the files lie, OpenCV's first.
+        Locations of the files, OpenCV's first.
 
     Raises:
         OSError: they cannot be written.

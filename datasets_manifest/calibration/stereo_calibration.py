@@ -1,7 +1,7 @@
-"""A rig from somebody's stereo calibration.
+"""A rig from a user's stereo calibration.
 
-Images are not resampled. The rectified cameras of OpenCV's `stereoRectify` become the rig's ideal ones, and the cameras
-as they are its real eyes, so that navigation measures where the light fell and moves its measurements, not the pixels.
+Images are not resampled. The rectified cameras of OpenCV's `stereoRectify` become the rig's ideal eyes, and the
+calibrated cameras its lenses, so that navigation measures in the original images and rectifies its measurements.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
 
-# A baseline outside is taken for one in another unit than metres. [m]
+# A baseline outside this range is taken to be in another unit. [m]
 _BASELINES_M = (1e-3, 10.0)
 # Radial k1, k2, tangential p1, p2, radial k3; OpenCV's longer models go on from there.
 _COEFFICIENTS = 5
@@ -26,7 +26,7 @@ _SHAPES = {"M1": (3, 3), "D1": None, "M2": (3, 3), "D2": None, "R": (3, 3), "T":
 
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
-    """What `cv2.stereoCalibrate` finds.
+    """The result of `cv2.stereoCalibrate`.
 
     Attributes:
         size_px: (width, height) of both images.
@@ -48,8 +48,8 @@ def read_opencv_stereo(path: Path, unit_m: float = 1.0) -> StereoCalibration:
     """A calibration from OpenCV's YAML, XML or JSON storage, with the names that OpenCV's own samples use.
 
     Args:
-        path: the file; it holds M1, D1, M2, D2, R, T, image_width and image_height.
-        unit_m: the unit of T, which is that of the board's squares. [m]
+        path: the file, with M1, D1, M2, D2, R, T, image_width and image_height.
+        unit_m: the unit of T, which is that of the calibration board's squares. [m]
 
     Raises:
         ValueError: it cannot be read, or something is missing or impossible; names the file.
@@ -130,7 +130,7 @@ def _distortion(coefficients: Array, name: str) -> BrownConrady:
 
 
 def _is_ideal(calibration: StereoCalibration, left: Lens, right: Lens) -> bool:
-    """Whether the images are rectified already: then rectifying again would only add rounding."""
+    """Whether the images are rectified already, in which case rectification would only add rounding errors."""
     return (
         not left.distortion.coefficients().any()
         and not right.distortion.coefficients().any()

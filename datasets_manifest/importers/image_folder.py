@@ -13,7 +13,7 @@ from datasets_manifest.importers.imported_dataset import VIEW_FOLDERS, ImportedP
 from datasets_manifest.types.images import Pixels
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
-# What tells the views apart in a file's name, at its beginning or its end.
+# A file's name says left or right at its beginning or its end.
 _SIDE = re.compile(
     r"^(?:(?P<first>left|right|l[-_. ]|r[-_. ])[-_. ]?)?(?P<rest>.*?)(?:[-_. ]?(?P<last>left|right|[-_. ][lr]))?$", re.I
 )
@@ -23,21 +23,21 @@ class ImageFolder:
     """The pairs of a folder.
 
     Attributes:
-        count: how many pairs there are.
+        count: number of pairs.
         left_out: files without a partner.
     """
 
     def __init__(self, folder: Path, width_px: int, rate_hz: float) -> None:
-        """Look through a folder; images are read later.
+        """List the pairs of a folder; images are read later.
 
         Args:
             folder: with `left/` and `right/` (or names like them), files whose names differ in `left` and `right`, or
                 images of twice the calibration's width.
             width_px: of one view.
-            rate_hz: pairs a second, for their times.
+            rate_hz: pairs per second, from which their times follow. [Hz]
 
         Raises:
-            ValueError: no such folder, or nothing in it that is a pair.
+            ValueError: no such folder, or no pairs in it.
         """
         if not folder.is_dir():
             raise ValueError(f"{folder}: there is no such folder of images")
@@ -68,7 +68,7 @@ class ImageFolder:
 
 
 def read_image(path: Path) -> Pixels:
-    """An image file as (H, W, 3) red, green, blue, or (H, W) grey, with its own depth.
+    """An image file as (H, W, 3) RGB or (H, W) grey, with its stored depth.
 
     Raises:
         ValueError: it cannot be read, or is not of 8 or 16 bits; names the file.
@@ -128,5 +128,5 @@ def _side(stem: str) -> tuple[int | None, str]:
 
 
 def _in_number_order(name: str) -> list[tuple[int, int | str]]:
-    """So that image 10 comes after image 9."""
+    """Sort key by which image 10 comes after image 9."""
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name)]

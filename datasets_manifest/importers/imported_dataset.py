@@ -1,4 +1,4 @@
-"""Imported stereo pairs as a dataset without truth, but for boxes that somebody drew."""
+"""Writes imported stereo pairs as a dataset without truth, optionally with hand-drawn boxes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from geometry.stereo import EYES, StereoRig
 VIEW_FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("L", "R"))
 """Names of the two folders of a dataset with a folder a view, in the order in which they are looked for."""
 
-# What deep images are kept in.
+# Images of more than 8 bits are stored with this many.
 _KEPT_BITS: Final = 12
 
 _DEEPEST_BITS = 16
@@ -42,11 +42,11 @@ _DEEPEST_BITS = 16
 
 @dataclass(frozen=True, eq=False)
 class ImportedPair:
-    """One stereo pair of somebody's camera.
+    """One stereo pair from a user's camera.
 
     Attributes:
-        names: of the left and the right image where it came from.
-        time_s: mid-exposure, or what its source has for it. [s]
+        names: of the left and the right image in the source.
+        time_s: the source's time stamp, nominally of mid-exposure. [s]
         left, right: (H, W, 3) red, green, blue, or (H, W) grey.
     """
 
@@ -57,43 +57,43 @@ class ImportedPair:
 
 
 class ImportedPairs(Protocol):
-    """Stereo pairs in the order of time.
+    """A source of stereo pairs in the order of time.
 
     Attributes:
-        count: how many there are.
-        left_out: what has no partner or is nothing to import, and why.
+        count: number of pairs.
+        left_out: images that cannot be imported, with the reason, a line each.
     """
 
     count: int
     left_out: tuple[str, ...]
 
     def __iter__(self) -> Iterator[ImportedPair]:
-        """The pairs, each read when it is asked for.
+        """The pairs, each read on demand.
 
         Raises:
-            ValueError: one that cannot be read; names it.
+            ValueError: a pair cannot be read; names it.
         """
         ...
 
 
 def image_key(path: PurePath) -> str:
-    """An image's own name, with its folder where that tells the views apart."""
+    """An image's file name, preceded by its folder where there is a folder for each view."""
     is_view = any(path.parent.name in names for names in VIEW_FOLDERS)
     return f"{path.parent.name}/{path.name}" if is_view else path.name
 
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """What the images themselves do not tell.
+    """What the images themselves do not say.
 
     Attributes:
         name: of the dataset.
-        rig: that took them.
-        drogue: what to look for.
-        encoding: of the numbers; by default `gamma` for 8 bit and `linear` for deeper images.
-        black_level_dn: number that no light gives, in the source's numbers. [DN]
-        bits: how many bits of deep images are used; by default what the first pair needs.
-        exposure_s: how long the shutter was open; 0 where nobody knows. [s]
+        rig: the cameras.
+        drogue: the drogue to look for.
+        encoding: of the pixel values; by default `gamma` for 8 bits and `linear` for more.
+        black_level_dn: pixel value without light, in the source. [DN]
+        bits: significant bits of images with more than 8; by default as many as the first pair needs.
+        exposure_s: exposure time; 0 where it is unknown. [s]
         boxes: around the drogue, by image name.
     """
 
@@ -112,12 +112,12 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
 
     Args:
         source: the pairs.
-        settings: what else is to be known.
-        out: the dataset's folder; must not be there yet.
+        settings: rig, drogue and meaning of the pixel values.
+        out: the dataset's folder; must not exist yet.
         advance: called after each pair.
 
     Returns:
-        How many of the boxes found their image.
+        Number of boxes whose image was found.
 
     Raises:
         ValueError: an image that cannot be read, or of another size, depth or colour than rig and first pair.
@@ -156,7 +156,7 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
 
 
 class _Depth:
-    """Colour and depth of all images, as the first pair's are."""
+    """Colour and depth of all images, taken from the first pair."""
 
     def __init__(self, pair: ImportedPair, bits: int | None) -> None:
         image = pair.left
@@ -169,10 +169,10 @@ class _Depth:
         self._bits = bits or (_DEEPEST_BITS if is_deep else _KEPT_BITS)
 
     def kept_level_dn(self, level_dn: float) -> float:
-        """A level of the source's numbers, in the numbers that are kept.
+        """A pixel value of the source as a pixel value of the stored images.
 
         Raises:
-            ValueError: the images have no such numbers.
+            ValueError: outside the range of the images.
         """
         kept = level_dn if self.output_bits == 8 else level_dn * 2.0 ** (_KEPT_BITS - self._bits)
         if not 0 <= kept < 2**self.output_bits - 1:
@@ -180,7 +180,7 @@ class _Depth:
         return kept
 
     def checked(self, image: Pixels, name: str, rig: StereoRig) -> Pixels:
-        """The image in the depth in which it is kept.
+        """The image with the depth in which it is stored.
 
         Raises:
             ValueError: of another size than the rig's, or of another depth or colour than the first pair.
@@ -201,7 +201,7 @@ class _Depth:
 
 
 def _record(pair: ImportedPair, settings: ImportSettings, black_level_dn: float) -> dict[str, Any]:
-    """What a pair's record says besides the truth."""
+    """The parts of a pair's record that are no truth."""
     return {
         "time_s": pair.time_s,
         "image_black_level_dn": black_level_dn,
@@ -210,7 +210,7 @@ def _record(pair: ImportedPair, settings: ImportSettings, black_level_dn: float)
 
 
 def _index(settings: ImportSettings, depth: _Depth, count: int) -> BlindIndex:
-    """Electrons and noise are those of a sensor of that kind: nobody measured this one's."""
+    """The blind index; electrons and noise are those of a usual sensor, as the real ones are unknown."""
     usual = SENSORS["rgb-ideal"].model_dump()
     encoding = settings.encoding or ("gamma" if depth.output_bits == 8 else "linear")
     sensor = Sensor.model_validate(
@@ -227,10 +227,10 @@ def _index(settings: ImportSettings, depth: _Depth, count: int) -> BlindIndex:
 
 
 def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:
-    """The boxes of each image, by `image_key`, in pixel-centre coordinates.
+    """Hand-drawn boxes from a COCO file, by `image_key`, in pixel-centre coordinates.
 
     Raises:
-        ValueError: it cannot be read or is not COCO; names the file.
+        ValueError: it cannot be read or is not a COCO file; names it.
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -250,11 +250,11 @@ def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:
 def boxes_of_pair(
     boxes: Mapping[str, list[PixelBox]], names: tuple[str, str], width_px: int
 ) -> tuple[PixelBox | None, PixelBox | None]:
-    """The left and the right view's box.
+    """The boxes of the left and the right view.
 
     Args:
         boxes: as `read_boxes` gives them.
-        names: of the left and the right image; equal where both views stand side by side in one.
+        names: of the left and the right image; equal where one image holds both views side by side.
         width_px: of one view.
 
     Raises:
@@ -280,7 +280,7 @@ def _number(value: Any) -> int:
 
 
 def _box(value: Any) -> PixelBox:
-    """COCO counts from the image's corner, half a pixel before the first pixel's centre."""
+    """A COCO box in pixel-centre coordinates; COCO's origin is half a pixel before the first pixel's centre."""
     x, y, width, height = (float(number) for number in value)
     if not (abs(x) < 1e6 and abs(y) < 1e6 and 0 < width < 1e6 and 0 < height < 1e6):
         raise ValueError(f"a bbox must be x, y, width, height in pixels, got {value}")
@@ -293,7 +293,7 @@ def _coco_image(image_id: int, frame_index: int, view: int, rig: StereoRig) -> d
 
 
 def _coco_box(image_id: int, box: PixelBox) -> dict[str, Any]:
-    """COCO counts from the image's corner."""
+    """COCO entry of a box; COCO's origin is the corner of the image."""
     x, y, width, height = box
     return {
         "id": image_id,

@@ -35,22 +35,22 @@ _MODELS = ("plumb_bob", "")
 
 
 class RosBag:
-    """The pairs of a bag: images of equal time stamps.
+    """The pairs of a bag: images with equal time stamps.
 
     Attributes:
-        count: how many pairs there are.
+        count: number of pairs.
         left_out: images without a partner.
     """
 
     def __init__(self, path: Path, topics: tuple[str, str] | None = None) -> None:
-        """Look through a bag; images are decoded later.
+        """List the pairs of a bag; images are decoded later.
 
         Args:
             path: a rosbag2 folder, or a `.bag` file of ROS 1.
-            topics: of the left and the right images; without them the two whose names differ in left and right.
+            topics: of the left and the right images; by default the two whose names differ in left and right.
 
         Raises:
-            ValueError: no bag, one that is damaged, or topics that do not fit.
+            ValueError: not a bag, a damaged one, or topics that do not fit.
         """
         self._path = path
         with self._open() as reader:
@@ -94,10 +94,10 @@ class RosBag:
                     yield ImportedPair(self._topics, 1e-9 * stamp_ns, left, right)
 
     def calibration(self) -> StereoCalibration:
-        """The calibration in the bag: both CameraInfo beside the images.
+        """The calibration in the bag, from the CameraInfo of both image topics.
 
         Raises:
-            ValueError: there is none, or it is none of a stereo pair.
+            ValueError: there is none, or it does not describe a stereo pair.
         """
         for topic in self._topics:
             if "image_rect" in topic:
@@ -170,7 +170,7 @@ def _decompressed(message: Any, name: str) -> Pixels:
 
 
 def _messages(reader: AnyReader, topics: tuple[str, ...], path: Path) -> Iterator[tuple[Connection, int, Any]]:
-    """Decoded messages of some topics; whatever a damaged bag makes its reader raise becomes one clear line."""
+    """Decoded messages of some topics; errors of the reader on damaged bags become a ValueError of one line."""
     connections = [connection for connection in reader.connections if connection.topic in topics]
     if not connections:
         return
@@ -206,7 +206,7 @@ def _stereo_topics(reader: AnyReader) -> tuple[str, str]:
 
 
 def _calibration(left: Any, right: Any, path: Path) -> StereoCalibration:
-    """From both messages: R and P of each eye rectify it, and the right one's P[0, 3] is -f B."""
+    """Calibration from both CameraInfo: R and P of each eye rectify it, and P[0, 3] of the right one is -f B."""
     for info in (left, right):
         if info.distortion_model not in _MODELS:
             raise ValueError(

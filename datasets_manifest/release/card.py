@@ -1,4 +1,4 @@
-"""The dataset's card: what it is, how it was made, what it is good for, in words, with Hugging Face's metadata."""
+"""The dataset's card: contents, origin, purpose and limits in words, with Hugging Face's metadata."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _LARGEST = "n>1M"
 _TAGS = ("aerial-refuelling", "drogue", "stereo", "6d-pose", "synthetic")
 _LIMITS = """\
 * Every image is computed. What the model leaves out, such as rain, ice, heat haze of engines and cloth that flutters,
-  is not there, and results on these images are no proof of results on a real camera.
-* Dimensions that the seed paper does not give (marker circle, hub, canopy, hose, tanker) are the makers' choice; the
-  manifest holds all of them.
-* Equal, evenly spaced markers leave the roll open up to one marker's turn: no method can tell more than the roll modulo
-  that.
+  is missing, and results on these images do not prove results with a real camera.
+* Dimensions that the seed paper does not give (marker circle, hub, canopy, hose, tanker) are our choice; the manifest
+  holds all of them.
+* Equal, evenly spaced markers determine the roll only modulo the angle between neighbours; no method can determine
+  more.
 * Scenes, not frames, are split: frames of one scene share sky, sun and ground, and are not independent draws."""
 
 
 def card_text(manifest: Manifest) -> str:
-    """The whole card as Markdown, with YAML metadata at its head; a function of the manifest alone."""
+    """The card as Markdown with YAML front matter; depends on the manifest alone."""
     return f"{_metadata(manifest)}\n{_body(manifest)}"
 
 
@@ -39,7 +39,7 @@ def write_card(dataset: Location, manifest: Manifest) -> Location:
 
 
 def citation(manifest: Manifest) -> str:
-    """A BibTeX entry; the hash says which data are meant."""
+    """A BibTeX entry, which identifies the data by their hash."""
     version = manifest.software.get("droguekit", "")
     return "\n".join(
         [

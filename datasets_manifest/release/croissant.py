@@ -1,4 +1,4 @@
-"""The dataset described in Croissant, the format that search engines and data loaders read.
+"""The dataset's description in Croissant, a metadata format for search engines and data loaders.
 
 Source: Croissant Format Specification 1.0, MLCommons, http://mlcommons.org/croissant/1.0.
 """
@@ -101,7 +101,7 @@ def write_croissant(dataset: Location, manifest: Manifest) -> Location:
 
 
 def describe_croissant(dataset: Location, manifest: Manifest) -> dict[str, Any]:
-    """The description as JSON-LD; nothing in it depends on where or when the files lie.
+    """The description as JSON-LD; it does not depend on location or time.
 
     Raises:
         OSError: a file that it names cannot be read.

@@ -1,4 +1,4 @@
-"""Published manifests: what regenerating a shipped recipe must give, so that a regeneration proves itself."""
+"""Published manifests of shipped recipes, against which a regenerated dataset can be checked."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ViewLabels(FrozenModel):
 
     Attributes:
         box_full_xywh_px: as in `ViewRecord`.
-        centers_px: by marker, then the hub: projected centre, ellipse centre, the hub also its inner edge's. [px]
+        centers_px: by marker, then the hub: projected centre and ellipse centre; of the hub also the inner edge's. [px]
     """
 
     box_full_xywh_px: Rounded
@@ -55,7 +55,7 @@ class FrameLabels(FrozenModel):
 
 
 class Publication(FrozenModel):
-    """A dataset's manifest with the labels of its pairs; of a large recipe perhaps only of its first ones."""
+    """A dataset's manifest with the labels of its pairs; for a large recipe possibly only of its first ones."""
 
     schema_version: Literal[1] = 1
     manifest: Manifest
@@ -64,32 +64,32 @@ class Publication(FrozenModel):
 
 @dataclass(frozen=True)
 class PublishedComparison:
-    """A dataset against what was published.
+    """Comparison of a dataset with the published one of its recipe.
 
     Attributes:
-        compared: pairs that both hold.
-        identical: of them, those whose record, and with it every image, is the same bit for bit.
-        label_faults: labels that differ, and why the datasets cannot be the same, a line each.
-        elsewhere: how software and processor differ from those of the published dataset.
+        compared: number of pairs in both.
+        identical: number of those whose record, and with it every image, is identical bit for bit.
+        label_faults: labels that differ, and other reasons why the datasets cannot be equal, a line each.
+        build_differences: differences in software and processor from the published dataset, a line each.
     """
 
     compared: int
     identical: int
     label_faults: tuple[str, ...]
-    elsewhere: tuple[str, ...]
+    build_differences: tuple[str, ...]
 
     @property
     def verdict(self) -> Literal["identical", "equivalent", "different"]:
-        """`identical` bit for bit; `equivalent`, made with another build, with equal labels; or `different`."""
+        """`identical` bit for bit; `equivalent`: equal labels from another build; or `different`."""
         if self.label_faults or self.compared == 0:
             return "different"
         if self.identical == self.compared:
             return "identical"
-        return "equivalent" if self.elsewhere else "different"
+        return "equivalent" if self.build_differences else "different"
 
 
 def publication_names() -> list[str]:
-    """Names of the recipes of which a manifest is published."""
+    """Names of the recipes with a published manifest."""
     folder = files("datasets_manifest") / "published"
     return sorted(entry.name.removesuffix(".json") for entry in folder.iterdir() if entry.name.endswith(".json"))
 
@@ -112,7 +112,7 @@ def read_publication(name: str) -> Publication:
 
 
 def build_publication(dataset: Location) -> Publication:
-    """What is published of a dataset.
+    """The publication of a dataset: its manifest and labels.
 
     Raises:
         ValueError: it cannot be read, or has dropped frames.
@@ -122,19 +122,19 @@ def build_publication(dataset: Location) -> Publication:
         raise ValueError(
             f"{dataset}: has dropped frames, and is not published; first {source.manifest.drops[0].reason}"
         )
-    labels = tuple(labels_of(source.record(frame_index)) for frame_index in source.frame_indices)
+    labels = tuple(published_labels(source.record(frame_index)) for frame_index in source.frame_indices)
     return Publication(manifest=source.manifest, labels=labels)
 
 
 def publication_text(publication: Publication) -> str:
-    """JSON with a line for each pair, so that versions can be compared."""
+    """JSON with a line for each pair, so that version control shows differences."""
     manifest = json.dumps(publication.manifest.model_dump(mode="json"), indent=1, allow_nan=False)
     lines = ",\n".join(canonical_json(labels.model_dump(mode="json")) for labels in publication.labels)
     return f'{{"schema_version": {publication.schema_version}, "manifest": {manifest}, "labels": [\n{lines}\n]}}\n'
 
 
-def labels_of(record: PairRecord) -> FrameLabels:
-    """The labels of a record that are published."""
+def published_labels(record: PairRecord) -> FrameLabels:
+    """The labels that are published of a record."""
     pose = record.left_from_drogue
     return FrameLabels(
         frame_index=record.frame_index,
@@ -157,16 +157,16 @@ def _centers(feature: FeatureView) -> tuple[float, ...]:
 
 
 def compare_with_published(dataset: Location, published: Publication) -> PublishedComparison:
-    """Compare a dataset with what was published of its recipe, pair by pair.
+    """Compare a dataset with the published one of its recipe, pair by pair.
 
-    The dataset's files are taken to be those of its manifest, which `validate` checks.
+    The dataset's files are assumed to match its manifest, which `validate` checks.
 
     Raises:
         ValueError: the dataset or a record cannot be read.
     """
     source = Dataset(dataset)
     mine, theirs = source.manifest, published.manifest
-    # Presets are computed, and so may differ in their last bits too.
+    # Presets are computed, so their last bits may differ too.
     differing = _differing(theirs.recipe.model_dump(mode="json"), mine.recipe.model_dump(mode="json"))
     if differing:
         fault = f"{dataset}: its recipe is not the published {theirs.name}: {', '.join(differing[:_SHOWN])}"
@@ -175,7 +175,7 @@ def compare_with_published(dataset: Location, published: Publication) -> Publish
     labels = {entry.frame_index: entry for entry in published.labels}
     common = [entry for entry in mine.frames if entry.frame_index in known]
     other = [entry.frame_index for entry in common if entry.record_sha256 != known[entry.frame_index]]
-    faults = [fault for i in other for fault in differing_labels(labels[i], labels_of(source.record(i)))]
+    faults = [fault for i in other for fault in differing_labels(labels[i], published_labels(source.record(i)))]
     if mine.render_version != theirs.render_version:
         faults.insert(
             0,
@@ -184,13 +184,13 @@ def compare_with_published(dataset: Location, published: Publication) -> Publish
         )
     if not common:
         faults.append(f"{dataset}: has none of the {len(known)} published pairs")
-    return PublishedComparison(len(common), len(common) - len(other), tuple(faults), _elsewhere(theirs, mine))
+    return PublishedComparison(len(common), len(common) - len(other), tuple(faults), _build_differences(theirs, mine))
 
 
-def differing_labels(there: FrameLabels, here: FrameLabels) -> list[str]:
-    """Labels of a pair that are not equal on any machine, a line each."""
-    found = _differing(there.model_dump(mode="json"), here.model_dump(mode="json"))
-    return [f"frame {there.frame_index}: {where}: differs from what was published" for where in found]
+def differing_labels(published: FrameLabels, own: FrameLabels) -> list[str]:
+    """Labels of a pair that differ by more than rounding, a line each."""
+    found = _differing(published.model_dump(mode="json"), own.model_dump(mode="json"))
+    return [f"frame {published.frame_index}: {where}: differs from what was published" for where in found]
 
 
 def _differing(there: Any, here: Any, where: str = "") -> list[str]:
@@ -205,7 +205,7 @@ def _differing(there: Any, here: Any, where: str = "") -> list[str]:
     return [] if there == here else [where]
 
 
-def _elsewhere(theirs: Manifest, mine: Manifest) -> tuple[str, ...]:
+def _build_differences(theirs: Manifest, mine: Manifest) -> tuple[str, ...]:
     found = differing_builds(theirs.software, theirs.cpu_features, mine.software, mine.cpu_features)
     engines = " and ".join(sorted(theirs.engines)), " and ".join(sorted(mine.engines))
     return (*found, *([f"{engines[0]} there, {engines[1]} here"] if engines[0] != engines[1] else ()))

@@ -1,4 +1,4 @@
-"""A dataset as navigation may see it: images, time stamps, rig and the drogue, nothing else."""
+"""A dataset as navigation may see it: images, time stamps, rig and drogue, without the truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import BLIND_FILE
 from datasets_manifest.storage.manifest import read_manifest
-from datasets_manifest.storage.reader import read_images, read_shutter, read_sought
+from datasets_manifest.storage.reader import read_images, read_shutter, read_sought_drogue
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.field_types import Rig
 from datasets_manifest.types.frame import Sensor
@@ -27,10 +27,10 @@ class BlindPair:
     """One stereo pair.
 
     Attributes:
-        frame_index: place in the dataset.
-        images: what the cameras saw, with time stamp and exposure.
+        frame_index: index in the dataset.
+        images: with time stamp and exposure.
         rig: the cameras.
-        drogue: what to look for; whether it is there is for the images to tell.
+        drogue: the drogue to look for, which the images may or may not show.
     """
 
     frame_index: int
@@ -40,13 +40,13 @@ class BlindPair:
 
 
 class BlindIndex(FrozenModel):
-    """What stands for a dataset without its truth: `blind.json` of a blind export, or what a manifest says of it.
+    """Description of a dataset without its truth: `blind.json` of a blind export, or an excerpt of a manifest.
 
     Attributes:
         name: of the dataset.
         rig, sensor: the cameras.
-        drogue: what to look for.
-        drogues_differ: each pair names its own drogue instead.
+        drogue: the drogue to look for.
+        drogues_differ: whether each pair has a drogue of its own instead.
         frames: indices of the pairs, ascending.
     """
 
@@ -60,7 +60,7 @@ class BlindIndex(FrozenModel):
 
 
 def read_blind_index(dataset: Location) -> BlindIndex:
-    """What may be known of a dataset, blind or not.
+    """The blind index of a dataset, from `blind.json` or from the manifest.
 
     Raises:
         ValueError: no such folder, or neither a manifest nor an index that can be trusted; names the file.
@@ -88,7 +88,7 @@ def read_blind_index(dataset: Location) -> BlindIndex:
 
 
 class BlindDataset:
-    """Stereo pairs without their truth; images are read when they are asked for."""
+    """Stereo pairs without their truth; images are read on demand."""
 
     def __init__(self, path: Location) -> None:
         """Open the dataset in a folder, or at a URL such as `s3://bucket/name`.
@@ -112,5 +112,5 @@ class BlindDataset:
         """
         shutter = read_shutter(self._frames, frame_index)
         images = read_images(self._frames, frame_index, self._rig.camera, self._sensor, shutter)
-        drogue = read_sought(self._frames, frame_index, self._drogue) if self._has_variants else self._drogue
+        drogue = read_sought_drogue(self._frames, frame_index, self._drogue) if self._has_variants else self._drogue
         return BlindPair(frame_index, images, self._rig, drogue)

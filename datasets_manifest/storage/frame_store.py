@@ -1,4 +1,4 @@
-"""Where the files of a dataset's frames lie: in a folder for each frame, or many frames in a tar file."""
+"""Access to the files of a dataset's frames, in a folder for each frame or in tar files of many frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from datasets_manifest.storage.layout import (
     shard_file,
     shard_index_file,
 )
-from datasets_manifest.storage.storage import Location, Storage, in_order, open_storage
+from datasets_manifest.storage.storage import Location, Storage, map_in_order, open_storage
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 
@@ -31,14 +31,14 @@ _BLOCK_BYTES = 2**20
 
 
 class ShardLayout(FrozenModel):
-    """`shards/layout.json`: a dataset that has it keeps its frames in tar files, so many in each."""
+    """`shards/layout.json`, which says that a dataset keeps its frames in tar files of that many pairs."""
 
     schema_version: Literal[1] = 1
     pairs_per_tar: int = Field(ge=1, le=MAX_PAIRS_PER_TAR)
 
 
 class PackedFile(NamedTuple):
-    """A file within an archive: from which byte on, how many bytes, and their hash."""
+    """Position, size and hash of a file within an archive. [bytes]"""
 
     offset: Annotated[int, Field(ge=0)]
     size: Annotated[int, Field(ge=0)]
@@ -46,16 +46,16 @@ class PackedFile(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Where it ends. [bytes]"""
+        """Offset of its end. [bytes]"""
         return self.offset + self.size
 
 
 class ShardIndex(FrozenModel):
-    """The list beside a tar file.
+    """`shards/NNNNNN.json`, the index beside a tar file.
 
     Attributes:
         size, sha256: of the tar file. [bytes]
-        frames: the files of each frame by their name.
+        frames: the files of each frame by name.
     """
 
     schema_version: Literal[1] = 1
@@ -74,10 +74,10 @@ class ShardIndex(FrozenModel):
 
 
 def read_pairs_per_tar(storage: Storage) -> int | None:
-    """How many frames the tar files of a dataset hold, or None where every frame has a folder.
+    """Number of frames in each tar file of a dataset, or None where every frame has a folder.
 
     Raises:
-        ValueError: the file that says so is damaged.
+        ValueError: `shards/layout.json` is damaged.
     """
     try:
         data = storage.read(SHARDS_FILE)
@@ -90,16 +90,16 @@ def read_pairs_per_tar(storage: Storage) -> int | None:
 
 
 def shard_numbers(storage: Storage) -> list[int]:
-    """Numbers of the tar files that are there, ascending."""
+    """Numbers of the stored tar files, ascending."""
     names = storage.names(SHARDS_FOLDER)
     return sorted(int(name[:-4]) for name in names if name.endswith(".tar") and name[:-4].isdecimal())
 
 
 def read_shard_index(storage: Storage, number: int) -> ShardIndex:
-    """The list beside a tar file.
+    """The index beside a tar file.
 
     Raises:
-        ValueError: it is missing or damaged, or not that of the tar file; names the file.
+        ValueError: it is missing or damaged, or belongs to another tar file; names the file.
     """
     name = shard_index_file(number)
     where = storage.where(name)
@@ -122,10 +122,10 @@ def read_shard_index(storage: Storage, number: int) -> ShardIndex:
 
 
 def index_of_archive(stream: BinaryIO) -> ShardIndex:
-    """The list of a tar file, from the archive itself, which is read once from its beginning to its end.
+    """The index of a tar file from the archive itself, which is read once from beginning to end.
 
     Raises:
-        ValueError: it is no archive of frames, or damaged.
+        ValueError: it is not an archive of frames, or damaged.
         OSError: it cannot be read.
     """
     frames: dict[int, dict[str, PackedFile]] = {}
@@ -151,13 +151,13 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
 
 
 class _HashedStream:
-    """A stream that is read once, with the number of bytes that were read and their hash."""
+    """A stream that counts and hashes the bytes that are read from it."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream, self.size, self.digest = stream, 0, hashlib.sha256()
 
     def read(self, size: int) -> bytes:
-        """The next bytes, none at its end."""
+        """The next bytes; empty at the end."""
         block = self._stream.read(size)
         self.size += len(block)
         self.digest.update(block)
@@ -165,7 +165,7 @@ class _HashedStream:
 
 
 def sha256_of(stream: IO[bytes]) -> str:
-    """Hash of what is left of a stream."""
+    """Hash of the rest of a stream."""
     digest = hashlib.sha256()
     while block := stream.read(_BLOCK_BYTES):
         digest.update(block)
@@ -173,12 +173,12 @@ def sha256_of(stream: IO[bytes]) -> str:
 
 
 def member_name(frame_index: int, name: str) -> str:
-    """A frame's file within an archive: the name by which the `webdataset` package puts a sample together."""
+    """Name of a frame's file within an archive, by which the `webdataset` package groups samples."""
     return f"{frame_index:06d}.{name}"
 
 
 def index_text(index: ShardIndex) -> str:
-    """The list as it is written, with a line for each frame."""
+    """JSON text of the index, with a line for each frame."""
     table: dict[str, Any] = index.model_dump(mode="json")
     frames = table.pop("frames")
     head = _compact(table).removesuffix("}")
@@ -190,27 +190,27 @@ def _compact(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"))
 
 
-# A list of 1000 frames takes some 2 MB of memory.
-_LISTS_KEPT = 64
-# Requests run in threads. It is not the store's own: a store is pickled for the processes of data loaders.
-_LISTS_LOCK = Lock()
+# The index of a tar file of 1000 frames takes some 2 MB of memory.
+_MAX_CACHED_INDICES = 64
+# Reads run in threads. The lock is global, because stores are pickled for the processes of data loaders.
+_CACHE_LOCK = Lock()
 
 
 class FrameStore:
-    """Reads frames of one dataset; a frame with a folder of its own has been made since its tar file was packed."""
+    """Reads frames of one dataset; a frame's folder, where it exists, takes precedence over its tar file."""
 
     def __init__(self, dataset: Location) -> None:
-        """Look how a dataset keeps its frames.
+        """Open a dataset in either layout.
 
         Raises:
-            ValueError: a URL that cannot be used, or a damaged list of tar files.
+            ValueError: a URL that cannot be used, or a damaged `shards/layout.json`.
         """
         self.storage = open_storage(dataset)
         self.pairs_per_tar = read_pairs_per_tar(self.storage)
         self._shards: dict[int, ShardIndex] = {}
 
     def indices(self) -> list[int]:
-        """Indices of the frames that are there, ascending.
+        """Indices of the stored frames, ascending.
 
         Raises:
             ValueError: a list of tar files is missing or damaged; names the file.
@@ -218,7 +218,7 @@ class FrameStore:
         found = set(self.staged)
         if self.pairs_per_tar is not None:
             read = partial(read_shard_index, self.storage)
-            for shard in in_order(read, shard_numbers(self.storage), self.storage):
+            for shard in map_in_order(read, shard_numbers(self.storage), self.storage):
                 found.update(shard.frames)
         return sorted(found)
 
@@ -238,7 +238,7 @@ class FrameStore:
         return self.storage.names(frame_name(frame_index)) if shard is None else sorted(shard.frames[frame_index])
 
     def where(self, frame_index: int, name: str = "") -> str:
-        """What to call a file of a frame, or the frame, in messages."""
+        """Path or URL of a file of a frame, or of the frame, for messages."""
         if self._is_packed(frame_index):
             tar = shard_file(frame_index // (self.pairs_per_tar or 1))
             return self.storage.where(f"{tar}/{member_name(frame_index, name) if name else f'{frame_index:06d}'}")
@@ -249,7 +249,7 @@ class FrameStore:
         """A file of a frame.
 
         Raises:
-            ValueError: it is missing, leads elsewhere or cannot be read; names the file.
+            ValueError: it is missing, leads out of the frame's folder or cannot be read; names the file.
         """
         path = f"{frame_name(frame_index)}/{name}"
         try:
@@ -269,10 +269,10 @@ class FrameStore:
             raise ValueError(f"{self.where(frame_index, name)}: cannot be read: {error}") from error
 
     def path(self, frame_index: int, name: str) -> Path | None:
-        """The file of a frame itself, where it is one of this machine.
+        """Path of a file of a frame, or None where it is remote or inside a tar file.
 
         Raises:
-            ValueError: it is missing or leads elsewhere; names the file.
+            ValueError: it is missing or leads out of the frame's folder; names the file.
         """
         inside = f"{frame_name(frame_index)}/{name}"
         path = None if self._is_packed(frame_index) else self.storage.path(inside)
@@ -288,24 +288,24 @@ class FrameStore:
         return self.pairs_per_tar is not None and frame_index not in self.staged
 
     def _shard_of(self, frame_index: int) -> ShardIndex | None:
-        """The list of the tar file that a frame lies in, or None where it has a folder, or is nowhere."""
+        """Index of the tar file that holds a frame, or None where the frame has a folder or does not exist."""
         if not self._is_packed(frame_index) or self.pairs_per_tar is None:
             return None
         shard = self._shard(frame_index // self.pairs_per_tar)
         return shard if frame_index in shard.frames else None
 
     def _shard(self, number: int) -> ShardIndex:
-        """The list of a tar file; those that were read last are kept."""
-        with _LISTS_LOCK:
+        """Index of a tar file; the most recently used are cached."""
+        with _CACHE_LOCK:
             shard = self._shards.pop(number, None) or read_shard_index(self.storage, number)
             self._shards[number] = shard
-            if len(self._shards) > _LISTS_KEPT:
+            if len(self._shards) > _MAX_CACHED_INDICES:
                 del self._shards[next(iter(self._shards))]
         return shard
 
 
-def frames_there(dataset: Location) -> list[int]:
-    """Indices of the frames that are in a dataset, ascending.
+def list_frames(dataset: Location) -> list[int]:
+    """Indices of the frames that a dataset holds, ascending.
 
     Raises:
         ValueError: a list of tar files is missing or damaged; names the file.

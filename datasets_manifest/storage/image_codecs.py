@@ -17,36 +17,37 @@ from geometry.pinhole import PinholeCamera
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
-# Noise has no repeats to search for: Huffman codes alone take half the time of level 1 and a sixth less room. Part ids
-# are runs. Without a level given, OpenCV filters every row by the difference to the left, which is the cheapest.
+# Noise has no repeats to search for: Huffman coding alone takes half the time of level 1 and a sixth less space. Part
+# ids consist of runs. Without a level, OpenCV filters every row by the difference to the left, the cheapest filter.
 _OF_NOISE = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 _OF_RUNS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 
 
-def encode_png(pixels: Pixels, of_areas: bool = False) -> bytes:
-    """PNG of an (H, W) or (H, W, 3) image; 12-bit values stay as they are in 16-bit samples.
+def encode_png(pixels: Pixels, is_piecewise_constant: bool = False) -> bytes:
+    """PNG of an (H, W) or (H, W, 3) image in RGB order; 12-bit values are stored unchanged in 16-bit samples.
 
     Args:
         pixels: the image.
-        of_areas: its values are even over areas, as part ids are, instead of noisy as a picture; for size and speed.
+        is_piecewise_constant: whether it has areas of one value, as part ids do, instead of noise; chooses the
+            compression.
 
     Raises:
         ValueError: the image cannot be encoded.
     """
     # OpenCV's channel order is blue, green, red.
     image = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-    done, data = cv2.imencode(".png", image, _OF_RUNS if of_areas else _OF_NOISE)
+    done, data = cv2.imencode(".png", image, _OF_RUNS if is_piecewise_constant else _OF_NOISE)
     if not done:
         raise ValueError(f"image: cannot be written as PNG, got {pixels.shape} {pixels.dtype}")
     return data.tobytes()
 
 
 def decode_png(data: bytes, name: str) -> Pixels:
-    """The image in PNG bytes, with the depth and the channels that it is stored with.
+    """The image in PNG bytes, in RGB order, with its stored depth and channels.
 
     Args:
         data: the whole file.
-        name: what to call it in errors.
+        name: of the file, for errors.
 
     Raises:
         ValueError: not a PNG, truncated or damaged, or not 8 or 16 bit grey or RGB.
@@ -63,7 +64,7 @@ def decode_png(data: bytes, name: str) -> Pixels:
 
 
 def png_fault(data: bytes) -> str | None:
-    """What is wrong with the chunks of a PNG, or None: found here, a damaged file never reaches the decoder.
+    """The fault in the chunks of a PNG, or None; checked first, so that damaged files never reach the decoder.
 
     Source: PNG specification (ISO/IEC 15948), section 5.3: length, type, data, CRC of type and data.
     """
@@ -84,11 +85,11 @@ def png_fault(data: bytes) -> str | None:
     return "the PNG is truncated"
 
 
-CHANNELS = ("R", "G", "B", "depth.Z", "normal.X", "normal.Y", "normal.Z", "id.X")
+EXR_CHANNELS = ("R", "G", "B", "depth.Z", "normal.X", "normal.Y", "normal.Z", "id.X")
 _MAGIC = 20000630
 # Version 2 with none of the flags for tiles, deep pixels and several parts; long names alone are harmless.
 _PLAIN_VERSIONS = (2, 2 | 0x400)
-_MOST_HEADER_BYTES = 65536
+_MAX_HEADER_BYTES = 65536
 
 
 def read_passes(data: bytes, name: str, camera: PinholeCamera) -> dict[str, NDArray[np.float32]]:
@@ -96,11 +97,11 @@ def read_passes(data: bytes, name: str, camera: PinholeCamera) -> dict[str, NDAr
 
     Args:
         data: the whole file.
-        name: what to call it in errors.
-        camera: whose size the image must have; a file of another size never reaches the decoder.
+        name: of the file, for errors.
+        camera: gives the size that the image must have; a file of another size never reaches the decoder.
 
     Raises:
-        ValueError: no EXR file, truncated, damaged, of another size, or without one of the channels.
+        ValueError: not an EXR file, truncated, damaged, of another size, or without one of the channels.
     """
     size = (camera.width_px, camera.height_px)
     window = _data_window(data)
@@ -110,17 +111,17 @@ def read_passes(data: bytes, name: str, camera: PinholeCamera) -> dict[str, NDAr
         planes = decode_exr(data)
     except ValueError as error:
         raise ValueError(f"{name}: cannot be read as EXR: {error}") from error
-    for channel in CHANNELS:
+    for channel in EXR_CHANNELS:
         if channel not in planes or planes[channel].shape != size[::-1] or planes[channel].dtype != np.float32:
             raise ValueError(f"{name}: channel {channel}: must be {size[::-1]} of float32")
-    return {channel: planes[channel].astype(np.float32, copy=False) for channel in CHANNELS}
+    return {channel: planes[channel].astype(np.float32, copy=False) for channel in EXR_CHANNELS}
 
 
 def decode_exr(data: bytes) -> dict[str, NDArray[np.generic]]:
-    """The planes of a single-part EXR file by channel, as they are stored.
+    """The planes of a single-part EXR file by channel, as stored.
 
     Raises:
-        ValueError: the library cannot read it; its one-line message.
+        ValueError: the library cannot read it; with its message on one line.
     """
     import OpenEXR
 
@@ -137,7 +138,7 @@ def decode_exr(data: bytes) -> dict[str, NDArray[np.generic]]:
 
 
 def _data_window(data: bytes) -> tuple[int, int, int, int] | None:
-    """Lowest and highest x and y of a plain EXR file's pixels, or None where the header does not tell.
+    """Lowest and highest x and y of a plain EXR file's pixels, or None without a readable header.
 
     Source: OpenEXR's description of its file layout: magic number, version, then attributes, each a name, a type, both
     ended by 0, a size and a value; an empty name ends the header.
@@ -145,7 +146,7 @@ def _data_window(data: bytes) -> tuple[int, int, int, int] | None:
     if len(data) < 8 or struct.unpack_from("<ii", data) not in [(_MAGIC, version) for version in _PLAIN_VERSIONS]:
         return None
     position = 8
-    while position < min(len(data), _MOST_HEADER_BYTES):
+    while position < min(len(data), _MAX_HEADER_BYTES):
         name_end = data.find(b"\0", position)
         type_end = data.find(b"\0", name_end + 1)
         if name_end in (-1, position) or type_end == -1 or type_end + 5 > len(data):

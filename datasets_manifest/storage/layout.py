@@ -1,4 +1,4 @@
-"""Where things lie in a dataset folder."""
+"""Names of files and folders in a dataset."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ CALIBRATION_FOLDER = "calibration"
 
 
 def frame_folder(dataset: Path, frame_index: int) -> Path:
-    """Folder of one frame of a dataset on this machine's disk."""
+    """Folder of one frame of a dataset on the local disk."""
     return dataset / frame_name(frame_index)
 
 
 def frame_name(frame_index: int) -> str:
-    """Folder of one frame below its dataset."""
+    """Folder of one frame, relative to its dataset."""
     return f"{FRAMES_FOLDER}/{frame_index:06d}"
 
 
 def frame_indices(dataset: Path) -> list[int]:
-    """Indices of the frames that have folders on this machine's disk, ascending; `FrameStore` knows all others too."""
+    """Indices of the frames with folders on the local disk, ascending; see `FrameStore` for tar files and URLs."""
     folder = dataset / FRAMES_FOLDER
     if not folder.is_dir():
         return []
@@ -39,12 +39,12 @@ def frame_indices(dataset: Path) -> list[int]:
 
 
 def shard_file(number: int) -> str:
-    """A tar file of frames."""
+    """Tar file of frames, relative to its dataset."""
     return f"{SHARDS_FOLDER}/{number:06d}.tar"
 
 
 def shard_index_file(number: int) -> str:
-    """What lies where in that tar file, with hashes."""
+    """Index of that tar file, with offsets and hashes."""
     return f"{SHARDS_FOLDER}/{number:06d}.json"
 
 
@@ -54,20 +54,20 @@ def is_plain_name(name: str) -> bool:
 
 
 def image_file(eye: str) -> str:
-    """What the camera saw."""
+    """Image of an eye."""
     return f"{eye}.png"
 
 
 def mosaic_file(eye: str) -> str:
-    """The raw mosaic of a Bayer sensor."""
+    """Raw mosaic of an eye with a Bayer sensor."""
     return f"{eye}_mosaic.png"
 
 
 def parts_file(eye: str) -> str:
-    """Part ids."""
+    """Part ids of an eye."""
     return f"{eye}_parts.png"
 
 
 def passes_file(eye: str) -> str:
-    """Linear radiance, depth, normals and ids."""
+    """Linear radiance, depth, normals and ids of an eye."""
     return f"{eye}.exr"

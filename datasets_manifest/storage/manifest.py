@@ -1,4 +1,4 @@
-"""What a dataset is made of and how it was made: the file that stands for the whole."""
+"""`manifest.json`: what a dataset holds and how it was made, with hashes of all of it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import BLIND_FILE, MANIFEST_FILE, RECORD_FILE
 from datasets_manifest.storage.provenance import CONVENTIONS, cpu_features, software_versions
-from datasets_manifest.storage.storage import Location, in_order, open_storage
+from datasets_manifest.storage.storage import Location, map_in_order, open_storage
 from datasets_manifest.storage.writer import canonical_json
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
@@ -28,8 +28,8 @@ class FrameEntry(FrozenModel):
     """One stereo pair of the dataset.
 
     Attributes:
-        empty: there is no drogue.
-        record_sha256: of its `record.json`, which in turn holds the hashes of the frame's other files.
+        empty: whether it has no drogue.
+        record_sha256: of its `record.json`, which holds the hashes of the frame's other files.
     """
 
     frame_index: int = Field(ge=0)
@@ -40,14 +40,14 @@ class FrameEntry(FrozenModel):
 
 
 class Drop(FrozenModel):
-    """A frame of the recipe that was not made, and why."""
+    """A frame of the recipe that was not made, with the reason."""
 
     frame_index: int = Field(ge=0)
     reason: str = Field(min_length=1)
 
 
 class Counts(FrozenModel):
-    """How many pairs there are; those by scene have the scene's id as their key."""
+    """Numbers of pairs; `by_scene` is keyed by the scene's id."""
 
     pairs: int
     empty: int
@@ -63,7 +63,7 @@ class Manifest(FrozenModel):
         conventions: axes, units, pixels, quaternions.
         software, cpu_features: of the machine that wrote this file.
         engines: pairs by engine and version.
-        render_version: changes whenever the same recipe gives other pixels.
+        render_version: changes whenever the same recipe gives different pixels.
         drops: frames of the recipe that were not made.
         data_licence: SPDX name, of the data.
         dataset_sha256: hash of the sorted record hashes and the recipe.
@@ -100,9 +100,9 @@ class Manifest(FrozenModel):
 
 
 def dataset_sha256(recipe: Recipe, record_hashes: Iterable[str]) -> str:
-    """Hash of a dataset: of the resolved recipe and its records' hashes, in whatever order they come.
+    """Hash of a dataset: of the resolved recipe and its records' hashes, regardless of their order.
 
-    It depends on no machine, time, path or number of workers.
+    It does not depend on machine, time, path or number of workers.
     """
     content = {"recipe": recipe.model_dump(mode="json"), "records": sorted(record_hashes)}
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()
@@ -115,21 +115,21 @@ def build_manifest(
     split_of_scene: Mapping[int, SplitName],
     drops: Sequence[Drop] = (),
 ) -> Manifest:
-    """Describe the frames that lie in a dataset.
+    """The manifest of the frames that are stored in a dataset.
 
     Args:
-        dataset: where it lies.
-        recipe: that it was made from.
+        dataset: its location.
+        recipe: from which it was made.
         render_version: `render.version.RENDER_VERSION`.
         split_of_scene: the split of every scene, by its id.
-        drops: frames that were given up.
+        drops: frames that were not made.
 
     Raises:
         ValueError: a record that cannot be read; names the file.
     """
     entries, engines = [], Counter[str]()
     store = FrameStore(dataset)
-    found = in_order(lambda index: _read_entry(store, index, split_of_scene), store.indices(), store.storage)
+    found = map_in_order(lambda index: _read_entry(store, index, split_of_scene), store.indices(), store.storage)
     for entry, engine in found:
         entries.append(entry)
         engines[engine] += 1
@@ -151,8 +151,8 @@ def build_manifest(
     return Manifest.model_validate({**content, "manifest_sha256": _content_sha256(content)})
 
 
-def made_with(manifest: Manifest, software: Mapping[str, str], cpu_features: Sequence[str]) -> Manifest:
-    """The manifest with the versions and processor features of the machines that made the frames."""
+def with_build(manifest: Manifest, software: Mapping[str, str], cpu_features: Sequence[str]) -> Manifest:
+    """The manifest with other software versions and processor features: those of the machines that made the frames."""
     content = manifest.model_dump(mode="json", exclude={"manifest_sha256"})
     content.update(software=dict(software), cpu_features=list(cpu_features))
     return Manifest.model_validate({**content, "manifest_sha256": _content_sha256(content)})
@@ -176,7 +176,7 @@ def read_manifest(dataset: Location) -> Manifest:
     """
     storage = open_storage(dataset)
     path = storage.where(MANIFEST_FILE)
-    if not storage.is_there():
+    if not storage.root_exists():
         raise ValueError(f"{dataset}: there is no such dataset folder")
     try:
         table = json.loads(storage.read(MANIFEST_FILE))
@@ -197,7 +197,7 @@ def read_manifest(dataset: Location) -> Manifest:
 
 
 def count_pairs(entries: Sequence[FrameEntry]) -> Counts:
-    """How many pairs there are of each kind."""
+    """Numbers of pairs in total, empty, by split and by scene."""
     splits = Counter(entry.split for entry in entries)
     return Counts(
         pairs=len(entries),
@@ -213,7 +213,7 @@ def _content_sha256(table: dict[str, Any]) -> str:
 
 
 def _read_entry(store: FrameStore, frame_index: int, split_of_scene: Mapping[int, SplitName]) -> tuple[FrameEntry, str]:
-    """What the manifest holds of one record, and its engine; the record's other contents are not checked here."""
+    """The manifest's entry of one record, and its engine; the record's other contents are not checked here."""
     path = store.where(frame_index, RECORD_FILE)
     try:
         data = store.read(frame_index, RECORD_FILE)

@@ -1,7 +1,8 @@
-"""Finished frames into tar files, so that no instant at which a run may be killed costs a frame.
+"""Packs finished frames into tar files, so that a run that is killed at any instant loses no frame.
 
-A frame is first written into a folder of its own. Once all frames of a tar file are there, the archive is written and
-appears whole; then the list beside it; and only then the folders go. An archive without a list is listed anew.
+A frame is first written into a folder of its own. Once all frames of a tar file exist, the archive is written and
+appears whole; then the index beside it; and only then are the folders removed. An archive without an index gets a new
+one from `repair_shards`.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from datasets_manifest.storage.layout import (
     shard_file,
     shard_index_file,
 )
-from datasets_manifest.storage.storage import Location, Storage, in_order, open_storage
+from datasets_manifest.storage.storage import Location, Storage, map_in_order, open_storage
 
 Contents = list[tuple[str, bytes]]
 Packed = Mapping[str, PackedFile]
@@ -48,11 +49,11 @@ Packed = Mapping[str, PackedFile]
 
 @dataclass(frozen=True)
 class Packing:
-    """Which frames come together.
+    """How frames are grouped into tar files.
 
     Attributes:
-        pairs_per_tar: frame i belongs to the tar file i // pairs_per_tar.
-        frames: that are made; a tar file is complete with those of them that belong to it.
+        pairs_per_tar: frame i belongs to tar file i // pairs_per_tar.
+        frames: all frames that are to be made; a tar file is complete once it holds those that belong to it.
     """
 
     pairs_per_tar: int
@@ -64,34 +65,34 @@ class Packing:
         return {index for index in range(first, first + self.pairs_per_tar) if index in self.frames}
 
 
-def choose_packing(dataset: Location, pairs_per_tar: int | None) -> None:
-    """Let a dataset keep its frames in tar files from now on; those that it has are packed when a run ends.
+def configure_packing(dataset: Location, pairs_per_tar: int | None) -> None:
+    """Make a dataset keep its frames in tar files; frames that it already has are packed when a run ends.
 
     Args:
-        dataset: where it lies.
-        pairs_per_tar: how many in each; None leaves it as it is.
+        dataset: its location.
+        pairs_per_tar: pairs in each tar file; None leaves the dataset as it is.
 
     Raises:
-        ValueError: it has tar files of another number already.
+        ValueError: it has tar files with another number of pairs already.
         OSError: it cannot be written.
     """
     if pairs_per_tar is None:
         return
     check_pairs_per_tar(pairs_per_tar)
     storage = open_storage(dataset)
-    there = read_pairs_per_tar(storage)
-    if there is None:
+    present = read_pairs_per_tar(storage)
+    if present is None:
         text = ShardLayout(pairs_per_tar=pairs_per_tar).model_dump_json() + "\n"
         storage.write(SHARDS_FILE, text.encode())
-    elif there != pairs_per_tar:
+    elif present != pairs_per_tar:
         raise ValueError(
-            f"--tar: {storage.where()} has tar files of {there} pairs, got {pairs_per_tar}; leave it out, or render "
+            f"--tar: {storage.where()} has tar files of {present} pairs, got {pairs_per_tar}; leave it out, or render "
             "into a new folder"
         )
 
 
 def check_pairs_per_tar(pairs_per_tar: int | None) -> None:
-    """See that a number of pairs can be chosen; None leaves a dataset as it is.
+    """Check a number of pairs for a tar file; None, which leaves a dataset as it is, is valid.
 
     Raises:
         ValueError: it is out of range.
@@ -100,24 +101,24 @@ def check_pairs_per_tar(pairs_per_tar: int | None) -> None:
         raise ValueError(f"--tar: must be from 1 to {MAX_PAIRS_PER_TAR} pairs, got {pairs_per_tar}")
 
 
-def packing_of(dataset: Location, frames: range) -> Packing | None:
-    """How a dataset packs frames that are made, or None where each keeps its folder.
+def read_packing(dataset: Location, frames: range) -> Packing | None:
+    """How a dataset packs the frames that are made, or None where each keeps its folder.
 
     Raises:
-        ValueError: the file that says so is damaged.
+        ValueError: `shards/layout.json` is damaged.
     """
     pairs_per_tar = read_pairs_per_tar(open_storage(dataset))
     return None if pairs_per_tar is None else Packing(pairs_per_tar, frames)
 
 
-class _NotWholeError(Exception):
-    """Frames' folders are damaged, or another process has packed them and removes them."""
+class _IncompleteFrameError(Exception):
+    """A frame's folder is damaged, or another process has packed it and is removing it."""
 
 
 def pack_if_complete(dataset: Location, frame_index: int, packing: Packing) -> None:
-    """Pack the tar file that a frame belongs to, if that frame was the last one missing.
+    """Write the tar file that a frame belongs to, if that frame was the last one missing.
 
-    Several processes may come here at once: they write the same bytes. What cannot be packed is left to `pack_all`.
+    Several processes may do so at once, as they write the same bytes. What cannot be packed is left to `pack_all`.
 
     Raises:
         OSError: it cannot be read or written.
@@ -125,7 +126,7 @@ def pack_if_complete(dataset: Location, frame_index: int, packing: Packing) -> N
     storage = open_storage(dataset)
     number = frame_index // packing.pairs_per_tar
     wanted = packing.members(number)
-    # What is begun has a name too, so that the second look is seldom taken.
+    # The cheaper test first: it also counts folders that are still incomplete.
     if not wanted <= _indices(storage.names(FRAMES_FOLDER)):
         return
     staged = _indices(storage.folders_with(FRAMES_FOLDER, RECORD_FILE))
@@ -133,18 +134,18 @@ def pack_if_complete(dataset: Location, frame_index: int, packing: Packing) -> N
         return
     try:
         _pack(storage, number, _all_staged(storage, sorted(wanted)))
-    except _NotWholeError:
+    except _IncompleteFrameError:
         return
     _remove_folders(storage, wanted)
 
 
 def pack_all(dataset: Location) -> None:
-    """Pack all frames that still have folders, those of incomplete tar files too; only while nobody else writes.
+    """Pack all frames that still have folders, also into incomplete tar files; only while no other process writes.
 
-    Damaged ones keep their folders.
+    Damaged frames keep their folders.
 
     Raises:
-        ValueError: a list of a tar file is missing or damaged; names it.
+        ValueError: the index of a tar file is missing or damaged; names it.
         OSError: it cannot be read or written.
     """
     store = FrameStore(dataset)
@@ -153,17 +154,17 @@ def pack_all(dataset: Location) -> None:
     by_number: dict[int, list[int]] = {}
     for frame_index in sorted(store.staged):
         by_number.setdefault(frame_index // store.pairs_per_tar, []).append(frame_index)
-    there = set(shard_numbers(store.storage))
+    present = set(shard_numbers(store.storage))
     for number, staged in by_number.items():
-        packed = read_shard_index(store.storage, number).frames if number in there else {}
+        packed = read_shard_index(store.storage, number).frames if number in present else {}
         _pack_again(store.storage, number, staged, packed)
 
 
-def mend_shards(dataset: Location) -> None:
-    """List anew what killed runs have left without its list; only while nobody else writes into the dataset.
+def repair_shards(dataset: Location) -> None:
+    """Rebuild the indices that killed runs did not write; only while no other process writes into the dataset.
 
     Raises:
-        ValueError: a tar file that cannot be read as one; names it.
+        ValueError: a tar file is damaged; names it.
         OSError: it cannot be read or written.
     """
     storage = open_storage(dataset)
@@ -187,9 +188,9 @@ def _indices(names: list[str]) -> set[int]:
 
 
 def _pack_again(storage: Storage, number: int, staged: list[int], packed: Mapping[int, Packed]) -> None:
-    """Pack the whole ones of the frames that have folders, with those that their tar file holds already."""
+    """Write a tar file anew, with the undamaged frames that have folders and those that it already holds."""
     if all(index in packed for index in staged) and all(
-        in_order(partial(_is_known, storage, number, packed), staged, storage)
+        map_in_order(partial(_is_known, storage, number, packed), staged, storage)
     ):
         _remove_folders(storage, staged)
         return
@@ -197,46 +198,46 @@ def _pack_again(storage: Storage, number: int, staged: list[int], packed: Mappin
 
     def files_of(index: int) -> tuple[Contents | None, Contents | None]:
         files = _staged_files(storage, index) if index in waiting else None
-        # What is damaged in the tar file and was not made again is none of the dataset's frames any more.
+        # A frame that is damaged in the tar file and was not made again is dropped from the dataset.
         return files, _packed_files(storage, number, packed[index]) if files is None and index in packed else None
 
     def contents() -> Iterator[tuple[int, Contents]]:
         indices = sorted({*packed, *waiting})
-        for index, (mine, before) in zip(indices, in_order(files_of, indices, storage), strict=True):
+        for index, (mine, before) in zip(indices, map_in_order(files_of, indices, storage), strict=True):
             if mine is not None:
                 whole.append(index)
             files = mine or before
             if files is not None:
                 yield index, files
         if not whole:
-            raise _NotWholeError
+            raise _IncompleteFrameError
 
-    with suppress(_NotWholeError):
+    with suppress(_IncompleteFrameError):
         _pack(storage, number, contents())
         _remove_folders(storage, whole)
 
 
 def _is_known(storage: Storage, number: int, packed: Mapping[int, Packed], frame_index: int) -> bool:
-    """Whether a frame's folder is whole, and its tar file holds the same."""
+    """Whether a frame's folder is undamaged and equal to its copy in the tar file."""
     files = _staged_files(storage, frame_index)
     return files is not None and files == _packed_files(storage, number, packed[frame_index])
 
 
 def _all_staged(storage: Storage, indices: Sequence[int]) -> Iterator[tuple[int, Contents]]:
-    """Frames that have folders, with their files, of which only a few are in memory at a time.
+    """Frames that have folders, with their files; only a few are in memory at a time.
 
     Raises:
-        _NotWholeError: one is damaged.
+        _IncompleteFrameError: one is damaged.
     """
-    contents = in_order(partial(_staged_files, storage), indices, storage)
+    contents = map_in_order(partial(_staged_files, storage), indices, storage)
     for index, files in zip(indices, contents, strict=True):
         if files is None:
-            raise _NotWholeError
+            raise _IncompleteFrameError
         yield index, files
 
 
 def _staged_files(storage: Storage, frame_index: int) -> Contents | None:
-    """The files in a frame's folder, sorted, or None where they are not those of its record."""
+    """The files in a frame's folder, sorted, or None where they do not match the hashes of its record."""
     folder = frame_name(frame_index)
     try:
         record = storage.read(f"{folder}/{RECORD_FILE}")
@@ -250,7 +251,7 @@ def _staged_files(storage: Storage, frame_index: int) -> Contents | None:
 
 
 def _packed_files(storage: Storage, number: int, files: Packed) -> Contents | None:
-    """The files of a frame in a tar file, sorted, or None where they are not those of its list."""
+    """The files of a frame in a tar file, sorted, or None where they do not match the hashes of the index."""
     found = [(name, storage.read(shard_file(number), file.offset, file.size)) for name, file in sorted(files.items())]
     same = all(hashlib.sha256(data).hexdigest() == files[name].sha256 for name, data in found)
     return found if same else None
@@ -259,13 +260,13 @@ def _packed_files(storage: Storage, number: int, files: Packed) -> Contents | No
 def _pack(storage: Storage, number: int, frames: Iterable[tuple[int, Contents]]) -> None:
     with storage.write_large(shard_file(number)) as stream:
         index = _write_archive(frames, stream)
-        # A list never stands beside an archive that it is not of.
+        # An index must never stand beside another archive.
         storage.delete(shard_index_file(number))
     storage.write(shard_index_file(number), index_text(index).encode())
 
 
 def _write_archive(frames: Iterable[tuple[int, Contents]], stream: BinaryIO) -> ShardIndex:
-    """Write a tar file, which is a function of its frames alone: nobody's files, of no time."""
+    """Write a tar file whose bytes depend on its frames alone: without owners and time stamps."""
     lists: dict[int, dict[str, PackedFile]] = {}
     with tarfile.TarFile(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as archive:
         for frame_index, contents in frames:
@@ -282,5 +283,5 @@ def _write_archive(frames: Iterable[tuple[int, Contents]], stream: BinaryIO) -> 
 
 
 def _remove_folders(storage: Storage, indices: Iterable[int]) -> None:
-    for _ in in_order(lambda index: storage.delete_folder(frame_name(index), RECORD_FILE), indices, storage):
+    for _ in map_in_order(lambda index: storage.delete_folder(frame_name(index), RECORD_FILE), indices, storage):
         pass

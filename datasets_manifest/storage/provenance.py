@@ -1,4 +1,4 @@
-"""What a dataset's numbers rest on: the conventions they follow and the machine they were made on."""
+"""Conventions of a dataset's numbers, and the software and processor with which they were made."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SOFTWARE = ("droguekit", "numpy", "scipy", "opencv-python-headless", "pydantic"
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of Python and of the packages that pixels and labels depend on, as far as they are installed."""
+    """Versions of Python and of the installed packages on which pixels and labels depend."""
     versions = {"python": platform.python_version()}
     for package in _SOFTWARE:
         try:
@@ -41,18 +41,18 @@ def software_versions() -> dict[str, str]:
 
 
 def cpu_features() -> list[str]:
-    """Instruction sets that numpy found on this machine, and the processor's maker where the system tells it.
+    """Instruction sets that numpy found on this machine, and the processor's vendor where the system names it.
 
-    They decide the last bits of derived numbers: libraries choose their code by both.
+    Libraries choose their code by both, which decides the last bits of derived numbers.
     """
     # numpy's stubs leave out the form with `mode`.
     report: dict[str, Any] = np.show_config(mode="dicts")  # type: ignore[call-arg, assignment, func-returns-value]
     extensions = report["SIMD Extensions"]
-    return [*extensions.get("baseline", ()), *extensions.get("found", ()), *_maker(_CPU_INFO)]
+    return [*extensions.get("baseline", ()), *extensions.get("found", ()), *_vendor(_CPU_INFO)]
 
 
-def _maker(cpu_info: Path) -> list[str]:
-    """The maker of a Linux machine's processor, such as `GenuineIntel`; nothing where the file does not name one."""
+def _vendor(cpu_info: Path) -> list[str]:
+    """The vendor of a Linux machine's processor, such as `GenuineIntel`; empty where the file does not name one."""
     try:
         found = re.search(r"^vendor_id\s*:\s*(\S+)", cpu_info.read_text(encoding="utf-8", errors="replace"), re.M)
     except OSError:
@@ -61,15 +61,15 @@ def _maker(cpu_info: Path) -> list[str]:
 
 
 def differing_builds(
-    there_software: Mapping[str, str],
-    there_features: Collection[str],
-    here_software: Mapping[str, str],
-    here_features: Collection[str],
+    other_software: Mapping[str, str],
+    other_features: Collection[str],
+    own_software: Mapping[str, str],
+    own_features: Collection[str],
 ) -> list[str]:
-    """How the software and the processor of two places differ, a line each; without a difference pixels are equal."""
+    """Differences in software and processor from another build, a line each; equal builds make equal pixels."""
     found = [
-        f"{name} {there_software.get(name, 'missing')} there, {here_software.get(name, 'missing')} here"
-        for name in sorted({*there_software, *here_software})
-        if there_software.get(name) != here_software.get(name)
+        f"{name} {other_software.get(name, 'missing')} there, {own_software.get(name, 'missing')} here"
+        for name in sorted({*other_software, *own_software})
+        if other_software.get(name) != own_software.get(name)
     ]
-    return found if set(there_features) == set(here_features) else [*found, "another set of processor features"]
+    return found if set(other_features) == set(own_features) else [*found, "another set of processor features"]

@@ -1,4 +1,4 @@
-"""A dataset, read as it is asked for, wherever and however its frames lie."""
+"""Reads datasets: truth, images and part ids, each on demand."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from geometry.stereo import EYES, Eye
 
 
 class Shutter(NamedTuple):
-    """What a pair's record says of its images besides the truth."""
+    """Metadata of a pair's images that is no truth."""
 
     time_s: float
     exposure_s: float
@@ -35,7 +35,7 @@ class Shutter(NamedTuple):
 
 
 class Dataset:
-    """Stereo pairs with their truth; nothing but the manifest is read before it is asked for."""
+    """Stereo pairs with their truth; all but the manifest is read on demand."""
 
     def __init__(self, path: Location) -> None:
         """Open the dataset in a folder, or at a URL such as `s3://bucket/name`.
@@ -68,8 +68,8 @@ class Dataset:
         """
         return self._parse_record(frame_index, self.frames.read(frame_index, RECORD_FILE))
 
-    def drogue_sought(self, record: PairRecord) -> DrogueParameters:
-        """What navigation looks for in a pair, whether it is there or not."""
+    def sought_drogue(self, record: PairRecord) -> DrogueParameters:
+        """The drogue that navigation looks for in a pair, whether the pair shows it or not."""
         return record.frame.drogue or record.frame.sought or self.manifest.recipe.drogue
 
     def _parse_record(self, frame_index: int, data: bytes) -> PairRecord:
@@ -89,10 +89,10 @@ class Dataset:
         return record
 
     def whole_frame(self, frame_index: int) -> tuple[PairRecord, dict[str, bytes]]:
-        """The record and the other files by name of a pair of the manifest, each read once and hashed.
+        """The record of a pair, and its other files by name, each read once and checked against its hash.
 
         Raises:
-            ValueError: a file is missing, or is not the one on record; names it.
+            ValueError: a file is missing, or its hash is not the recorded one; names it.
         """
         data = self.frames.read(frame_index, RECORD_FILE)
         self._check_hash(frame_index, RECORD_FILE, data, self._record_hashes[frame_index])
@@ -108,7 +108,7 @@ class Dataset:
             raise ValueError(f"{self.frames.where(frame_index, name)}: was changed, its hash is not the one on record")
 
     def images(self, frame_index: int) -> StereoImages:
-        """What the cameras saw.
+        """Both images of a pair.
 
         Raises:
             ValueError: a file is missing, truncated or of another size or depth than the rig's; names the file.
@@ -127,10 +127,10 @@ class Dataset:
         return cast(NDArray[np.uint8], _read_gray(self.frames, frame_index, parts_file(eye), camera, np.uint8))
 
     def verify(self, frame_index: int) -> list[str]:
-        """Hash a pair's files again.
+        """Compare a pair's files with their hashes.
 
         Returns:
-            What is wrong, one line for each file; empty if nothing is.
+            The faults, one line for each file; empty without faults.
         """
         expected = self._record_hashes.get(frame_index)
         if expected is None:
@@ -156,7 +156,7 @@ def read_record_table(frames: FrameStore, frame_index: int) -> dict[str, Any]:
     """The JSON object in a pair's record, unchecked.
 
     Raises:
-        ValueError: it is missing, truncated or no JSON object; names the file.
+        ValueError: it is missing, truncated or not a JSON object; names the file.
     """
     return _parse_table(frames.read(frame_index, RECORD_FILE), frames.where(frame_index, RECORD_FILE))
 
@@ -172,7 +172,7 @@ def _parse_table(data: bytes, path: str) -> dict[str, Any]:
 
 
 def read_shutter(frames: FrameStore, frame_index: int) -> Shutter:
-    """Time stamp, exposure and black level of a pair's images; no truth is looked at.
+    """Time stamp, exposure and black level of a pair's images, without the truth.
 
     Raises:
         ValueError: the record is missing or truncated, or lacks them; names the file.
@@ -185,13 +185,13 @@ def read_shutter(frames: FrameStore, frame_index: int) -> Shutter:
         raise ValueError(f"{frames.where(frame_index, RECORD_FILE)}: no valid time_s or exposure") from error
 
 
-def read_sought(frames: FrameStore, frame_index: int, usual: DrogueParameters) -> DrogueParameters:
-    """The drogue that a receiver would look for in a pair; whether it is there is not told.
+def read_sought_drogue(frames: FrameStore, frame_index: int, default: DrogueParameters) -> DrogueParameters:
+    """The drogue that navigation is to look for in a pair, whether the pair shows it or not.
 
     Args:
         frames: of the dataset.
         frame_index: which pair.
-        usual: the recipe's drogue, for datasets with one.
+        default: the recipe's drogue, for datasets with one.
 
     Raises:
         ValueError: the record is missing, truncated or wrong; names the file.
@@ -199,7 +199,7 @@ def read_sought(frames: FrameStore, frame_index: int, usual: DrogueParameters) -
     frame = read_record_table(frames, frame_index).get("frame")
     given = (frame.get("drogue") or frame.get("sought")) if isinstance(frame, dict) else None
     if given is None:
-        return usual
+        return default
     try:
         return DrogueParameters.model_validate(given)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""Any place that fsspec knows as storage: an object appears whole, and the last one of a folder makes it count."""
+"""Storage at any URL that fsspec supports: objects appear whole, and a folder counts once its last object exists."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TextIO, cast
 
-# Streams are for tar archives, which are read from end to end: few requests, whose answers take longer than their way.
+# Tar archives are streamed from end to end: large blocks, so that transfer dominates the latency of the requests.
 _BLOCK_BYTES = 2**23
 
 
@@ -22,10 +22,10 @@ class RemoteStorage:
     is_remote = True
 
     def __init__(self, url: str) -> None:
-        """For a URL that fsspec knows.
+        """Connect to a URL that fsspec supports.
 
         Raises:
-            ValueError: it does not, or lacks a package for it.
+            ValueError: fsspec does not support it, or lacks a package for it.
         """
         self._url = url
         self._connect()
@@ -35,11 +35,11 @@ class RemoteStorage:
         return f"{self._url}/{name}" if name else self._url
 
     def path(self, name: str) -> Path | None:
-        """None."""
+        """None, as there is no local file."""
         return None
 
-    def is_there(self) -> bool:
-        """Whether any object lies below the URL."""
+    def root_exists(self) -> bool:
+        """Whether any object exists below the URL."""
         return self._info("") is not None
 
     def exists(self, name: str) -> bool:
@@ -48,36 +48,36 @@ class RemoteStorage:
         return info is not None and info["type"] == "file"
 
     def leads_outside(self, name: str) -> bool:
-        """There are no links."""
+        """False, as there are no links."""
         return False
 
     def size(self, name: str) -> int:
-        """Of an object. [bytes]"""
-        with self._told(name, "read"):
+        """Size of an object. [bytes]"""
+        with self._named_errors(name, "read"):
             return int(self._fs.info(self._path(name))["size"])
 
     def read(self, name: str, offset: int = 0, size: int | None = None) -> bytes:
         """An object or a part of it."""
         part = {} if offset == 0 and size is None else {"start": offset, "end": None if size is None else offset + size}
-        with self._told(name, "read"):
+        with self._named_errors(name, "read"):
             return bytes(self._fs.cat_file(self._path(name), **part))
 
     def open(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """A stream that fetches what is read, in large blocks."""
+        """A stream that fetches large blocks as they are read."""
         return io.BufferedReader(_ObjectStream(self, name), _BLOCK_BYTES)
 
     @contextmanager
     def local_copy(self, name: str) -> Iterator[Path]:
-        """A temporary file, as long as the block lasts."""
+        """A temporary copy for the duration of the block."""
         with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
             path = Path(folder) / PurePosixPath(name).name
-            with self._told(name, "read"):
+            with self._named_errors(name, "read"):
                 self._fs.get_file(self._path(name), str(path))
             yield path
 
     def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder."""
-        with self._told(folder, "read"):
+        """Names directly in a folder."""
+        with self._named_errors(folder, "read"):
             try:
                 entries = self._fs.ls(self._path(folder), detail=False)
             except FileNotFoundError:
@@ -87,7 +87,7 @@ class RemoteStorage:
         return sorted({PurePosixPath(entry).name for entry in entries if entry.strip("/") != own})
 
     def files_ending(self, suffix: str) -> list[str]:
-        """All objects at any depth that end so."""
+        """All objects with the suffix, at any depth."""
         return [name for name in self._find("") if name.endswith(suffix)]
 
     def folders_with(self, folder: str, mark: str) -> list[str]:
@@ -97,20 +97,20 @@ class RemoteStorage:
         return sorted({names[depth] for names in parts if len(names) == depth + 2 and names[-1] == mark})
 
     def leftovers(self, folder: str, mark: str) -> list[str]:
-        """Objects directly in the folders of a folder, where the one with the mark is the last to come."""
+        """Objects in those folders of a folder that lack the object `mark`, which is written last."""
         depth = len(PurePosixPath(folder).parts)
         deep = [name for name in self._find(folder) if len(PurePosixPath(name).parts) == depth + 2]
         whole = {str(PurePosixPath(name).parent) for name in deep if PurePosixPath(name).name == mark}
         return [name for name in deep if str(PurePosixPath(name).parent) not in whole]
 
     def write(self, name: str, data: bytes) -> None:
-        """One object."""
-        with self._told(name, "written"):
+        """Write one object."""
+        with self._named_errors(name, "written"):
             self._fs.pipe_file(self._path(name), data)
 
     @contextmanager
     def write_text(self, name: str) -> Iterator[TextIO]:
-        """Text that waits in a temporary file until it is whole."""
+        """A text stream into a temporary file, which is uploaded once it is complete."""
         with self.write_large(name) as stream:
             text = io.TextIOWrapper(stream, encoding="utf-8", newline="\n")
             yield text
@@ -118,27 +118,27 @@ class RemoteStorage:
 
     @contextmanager
     def write_large(self, name: str) -> Iterator[BinaryIO]:
-        """Bytes that wait in a temporary file until they are whole; it has no name, so that a kill leaves nothing."""
+        """A stream into a temporary file, uploaded once complete; unnamed, so that a killed process leaves nothing."""
         with tempfile.TemporaryFile() as stream:
             yield cast(BinaryIO, stream)
             stream.flush()
-            with self._told(name, "written"):
+            with self._named_errors(name, "written"):
                 self._fs.put_file(f"/proc/self/fd/{stream.fileno()}", self._path(name))
 
     def spool(self, folder: str) -> TextIO:
-        """A file without a name among the temporary ones."""
+        """An unnamed temporary file."""
         return cast(TextIO, tempfile.TemporaryFile("w+", encoding="utf-8", newline="\n"))
 
     def write_together(self, folder: str, files: Mapping[str, bytes], mark: str) -> None:
-        """The old mark goes first, then the other objects come, and the new mark is the last."""
+        """Delete the old mark, write the other objects, then the new mark."""
         self.delete(f"{folder}/{mark}")
-        with self._told(folder, "written"):
+        with self._named_errors(folder, "written"):
             self._fs.pipe({self._path(f"{folder}/{name}"): data for name, data in files.items() if name != mark})
             self._fs.pipe_file(self._path(f"{folder}/{mark}"), files[mark])
 
     def delete(self, name: str) -> None:
-        """Remove an object, if it is there."""
-        with self._told(name, "removed"):
+        """Remove an object, if it exists."""
+        with self._named_errors(name, "removed"):
             try:
                 self._fs.rm_file(self._path(name))
             except FileNotFoundError as error:
@@ -146,9 +146,9 @@ class RemoteStorage:
                     raise
 
     def delete_folder(self, folder: str, mark: str) -> None:
-        """The mark first, then all objects."""
+        """Remove the mark first, then all objects."""
         self.delete(f"{folder}/{mark}")
-        # One by one: what removes many takes names for patterns, and brackets in them for a choice.
+        # One by one: the call that removes many expands brackets in names as patterns.
         for name in self._find(folder):
             self.delete(name)
 
@@ -174,12 +174,12 @@ class RemoteStorage:
         return f"{self._root}/{name}".rstrip("/")
 
     def _info(self, name: str) -> dict[str, Any] | None:
-        """What the store tells of an object or a folder, or None where there is neither.
+        """The store's information on an object or a folder, or None where there is neither.
 
         Raises:
-            OSError: it cannot tell. That is no answer: what asks may be about to delete what it does not find.
+            OSError: the store does not answer. This must not count as missing, as callers delete what has no entry.
         """
-        with self._told(name, "read"):
+        with self._named_errors(name, "read"):
             try:
                 info: dict[str, Any] = self._fs.info(self._path(name))
             except FileNotFoundError:
@@ -188,7 +188,7 @@ class RemoteStorage:
 
     def _find(self, folder: str) -> list[str]:
         """Names of all objects below a folder, sorted."""
-        with self._told(folder, "read"):
+        with self._named_errors(folder, "read"):
             try:
                 found = self._fs.find(self._path(folder))
             except FileNotFoundError:
@@ -196,12 +196,12 @@ class RemoteStorage:
         return sorted(path.removeprefix(f"{self._root}/") for path in found)
 
     def _is_of_object(self, error: FileNotFoundError, name: str) -> bool:
-        """Whether the object is missing, which may be expected, and not the bucket that it would be in."""
+        """Whether the error says that the object is missing, which may be expected, and not its bucket."""
         return self._path(name) in str(error)
 
     @contextmanager
-    def _told(self, name: str, what: str) -> Iterator[None]:
-        """Let whatever the many libraries behind fsspec raise be one line that names the object."""
+    def _named_errors(self, name: str, what: str) -> Iterator[None]:
+        """Turn the errors of the libraries behind fsspec into one line that names the object."""
         try:
             yield
         except Exception as error:
@@ -218,7 +218,7 @@ class _ObjectStream(io.RawIOBase):
     """An object as a file; every read is a request."""
 
     def __init__(self, storage: RemoteStorage, name: str) -> None:
-        """Look how large it is.
+        """Ask for its size.
 
         Raises:
             FileNotFoundError: it is missing.
@@ -227,21 +227,21 @@ class _ObjectStream(io.RawIOBase):
         self._size, self._position = storage.size(name), 0
 
     def readable(self) -> bool:
-        """Yes."""
+        """True."""
         return True
 
     def seekable(self) -> bool:
-        """Yes."""
+        """True."""
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a place, which is the next to be read."""
+        """Set the position of the next read."""
         start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
         self._position = max(0, start + offset)
         return self._position
 
     def readinto(self, buffer: Any) -> int:
-        """Fill a buffer, as far as the object goes."""
+        """Fill a buffer, up to the object's end."""
         size = min(len(buffer), self._size - self._position)
         if size <= 0:
             return 0
@@ -256,12 +256,12 @@ def _connect(url: str, process: int) -> tuple[Any, str]:
     """The file system of a URL, and the URL's path in it; one for each process.
 
     Raises:
-        ValueError: fsspec does not know it, or lacks a package for it.
+        ValueError: fsspec does not support it, or lacks a package for it.
     """
     try:
         from fsspec.core import url_to_fs  # type: ignore[import-untyped]
 
-        # Listings that are kept would hide what other processes write.
+        # Cached listings would hide what other processes write.
         system, root = url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
         raise ValueError(f'{url}: {error.name or error} is missing: pip install "droguekit[remote]"') from error

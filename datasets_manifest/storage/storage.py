@@ -1,4 +1,4 @@
-"""Where a dataset lies: a folder of this machine, or any place that fsspec knows, behind one small interface."""
+"""One interface to the two places where a dataset may lie: a local folder, or any URL that fsspec supports."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from datasets_manifest.storage.remote_storage import RemoteStorage
 
 
 class LocalStorage:
-    """Files below a folder; see `datasets_manifest.storage.storage.Storage`."""
+    """A local folder as `Storage`: everything appears by one rename and is synced to the disk."""
 
     is_remote = False
 
@@ -32,15 +32,15 @@ class LocalStorage:
         self._root = root
 
     def where(self, name: str = "") -> str:
-        """The path."""
+        """Path of a file."""
         return str(self._root / name)
 
     def path(self, name: str) -> Path | None:
         """The file itself."""
         return self._root / name
 
-    def is_there(self) -> bool:
-        """Whether the folder is there."""
+    def root_exists(self) -> bool:
+        """Whether the folder exists."""
         return self._root.is_dir()
 
     def exists(self, name: str) -> bool:
@@ -75,14 +75,14 @@ class LocalStorage:
         yield self._root / name
 
     def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder."""
+        """Names directly in a folder."""
         try:
             return sorted(entry.name for entry in os.scandir(self._root / folder))
         except (FileNotFoundError, NotADirectoryError):
             return []
 
     def files_ending(self, suffix: str) -> list[str]:
-        """All files at any depth that end so."""
+        """All files with the suffix, at any depth."""
         found = self._root.rglob(f"*{suffix}")
         return sorted(
             path.relative_to(self._root).as_posix() for path in found if path.is_file() and not path.is_symlink()
@@ -93,7 +93,7 @@ class LocalStorage:
         return [name for name in self.names(folder) if (self._root / folder / name / mark).is_file()]
 
     def leftovers(self, folder: str, mark: str) -> list[str]:
-        """What is still called as only unfinished things are; folders with a mark appear with all their files."""
+        """Whatever still has a temporary name; a folder gets its final one only with all its files."""
         folders = [name for name in self.names("") if not name.startswith(".") and (self._root / name).is_dir()]
         return sorted(
             f"{place}/{name}".lstrip("/")
@@ -107,21 +107,21 @@ class LocalStorage:
         write_bytes_atomic(self._root / name, data)
 
     def write_text(self, name: str) -> AbstractContextManager[TextIO]:
-        """Text by one rename."""
+        """A text stream whose file appears by one rename."""
         return open_text_atomic(self._root / name)
 
     def write_large(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """Bytes by one rename."""
+        """A stream of bytes whose file appears by one rename."""
         return open_bytes_atomic(self._root / name)
 
     def spool(self, folder: str) -> TextIO:
-        """A file without a name on the disk of the folder, not in memory as /tmp is on many machines."""
+        """An unnamed file on the disk of the folder, and not in /tmp, which is in memory on many machines."""
         place = self._root / folder
         place.mkdir(parents=True, exist_ok=True)
         return cast(TextIO, tempfile.TemporaryFile("w+", encoding="utf-8", newline="\n", dir=place))
 
     def write_together(self, folder: str, files: Mapping[str, bytes], mark: str) -> None:
-        """All files beside the folder first, then one rename."""
+        """Write all files into a temporary folder, then rename it."""
         target = self._root / folder
         part = part_path(target)
         try:
@@ -129,7 +129,7 @@ class LocalStorage:
             for name in sorted(files):
                 _write_synced(part / name, files[name])
             sync_folder(part)
-            self._bury(target)
+            self._remove_atomically(target)
             part.rename(target)
             sync_folder(target.parent)
         except OSError as error:
@@ -138,7 +138,7 @@ class LocalStorage:
             shutil.rmtree(part, ignore_errors=True)
 
     def delete(self, name: str) -> None:
-        """Remove a file or, of what killed runs have left, a folder."""
+        """Remove a file, or a leftover folder of a killed run."""
         path = self._root / name
         try:
             if path.is_dir() and not path.is_symlink():
@@ -149,15 +149,15 @@ class LocalStorage:
             raise OSError(error.errno, f"{path}: cannot be removed: {error.strerror}") from error
 
     def delete_folder(self, folder: str, mark: str) -> None:
-        """By one rename before anything in it is deleted."""
-        self._bury(self._root / folder)
+        """Rename the folder, then delete it."""
+        self._remove_atomically(self._root / folder)
 
-    def _bury(self, target: Path) -> None:
+    def _remove_atomically(self, target: Path) -> None:
         if not target.exists():
             return
-        grave = part_path(target)
-        target.rename(grave)
-        shutil.rmtree(grave)
+        renamed = part_path(target)
+        target.rename(renamed)
+        shutil.rmtree(renamed)
 
 
 def _write_synced(path: Path, data: bytes) -> None:
@@ -173,31 +173,31 @@ Location = Path | str
 T = TypeVar("T")
 R = TypeVar("R")
 
-# An answer takes some 50 ms to come, whatever its size; with so many under way the line is full.
-_REQUESTS_AT_ONCE = 16
+# A response takes some 50 ms regardless of its size; this many concurrent requests saturate the connection.
+_CONCURRENT_REQUESTS = 16
 
 
 class Storage(Protocol):
-    """Files by their name below one place: parts with `/` between them.
+    """Files below one root, by names with `/` between folders.
 
-    What is missing raises `FileNotFoundError`, everything else that goes wrong an `OSError` of one line.
+    Missing files raise `FileNotFoundError`, all other failures an `OSError` of one line.
 
     Attributes:
-        is_remote: whether every look at it is a request that takes its time.
+        is_remote: whether every access is a network request.
     """
 
     is_remote: bool
 
     def where(self, name: str = "") -> str:
-        """What to call a file in messages."""
+        """Path or URL of a file, for messages."""
         ...
 
     def path(self, name: str) -> Path | None:
-        """The file itself where it is one of this machine, there or not."""
+        """Path of a local file, whether it exists or not; None for remote storage."""
         ...
 
-    def is_there(self) -> bool:
-        """Whether the place itself is there."""
+    def root_exists(self) -> bool:
+        """Whether the root exists."""
         ...
 
     def exists(self, name: str) -> bool:
@@ -209,27 +209,27 @@ class Storage(Protocol):
         ...
 
     def size(self, name: str) -> int:
-        """Of a file. [bytes]"""
+        """Size of a file. [bytes]"""
         ...
 
     def read(self, name: str, offset: int = 0, size: int | None = None) -> bytes:
-        """A file, or `size` bytes of it from `offset` on, fewer where it ends."""
+        """Contents of a file, or up to `size` bytes of it from `offset` on."""
         ...
 
     def open(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """A stream of a large file, which can be read from any place."""
+        """A seekable stream of a large file."""
         ...
 
     def local_copy(self, name: str) -> AbstractContextManager[Path]:
-        """A file of this machine with the contents, for libraries that open files themselves; not to be written."""
+        """A read-only local file with the contents, for libraries that open files themselves."""
         ...
 
     def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder, sorted; nothing where there is none."""
+        """Names directly in a folder, sorted; empty for a missing folder."""
         ...
 
     def files_ending(self, suffix: str) -> list[str]:
-        """Names of all files at any depth that end so, sorted; links are not followed."""
+        """Names of all files with the suffix, at any depth, sorted; links are not followed."""
         ...
 
     def folders_with(self, folder: str, mark: str) -> list[str]:
@@ -237,43 +237,43 @@ class Storage(Protocol):
         ...
 
     def leftovers(self, folder: str, mark: str) -> list[str]:
-        """Names of what killed runs left half-written, sorted; in folders of a folder `mark` tells what is whole."""
+        """Names of incomplete files and folders of killed runs, sorted; a folder is complete once it holds `mark`."""
         ...
 
     def write(self, name: str, data: bytes) -> None:
-        """Write or replace a file, which is there whole or not at all."""
+        """Write or replace a file atomically."""
         ...
 
     def write_text(self, name: str) -> AbstractContextManager[TextIO]:
-        """A stream of UTF-8 text whose file is there when the block ends without an error."""
+        """A stream of UTF-8 text, whose file appears when the block ends without an error."""
         ...
 
     def write_large(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """The same for bytes, any number of them; the stream can be read from any place too."""
+        """A seekable, readable stream of bytes, whose file appears when the block ends without an error."""
         ...
 
     def spool(self, folder: str) -> TextIO:
-        """A temporary file without a name, on the disk of the folder or on that for temporary files."""
+        """An unnamed temporary file, on the disk of the folder or among the system's temporary files."""
         ...
 
     def write_together(self, folder: str, files: Mapping[str, bytes], mark: str) -> None:
-        """Put a folder in place of what is there of that name: it counts only once `mark`, its last file, is there."""
+        """Write or replace a folder, which counts once its last file, `mark`, exists."""
         ...
 
     def delete(self, name: str) -> None:
-        """Remove a file, if it is there."""
+        """Remove a file, if it exists."""
         ...
 
     def delete_folder(self, folder: str, mark: str) -> None:
-        """Remove a folder, if it is there, so that it stops counting before anything else of it goes."""
+        """Remove a folder, if it exists, in such an order that it stops counting first."""
         ...
 
 
 def as_location(text: str) -> Location:
-    """What a user names: a URL stays one, and anything else is a folder.
+    """The location that a user named: a URL as text, anything else as the path of a folder.
 
     Raises:
-        ValueError: a URL that names nothing.
+        ValueError: a URL without a name.
     """
     scheme, slashes, name = text.partition("://")
     if not slashes:
@@ -286,42 +286,42 @@ def as_location(text: str) -> Location:
 
 
 def open_storage(location: Location) -> Storage:
-    """The storage at a location; nothing is looked at yet.
+    """The storage at a location, without any access yet.
 
     Raises:
-        ValueError: a URL of a kind that is not known, or whose package is missing.
+        ValueError: a URL of an unsupported kind, or whose package is missing.
     """
     place = as_location(location) if isinstance(location, str) else location
     return RemoteStorage(place) if isinstance(place, str) else LocalStorage(place)
 
 
 def join(location: Location, name: str) -> Location:
-    """A place below another."""
+    """A location below another."""
     place = as_location(location) if isinstance(location, str) else location
     return f"{place}/{name}" if isinstance(place, str) else place / name
 
 
 def absolute(location: Location) -> Location:
-    """The same place for a process that works in another folder."""
+    """The same location, valid for a process with another working directory."""
     place = as_location(location) if isinstance(location, str) else location
     return place if isinstance(place, str) else place.resolve()
 
 
-def in_order(function: Callable[[T], R], items: Iterable[T], storage: Storage) -> Iterator[R]:
-    """`function` of each item, in their order; where every look takes its time, of several at once.
+def map_in_order(function: Callable[[T], R], items: Iterable[T], storage: Storage) -> Iterator[R]:
+    """`function` of each item, in order; with remote storage several calls run concurrently.
 
     Raises:
-        Exception: what `function` raises, in its turn.
+        Exception: what `function` raises, when its item is due.
     """
     if not storage.is_remote:
         yield from map(function, items)
         return
     waiting: deque[Future[R]] = deque()
-    with ThreadPoolExecutor(_REQUESTS_AT_ONCE) as threads:
+    with ThreadPoolExecutor(_CONCURRENT_REQUESTS) as threads:
         try:
             for item in items:
                 waiting.append(threads.submit(function, item))
-                if len(waiting) >= _REQUESTS_AT_ONCE:
+                if len(waiting) >= _CONCURRENT_REQUESTS:
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()

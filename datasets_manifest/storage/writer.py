@@ -1,4 +1,4 @@
-"""Stereo pairs into a dataset: a frame appears whole or not at all."""
+"""Writes stereo pairs into a dataset; a frame appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def encode_files(images: StereoImages, part_ids: Mapping[Eye, NDArray[np.uint8]]
     """The PNG files of one stereo pair.
 
     Args:
-        images: what the cameras saw, with the mosaics of a Bayer sensor.
+        images: with the mosaics of a Bayer sensor.
         part_ids: per eye, (H, W) part ids.
 
     Returns:
-        File contents by file name.
+        Contents by file name.
 
     Raises:
         ValueError: part ids of another size than the images, or not uint8.
@@ -51,14 +51,14 @@ def encode_files(images: StereoImages, part_ids: Mapping[Eye, NDArray[np.uint8]]
                 f"part_ids[{eye!r}]: must be {image.shape[:2]} of uint8, got {parts.shape} of {parts.dtype}"
             )
         files[image_file(eye)] = encode_png(image)
-        files[parts_file(eye)] = encode_png(parts, of_areas=True)
+        files[parts_file(eye)] = encode_png(parts, is_piecewise_constant=True)
         if mosaic is not None:
             files[mosaic_file(eye)] = encode_png(mosaic)
     return files
 
 
 def canonical_json(value: Any) -> str:
-    """One line of JSON that is a function of the value alone: sorted keys, shortest floats that read back the same.
+    """JSON on one line that depends on the value alone: sorted keys, shortest floats that read back the same.
 
     Raises:
         ValueError: a number that is not finite.
@@ -72,19 +72,19 @@ def encode_record(record: PairRecord) -> bytes:
 
 
 def write_frame(dataset: Location, record: PairRecord, files: Mapping[str, bytes]) -> PairRecord:
-    """Put one stereo pair into a dataset; a frame of that index that is there already is replaced.
+    """Write one stereo pair into a dataset; an existing frame of that index is replaced.
 
     Args:
-        dataset: where the dataset lies; a folder is made if missing.
+        dataset: its location; a missing folder is made.
         record: the truth; its `file_sha256` is filled in here.
         files: contents by plain file name.
 
     Returns:
-        The record as it stands on disk.
+        The record as stored.
 
     Raises:
         ValueError: a file name that is not plain.
-        OSError: the disk is full or cannot be written. Nothing half-written is left.
+        OSError: the disk is full or cannot be written. Nothing incomplete is left.
     """
     for name in files:
         if not is_plain_name(name) or name == RECORD_FILE:
@@ -97,7 +97,7 @@ def write_frame(dataset: Location, record: PairRecord, files: Mapping[str, bytes
 
 
 def remove_frame(dataset: Location, frame_index: int) -> None:
-    """Take a frame that has a folder out of a dataset, at once before anything in it is deleted.
+    """Remove a frame's folder from a dataset; it stops counting before any of its files is deleted.
 
     Raises:
         OSError: it cannot be removed.
@@ -106,16 +106,16 @@ def remove_frame(dataset: Location, frame_index: int) -> None:
 
 
 def leftovers(dataset: Location) -> list[str]:
-    """What runs that were killed have left half-written, sorted."""
+    """Paths of incomplete files and folders of killed runs, sorted."""
     storage = open_storage(dataset)
     return [storage.where(name) for name in storage.leftovers(FRAMES_FOLDER, RECORD_FILE)]
 
 
 def remove_leftovers(dataset: Location) -> list[str]:
-    """Delete what killed runs have left half-written; only while nobody else writes into the dataset.
+    """Delete incomplete files and folders of killed runs; only while no other process writes into the dataset.
 
     Returns:
-        What was deleted.
+        The deleted paths.
 
     Raises:
         OSError: something cannot be deleted; one line that names it.

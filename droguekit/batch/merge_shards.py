@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage.layout import RECIPE_FILE
 from datasets_manifest.storage.manifest import Manifest, read_manifest
-from datasets_manifest.storage.packing import pack_if_complete, packing_of
+from datasets_manifest.storage.packing import pack_if_complete, read_packing
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.storage.writer import write_frame
@@ -51,7 +51,7 @@ def merge_shards(
         events = Events(stream)
         whole = sort_frames(out, read_manifest(out)).whole
         events.write("merge", shards=[str(shard) for shard in shards], kept=len(whole))
-        totals, packing = Totals(), packing_of(out, range(manifest.recipe.frames.count))
+        totals, packing = Totals(), read_packing(out, range(manifest.recipe.frames.count))
         report.begin("pairs", len(sources) - len(whole))
         try:
             for frame_index in sorted(set(sources) - whole):

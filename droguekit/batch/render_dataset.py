@@ -14,10 +14,10 @@ from datasets_manifest.calibration.calibration_files import write_calibration
 from datasets_manifest.recipe.recipe import Recipe, RecipeSource
 from datasets_manifest.release.card import write_card
 from datasets_manifest.release.croissant import write_croissant
-from datasets_manifest.storage.frame_store import frames_there
+from datasets_manifest.storage.frame_store import list_frames
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
-from datasets_manifest.storage.manifest import Drop, Manifest, build_manifest, made_with, read_manifest, write_manifest
-from datasets_manifest.storage.packing import packing_of
+from datasets_manifest.storage.manifest import Drop, Manifest, build_manifest, read_manifest, with_build, write_manifest
+from datasets_manifest.storage.packing import read_packing
 from datasets_manifest.storage.storage import Location, join
 from droguekit.batch.cluster import LostWorkersError, run_on_cluster
 from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, available_memory_gib
@@ -231,7 +231,7 @@ def render_dataset(
     with open_dataset(out, source, options.pairs_per_tar) as stream:
         events = Events(stream)
         manifest = read_manifest(out)
-        present = len(frames_there(out))
+        present = len(list_frames(out))
         if present >= _MANY_PAIRS:
             report.say(f"looking whether {present} pairs are as they were written")
         there = sort_frames(out, manifest)
@@ -241,7 +241,7 @@ def render_dataset(
         if there.damaged:
             report.say(f"{len(there.damaged)} pairs are damaged and made again: {_few(there.damaged)}")
         events.write("start", frames=len(frames), kept=kept, damaged=there.damaged, **asdict(options))
-        packing = packing_of(out, frames if isinstance(frames, range) else range(recipe.frames.count))
+        packing = read_packing(out, frames if isinstance(frames, range) else range(recipe.frames.count))
         task = FrameTask(recipe, out, there.engine_version, packing)
         todo = list(dict.fromkeys([*(index for index in frames if index not in there.whole), *there.damaged]))
         totals, dropped = make_frames(task, todo, options, report, events)
@@ -269,7 +269,7 @@ def describe_dataset(recipe: Recipe, out: Location, drops: Sequence[Drop], made_
     finish_frames(out)
     manifest = build_manifest(out, recipe, RENDER_VERSION, split_of_scenes(recipe), tuple(drops))
     if made_by is not None:
-        manifest = made_with(manifest, made_by.software, made_by.cpu_features)
+        manifest = with_build(manifest, made_by.software, made_by.cpu_features)
     write_manifest(out, manifest)
     write_calibration(out, recipe.rig)
     write_annotations(out, join(out, ANNOTATIONS_FOLDER))
@@ -280,7 +280,7 @@ def describe_dataset(recipe: Recipe, out: Location, drops: Sequence[Drop], made_
 
 def still_missing(drops: Iterable[Drop], out: Location) -> tuple[Drop, ...]:
     """The last reason for each dropped frame that has not been made since."""
-    there = set(frames_there(out))
+    there = set(list_frames(out))
     latest = {drop.frame_index: drop for drop in drops if drop.frame_index not in there}
     return tuple(latest.values())
 

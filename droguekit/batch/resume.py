@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
-from datasets_manifest.atomic import takes_lock
+from datasets_manifest.atomic import try_lock
 from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.frame_store import FrameStore, shard_numbers
 from datasets_manifest.storage.manifest import Manifest, build_manifest, read_manifest, write_manifest
-from datasets_manifest.storage.packing import check_pairs_per_tar, choose_packing, mend_shards, pack_all
-from datasets_manifest.storage.storage import Location, in_order, open_storage
+from datasets_manifest.storage.packing import check_pairs_per_tar, configure_packing, pack_all, repair_shards
+from datasets_manifest.storage.storage import Location, map_in_order, open_storage
 from datasets_manifest.storage.writer import remove_leftovers
 from datasets_manifest.types.records import PairRecord
 from render.version import RENDER_VERSION
@@ -63,8 +63,8 @@ def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None 
     with _open_place(out) if folder is None else _open_folder(folder) as events:
         remove_leftovers(out)
         _start(out, source)
-        choose_packing(out, pairs_per_tar)
-        mend_shards(out)
+        configure_packing(out, pairs_per_tar)
+        repair_shards(out)
         yield events
 
 
@@ -121,7 +121,7 @@ def _refuse_foreign(out: Location) -> None:
 
 
 def _lock(events: TextIO, out: Path) -> None:
-    if not takes_lock(events):
+    if not try_lock(events):
         raise ValueError(f"{out}: another run is writing into it; wait for its end, or give another folder")
 
 
@@ -192,7 +192,7 @@ def sort_frames(dataset: Location, manifest: Manifest) -> Found:
     versions: dict[str, int] = {}
     store = FrameStore(dataset)
     indices = store.indices()
-    records = in_order(lambda index: _read_whole(store, index, vouched.get(index)), indices, store.storage)
+    records = map_in_order(lambda index: _read_whole(store, index, vouched.get(index)), indices, store.storage)
     for frame_index, record in zip(indices, records, strict=True):
         if record is None or record.frame_index != frame_index:
             damaged.append(frame_index)

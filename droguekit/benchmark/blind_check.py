@@ -15,7 +15,7 @@ from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset, BlindIndex, read_blind_index
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
-from datasets_manifest.storage.reader import read_sought
+from datasets_manifest.storage.reader import read_sought_drogue
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
 from datasets_manifest.types.records import PixelBox
@@ -109,7 +109,7 @@ def blind_scenes(dataset: Location, index: BlindIndex) -> dict[int, BlindScene]:
     boxes, frames = _read_boxes(dataset), FrameStore(dataset)
     scenes = {}
     for frame in index.frames:
-        drogue = read_sought(frames, frame, index.drogue) if index.drogues_differ else index.drogue
+        drogue = read_sought_drogue(frames, frame, index.drogue) if index.drogues_differ else index.drogue
         given = {eye: boxes[2 * frame + view + 1] for view, eye in enumerate(EYES) if 2 * frame + view + 1 in boxes}
         scenes[frame] = BlindScene(index.rig, drogue, given)
     return scenes

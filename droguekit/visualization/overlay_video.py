@@ -94,7 +94,7 @@ def write_overlay_video(
     method, answers = estimates
 
     def draw(record: PairRecord) -> Picture:
-        drogue = dataset.drogue_sought(record)
+        drogue = dataset.sought_drogue(record)
         index = record.frame_index
         return draw_overlay(record, dataset.images(index), drogue, method, answers.get(index))
 

@@ -209,7 +209,7 @@ class _Scenes:
             for name, mask in zip(("mask", "mask_visib"), masks, strict=True):
                 path = scene / f"{name}_{eye}" / f"{index:06d}_000000.png"
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(encode_png(mask.astype(np.uint8) * np.uint8(255), of_areas=True))
+                path.write_bytes(encode_png(mask.astype(np.uint8) * np.uint8(255), is_piecewise_constant=True))
         self._append(scene / f"scene_gt_{eye}.json", index, truth)
         self._append(scene / f"scene_gt_info_{eye}.json", index, info)
         return visible_share
@@ -232,7 +232,7 @@ class _Scenes:
         numbers, scale = depth_numbers(passes["depth.Z"])
         path = scene / f"depth_{eye}" / f"{record.frame_index:06d}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(encode_png(numbers, of_areas=True))
+        path.write_bytes(encode_png(numbers, is_piecewise_constant=True))
         return scale
 
     def _append(self, path: Path, index: int, value: Any) -> None:

@@ -36,4 +36,4 @@ def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
 def _write(path: Path, mask: Mask) -> None:
     if mask.any():
-        path.write_bytes(encode_png(mask.astype(np.uint8) * np.uint8(255), of_areas=True))
+        path.write_bytes(encode_png(mask.astype(np.uint8) * np.uint8(255), is_piecewise_constant=True))

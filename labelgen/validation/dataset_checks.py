@@ -194,7 +194,7 @@ def validate_dataset(path: Location) -> ValidationReport:
         OSError: a place that cannot be reached.
     """
     storage = open_storage(path)
-    if not storage.is_there():
+    if not storage.root_exists():
         raise ValueError(f"{path}: there is no such dataset folder")
     tally = _Tally()
     try:

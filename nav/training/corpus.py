@@ -21,7 +21,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from datasets_manifest.atomic import PART_SUFFIX, new_folder, takes_lock
+from datasets_manifest.atomic import PART_SUFFIX, new_folder, try_lock
 from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
@@ -130,7 +130,7 @@ def _locked(folder: Path, observer: TrainingObserver, should_stop: Callable[[], 
     """Hold the lock of a folder of caches; the kernel releases it when the process ends, however it ends."""
     with (folder / _LOCK_FILE).open("a") as lock:
         is_reported = False
-        while not takes_lock(lock):
+        while not try_lock(lock):
             if not is_reported:
                 observer.say(f"{folder}: waiting for another training that caches images there")
                 is_reported = True

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from datasets_manifest.atomic import takes_lock, write_text_atomic
+from datasets_manifest.atomic import try_lock, write_text_atomic
 from datasets_manifest.storage.manifest import SplitName
 from datasets_manifest.storage.storage import Location
 from nav.detector.model_metadata import ModelMetadata
@@ -136,7 +136,7 @@ def _check_folder(out: Path) -> None:
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     with (out / _LOCK_FILE).open("a") as lock:
-        if not takes_lock(lock):
+        if not try_lock(lock):
             raise ValueError(f"{out}: another training is running in it; wait for its end, or give another folder")
         yield
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from datasets_manifest.atomic import takes_lock, write_text_atomic
+from datasets_manifest.atomic import try_lock, write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
 from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
@@ -141,7 +141,7 @@ def _own_folder(options: ComparisonOptions, out: Path) -> Iterator[None]:
     """Lock a new folder or that of this comparison, unless another run uses it."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / ".lock").open("a") as lock:
-        if not takes_lock(lock):
+        if not try_lock(lock):
             raise ValueError(f"{out}: another comparison is running in it; wait for its end, or name another folder")
         _check_folder(options, out)
         yield

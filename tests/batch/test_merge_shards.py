@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from datasets_manifest.storage import layout
-from datasets_manifest.storage.manifest import made_with, read_manifest, write_manifest
+from datasets_manifest.storage.manifest import read_manifest, with_build, write_manifest
 from droguekit.batch.render_dataset import RunSummary
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from labelgen.validation.dataset_checks import validate_dataset
@@ -112,7 +112,7 @@ def test_a_shard_made_with_something_else_is_refused(
         software["numpy"] = "0.9"
     else:
         features.append("AVX4096")
-    write_manifest(shards[2], made_with(manifest, software, features))
+    write_manifest(shards[2], with_build(manifest, software, features))
     assert merge(tmp_path / "out", *shards) == WRONG_INPUT
     told = capsys.readouterr().err
     assert f"was made with {what} {'0.9' if what == 'numpy' else 'AVX4096'}" in told
@@ -134,7 +134,7 @@ def test_two_frames_of_one_index_are_refused(
             "dataset_sha256": dataset_sha256(manifest.recipe, hashes),
         }
     )
-    write_manifest(shards[0], made_with(changed, changed.software, changed.cpu_features))
+    write_manifest(shards[0], with_build(changed, changed.software, changed.cpu_features))
     assert merge(tmp_path / "out", *shards, made_shards[0]) == WRONG_INPUT
     assert "its frame 0 is not the one of" in capsys.readouterr().err
 

@@ -19,7 +19,7 @@ from s3fs import S3FileSystem
 
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage import layout
-from datasets_manifest.storage.frame_store import FrameStore, frames_there
+from datasets_manifest.storage.frame_store import FrameStore, list_frames
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import open_storage
@@ -175,7 +175,7 @@ def test_shards_are_merged_from_there_and_to_there(
 ) -> None:
     make(f"{place}/even", range(0, 5, 2), ExecutionOptions(0, pairs_per_tar=4), text)
     make(tmp_path / "odd", range(1, 5, 2), 0, text)
-    assert frames_there(f"{place}/even") == [0, 2, 4]
+    assert list_frames(f"{place}/even") == [0, 2, 4]
     # Complete within the run: neighbours of a part come together in one file.
     assert open_storage(f"{place}/even").names("frames") == []
     assert run(["merge", f"{place}/whole", f"{place}/even", str(tmp_path / "odd"), "--tar", "3"]) == DONE
@@ -244,7 +244,7 @@ def test_a_store_that_does_not_answer_has_not_said_that_anything_is_missing(
             make(place, range(2), 0, text)
     trouble.refuse(lambda method, key: method == "head_object")
     with pytest.raises(OSError, match="reduce your request rate"):
-        storage.is_there()
+        storage.root_exists()
     trouble.refuse(lambda method, key: False)
     assert {name: storage.read(name) for name in before} == before
     assert (summary := make(place, range(2), 0, text)).kept == 2 and not summary.totals.made
@@ -340,4 +340,4 @@ def test_places_that_cannot_be_used_are_one_clear_line(
         assert run([*words, *(["--engine", "analytic"] if words[0] == "render" else [])]) == WRONG_INPUT
         told = capsys.readouterr().err
         assert message in told and told.count("\n") == 1
-    assert not open_storage(f"s3://{BUCKET}/none").is_there()
+    assert not open_storage(f"s3://{BUCKET}/none").root_exists()

@@ -15,10 +15,10 @@ import pytest
 import webdataset
 
 from datasets_manifest.storage.blind import BlindDataset
-from datasets_manifest.storage.frame_store import FrameStore, frames_there
+from datasets_manifest.storage.frame_store import FrameStore, list_frames
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
-from datasets_manifest.storage.packing import Packing, choose_packing, mend_shards, pack_all, pack_if_complete
+from datasets_manifest.storage.packing import Packing, configure_packing, pack_all, pack_if_complete, repair_shards
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.storage.writer import leftovers, remove_frame, remove_leftovers
@@ -33,7 +33,7 @@ def staged(maker, tmp_path):
     recipe, dataset = make_recipe(), tmp_path / "dataset"
     for index in FRAMES:
         add_frame(dataset, recipe, index)
-    choose_packing(dataset, 3)
+    configure_packing(dataset, 3)
     write_manifest(dataset, build_manifest(dataset, recipe, "1", dict.fromkeys(range(recipe.frames.scenes), "train")))
     return dataset
 
@@ -53,7 +53,7 @@ def test_packing_changes_where_frames_lie_and_nothing_else(staged):
     seen = [Dataset(staged).images(index).left for index in FRAMES]
     pack_all(staged)
     assert list((staged / "frames").iterdir()) == []
-    assert frames_there(staged) == list(FRAMES) and contents(staged) == before
+    assert list_frames(staged) == list(FRAMES) and contents(staged) == before
     dataset = Dataset(staged)
     again = build_manifest(staged, manifest.recipe, "1", dict.fromkeys(range(manifest.recipe.frames.scenes), "train"))
     assert again.dataset_sha256 == manifest.dataset_sha256
@@ -109,7 +109,7 @@ def test_a_tar_file_is_complete_with_the_frames_that_are_made(staged):
     assert [packing.members(number) for number in range(3)] == [{0, 2}, {4}, {6}]
     pack_if_complete(staged, 4, packing)
     assert sorted(FrameStore(staged).staged) == [0, 1, 2, 3, 6]
-    assert frames_there(staged) == list(FRAMES)
+    assert list_frames(staged) == list(FRAMES)
 
 
 def test_a_frame_that_is_made_again_replaces_the_packed_one(staged, maker):
@@ -134,7 +134,7 @@ def test_a_damaged_folder_is_not_packed(staged):
     pack_if_complete(staged, 1, Packing(3, range(7)))
     assert not (staged / "shards/000000.tar").exists()
     pack_all(staged)
-    assert sorted(FrameStore(staged).staged) == [1] and frames_there(staged) == list(FRAMES)
+    assert sorted(FrameStore(staged).staged) == [1] and list_frames(staged) == list(FRAMES)
 
 
 def _die_at(step: int) -> None:
@@ -179,7 +179,7 @@ def test_a_kill_at_any_change_of_the_disk_loses_no_frame(staged, tmp_path):
         shutil.copytree(staged, out)
         was_killed = _packs_until_killed(out, step)
         remove_leftovers(out)
-        mend_shards(out)
+        repair_shards(out)
         assert contents(out) == wanted
         pack_all(out)
         assert shards(out) == shards(calm) and leftovers(out) == [] and list((out / "frames").iterdir()) == []
@@ -192,12 +192,12 @@ def test_a_kill_at_any_change_of_the_disk_loses_no_frame(staged, tmp_path):
 
 
 def test_the_size_of_tar_files_stays(staged):
-    choose_packing(staged, None)
-    choose_packing(staged, 3)
+    configure_packing(staged, None)
+    configure_packing(staged, 3)
     with pytest.raises(ValueError, match=r"--tar: .* has tar files of 3 pairs, got 4; leave it out"):
-        choose_packing(staged, 4)
+        configure_packing(staged, 4)
     with pytest.raises(ValueError, match="--tar: must be from 1 to 100000 pairs, got 0"):
-        choose_packing(staged, 0)
+        configure_packing(staged, 0)
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_a_spoilt_list_is_one_clear_line(staged, spoil, message):
 def place(request, tmp_path):
     """A place of each kind where frames come into tar files of two."""
     place = tmp_path / "place" if request.param == "folder" else f"memory://{uuid.uuid4().hex}"
-    choose_packing(place, 2)
+    configure_packing(place, 2)
     return place
 
 
@@ -244,7 +244,7 @@ def test_an_archive_that_is_none_is_named(place, maker, spoil, message):
     storage.delete("shards/000000.json")
     storage.write("shards/000000.tar", spoil(storage.read("shards/000000.tar")))
     with pytest.raises(ValueError, match=rf"000000\.tar: {message}.*; delete it") as caught:
-        mend_shards(place)
+        repair_shards(place)
     assert "\n" not in str(caught.value)
 
 
@@ -259,7 +259,7 @@ def test_archives_of_a_store_are_packed_listed_and_mended_as_on_disk(place, make
     assert FrameStore(place).staged == frozenset() and contents(place) == before
     lists = [storage.read(f"shards/{name}") for name in storage.names("shards")]
     storage.delete("shards/000000.json")
-    mend_shards(place)
+    repair_shards(place)
     assert [storage.read(f"shards/{name}") for name in storage.names("shards")] == lists
     # A folder that a killed run has left beside the archive, one made since, and a damaged one.
     for index in (0, 2, 3):
@@ -277,8 +277,8 @@ def test_a_list_is_made_again_from_its_archive(staged):
     before = shards(staged)
     (staged / "shards/000000.json").unlink()
     with pytest.raises(ValueError, match=r"000000\.json: is missing; render the recipe again to mend it"):
-        frames_there(staged)
-    mend_shards(staged)
+        list_frames(staged)
+    repair_shards(staged)
     assert shards(staged) == before
 
 

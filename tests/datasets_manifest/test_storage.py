@@ -10,7 +10,7 @@ import pytest
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.manifest import build_manifest, read_manifest, write_manifest
 from datasets_manifest.storage.reader import Dataset
-from datasets_manifest.storage.storage import absolute, as_location, in_order, join, open_storage
+from datasets_manifest.storage.storage import absolute, as_location, join, map_in_order, open_storage
 from datasets_manifest.storage.writer import (
     encode_files,
     encode_record,
@@ -29,11 +29,11 @@ def place(request, tmp_path):
 
 def test_files_are_kept_replaced_and_removed(place):
     storage = open_storage(place)
-    assert not storage.is_there() and not storage.exists("a") and storage.names("") == []
+    assert not storage.root_exists() and not storage.exists("a") and storage.names("") == []
     storage.write("a", b"first")
     storage.write("a", b"0123456789")
     storage.write("folder/b.json", b"")
-    assert storage.is_there() and storage.exists("a") and storage.size("a") == 10
+    assert storage.root_exists() and storage.exists("a") and storage.size("a") == 10
     assert storage.read("a") == b"0123456789" and storage.read("a", 3, 4) == b"3456" and storage.read("a", 8) == b"89"
     assert storage.names("") == ["a", "folder"] and storage.names("folder") == ["b.json"] and storage.names("no") == []
     assert storage.files_ending(".json") == ["folder/b.json"]
@@ -201,8 +201,8 @@ def test_a_missing_package_is_named_with_its_cure(monkeypatch):
 @pytest.mark.parametrize("place", ["folder", "memory"], indirect=True)
 def test_work_comes_back_in_order_and_errors_in_their_turn(place):
     storage = open_storage(place)
-    assert list(in_order(lambda number: number**2, range(100), storage)) == [number**2 for number in range(100)]
-    results = in_order(lambda number: 1 / (50 - number), range(100), storage)
+    assert list(map_in_order(lambda number: number**2, range(100), storage)) == [number**2 for number in range(100)]
+    results = map_in_order(lambda number: 1 / (50 - number), range(100), storage)
     assert [next(results) for _ in range(50)] == [1 / (50 - number) for number in range(50)]
     with pytest.raises(ZeroDivisionError):
         next(results)

@@ -51,7 +51,7 @@ def validate(
 
 
 def _show(comparison: PublishedComparison) -> None:
-    for difference in comparison.elsewhere:
+    for difference in comparison.build_differences:
         typer.echo(f"not the build that was published: {difference}")
     for fault in comparison.label_faults:
         typer.echo(fault)

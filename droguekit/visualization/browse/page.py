@@ -18,7 +18,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from datasets_manifest.atomic import PART_SUFFIX, takes_lock, write_text_atomic
+from datasets_manifest.atomic import PART_SUFFIX, try_lock, write_text_atomic
 from datasets_manifest.storage.storage import Location, absolute
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
 from droguekit.batch.progress import ProgressReport
@@ -70,7 +70,7 @@ def opened_page(out: Path) -> Iterator[None]:
         try:
             out.mkdir(parents=True, exist_ok=True)
             mark = stack.enter_context((out / MARK_FILE).open("a", encoding="utf-8"))
-            if not takes_lock(mark):
+            if not try_lock(mark):
                 raise ValueError(f"{out}: another run is writing into it; wait for its end, or name another one")
             if not mark.tell():
                 mark.write(_MARK)

@@ -352,7 +352,7 @@ class TruePairs(_Opened):
     def entry(self, frame_index: int) -> FrameEntry:
         """From its record."""
         known, record = self._known[frame_index], self._dataset.record(frame_index)
-        drogue = self._dataset.drogue_sought(record)
+        drogue = self._dataset.sought_drogue(record)
         return frame_entry(record, drogue, known.split, known.record_sha256)
 
     def images(self, frame_index: int) -> StereoImages:

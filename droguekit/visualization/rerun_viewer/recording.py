@@ -70,7 +70,7 @@ def open_pairs(dataset: Location) -> ShownPairs:
 
     def read(index: int) -> ShownPair:
         record = source.record(index)
-        drogue = source.drogue_sought(record)
+        drogue = source.sought_drogue(record)
         return ShownPair(index, source.images(index), record.frame.rig, drogue, record)
 
     return ShownPairs(source.frame_indices, read)

@@ -21,7 +21,7 @@ from datasets_manifest.release.publication import (
     read_publication,
 )
 from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
-from datasets_manifest.storage.manifest import build_manifest, made_with, read_manifest, write_manifest
+from datasets_manifest.storage.manifest import build_manifest, read_manifest, with_build, write_manifest
 from datasets_manifest.storage.writer import encode_record
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
@@ -60,7 +60,7 @@ def relit(dataset: Path, out: Path, features: tuple[str, ...] | None = None) -> 
     path.write_bytes(encode_record(record.model_copy(update={"conditions": conditions})))
     old = read_manifest(dataset)
     manifest = build_manifest(out, old.recipe, old.render_version, split_of_scenes(old.recipe))
-    write_manifest(out, manifest if features is None else made_with(manifest, manifest.software, features))
+    write_manifest(out, manifest if features is None else with_build(manifest, manifest.software, features))
     return out
 
 
@@ -83,7 +83,7 @@ def test_a_regeneration_is_identical(dataset: Path, tmp_path: Path, analytic_rec
 def test_another_build_with_the_same_labels_is_equivalent(dataset: Path, tmp_path: Path) -> None:
     comparison = compare_with_published(relit(dataset, tmp_path / "a", OTHER_FEATURES), build_publication(dataset))
     assert verdicts(comparison) == ("equivalent", 8, 7)
-    assert comparison.elsewhere == ("another set of processor features",)
+    assert comparison.build_differences == ("another set of processor features",)
 
 
 def test_the_same_build_with_other_pixels_is_different(dataset: Path, tmp_path: Path) -> None:
