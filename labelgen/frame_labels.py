@@ -22,8 +22,8 @@ from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, SURROUNDING_PARTS,
 from geometry.circles import disc_image_centers
 from geometry.se3 import Array, RigidTransform, angles_from_rotation
 from geometry.stereo import Eye
-from labelgen.discs import DiscInEye, hub_discs, marker_discs, window_around
-from labelgen.part_pixels import full_box, leaves_image, visible_box, visible_mask
+from labelgen.disc_images import DiscInEye, hub_discs, marker_discs, window_around
+from labelgen.part_pixels import drogue_box, drogue_mask, is_truncated, mask_box
 from render.camera.sensor import MONO_WEIGHTS
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sky.clear_sky import REC709_LUMINANCE
@@ -81,7 +81,7 @@ def _feature_view(frame: FrameSpec, disc: DiscInEye, seen: EyeRadiance, proj: Ar
         center_proj_px=_point(proj),
         center_ellipse_px=_point(ellipse),
         visible_fraction=visible_fraction(disc.part, seen),
-        in_image=not leaves_image((u_low, v_low, u_high - u_low, v_high - v_low), disc.camera),
+        in_image=not is_truncated((u_low, v_low, u_high - u_low, v_high - v_low), disc.camera),
         signal_to_noise=signal_to_noise(frame, disc, seen),
     )
 
@@ -217,15 +217,15 @@ def _view(frame: FrameSpec, pose: RigidTransform | None, eye: Eye, seen: EyeRadi
             board_corners_px=_board_corners_px(frame, eye),
         )
     layout = marker_layout(frame.drogue)
-    mask = visible_mask(seen.part_id, layout.count)
-    box = full_box(frame.drogue, frame.rig, pose, eye)
+    mask = drogue_mask(seen.part_id, layout.count)
+    box = drogue_box(frame.drogue, frame.rig, pose, eye)
     return ViewRecord(
         markers=marker_views(frame, layout, pose, eye, seen),
         hub=hub_view(frame, layout, pose, eye, seen),
         box_full_xywh_px=box,
-        box_visible_xywh_px=visible_box(mask),
+        box_visible_xywh_px=mask_box(mask),
         visible_drogue_px=int(np.count_nonzero(mask)),
-        truncated=leaves_image(box, frame.rig.camera),
+        truncated=is_truncated(box, frame.rig.camera),
     )
 
 

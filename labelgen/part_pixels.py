@@ -22,7 +22,7 @@ Indices = NDArray[np.int64]
 _FEATURES = (int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + MAX_MARKERS))
 
 
-def is_one_of(part_id: NDArray[np.uint8], parts: tuple[int, ...] | list[int]) -> NDArray[np.bool_]:
+def parts_mask(part_id: NDArray[np.uint8], parts: tuple[int, ...] | list[int]) -> NDArray[np.bool_]:
     """(H, W) whether a pixel centre sees one of some parts."""
     table = np.zeros(256, dtype=np.uint8)
     table[list(parts)] = 1
@@ -34,7 +34,7 @@ class FeaturePixels:
     """Where one eye sees markers and hub; they are found in one pass over the image."""
 
     def __init__(self, part_id: NDArray[np.uint8]) -> None:
-        found = cv2.findNonZero(is_one_of(part_id, _FEATURES).view(np.uint8))
+        found = cv2.findNonZero(parts_mask(part_id, _FEATURES).view(np.uint8))
         places = np.zeros((0, 2), dtype=np.int64) if found is None else found[:, 0].astype(np.int64)
         parts = part_id[places[:, 1], places[:, 0]]
         order = np.argsort(parts, kind="stable")
@@ -45,7 +45,7 @@ class FeaturePixels:
         """How many pixel centres see a feature."""
         return int(self._ends[part + 1] - self._ends[part])
 
-    def places(self, part: int) -> tuple[Indices, Indices]:
+    def indices(self, part: int) -> tuple[Indices, Indices]:
         """Rows and columns of the pixel centres that see a feature, in the order of the image."""
         places = self._places[self._ends[part] : self._ends[part + 1]]
         return places[:, 1], places[:, 0]
@@ -65,7 +65,7 @@ def drogue_hull_m(drogue: DrogueParameters) -> Array:
     return hull
 
 
-def full_box(drogue: DrogueParameters, rig: StereoRig, left_from_drogue: RigidTransform, eye: Eye) -> PixelBox:
+def drogue_box(drogue: DrogueParameters, rig: StereoRig, left_from_drogue: RigidTransform, eye: Eye) -> PixelBox:
     """Box around the image of the whole drogue, neither clipped by the frame nor occluded. [px]
 
     Raises:
@@ -81,12 +81,12 @@ def full_box(drogue: DrogueParameters, rig: StereoRig, left_from_drogue: RigidTr
     return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
 
 
-def visible_mask(part_id: NDArray[np.uint8], marker_count: int) -> NDArray[np.bool_]:
+def drogue_mask(part_id: NDArray[np.uint8], marker_count: int) -> NDArray[np.bool_]:
     """(H, W) whether a pixel centre sees a part that belongs to the drogue's box."""
-    return is_one_of(part_id, drogue_part_ids(marker_count))
+    return parts_mask(part_id, drogue_part_ids(marker_count))
 
 
-def visible_box(mask: NDArray[np.bool_]) -> PixelBox | None:
+def mask_box(mask: NDArray[np.bool_]) -> PixelBox | None:
     """Box around the pixels of a mask, their whole areas included, or None for an empty one. [px]"""
     columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
     if columns.size == 0:
@@ -95,7 +95,7 @@ def visible_box(mask: NDArray[np.bool_]) -> PixelBox | None:
     return u_low - 0.5, v_low - 0.5, float(u_high - u_low + 1), float(v_high - v_low + 1)
 
 
-def leaves_image(box: PixelBox, camera: PinholeCamera) -> bool:
+def is_truncated(box: PixelBox, camera: PinholeCamera) -> bool:
     """Whether a box is not wholly on the image."""
     u, v, width, height = box
     return bool(u < -0.5 or v < -0.5 or u + width > camera.width_px - 0.5 or v + height > camera.height_px - 0.5)

@@ -13,7 +13,6 @@ from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, MAX_MARKERS, Part
 from drogue_models.tanker import tanker_mesh
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye
-from labelgen.part_pixels import is_one_of
 from labelgen.silhouettes import silhouette
 from render.analytic_engine.ring_passes import flat_part_masks
 from render.surfaces import missing_parts
@@ -62,7 +61,7 @@ Mask = NDArray[np.bool_]
 OCCLUDERS = (int(Part.PROBE), int(Part.OBSTACLE))
 
 
-def mask_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
+def named_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
     """Names of the masks of a pair, and the part ids that belong to each.
 
     `drogue` is all that belongs to its box, `occluder` the receiver's probe and obstacles; the others are single parts.
@@ -81,11 +80,6 @@ def mask_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
     if record.frame.board is not None:
         parts[part_name(Part.BOARD)] = (int(Part.BOARD),)
     return parts
-
-
-def visible_mask_of(part_id: NDArray[np.uint8], parts: tuple[int, ...]) -> Mask:
-    """(H, W) whether a pixel centre sees one of some parts."""
-    return is_one_of(part_id, parts)
 
 
 def amodal_masks(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> dict[int, Mask]:
@@ -110,7 +104,7 @@ def amodal_masks(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> di
     return alone
 
 
-def joined(masks: dict[int, Mask], parts: tuple[int, ...], shape: tuple[int, ...]) -> Mask:
+def union_of_masks(masks: dict[int, Mask], parts: tuple[int, ...], shape: tuple[int, ...]) -> Mask:
     """(H, W) of `shape`, the union of the masks of some parts; parts without a mask count as empty."""
     union = np.zeros(shape, dtype=np.bool_)
     for part in parts:

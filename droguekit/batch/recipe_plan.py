@@ -21,7 +21,7 @@ from droguekit.batch.failure_policy import FIRST_FRAMES, drop_of
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
-from labelgen.part_pixels import full_box
+from labelgen.part_pixels import drogue_box
 from scenes.drogue_appearance import drogue_of_scene
 from scenes.sampler import family_of_scene, recipe_of_scene, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
@@ -183,7 +183,7 @@ def _row(recipe: Recipe, frame_index: int, drogue: DrogueParameters, is_placed: 
 
 def _box(drogue: DrogueParameters, rig: StereoRig, pose: RigidTransform) -> tuple[Array, float, Array]:
     """Middle of the left image's full box [px], side of its square [px], and (4,) room of its middle [px]."""
-    boxes = np.array([full_box(drogue, rig, pose, eye) for eye in EYES])
+    boxes = np.array([drogue_box(drogue, rig, pose, eye) for eye in EYES])
     low, size = boxes[:, :2], boxes[:, 2:]
     center = low[0] + size[0] / 2
     # A box moves in both images alike, as far as neither leaves its image; lenses may move it further out.

@@ -26,7 +26,7 @@ from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.records import PairRecord
 from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
-from labelgen.export.frame_files import place_file
+from labelgen.export.frame_files import export_file
 
 
 def write_blind(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
@@ -54,7 +54,7 @@ def write_blind(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
         for record in log.records(source):
             target = frame_folder(folder, record.frame_index)
             for name in names:
-                place_file(source, record.frame_index, name, target / name)
+                export_file(source, record.frame_index, name, target / name)
             _write_text(target / RECORD_FILE, canonical_json(_blind_record(record, index.drogues_differ)) + "\n")
         _write_text(folder / BLIND_FILE, canonical_json(index.model_dump(mode="json")) + "\n")
     return [out]

@@ -34,8 +34,9 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import EYES, Eye
 from labelgen.export.export_log import ExportLog
-from labelgen.export.frame_files import place_image
-from labelgen.segmentation_masks import Mask, amodal_masks, joined, visible_mask_of
+from labelgen.export.frame_files import export_image
+from labelgen.part_pixels import parts_mask
+from labelgen.segmentation_masks import Mask, amodal_masks, union_of_masks
 
 MM_PER_M = 1000.0
 
@@ -197,7 +198,7 @@ class _Scenes:
     def _add_eye(self, record: PairRecord, eye: Eye, scene: Path) -> float:
         index = record.frame_index
         picture = "gray" if record.frame.sensor.color == "mono" else "rgb"
-        place_image(self._source, index, eye, scene / f"{picture}_{eye}" / f"{index:06d}.png", self._log)
+        export_image(self._source, index, eye, scene / f"{picture}_{eye}" / f"{index:06d}.png", self._log)
         depth_scale = self._add_depth(record, eye, scene)
         self._append(scene / f"scene_camera_{eye}.json", index, _scene_camera(record, eye, depth_scale))
         truth, info, visible_share = [], [], 0.0
@@ -219,7 +220,7 @@ class _Scenes:
         assert record.frame.drogue is not None
         part_id = self._source.part_ids(record.frame_index, eye)
         parts = tuple(drogue_part_ids(record.frame.drogue.marker_count))
-        return joined(amodal_masks(record, eye, part_id), parts, part_id.shape), visible_mask_of(part_id, parts)
+        return union_of_masks(amodal_masks(record, eye, part_id), parts, part_id.shape), parts_mask(part_id, parts)
 
     def _add_depth(self, record: PairRecord, eye: Eye, scene: Path) -> float:
         """Write the depth where the dataset has it; returns millimetres per number."""
@@ -304,7 +305,7 @@ def _count_all(record: PairRecord, eye: Eye, whole: Mask) -> int:
     nothing = np.zeros((wide.height_px, wide.width_px), np.uint8)
     masks = amodal_masks(record.model_copy(update={"frame": frame}), eye, nothing)
     parts = tuple(drogue_part_ids(record.frame.drogue.marker_count))
-    return int(np.count_nonzero(joined(masks, parts, nothing.shape)))
+    return int(np.count_nonzero(union_of_masks(masks, parts, nothing.shape)))
 
 
 def _info(record: PairRecord, eye: Eye, whole: Mask, visible: Mask) -> dict[str, Any]:

@@ -31,14 +31,14 @@ from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import (
     CORNER_FROM_CENTER_PX,
     clockwise_order,
-    count_absent_keypoints,
-    count_cuts,
-    equal_orders,
     keypoint_count,
+    log_absent_keypoints,
+    log_cut_labels,
+    symmetric_orders,
     view_keypoints,
     view_of,
 )
-from labelgen.part_pixels import FeaturePixels, visible_mask
+from labelgen.part_pixels import FeaturePixels, drogue_mask
 
 Indices = NDArray[np.int64]
 
@@ -107,11 +107,11 @@ class DroguePixels:
 
     def drogue(self) -> MaskPixels:
         """All that belongs to the drogue's box."""
-        return self._set(*np.nonzero(visible_mask(self._turned, self._marker_count)))
+        return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count)))
 
     def feature(self, part: int) -> MaskPixels:
         """One marker, or the hub."""
-        return self._set(*self._features.places(part))
+        return self._set(*self._features.indices(part))
 
     def _set(self, columns: Indices, rows: Indices) -> MaskPixels:
         return MaskPixels(columns + self._low[0], rows + self._low[1], self._size_px)
@@ -232,7 +232,7 @@ def coco_annotation(
             "truncated": view.truncated,
             "drogue": drogue.name,
             "keypoint_order_in_image": clockwise_order(view),
-            "equal_keypoint_orders": equal_orders(drogue),
+            "equal_keypoint_orders": symmetric_orders(drogue),
             "visible_fraction": [marker.visible_fraction for marker in view.markers],
             "left_from_drogue": record.left_from_drogue.as_matrix().tolist(),
             "eye_offset_m": record.frame.rig.eye_offset_m(eye).tolist(),
@@ -315,7 +315,7 @@ def _corner_box(box: PixelBox) -> list[float]:
     return [*_corner_point((box[0], box[1])), box[2], box[3]]
 
 
-def rolled_to_truth(truth: COCO, results: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Keypoint results in that one of the equal orders which fits the truth best; `COCOeval` then scores them as usual.
 
     An even ring of eight looks the same after each of eight turns, so a detector may begin with any marker. Its result
@@ -422,11 +422,11 @@ def _write(dataset: Location, out: Location, log: ExportLog, with_features: bool
 
 def _tell(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[str, Any]]) -> None:
     """Count what the annotations of a view lack."""
-    count_cuts(log, record, eye)
+    log_cut_labels(log, record, eye)
     if not annotations:
         return
     view = view_of(record, eye)
-    count_absent_keypoints(log, view_keypoints(view, record.frame.rig.camera, 0), len(view.markers))
+    log_absent_keypoints(log, view_keypoints(view, record.frame.rig.camera, 0), len(view.markers))
     if "segmentation" not in annotations[0]:
         log.lost("views without masks, markers and hub: the dataset has no part ids of them")
         return

@@ -15,7 +15,7 @@ from geometry.stereo import Eye
 from labelgen.export.export_log import ExportLog
 
 
-def place_file(source: Dataset, frame_index: int, name: str, target: Path) -> None:
+def export_file(source: Dataset, frame_index: int, name: str, target: Path) -> None:
     """A file of a pair once more: without taking room where the disk can do so.
 
     Raises:
@@ -47,7 +47,7 @@ def link_or_copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def place_image(source: Dataset, frame_index: int, eye: Eye, target: Path, log: ExportLog) -> None:
+def export_image(source: Dataset, frame_index: int, eye: Eye, target: Path, log: ExportLog) -> None:
     """One eye's image for programs that take 8 bits a sample.
 
     Args:
@@ -63,7 +63,7 @@ def place_image(source: Dataset, frame_index: int, eye: Eye, target: Path, log: 
     """
     name, bits = image_file(eye), source.manifest.recipe.sensor.output_bits
     if bits == 8:
-        place_file(source, frame_index, name, target)
+        export_file(source, frame_index, name, target)
         return
     where = source.frames.where(frame_index, name)
     pixels = decode_png(source.frames.read(frame_index, name), where) >> (bits - 8)

@@ -19,7 +19,7 @@ from labelgen.export.export_log import ExportLog
 _VISIBLE_FROM_FRACTION = 0.5
 CORNER_FROM_CENTER_PX = 0.5
 """What formats that count from the image's corner add to the records' pixel-centre coordinates."""
-FEWEST_KEYPOINTS = 8
+MIN_KEYPOINTS = 8
 """Drogues with fewer markers get as many keypoints, the rest absent, so that all datasets fit one network."""
 
 
@@ -41,7 +41,7 @@ def keypoint_count(manifest: Manifest) -> int:
     """Keypoints of every drogue in a dataset's exports: markers of the drogue with most of them, at least 8."""
     recipe = manifest.recipe
     counts = [recipe.drogue.marker_count, *(variant.drogue.marker_count for variant in recipe.variants)]
-    return max(FEWEST_KEYPOINTS, *counts)
+    return max(MIN_KEYPOINTS, *counts)
 
 
 def view_of(record: PairRecord, eye: Eye) -> ViewRecord:
@@ -75,7 +75,7 @@ def clockwise_order(view: ViewRecord) -> list[int]:
 
 
 @lru_cache(maxsize=64)
-def equal_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
+def symmetric_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
     """The orders of the markers that a turn of the drogue onto itself makes, beginning with the drogue's own.
 
     Returns:
@@ -92,7 +92,7 @@ def equal_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
     return tuple(orders)
 
 
-def count_cuts(log: ExportLog, record: PairRecord, eye: Eye) -> None:
+def log_cut_labels(log: ExportLog, record: PairRecord, eye: Eye) -> None:
     """Tell the log what formats with visible boxes do not hold of a view's drogue."""
     view = view_of(record, eye)
     if record.left_from_drogue is not None and view.box_visible_xywh_px is None:
@@ -101,7 +101,7 @@ def count_cuts(log: ExportLog, record: PairRecord, eye: Eye) -> None:
         log.lost("drogues that leave the image: their boxes end at its border", int(view.truncated))
 
 
-def count_absent_keypoints(log: ExportLog, points: list[Keypoint], marker_count: int) -> None:
+def log_absent_keypoints(log: ExportLog, points: list[Keypoint], marker_count: int) -> None:
     """Tell the log how many of the markers, which come first among the keypoints, have no place."""
     absent = sum(point.flag == 0 for point in points[:marker_count])
     log.lost("keypoints outside the image: without a place", absent)

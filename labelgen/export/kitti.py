@@ -23,8 +23,8 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog
-from labelgen.export.frame_files import place_image
-from labelgen.export.keypoints import count_cuts, view_of
+from labelgen.export.frame_files import export_image
+from labelgen.export.keypoints import log_cut_labels, view_of
 from labelgen.part_pixels import drogue_hull_m
 
 _NUMBER_OF_EYE: dict[Eye, int] = {"left": 2, "right": 3}
@@ -68,10 +68,10 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             _write_lines(training / "calib" / f"{name}.txt", calibration)
             for eye in EYES:
                 number = _NUMBER_OF_EYE[eye]
-                place_image(source, record.frame_index, eye, training / f"image_{number}" / f"{name}.png", log)
+                export_image(source, record.frame_index, eye, training / f"image_{number}" / f"{name}.png", log)
                 label = kitti_label(record, eye)
                 _write_lines(training / f"label_{number}" / f"{name}.txt", [] if label is None else [label])
-                count_cuts(log, record, eye)
+                log_cut_labels(log, record, eye)
                 log.lost("labels without pitch and roll, which KITTI does not know", int(label is not None))
     return [out]
 

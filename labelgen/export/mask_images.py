@@ -12,7 +12,8 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
-from labelgen.segmentation_masks import Mask, amodal_masks, joined, mask_parts, visible_mask_of
+from labelgen.part_pixels import parts_mask
+from labelgen.segmentation_masks import Mask, amodal_masks, named_parts, union_of_masks
 
 
 def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
@@ -28,9 +29,9 @@ def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             for eye in EYES:
                 part_id = source.part_ids(record.frame_index, eye)
                 alone = amodal_masks(record, eye, part_id)
-                for name, parts in mask_parts(record).items():
-                    _write(pair / f"{eye}_{name}_visible.png", visible_mask_of(part_id, parts))
-                    _write(pair / f"{eye}_{name}_amodal.png", joined(alone, parts, part_id.shape))
+                for name, parts in named_parts(record).items():
+                    _write(pair / f"{eye}_{name}_visible.png", parts_mask(part_id, parts))
+                    _write(pair / f"{eye}_{name}_amodal.png", union_of_masks(alone, parts, part_id.shape))
     return [out]
 
 

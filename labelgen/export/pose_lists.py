@@ -28,7 +28,7 @@ from datasets_manifest.types.records import PairRecord
 from geometry.distortion import Lens
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
-from labelgen.export.frame_files import place_image
+from labelgen.export.frame_files import export_image
 
 _LISTS = {"train": "train.json", "val": "validation.json", "test": "test.json"}
 
@@ -61,7 +61,7 @@ def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
         for record in log.records(source):
             for eye in EYES:
                 name = f"img{record.frame_index:06d}.png"
-                place_image(source, record.frame_index, eye, folder / eye / "images" / name, log)
+                export_image(source, record.frame_index, eye, folder / eye / "images" / name, log)
                 pose = speed_pose(record, eye)
                 if pose is None:
                     log.lost("images without a drogue: among the images, but in no list, for they have no pose")

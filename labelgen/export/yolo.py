@@ -19,13 +19,13 @@ from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
 from labelgen.export.coco import HUB, MARKER, coco_annotation, coco_features, read_part_ids
 from labelgen.export.export_log import ExportLog
-from labelgen.export.frame_files import place_image
+from labelgen.export.frame_files import export_image
 from labelgen.export.keypoints import (
     ABSENT,
     clockwise_order,
-    count_absent_keypoints,
-    count_cuts,
     keypoint_count,
+    log_absent_keypoints,
+    log_cut_labels,
     view_keypoints,
     view_of,
 )
@@ -94,7 +94,7 @@ def _write_pose(dataset: Location, out: Path, log: ExportLog, in_image_order: bo
         if drogue is None:
             return []
         points = view_keypoints(view, camera, count)
-        count_absent_keypoints(log, points, len(view.markers))
+        log_absent_keypoints(log, points, len(view.markers))
         if in_image_order:
             points = [points[index] for index in clockwise_order(view)] + [ABSENT] * (count - len(view.markers))
         shares = [(point.x / camera.width_px, point.y / camera.height_px, point.flag) for point in points]
@@ -113,12 +113,12 @@ def _write(source: Dataset, out: Path, log: ExportLog, rows: Rows, lines: tuple[
         for record in log.records(source):
             for eye in EYES:
                 place = f"{splits[record.frame_index]}/{record.frame_index:06d}_{eye}"
-                place_image(source, record.frame_index, eye, folder / "images" / f"{place}.png", log)
+                export_image(source, record.frame_index, eye, folder / "images" / f"{place}.png", log)
                 label = folder / "labels" / f"{place}.txt"
                 label.parent.mkdir(parents=True, exist_ok=True)
                 text = "".join(" ".join(map(repr, row)) + "\n" for row in rows(record, eye))
                 label.write_text(text, encoding="utf-8", newline="\n")
-                count_cuts(log, record, eye)
+                log_cut_labels(log, record, eye)
         names = _CLASSES[:1] if lines else _CLASSES
         yaml = [
             f"# droguekit dataset {source.manifest.name}, sha256 {source.manifest.dataset_sha256}",

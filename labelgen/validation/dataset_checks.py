@@ -32,7 +32,7 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES, Eye, StereoRig
-from labelgen.part_pixels import FeaturePixels, is_one_of
+from labelgen.part_pixels import FeaturePixels, parts_mask
 from labelgen.validation.bag_checks import bag_faults, bag_files
 from labelgen.validation.coco_checks import CocoFiles
 from labelgen.validation.exr_checks import passes_faults
@@ -317,7 +317,7 @@ def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> l
     if pose is None or drogue is None:
         return check_empty(view, part_id)
     layout = marker_layout(drogue)
-    faults = check_boxes(view, is_one_of(part_id, drogue_part_ids(layout.count)))
+    faults = check_boxes(view, parts_mask(part_id, drogue_part_ids(layout.count)))
     pixels = FeaturePixels(part_id)
     if len(view.markers) != layout.count:
         return [*faults, f"markers: {len(view.markers)} are labelled, the drogue has {layout.count}"]

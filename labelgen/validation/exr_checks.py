@@ -13,7 +13,7 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part
 from geometry.stereo import Eye
 from labelgen.part_pixels import FeaturePixels
-from labelgen.validation.label_checks import check_pixels, named_features
+from labelgen.validation.label_checks import check_feature_pixels, named_features
 
 # A unit vector in float32, turned by a rotation in float32.
 _UNIT_TOLERANCE = 1e-5
@@ -75,5 +75,5 @@ def _feature_faults(record: PairRecord, eye: Eye, depth_m: Plane, part_id: NDArr
     return [
         f"{name}: {fault}"
         for name, _, disc in named_features(record, layout, pose, eye)
-        for fault in check_pixels(disc, layout.hub_inner_radius_m if name == "hub" else 0.0, depth_m, pixels)
+        for fault in check_feature_pixels(disc, layout.hub_inner_radius_m if name == "hub" else 0.0, depth_m, pixels)
     ]

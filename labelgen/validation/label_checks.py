@@ -16,8 +16,8 @@ from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
 from geometry.distortion import Lens
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
-from labelgen.discs import DiscInEye, hub_discs, marker_discs
-from labelgen.part_pixels import FeaturePixels, is_one_of
+from labelgen.disc_images import DiscInEye, hub_discs, marker_discs
+from labelgen.part_pixels import FeaturePixels, parts_mask
 from render.engine import EyeRadiance, StereoRadiance
 
 # Root mean square distance between the centroid of the pixel centres in a disc and the disc's own centre is this times
@@ -114,7 +114,7 @@ def centroid_error(view: FeatureView, disc: DiscInEye, pixels: FeaturePixels) ->
         (2,) error [px], and the root mean square length that the pixel lattice alone gives it [px].
     """
     longer, shorter = disc.semi_axes_px()
-    rows, columns = pixels.places(disc.part)
+    rows, columns = pixels.indices(disc.part)
     error = np.array([columns.mean(), rows.mean()]) - np.array(view.center_ellipse_px)
     return error, LATTICE_RMS * float(np.sqrt(longer)) / shorter
 
@@ -128,11 +128,11 @@ def _check_drogue(
     if len(view.markers) != layout.count or (view.hub is None) != (layout.hub_center_m is None):
         return [f"markers, hub: {len(view.markers)} markers are labelled, the drogue has {layout.count}"]
     pixels = FeaturePixels(seen.part_id)
-    faults = check_boxes(view, is_one_of(seen.part_id, drogue_part_ids(layout.count)))
+    faults = check_boxes(view, parts_mask(seen.part_id, drogue_part_ids(layout.count)))
     for name, feature, disc in named_features(record, layout, pose, eye):
         hole_m = layout.hub_inner_radius_m if name == "hub" else 0.0
         found = _check_visibility(feature, pixels.count(disc.part), seen.amodal_px.get(disc.part, 0))
-        found += check_pixels(disc, hole_m, seen.depth_m, pixels)
+        found += check_feature_pixels(disc, hole_m, seen.depth_m, pixels)
         if name != "hub" and feature.in_image and feature.visible_fraction == 1:
             found += check_unoccluded_marker(feature, disc, seen.part_id, pixels)
         faults += [f"{name}: {fault}" for fault in found]
@@ -163,7 +163,9 @@ def _check_visibility(feature: FeatureView, visible: int, amodal: int) -> list[s
     return [] if feature.visible_fraction == want else [f"visible_fraction: is {feature.visible_fraction}, not {want}"]
 
 
-def check_pixels(disc: DiscInEye, hole_m: float, depth_m: NDArray[np.float32], pixels: FeaturePixels) -> list[str]:
+def check_feature_pixels(
+    disc: DiscInEye, hole_m: float, depth_m: NDArray[np.float32], pixels: FeaturePixels
+) -> list[str]:
     """Every pixel of a feature around a hole: whether it lies on it, and its depth against the feature's plane.
 
     Args:
@@ -172,7 +174,7 @@ def check_pixels(disc: DiscInEye, hole_m: float, depth_m: NDArray[np.float32], p
         depth_m: (H, W) planar depth. [m]
         pixels: where the eye sees which feature.
     """
-    rows, columns = pixels.places(disc.part)
+    rows, columns = pixels.indices(disc.part)
     places_px = np.stack([columns, rows], axis=-1).astype(np.float64)
     distance_m = disc.distance_m(places_px)
     faults = []

@@ -11,7 +11,7 @@ from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from droguekit.batch.recipe_plan import draw_frames, plan_recipe
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
-from labelgen.part_pixels import full_box
+from labelgen.part_pixels import drogue_box
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
 RECIPE = """
@@ -65,7 +65,7 @@ def test_boxes_are_those_of_the_labels() -> None:
         if pose is None:
             assert np.isnan([*center_px, side_px]).all()
             continue
-        u, v, width, height = full_box(recipe.drogue, recipe.rig, pose, "left")
+        u, v, width, height = drogue_box(recipe.drogue, recipe.rig, pose, "left")
         np.testing.assert_allclose(center_px, [u + width / 2, v + height / 2], rtol=1e-12)  # float64 sums
         np.testing.assert_allclose(side_px**2, width * height, rtol=1e-12)
 
@@ -84,7 +84,7 @@ def test_a_box_at_the_end_of_its_room_touches_the_edge_of_an_image(rig: str) -> 
             shift_px = room_px[2 * axis + end] - center_px[axis]
             step_m[axis] = shift_px * pose.translation_m[2] / camera.fx_px
             moved = RigidTransform(pose.rotation, pose.translation_m + step_m)
-            boxes = np.array([full_box(recipe.drogue, recipe.rig, moved, eye) for eye in EYES])
+            boxes = np.array([drogue_box(recipe.drogue, recipe.rig, moved, eye) for eye in EYES])
             low, high = boxes[:, axis].min() + 0.5, last_px[axis] - (boxes[:, axis] + boxes[:, 2 + axis]).max()
             # The box's ends are nearer or farther than the centre by up to 0.4 m, and move so much more or less; a lens
             # bends the way by up to what is kept free for it.

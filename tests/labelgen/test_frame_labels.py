@@ -9,7 +9,7 @@ from drogue_models.parts import drogue_part_ids
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
-from labelgen.part_pixels import drogue_hull_m, full_box, visible_box
+from labelgen.part_pixels import drogue_box, drogue_hull_m, mask_box
 
 
 def views_of(pair):
@@ -107,8 +107,8 @@ def test_boxes(full_pairs):
 
 
 def test_full_mask_has_the_full_frame_as_its_box():
-    assert visible_box(np.ones((960, 1280), dtype=bool)) == (-0.5, -0.5, 1280.0, 960.0)
-    assert visible_box(np.zeros((960, 1280), dtype=bool)) is None
+    assert mask_box(np.ones((960, 1280), dtype=bool)) == (-0.5, -0.5, 1280.0, 960.0)
+    assert mask_box(np.zeros((960, 1280), dtype=bool)) is None
 
 
 def test_hull_is_made_once_for_each_drogue(full_pairs):
@@ -120,7 +120,7 @@ def test_hull_is_made_once_for_each_drogue(full_pairs):
 def test_a_drogue_behind_the_camera_is_refused(full_pairs):
     frame = full_pairs[0].frame
     with pytest.raises(ValueError, match="in front of the camera"):
-        full_box(frame.drogue, frame.rig, RigidTransform(np.eye(3), np.array([0.0, 0.0, -0.2])), "left")
+        drogue_box(frame.drogue, frame.rig, RigidTransform(np.eye(3), np.array([0.0, 0.0, -0.2])), "left")
 
 
 def test_poses_follow_the_motion(full_pairs):

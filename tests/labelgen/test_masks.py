@@ -9,11 +9,12 @@ from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
-from labelgen.discs import marker_discs
+from labelgen.disc_images import marker_discs
 from labelgen.export.export_log import ExportLog
 from labelgen.export.mask_images import write_masks
 from labelgen.frame_labels import label_frame
-from labelgen.segmentation_masks import OCCLUDERS, amodal_masks, joined, mask_parts, part_triangles, visible_mask_of
+from labelgen.part_pixels import parts_mask
+from labelgen.segmentation_masks import OCCLUDERS, amodal_masks, named_parts, part_triangles, union_of_masks
 from labelgen.silhouettes import silhouette
 from render.analytic_engine.engine import AnalyticEngine
 from render.camera.sensor import expose
@@ -115,14 +116,14 @@ def test_masks_divide_the_image(full_pairs):
     for pair in full_pairs:
         part_id = pair.radiance.left.part_id
         alone = amodal_masks(pair.record, "left", part_id)
-        named = mask_parts(pair.record)
-        single = [visible_mask_of(part_id, parts) for name, parts in named.items() if name != "drogue"]
+        named = named_parts(pair.record)
+        single = [parts_mask(part_id, parts) for name, parts in named.items() if name != "drogue"]
         np.testing.assert_array_equal(np.sum(single, axis=0), part_id != Part.SKY)
         np.testing.assert_array_equal(
-            visible_mask_of(part_id, named["drogue"]), joined(alone, named["drogue"], part_id.shape) & (part_id > 0)
+            parts_mask(part_id, named["drogue"]), union_of_masks(alone, named["drogue"], part_id.shape) & (part_id > 0)
         )
         for parts in named.values():
-            assert not (visible_mask_of(part_id, parts) & ~joined(alone, parts, part_id.shape)).any()
+            assert not (parts_mask(part_id, parts) & ~union_of_masks(alone, parts, part_id.shape)).any()
         assert named["occluder"] == OCCLUDERS and {"rim", "canopy", "hub", "hose", "tanker", "marker_7"} <= set(named)
 
 

@@ -20,7 +20,7 @@ from droguekit.batch.render_dataset import render_dataset
 from geometry.circles import disc_area_px2
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from labelgen.discs import hub_discs, marker_discs
+from labelgen.disc_images import hub_discs, marker_discs
 from labelgen.frame_labels import label_frame
 from labelgen.validation.dataset_checks import validate_dataset
 from labelgen.validation.label_checks import check_against_passes

@@ -10,7 +10,7 @@ from datasets_manifest.recipe.recipe import load_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.stereo import EYES
-from labelgen.discs import marker_discs
+from labelgen.disc_images import marker_discs
 from scenes.sampler import sample_frame
 from scenes.sky.clear_sky import REC709_LUMINANCE
 

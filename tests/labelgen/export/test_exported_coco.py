@@ -14,9 +14,9 @@ from datasets_manifest.storage.reader import Dataset
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.presets import PRESETS
 from geometry.stereo import EYES
-from labelgen.export.coco import DROGUE, HUB, MARKER, coco_image_id, rolled_to_truth, write_coco
+from labelgen.export.coco import DROGUE, HUB, MARKER, align_keypoint_orders, coco_image_id, write_coco
 from labelgen.export.export_log import ExportLog
-from labelgen.export.keypoints import equal_orders
+from labelgen.export.keypoints import symmetric_orders
 
 
 @pytest.fixture(scope="module")
@@ -75,25 +75,27 @@ def test_truth_against_itself_is_perfect(truth):
 def test_keypoints_in_the_image_order_are_perfect_up_to_a_turn(truth):
     results = keypoint_results(truth, image_order)
     assert average_precision(truth, results, "keypoints") < 0.6
-    assert average_precision(truth, rolled_to_truth(truth, results), "keypoints") == pytest.approx(1, abs=1e-12)
+    assert average_precision(truth, align_keypoint_orders(truth, results), "keypoints") == pytest.approx(1, abs=1e-12)
 
 
 def test_a_mirrored_order_is_no_turn(truth):
     results = keypoint_results(truth, lambda extra: image_order(extra)[::-1])
-    assert average_precision(truth, rolled_to_truth(truth, results), "keypoints") < 0.2
+    assert average_precision(truth, align_keypoint_orders(truth, results), "keypoints") < 0.2
 
 
 def test_another_number_of_keypoints_is_refused(truth):
     (result, *_) = keypoint_results(truth, image_order)
     with pytest.raises(ValueError, match="keypoints: must be 8 in every result, got 7"):
-        rolled_to_truth(truth, [{**result, "keypoints": result["keypoints"][:21]}])
+        align_keypoint_orders(truth, [{**result, "keypoints": result["keypoints"][:21]}])
 
 
 def test_a_ring_turns_onto_itself_as_often_as_it_has_markers():
-    assert equal_orders(PRESETS["red-5"]) == tuple(tuple((i + step) % 5 for i in range(5)) for step in range(5))
+    assert symmetric_orders(PRESETS["red-5"]) == tuple(tuple((i + step) % 5 for i in range(5)) for step in range(5))
     places = list(PRESETS["red-8"].marker_positions_m)
     places[0] = (places[0][0] + 0.002, places[0][1])
-    assert equal_orders(PRESETS["red-8"].model_copy(update={"marker_positions_m": tuple(places)})) == (tuple(range(8)),)
+    assert symmetric_orders(PRESETS["red-8"].model_copy(update={"marker_positions_m": tuple(places)})) == (
+        tuple(range(8)),
+    )
 
 
 def test_ids_are_unique_and_stable(truth, mixed_dataset):

@@ -29,7 +29,7 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import RunSummary, render_dataset
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.stereo import EYES
-from labelgen.part_pixels import full_box
+from labelgen.part_pixels import drogue_box
 from render.version import RENDER_VERSION
 from scenes.sampler import sample_left_from_drogue, split_of_scenes
 from studies.publish.__main__ import PUBLISHED, publish
@@ -197,7 +197,7 @@ def test_published_labels_are_those_of_the_shipped_recipe(name: str) -> None:
             assert view is not None
             if recipe.variants:
                 continue
-            box = full_box(recipe.drogue, recipe.rig, pose, eye)
+            box = drogue_box(recipe.drogue, recipe.rig, pose, eye)
             np.testing.assert_allclose(view.box_full_xywh_px, box, rtol=2e-9, atol=2e-9)
             centers_m = pose.apply(marker_layout(recipe.drogue).centers_m)
             published = [center[:2] for center in view.centers_px[: recipe.drogue.marker_count]]

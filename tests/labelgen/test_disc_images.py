@@ -8,7 +8,7 @@ from drogue_models.presets import PRESETS
 from geometry.circles import disc_area_px2, disc_outline
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, paper_rig
-from labelgen.discs import hub_discs, marker_discs, window_around
+from labelgen.disc_images import hub_discs, marker_discs, window_around
 
 LAYOUT = marker_layout(PRESETS["red-8"])
 RIG = paper_rig()
