@@ -170,8 +170,9 @@ def tiers(work: Path) -> Record:
             run(work, "-m", "studies.acceptance", *arguments, may_fail=True)
         else:
             command(work, "bars", *arguments, may_fail=True)
-        file = work / f"tier-{tier}"
-        (written,) = [file / name for name in ("bars.json", "acceptance.json") if (file / name).exists()]
+        written = work / f"tier-{tier}" / "bars.json"
+        if not written.exists():
+            raise RuntimeError(f"tier {tier}: {written} was not written")
         record[tier] = json_digest(written)
     return record
 
@@ -236,8 +237,12 @@ def record(out: Path, work: Path, parts: list[str]) -> None:
     found: Record = {}
     for part in parts:
         print(f"{part} ...", flush=True)
-        found |= {f"{part}: {name}": value for name, value in PARTS[part](work).items()}
-    out.write_text(json.dumps(dict(sorted(found.items())), indent=1) + "\n", encoding="utf-8")
+        try:
+            found |= {f"{part}: {name}": value for name, value in PARTS[part](work).items()}
+        except RuntimeError as error:
+            found[f"{part}: failed"] = str(error)
+            print(error, flush=True)
+        out.write_text(json.dumps(dict(sorted(found.items())), indent=1) + "\n", encoding="utf-8")
 
 
 def compare(before: Path, after: Path) -> int:
