@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import importlib.util
 import json
 import os
 import re
@@ -166,7 +165,7 @@ def tiers(work: Path) -> Record:
     record = {}
     for tier in ("c", "d"):
         arguments = (tier, "--out", f"tier-{tier}", "--draws", "20")
-        if importlib.util.find_spec("studies") is not None:
+        if (REPOSITORY / "studies").is_dir():
             run(work, "-m", "studies.acceptance", *arguments, may_fail=True)
         else:
             command(work, "bars", *arguments, may_fail=True)
