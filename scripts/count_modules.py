@@ -1,7 +1,6 @@
 """Counts what a newcomer has to look through: modules, folders, modules with one importer, names that exist twice.
 
-    python scripts/count_modules.py            # four lines
-    python scripts/count_modules.py --verbose  # and which they are
+`python scripts/count_modules.py` prints four lines; with `--verbose` also which they are.
 """
 
 from __future__ import annotations
