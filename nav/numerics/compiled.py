@@ -1,14 +1,19 @@
-"""Compilation of loops over numbers for this machine's processor."""
+"""Compilation of loops over numbers for this machine's processor, by numba."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -16,22 +21,38 @@ Array32 = NDArray[np.float32]
 
 _Loop = TypeVar("_Loop", bound=Callable[..., Any])
 
-# Sums may be taken in any order and divisions be products, so that a processor takes many pixels at once. Infinities
-# and what is no number keep their meaning: a step gone astray must be seen.
-_FREEDOMS = {"reassoc", "nsz", "contract", "arcp"}
+# The compiler may take sums in any order and turn divisions into products, so that a processor works on many pixels at
+# once. Infinities and NaN keep their meaning: a step that diverges must be seen.
+_FASTMATH = {"reassoc", "nsz", "contract", "arcp"}
+# In every file that holds compiled functions, this one included.
+_MARK = b"@compiled"
 
 
 def compiled(loop: _Loop) -> _Loop:
-    """Compile a function over arrays at its first call, once a machine where its cache can be written.
+    """Compile a function over arrays at its first call, and keep the result on disk for later processes.
 
-    The cache sees changes of the function's own file alone, not of files whose compiled functions it calls.
+    The result is kept beside the function's file, else in the user's cache folder; where neither can be written, every
+    process compiles anew.
     """
-    settings: dict[str, Any] = {"fastmath": _FREEDOMS, "error_model": "numpy", "nogil": True}
-    try:
-        quick: _Loop = numba.njit(loop, cache=True, **settings)
-    except RuntimeError:  # neither beside the file nor at home can anything be written
-        quick = numba.njit(loop, **settings)
-    return quick
+    quick: Any = numba.njit(loop, fastmath=_FASTMATH, error_model="numpy", nogil=True)
+    with suppress(RuntimeError):  # numba found no folder that can be written
+        quick._cache = _KernelCache(loop)
+    kernel: _Loop = quick
+    return kernel
+
+
+class _KernelCache(FunctionCache):  # type: ignore[misc]
+    """Numba's cache on disk, which does not see changes in other files whose compiled functions a function calls."""
+
+    def _index_key(self, signature: Any, code_generator: Any) -> tuple[Any, ...]:
+        return (*super()._index_key(signature, code_generator), _sources_digest())
+
+
+@cache
+def _sources_digest() -> str:
+    """Hash of all files of this package that hold compiled functions."""
+    texts = (path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py")))
+    return hashlib.sha256(b"".join(text for text in texts if _MARK in text)).hexdigest()
 
 
 @intrinsic  # type: ignore[untyped-decorator]
