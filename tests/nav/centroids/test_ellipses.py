@@ -1,0 +1,27 @@
+"""Closed forms of the ellipses' small matrices, and which ellipses there are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
+
+
+def shapes_of(rng, count):
+    arms = rng.normal(0, 3, (count, 2, 2))
+    return arms @ arms.transpose(0, 2, 1) + 0.5 * np.eye(2)
+
+
+def test_closed_forms_of_shapes():
+    shapes = shapes_of(np.random.default_rng(1), 200)
+    # Rounding, of matrices with condition numbers of up to some hundred.
+    np.testing.assert_allclose(shape_inverses(shapes) @ shapes, np.broadcast_to(np.eye(2), shapes.shape), atol=1e-11)
+    np.testing.assert_allclose(shape_radii(shapes), np.sqrt(np.linalg.det(shapes)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("axes", [(-1.0, -2.0), (1.0, -2.0), (0.0, 2.0)])
+def test_an_ellipse_has_positive_semi_axes(axes):
+    shapes = np.stack([np.eye(2), np.diag(axes)])
+    with pytest.raises(ValueError, match="shapes_px: must be positive"):
+        Ellipses(np.zeros(2, np.int64), np.zeros((2, 2)), shapes)
