@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from droguekit.batch.progress import ProgressReport
-    from droguekit.benchmark.detection.detection_run import DetectorPass
     from droguekit.benchmark.detection.detection_scores import DetectorRun
+    from droguekit.benchmark.detection.detector_runner import DetectorPass
     from droguekit.benchmark.results.detection_result import DetectionResult, FoundBox, PairTimes
     from nav.detector.onnx_cost import NetworkCost
 
@@ -44,7 +44,7 @@ def detect_dataset(
         ValueError: no such dataset, detector or tracker, a score that is none, or an image that cannot be read.
         OSError: the file cannot be written; it is then left as it was.
     """
-    from droguekit.benchmark.detection.detection_run import DetectorPass
+    from droguekit.benchmark.detection.detector_runner import DetectorPass
     from droguekit.benchmark.results.detection_result import write_detections
     from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 
@@ -118,8 +118,8 @@ def benchmark_detections(
 def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorRun]:
     """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
-    from droguekit.benchmark.detection.detection_run import DetectorPass
     from droguekit.benchmark.detection.detection_scores import DetectorRun
+    from droguekit.benchmark.detection.detector_runner import DetectorPass
     from droguekit.benchmark.results.detection_result import image_id_of, read_detections
     from geometry.stereo import EYES
     from nav.detector.detector_registry import detector_factory
@@ -138,8 +138,8 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
 
 def _detector_run(name_or_file: str, detecting: DetectorPass, report: ProgressReport) -> DetectorRun:
     """What a detector finds in all images."""
-    from droguekit.benchmark.detection.detection_run import LEAST_SCORE
     from droguekit.benchmark.detection.detection_scores import DetectorRun
+    from droguekit.benchmark.detection.detector_runner import LEAST_SCORE
 
     report.say(f"{detecting.name}: looking for the drogue, without the truth")
     report.begin("pairs", detecting.pairs)

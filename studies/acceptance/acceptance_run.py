@@ -16,7 +16,7 @@ from droguekit.workflows.rendering import open_recipe, render_frames
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe
     from droguekit.batch.progress import ProgressReport
-    from studies.acceptance.criteria import BarRow, BarTable
+    from studies.acceptance.acceptance_table import BarRow, BarTable
     from studies.acceptance.rendered.flight_tiers import FlightData
 
 DEFAULT_TRACKER, DEFAULT_RIG = "pose-predict", "rgb-ideal"
@@ -78,9 +78,9 @@ def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
     from importlib.metadata import version
 
     from datasets_manifest.atomic import write_text_atomic
+    from studies.acceptance.acceptance_table import BarTable
     from studies.acceptance.centroid_level.centroid_tiers import bars_tier_c, bars_tier_d
     from studies.acceptance.centroid_level.speed import bars_speed
-    from studies.acceptance.criteria import BarTable
     from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS
     from studies.acceptance.rendered.image_tiers import IMAGE_TIERS
 

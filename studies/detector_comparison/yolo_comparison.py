@@ -14,7 +14,7 @@ from typing import Any
 from datasets_manifest.atomic import try_lock, write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
-from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorPass
 from droguekit.benchmark.results.detection_result import write_detections
 from nav.detector.detector import Detector
 from nav.detector.onnx_cost import network_cost

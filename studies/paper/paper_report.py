@@ -20,7 +20,6 @@ from droguekit.benchmark.report.figures import MethodStyle, legend_key, method_s
 from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
 from droguekit.benchmark.results.detection_result import DetectionResult
 from droguekit.benchmark.sequences.sequence_latency import worked_s
-from studies.paper.bench_experiment import SemiPhysicalRun, read_semi_physical
 from studies.paper.corpus_figures import CorpusBoxes, place_panel, read_corpus, shape_panel, size_panel
 from studies.paper.docking_experiment import DockingData, Run, read_docking
 from studies.paper.paper_inputs import code_facts, dataset_facts, file_sha256
@@ -59,6 +58,7 @@ from studies.paper.published_results import (
     absent,
     style_of,
 )
+from studies.paper.semi_physical import SemiPhysicalRun, read_semi_physical
 from studies.paper.worst_frames import (
     BOX_COLOR,
     CENTROID_COLOR,

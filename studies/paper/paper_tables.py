@@ -15,7 +15,6 @@ from droguekit.benchmark.report.number_text import ABSENT, interval_text, millim
 from droguekit.benchmark.results.benchmark_result import MethodResult, Row
 from droguekit.benchmark.results.detection_result import DetectionResult, DetectorResult
 from geometry.se3 import Array
-from studies.paper.bench_experiment import SemiPhysicalRun, StationErrors
 from studies.paper.docking_experiment import LEAST_MARKERS, DockingData, chosen_scores, frames_in_view
 from studies.paper.pose_figures import published_row
 from studies.paper.published_results import (
@@ -29,6 +28,7 @@ from studies.paper.published_results import (
     TABLE_2,
     Contender,
 )
+from studies.paper.semi_physical import SemiPhysicalRun, StationErrors
 
 
 @dataclass(frozen=True)

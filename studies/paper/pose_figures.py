@@ -12,7 +12,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from droguekit.benchmark.report.figures import INK, PANEL_IN, MethodStyle, drawing, svg_element
 from droguekit.benchmark.report.number_text import plain_number
 from geometry.se3 import Array
-from studies.paper.bench_experiment import SemiPhysicalRun, StationErrors
 from studies.paper.docking_experiment import Run
 from studies.paper.published_results import (
     ANGLE_LIMIT_DEG,
@@ -22,6 +21,7 @@ from studies.paper.published_results import (
     PublishedStation,
     style_of,
 )
+from studies.paper.semi_physical import SemiPhysicalRun, StationErrors
 
 _PANEL_IN = (4.4, 2.7)
 

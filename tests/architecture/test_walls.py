@@ -22,7 +22,7 @@ TRESPASSES = [
     ("rooms", "scenes/trespass.py", "import render.engine"),
     ("rooms", "datasets_manifest/trespass.py", "import scenes.sampler"),
     ("rooms", "labelgen/trespass.py", "import nav.runner"),
-    ("rooms", "droguekit/trespass.py", "import studies.acceptance.criteria"),
+    ("rooms", "droguekit/trespass.py", "import studies.acceptance.acceptance_table"),
     ("application", "droguekit/workflows/trespass.py", "import droguekit.cli.main"),
     ("application", "droguekit/benchmark/trespass.py", "import droguekit.batch.worker_pool"),
     ("application", "droguekit/batch/trespass.py", "import droguekit.benchmark.pose_benchmark"),

@@ -14,6 +14,7 @@ from droguekit.batch.progress import ProgressReport
 from droguekit.benchmark.confidence_intervals import CONFIDENCE, rms_upper_limit
 from droguekit.benchmark.poses.cramer_rao import FacingRing
 from geometry.stereo import paper_rig
+from studies.acceptance.acceptance_table import BarRow, at_most, between, worst
 from studies.acceptance.centroid_level.drawn_frames import (
     AS_BUILT,
     CLEAN,
@@ -38,7 +39,6 @@ from studies.acceptance.centroid_level.monte_carlo import (
     run_cells,
 )
 from studies.acceptance.confidence_limits import Limited, nees_limits, paired_ratio_limit, paired_rms_ratio_limit
-from studies.acceptance.criteria import BarRow, at_most, between, worst
 
 # Where the ring's radius outweighs all else, knowing of it or not changes nothing: the ratio is 1, and its limit above.
 _NEVER_WORSE = 1.01

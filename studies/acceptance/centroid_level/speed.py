@@ -23,10 +23,10 @@ from nav.pair_measurement import Sighting
 from nav.pose.joint import joint
 from nav.pose.pose_method import Observation, Solution
 from nav.pose.pose_methods import pose_method
+from studies.acceptance.acceptance_table import BarRow, at_most
 from studies.acceptance.centroid_level.drawn_frames import Corruption, draw_poses, draw_shifts, ellipse_centers_px
 from studies.acceptance.centroid_level.monte_carlo import DOCKING_RANGE_M
 from studies.acceptance.centroid_level.solvers import Measured, observations, solve
-from studies.acceptance.criteria import BarRow, at_most
 
 _SIGMA_PX = 0.1
 _SINGLE_FRAMES, _BATCH_FRAMES = 100, 1000

@@ -12,6 +12,7 @@ from datasets_manifest.recipe.recipe import FrameCounts, Recipe
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
 from droguekit.benchmark.sequences.tracking_scores import SOON_FRAMES, reacquisition
+from studies.acceptance.acceptance_table import BESIDE, GOAL, BarRow, at_most, between, not_measured, worst
 from studies.acceptance.confidence_limits import (
     Limited,
     block_mean_limit,
@@ -22,7 +23,6 @@ from studies.acceptance.confidence_limits import (
     paired_ratio_limit,
     share_limit,
 )
-from studies.acceptance.criteria import BESIDE, GOAL, BarRow, at_most, between, not_measured, worst
 from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, Scores
 

@@ -13,6 +13,7 @@ from droguekit.benchmark.confidence_intervals import ratio_intervals, rms_upper_
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, BinRow
 from geometry.se3 import Array
+from studies.acceptance.acceptance_table import BarRow, at_most, between, not_measured, worst
 from studies.acceptance.confidence_limits import (
     mean_limit,
     nees_limits,
@@ -22,7 +23,6 @@ from studies.acceptance.confidence_limits import (
     share_limit,
     size_of_mean_limit,
 )
-from studies.acceptance.criteria import BarRow, at_most, between, not_measured, worst
 from studies.acceptance.rendered.scored_frames import (
     BEST,
     CHAIN,

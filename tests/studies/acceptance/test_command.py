@@ -23,7 +23,7 @@ from studies.acceptance.acceptance_run import (
     plan_images,
     run_bars,
 )
-from studies.acceptance.criteria import BarRow
+from studies.acceptance.acceptance_table import BarRow
 from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS, FlightData, approach_rows, lost_rows, part_length
 from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs

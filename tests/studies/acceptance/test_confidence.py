@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from studies.acceptance import confidence_limits
-from studies.acceptance.criteria import BarTable, at_most, between, not_measured
+from studies.acceptance.acceptance_table import BarTable, at_most, between, not_measured
 
 
 def rng(stream: int) -> np.random.Generator:

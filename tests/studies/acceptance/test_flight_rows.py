@@ -15,7 +15,7 @@ from geometry.se3 import RigidTransform
 from geometry.stereo import paper_rig
 from scenes.drogue_appearance import drogue_of_scene
 from scenes.sampler import recipe_of_scene, scene_of_frame
-from studies.acceptance.criteria import BarRow
+from studies.acceptance.acceptance_table import BarRow
 from studies.acceptance.rendered.flight_tiers import (
     FLIGHT_TIERS,
     approach_rows,

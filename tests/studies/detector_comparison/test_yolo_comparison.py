@@ -18,9 +18,9 @@ from datasets_manifest.recipe.recipe import RecipeSource, load_recipe, parse_rec
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.detection.detection_run import LEAST_SCORE, DetectorPass
 from droguekit.benchmark.detection.detection_scores import DetectorRun, score_detections
 from droguekit.benchmark.detection.detection_truth import read_detection_truth
+from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorPass
 from droguekit.cli.main import DONE, run
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
