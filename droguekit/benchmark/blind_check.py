@@ -21,8 +21,8 @@ from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estim
 from datasets_manifest.types.records import PixelBox
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
-from droguekit.benchmark.poses.pose_errors import by_method
-from droguekit.benchmark.report.label_drawing import Tile, display_picture, label_picture, spread, tile_of
+from droguekit.benchmark.poses.pose_errors import estimates_by_method
+from droguekit.benchmark.report.label_drawing import Tile, display_picture, evenly_spaced, label_picture, tile_of
 from droguekit.benchmark.report.number_text import percent, plain_number, three_digits
 from droguekit.benchmark.report.pose_report import page_template
 from droguekit.benchmark.results.pose_result import ResultModel
@@ -91,7 +91,7 @@ def check_blind(dataset: Location, estimates: Path) -> BlindCheck:
         ValueError: the dataset or the file cannot be read, or names pairs that the dataset lacks.
     """
     index = read_blind_index(dataset)
-    methods = by_method(read_estimates(estimates), index.frames, str(estimates))
+    methods = estimates_by_method(read_estimates(estimates), index.frames, str(estimates))
     scenes = blind_scenes(dataset, index)
     return BlindCheck(
         dataset=BlindFacts(name=index.name, pairs=len(index.frames)),
@@ -141,7 +141,7 @@ def _row(estimates: Mapping[int, Estimate], scenes: Mapping[int, BlindScene]) ->
         for frame, e in fixes.items()
         for eye, given in scenes[frame].boxes.items()
     ]
-    inside = [_holds(given, rim) for given, rim in views]
+    inside = [_holds_center(given, rim) for given, rim in views]
     return BlindRow(
         n=len(scenes),
         fixes=len(fixes),
@@ -170,7 +170,7 @@ def _residuals_px(estimate: PoseEstimate, scene: BlindScene) -> Iterator[float]:
             yield from (np.array(feature.center_px) - expected[place]).tolist()
 
 
-def _holds(box: PixelBox, rim: PixelBox) -> bool:
+def _holds_center(box: PixelBox, rim: PixelBox) -> bool:
     x, y = rim[0] + rim[2] / 2, rim[1] + rim[3] / 2
     return box[0] <= x <= box[0] + box[2] and box[1] <= y <= box[1] + box[3]
 
@@ -236,7 +236,7 @@ def _tiles(dataset: Location, estimates: Path, method: str) -> list[tuple[Tile, 
         for e in read_estimates(estimates)
         if e.method == method and isinstance(e, PoseEstimate)
     }
-    frames = [index.frames[place] for place in spread(len(index.frames), _MOST_TILES)]
+    frames = [index.frames[place] for place in evenly_spaced(len(index.frames), _MOST_TILES)]
     tiles = []
     for frame in frames:
         scene, pose = scenes[frame], poses.get(frame)

@@ -14,24 +14,30 @@ from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estim
 from droguekit.benchmark.confidence_intervals import CONFIDENCE, fraction_interval
 from droguekit.benchmark.poses.centroid_errors import CentroidErrors, centroid_errors
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
-from droguekit.benchmark.poses.method_comparison import PAPER_METHOD, PairGroups, best_method, compare
+from droguekit.benchmark.poses.method_comparison import PAPER_METHOD, PairGroups, best_method, compare_methods
 from droguekit.benchmark.poses.method_scores import FrameScore, frame_scores, summarize
-from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from droguekit.benchmark.poses.reference import DistanceBin, Reference, build_reference, distance_bins
 from droguekit.benchmark.results.benchmark_result import (
     BenchmarkResult,
-    BinRow,
     DatasetFacts,
     EmptyFrames,
     MethodResult,
+    PoseBin,
 )
-from droguekit.benchmark.results.pose_result import Comparison
+from droguekit.benchmark.results.pose_result import MethodComparison
 from droguekit.benchmark.results.sequence_result import HiddenPairs, MethodSequences, SequencesResult
 from droguekit.benchmark.sequences.docking_errors import docking_errors, true_dockings
-from droguekit.benchmark.sequences.filter_errors import SequenceData, filtering, root_mean_length
+from droguekit.benchmark.sequences.filter_errors import SequenceData, filter_errors, rms_length
 from droguekit.benchmark.sequences.sequence_latency import latency
-from droguekit.benchmark.sequences.sequence_truth import Moment, TrueSequence, moment, true_motions, true_sequences
-from droguekit.benchmark.sequences.tracking_scores import reacquisition, track_regions
+from droguekit.benchmark.sequences.sequence_truth import (
+    TrueSequence,
+    TrueState,
+    true_motions,
+    true_sequences,
+    true_state,
+)
+from droguekit.benchmark.sequences.tracking_scores import reacquisition, score_regions
 
 Methods = Mapping[str, Mapping[int, Estimate]]
 
@@ -58,8 +64,8 @@ def score_sequences(
     scored: dict[str, MethodSequences] = {}
     for name, estimates in methods.items():
         parts = {
-            "tracking": track_regions(sequences, estimates) if has_regions else None,
-            "filtering": filtering(data, name, methods),
+            "tracking": score_regions(sequences, estimates) if has_regions else None,
+            "filtering": filter_errors(data, name, methods),
             "docking": docking_errors(data, dockings, estimates, f"{name}, docking"),
             "latency": latency(data, estimates),
         }
@@ -67,12 +73,12 @@ def score_sequences(
             scored[name] = MethodSequences(hiding=_hidden_pairs(sequences, estimates), **parts)
     if not scored:
         return None
-    spans = [sequence.moments[-1].time_s - sequence.moments[0].time_s for sequence in sequences]
+    spans = [sequence.states[-1].time_s - sequence.states[0].time_s for sequence in sequences]
     return SequencesResult(
         count=len(sequences),
-        pairs=sum(len(sequence.moments) for sequence in sequences),
+        pairs=sum(len(sequence.states) for sequence in sequences),
         minutes=float(np.sum(spans)) / 60,
-        vibration_rms_m_s=root_mean_length(
+        vibration_rms_m_s=rms_length(
             [motion.vibration_m_s for motion in data.motions.values() if motion.vibration_m_s is not None]
         ),
         methods=scored,
@@ -91,24 +97,24 @@ def sequence_data(sequences: Sequence[TrueSequence], drogues: Mapping[int, Drogu
 
 
 def _hidden_pairs(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> HiddenPairs:
-    moments = [moment for sequence in sequences for moment in sequence.moments if moment.sight == "hidden"]
+    states = [state for sequence in sequences for state in sequence.states if state.visibility == "hidden"]
     courses = [
         (
-            [moment.sight for moment in sequence.moments],
-            [_has_found(moment, estimates.get(moment.frame_index)) for moment in sequence.moments],
+            [state.visibility for state in sequence.states],
+            [_has_found(state, estimates.get(state.frame_index)) for state in sequence.states],
         )
         for sequence in sequences
     ]
     return HiddenPairs(
-        hidden=len(moments),
-        poses_while_hidden=sum(isinstance(estimates.get(moment.frame_index), PoseEstimate) for moment in moments),
+        hidden=len(states),
+        poses_while_hidden=sum(isinstance(estimates.get(state.frame_index), PoseEstimate) for state in states),
         reacquisition=reacquisition(courses),
     )
 
 
-def _has_found(moment: Moment, estimate: Estimate | None) -> bool:
+def _has_found(state: TrueState, estimate: Estimate | None) -> bool:
     """Whether an answer is a pose that lies within the rim of the drogue."""
-    pose, drogue = moment.left_from_drogue, moment.drogue
+    pose, drogue = state.left_from_drogue, state.drogue
     if pose is None or drogue is None or not isinstance(estimate, PoseEstimate):
         return False
     error_m = estimate.left_from_drogue.translation_m - pose.translation_m
@@ -132,14 +138,14 @@ def run_benchmark(dataset: Location, estimates: Path) -> BenchmarkResult:
             names one twice for a method.
     """
     data = Dataset(dataset)
-    methods = by_method(read_estimates(estimates), data.frame_indices, str(estimates))
-    truths, moments = {}, []
+    methods = estimates_by_method(read_estimates(estimates), data.frame_indices, str(estimates))
+    truths, states = {}, []
     for index in data.frame_indices:
         record = data.record(index)
         truths[index] = drogue_truth(record)
-        moments.append(moment(record))
+        states.append(true_state(record))
     facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(data.frame_indices))
-    return score(facts, truths, methods, true_sequences(moments))
+    return score(facts, truths, methods, true_sequences(states))
 
 
 def score(
@@ -197,7 +203,7 @@ def _rows(scores: Mapping[int, FrameScore], reference: Reference) -> dict[str, o
     spread, bins = reference.truth_spread, []
     for k, place in enumerate(reference.bins):
         inside = [score for index, score in scores.items() if reference.bin_of_frame[index] == k]
-        bins.append(BinRow(**dict(summarize(inside, spread, f"bin {k}")), low_m=place.low_m, high_m=place.high_m))
+        bins.append(PoseBin(**dict(summarize(inside, spread, f"bin {k}")), low_m=place.low_m, high_m=place.high_m))
     return {"overall": summarize(list(scores.values()), spread, "overall"), "bins": bins}
 
 
@@ -206,7 +212,7 @@ def _comparisons(
     rows: Mapping[str, MethodResult],
     scores: Mapping[str, Mapping[int, FrameScore]],
     reference: Reference,
-) -> list[Comparison]:
+) -> list[MethodComparison]:
     """Every method beside the best one and beside the seed paper's."""
     errors = {
         name: {index: score.pose.error for index, score in frames.items() if score.pose is not None}
@@ -218,7 +224,7 @@ def _comparisons(
         {index: truth.sequence_id for index, truth in drogues.items()},
     )
     best = best_method(rows)
-    return compare(errors, [name for name in (best, PAPER_METHOD) if name in errors], groups)
+    return compare_methods(errors, [name for name in (best, PAPER_METHOD) if name in errors], groups)
 
 
 def _empty_frames(truths: Truths, estimates: Mapping[int, Estimate]) -> EmptyFrames:

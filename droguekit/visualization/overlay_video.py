@@ -14,7 +14,7 @@ from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, rea
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
 from drogue_models.parameters import DrogueParameters
-from droguekit.benchmark.poses.pose_errors import by_method, pose_error
+from droguekit.benchmark.poses.pose_errors import estimates_by_method, pose_error
 from droguekit.benchmark.report.label_drawing import (
     Picture,
     Rgb,
@@ -54,7 +54,7 @@ def read_method(path: Path, dataset: Dataset, method: str | None) -> tuple[str, 
     Raises:
         ValueError: the file cannot be used, has no such method, or several where none was named.
     """
-    methods = by_method(read_estimates(path), dataset.frame_indices, str(path))
+    methods = estimates_by_method(read_estimates(path), dataset.frame_indices, str(path))
     if method is None and len(methods) > 1:
         raise ValueError(f"--method: {path} holds several; name one of {', '.join(methods)}")
     name = next(iter(methods)) if method is None else method

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from droguekit.batch.progress import ProgressReport
-    from droguekit.benchmark.detection.detection_scores import DetectorRun
-    from droguekit.benchmark.detection.detector_runner import DetectorPass
-    from droguekit.benchmark.results.detection_result import DetectionResult, FoundBox, PairTimes
+    from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import DetectorRunner
+    from droguekit.benchmark.results.detection_result import DetectedBox, DetectionResult, PairTimes
     from nav.detector.onnx_cost import NetworkCost
 
 
@@ -44,7 +44,7 @@ def detect_dataset(
         ValueError: no such dataset, detector or tracker, a score that is none, or an image that cannot be read.
         OSError: the file cannot be written; it is then left as it was.
     """
-    from droguekit.benchmark.detection.detector_runner import DetectorPass
+    from droguekit.benchmark.detection.detector_runner import DetectorRunner
     from droguekit.benchmark.results.detection_result import write_detections
     from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 
@@ -55,10 +55,10 @@ def detect_dataset(
         from nav.tracking.tracked_detector import tracked_detector_factory
 
         detector_of = tracked_detector_factory(detector_of, tracker)
-    detecting = DetectorPass(dataset, detector_of)
+    detecting = DetectorRunner(dataset, detector_of)
     images = set()
 
-    def counted() -> Iterator[FoundBox]:
+    def counted() -> Iterator[DetectedBox]:
         for box in detecting.boxes(least_score, report.advance):
             images.add(box.image_id)
             yield box
@@ -115,19 +115,19 @@ def benchmark_detections(
     return scored.result
 
 
-def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorRun]:
+def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorOutput]:
     """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
-    from droguekit.benchmark.detection.detection_scores import DetectorRun
-    from droguekit.benchmark.detection.detector_runner import DetectorPass
+    from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import DetectorRunner
     from droguekit.benchmark.results.detection_result import image_id_of, read_detections
     from geometry.stereo import EYES
     from nav.detector.detector_registry import detector_factory
 
     # Also of images that are not scored, for a detector answers for all.
     image_ids = frozenset(image_id_of(frame, eye) for frame in read_blind_index(dataset).frames for eye in EYES)
-    runs = [(file.stem, DetectorRun(read_detections(file, image_ids))) for file in options.files]
-    passes = [(name, DetectorPass(dataset, detector_factory(name))) for name in options.detectors]
+    runs = [(file.stem, DetectorOutput(read_detections(file, image_ids))) for file in options.files]
+    passes = [(name, DetectorRunner(dataset, detector_factory(name))) for name in options.detectors]
     names = [name for name, _ in runs] + [detecting.name for _, detecting in passes]
     for name in names:
         if names.count(name) > 1:
@@ -136,9 +136,9 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
     return dict(runs)
 
 
-def _detector_run(name_or_file: str, detecting: DetectorPass, report: ProgressReport) -> DetectorRun:
+def _detector_run(name_or_file: str, detecting: DetectorRunner, report: ProgressReport) -> DetectorOutput:
     """What a detector finds in all images."""
-    from droguekit.benchmark.detection.detection_scores import DetectorRun
+    from droguekit.benchmark.detection.detection_scores import DetectorOutput
     from droguekit.benchmark.detection.detector_runner import LEAST_SCORE
 
     report.say(f"{detecting.name}: looking for the drogue, without the truth")
@@ -148,7 +148,7 @@ def _detector_run(name_or_file: str, detecting: DetectorPass, report: ProgressRe
     finally:
         report.end()
     cost = _network_cost(name_or_file, detecting.pass_sizes_px)
-    return DetectorRun(
+    return DetectorOutput(
         boxes,
         detecting.times(),
         detecting.score_threshold,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +11,14 @@ import typer
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import WorkersOption
 from droguekit.cli.main import FAULT, run
-from studies.acceptance.acceptance_run import DEFAULT_RIG, DEFAULT_TRACKER, BarsOrder, FlightOrder, run_bars
+from studies.acceptance.acceptance_run import (
+    DEFAULT_RIG,
+    DEFAULT_TRACKER,
+    AcceptanceOptions,
+    FlightOptions,
+    measure_tier,
+)
+from studies.acceptance.rendered.image_tiers import LightLevel
 
 EXAMPLES = (
     "python -m studies.acceptance c --out out/bars/c",
@@ -28,14 +34,7 @@ EXAMPLES = (
 _IMAGE_TIERS, _FLIGHT_TIERS = ("a", "b"), ("e", "docking")
 
 
-class Light(StrEnum):
-    """Which dataset of a tier that has two."""
-
-    DAY = "day"
-    DUSK = "dusk"
-
-
-def bars(
+def acceptance(
     tier: Annotated[
         str,
         typer.Argument(
@@ -49,7 +48,7 @@ def bars(
         int | None, typer.Option("--pairs-per-station", help="Tiers a and b: pairs at each distance; all by default.")
     ] = None,
     light: Annotated[
-        list[Light] | None, typer.Option("--light", help="Tiers a and b: only this; both by default.")
+        list[LightLevel] | None, typer.Option("--light", help="Tiers a and b: only this; both by default.")
     ] = None,
     draws: Annotated[
         int | None, typer.Option("--draws", help="Tiers c and d: frames a cell; the protocol's by default.")
@@ -88,41 +87,41 @@ def bars(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything drawn; 1 is for development.")] = 1,
     workers: WorkersOption = None,
 ) -> None:
-    """Measure the accuracy bars of a tier: bar, measured value, its 95 % limit, met or not.
+    """Measure the accuracy criteria of a tier: criterion, measured value, its 95 % limit, met or not.
 
     Stopped and started again, it goes on with what is finished; results of other code are made again. Exit code 1 says
-    that a bar is missed.
+    that a criterion is missed.
     """
-    images, flights = tier in _IMAGE_TIERS, tier in _FLIGHT_TIERS
-    if (images or flights) and draws is not None:
+    has_images, has_flights = tier in _IMAGE_TIERS, tier in _FLIGHT_TIERS
+    if (has_images or has_flights) and draws is not None:
         raise ValueError("--draws: is for tiers c and d and speed; the others take --pairs-per-station or --sequences")
-    if not images and pairs_per_station is not None:
+    if not has_images and pairs_per_station is not None:
         raise ValueError("--pairs-per-station: is for tiers a and b; the others take --draws or --sequences")
-    if not images and light is not None:
+    if not has_images and light is not None:
         raise ValueError("--light: is for tiers a and b; the others have no day and dusk")
-    if not flights and any(value is not None for value in (recipe, sequences, rig, tracker)):
+    if not has_flights and any(value is not None for value in (recipe, sequences, rig, tracker)):
         raise ValueError("--recipe, --sequences, --rig, --tracker: are for tiers e and docking")
-    if engine is not None and not (flights or tier == "b"):
+    if engine is not None and not (has_flights or tier == "b"):
         raise ValueError("--engine: is for tiers b, e and docking; tier a is of analytic images")
     if draws is not None and draws < 2:
         raise ValueError(f"--draws: must be at least 2, got {draws}")
-    what = FlightOrder(
+    flights = FlightOptions(
         recipes=tuple(dict.fromkeys(recipe or ())),
         rigs=tuple(dict.fromkeys(rig or (DEFAULT_RIG,))),
         sequences=sequences,
         tracker=tracker or DEFAULT_TRACKER,
     )
-    order = BarsOrder(
+    options = AcceptanceOptions(
         tier=tier,
         seed=seed,
         pairs_per_station=pairs_per_station,
         draws=draws,
         engines=tuple(dict.fromkeys(engine or ())),
-        lights=tuple(dict.fromkeys(each.value for each in light or Light)),
+        lights=tuple(dict.fromkeys(light or LightLevel)),
         workers=workers,
-        flights=what,
+        flights=flights,
     )
-    table = run_bars(order, out, progress_report())
+    table = measure_tier(options, out, progress_report())
     for line in table.to_lines():
         typer.echo(line)
     typer.echo(f"wrote {out / 'bars.json'} and {out / 'bars.md'}")
@@ -134,7 +133,7 @@ def bars(
 def run_command(arguments: list[str]) -> int:
     """Run the command line of the acceptance study, and return its exit code."""
     command = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    command.command(epilog="\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES)]))(bars)
+    command.command(epilog="\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES)]))(acceptance)
     return run(arguments, command, "python -m studies.acceptance")
 
 

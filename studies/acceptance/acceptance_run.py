@@ -1,38 +1,43 @@
-"""What `bars` does; rooms are imported where they are used, as in `pipelines`."""
+"""Measures a tier of the acceptance criteria: renders, navigates, scores and writes the table.
+
+Packages are imported where they are used, so that `--help` stays fast.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from datasets_manifest.recipe.recipe import RecipeSource
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.workflows.benchmarking import benchmark_dataset
 from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
 from droguekit.workflows.rendering import open_recipe, render_frames
+from studies.acceptance.rendered.image_tiers import IMAGE_TIERS, LightLevel, TierData, recipe_of
 
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe
     from droguekit.batch.progress import ProgressReport
-    from studies.acceptance.acceptance_table import BarRow, BarTable
+    from studies.acceptance.acceptance_table import AcceptanceRow, AcceptanceTable
     from studies.acceptance.rendered.flight_tiers import FlightData
 
 DEFAULT_TRACKER, DEFAULT_RIG = "pose-predict", "rgb-ideal"
-# Engine and recipe; data of another rig than the bars' name it besides.
-_NAMES_OF_BARS = 2
-# At each distance, whose centroids are timed.
+# Engine and recipe name the data that the criteria judge; a third name is that of another rig.
+_NAMES_OF_CRITERIA = 2
+# Pairs at each distance whose centroids are timed.
 _TIMED_PAIRS = 8
 
 
 @dataclass(frozen=True)
-class FlightOrder:
+class FlightOptions:
     """What of the tiers `e` and `docking` to measure, and with what.
 
     Attributes:
         recipes: names of those recipes of the tier to take; all when empty.
-        rigs: that see; bars are those of `rgb-ideal`, the others' figures stand beside. Ignored by recipes of a bench.
+        rigs: camera rigs. The criteria judge `rgb-ideal`; figures of other rigs are given for comparison. Recipes of a
+            bench ignore this.
         sequences: of each recipe; as many as a full measurement takes when None.
         tracker: name.
     """
@@ -44,8 +49,8 @@ class FlightOrder:
 
 
 @dataclass(frozen=True)
-class BarsOrder:
-    """Which bars to measure, and how much to spend on them.
+class AcceptanceOptions:
+    """Which criteria to measure, and how much to spend on them.
 
     Attributes:
         tier: `a`, `b`, `c`, `d`, `e`, `docking` or `speed`.
@@ -63,13 +68,13 @@ class BarsOrder:
     pairs_per_station: int | None = None
     draws: int | None = None
     engines: tuple[str, ...] = ()
-    lights: tuple[Literal["day", "dusk"], ...] = ("day", "dusk")
+    lights: tuple[LightLevel, ...] = tuple(LightLevel)
     workers: int | None = None
-    flights: FlightOrder = FlightOrder()
+    flights: FlightOptions = FlightOptions()
 
 
-def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
-    """Measure the bars of a tier and write bars.json and bars.md; what an earlier run finished is kept.
+def measure_tier(options: AcceptanceOptions, out: Path, report: ProgressReport) -> AcceptanceTable:
+    """Measure the criteria of a tier and write bars.json and bars.md; what an earlier run finished is kept.
 
     Raises:
         ValueError: no such tier, a wrong number, or a folder of something else.
@@ -78,25 +83,24 @@ def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
     from importlib.metadata import version
 
     from datasets_manifest.atomic import write_text_atomic
-    from studies.acceptance.acceptance_table import BarTable
-    from studies.acceptance.centroid_level.centroid_tiers import bars_tier_c, bars_tier_d
-    from studies.acceptance.centroid_level.speed import bars_speed
+    from studies.acceptance.acceptance_table import AcceptanceTable
+    from studies.acceptance.centroid_level.centroid_tiers import measure_tier_c, measure_tier_d
+    from studies.acceptance.centroid_level.speed import measure_speed
     from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS
-    from studies.acceptance.rendered.image_tiers import IMAGE_TIERS
 
-    drawn = {"c": bars_tier_c, "d": bars_tier_d}
-    if order.tier in IMAGE_TIERS:
-        rows = image_bars(order, out, report)
-    elif order.tier in drawn:
-        rows = drawn[order.tier](out, order.seed, order.draws, report)
-    elif order.tier == "speed":
-        rows = bars_speed(_timed_pairs(order, out, report), order.seed, order.draws, report)
-    elif order.tier in FLIGHT_TIERS:
-        rows = flight_bars(order, FLIGHT_TIERS[order.tier], out, report)
+    drawn = {"c": measure_tier_c, "d": measure_tier_d}
+    if options.tier in IMAGE_TIERS:
+        rows = measure_image_tier(options, out, report)
+    elif options.tier in drawn:
+        rows = drawn[options.tier](out, options.seed, options.draws, report)
+    elif options.tier == "speed":
+        rows = measure_speed(_timed_pairs(options, out, report), options.seed, options.draws, report)
+    elif options.tier in FLIGHT_TIERS:
+        rows = measure_flight_tier(options, FLIGHT_TIERS[options.tier], out, report)
     else:
         tiers = ", ".join((*IMAGE_TIERS, *drawn, *FLIGHT_TIERS, "speed"))
-        raise ValueError(f"tier: there is none named {order.tier!r}; there are {tiers}")
-    table = BarTable(tier=order.tier, seed=order.seed, code_version=version("droguekit"), rows=tuple(rows))
+        raise ValueError(f"tier: there is none named {options.tier!r}; there are {tiers}")
+    table = AcceptanceTable(tier=options.tier, seed=options.seed, code_version=version("droguekit"), rows=tuple(rows))
     write_text_atomic(out / "bars.json", table.to_json())
     write_text_atomic(out / "bars.md", table.to_markdown())
     return table
@@ -104,7 +108,7 @@ def run_bars(order: BarsOrder, out: Path, report: ProgressReport) -> BarTable:
 
 @dataclass(frozen=True)
 class PlannedData:
-    """One dataset that is to be made, from an order that was checked.
+    """One dataset that is to be made, from options that were checked.
 
     Attributes:
         source: the recipe.
@@ -117,46 +121,43 @@ class PlannedData:
     names: tuple[str, ...]
 
 
-def image_bars(order: BarsOrder, out: Path, report: ProgressReport) -> list[BarRow]:
-    """Measure the bars of tier `a` or `b`, engine by engine and light by light.
+def measure_image_tier(options: AcceptanceOptions, out: Path, report: ProgressReport) -> list[AcceptanceRow]:
+    """Measure the criteria of tier `a` or `b`, engine by engine and light by light.
 
     Raises:
         ValueError: no such engine, a wrong number, or pairs that could not be made.
         OSError: the folder cannot be written.
     """
-    from studies.acceptance.rendered.image_tiers import IMAGE_TIERS, TierData
     from studies.acceptance.rendered.scored_frames import METHODS
 
-    plans = plan_images(order)
+    plans = plan_images(options)
     _check_engines([plan for _, plan in plans])
-    rows: list[BarRow] = []
+    rows: list[AcceptanceRow] = []
     for light, plan in plans:
         folder = out.joinpath(*plan.names)
-        sha256 = _render(plan, folder, order, report)
+        sha256 = _render(plan, folder, options, report)
         estimates = _navigated(folder, "estimates", sha256, METHODS, NavigationOptions(), report)
         result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
-        measured = IMAGE_TIERS[order.tier](TierData(light, folder / "dataset", estimates, result))
+        measured = IMAGE_TIERS[options.tier](TierData(light, folder / "dataset", estimates, result))
         by_engine = "".join(f"{name}, " for name in plan.names[:-1])
         rows += [row.model_copy(update={"quantity": by_engine + row.quantity}) for row in measured]
     return rows
 
 
-def plan_images(order: BarsOrder) -> list[tuple[Literal["day", "dusk"], PlannedData]]:
+def plan_images(options: AcceptanceOptions) -> list[tuple[LightLevel, PlannedData]]:
     """The datasets to make; an engine has folders of its own where it is asked for by name.
 
     Raises:
         ValueError: no such engine, or a wrong number.
     """
-    from studies.acceptance.rendered.image_tiers import recipe_of
-
     plans = []
-    for engine in order.engines or (None,):
-        for light in order.lights:
-            source = open_recipe(recipe_of(order.tier, light), order.seed, engine)
+    for engine in options.engines or (None,):
+        for light in options.lights:
+            source = open_recipe(recipe_of(options.tier, light), options.seed, engine)
             recipe = source.recipe
             stations = len(recipe.distance.stations_m or ())
             most = recipe.frames.count // stations
-            pairs = most if order.pairs_per_station is None else order.pairs_per_station
+            pairs = most if options.pairs_per_station is None else options.pairs_per_station
             if not 1 <= pairs <= most:
                 raise ValueError(f"--pairs-per-station: must be from 1 to {most}, got {pairs}")
             names = (light,) if engine is None else (engine, light)
@@ -164,18 +165,18 @@ def plan_images(order: BarsOrder) -> list[tuple[Literal["day", "dusk"], PlannedD
     return plans
 
 
-def _timed_pairs(order: BarsOrder, out: Path, report: ProgressReport) -> Path:
+def _timed_pairs(options: AcceptanceOptions, out: Path, report: ProgressReport) -> Path:
     """A dataset of analytic pairs by day at every distance."""
-    from studies.acceptance.rendered.image_tiers import recipe_of
-
-    source = open_recipe(recipe_of("a", "day"), order.seed, None)
+    source = open_recipe(recipe_of("a", "day"), options.seed, None)
     plan = PlannedData(source, _TIMED_PAIRS * len(source.recipe.distance.stations_m or ()), ())
-    _render(plan, out, order, report)
+    _render(plan, out, options, report)
     return out / "dataset"
 
 
-def flight_bars(order: BarsOrder, data: Sequence[FlightData], out: Path, report: ProgressReport) -> list[BarRow]:
-    """Measure the bars of whole flights, dataset by dataset; a wrong order is found before anything is made.
+def measure_flight_tier(
+    options: AcceptanceOptions, data: Sequence[FlightData], out: Path, report: ProgressReport
+) -> list[AcceptanceRow]:
+    """Measure the criteria of whole flights, dataset by dataset; wrong options are found before anything is made.
 
     Raises:
         ValueError: no such recipe in the tier, engine, rig or tracker, a wrong number, or pairs that could not be made.
@@ -183,14 +184,14 @@ def flight_bars(order: BarsOrder, data: Sequence[FlightData], out: Path, report:
     """
     from nav.tracking.tracker import tracker_names
 
-    if order.flights.tracker not in tracker_names():
-        raise ValueError(f"--tracker: must be one of {', '.join(tracker_names())}, got {order.flights.tracker!r}")
-    plans = plan_flights(order, data)
+    if options.flights.tracker not in tracker_names():
+        raise ValueError(f"--tracker: must be one of {', '.join(tracker_names())}, got {options.flights.tracker!r}")
+    plans = plan_flights(options, data)
     _check_engines([plan for _, plan in plans])
-    return [row for each, plan in plans for row in _flight_rows(order, each, plan, out, report)]
+    return [row for each, plan in plans for row in _flight_rows(options, each, plan, out, report)]
 
 
-def plan_flights(order: BarsOrder, data: Sequence[FlightData]) -> list[tuple[FlightData, PlannedData]]:
+def plan_flights(options: AcceptanceOptions, data: Sequence[FlightData]) -> list[tuple[FlightData, PlannedData]]:
     """The datasets to make. The first sequences of a recipe are the same however many are asked for.
 
     That holds up to a full measurement; beyond it the recipe is another.
@@ -200,10 +201,10 @@ def plan_flights(order: BarsOrder, data: Sequence[FlightData]) -> list[tuple[Fli
     """
     from studies.acceptance.rendered.flight_tiers import part_length, with_parts
 
-    flights, names = order.flights, [each.recipe for each in data]
+    flights, names = options.flights, [each.recipe for each in data]
     for name in flights.recipes:
         if name not in names:
-            raise ValueError(f"--recipe: {order.tier} has none named {name!r}; there are {', '.join(names)}")
+            raise ValueError(f"--recipe: {options.tier} has none named {name!r}; there are {', '.join(names)}")
     if flights.sequences is not None and flights.sequences < 1:
         raise ValueError(f"--sequences: must be at least 1, got {flights.sequences}")
     plans = []
@@ -211,8 +212,8 @@ def plan_flights(order: BarsOrder, data: Sequence[FlightData]) -> list[tuple[Fli
         if flights.recipes and each.recipe not in flights.recipes:
             continue
         parts = each.parts if flights.sequences is None else flights.sequences
-        for engine in order.engines or (None,):
-            source = open_recipe(each.recipe, order.seed, engine)
+        for engine in options.engines or (None,):
+            source = open_recipe(each.recipe, options.seed, engine)
             recipe = with_parts(source.recipe, max(each.parts, parts))
             for rig in flights.rigs if each.follows else (DEFAULT_RIG,):
                 made = recipe.render.engine, recipe.name, *([] if rig == DEFAULT_RIG else [rig])
@@ -222,17 +223,17 @@ def plan_flights(order: BarsOrder, data: Sequence[FlightData]) -> list[tuple[Fli
 
 
 def _flight_rows(
-    order: BarsOrder, data: FlightData, plan: PlannedData, out: Path, report: ProgressReport
-) -> list[BarRow]:
+    options: AcceptanceOptions, data: FlightData, plan: PlannedData, out: Path, report: ProgressReport
+) -> list[AcceptanceRow]:
     """The rows of one dataset."""
     from nav.runner import method_names
-    from studies.acceptance.rendered.flight_tiers import following_rows, speed_rows
+    from studies.acceptance.rendered.flight_tiers import processing_time_rows, tracking_filter_rows
     from studies.acceptance.rendered.scored_frames import BEST, METHODS
     from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
 
-    title, folder, is_beside = ", ".join(plan.names), out.joinpath(*plan.names), len(plan.names) > _NAMES_OF_BARS
-    sha256 = _render(plan, folder, order, report)
-    tracked = NavigationOptions(tracker=order.flights.tracker, filtered=True) if data.follows else NavigationOptions()
+    title, folder, is_beside = ", ".join(plan.names), out.joinpath(*plan.names), len(plan.names) > _NAMES_OF_CRITERIA
+    sha256 = _render(plan, folder, options, report)
+    tracked = NavigationOptions(tracker=options.flights.tracker, filtered=True) if data.follows else NavigationOptions()
     estimates = _navigated(folder, "estimates", sha256, METHODS, tracked, report)
     result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
     scores = score_pairs(folder / "dataset", estimates)
@@ -240,12 +241,12 @@ def _flight_rows(
     scores = {name: scores[name] for name in (*METHODS, FILTERED) if name in scores}
     rows = data.rows(title, scores, is_beside)
     if data.follows:
-        rows += following_rows(title, scores, result)
+        rows += tracking_filter_rows(title, scores, result)
     untracked = f"{title}, detector at every pair"
     if data.times:
-        rows += speed_rows(f"{title}, {order.flights.tracker}", scores[FILTERED], is_beside)
+        rows += processing_time_rows(f"{title}, {options.flights.tracker}", scores[FILTERED], is_beside)
         alone = _navigated(folder, "detector-alone", sha256, (BEST,), NavigationOptions(filtered=True), report)
-        rows += speed_rows(untracked, score_pairs(folder / "dataset", alone)[FILTERED], True)
+        rows += processing_time_rows(untracked, score_pairs(folder / "dataset", alone)[FILTERED], True)
     if data.compares:
         # Apart, so that the time of many methods is in that of no pair above.
         all_methods = _navigated(folder, "all-methods", sha256, method_names(), NavigationOptions(), report)
@@ -290,20 +291,21 @@ def _with_rig(recipe: Recipe, rig: str) -> Recipe:
         raise ValueError(f"--rig {rig}: {error}") from error
 
 
-def _render(plan: PlannedData, folder: Path, order: BarsOrder, report: ProgressReport) -> str:
+def _render(plan: PlannedData, folder: Path, options: AcceptanceOptions, report: ProgressReport) -> str:
     """Make what is missing of a dataset's first pairs; its hash.
 
     Raises:
-        ValueError: pairs could not be made; without them bars would look better than they are.
+        ValueError: pairs could not be made; without them criteria would look better than they are.
     """
     dataset = folder / "dataset"
     report.say(f"{folder.name}: rendering {plan.count} pairs of {plan.source.recipe.name} into {dataset}")
-    made = render_frames(plan.source, dataset, range(plan.count), ExecutionOptions(order.workers), report)
+    made = render_frames(plan.source, dataset, range(plan.count), ExecutionOptions(options.workers), report)
     if made.drops:
         first = min(made.drops, key=lambda drop: drop.frame_index)
         raise ValueError(
             f"{dataset}: {len(made.drops)} pairs could not be made, pair {first.frame_index} the first: "
-            f"{first.reason}; bars count every pair: change the recipe or the seed, or run again if it was an accident"
+            f"{first.reason}; the criteria count every pair: change the recipe or the seed, or run it again if "
+            "the failure was an accident"
         )
     return made.dataset_sha256
 

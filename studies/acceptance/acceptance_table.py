@@ -1,4 +1,4 @@
-"""Bars with what was measured, as a table for people and for programs."""
+"""Criteria with what was measured, as a table for people and for programs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 from pydantic import BaseModel, ConfigDict
 
-GOAL, BESIDE = "goal", "beside"
+GOAL, COMPARISON = "goal", "beside"
 
 
-class BarRow(BaseModel):
-    """One bar.
+class AcceptanceRow(BaseModel):
+    """One criterion.
 
     Attributes:
         bar: its number in docs/explanation/acceptance.md, `goal` for an aim that is not demanded, or `beside` for a
@@ -21,7 +21,7 @@ class BarRow(BaseModel):
         measured: None where nothing could be measured.
         limit_low, limit_high: one-sided 95 % limits of what is measured.
         n: how many numbers it rests on.
-        met: whether the limits lie within the bar; False where nothing could be measured.
+        met: whether the limits lie within the criterion; False where nothing could be measured.
         note: what the reader should know, in one sentence; empty when there is nothing.
     """
 
@@ -39,14 +39,14 @@ class BarRow(BaseModel):
     note: str = ""
 
 
-class BarTable(BaseModel):
-    """All bars of one tier.
+class AcceptanceTable(BaseModel):
+    """All criteria of one tier.
 
     Attributes:
         tier: its name.
         seed: of everything drawn.
         code_version: of this package.
-        rows: the bars.
+        rows: the criteria.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -54,11 +54,11 @@ class BarTable(BaseModel):
     tier: str
     seed: int
     code_version: str
-    rows: tuple[BarRow, ...]
+    rows: tuple[AcceptanceRow, ...]
 
     @property
     def missed(self) -> int:
-        """How many numbered bars are not met."""
+        """How many numbered criteria are not met."""
         return sum(not row.met for row in self.rows if row.bar not in _WITHOUT_NUMBER)
 
     def to_json(self) -> str:
@@ -83,24 +83,26 @@ class BarTable(BaseModel):
         return [_row_cells(row) for row in self.rows]
 
 
-_WITHOUT_NUMBER = (GOAL, BESIDE)
+_WITHOUT_NUMBER = (GOAL, COMPARISON)
 _HEADINGS = ["bar", "quantity", "must be", "measured", "95 % limit", "n", "met", "note"]
 
 
-def at_most(bar: str, quantity: str, high: float, measured: tuple[float, float], n: int, note: str = "") -> BarRow:
+def at_most(
+    bar: str, quantity: str, high: float, measured: tuple[float, float], n: int, note: str = ""
+) -> AcceptanceRow:
     """A quantity that must not exceed `high`; `measured` is its value and upper limit."""
     value, limit = measured
-    return BarRow(
+    return AcceptanceRow(
         bar=bar, quantity=quantity, high=high, measured=value, limit_high=limit, n=n, met=limit <= high, note=note
     )
 
 
 def between(
     bar: str, quantity: str, wanted: tuple[float, float], measured: tuple[float, float, float], n: int
-) -> BarRow:
-    """A quantity with a bar on either side; `measured` is its value, lower and upper limit."""
+) -> AcceptanceRow:
+    """A quantity with a criterion on either side; `measured` is its value, lower and upper limit."""
     (low, high), (value, limit_low, limit_high) = wanted, measured
-    return BarRow(
+    return AcceptanceRow(
         bar=bar,
         quantity=quantity,
         low=low,
@@ -113,12 +115,12 @@ def between(
     )
 
 
-def not_measured(bar: str, quantity: str, high: float, note: str) -> BarRow:
-    """A bar for which there is nothing to measure, and why; it counts as missed."""
-    return BarRow(bar=bar, quantity=quantity, high=high, measured=None, n=0, met=False, note=note)
+def not_measured(bar: str, quantity: str, high: float, note: str) -> AcceptanceRow:
+    """A criterion for which there is nothing to measure, and why; it counts as missed."""
+    return AcceptanceRow(bar=bar, quantity=quantity, high=high, measured=None, n=0, met=False, note=note)
 
 
-def _row_cells(row: BarRow) -> list[str]:
+def _row_cells(row: AcceptanceRow) -> list[str]:
     wanted = f"<= {row.high:.4g}" if row.low is None else f"{row.low:.4g} to {row.high:.4g}"
     measured = "-" if row.measured is None else f"{row.measured:.4g}"
     limits = [f"{limit:.4g}" for limit in (row.limit_low, row.limit_high) if limit is not None]

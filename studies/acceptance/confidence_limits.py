@@ -12,18 +12,18 @@ from datasets_manifest.random_streams import named_generator
 from droguekit.benchmark.confidence_intervals import CONFIDENCE, RESAMPLES, rms_upper_limit
 from geometry.se3 import Array
 
-Limited = tuple[float, float]
+ValueWithLimit = tuple[float, float]
 """A value and its upper limit."""
 
 
-def rms_limit(values: ArrayLike) -> Limited:
+def rms_limit(values: ArrayLike) -> ValueWithLimit:
     """Root mean square of normal errors about zero."""
     errors = np.asarray(values, dtype=np.float64)
     rms = float(np.sqrt(np.mean(np.square(errors))))
     return rms, rms_upper_limit(rms, errors.size)
 
 
-def mean_limit(values: ArrayLike) -> Limited:
+def mean_limit(values: ArrayLike) -> ValueWithLimit:
     """Mean, by Student's law; no limit but the value itself with a single number."""
     numbers = np.asarray(values, dtype=np.float64)
     mean, count = float(numbers.mean()), numbers.size
@@ -32,19 +32,19 @@ def mean_limit(values: ArrayLike) -> Limited:
     return mean, mean + float(t.ppf(CONFIDENCE, count - 1) * numbers.std(ddof=1) / np.sqrt(count))
 
 
-def size_of_mean_limit(blocks: Array) -> Limited:
+def absolute_mean_limit(blocks: Array) -> ValueWithLimit:
     """Absolute value of a mean, from one mean for each independent block."""
     mean = float(blocks.mean())
     _, high = mean_limit(blocks)
     return abs(mean), abs(mean) + (high - mean)
 
 
-def share_limit(hits: int, count: int) -> Limited:
+def share_limit(hits: int, count: int) -> ValueWithLimit:
     """A share, by the binomial law (C. Clopper, E. Pearson, Biometrika 26 (1934) 404, doi:10.1093/biomet/26.4.404)."""
     return hits / count, 1.0 if hits == count else float(beta.ppf(CONFIDENCE, hits + 1, count - hits))
 
 
-def percentile_limit(values: ArrayLike, percent: float) -> Limited:
+def percentile_limit(values: ArrayLike, percent: float) -> ValueWithLimit:
     """Percentile of absolute values, and the smallest order statistic that covers the true one with 95 %.
 
     With too few values none does, and the largest stands in.
@@ -54,7 +54,7 @@ def percentile_limit(values: ArrayLike, percent: float) -> Limited:
     return float(np.percentile(ordered, percent)), float(ordered[min(rank, ordered.size - 1)])
 
 
-def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> Limited:
+def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> ValueWithLimit:
     """Ratio of two positive means over the same frames, by Student's law of its logarithm to first order.
 
     Args:
@@ -67,14 +67,14 @@ def paired_ratio_limit(above: ArrayLike, below: ArrayLike) -> Limited:
     return ratio, ratio * float(np.exp(t.ppf(CONFIDENCE, blocks - 1) * error))
 
 
-def rms_ratio_limit(above: tuple[float, int], below: tuple[float, int]) -> Limited:
+def rms_ratio_limit(above: tuple[float, int], below: tuple[float, int]) -> ValueWithLimit:
     """Ratio of two root mean squares of normal errors, each given with the number of values."""
     ratio = above[0] / below[0]
     variance = sum(1 / (2 * count) for _, count in (above, below))
     return ratio, ratio * float(np.exp(norm.ppf(CONFIDENCE) * np.sqrt(variance)))
 
 
-def paired_rms_ratio_limit(above: float, below: float, correlation: float, count: int) -> Limited:
+def paired_rms_ratio_limit(above: float, below: float, correlation: float, count: int) -> ValueWithLimit:
     """Ratio of root mean squares of two normal errors in the same frames.
 
     The logarithms of two such root mean squares have a difference of variance `(1 - correlation^2) / count`.
@@ -99,7 +99,7 @@ def nees_limits(per_freedom: float, freedom: int) -> tuple[float, float, float]:
     return per_freedom, per_freedom - float(reach), per_freedom + float(reach)
 
 
-def block_mean_limit(values: ArrayLike, blocks: Sequence[int]) -> Limited:
+def block_mean_limit(values: ArrayLike, blocks: Sequence[int]) -> ValueWithLimit:
     """Mean, with the larger of the limits by the scatter of the blocks about it and by that of the values.
 
     Args:
@@ -119,7 +119,7 @@ def block_mean_limit(values: ArrayLike, blocks: Sequence[int]) -> Limited:
     return mean, max(limit, mean + float(t.ppf(CONFIDENCE, len(counts) - 1)) * error)
 
 
-def block_share_limit(hits: ArrayLike, blocks: Sequence[int]) -> Limited:
+def block_share_limit(hits: ArrayLike, blocks: Sequence[int]) -> ValueWithLimit:
     """A share, with the larger of the limits by blocks and by the binomial law; of a single block by the latter."""
     numbers = np.asarray(hits, dtype=np.float64)
     share, limit = share_limit(int(numbers.sum()), numbers.size)
@@ -128,13 +128,13 @@ def block_share_limit(hits: ArrayLike, blocks: Sequence[int]) -> Limited:
     return share, min(1.0, max(limit, block_mean_limit(numbers, blocks)[1]))
 
 
-def block_rms_limit(errors: ArrayLike, blocks: Sequence[int]) -> Limited:
+def block_rms_limit(errors: ArrayLike, blocks: Sequence[int]) -> ValueWithLimit:
     """Root mean square, from the limit of the mean square."""
     mean, limit = block_mean_limit(np.square(np.asarray(errors, dtype=np.float64)), blocks)
     return float(np.sqrt(mean)), float(np.sqrt(limit))
 
 
-def block_percentile_limit(values: ArrayLike, blocks: Sequence[int], percent: float, key: str) -> Limited:
+def block_percentile_limit(values: ArrayLike, blocks: Sequence[int], percent: float, key: str) -> ValueWithLimit:
     """Percentile of absolute values, with the larger of the limits by resampled blocks and by order statistics.
 
     Args:

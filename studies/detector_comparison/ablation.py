@@ -15,9 +15,9 @@ from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset, read_blind_index
 from datasets_manifest.types.images import StereoImages
 from droguekit.benchmark.detection.detection_metrics import Evaluation
-from droguekit.benchmark.detection.detection_tables import share
+from droguekit.benchmark.detection.detection_tables import percent_text
 from droguekit.benchmark.detection.detection_truth import ImageTruth, read_detection_truth
-from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorRunner
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, Detector, StereoDetection
 from nav.detector.input_image import input_image
@@ -150,7 +150,7 @@ def _test_precision(dataset: Path, detector: Detector, images: Sequence[ImageTru
     """Average precision on some images by the rules of our benchmark; None without images."""
     if not images:
         return None
-    detecting = DetectorPass(dataset, lambda drogue: detector, sorted({image.frame_index for image in images}))
+    detecting = DetectorRunner(dataset, lambda drogue: detector, sorted({image.frame_index for image in images}))
     boxes = list(detecting.boxes(LEAST_SCORE, lambda: None))
     return Evaluation(images, boxes).average_precision(images)._asdict()
 
@@ -162,7 +162,7 @@ def ablation_lines(rows: dict[str, dict[str, Any]]) -> list[str]:
     ]
     for name, row in rows.items():
         test = row["test"]
-        ap50, ap = (share(None if test is None else test[key]) for key in ("ap50", "ap"))
+        ap50, ap = (percent_text(None if test is None else test[key]) for key in ("ap50", "ap"))
         lines.append(
             f"{name:<12} {row['parameters']:>11,} {row['gflops_per_image']:7.2f} {ap50:>8} {ap:>8} "
             f"{row['wall_ms'][0]:10.1f} {row['cpu_ms'][0]:9.1f}"

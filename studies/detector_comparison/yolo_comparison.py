@@ -14,7 +14,7 @@ from typing import Any
 from datasets_manifest.atomic import try_lock, write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
-from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorRunner
 from droguekit.benchmark.results.detection_result import write_detections
 from nav.detector.detector import Detector
 from nav.detector.onnx_cost import network_cost
@@ -242,7 +242,7 @@ def _scores(
 
 
 def _detect(corpus: Path, detector: Detector, file: Path) -> None:
-    detecting = DetectorPass(corpus, lambda drogue: detector)
+    detecting = DetectorRunner(corpus, lambda drogue: detector)
     write_detections(file, detecting.boxes(LEAST_SCORE, lambda: None))
 
 

@@ -19,11 +19,11 @@ from droguekit.benchmark.poses.drogue_truth import VISIBLE_FRACTION, drogue_trut
 from droguekit.benchmark.poses.pose_errors import pose_error
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import Array, RigidTransform
-from studies.paper.paper_inputs import NavigatedData, read_estimates_file
+from studies.paper.paper_inputs import ExperimentData, read_estimates_file
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class DockingRun:
     """One sequence over its image number.
 
     Attributes:
@@ -41,7 +41,7 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False)
-class DockingData(NavigatedData):
+class DockingData(ExperimentData):
     """Everything that the page needs of the docking runs.
 
     Attributes:
@@ -72,7 +72,7 @@ class DockingData(NavigatedData):
         ids = {record.sequence_id for record in self.records.values()}
         return sorted(ids, key=lambda number: (number is None, number or 0))
 
-    def run(self, sequence_id: int | None) -> Run:
+    def run(self, sequence_id: int | None) -> DockingRun:
         """One sequence.
 
         Raises:
@@ -89,7 +89,7 @@ class DockingData(NavigatedData):
             nothing = np.full(5, np.nan)
             errors[contender.method] = np.array([found.get(index, nothing) for index in indices])
         truth = np.array([_pose(self.records[index]).translation_m for index in indices])
-        return Run(sequence_id, np.array(indices) - self.first_frames[sequence_id], truth, errors)
+        return DockingRun(sequence_id, np.array(indices) - self.first_frames[sequence_id], truth, errors)
 
 
 def read_docking(dataset: Location, estimates: Path) -> DockingData:
@@ -121,7 +121,7 @@ LEAST_MARKERS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class ChosenScores:
+class SubsetScores:
     """A method over some pairs; errors are over those with a pose, and None without any.
 
     Attributes:
@@ -148,7 +148,7 @@ def frames_in_view(records: Mapping[int, PairRecord]) -> list[int]:
     ]
 
 
-def chosen_scores(errors: Mapping[int, Array], frames: Sequence[int], key: str) -> ChosenScores:
+def subset_scores(errors: Mapping[int, Array], frames: Sequence[int], key: str) -> SubsetScores:
     """Scores over some pairs, of which there is at least one.
 
     Args:
@@ -158,11 +158,11 @@ def chosen_scores(errors: Mapping[int, Array], frames: Sequence[int], key: str) 
     """
     rows = np.array([errors[index] for index in frames if index in errors])
     if not len(rows):
-        return ChosenScores(0.0)
+        return SubsetScores(0.0)
     lengths = np.linalg.norm(rows[:, :3], axis=1)
     means, _ = bootstrap_intervals(lengths[:, None], (99.0,), key)
     sizes = np.abs(rows)
-    return ChosenScores(
+    return SubsetScores(
         fix_fraction=len(rows) / len(frames),
         mean_m=float(lengths.mean()),
         interval_m=(float(means[0, 0]), float(means[0, 1])),

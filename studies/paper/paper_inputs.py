@@ -12,7 +12,7 @@ from pathlib import Path
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, read_estimates
-from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from studies.paper.published_results import CONTENDERS, Contender, present
 
 _PACKAGES = ("datasets_manifest", "drogue_models", "droguekit", "geometry", "labelgen", "nav", "render", "scenes")
@@ -87,7 +87,7 @@ class EstimatesFile:
 
 
 @dataclass(frozen=True, eq=False)
-class NavigatedData:
+class ExperimentData:
     """A dataset with estimates.
 
     Attributes:
@@ -121,7 +121,7 @@ def read_estimates_file(path: Path, frame_indices: Sequence[int]) -> EstimatesFi
         ValueError: the file cannot be read, names other frames than the dataset's, or holds none of the contenders.
     """
     names = [contender.method for contender in CONTENDERS]
-    found = by_method(read_estimates(path), frame_indices, str(path))
+    found = estimates_by_method(read_estimates(path), frame_indices, str(path))
     methods = {name: estimates for name, estimates in found.items() if name in names}
     if not methods:
         raise ValueError(

@@ -19,9 +19,9 @@ from droguekit.benchmark.detection.detection_figures import is_timed, speed_pane
 from droguekit.benchmark.report.figures import MethodStyle, legend_key, method_styles
 from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
 from droguekit.benchmark.results.detection_result import DetectionResult
-from droguekit.benchmark.sequences.sequence_latency import worked_s
+from droguekit.benchmark.sequences.sequence_latency import processing_time_s
 from studies.paper.corpus_figures import CorpusBoxes, place_panel, read_corpus, shape_panel, size_panel
-from studies.paper.docking_experiment import DockingData, Run, read_docking
+from studies.paper.docking_experiment import DockingData, DockingRun, read_docking
 from studies.paper.paper_inputs import code_facts, dataset_facts, file_sha256
 from studies.paper.paper_tables import (
     Claim,
@@ -118,7 +118,7 @@ def speed_figures(result: DetectionResult) -> list[FigureGroup]:
     ]
 
 
-def docking_figures(docking: DockingData, run: Run, number: int) -> list[FigureGroup]:
+def docking_figures(docking: DockingData, run: DockingRun, number: int) -> list[FigureGroup]:
     """The paper's Figures 16 to 18; `number` tells those of several datasets apart."""
     chosen = docking.contenders
     own = [contender for contender in chosen if contender.method in (OURS, FILTERED)]
@@ -207,7 +207,7 @@ def time_rows(docking: DockingData) -> list[list[str]]:
         for estimate in estimates:
             for stage, seconds in estimate.stage_s.items():
                 stages.setdefault(stage, []).append(1e3 * seconds)
-        work = [worked_s(estimate.stage_s) for estimate in estimates]
+        work = [processing_time_s(estimate.stage_s) for estimate in estimates]
         totals = [1e3 * work_s for work_s in work if work_s is not None]
         if totals or told:
             timed = sum(bool(estimate.stage_s) for estimate in estimates)
@@ -248,11 +248,11 @@ def _key(name: str, style: MethodStyle) -> Markup:
     return Markup(re.sub(r"([\"#])key-", rf"\g<1>{plain}-key-", legend_key(style)))
 
 
-def _ends(run: Run) -> str:
+def _ends(run: DockingRun) -> str:
     return " to ".join(plain_number(float(z)) for z in (run.truth[0, 2], run.truth[-1, 2]))
 
 
-class Navigated(NamedTuple):
+class DatasetWithEstimates(NamedTuple):
     """A dataset with the estimates that were made on it."""
 
     dataset: Location
@@ -271,14 +271,14 @@ class ReportInputs:
         corpus: the detectors' dataset.
     """
 
-    docking: tuple[Navigated, ...] = ()
+    docking: tuple[DatasetWithEstimates, ...] = ()
     docking_sequence: int | None = None
-    semi_physical: tuple[Navigated, ...] = ()
+    semi_physical: tuple[DatasetWithEstimates, ...] = ()
     detection: Path | None = None
     corpus: Location | None = None
 
 
-class LeftOut(NamedTuple):
+class MissingPart(NamedTuple):
     """A part that is not on the page, and the commands that make its input."""
 
     what: str
@@ -309,7 +309,7 @@ def build_page(inputs: ReportInputs) -> str:
         paper=TITLE,
         contradiction=CONTRADICTION,
         claims=_claims(docking, bench, detection),
-        left_out=left_out(inputs),
+        missing_parts=missing_parts(inputs),
         detection=None if detection is None else table_1(detection),
         detection_figures=[
             *([] if corpus is None else corpus_figures(corpus)),
@@ -343,7 +343,7 @@ def read_detection(path: Path) -> DetectionResult:
     return result
 
 
-def left_out(inputs: ReportInputs) -> list[LeftOut]:
+def missing_parts(inputs: ReportInputs) -> list[MissingPart]:
     """The parts whose inputs are missing."""
     docking = (
         "droguekit render docking-10m --out docking",
@@ -355,13 +355,13 @@ def left_out(inputs: ReportInputs) -> list[LeftOut]:
     )
     scores = ("droguekit benchmark CORPUS --detector NETWORK.onnx --json detection.json",)
     parts = [
-        (inputs.corpus, LeftOut("Figure 10", ("droguekit render paper-corpus --out corpus",), "--corpus corpus")),
-        (inputs.detection, LeftOut("Table 1 and Figure 11", scores, "--detection detection.json")),
+        (inputs.corpus, MissingPart("Figure 10", ("droguekit render paper-corpus --out corpus",), "--corpus corpus")),
+        (inputs.detection, MissingPart("Table 1 and Figure 11", scores, "--detection detection.json")),
         (
             inputs.docking,
-            LeftOut("Figures 16 to 18, worst frames and times", docking, "--docking docking:docking.jsonl"),
+            MissingPart("Figures 16 to 18, worst frames and times", docking, "--docking docking:docking.jsonl"),
         ),
-        (inputs.semi_physical, LeftOut("Table 2 and Figure 19", bench, "--semi-physical bench-7:bench-7.jsonl")),
+        (inputs.semi_physical, MissingPart("Table 2 and Figure 19", bench, "--semi-physical bench-7:bench-7.jsonl")),
     ]
     return [part for given, part in parts if not given]
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from droguekit.benchmark.detection.detection_figures import published_name
 from droguekit.benchmark.detection.detection_report import best_detector
-from droguekit.benchmark.detection.detection_tables import PUBLISHED_DETECTORS, share
+from droguekit.benchmark.detection.detection_tables import PUBLISHED_DETECTORS, percent_text
 from droguekit.benchmark.report.number_text import ABSENT, interval_text, millimetres, percent, three_digits
-from droguekit.benchmark.results.benchmark_result import MethodResult, Row
+from droguekit.benchmark.results.benchmark_result import MethodResult, PoseRow
 from droguekit.benchmark.results.detection_result import DetectionResult, DetectorResult
 from geometry.se3 import Array
-from studies.paper.docking_experiment import LEAST_MARKERS, DockingData, chosen_scores, frames_in_view
+from studies.paper.docking_experiment import LEAST_MARKERS, DockingData, frames_in_view, subset_scores
 from studies.paper.pose_figures import published_row
 from studies.paper.published_results import (
     ANGLE_LIMIT_DEG,
@@ -151,7 +151,7 @@ def _detector_cells(name: str, detector: DetectorResult) -> list[str]:
     row, times = detector.overall, detector.times
     return [
         name,
-        *map(share, (row.precision, row.recall, row.ap50)),
+        *map(percent_text, (row.precision, row.recall, row.ap50)),
         ABSENT if detector.gflops_per_image is None else three_digits(detector.gflops_per_image),
         ABSENT if times is None else three_digits(times.wall_ms / 2000),
     ]
@@ -200,7 +200,7 @@ def _docking_cells(contender: Contender, method: MethodResult) -> list[str]:
 
 
 def _chosen_cells(docking: DockingData, contender: Contender, frames: Sequence[int]) -> list[str]:
-    scores = chosen_scores(docking.pose_errors(contender.method), frames, f"in view, {contender.method}")
+    scores = subset_scores(docking.pose_errors(contender.method), frames, f"in view, {contender.method}")
     largest = [None] * 3 if scores.largest_m is None else scores.largest_m.tolist()
     angles = [None] * 2 if scores.angles_p99_deg is None else scores.angles_p99_deg.tolist()
     return [
@@ -280,7 +280,7 @@ def detection_claims(result: DetectionResult) -> list[Claim]:
             "named in the file)"
         )
     return [
-        Claim(f"{what}: mAP at overlap 0.5", share(DETECTION_MAP), share(detector.overall.ap50), ABSENT),
+        Claim(f"{what}: mAP at overlap 0.5", percent_text(DETECTION_MAP), percent_text(detector.overall.ap50), ABSENT),
         Claim(f"{what}: speed", f"{DETECTION_FPS:g} images a second, Xavier AGX", speed, ABSENT),
     ]
 
@@ -304,19 +304,19 @@ def _of_stations(errors: StationErrors) -> str:
     return f"; poses in {errors.poses} of {errors.pairs} pairs, at {errors.stations_text} stations"
 
 
-def _mean(row: Row | None) -> str:
+def _mean(row: PoseRow | None) -> str:
     if row is None or row.position_mean_m is None:
         return ABSENT
     return f"{millimetres(row.position_mean_m)} mm ({interval_text(row.intervals.get('position_mean_m'), 1e3)})"
 
 
-def _largest(row: Row | None) -> str:
+def _largest(row: PoseRow | None) -> str:
     if row is None or row.x_max_m is None:
         return ABSENT
     return f"{', '.join(map(millimetres, (row.x_max_m, row.y_max_m, row.z_max_m)))} mm"
 
 
-def _angles(row: Row | None) -> str:
+def _angles(row: PoseRow | None) -> str:
     if row is None or row.pitch_p99_deg is None:
         return ABSENT
     return f"within {three_digits(row.pitch_p99_deg)}°, {three_digits(row.yaw_p99_deg)}°"

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from droguekit.benchmark.report.figures import INK, PANEL_IN, MethodStyle, drawing, svg_element
 from droguekit.benchmark.report.number_text import plain_number
 from geometry.se3 import Array
-from studies.paper.docking_experiment import Run
+from studies.paper.docking_experiment import DockingRun
 from studies.paper.published_results import (
     ANGLE_LIMIT_DEG,
     POSITION_LIMIT_M,
@@ -63,7 +63,7 @@ X, Y, Z, PITCH, YAW = (
 )
 
 
-def error_series(figure_name: str, run: Run, contenders: Sequence[Contender], quantity: SeriesQuantity) -> str:
+def error_series(figure_name: str, run: DockingRun, contenders: Sequence[Contender], quantity: SeriesQuantity) -> str:
     """Signed errors of some methods over the image number; what the paper claims as a dotted line where it fits in.
 
     Args:
@@ -92,7 +92,7 @@ def error_series(figure_name: str, run: Run, contenders: Sequence[Contender], qu
         return svg_element(figure, f"{figure_name}-{quantity.name}", label)
 
 
-def truth_series(figure_name: str, run: Run, contenders: Sequence[Contender], quantity: SeriesQuantity) -> str:
+def truth_series(figure_name: str, run: DockingRun, contenders: Sequence[Contender], quantity: SeriesQuantity) -> str:
     """True and estimated component over the image number; one of the first three.
 
     Returns:
@@ -115,7 +115,7 @@ def truth_series(figure_name: str, run: Run, contenders: Sequence[Contender], qu
         return svg_element(figure, f"{figure_name}-{quantity.name}", label)
 
 
-def length_series(figure_name: str, run: Run, contenders: Sequence[Contender]) -> str:
+def length_series(figure_name: str, run: DockingRun, contenders: Sequence[Contender]) -> str:
     """Length of the position error over the image number, logarithmic, so that all methods can be seen at once.
 
     Returns:
@@ -134,7 +134,7 @@ def length_series(figure_name: str, run: Run, contenders: Sequence[Contender]) -
         return svg_element(figure, f"{figure_name}-length", label)
 
 
-def _draw_series(axes: Axes, run: Run, values: Array, style: MethodStyle, order: int) -> None:
+def _draw_series(axes: Axes, run: DockingRun, values: Array, style: MethodStyle, order: int) -> None:
     """A line with gaps where there is no pose, or no pair; single poses stand as dots, and some bear the method's mark.
 
     Args:
@@ -169,7 +169,7 @@ def _reach(series: Sequence[Array]) -> float:
     return max(1.06 * most if most <= _FAR_LARGER * nearly else 1.25 * nearly, 1e-9)
 
 
-def _finish(axes: Axes, run: Run, title: str) -> None:
+def _finish(axes: Axes, run: DockingRun, title: str) -> None:
     axes.set_title(title, fontsize=10.5, loc="left")
     axes.set_xlabel("Image number")
     axes.set_xlim(run.numbers[0] - 0.5, run.numbers[-1] + 0.5)

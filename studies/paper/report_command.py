@@ -11,7 +11,7 @@ from datasets_manifest.storage.storage import as_location
 from droguekit.cli.arguments import Place, output_option
 
 if TYPE_CHECKING:
-    from studies.paper.paper_report import Navigated, ReportInputs
+    from studies.paper.paper_report import DatasetWithEstimates, ReportInputs
 
 EXAMPLES = (
     "droguekit report --docking data/docking:docking.jsonl --html report.html",
@@ -113,15 +113,15 @@ def _write(inputs: ReportInputs, html: Path | None, pdf: Path | None) -> None:
         typer.echo(f"wrote {pdf}")
 
 
-def _pair(option: str, text: str) -> Navigated:
+def _pair(option: str, text: str) -> DatasetWithEstimates:
     """A dataset and its estimates, divided at the last colon, for a URL has one too.
 
     Raises:
         ValueError: not of that form.
     """
-    from studies.paper.paper_report import Navigated
+    from studies.paper.paper_report import DatasetWithEstimates
 
     dataset, colon, estimates = text.rpartition(":")
     if not colon or not dataset or not estimates or estimates.startswith("//"):
         raise ValueError(f"{option}: must be DIR:FILE.jsonl, a dataset and its estimates, got {text!r}")
-    return Navigated(as_location(dataset), Path(estimates))
+    return DatasetWithEstimates(as_location(dataset), Path(estimates))

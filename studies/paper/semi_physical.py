@@ -14,7 +14,7 @@ from datasets_manifest.types.estimates import Estimate, Feature, PoseEstimate
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from geometry.se3 import Array
-from studies.paper.paper_inputs import NavigatedData, read_estimates_file
+from studies.paper.paper_inputs import ExperimentData, read_estimates_file
 
 # Centroids lie within a pixel of their markers. Five markers in the place of seven lie 10 degrees off in the median, on
 # a ring whose image has a radius of more than 40 px at 10 m: 7 px there and more elsewhere.
@@ -53,7 +53,7 @@ class StationErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class SemiPhysicalRun(NavigatedData):
+class SemiPhysicalRun(ExperimentData):
     """One dataset of the experiment.
 
     Attributes:

@@ -12,7 +12,7 @@ from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.pose_benchmark import run_benchmark, score
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
 from droguekit.benchmark.poses.drogue_truth import drogue_truth
-from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform, exp_twist
 
@@ -34,7 +34,7 @@ def shifted(pose: RigidTransform, offset_m: tuple[float, float, float]) -> Rigid
 
 def score_records(records: list[PairRecord], estimates: list[PoseEstimate | NoFix]) -> BenchmarkResult:
     truths = {record.frame_index: drogue_truth(record) for record in records}
-    return score(FACTS, truths, by_method(estimates, truths, "estimates"))
+    return score(FACTS, truths, estimates_by_method(estimates, truths, "estimates"))
 
 
 def test_the_json_has_the_fixed_keys(

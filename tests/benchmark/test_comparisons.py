@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from droguekit.benchmark.confidence_intervals import ratio_intervals
-from droguekit.benchmark.poses.method_comparison import PairGroups, compare
+from droguekit.benchmark.poses.method_comparison import PairGroups, compare_methods
 from droguekit.benchmark.poses.pose_errors import PoseError
 from droguekit.benchmark.poses.reference import DistanceBin
 
@@ -22,7 +22,7 @@ def test_ratios_are_of_means_over_common_frames() -> None:
         "a": {0: error(1.0), 1: error(3.0), 2: error(100.0)},
         "b": {0: error(4.0, 2.0), 1: error(4.0, 6.0), 3: error(500.0)},
     }
-    (pair,) = compare(errors, ["b"], groups(4))
+    (pair,) = compare_methods(errors, ["b"], groups(4))
     assert (pair.method, pair.against, pair.overall.n, pair.overall.blocks) == ("a", "b", 2, 2)
     assert pair.overall.position == pytest.approx(0.5)
     assert pair.overall.attitude == pytest.approx(0.25)
@@ -33,14 +33,14 @@ def test_ratios_are_of_means_over_common_frames() -> None:
 
 def test_every_method_is_compared_with_every_standard_once() -> None:
     errors = {name: {0: error(1.0), 1: error(2.0)} for name in ("a", "b", "c")}
-    pairs = compare(errors, ["a", "b", "a"], groups(2))
+    pairs = compare_methods(errors, ["a", "b", "a"], groups(2))
     assert [(pair.method, pair.against) for pair in pairs] == [("b", "a"), ("c", "a"), ("a", "b"), ("c", "b")]
     assert pairs[0].overall.position_interval == (1.0, 1.0)
 
 
 def test_a_perfect_standard_has_no_ratio() -> None:
     errors = {"a": {0: error(1.0), 1: error(1.0)}, "truth": {0: error(0.0, 0.0), 1: error(0.0, 0.0)}}
-    (pair,) = compare(errors, ["truth"], groups(2))
+    (pair,) = compare_methods(errors, ["truth"], groups(2))
     assert (pair.overall.position, pair.overall.position_interval) == (None, None)
 
 
@@ -51,7 +51,7 @@ def test_common_difficulty_cancels(rng: np.random.Generator) -> None:
         "a": {i: error(float(0.5 * s * rng.uniform(0.98, 1.02))) for i, s in enumerate(scale)},
         "b": {i: error(float(s)) for i, s in enumerate(scale)},
     }
-    low, high = compare(errors, ["b"], groups(40))[0].overall.position_interval
+    low, high = compare_methods(errors, ["b"], groups(40))[0].overall.position_interval
     assert 0.49 <= low <= 0.5 * 1.01
     assert high - low < 0.02
 
@@ -81,7 +81,7 @@ def test_frames_of_a_sequence_are_drawn_together(rng: np.random.Generator) -> No
 
 def test_one_sequence_has_no_interval() -> None:
     errors = {name: {i: error(1.0 + i) for i in range(6)} for name in ("a", "b")}
-    (pair,) = compare(errors, ["b"], groups(6, dict.fromkeys(range(6), 0)))
+    (pair,) = compare_methods(errors, ["b"], groups(6, dict.fromkeys(range(6), 0)))
     assert pair.overall.blocks == 1
     assert pair.overall.position == 1.0
     assert pair.overall.position_interval is None

@@ -26,7 +26,7 @@ from droguekit.benchmark.detection.detection_metrics import (
     resampled_precision,
 )
 from droguekit.benchmark.detection.detection_truth import ImageTruth
-from droguekit.benchmark.results.detection_result import FoundBox
+from droguekit.benchmark.results.detection_result import DetectedBox
 from geometry.stereo import EYES
 from nav.training.evaluation import best_threshold
 
@@ -47,11 +47,11 @@ def image(frame: int, scene: int = 0, eye: int = 0, box: PixelBox | None = BOX) 
     )
 
 
-def found(where: ImageTruth, score: float, box: PixelBox = BOX) -> FoundBox:
-    return FoundBox(where.image_id, box, score)
+def found(where: ImageTruth, score: float, box: PixelBox = BOX) -> DetectedBox:
+    return DetectedBox(where.image_id, box, score)
 
 
-def random_corpus(rng: np.random.Generator, frames: int = 60) -> tuple[list[ImageTruth], list[FoundBox]]:
+def random_corpus(rng: np.random.Generator, frames: int = 60) -> tuple[list[ImageTruth], list[DetectedBox]]:
     """Drogues with boxes that are more or less right, misses, doubles, false alarms; no two scores are equal."""
     images, boxes = [], []
     for frame in range(frames):
@@ -61,14 +61,14 @@ def random_corpus(rng: np.random.Generator, frames: int = 60) -> tuple[list[Imag
             images.append(image(frame, scene=frame // 6, eye=eye, box=box))
             for _ in range(rng.integers(0, 3) if box is not None else 0):
                 shift = rng.normal(0, 0.08 * size, 4)
-                boxes.append(FoundBox(images[-1].image_id, tuple(np.add(box, shift).tolist()), float(rng.uniform())))
+                boxes.append(DetectedBox(images[-1].image_id, tuple(np.add(box, shift).tolist()), float(rng.uniform())))
             for _ in range(rng.poisson(0.4)):
                 low = rng.uniform(0, 800, 2).tolist()
-                boxes.append(FoundBox(images[-1].image_id, (low[0], low[1], 50.0, 50.0), float(rng.uniform(0, 0.6))))
+                boxes.append(DetectedBox(images[-1].image_id, (low[0], low[1], 50.0, 50.0), float(rng.uniform(0, 0.6))))
     return images, boxes
 
 
-def judged(images: list[ImageTruth], boxes: list[FoundBox], folder: Path) -> COCOeval:
+def judged(images: list[ImageTruth], boxes: list[DetectedBox], folder: Path) -> COCOeval:
     """The same by pycocotools from files, with none of our code."""
     truth = {
         "images": [{"id": each.image_id} for each in images],

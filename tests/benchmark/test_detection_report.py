@@ -29,19 +29,19 @@ from droguekit.benchmark.detection.detection_report import (
     worst_misses,
     write_detection_report,
 )
-from droguekit.benchmark.detection.detection_scores import DetectorRun, ScoredDetections, score_detections
+from droguekit.benchmark.detection.detection_scores import DetectorOutput, ScoredDetections, score_detections
 from droguekit.benchmark.detection.detection_tables import (
     PUBLISHED_DETECTORS,
     SUMMARY_COLUMNS,
     SUMMARY_COLUMNS_MORE,
     detector_lines,
+    percent_text,
     published_rows,
-    share,
     summary_rows,
 )
 from droguekit.benchmark.detection.detection_truth import DetectionTruth, ImageTruth, read_detection_truth
 from droguekit.benchmark.report.label_drawing import BOX_RGB, MARKER_RGB
-from droguekit.benchmark.results.detection_result import DetectionResult, FoundBox, PairTimes
+from droguekit.benchmark.results.detection_result import DetectedBox, DetectionResult, PairTimes
 from geometry.stereo import EYES
 
 FALSE_BOX = (700.0, 40.0, 60.0, 60.0)
@@ -70,20 +70,22 @@ def corpus(scenes: int = 8, pairs: int = 40) -> DetectionTruth:
     return DetectionTruth("corpus", "0" * 64, tuple(images))
 
 
-def boxes_of(truth: DetectionTruth, missed: int = 0, false_score: float = 0.3) -> list[FoundBox]:
+def boxes_of(truth: DetectionTruth, missed: int = 0, false_score: float = 0.3) -> list[DetectedBox]:
     """Every drogue but every `missed`-th, and a false box in the left image of each empty pair."""
     boxes = []
     for k, image in enumerate(truth.images):
         if image.box_xywh is not None and not (missed and k % missed == 0):
-            boxes.append(FoundBox(image.image_id, image.box_xywh, 0.6 + 0.0001 * (k % 1000)))
+            boxes.append(DetectedBox(image.image_id, image.box_xywh, 0.6 + 0.0001 * (k % 1000)))
         elif image.is_known_empty and image.eye == "left":
-            boxes.append(FoundBox(image.image_id, FALSE_BOX, false_score))
+            boxes.append(DetectedBox(image.image_id, FALSE_BOX, false_score))
     return boxes
 
 
 def test_cells_add_up_to_the_whole() -> None:
     truth = corpus()
-    result = score_detections(truth, {"mine": DetectorRun(boxes_of(truth, missed=9))}, "all").result.detectors["mine"]
+    result = score_detections(truth, {"mine": DetectorOutput(boxes_of(truth, missed=9))}, "all").result.detectors[
+        "mine"
+    ]
     whole = result.overall
     for rows in (result.distances, result.families.values(), result.eyes.values(), result.splits.values()):
         assert sum(row.boxes for row in rows) == whole.boxes
@@ -95,7 +97,7 @@ def test_cells_add_up_to_the_whole() -> None:
 def test_the_test_split_is_scored_by_default_with_a_threshold_from_val() -> None:
     truth = corpus()
     low = [box._replace(score=0.9 * box.score) if k % 2 else box for k, box in enumerate(boxes_of(truth))]
-    scored = score_detections(truth, {"mine": DetectorRun(low)})
+    scored = score_detections(truth, {"mine": DetectorOutput(low)})
     detector = scored.result.detectors["mine"]
     assert (scored.result.dataset.split, detector.threshold_from) == ("test", "val")
     val_ids = {image.image_id for image in truth.images if image.split == "val" and image.box_xywh is not None}
@@ -107,7 +109,7 @@ def test_the_test_split_is_scored_by_default_with_a_threshold_from_val() -> None
 
 def test_a_given_threshold_goes_before_the_detectors_own_and_that_before_val() -> None:
     truth = corpus()
-    run = DetectorRun(boxes_of(truth), PairTimes(wall_ms=10, cpu_ms=9, pairs=4), 0.25)
+    run = DetectorOutput(boxes_of(truth), PairTimes(wall_ms=10, cpu_ms=9, pairs=4), 0.25)
     own = score_detections(truth, {"mine": run}).result.detectors["mine"]
     given = score_detections(truth, {"mine": run}, threshold=0.65).result.detectors["mine"]
     assert (own.operating_threshold, own.threshold_from, given.threshold_from) == (0.25, "detector", "given")
@@ -121,10 +123,10 @@ def test_a_given_threshold_goes_before_the_detectors_own_and_that_before_val() -
 def test_false_alarms_of_both_eyes_tell_no_more_than_those_of_one() -> None:
     truth = corpus()
     empty = [image for image in truth.images if image.is_known_empty and image.split == "test"]
-    left = [FoundBox(image.image_id, FALSE_BOX, 0.9) for image in empty[: len(empty) // 2] if image.eye == "left"]
+    left = [DetectedBox(image.image_id, FALSE_BOX, 0.9) for image in empty[: len(empty) // 2] if image.eye == "left"]
     both = left + [box._replace(image_id=box.image_id + 1) for box in left]
     alarms = [
-        score_detections(truth, {"mine": DetectorRun(boxes)}, "test", 0.5).result.detectors["mine"].false_alarms
+        score_detections(truth, {"mine": DetectorOutput(boxes)}, "test", 0.5).result.detectors["mine"].false_alarms
         for boxes in (left, both)
     ]
     assert alarms[0] is not None and alarms[1] is not None
@@ -138,7 +140,7 @@ def test_false_alarms_of_both_eyes_tell_no_more_than_those_of_one() -> None:
 
 def test_rows_with_little_behind_them_say_so() -> None:
     truth = corpus()
-    detector = score_detections(truth, {"mine": DetectorRun(boxes_of(truth))}, "all").result.detectors["mine"]
+    detector = score_detections(truth, {"mine": DetectorOutput(boxes_of(truth))}, "all").result.detectors["mine"]
     assert detector.overall.note is None
     assert detector.families["clear"].note == "fewer than 300 boxes, fewer than 5 scenes"
 
@@ -148,15 +150,15 @@ def test_what_cannot_be_scored_is_said() -> None:
     with pytest.raises(
         ValueError, match=r"--split: the dataset has no pairs of 'best'; it has test, train, val, or take all"
     ):
-        score_detections(truth, {"mine": DetectorRun([])}, "best")
+        score_detections(truth, {"mine": DetectorOutput([])}, "best")
     empty = replace(truth, images=tuple(image for image in truth.images if image.is_known_empty))
     with pytest.raises(ValueError, match="no image of the split 'test' shows a drogue that must be found"):
-        score_detections(empty, {"mine": DetectorRun([])})
+        score_detections(empty, {"mine": DetectorOutput([])})
 
 
 def test_a_detector_that_finds_nothing_has_a_result_and_figures() -> None:
     truth = corpus(pairs=10)
-    scored = score_detections(truth, {"blind": DetectorRun([])})
+    scored = score_detections(truth, {"blind": DetectorOutput([])})
     detector = scored.result.detectors["blind"]
     assert (detector.overall.ap, detector.overall.recall, detector.overall.precision) == (0.0, 0.0, None)
     assert detector.best_f1 is None
@@ -168,14 +170,14 @@ def test_a_detector_that_finds_nothing_has_a_result_and_figures() -> None:
 
 def test_json_comes_back_without_loss() -> None:
     truth = corpus(pairs=10)
-    result = score_detections(truth, {"mine": DetectorRun(boxes_of(truth))}).result
+    result = score_detections(truth, {"mine": DetectorOutput(boxes_of(truth))}).result
     assert DetectionResult.model_validate_json(result.to_json()) == result
 
 
 def test_panels_are_wellformed_and_their_ids_differ() -> None:
     truth = corpus(pairs=10)
     scored = score_detections(
-        truth, {"a<b $x": DetectorRun(boxes_of(truth)), "c": DetectorRun(boxes_of(truth, missed=3))}
+        truth, {"a<b $x": DetectorOutput(boxes_of(truth)), "c": DetectorOutput(boxes_of(truth, missed=3))}
     )
     matches = {name: evaluation.matches(scored.images) for name, evaluation in scored.evaluations.items()}
     assert not is_timed(scored.result)
@@ -204,7 +206,7 @@ def timed(scored: ScoredDetections) -> ScoredDetections:
 
 def test_speed_is_shown_beside_that_of_all_published_detectors() -> None:
     truth = corpus(pairs=10)
-    scored = timed(score_detections(truth, {"mine": DetectorRun(boxes_of(truth)), "file": DetectorRun([])}))
+    scored = timed(score_detections(truth, {"mine": DetectorOutput(boxes_of(truth)), "file": DetectorOutput([])}))
     panel = speed_panel(scored.result)
     for row in PUBLISHED_DETECTORS:
         assert panel.count(f">{published_name(row.name)}<") == 1
@@ -221,7 +223,7 @@ def test_misses_come_by_size_and_false_alarms_by_score() -> None:
     boxes = [
         box._replace(score=box.score / (1 + k)) for k, box in enumerate(boxes_of(truth, missed=4, false_score=0.9))
     ]
-    scored = score_detections(truth, {"mine": DetectorRun(boxes)}, "all")
+    scored = score_detections(truth, {"mine": DetectorOutput(boxes)}, "all")
     matches = scored.evaluations["mine"].matches(scored.images)
     widths = [shown.image.box_xywh[2] for shown in worst_misses(matches, 0.0) if shown.image.box_xywh is not None]
     scores = [shown.box.score for shown in worst_false_alarms(matches, 0.0) if shown.box is not None]
@@ -251,7 +253,7 @@ def test_a_small_box_is_shown_enlarged_in_the_corner_away_from_it() -> None:
 
 
 def test_percentages_never_say_all_where_one_is_missing() -> None:
-    assert [share(value) for value in (1.0, 0.99999, 0.5, 0.0, None)] == [
+    assert [percent_text(value) for value in (1.0, 0.99999, 0.5, 0.0, None)] == [
         "100.00 %",
         "99.99 %",
         "50.00 %",
@@ -275,9 +277,9 @@ class Page(HTMLParser):
 
 def scored_dataset(folder: Path) -> ScoredDetections:
     truth = read_detection_truth(folder)
-    good = [FoundBox(image.image_id, image.box_xywh, 0.9) for image in truth.images if image.box_xywh is not None]
-    poor = [*good[:-5], FoundBox(truth.images[-1].image_id, FALSE_BOX, 0.95)]
-    return score_detections(truth, {"good": DetectorRun(good), "<i>poor</i>": DetectorRun(poor)}, "all")
+    good = [DetectedBox(image.image_id, image.box_xywh, 0.9) for image in truth.images if image.box_xywh is not None]
+    poor = [*good[:-5], DetectedBox(truth.images[-1].image_id, FALSE_BOX, 0.95)]
+    return score_detections(truth, {"good": DetectorOutput(good), "<i>poor</i>": DetectorOutput(poor)}, "all")
 
 
 def test_the_page_needs_nothing_from_outside_and_names_the_published_rows(

@@ -18,7 +18,7 @@ from datasets_manifest.types.records import PairRecord, ViewRecord
 from droguekit.benchmark.detection.detection_truth import image_truth, read_detection_truth
 from droguekit.benchmark.poses.drogue_truth import LEAST_SEEN_FRACTION, seen_fraction
 from droguekit.benchmark.results.detection_result import (
-    FoundBox,
+    DetectedBox,
     center_box,
     clipped_box,
     corner_box,
@@ -139,7 +139,7 @@ def test_clipping_keeps_the_part_on_the_image(rng: np.random.Generator) -> None:
 
 
 def test_files_of_boxes_are_read_by_pycocotools_and_come_back(tmp_path: Path) -> None:
-    boxes = [FoundBox(2, (1.5, 2.25, 30.125, 40.0), 0.75), FoundBox(1, (0.0, 0.0, 1280.0, 960.0), 0.001)]
+    boxes = [DetectedBox(2, (1.5, 2.25, 30.125, 40.0), 0.75), DetectedBox(1, (0.0, 0.0, 1280.0, 960.0), 0.001)]
     path = tmp_path / "new" / "boxes.json"
     assert write_detections(path, boxes) == 2
     assert read_detections(path, {1, 2}) == boxes
@@ -154,7 +154,7 @@ def test_files_of_boxes_are_read_by_pycocotools_and_come_back(tmp_path: Path) ->
 @pytest.mark.parametrize("sliver", [1e-9, 4e-4, 6e-4, 1e-3, 0.0015])
 def test_what_is_left_of_a_box_after_clipping_can_be_read_again(tmp_path: Path, sliver: float) -> None:
     boxes = [clipped_box((x, 10.0, 50.0, 40.0), SIZE_PX) for x in (sliver - 50.0, 1280.0 - sliver)]
-    kept = [FoundBox(1, box, 0.5) for box in boxes if box is not None]
+    kept = [DetectedBox(1, box, 0.5) for box in boxes if box is not None]
     write_detections(tmp_path / "boxes.json", kept)
     assert len(read_detections(tmp_path / "boxes.json", {1})) == len(kept)
     assert not (kept and sliver < 9e-4)

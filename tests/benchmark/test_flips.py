@@ -6,7 +6,7 @@ import pytest
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
 from droguekit.benchmark.poses.cramer_rao import FacingRing, flip_probability
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
-from droguekit.benchmark.poses.pose_errors import FlipTrial, flip_row, flip_trials, ring_tilt_scale
+from droguekit.benchmark.poses.pose_errors import FlipTrial, flip_statistics, flip_trials, ring_tilt_scale
 from geometry.se3 import RigidTransform
 
 MIDDLE_M = 0.06
@@ -92,9 +92,9 @@ def test_the_law_says_nothing_of_a_hub_or_one_eye(build: SimpleNamespace) -> Non
 
 
 def test_rows_count_flips() -> None:
-    row = flip_row([FlipTrial(True, 0.3), FlipTrial(False, 0.1), FlipTrial(False, 0.2)])
+    row = flip_statistics([FlipTrial(True, 0.3), FlipTrial(False, 0.1), FlipTrial(False, 0.2)])
     assert (row.n, row.flips, row.rate) == (3, 1, 1 / 3)
     assert row.predicted == pytest.approx(0.2)
     assert row.interval[0] < 1 / 3 < row.interval[1]
-    assert flip_row([FlipTrial(True, None), FlipTrial(False, 0.1)]).predicted is None
-    assert flip_row([]).model_dump() == {"n": 0, "flips": 0, "rate": None, "interval": None, "predicted": None}
+    assert flip_statistics([FlipTrial(True, None), FlipTrial(False, 0.1)]).predicted is None
+    assert flip_statistics([]).model_dump() == {"n": 0, "flips": 0, "rate": None, "interval": None, "predicted": None}

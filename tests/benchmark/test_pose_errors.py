@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.estimates import NoFix
-from droguekit.benchmark.poses.pose_errors import by_method, pose_error
+from droguekit.benchmark.poses.pose_errors import estimates_by_method, pose_error
 from geometry.se3 import RigidTransform
 
 
@@ -51,21 +51,21 @@ def test_estimates_are_sorted_by_method(build: SimpleNamespace) -> None:
         build.estimate(1, pose, "a"),
         NoFix(frame_index=1, method="b", reason="dark"),
     ]
-    methods = by_method(estimates, [1, 2, 3], "e.jsonl")
+    methods = estimates_by_method(estimates, [1, 2, 3], "e.jsonl")
     assert list(methods) == ["b", "a"]
     assert sorted(methods["b"]) == [1, 2]
 
 
 def test_an_unknown_frame_is_named(build: SimpleNamespace) -> None:
     with pytest.raises(ValueError, match=r"e\.jsonl: method 'joint': frame 9 is not in the dataset"):
-        by_method([build.estimate(9, build.pose(0, 0, 5))], [1, 2], "e.jsonl")
+        estimates_by_method([build.estimate(9, build.pose(0, 0, 5))], [1, 2], "e.jsonl")
 
 
 def test_a_frame_given_twice_is_named(build: SimpleNamespace) -> None:
     with pytest.raises(ValueError, match=r"e\.jsonl: method 'joint': frame 1 occurs twice"):
-        by_method([build.estimate(1, build.pose(0, 0, 5))] * 2, [1, 2], "e.jsonl")
+        estimates_by_method([build.estimate(1, build.pose(0, 0, 5))] * 2, [1, 2], "e.jsonl")
 
 
 def test_no_estimates_at_all_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"e\.jsonl: holds no estimates"):
-        by_method([], [1, 2], "e.jsonl")
+        estimates_by_method([], [1, 2], "e.jsonl")

@@ -11,7 +11,7 @@ from datasets_manifest.types.estimates import write_estimates
 from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.pose_benchmark import run_benchmark, score
 from droguekit.benchmark.poses.drogue_truth import drogue_truth
-from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from droguekit.benchmark.report.pose_report import write_report
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform
@@ -26,7 +26,7 @@ def read(record: PairRecord, reading_m: float) -> PairRecord:
 def scored(records: list[PairRecord], estimates: list[object]) -> BenchmarkResult:
     truths = {record.frame_index: drogue_truth(record) for record in records}
     facts = DatasetFacts(name="test", sha256="0" * 64, pairs=len(records))
-    return score(facts, truths, by_method(estimates, truths, "estimates"))
+    return score(facts, truths, estimates_by_method(estimates, truths, "estimates"))
 
 
 def deeper(build: SimpleNamespace, record: PairRecord, by_m: float) -> object:

@@ -14,7 +14,7 @@ from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.results.sequence_result import Captures
 from droguekit.benchmark.sequences.docking_errors import (
     Arrival,
-    arrivals_in_the_end,
+    actual_arrivals,
     calibration,
     docking_errors,
     predicted_arrival,
@@ -22,7 +22,7 @@ from droguekit.benchmark.sequences.docking_errors import (
     true_dockings,
 )
 from droguekit.benchmark.sequences.filter_errors import SequenceData
-from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, true_sequences, true_state
 from nav.docking import capture_radius_m, docking_of
 
 TIP_LEFT_M = np.array([0.45, 0.35, 1.0])
@@ -63,13 +63,13 @@ def test_nothing_arrives_that_goes_away_stands_or_is_past(build: SimpleNamespace
 def straight(build: SimpleNamespace, count: int = 60) -> tuple[list[PairRecord], tuple[TrueSequence, ...]]:
     """A drogue that comes straight to the tip, 3 cm beside it, and passes it after 1.62 s."""
     records = build.sequence(lambda t: build.pose(0.45 + 0.03, 0.35, 1.81 - 0.5 * t), count)
-    return records, true_sequences([moment(record) for record in records])
+    return records, true_sequences([true_state(record) for record in records])
 
 
 def test_what_happens_in_the_end_is_what_was_predicted_of_straight_flight(build: SimpleNamespace) -> None:
     _, (sequence,) = straight(build)
-    arrivals = arrivals_in_the_end(sequence.moments)
-    for k, one in enumerate(sequence.moments):
+    arrivals = actual_arrivals(sequence.states)
+    for k, one in enumerate(sequence.states):
         expected = predicted_arrival(one.left_from_drogue, np.array([0, 0, -0.5]), TIP_LEFT_M)
         # 1.62 s are 40.5 pairs.
         assert (expected is None) == (arrivals[k] is None) == (k > 40)
@@ -79,7 +79,7 @@ def test_what_happens_in_the_end_is_what_was_predicted_of_straight_flight(build:
 
 def test_a_sequence_that_stops_short_has_no_end(build: SimpleNamespace) -> None:
     _, (sequence,) = straight(build, count=30)
-    assert arrivals_in_the_end(sequence.moments) == [None] * 30
+    assert actual_arrivals(sequence.states) == [None] * 30
 
 
 def data_of(records: list[PairRecord], sequences: tuple[TrueSequence, ...]) -> SequenceData:
@@ -159,7 +159,7 @@ def test_wrong_captures_are_told_apart(build: SimpleNamespace) -> None:
 def captures_of(build: SimpleNamespace, told: Callable[[int], dict[str, object]]) -> Captures:
     """Of 128 pairs that come to 3 cm beside the axis, of which 4 at either end have no true motion."""
     records = build.sequence(lambda t: build.pose(0.45 + 0.03, 0.35, 8.01 - 0.5 * t), 128)
-    sequences = true_sequences([moment(record) for record in records])
+    sequences = true_sequences([true_state(record) for record in records])
     data = data_of(records, sequences)
     estimates = {
         k: PoseEstimate(

@@ -9,7 +9,7 @@ import pytest
 from datasets_manifest.types.estimates import PoseEstimate
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
 from droguekit.benchmark.sequences.filter_errors import MOST_LAG_S, lags
-from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, true_sequences, true_state
 from geometry.se3 import RigidTransform
 
 COUNT = 75
@@ -19,7 +19,7 @@ def flights(
     build: SimpleNamespace, pose_at: Callable[[float], RigidTransform], number: int
 ) -> tuple[TrueSequence, ...]:
     records = [record for s in range(number) for record in build.sequence(pose_at, COUNT, sequence_id=s)]
-    return true_sequences([moment(record) for record in records])
+    return true_sequences([true_state(record) for record in records])
 
 
 def late_estimates(
@@ -28,8 +28,8 @@ def late_estimates(
     """What a drogue that moves like that was like some time before each pair."""
     estimates = {}
     for sequence in sequences:
-        for one in sequence.moments:
-            since_s = one.time_s - sequence.moments[0].time_s
+        for one in sequence.states:
+            since_s = one.time_s - sequence.states[0].time_s
             pose = pose_at(since_s - lag_s(sequence.sequence_id))
             estimates[one.frame_index] = PoseEstimate(frame_index=one.frame_index, method="late", left_from_drogue=pose)
     return estimates
@@ -112,7 +112,7 @@ def test_even_motion_and_large_lags_tell_nothing(build: SimpleNamespace) -> None
 
 def test_short_sequences_have_no_lag(build: SimpleNamespace) -> None:
     records = build.sequence(build.swinging, 40)
-    sequences = true_sequences([moment(record) for record in records])
+    sequences = true_sequences([true_state(record) for record in records])
     estimates = late_estimates(sequences, build.swinging, lambda _: 0.0)
     # 40 pairs leave 15 whose truth is known half a second before and after.
     assert lags(sequences, estimates, "test") is None

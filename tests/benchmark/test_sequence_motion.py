@@ -14,17 +14,17 @@ from datasets_manifest.types.estimates import Motion, PoseEstimate
 from droguekit.benchmark.pose_benchmark import sequence_data
 from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.poses.pose_errors import normalized_squares
-from droguekit.benchmark.sequences.filter_errors import filtering
+from droguekit.benchmark.sequences.filter_errors import filter_errors
 from droguekit.benchmark.sequences.sequence_truth import (
     MOTION_PARTS,
-    Moment,
     TrueSequence,
-    moment,
+    TrueState,
     motion_errors,
     pairs_per_knot,
     smoothing_spline,
     true_motions,
     true_sequences,
+    true_state,
 )
 from geometry.se3 import RigidTransform
 from scenes.flight.sequence import moment_of_sequence
@@ -35,7 +35,7 @@ MARGIN = 4
 
 
 def sequence_of(build: SimpleNamespace, pose_at: Callable[[float], RigidTransform], count: int = 100) -> TrueSequence:
-    (sequence,) = true_sequences([moment(record) for record in build.sequence(pose_at, count)])
+    (sequence,) = true_sequences([true_state(record) for record in build.sequence(pose_at, count)])
     return sequence
 
 
@@ -43,7 +43,7 @@ def test_velocity_of_a_swing_is_its_derivative(build: SimpleNamespace) -> None:
     turn_s = 2 * np.pi * 0.5
     sequence = sequence_of(build, lambda t: build.pose(0.2 * np.sin(turn_s * t), 0.0, 6 - 0.6 * t))
     motions = true_motions([sequence])
-    times = np.array([sequence.moments[k].time_s for k in motions])
+    times = np.array([sequence.states[k].time_s for k in motions])
     velocity = np.array([motion.velocity_m_s for motion in motions.values()])
     expected = np.column_stack([0.2 * turn_s * np.cos(turn_s * times), 0 * times, 0 * times - 0.6])
     # A cubic spline's derivative errs by about h^3 x''''/24 for knots h = 0.16 s apart: 3 mm/s of 628.
@@ -76,7 +76,7 @@ def test_rates_of_a_nod_belong_to_their_pair(build: SimpleNamespace) -> None:
 
     sequence = sequence_of(build, pose_at)
     motions = true_motions([sequence])
-    times = np.array([sequence.moments[k].time_s for k in motions])
+    times = np.array([sequence.states[k].time_s for k in motions])
     rates = np.array([motion.rate_rad_s for motion in motions.values()])
     expected = np.column_stack([size * turn_s * np.cos(turn_s * times), 0 * times, 0 * times])
     # Means from pair to pair are less by (0.04 turn_s)^2/24 of 548 mrad/s, which is 0.4; the spline errs by less.
@@ -88,7 +88,7 @@ def test_the_instants_velocity_is_the_derivative_of_the_frame(build: SimpleNames
     frame = record.frame.model_copy(update={"left_twist_per_s": np.array([0.3, -0.2, 0.5, 0.02, -0.03, 0.01])})
     step_s = 1e-5
     ends = [frame.left_from_drogue_at(sign * step_s).translation_m for sign in (1, -1)]
-    found = moment(record.model_copy(update={"frame": frame}))
+    found = true_state(record.model_copy(update={"frame": frame}))
     assert found is not None and found.instant_velocity_m_s is not None
     # Central differences err by their rounding, 1e-15 / 1e-5.
     np.testing.assert_allclose(found.instant_velocity_m_s, (ends[0] - ends[1]) / (2 * step_s), atol=1e-8)
@@ -124,17 +124,17 @@ def test_the_motion_is_that_of_the_simulation_without_its_vibration() -> None:
     assert np.sqrt((instant**2).mean(axis=0)[:2]).min() > 0.15
 
 
-def moment_of(recipe: Recipe, place: int) -> Moment:
+def moment_of(recipe: Recipe, place: int) -> TrueState:
     one = moment_of_sequence(recipe, recipe.sequence, recipe.drogue, place)
     pose, drogue, camera = one.left_from_drogue, one.drogue_twist_per_s, one.left_twist_per_s
     velocity = pose.rotate(drogue[:3]) - camera[:3] - np.cross(camera[3:], pose.translation_m)
-    return Moment(place, 0, one.time_s, recipe.rig, recipe.drogue, pose, velocity, {})
+    return TrueState(place, 0, one.time_s, recipe.rig, recipe.drogue, pose, velocity, {})
 
 
 def test_ends_gaps_and_short_runs_have_no_motion(build: SimpleNamespace) -> None:
     records = build.sequence(build.swinging, 60)
     del records[30:33]
-    (sequence,) = true_sequences([moment(record) for record in records])
+    (sequence,) = true_sequences([true_state(record) for record in records])
     runs = [(0, 30), (33, 60)]
     known = [k for low, high in runs for k in range(low + MARGIN, high - MARGIN)]
     assert list(true_motions([sequence])) == known
@@ -145,11 +145,11 @@ def test_ends_gaps_and_short_runs_have_no_motion(build: SimpleNamespace) -> None
 def swing_at(build: SimpleNamespace, rate_hz: float, count: int) -> tuple[TrueSequence, Callable[[float], float]]:
     """A swing of 0.5 Hz seen at another rate, and its velocity along X."""
     turn_s = 2 * np.pi * 0.5
-    moments = []
+    states = []
     for k in range(count):
         record = build.record(k, build.pose(0.2 * np.sin(turn_s * k / rate_hz), 0.0, 6.0))
-        moments.append(moment(record.model_copy(update={"time_s": k / rate_hz, "sequence_id": 0})))
-    (sequence,) = true_sequences(moments)
+        states.append(true_state(record.model_copy(update={"time_s": k / rate_hz, "sequence_id": 0})))
+    (sequence,) = true_sequences(states)
     return sequence, lambda time_s: 0.2 * turn_s * np.cos(turn_s * time_s)
 
 
@@ -158,7 +158,7 @@ def test_knots_are_as_far_apart_in_time_at_every_rate(build: SimpleNamespace, ra
     sequence, velocity_at = swing_at(build, rate_hz, round(3 * rate_hz))
     assert pairs_per_knot(sequence.period_s) == margin
     motions = true_motions([sequence])
-    assert list(motions) == list(range(margin, len(sequence.moments) - margin))
+    assert list(motions) == list(range(margin, len(sequence.states) - margin))
     errors = [motion.velocity_m_s[0] - velocity_at(k / rate_hz) for k, motion in motions.items()]
     # As at 25 Hz: 3 mm/s for knots 0.16 s apart.
     assert np.abs(errors).max() < 3e-3
@@ -171,10 +171,10 @@ def test_vibration_averages_out_better_at_twice_the_rate(build: SimpleNamespace,
         sequence, velocity_at = swing_at(build, rate_hz, round(8 * rate_hz))
         shaken = tuple(
             replace(one, left_from_drogue=RigidTransform(pose.rotation, pose.translation_m + rng.normal(0, 2e-3, 3)))
-            for one in sequence.moments
+            for one in sequence.states
             if (pose := one.left_from_drogue) is not None
         )
-        motions = true_motions([replace(sequence, moments=shaken)])
+        motions = true_motions([replace(sequence, states=shaken)])
         errors = [motion.velocity_m_s[0] - velocity_at(k / rate_hz) for k, motion in motions.items()]
         left[rate_hz] = np.sqrt(np.mean(np.square(errors)))
     # Twice the pairs to a knot leave 0.71 of it; 50 knots know each of the two to a tenth.
@@ -202,7 +202,7 @@ def test_the_period_is_one_of_the_steps(build: SimpleNamespace) -> None:
     """Of three pairs the middle of two steps is no step, where one is a gap."""
     records = build.sequence(build.swinging, 3)
     late = records[2].model_copy(update={"time_s": records[1].time_s + 10})
-    (sequence,) = true_sequences([moment(record) for record in (*records[:2], late)])
+    (sequence,) = true_sequences([true_state(record) for record in (*records[:2], late)])
     assert sequence.period_s == pytest.approx(PERIOD_S)
     assert [len(run) for run in sequence.runs()] == [2, 1]
 
@@ -227,7 +227,7 @@ def test_a_filter_that_tells_the_truth_of_itself(build: SimpleNamespace, rng: np
     """Errors drawn from the reported covariance: RMS, NEES and ratio to the raw method are what went in."""
     records = [r for s in range(3) for r in build.sequence(build.swinging, 100, sequence_id=s)]
     drogues = {record.frame_index: drogue_truth(record) for record in records}
-    data = sequence_data(true_sequences([moment(record) for record in records]), drogues)
+    data = sequence_data(true_sequences([true_state(record) for record in records]), drogues)
     deviations = np.array([0.02, 0.02, 0.05, 0.01, 0.01, 0.01])
     root = np.linalg.cholesky(0.5 * np.diag(deviations**2) + 0.5 * np.outer(deviations, deviations))
     methods: dict[str, dict[int, PoseEstimate]] = {"joint": {}, "joint+filter": {}}
@@ -242,8 +242,8 @@ def test_a_filter_that_tells_the_truth_of_itself(build: SimpleNamespace, rng: np
             assert motion_errors(reported, motion) == pytest.approx(told - [*motion.velocity_m_s, *motion.rate_rad_s])
             estimate = methods["joint+filter"][index]
             methods["joint+filter"][index] = estimate.model_copy(update={"motion": reported})
-    result = filtering(data, "joint+filter", methods)
-    assert filtering(data, "joint", methods) is None
+    result = filter_errors(data, "joint+filter", methods)
+    assert filter_errors(data, "joint", methods) is None
     assert result is not None and result.motion is not None and result.nees is not None and result.raw is not None
     count = 3 * (100 - 2 * MARGIN)
     # Four standard errors of a root mean square of that many.
@@ -266,4 +266,4 @@ def test_two_pairs_of_one_time_are_an_error(build: SimpleNamespace) -> None:
     records = build.sequence(build.swinging, 3)
     same = records[2].model_copy(update={"time_s": records[1].time_s})
     with pytest.raises(ValueError, match="frame 1: time_s: must differ from that of the next pair of sequence 0"):
-        true_sequences([moment(record) for record in (*records[:2], same)])
+        true_sequences([true_state(record) for record in (*records[:2], same)])

@@ -16,7 +16,7 @@ import pytest
 from datasets_manifest.types.estimates import Docking, Estimate, Motion, NoFix, PoseEstimate, Region, write_estimates
 from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.detection.detection_report import write_detection_report
-from droguekit.benchmark.detection.detection_scores import DetectorRun, score_detections
+from droguekit.benchmark.detection.detection_scores import DetectorOutput, score_detections
 from droguekit.benchmark.detection.detection_truth import read_detection_truth
 from droguekit.benchmark.pose_benchmark import run_benchmark, score_sequences
 from droguekit.benchmark.poses.drogue_truth import drogue_truth
@@ -24,9 +24,9 @@ from droguekit.benchmark.report.figures import DistanceLine, Point, distance_lin
 from droguekit.benchmark.report.pose_report import write_report
 from droguekit.benchmark.report.sequence_report import sequence_section, sequence_sentences
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
-from droguekit.benchmark.results.detection_result import FoundBox, corner_box, image_id_of
+from droguekit.benchmark.results.detection_result import DetectedBox, corner_box, image_id_of
 from droguekit.benchmark.results.sequence_result import SequencesResult
-from droguekit.benchmark.sequences.sequence_truth import moment, true_sequences
+from droguekit.benchmark.sequences.sequence_truth import true_sequences, true_state
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 
@@ -145,7 +145,7 @@ def test_the_numbers_are_those_that_went_in(scored: tuple[Path, Path, BenchmarkR
 
 def score_of(records: list[PairRecord], methods: dict[str, dict[int, Estimate]]) -> SequencesResult:
     result = score_sequences(
-        true_sequences([moment(record) for record in records]),
+        true_sequences([true_state(record) for record in records]),
         {record.frame_index: drogue_truth(record) for record in records},
         methods,
     )
@@ -303,20 +303,20 @@ def test_files_of_boxes_of_sequences_are_scored_as_trackers(
 ) -> None:
     folder, records = flown
     boxes = [
-        FoundBox(image_id_of(record.frame_index, eye), corner_box(view.box_visible_xywh_px), 0.8)
+        DetectedBox(image_id_of(record.frame_index, eye), corner_box(view.box_visible_xywh_px), 0.8)
         for record in records
         for eye, view in zip(EYES, (record.views.left, record.views.right), strict=True)
         if view.box_visible_xywh_px is not None and record.frame_index not in (5, 6)
     ]
     truth = read_detection_truth(folder)
-    scored = score_detections(truth, {"flow": DetectorRun(boxes)})
+    scored = score_detections(truth, {"flow": DetectorOutput(boxes)})
     tracking = scored.result.detectors["flow"].sequences
     assert tracking is not None and tracking.both.losses is not None and tracking.both.overlap is not None
     assert (tracking.both.losses.count, tracking.both.hidden, tracking.both.overlap.n) == (1, 6, 194)
     assert tracking.both.overlap.auc == pytest.approx(190 / 194 * 20 / 21)
     # Of a split only its own sequences: the second one, in which nothing is hidden or lost.
     images = tuple(replace(i, split="test" if i.frame_index >= COUNT else "train") for i in truth.images)
-    part = score_detections(replace(truth, images=images), {"flow": DetectorRun(boxes)}).result.detectors["flow"]
+    part = score_detections(replace(truth, images=images), {"flow": DetectorOutput(boxes)}).result.detectors["flow"]
     assert part.sequences is not None and part.sequences.both.overlap is not None
     assert (part.sequences.both.overlap.n, part.sequences.both.hidden) == (2 * COUNT, 0)
     write_detection_report(folder, scored, tmp_path / "report.html")
@@ -324,7 +324,7 @@ def test_files_of_boxes_of_sequences_are_scored_as_trackers(
     assert {"tracking", "table-overlap", "table-losses"} <= set(ids)
     assert len(ids) == len(set(ids))
 
-    single = score_detections(read_detection_truth(dataset[0]), {"flow": DetectorRun(boxes[:2])})
+    single = score_detections(read_detection_truth(dataset[0]), {"flow": DetectorOutput(boxes[:2])})
     assert "sequences" not in json.loads(single.result.to_json())["detectors"]["flow"]
     write_detection_report(dataset[0], single, tmp_path / "single.html")
     assert "tracking" not in Page((tmp_path / "single.html").read_text(encoding="utf-8")).ids

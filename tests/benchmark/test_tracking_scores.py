@@ -12,16 +12,16 @@ from droguekit.benchmark.confidence_intervals import rate_interval
 from droguekit.benchmark.pose_benchmark import score_sequences
 from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.report.sequence_report import sequence_sentences
-from droguekit.benchmark.results.detection_result import FoundBox, corner_box, image_id_of
-from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
-from droguekit.benchmark.sequences.tracking_scores import reacquisition, track_found_boxes, track_regions
+from droguekit.benchmark.results.detection_result import DetectedBox, corner_box, image_id_of
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, true_sequences, true_state
+from droguekit.benchmark.sequences.tracking_scores import reacquisition, score_detected_boxes, score_regions
 from geometry.stereo import EYES
 
 SEEN, HIDDEN, PARTLY, DAZZLED = "seen", "hidden", "partly", "dazzled"
 
 
 def sequences_of(records: list[PairRecord]) -> tuple[TrueSequence, ...]:
-    return true_sequences([moment(record) for record in records])
+    return true_sequences([true_state(record) for record in records])
 
 
 def answers_of(records: list[PairRecord], lost: tuple[int, ...] = (), stage_s: float = 0.01) -> dict[int, Estimate]:
@@ -44,7 +44,7 @@ def answers_of(records: list[PairRecord], lost: tuple[int, ...] = (), stage_s: f
 
 
 @pytest.mark.parametrize(
-    ("sights", "answers", "expected"),
+    ("visibilities", "answers", "expected"),
     [
         # Never hidden: there is nothing to find again.
         ([SEEN] * 4, [0, 0, 1, 1], (0, 0, 0, None, None)),
@@ -72,14 +72,14 @@ def answers_of(records: list[PairRecord], lost: tuple[int, ...] = (), stage_s: f
         ([HIDDEN, SEEN, DAZZLED, SEEN], [0, 0, 0, 1], (2, 1, 1, 0, 0)),
     ],
 )
-def test_delays_after_reappearing(sights: list[str], answers: list[int], expected: tuple[object, ...]) -> None:
-    row = reacquisition([(sights, [bool(answer) for answer in answers])])
+def test_delays_after_reappearing(visibilities: list[str], answers: list[int], expected: tuple[object, ...]) -> None:
+    row = reacquisition([(visibilities, [bool(answer) for answer in answers])])
     assert (row.n, row.found, row.within_3, row.median_frames, row.max_frames) == expected
 
 
 def test_the_true_boxes_have_perfect_scores_in_both_eyes(build: SimpleNamespace) -> None:
     records = build.sequence(build.swinging, 30)
-    result = track_regions(sequences_of(records), answers_of(records))
+    result = score_regions(sequences_of(records), answers_of(records))
     for row in (result.both, *result.eyes.values()):
         assert row.overlap is not None and row.losses is not None
         assert (row.overlap.auc, row.overlap.precision) == (pytest.approx(20 / 21), 1)
@@ -95,7 +95,7 @@ def test_losses_are_counted_where_they_begin(build: SimpleNamespace) -> None:
     records = build.sequence(build.swinging, 40, hidden=(20, 21, 22))
     # Two stretches of it in plain sight; 19 is lost and stays so while it is hidden; 23 and 24 are late to find it.
     answers = answers_of(records, lost=(5, 6, 7, 12, 19, 23, 24))
-    result = track_regions(sequences_of(records), answers)
+    result = score_regions(sequences_of(records), answers)
     left = result.eyes["left"]
     assert left.losses is not None and left.overlap is not None
     assert left.losses.count == 3
@@ -115,7 +115,7 @@ def test_a_box_that_hardly_overlaps_is_lost_and_one_on_nothing_is_counted(build:
     aside = Region(eye="left", box_xywh_px=(x + 0.85 * w, y, w, h), source="flow", score=0.5)
     answers[4] = answers[4].model_copy(update={"regions": (aside,)})
     answers[10] = answers[10].model_copy(update={"regions": (aside,)})
-    result = track_regions(sequences_of(records), answers)
+    result = score_regions(sequences_of(records), answers)
     left, right = result.eyes["left"], result.eyes["right"]
     assert left.losses is not None and right.losses is not None
     # The overlap is 0.15 over 1.85, less than a tenth; the right eye has no box in that pair.
@@ -135,7 +135,7 @@ def test_only_the_part_on_the_image_counts(build: SimpleNamespace) -> None:
     records = [r.model_copy(update={"views": r.views.model_copy(update={"left": clipped})}) for r in record]
     whole = Region(eye="left", box_xywh_px=view.box_full_xywh_px, source="flow", score=1)
     answers = {k: NoFix(frame_index=k, method="m", reason="none", regions=(whole,)) for k in (0, 1)}
-    result = track_regions(sequences_of(records), answers)
+    result = score_regions(sequences_of(records), answers)
     assert result.eyes["left"].overlap is not None
     # Boxes are clipped in thousandths of a pixel at the most.
     assert result.eyes["left"].overlap.mean_overlap == pytest.approx(1, abs=1e-4)
@@ -147,7 +147,7 @@ def test_half_seen_drogues_count_neither_way(build: SimpleNamespace) -> None:
     x, y, w, h = view.box_full_xywh_px
     little = view.model_copy(update={"box_visible_xywh_px": (x, y, 0.3 * w, h)})
     records[3] = records[3].model_copy(update={"views": records[3].views.model_copy(update={"left": little})})
-    result = track_regions(sequences_of(records), answers_of(records, lost=(3,)))
+    result = score_regions(sequences_of(records), answers_of(records, lost=(3,)))
     left, right = result.eyes["left"], result.eyes["right"]
     assert left.overlap is not None and left.losses is not None and right.losses is not None
     assert (left.overlap.n, left.losses.count, right.losses.count) == (9, 0, 1)
@@ -160,9 +160,9 @@ def test_beside_the_sun_no_answer_is_wrong(build: SimpleNamespace) -> None:
         frame = records[k].frame.model_copy(update={"loss": "glare"})
         records[k] = records[k].model_copy(update={"frame": frame})
     sequences = sequences_of(records)
-    assert [one.sight for one in sequences[0].moments[3:8]] == [SEEN, DAZZLED, DAZZLED, DAZZLED, SEEN]
+    assert [one.visibility for one in sequences[0].states[3:8]] == [SEEN, DAZZLED, DAZZLED, DAZZLED, SEEN]
     for lost, delay in (((), None), ((4, 6), 0), ((5, 6, 7, 8), 2)):
-        result = track_regions(sequences, answers_of(records, lost=lost))
+        result = score_regions(sequences, answers_of(records, lost=lost))
         assert result.both.losses is not None and result.both.overlap is not None
         assert (result.both.losses.count, result.both.hidden, result.both.overlap.n) == (0, 0, 18)
         again = result.both.reacquisition
@@ -172,7 +172,7 @@ def test_beside_the_sun_no_answer_is_wrong(build: SimpleNamespace) -> None:
 def test_sources_have_their_own_boxes_and_times(build: SimpleNamespace) -> None:
     records = build.sequence(build.swinging, 40)
     answers = answers_of(records, stage_s=0.01)
-    result = track_regions(sequences_of(records), answers)
+    result = score_regions(sequences_of(records), answers)
     assert set(result.sources) == {"detector", "flow"}
     detector, flow = result.sources["detector"], result.sources["flow"]
     assert detector.overlap is not None and flow.overlap is not None
@@ -192,11 +192,11 @@ def test_waiting_is_no_work_and_following_is(build: SimpleNamespace) -> None:
         k: answer.model_copy(update={"stage_s": {stage: 1e-3 * ms for stage, ms in stages_ms.items()}})
         for k, answer in answers_of(records).items()
     }
-    flow = track_regions(sequences_of(records), answers).sources["flow"]
+    flow = score_regions(sequences_of(records), answers).sources["flow"]
     assert flow.box_ms == pytest.approx(7)
     assert (flow.frame_ms, flow.frame_p95_ms) == (pytest.approx(63), pytest.approx(63))
     only = {k: answer.model_copy(update={"stage_s": {"read": 0.5}}) for k, answer in answers.items()}
-    flow = track_regions(sequences_of(records), only).sources["flow"]
+    flow = score_regions(sequences_of(records), only).sources["flow"]
     assert (flow.box_ms, flow.frame_ms) == (None, None)
 
 
@@ -205,7 +205,7 @@ def test_both_eyes_lose_what_one_of_them_loses_most(build: SimpleNamespace) -> N
     records = build.sequence(build.swinging, 30)
     answers = answers_of(records, lost=(5, 6, 15))
     answers[25] = answers[25].model_copy(update={"regions": answers[25].regions[:1]})
-    result = track_regions(sequences_of(records), answers)
+    result = score_regions(sequences_of(records), answers)
     left, right = result.eyes["left"].losses, result.eyes["right"].losses
     assert left is not None and right is not None
     assert (left.count, right.count) == (2, 3)
@@ -218,26 +218,29 @@ def test_a_file_of_the_same_boxes_has_the_same_scores(build: SimpleNamespace) ->
     records = build.sequence(build.swinging, 20, hidden=(8, 9))
     answers = answers_of(records, lost=(3, 10))
     boxes = [
-        FoundBox(image_id_of(index, region.eye), corner_box(region.box_xywh_px), region.score)
+        DetectedBox(image_id_of(index, region.eye), corner_box(region.box_xywh_px), region.score)
         for index, answer in answers.items()
         for region in answer.regions
     ]
     sequences = sequences_of(records)
-    by_regions = track_regions(sequences, answers)
+    by_regions = score_regions(sequences, answers)
     # A worse box of an image, and one below the threshold in an image without any, change nothing.
-    noise = [FoundBox(image_id_of(0, "left"), (5, 5, 9, 9), 0.6), FoundBox(image_id_of(3, "left"), (5, 5, 9, 9), 0.2)]
-    by_file = track_found_boxes(sequences, [*noise, *boxes], 0.5)
+    noise = [
+        DetectedBox(image_id_of(0, "left"), (5, 5, 9, 9), 0.6),
+        DetectedBox(image_id_of(3, "left"), (5, 5, 9, 9), 0.2),
+    ]
+    by_file = score_detected_boxes(sequences, [*noise, *boxes], 0.5)
     assert by_file is not None
     assert (by_file.both, by_file.eyes) == (by_regions.both, by_regions.eyes)
     assert by_file.sources == {}
-    assert track_found_boxes((), boxes, 0.5) is None
+    assert score_detected_boxes((), boxes, 0.5) is None
 
 
 def test_intervals_are_of_whole_sequences(build: SimpleNamespace) -> None:
     records = [r for s in range(6) for r in build.sequence(build.swinging, 10, sequence_id=s)]
     # Sequences differ: number s has lost its first s pairs.
     lost = tuple(10 * s + k for s in range(6) for k in range(s))
-    result = track_regions(sequences_of(records), answers_of(records, lost=lost))
+    result = score_regions(sequences_of(records), answers_of(records, lost=lost))
     assert result.both.overlap is not None
     low, high = result.both.overlap.precision_interval or (0.0, 0.0)
     values = 1 - np.arange(6) / 10

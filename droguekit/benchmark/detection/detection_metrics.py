@@ -17,7 +17,7 @@ from scipy.sparse import csr_matrix
 from datasets_manifest.random_streams import named_generator
 from droguekit.benchmark.confidence_intervals import CONFIDENCE, RESAMPLES, Interval
 from droguekit.benchmark.detection.detection_truth import ImageTruth, scored_boxes
-from droguekit.benchmark.results.detection_result import DROGUE_CATEGORY, FoundBox
+from droguekit.benchmark.results.detection_result import DROGUE_CATEGORY, DetectedBox
 from geometry.se3 import Array
 
 IOU_THRESHOLDS: tuple[float, ...] = tuple(np.linspace(0.5, 0.95, 10).tolist())
@@ -56,7 +56,7 @@ class Matches:
     image: NDArray[np.intp]
     score: Array
     is_true: NDArray[np.bool_]
-    box: tuple[FoundBox, ...]
+    box: tuple[DetectedBox, ...]
     has_drogue: NDArray[np.bool_]
 
     @property
@@ -75,7 +75,7 @@ class Matches:
 class Evaluation:
     """A detector's boxes on a dataset, matched."""
 
-    def __init__(self, images: Sequence[ImageTruth], found: Sequence[FoundBox]) -> None:
+    def __init__(self, images: Sequence[ImageTruth], found: Sequence[DetectedBox]) -> None:
         """Match boxes with truth; those on ignored drogues and on images that are not given do not count."""
         self._images = {image.image_id: image for image in images}
         counted = scored_boxes(images, found)
@@ -132,7 +132,7 @@ class Evaluation:
         )
 
 
-def _evaluator(images: Sequence[ImageTruth], boxes: dict[int, FoundBox]) -> COCOeval:
+def _evaluator(images: Sequence[ImageTruth], boxes: dict[int, DetectedBox]) -> COCOeval:
     """The evaluator, with all images evaluated."""
     truth = [(image.image_id, image.image_id, image.box_xywh) for image in images if image.box_xywh is not None]
     found = [(number, box.image_id, box.box_xywh, box.score) for number, box in boxes.items()]

@@ -30,8 +30,8 @@ from droguekit.benchmark.detection.detection_tables import (
     SUMMARY_COLUMNS,
     SUMMARY_COLUMNS_MORE,
     cell_tables,
+    percent_text,
     published_rows,
-    share,
     summary_rows,
 )
 from droguekit.benchmark.detection.detection_truth import ImageTruth
@@ -47,15 +47,15 @@ from droguekit.benchmark.report.label_drawing import (
     display_picture,
     draw_box,
     enlarged_surroundings,
+    evenly_spaced,
     put_in_far_corner,
     resized,
-    spread,
     tile_of,
 )
 from droguekit.benchmark.report.number_text import plain_number
 from droguekit.benchmark.report.pose_report import page_template
 from droguekit.benchmark.report.sequence_tables import tracking_part
-from droguekit.benchmark.results.detection_result import DetectionResult, FoundBox, center_box
+from droguekit.benchmark.results.detection_result import DetectedBox, DetectionResult, center_box
 
 _FOUND_OF_A_FAMILY = 4
 _MOST_FAULTS = 8
@@ -68,7 +68,7 @@ class PictureGroup(NamedTuple):
     tiles: list[tuple[Tile, str]]
 
 
-class Shown(NamedTuple):
+class PicturedImage(NamedTuple):
     """An image to be shown.
 
     Attributes:
@@ -78,7 +78,7 @@ class Shown(NamedTuple):
     """
 
     image: ImageTruth
-    box: FoundBox | None
+    box: DetectedBox | None
     is_miss: bool = False
 
 
@@ -103,35 +103,35 @@ def detection_pictures(dataset: Location, matches: Matches, threshold: float) ->
     return [PictureGroup(title, [_tile(source, one) for one in shown]) for title, shown in chosen if shown]
 
 
-def found_images(matches: Matches, threshold: float) -> list[Shown]:
+def found_images(matches: Matches, threshold: float) -> list[PicturedImage]:
     """Drogues that were found, in the order of the images."""
     right = matches.is_true[AT_50] & (matches.score >= threshold)
     places = sorted(np.flatnonzero(right).tolist(), key=lambda k: int(matches.image[k]))
-    return [Shown(matches.images[matches.image[k]], matches.box[k]) for k in places]
+    return [PicturedImage(matches.images[matches.image[k]], matches.box[k]) for k in places]
 
 
-def worst_misses(matches: Matches, threshold: float) -> list[Shown]:
+def worst_misses(matches: Matches, threshold: float) -> list[PicturedImage]:
     """Drogues that were not found, the largest first, each with the best box of its image if there is one."""
     missed = np.flatnonzero(matches.has_drogue & (matches.found_scores() < threshold)).tolist()
     missed.sort(key=lambda k: -_area(matches.images[k].box_xywh))
     best = {int(image): box for image, box in zip(matches.image[::-1], matches.box[::-1], strict=True)}
-    return [Shown(matches.images[k], best.get(k), is_miss=True) for k in missed[:_MOST_FAULTS]]
+    return [PicturedImage(matches.images[k], best.get(k), is_miss=True) for k in missed[:_MOST_FAULTS]]
 
 
-def worst_false_alarms(matches: Matches, threshold: float) -> list[Shown]:
+def worst_false_alarms(matches: Matches, threshold: float) -> list[PicturedImage]:
     """Boxes that are no drogue, the highest score first."""
     wrong = np.flatnonzero(~matches.is_true[AT_50] & (matches.score >= threshold))
-    return [Shown(matches.images[matches.image[k]], matches.box[k]) for k in wrong[:_MOST_FAULTS].tolist()]
+    return [PicturedImage(matches.images[matches.image[k]], matches.box[k]) for k in wrong[:_MOST_FAULTS].tolist()]
 
 
-def _by_family(found: Sequence[Shown]) -> list[tuple[str, list[Shown]]]:
+def _by_family(found: Sequence[PicturedImage]) -> list[tuple[str, list[PicturedImage]]]:
     """A few of each family, spread over distance, near ones first."""
     families = []
     for family in sorted({shown.image.family for shown in found}):
         members = sorted(
             (shown for shown in found if shown.image.family == family), key=lambda shown: shown.image.distance_m or 0.0
         )
-        families.append((family, [members[k] for k in spread(len(members), _FOUND_OF_A_FAMILY)]))
+        families.append((family, [members[k] for k in evenly_spaced(len(members), _FOUND_OF_A_FAMILY)]))
     return families
 
 
@@ -139,7 +139,7 @@ def _area(box: PixelBox | None) -> float:
     return 0.0 if box is None else box[2] * box[3]
 
 
-def _tile(source: BlindDataset, shown: Shown) -> tuple[Tile, str]:
+def _tile(source: BlindDataset, shown: PicturedImage) -> tuple[Tile, str]:
     images = source.pair(shown.image.frame_index).images
     if shown.image.eye == "right":
         images = replace(images, left=images.right, right=images.left)
@@ -174,7 +174,7 @@ def detection_picture(
     return tile
 
 
-def _caption(shown: Shown) -> str:
+def _caption(shown: PicturedImage) -> str:
     image, box, is_miss = shown
     parts = [f"Frame {image.frame_index} {image.eye}, {image.family}"]
     parts.append(f"{plain_number(image.distance_m)} m" if image.distance_m is not None else "no drogue")
@@ -253,9 +253,10 @@ def detection_sentences(result: DetectionResult, name: str) -> list[str]:
     }
     sentences = [
         f"On {images}, with {data.boxes} drogues of {row.scenes} scenes to be found, {name} reaches an AP50 of "
-        f"{share(row.ap50)} and an AP of {share(row.ap)}.",
+        f"{percent_text(row.ap50)} and an AP of {percent_text(row.ap)}.",
         f"With a score of {plain_number(detector.operating_threshold)} or more, {chosen[detector.threshold_from]}, "
-        f"it finds {share(row.recall)} of the drogues, and {share(row.precision)} of its boxes are right.",
+        f"it finds {percent_text(row.recall)} of the drogues, and {percent_text(row.precision)} of its boxes "
+        "are right.",
     ]
     if alarms is not None:
         sentences.append(f"In {alarms.frames} pairs without a drogue it sees {alarms.boxes}.")
@@ -280,7 +281,7 @@ def _facts(result: DetectionResult) -> list[tuple[str, str]]:
         ("Drogues to be found", str(data.boxes)),
         (
             "Drogues that count neither way",
-            f"{data.ignored}, of which less than {share(result.least_seen_fraction)} is seen",
+            f"{data.ignored}, of which less than {percent_text(result.least_seen_fraction)} is seen",
         ),
         ("Pairs without a drogue", str(data.empty_frames)),
         ("Operating thresholds", "; ".join(thresholds)),

@@ -23,16 +23,16 @@ from droguekit.benchmark.detection.detection_truth import DetectionTruth, ImageT
 from droguekit.benchmark.poses.drogue_truth import LEAST_SEEN_FRACTION
 from droguekit.benchmark.results.detection_result import (
     BestF1,
+    DetectedBox,
     DetectionDataset,
     DetectionResult,
     DetectionRow,
     DetectorResult,
     DistanceRow,
     FalseAlarms,
-    FoundBox,
     PairTimes,
 )
-from droguekit.benchmark.sequences.tracking_scores import track_found_boxes
+from droguekit.benchmark.sequences.tracking_scores import score_detected_boxes
 from geometry.stereo import EYES
 
 DISTANCE_EDGES_M = (0.0, 3.0, 5.0, 10.0, 20.0, 30.0, 40.0, math.inf)
@@ -192,7 +192,7 @@ def _distance_rows(images: Images, row: Callable[[Images, str], DetectionRow]) -
             )
 
 
-class DetectorRun(NamedTuple):
+class DetectorOutput(NamedTuple):
     """What a detector found.
 
     Attributes:
@@ -202,7 +202,7 @@ class DetectorRun(NamedTuple):
         parameters, gflops_per_image: of its network, where they could be counted.
     """
 
-    boxes: Sequence[FoundBox]
+    boxes: Sequence[DetectedBox]
     times: PairTimes | None = None
     score_threshold: float | None = None
     parameters: int | None = None
@@ -219,7 +219,7 @@ class ScoredDetections(NamedTuple):
 
 def score_detections(
     truth: DetectionTruth,
-    runs: Mapping[str, DetectorRun],
+    runs: Mapping[str, DetectorOutput],
     split: str | None = None,
     threshold: float | None = None,
 ) -> ScoredDetections:
@@ -238,17 +238,17 @@ def score_detections(
     chosen = images_of_split(truth.images, chosen_split)
     evaluations = {name: Evaluation(truth.images, run.boxes) for name, run in runs.items()}
     frames = {image.frame_index for image in chosen}
-    sequences = [sequence for sequence in truth.sequences if sequence.moments[0].frame_index in frames]
+    sequences = [sequence for sequence in truth.sequences if sequence.states[0].frame_index in frames]
 
     def scored(name: str) -> DetectorResult:
         run = runs[name]
-        row = score_detector(evaluations[name], truth.images, chosen_split, _asked(threshold, run))
+        row = score_detector(evaluations[name], truth.images, chosen_split, _requested_threshold(threshold, run))
         return row.model_copy(
             update={
                 "times": run.times,
                 "parameters": run.parameters,
                 "gflops_per_image": run.gflops_per_image,
-                "sequences": track_found_boxes(sequences, run.boxes, row.operating_threshold),
+                "sequences": score_detected_boxes(sequences, run.boxes, row.operating_threshold),
             }
         )
 
@@ -270,7 +270,7 @@ def score_detections(
     return ScoredDetections(result, evaluations, chosen)
 
 
-def _asked(threshold: float | None, run: DetectorRun) -> Threshold | None:
+def _requested_threshold(threshold: float | None, run: DetectorOutput) -> Threshold | None:
     if threshold is not None:
         return Threshold(threshold, "given")
     return None if run.score_threshold is None else Threshold(run.score_threshold, "detector")

@@ -75,7 +75,7 @@ def published_rows() -> list[list[str]]:
     return [
         [
             row.name,
-            *map(share, (row.precision, row.recall, row.ap50)),
+            *map(percent_text, (row.precision, row.recall, row.ap50)),
             *[ABSENT] * 5,
             f"{row.gflops:g}",
             f"{1e3 * row.image_s:.1f}",
@@ -109,14 +109,15 @@ def detector_lines(result: DetectionResult) -> Iterator[str]:
     yield f"{'detector':<16} {'AP50':>8} {'AP':>8} {'recall':>8} {'precision':>9} {'at score':>9}  false alarms"
     for name, detector in result.detectors.items():
         row, alarms = detector.overall, detector.false_alarms
-        told = "no empty frames" if alarms is None else f"{alarms.boxes} in {alarms.frames} empty frames"
+        false_alarms = "no empty frames" if alarms is None else f"{alarms.boxes} in {alarms.frames} empty frames"
+        ap50, ap, recall, precision = map(percent_text, (row.ap50, row.ap, row.recall, row.precision))
         yield (
-            f"{name:<16} {share(row.ap50):>8} {share(row.ap):>8} {share(row.recall):>8} {share(row.precision):>9} "
-            f"{detector.operating_threshold:9.3f}  {told}"
+            f"{name:<16} {ap50:>8} {ap:>8} {recall:>8} {precision:>9} "
+            f"{detector.operating_threshold:9.3f}  {false_alarms}"
         )
 
 
-def share(fraction: float | None) -> str:
+def percent_text(fraction: float | None) -> str:
     """A fraction in percent with two decimals, as the paper gives it; never all where one is missing."""
     if fraction is None:
         return ABSENT
@@ -125,7 +126,7 @@ def share(fraction: float | None) -> str:
     return f"{shown:.2f} %"
 
 
-def shares(ends: Interval | None) -> str:
+def percent_interval_text(ends: Interval | None) -> str:
     """An interval of fractions."""
     return ABSENT if ends is None else f"{100 * ends[0]:.2f} to {100 * ends[1]:.2f}"
 
@@ -133,11 +134,11 @@ def shares(ends: Interval | None) -> str:
 def _summary_cells(detector: DetectorResult) -> list[str]:
     row, alarms, times = detector.overall, detector.false_alarms, detector.times
     return [
-        *map(share, (row.precision, row.recall, row.ap50)),
-        shares(row.ap50_interval),
-        share(row.ap),
-        shares(row.ap_interval),
-        share(row.ap75),
+        *map(percent_text, (row.precision, row.recall, row.ap50)),
+        percent_interval_text(row.ap50_interval),
+        percent_text(row.ap),
+        percent_interval_text(row.ap_interval),
+        percent_text(row.ap75),
         ABSENT if detector.parameters is None else three_digits(1e-6 * detector.parameters),
         ABSENT if detector.gflops_per_image is None else three_digits(detector.gflops_per_image),
         ABSENT if times is None else three_digits(times.wall_ms / 2),
@@ -158,11 +159,11 @@ def _cells(row: DetectionRow) -> list[str]:
     return [
         str(row.scenes),
         str(row.boxes),
-        share(row.ap50),
-        shares(row.ap50_interval),
-        share(row.ap),
-        share(row.recall),
-        shares(row.recall_interval),
-        share(row.precision),
+        percent_text(row.ap50),
+        percent_interval_text(row.ap50_interval),
+        percent_text(row.ap),
+        percent_text(row.recall),
+        percent_interval_text(row.recall_interval),
+        percent_text(row.precision),
         row.note or "",
     ]

@@ -16,8 +16,8 @@ from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.records import PairRecord, PixelBox
 from droguekit.benchmark.blind_check import blind_scenes
 from droguekit.benchmark.poses.drogue_truth import LEAST_SEEN_FRACTION, seen_fraction
-from droguekit.benchmark.results.detection_result import FoundBox, clipped_box, corner_box, image_id_of
-from droguekit.benchmark.sequences.sequence_truth import TrueSequence, moment, true_sequences
+from droguekit.benchmark.results.detection_result import DetectedBox, clipped_box, corner_box, image_id_of
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, true_sequences, true_state
 from geometry.stereo import EYES, Eye
 
 # So much of a box must lie in an ignored drogue's for it to count as that drogue's: COCO's rule for crowds at IoU 0.5.
@@ -83,13 +83,13 @@ def read_detection_truth(dataset: Location) -> DetectionTruth:
     camera = source.manifest.recipe.rig.camera
     size_px = (camera.width_px, camera.height_px)
     splits = source.manifest.split_of_frame()
-    images, moments = [], []
+    images, states = [], []
     for index in source.frame_indices:
         record = source.record(index)
         images += [image_truth(record, eye, splits[index], size_px) for eye in EYES]
-        moments.append(moment(record))
+        states.append(true_state(record))
     manifest = source.manifest
-    return DetectionTruth(manifest.name, manifest.dataset_sha256, tuple(images), true_sequences(moments))
+    return DetectionTruth(manifest.name, manifest.dataset_sha256, tuple(images), true_sequences(states))
 
 
 def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, int]) -> ImageTruth:
@@ -121,13 +121,13 @@ def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, in
     )
 
 
-def scored_boxes(images: Sequence[ImageTruth], found: Sequence[FoundBox]) -> list[FoundBox]:
+def scored_boxes(images: Sequence[ImageTruth], found: Sequence[DetectedBox]) -> list[DetectedBox]:
     """Those boxes on the given images that count: not on others, nor on an ignored drogue."""
     by_id = {image.image_id: image for image in images}
     return [box for box in found if box.image_id in by_id and not _is_ignored(box, by_id[box.image_id])]
 
 
-def _is_ignored(box: FoundBox, image: ImageTruth) -> bool:
+def _is_ignored(box: DetectedBox, image: ImageTruth) -> bool:
     """Whether at least half of a box lies in the box of an ignored drogue."""
     region = image.ignored_xywh
     if region is None:

@@ -11,7 +11,7 @@ from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.images import StereoImages
 from drogue_models.parameters import DrogueParameters
-from droguekit.benchmark.results.detection_result import FoundBox, PairTimes, clipped_box, corner_box, image_id_of
+from droguekit.benchmark.results.detection_result import DetectedBox, PairTimes, clipped_box, corner_box, image_id_of
 from geometry.stereo import EYES
 from nav.detector.detector import Detector
 
@@ -19,7 +19,7 @@ LEAST_SCORE = 0.001
 """From so low a score on boxes are kept for average precision, which looks at all of them."""
 
 
-class DetectorPass:
+class DetectorRunner:
     """One look at every pair.
 
     Attributes:
@@ -61,7 +61,7 @@ class DetectorPass:
         self.wall_s: list[float] = []
         self.cpu_s: list[float] = []
 
-    def boxes(self, least_score: float, advance: Callable[[], None]) -> Iterator[FoundBox]:
+    def boxes(self, least_score: float, advance: Callable[[], None]) -> Iterator[DetectedBox]:
         """Boxes of all images, clipped to them, pair by pair.
 
         Args:
@@ -81,7 +81,7 @@ class DetectorPass:
         wall_ms, cpu_ms = (1e3 * float(np.median(seconds)) for seconds in (self.wall_s, self.cpu_s))
         return PairTimes(wall_ms=wall_ms, cpu_ms=cpu_ms, pairs=len(self.wall_s))
 
-    def _look(self, index: int, detector: Detector, images: StereoImages, least_score: float) -> Iterator[FoundBox]:
+    def _look(self, index: int, detector: Detector, images: StereoImages, least_score: float) -> Iterator[DetectedBox]:
         wall_s, cpu_s = time.perf_counter(), time.process_time()
         found = detector.candidates(images, least_score)
         self.wall_s.append(time.perf_counter() - wall_s)
@@ -90,4 +90,4 @@ class DetectorPass:
             for detection in found.get(eye, ()):
                 box = clipped_box(corner_box(detection.box_xywh_px), images.size_px)
                 if box is not None:
-                    yield FoundBox(image_id_of(index, eye), box, detection.score)
+                    yield DetectedBox(image_id_of(index, eye), box, detection.score)

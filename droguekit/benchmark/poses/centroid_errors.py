@@ -12,7 +12,7 @@ from datasets_manifest.types.estimates import Feature
 from drogue_models.marker_layout import MarkerLayout
 from droguekit.benchmark.poses.cramer_rao import pose_covariance
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth
-from droguekit.benchmark.results.pose_result import Centroids
+from droguekit.benchmark.results.pose_result import CentroidStatistics
 from geometry.se3 import Array
 from geometry.stereo import EYES
 
@@ -90,14 +90,14 @@ def symmetric_orders(layout: MarkerLayout) -> list[NDArray[np.intp]]:
     return orders
 
 
-def centroid_statistics(errors: Sequence[CentroidErrors]) -> Centroids:
+def centroid_statistics(errors: Sequence[CentroidErrors]) -> CentroidStatistics:
     """Noise and bias over many pairs."""
     offsets = np.concatenate([e.offset_px for e in errors] or [np.zeros((0, 2))])
     outward = np.concatenate([e.outward_px for e in errors] or [np.zeros(0)])
     hub = np.concatenate([e.is_hub for e in errors] or [np.zeros(0, dtype=np.bool_)])
     markers = offsets[~hub]
     some = len(markers) > 0
-    return Centroids(
+    return CentroidStatistics(
         count=len(markers),
         sigma_px=_coordinate_rms(markers),
         bias_u_px=float(markers[:, 0].mean()) if some else None,

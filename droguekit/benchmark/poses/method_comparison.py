@@ -11,7 +11,7 @@ from droguekit.benchmark.confidence_intervals import Interval, ratio_intervals
 from droguekit.benchmark.poses.pose_errors import PoseError
 from droguekit.benchmark.poses.reference import DistanceBin
 from droguekit.benchmark.results.benchmark_result import MethodResult
-from droguekit.benchmark.results.pose_result import BinRatios, Comparison, MeanRatios
+from droguekit.benchmark.results.pose_result import BinRatios, MeanRatios, MethodComparison
 from geometry.se3 import Array
 
 Errors = Mapping[str, Mapping[int, PoseError]]
@@ -32,7 +32,7 @@ class PairGroups:
     sequence_of_frame: Mapping[int, int | None]
 
 
-def compare(errors: Errors, against: Sequence[str], groups: PairGroups) -> list[Comparison]:
+def compare_methods(errors: Errors, against: Sequence[str], groups: PairGroups) -> list[MethodComparison]:
     """Every method beside each of some others.
 
     Args:
@@ -45,7 +45,7 @@ def compare(errors: Errors, against: Sequence[str], groups: PairGroups) -> list[
     ]
 
 
-def _comparison(name: str, other: str, errors: Errors, groups: PairGroups) -> Comparison:
+def _comparison(name: str, other: str, errors: Errors, groups: PairGroups) -> MethodComparison:
     common = sorted(errors[name].keys() & errors[other].keys())
     above, below = (_sizes([errors[method][i] for i in common]) for method in (name, other))
     bins = np.array([groups.bin_of_frame[i] for i in common], dtype=np.intp)
@@ -58,7 +58,7 @@ def _comparison(name: str, other: str, errors: Errors, groups: PairGroups) -> Co
         ratios = _ratios(above[inside], below[inside], blocks[inside].tolist(), f"{name} / {other}, bin {k}")
         rows.append(BinRatios(**dict(ratios), low_m=place.low_m, high_m=place.high_m))
     overall = _ratios(above, below, blocks.tolist(), f"{name} / {other}")
-    return Comparison(method=name, against=other, overall=overall, bins=rows)
+    return MethodComparison(method=name, against=other, overall=overall, bins=rows)
 
 
 def _sizes(errors: Sequence[PoseError]) -> Array:

@@ -21,10 +21,10 @@ from droguekit.benchmark.poses.cramer_rao import FeatureNoise, component_deviati
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth
 from droguekit.benchmark.poses.pose_errors import (
     COMPONENTS,
-    Depth,
     FlipTrials,
     PoseError,
-    flip_row,
+    RangefinderSample,
+    flip_statistics,
     flip_trials,
     nees,
     normalized_errors,
@@ -34,7 +34,7 @@ from droguekit.benchmark.poses.pose_errors import (
     squared_errors,
 )
 from droguekit.benchmark.poses.reference import Reference, bound_covariance, feature_noise, mean_bound
-from droguekit.benchmark.results.benchmark_result import Row
+from droguekit.benchmark.results.benchmark_result import PoseRow
 from droguekit.benchmark.results.pose_result import Bound, ComponentErrors, ComponentRatios
 from geometry.se3 import Array
 
@@ -62,7 +62,7 @@ class PoseScore:
     has_covariance: bool
     squared_errors: Array | None
     flips: FlipTrials | None
-    depth: Depth | None
+    depth: RangefinderSample | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class FrameScore:
     from_centroids_m: Array | None
 
 
-def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Row:
+def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> PoseRow:
     """The row of some pairs, of which there is at least one.
 
     Args:
@@ -99,7 +99,7 @@ def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Ro
     if poses:
         numbers, error_intervals = _error_numbers([pose.error for pose in poses], key)
         intervals |= error_intervals
-    return Row.model_validate(
+    return PoseRow.model_validate(
         {
             "n": len(scores),
             "fixes": len(fixed),
@@ -159,8 +159,8 @@ def _checks(poses: Sequence[PoseScore]) -> dict[str, object]:
         "normalized": normalized_errors([(p.error, p.common_bound) for p in poses if p.common_bound is not None]),
         "normalized_own": normalized_errors([(p.error, p.own_bound) for p in poses if p.own_bound is not None]),
         "nees": nees([pose.squared_errors for pose in poses if pose.has_covariance]),
-        "flips": flip_row([trial for trial in optical if trial is not None]),
-        "sight_flips": flip_row([trial for trial in sight if trial is not None]),
+        "flips": flip_statistics([trial for trial in optical if trial is not None]),
+        "sight_flips": flip_statistics([trial for trial in sight if trial is not None]),
     }
 
 
@@ -239,7 +239,9 @@ def _pose_score(
         has_covariance=estimate.covariance is not None,
         squared_errors=squared_errors(estimate, error),
         flips=None if covariance is None else flip_trials(pose, truth, covariance, scale_rad),
-        depth=None if reading_m is None else Depth(float(pose.translation_m[2]), truth.distance_m, reading_m),
+        depth=None
+        if reading_m is None
+        else RangefinderSample(float(pose.translation_m[2]), truth.distance_m, reading_m),
     )
 
 

@@ -34,7 +34,7 @@ COMPONENTS = ("x", "y", "z", "pitch", "yaw")
 """Order of errors and bounds: X, Y, Z in the left camera [m], then pitch and yaw [deg]."""
 
 # Larger than anything that flies, and its square far from overflow.
-_MOST = 1e9
+_LARGEST_PLAUSIBLE = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ def pose_error(estimate: RigidTransform, truth: RigidTransform) -> PoseError:
     return PoseError(np.concatenate([offset, wrapped]), float(np.linalg.norm(across)))
 
 
-def by_method(
+def estimates_by_method(
     estimates: Iterable[Estimate], frame_indices: Iterable[int], source: str
 ) -> dict[str, dict[int, Estimate]]:
     """Estimates by method and frame, methods in the order of the file.
@@ -93,10 +93,10 @@ def by_method(
         if index in frames:
             raise ValueError(f"{source}: method {method!r}: frame {index} occurs twice")
         largest = _largest_number(estimate)
-        if largest > _MOST:
+        if largest > _LARGEST_PLAUSIBLE:
             raise ValueError(
-                f"{source}: method {method!r}: frame {index}: lengths, speeds and times must be at most {_MOST:g} "
-                f"in SI units, got {largest:g}"
+                f"{source}: method {method!r}: frame {index}: lengths, speeds and times must be at most "
+                f"{_LARGEST_PLAUSIBLE:g} in SI units, got {largest:g}"
             )
         frames[index] = estimate
     if not methods:
@@ -120,7 +120,7 @@ def _largest_number(estimate: Estimate) -> float:
 
 
 @dataclass(frozen=True)
-class Depth:
+class RangefinderSample:
     """One pair in three ways, all along the left camera's optical axis.
 
     Attributes:
@@ -133,7 +133,7 @@ class Depth:
     reading_m: float
 
 
-def rangefinder_errors(depths: Sequence[Depth]) -> RangefinderErrors | None:
+def rangefinder_errors(depths: Sequence[RangefinderSample]) -> RangefinderErrors | None:
     """What an experiment with a rangefinder would find, and what it would not; None without a depth."""
     if not depths:
         return None
@@ -317,7 +317,7 @@ def ring_tilt_scale(truth: DrogueTruth, centroids: CentroidErrors, sigma_px: flo
     return sigma_px * ring.tilt_rad
 
 
-def flip_row(trials: Sequence[FlipTrial]) -> Flips:
+def flip_statistics(trials: Sequence[FlipTrial]) -> Flips:
     """Share of flips among poses of clear tilt, and what the law predicts for the same poses."""
     count, hits = len(trials), sum(trial.flipped for trial in trials)
     predicted = [trial.predicted for trial in trials if trial.predicted is not None]

@@ -12,7 +12,7 @@ from droguekit.benchmark.poses.centroid_errors import CentroidErrors, centroid_s
 from droguekit.benchmark.poses.cramer_rao import FeatureNoise, component_deviations, pose_covariance
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth
 from droguekit.benchmark.results.benchmark_result import ReferenceBin
-from droguekit.benchmark.results.pose_result import Bound, Centroids
+from droguekit.benchmark.results.pose_result import Bound, CentroidStatistics
 from geometry.se3 import Array, angles_from_axis
 
 # Distances this close count as one station.
@@ -178,7 +178,7 @@ def feature_noise(marker_px: float | None, hub_px: float | None) -> FeatureNoise
     return FeatureNoise(marker_px, marker_px if hub_px is None else hub_px)
 
 
-def _reference_bin(place: DistanceBin, count: int, found: Mapping[str, Centroids]) -> ReferenceBin:
+def _reference_bin(place: DistanceBin, count: int, found: Mapping[str, CentroidStatistics]) -> ReferenceBin:
     method, sigma = _best(found, lambda s: (s.count, s.sigma_px))
     hub_method, hub_sigma = _best(found, lambda s: (s.hub_count, s.hub_sigma_px))
     return ReferenceBin(
@@ -194,7 +194,7 @@ def _reference_bin(place: DistanceBin, count: int, found: Mapping[str, Centroids
 
 
 def _best(
-    found: Mapping[str, Centroids], kind: Callable[[Centroids], tuple[int, float | None]]
+    found: Mapping[str, CentroidStatistics], kind: Callable[[CentroidStatistics], tuple[int, float | None]]
 ) -> tuple[str | None, float | None]:
     """The method with the least noise among those that measured enough features of a kind, and that noise. [px]"""
     kinds = {name: kind(statistics) for name, statistics in found.items()}

@@ -125,11 +125,11 @@ class Tile:
 def contact_tiles(dataset: Dataset, count: int = 12) -> list[Tile]:
     """Up to `count` pairs spread over the distances, nearest first; empty if no pair shows a drogue."""
     indices = dataset.frame_indices
-    looked_at = [indices[k] for k in spread(len(indices), _MOST_LOOKED_AT)]
+    looked_at = [indices[k] for k in evenly_spaced(len(indices), _MOST_LOOKED_AT)]
     records = [record for record in map(dataset.record, looked_at) if record.left_from_drogue is not None]
     records.sort(key=lambda record: (_distance_m(record), record.frame_index))
     tiles = []
-    for record in (records[k] for k in spread(len(records), count)):
+    for record in (records[k] for k in evenly_spaced(len(records), count)):
         view = record.views.left
         centers = [marker.center_ellipse_px for marker in view.markers if marker.visible_fraction > 0]
         picture = label_picture(display_picture(dataset.images(record.frame_index)), view.box_visible_xywh_px, centers)
@@ -204,7 +204,7 @@ def put_in_far_corner(tile: Picture, inset: Picture, x_share: float, y_share: fl
     tile[y : y + side, x : x + side] = inset
 
 
-def spread(length: int, count: int) -> list[int]:
+def evenly_spaced(length: int, count: int) -> list[int]:
     """Up to `count` places spread over a list, both ends among them."""
     return sorted({round(place) for place in np.linspace(0, length - 1, min(count, length))}) if length else []
 

@@ -34,8 +34,8 @@ from droguekit.benchmark.report.pose_tables import (
     rangefinder_tables,
 )
 from droguekit.benchmark.report.sequence_report import sequence_section
-from droguekit.benchmark.results.benchmark_result import BenchmarkResult, BinRow
-from droguekit.benchmark.sequences.sequence_latency import worked_s
+from droguekit.benchmark.results.benchmark_result import BenchmarkResult, PoseBin
+from droguekit.benchmark.sequences.sequence_latency import processing_time_s
 
 
 def result_sentences(result: BenchmarkResult) -> list[str]:
@@ -61,7 +61,7 @@ def result_sentences(result: BenchmarkResult) -> list[str]:
     return sentences + _others(result, best)
 
 
-def _at(row: BinRow) -> str:
+def _at(row: PoseBin) -> str:
     return (
         f"At {distance_text(row.low_m, row.high_m)} its RMS error is {millimetres(row.z_rmse_m)} mm in depth, "
         f"{millimetres(row.transverse_rmse_m)} mm across the line of sight, {three_digits(row.pitch_rmse_deg)} deg in "
@@ -202,7 +202,7 @@ def stage_times_ms(estimates: Path) -> list[tuple[str, str, str]]:
     """
     stages: dict[str, dict[str, list[float]]] = {}
     for estimate in read_estimates(estimates):
-        work_s = worked_s(estimate.stage_s)
+        work_s = processing_time_s(estimate.stage_s)
         if work_s is None:
             continue
         for stage, seconds in {**estimate.stage_s, "": work_s}.items():

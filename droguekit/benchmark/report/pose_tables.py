@@ -14,8 +14,8 @@ from droguekit.benchmark.report.number_text import (
     percent,
     three_digits,
 )
-from droguekit.benchmark.results.benchmark_result import BenchmarkResult, Row
-from droguekit.benchmark.results.pose_result import Comparison, Flips, MeanRatios, NeesPart, NormalizedErrors
+from droguekit.benchmark.results.benchmark_result import BenchmarkResult, PoseRow
+from droguekit.benchmark.results.pose_result import Flips, MeanRatios, MethodComparison, NeesPart, NormalizedErrors
 
 TITLES = {
     "x": "X, to the right [mm]",
@@ -92,7 +92,7 @@ def position_table(result: BenchmarkResult) -> Table:
     columns = ["pairs", "pose found", "mean", "95 % interval", "RMS", "95 % interval", "transverse RMS", "p95", "p99"]
     columns += ["max", "bound"]
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         return [
             str(row.n),
             percent(row.fix_fraction),
@@ -117,7 +117,7 @@ def centroid_table(result: BenchmarkResult) -> Table:
     columns = ["centroids", "RMS", "bias right", "bias down", "bias outward", "hub RMS", "mistaken"]
     columns += ["position from centroids [mm]", "share"]
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         c = row.centroids
         biases = (c.bias_u_px, c.bias_v_px, c.bias_outward_px)
         return [
@@ -141,7 +141,7 @@ def rangefinder_tables(result: BenchmarkResult) -> list[Table]:
     columns = ["pairs", "RMS against reading", "mean against reading", "of the distance"]
     columns += ["RMS against truth", "mean against truth", "of the distance", "reading against truth, RMS", "bias"]
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         found = row.rangefinder
         if found is None:
             return ["0", *[ABSENT] * (len(columns) - 1)]
@@ -165,14 +165,14 @@ def _component_table(result: BenchmarkResult, name: str) -> Table:
     unit = "deg" if name in ("pitch", "yaw") else "m"
     scale = 1.0 if unit == "deg" else 1e3
 
-    def shown(row: Row, key: str) -> str:
+    def shown(row: PoseRow, key: str) -> str:
         value = row.value(f"{name}_{key}_{unit}")
         return three_digits(None if value is None else value * scale)
 
-    def ends(row: Row, key: str) -> str:
+    def ends(row: PoseRow, key: str) -> str:
         return interval_text(row.intervals.get(f"{name}_{key}_{unit}"), scale)
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         bound = getattr(row.bound, f"{name}_{unit}") * scale if row.bound else None
         ratio = getattr(row.bound_ratio, name) if row.bound_ratio else None
         return [
@@ -190,7 +190,7 @@ def _component_table(result: BenchmarkResult, name: str) -> Table:
     return Table(name, TITLES[name], columns, _by_distance(result, cells))
 
 
-def with_overall(result: BenchmarkResult, names: Sequence[str], cells: Callable[[Row], list[str]]) -> list[Group]:
+def with_overall(result: BenchmarkResult, names: Sequence[str], cells: Callable[[PoseRow], list[str]]) -> list[Group]:
     """A group over all distances and one for each bin, with a row for each of the named methods."""
     groups = [Group("all", [[name, *cells(result.methods[name].overall)] for name in names])]
     for k, place in enumerate(result.reference):
@@ -199,7 +199,7 @@ def with_overall(result: BenchmarkResult, names: Sequence[str], cells: Callable[
     return groups
 
 
-def _by_distance(result: BenchmarkResult, cells: Callable[[Row], list[str]]) -> list[Group]:
+def _by_distance(result: BenchmarkResult, cells: Callable[[PoseRow], list[str]]) -> list[Group]:
     return with_overall(result, list(result.methods), cells)[1:]
 
 
@@ -221,7 +221,7 @@ def check_tables(result: BenchmarkResult) -> list[Table]:
 def normalized_table(result: BenchmarkResult, key: str, title: str) -> Table:
     """Normalized errors of every component with their upper limits; `key` is that of the row."""
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         errors: NormalizedErrors | None = getattr(row, key)
         if errors is None:
             return ["0"] + [three_digits(None)] * (2 * len(COMPONENTS))
@@ -242,7 +242,7 @@ def nees_tables(result: BenchmarkResult) -> list[Table]:
     if not names:
         return []
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         if row.nees is None:
             return ["0", *[three_digits(None)] * 6, "0"]
         parts = [_nees_cells(part) for part in (row.nees.position, row.nees.attitude, row.nees.pose)]
@@ -259,7 +259,7 @@ def nees_tables(result: BenchmarkResult) -> list[Table]:
 def flip_table(result: BenchmarkResult) -> Table:
     """Mirrored tilts, and what the flip law expects."""
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         return _flip_cells(row.flips) + _flip_cells(row.sight_flips)
 
     columns = ["clear tilts", "mirrored", "share", "95 % interval", "law"]
@@ -270,7 +270,7 @@ def flip_table(result: BenchmarkResult) -> Table:
 def failure_table(result: BenchmarkResult) -> Table:
     """Pairs without a pose, and errors that count them."""
 
-    def cells(row: Row) -> list[str]:
+    def cells(row: PoseRow) -> list[str]:
         errors = row.rmse_with_failures
         lengths = (errors.x_m, errors.y_m, errors.z_m)
         angles = (errors.pitch_deg, errors.yaw_deg)
@@ -292,7 +292,7 @@ def comparison_tables(result: BenchmarkResult) -> list[Table]:
     return tables
 
 
-def _comparison_groups(result: BenchmarkResult, pairs: Sequence[Comparison]) -> list[Group]:
+def _comparison_groups(result: BenchmarkResult, pairs: Sequence[MethodComparison]) -> list[Group]:
     groups = [Group("all", [[pair.method, *_ratio_cells(pair.overall)] for pair in pairs])]
     for k, place in enumerate(result.reference):
         rows = [[pair.method, *_ratio_cells(pair.bins[k])] for pair in pairs]

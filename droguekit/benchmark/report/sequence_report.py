@@ -22,7 +22,7 @@ from droguekit.benchmark.report.sequence_tables import (
 from droguekit.benchmark.results.sequence_result import (
     DockingBin,
     DockingErrors,
-    Filtering,
+    FilterErrors,
     Latency,
     LatencyBin,
     MethodSequences,
@@ -129,7 +129,7 @@ def _hiding_part(methods: Mapping[str, MethodSequences]) -> ReportPart | None:
 
 
 def _filter_part(
-    filters: Mapping[str, Filtering], styles: Mapping[str, MethodStyle], result: SequencesResult
+    filters: Mapping[str, FilterErrors], styles: Mapping[str, MethodStyle], result: SequencesResult
 ) -> ReportPart | None:
     if not filters:
         return None

@@ -27,18 +27,18 @@ from droguekit.benchmark.results.sequence_result import (
     DockingErrors,
     DockingRow,
     EyeTracking,
-    Filtering,
+    FilterErrors,
     Latency,
-    Losses,
     MethodSequences,
     MissRow,
     MotionBin,
     MotionRow,
     OverlapRow,
-    Percentiles,
     Reacquisition,
     SourceTracking,
+    TimePercentiles,
     Tracking,
+    TrackLosses,
 )
 
 _OVERLAP_COLUMNS = ["images", "AUC", "95 % interval", "mean overlap", "within 20 px", "95 % interval"]
@@ -182,7 +182,7 @@ def _loss_cells(row: EyeTracking) -> list[str]:
     ]
 
 
-def _rate_cells(losses: Losses | None) -> list[str]:
+def _rate_cells(losses: TrackLosses | None) -> list[str]:
     if losses is None:
         return [ABSENT] * 5
     return [
@@ -242,7 +242,7 @@ def hiding_table(methods: Methods) -> Table:
     return Table("hiding", "Poses while the drogue is hidden, and after", columns, [Group("all", rows)], "sequences")
 
 
-def filter_tables(filters: Mapping[str, Filtering]) -> list[Table]:
+def filter_tables(filters: Mapping[str, FilterErrors]) -> list[Table]:
     """Motion, its covariances, lag, and errors beside the raw method's."""
     motion = {name: (part.motion, part.bins) for name, part in filters.items() if part.motion is not None}
     return [
@@ -321,7 +321,7 @@ def _motion_table(rows: Mapping[str, tuple[MotionRow, Sequence[MotionBin]]]) -> 
     return Table("motion", "Velocity and rate, RMS errors", columns, _by_distance(rows, cells))
 
 
-def _nees_table(filters: Mapping[str, Filtering]) -> Table:
+def _nees_table(filters: Mapping[str, FilterErrors]) -> Table:
     columns = ["pairs", "velocity", "95 % of true ones", "rate", "95 % of true ones", "all six", "95 % of true ones"]
     columns += ["95 % interval", "unusable"]
     rows = []
@@ -336,7 +336,7 @@ def _nees_table(filters: Mapping[str, Filtering]) -> Table:
     return Table("motion-nees", title, columns, [Group("all", rows)])
 
 
-def _lag_table(filters: Mapping[str, Filtering]) -> Table:
+def _lag_table(filters: Mapping[str, FilterErrors]) -> Table:
     rows = []
     for name, part in filters.items():
         cells = []
@@ -349,7 +349,7 @@ def _lag_table(filters: Mapping[str, Filtering]) -> Table:
     return Table("lag", "Lag behind the truth [ms]", columns, [Group("all", rows)])
 
 
-def _raw_tables(filters: Mapping[str, Filtering]) -> list[Table]:
+def _raw_tables(filters: Mapping[str, FilterErrors]) -> list[Table]:
     compared = {name: part.raw for name, part in filters.items() if part.raw is not None}
     if not compared:
         return []
@@ -429,7 +429,7 @@ def _nees_cells(part: NeesPart | None) -> list[str]:
     return [three_digits(part.per_freedom), interval_text((part.low, part.high))]
 
 
-def _time_cells(row: Percentiles | None) -> list[str]:
+def _time_cells(row: TimePercentiles | None) -> list[str]:
     if row is None:
         return ["0", *[ABSENT] * 4]
     return [str(row.n), *map(three_digits, (row.p50_ms, row.p95_ms, row.p99_ms, row.max_ms))]

@@ -10,11 +10,11 @@ from pydantic import Field, model_serializer
 from droguekit.benchmark.confidence_intervals import Interval
 from droguekit.benchmark.results.pose_result import (
     Bound,
-    Centroids,
-    Comparison,
+    CentroidStatistics,
     ComponentErrors,
     ComponentRatios,
     Flips,
+    MethodComparison,
     Nees,
     NormalizedErrors,
     RangefinderErrors,
@@ -23,7 +23,7 @@ from droguekit.benchmark.results.pose_result import (
 from droguekit.benchmark.results.sequence_result import SequencesResult
 
 
-class Row(ResultModel):
+class PoseRow(ResultModel):
     """One method over a set of frames: estimate minus truth, over the frames with a fix. All null without a fix.
 
     Attributes:
@@ -91,7 +91,7 @@ class Row(ResultModel):
     intervals: dict[str, Interval]
     bound: Bound | None
     bound_ratio: ComponentRatios | None
-    centroids: Centroids
+    centroids: CentroidStatistics
     position_from_centroids_rmse_m: float | None
     centroid_share: float | None
     normalized: NormalizedErrors | None
@@ -115,7 +115,7 @@ class Row(ResultModel):
         return number
 
 
-class BinRow(Row):
+class PoseBin(PoseRow):
     """A row of the distances from `low_m` to `high_m`. [m]"""
 
     low_m: float
@@ -134,8 +134,8 @@ class EmptyFrames(ResultModel):
 class MethodResult(ResultModel):
     """One method: all frames, then by distance."""
 
-    overall: Row
-    bins: list[BinRow]
+    overall: PoseRow
+    bins: list[PoseBin]
     empty_frames: EmptyFrames
 
 
@@ -181,7 +181,7 @@ class BenchmarkResult(ResultModel):
     confidence: float
     reference: list[ReferenceBin]
     methods: dict[str, MethodResult]
-    comparisons: list[Comparison]
+    comparisons: list[MethodComparison]
     sequences: SequencesResult | None = None
 
     @model_serializer(mode="plain")

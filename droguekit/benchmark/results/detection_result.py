@@ -171,7 +171,7 @@ _BOX_DECIMALS = 3
 _SCORE_DECIMALS = 6
 
 
-class FoundBox(NamedTuple):
+class DetectedBox(NamedTuple):
     """One box.
 
     Attributes:
@@ -214,7 +214,7 @@ def clipped_box(box_xywh: PixelBox, size_px: tuple[int, int]) -> PixelBox | None
     return (lows[0], lows[1], width, height) if min(width, height) >= 10**-_BOX_DECIMALS else None
 
 
-def write_detections(path: Path, boxes: Iterable[FoundBox]) -> int:
+def write_detections(path: Path, boxes: Iterable[DetectedBox]) -> int:
     """Write or replace a file of results by one rename.
 
     Returns:
@@ -239,7 +239,7 @@ def write_detections(path: Path, boxes: Iterable[FoundBox]) -> int:
     return count
 
 
-def read_detections(path: Path, image_ids: Collection[int]) -> list[FoundBox]:
+def read_detections(path: Path, image_ids: Collection[int]) -> list[DetectedBox]:
     """The boxes of a file of results, whoever wrote it, in its order.
 
     Args:
@@ -268,7 +268,7 @@ def read_detections(path: Path, image_ids: Collection[int]) -> list[FoundBox]:
     return boxes
 
 
-def _found_box(entry: Any, known: frozenset[int]) -> FoundBox:
+def _found_box(entry: Any, known: frozenset[int]) -> DetectedBox:
     if not isinstance(entry, dict):
         raise ValueError(f"must be an object, got {type(entry).__name__}")
     image_id, category = entry["image_id"], entry["category_id"]
@@ -282,4 +282,4 @@ def _found_box(entry: Any, known: frozenset[int]) -> FoundBox:
     x, y, width, height, score = (float(number) for number in numbers)
     if not (width > 0 and height > 0 and max(abs(x), abs(y), width, height) < 1e6):
         raise ValueError(f"bbox: must be x, y, width, height in pixels, got {entry['bbox']!r}")
-    return FoundBox(image_id, (x, y, width, height), score)
+    return DetectedBox(image_id, (x, y, width, height), score)

@@ -34,7 +34,7 @@ class Bound(ResultModel):
     yaw_deg: float
 
 
-class Centroids(ResultModel):
+class CentroidStatistics(ResultModel):
     """Measured minus true ellipse centres of many features.
 
     Attributes:
@@ -186,7 +186,7 @@ class BinRatios(MeanRatios):
     high_m: float
 
 
-class Comparison(ResultModel):
+class MethodComparison(ResultModel):
     """One method beside another on the same pairs."""
 
     method: str

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from droguekit.benchmark.confidence_intervals import Interval
-from droguekit.benchmark.results.pose_result import Comparison, NeesPart, ResultModel
+from droguekit.benchmark.results.pose_result import MethodComparison, NeesPart, ResultModel
 
 
 class BodyAxes(ResultModel):
@@ -136,7 +136,7 @@ class OverlapRow(ResultModel):
     normalized: tuple[float, ...]
 
 
-class Losses(ResultModel):
+class TrackLosses(ResultModel):
     """How often a drogue that was followed got lost while it was there to be seen.
 
     A loss begins with the first image without a box, or with one that overlaps the true one by less than 0.1, after an
@@ -188,7 +188,7 @@ class EyeTracking(ResultModel):
     """
 
     overlap: OverlapRow | None
-    losses: Losses | None
+    losses: TrackLosses | None
     reacquisition: Reacquisition
     hidden: int
     hidden_with_box: int
@@ -226,7 +226,7 @@ class Tracking(ResultModel):
     sources: dict[str, SourceTracking]
 
 
-class Axes(ResultModel):
+class CameraAxes(ResultModel):
     """One number for each axis of the left camera."""
 
     x: float
@@ -260,10 +260,10 @@ class MotionRow(ResultModel):
 
     n: int
     of: int
-    velocity_rmse_m_s: Axes
+    velocity_rmse_m_s: CameraAxes
     speed_rmse_m_s: float
     speed_interval: Interval | None
-    rate_rmse_deg_s: Axes
+    rate_rmse_deg_s: CameraAxes
     turn_rmse_deg_s: float
     turn_interval: Interval | None
 
@@ -304,7 +304,7 @@ class Lag(ResultModel):
     interval: Interval | None
 
 
-class Filtering(ResultModel):
+class FilterErrors(ResultModel):
     """What a filter makes of a method's poses.
 
     Attributes:
@@ -318,10 +318,10 @@ class Filtering(ResultModel):
     bins: tuple[MotionBin, ...]
     nees: MotionNees | None
     lags: dict[str, Lag] | None
-    raw: Comparison | None
+    raw: MethodComparison | None
 
 
-class Percentiles(ResultModel):
+class TimePercentiles(ResultModel):
     """Times of some pairs. [ms]"""
 
     n: int
@@ -331,7 +331,7 @@ class Percentiles(ResultModel):
     max_ms: float
 
 
-class LatencyBin(Percentiles):
+class LatencyBin(TimePercentiles):
     """The pairs whose drogue stands from `low_m` to `high_m`. [m]"""
 
     low_m: float
@@ -349,9 +349,9 @@ class Latency(ResultModel):
         late: of these, those that were not worked on, because newer ones had come.
     """
 
-    overall: Percentiles | None
+    overall: TimePercentiles | None
     bins: tuple[LatencyBin, ...]
-    stages: dict[str, Percentiles]
+    stages: dict[str, TimePercentiles]
     answers: int
     late: int
     late_fraction: float
@@ -370,7 +370,7 @@ class MethodSequences(ResultModel):
 
     hiding: HiddenPairs
     tracking: Tracking | None
-    filtering: Filtering | None
+    filtering: FilterErrors | None
     docking: DockingErrors | None
     latency: Latency | None
 

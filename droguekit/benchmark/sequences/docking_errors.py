@@ -20,7 +20,7 @@ from droguekit.benchmark.results.sequence_result import (
     MissRow,
 )
 from droguekit.benchmark.sequences.filter_errors import SequenceData
-from droguekit.benchmark.sequences.sequence_truth import Moment, TrueMotion, TrueSequence
+from droguekit.benchmark.sequences.sequence_truth import TrueMotion, TrueSequence, TrueState
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
 from nav.docking import capture_radius_m
@@ -51,14 +51,14 @@ class TrueDocking:
         capture_radius_m: within which the drogue takes the tip in. [m]
         closure_m_s: how fast its forward part shrinks; None where the motion is not known. [m/s]
         predicted: if both go on as they truly move at this instant; None unless they close.
-        in_the_end: what the sequence brings; None where the tip never comes to the rim, or only after a gap.
+        actual: what the sequence brings; None where the tip never comes to the rim, or only after a gap.
     """
 
     mouth_from_tip_m: Array
     capture_radius_m: float
     closure_m_s: float | None
     predicted: Arrival | None
-    in_the_end: Arrival | None
+    actual: Arrival | None
 
 
 def true_dockings(sequences: Sequence[TrueSequence], motions: Mapping[int, TrueMotion]) -> dict[int, TrueDocking]:
@@ -66,9 +66,9 @@ def true_dockings(sequences: Sequence[TrueSequence], motions: Mapping[int, TrueM
     found: dict[int, TrueDocking] = {}
     for sequence in sequences:
         for run in sequence.runs():
-            arrivals = arrivals_in_the_end(run)
-            for moment, arrival in zip(run, arrivals, strict=True):
-                found[moment.frame_index] = _true_docking(moment, motions.get(moment.frame_index), arrival)
+            arrivals = actual_arrivals(run)
+            for state, arrival in zip(run, arrivals, strict=True):
+                found[state.frame_index] = _true_docking(state, motions.get(state.frame_index), arrival)
     return found
 
 
@@ -97,12 +97,12 @@ def predicted_arrival(left_from_drogue: RigidTransform, velocity_m_s: Array, tip
     return Arrival(float(np.linalg.norm(tip_from_mouth - contact_s * velocity_m_s)), contact_s)
 
 
-def arrivals_in_the_end(run: Sequence[Moment]) -> list[Arrival | None]:
+def actual_arrivals(run: Sequence[TrueState]) -> list[Arrival | None]:
     """For each pair of a run how the tip next comes through the plane of the rim, from the mouth's side."""
-    poses = [moment.left_from_drogue for moment in run if moment.left_from_drogue is not None]
+    poses = [state.left_from_drogue for state in run if state.left_from_drogue is not None]
     tip_m = tip_in_left_m(run[0].rig)
     tips = np.array([pose.inverse().apply(tip_m) for pose in poses])
-    times = np.array([moment.time_s for moment in run])
+    times = np.array([state.time_s for state in run])
     arrivals: list[Arrival | None] = [None] * len(run)
     miss_m, at_s = None, 0.0
     for k in range(len(run) - 1, -1, -1):
@@ -118,34 +118,34 @@ def arrivals_in_the_end(run: Sequence[Moment]) -> list[Arrival | None]:
     return arrivals
 
 
-def _true_docking(moment: Moment, motion: TrueMotion | None, in_the_end: Arrival | None) -> TrueDocking:
-    rig, pose, drogue = moment.rig, moment.left_from_drogue, moment.drogue
+def _true_docking(state: TrueState, motion: TrueMotion | None, actual: Arrival | None) -> TrueDocking:
+    rig, pose, drogue = state.rig, state.left_from_drogue, state.drogue
     if pose is None or drogue is None:
-        raise ValueError(f"frame {moment.frame_index}: shows no drogue")
+        raise ValueError(f"frame {state.frame_index}: shows no drogue")
     radius_m = capture_radius_m(drogue)
     mouth = rig.body_from_left.apply(pose.translation_m) - rig.probe_tip_body_m
     if motion is None:
-        return TrueDocking(mouth, radius_m, None, None, in_the_end)
+        return TrueDocking(mouth, radius_m, None, None, actual)
     closure = -float(rig.body_from_left.rotate(motion.velocity_m_s)[0])
     predicted = predicted_arrival(pose, motion.velocity_m_s, tip_in_left_m(rig))
-    return TrueDocking(mouth, radius_m, closure, predicted, in_the_end)
+    return TrueDocking(mouth, radius_m, closure, predicted, actual)
 
 
 _AXES = ("forward", "right", "down")
 
 
 class DockingPair(NamedTuple):
-    """One pair with docking quantities, told and true."""
+    """One pair with docking quantities, reported and true."""
 
     frame_index: int
-    told: Docking
+    reported: Docking
     true: TrueDocking
 
     @property
     def capture_radius_m(self) -> float:
-        """What captures are judged by: the radius that the answer tells, or the drogue's. [m]"""
-        told_m = self.told.capture_radius_m
-        return self.true.capture_radius_m if told_m is None else told_m
+        """The radius that captures are judged by: the estimate's own if it reports one, else the drogue's. [m]"""
+        reported_m = self.reported.capture_radius_m
+        return self.true.capture_radius_m if reported_m is None else reported_m
 
 
 def docking_errors(
@@ -177,32 +177,32 @@ def docking_errors(
 
 def calibration(errors: Array, deviations: Array) -> Calibration | None:
     """How often errors stay within once and twice their standard deviation; None where none is above 0."""
-    told = deviations > 0
-    if not told.any():
+    known = deviations > 0
+    if not known.any():
         return None
-    ratios = np.abs(errors[told]) / deviations[told]
-    return Calibration(n=int(told.sum()), within_1=float(np.mean(ratios <= 1)), within_2=float(np.mean(ratios <= 2)))
+    ratios = np.abs(errors[known]) / deviations[known]
+    return Calibration(n=int(known.sum()), within_1=float(np.mean(ratios <= 1)), within_2=float(np.mean(ratios <= 2)))
 
 
 def _row(data: SequenceData, pairs: Sequence[DockingPair], of: int, key: str) -> DockingRow:
-    errors = np.array([pair.told.mouth_from_tip_m - pair.true.mouth_from_tip_m for pair in pairs])
-    deviations = np.array([pair.told.mouth_sd_m for pair in pairs])
+    errors = np.array([pair.reported.mouth_from_tip_m - pair.true.mouth_from_tip_m for pair in pairs])
+    deviations = np.array([pair.reported.mouth_sd_m for pair in pairs])
     squares = np.square(errors).sum(axis=1)
     ends = mean_interval(squares, [data.sequence_of(pair.frame_index) for pair in pairs], f"{key}, mouth")
     closures = np.array(
         [
-            pair.told.closure_m_s - pair.true.closure_m_s
+            pair.reported.closure_m_s - pair.true.closure_m_s
             for pair in pairs
-            if pair.told.closure_m_s is not None and pair.true.closure_m_s is not None
+            if pair.reported.closure_m_s is not None and pair.true.closure_m_s is not None
         ]
     )
     contacts = [
-        pair.told.contact_s - pair.true.predicted.contact_s
+        pair.reported.contact_s - pair.true.predicted.contact_s
         for pair in pairs
-        if pair.told.contact_s is not None and pair.true.predicted is not None
+        if pair.reported.contact_s is not None and pair.true.predicted is not None
     ]
     predicted = [(pair, pair.true.predicted) for pair in pairs]
-    final = [(pair, pair.true.in_the_end) for pair in pairs]
+    final = [(pair, pair.true.actual) for pair in pairs]
     return DockingRow(
         n=len(pairs),
         of=of,
@@ -224,9 +224,9 @@ def _row(data: SequenceData, pairs: Sequence[DockingPair], of: int, key: str) ->
 
 def _miss_row(pairs: Sequence[tuple[DockingPair, Arrival | None]]) -> MissRow | None:
     both = [
-        (pair.told.miss_m - true.miss_m, pair.told.miss_sd_m or 0.0)
+        (pair.reported.miss_m - true.miss_m, pair.reported.miss_sd_m or 0.0)
         for pair, true in pairs
-        if pair.told.miss_m is not None and true is not None
+        if pair.reported.miss_m is not None and true is not None
     ]
     if not both:
         return None
@@ -242,11 +242,11 @@ def _miss_row(pairs: Sequence[tuple[DockingPair, Arrival | None]]) -> MissRow | 
 
 
 def _captures(pairs: Sequence[tuple[DockingPair, Arrival | None]]) -> Captures | None:
-    """Told against true captures; None where either is nowhere known."""
-    known = [(pair, true) for pair, true in pairs if pair.told.captured is not None and true is not None]
+    """Reported against true captures; None where no pair has both."""
+    known = [(pair, true) for pair, true in pairs if pair.reported.captured is not None and true is not None]
     if not known:
         return None
-    cases = [(pair.told.captured, true.miss_m <= pair.capture_radius_m) for pair, true in known]
+    cases = [(pair.reported.captured, true.miss_m <= pair.capture_radius_m) for pair, true in known]
     radii = {pair.capture_radius_m for pair, _ in known}
     return Captures(
         radius_m=radii.pop() if len(radii) == 1 else None,

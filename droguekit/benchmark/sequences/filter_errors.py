@@ -11,15 +11,15 @@ from datasets_manifest.random_streams import named_generator
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from droguekit.benchmark.confidence_intervals import CONFIDENCE, RESAMPLES, mean_interval, root_mean_square
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth
-from droguekit.benchmark.poses.method_comparison import PairGroups, compare
+from droguekit.benchmark.poses.method_comparison import PairGroups, compare_methods
 from droguekit.benchmark.poses.pose_errors import COMPONENTS, PoseError, nees_parts, normalized_squares, pose_error
-from droguekit.benchmark.results.pose_result import Comparison
-from droguekit.benchmark.results.sequence_result import Axes, Filtering, Lag, MotionBin, MotionNees, MotionRow
+from droguekit.benchmark.results.pose_result import MethodComparison
+from droguekit.benchmark.results.sequence_result import CameraAxes, FilterErrors, Lag, MotionBin, MotionNees, MotionRow
 from droguekit.benchmark.sequences.sequence_truth import (
     MOTION_PARTS,
-    Moment,
     TrueMotion,
     TrueSequence,
+    TrueState,
     motion_errors,
     smoothing_spline,
 )
@@ -63,16 +63,16 @@ def lags(sequences: Sequence[TrueSequence], estimates: Mapping[int, PoseEstimate
 
 
 def _run_sums(
-    run: Sequence[Moment], period_s: float, estimates: Mapping[int, PoseEstimate]
+    run: Sequence[TrueState], period_s: float, estimates: Mapping[int, PoseEstimate]
 ) -> tuple[Array, int] | None:
     """(5, 201) squared errors by component and shift, of how many estimates; None where the run is too short."""
-    times = np.array([moment.time_s for moment in run])
+    times = np.array([state.time_s for state in run])
     # The same estimates at every shift: those whose truth is known at all of them.
     inside = (times - MOST_LAG_S >= times[0]) & (times + MOST_LAG_S <= times[-1])
-    chosen = [k for k, moment in enumerate(run) if inside[k] and moment.frame_index in estimates]
+    chosen = [k for k, state in enumerate(run) if inside[k] and state.frame_index in estimates]
     if len(chosen) < _FEWEST_PER_RUN:
         return None
-    poses = [moment.left_from_drogue for moment in run if moment.left_from_drogue is not None]
+    poses = [state.left_from_drogue for state in run if state.left_from_drogue is not None]
     truth = smoothing_spline(times, _components(poses), period_s)
     found = _components([estimates[run[k].frame_index].left_from_drogue for k in chosen])
     sums = np.empty((len(COMPONENTS), len(_SHIFTS)))
@@ -116,7 +116,7 @@ def _vertex(total: Array) -> float | None:
 
 
 # A method that works on the poses of another is called by its name, this, and its own.
-_BEHIND = "+"
+_FILTER_SEPARATOR = "+"
 
 
 class SequenceData(NamedTuple):
@@ -146,7 +146,7 @@ class _MotionScore(NamedTuple):
     squares: Array | None
 
 
-def filtering(data: SequenceData, name: str, methods: Mapping[str, Mapping[int, Estimate]]) -> Filtering | None:
+def filter_errors(data: SequenceData, name: str, methods: Mapping[str, Mapping[int, Estimate]]) -> FilterErrors | None:
     """The scores of a method that reports motion; None where it does not.
 
     Args:
@@ -165,7 +165,7 @@ def filtering(data: SequenceData, name: str, methods: Mapping[str, Mapping[int, 
             of = sum(data.groups.bin_of_frame[index] == k for index in data.motions)
             row = _motion_row(data, inside, of, f"{name}, bin {k}")
             bins.append(MotionBin(**dict(row), low_m=place.low_m, high_m=place.high_m))
-    return Filtering(
+    return FilterErrors(
         motion=_motion_row(data, scores, len(data.motions), name) if scores else None,
         bins=tuple(bins),
         nees=_motion_nees(data, scores, name) if scores else None,
@@ -195,10 +195,10 @@ def _motion_row(data: SequenceData, scores: Sequence[_MotionScore], of: int, key
     return MotionRow(
         n=len(scores),
         of=of,
-        velocity_rmse_m_s=Axes(x=rms[0], y=rms[1], z=rms[2]),
+        velocity_rmse_m_s=CameraAxes(x=rms[0], y=rms[1], z=rms[2]),
         speed_rmse_m_s=float(np.sqrt(squares["velocity"].mean())),
         speed_interval=roots["velocity"],
-        rate_rmse_deg_s=Axes(x=rms[3], y=rms[4], z=rms[5]),
+        rate_rmse_deg_s=CameraAxes(x=rms[3], y=rms[4], z=rms[5]),
         turn_rmse_deg_s=float(np.sqrt(squares["rate"].mean())),
         turn_interval=roots["rate"],
     )
@@ -222,11 +222,13 @@ def _motion_nees(data: SequenceData, scores: Sequence[_MotionScore], key: str) -
     )
 
 
-def _against_raw(data: SequenceData, name: str, methods: Mapping[str, Mapping[int, Estimate]]) -> Comparison | None:
-    raw = name.rpartition(_BEHIND)[0]
+def _against_raw(
+    data: SequenceData, name: str, methods: Mapping[str, Mapping[int, Estimate]]
+) -> MethodComparison | None:
+    raw = name.rpartition(_FILTER_SEPARATOR)[0]
     if raw not in methods:
         return None
-    in_sequences = {moment.frame_index for sequence in data.sequences for moment in sequence.moments}
+    in_sequences = {state.frame_index for sequence in data.sequences for state in sequence.states}
     errors = {
         method: {
             index: _error(estimate, data.drogues[index])
@@ -235,13 +237,13 @@ def _against_raw(data: SequenceData, name: str, methods: Mapping[str, Mapping[in
         }
         for method in (name, raw)
     }
-    return compare(errors, [raw], data.groups)[0]
+    return compare_methods(errors, [raw], data.groups)[0]
 
 
 def _error(estimate: PoseEstimate, truth: DrogueTruth) -> PoseError:
     return pose_error(estimate.left_from_drogue, truth.left_from_drogue)
 
 
-def root_mean_length(vectors: Sequence[Array]) -> float | None:
+def rms_length(vectors: Sequence[Array]) -> float | None:
     """Root mean square of the lengths of vectors; None without any."""
     return root_mean_square(np.linalg.norm(vectors, axis=1)) if len(vectors) else None

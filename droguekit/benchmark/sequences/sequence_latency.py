@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from datasets_manifest.types.estimates import Estimate, NoFix
-from droguekit.benchmark.results.sequence_result import Latency, LatencyBin, Percentiles
+from droguekit.benchmark.results.sequence_result import Latency, LatencyBin, TimePercentiles
 from droguekit.benchmark.sequences.filter_errors import SequenceData
 
 LATE = "late:"
@@ -16,7 +16,7 @@ LATE = "late:"
 _WAITING = frozenset({"read", "wait", "handover"})
 
 
-def worked_s(stage_s: Mapping[str, float]) -> float | None:
+def processing_time_s(stage_s: Mapping[str, float]) -> float | None:
     """Time that was worked on a pair; None where no such stage is told. [s]
 
     Args:
@@ -33,7 +33,7 @@ def latency(data: SequenceData, estimates: Mapping[int, Estimate]) -> Latency | 
         data: the truth.
         estimates: of the method, by frame.
     """
-    frames = [moment.frame_index for sequence in data.sequences for moment in sequence.moments]
+    frames = [state.frame_index for sequence in data.sequences for state in sequence.states]
     answers = {index: estimates[index] for index in sorted(frames) if index in estimates}
     in_time = {index: answer for index, answer in answers.items() if not _is_late(answer)}
     late = len(answers) - len(in_time)
@@ -48,11 +48,11 @@ def latency(data: SequenceData, estimates: Mapping[int, Estimate]) -> Latency | 
     for k, place in enumerate(data.groups.bins):
         inside = [ms for index, ms in took_ms.items() if data.groups.bin_of_frame.get(index) == k]
         if inside:
-            bins.append(LatencyBin(**dict(percentiles(inside)), low_m=place.low_m, high_m=place.high_m))
+            bins.append(LatencyBin(**dict(time_percentiles(inside)), low_m=place.low_m, high_m=place.high_m))
     return Latency(
-        overall=percentiles(list(took_ms.values())) if took_ms else None,
+        overall=time_percentiles(list(took_ms.values())) if took_ms else None,
         bins=tuple(bins),
-        stages={stage: percentiles(times) for stage, times in stages.items()},
+        stages={stage: time_percentiles(times) for stage, times in stages.items()},
         answers=len(answers),
         late=late,
         late_fraction=late / len(answers),
@@ -63,7 +63,7 @@ def _is_late(answer: Estimate) -> bool:
     return isinstance(answer, NoFix) and answer.reason.startswith(LATE)
 
 
-def percentiles(times_ms: Sequence[float]) -> Percentiles:
+def time_percentiles(times_ms: Sequence[float]) -> TimePercentiles:
     """Of at least one time. [ms]"""
     p50, p95, p99 = np.percentile(times_ms, (50, 95, 99)).tolist()
-    return Percentiles(n=len(times_ms), p50_ms=p50, p95_ms=p95, p99_ms=p99, max_ms=max(times_ms))
+    return TimePercentiles(n=len(times_ms), p50_ms=p50, p95_ms=p95, p99_ms=p99, max_ms=max(times_ms))

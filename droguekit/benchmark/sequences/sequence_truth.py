@@ -18,7 +18,7 @@ from droguekit.benchmark.poses.pose_errors import Parts
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 
-Sight = Literal["seen", "partly", "hidden", "dazzled"]
+Visibility = Literal["seen", "partly", "hidden", "dazzled"]
 """`seen`: enough of the drogue to be found; `hidden`: nothing of it, or of none of its markers; `dazzled`: the sun in
 the lens may or may not outshine it, so that neither answer is wrong."""
 
@@ -41,7 +41,7 @@ class EyeTruth:
     is_dazzled: bool
 
     @property
-    def sight(self) -> Sight:
+    def visibility(self) -> Visibility:
         """Whether it is to be found there."""
         if self.seen_fraction == 0:
             return "hidden"
@@ -51,7 +51,7 @@ class EyeTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class TrueState:
     """One pair of a sequence.
 
     Attributes:
@@ -74,10 +74,10 @@ class Moment:
     eyes: Mapping[Eye, EyeTruth]
 
     @property
-    def sight(self) -> Sight:
+    def visibility(self) -> Visibility:
         """Of the pair: that of both images, or `partly` where they differ."""
-        sights = {eye.sight for eye in self.eyes.values()}
-        return sights.pop() if len(sights) == 1 else "partly"
+        visibilities = {eye.visibility for eye in self.eyes.values()}
+        return visibilities.pop() if len(visibilities) == 1 else "partly"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,29 +87,29 @@ class TrueSequence:
     Attributes:
         sequence_id: its number.
         period_s: median time from one pair to the next, the lesser one of two. [s]
-        moments: by ascending time.
+        states: by ascending time.
     """
 
     sequence_id: int
     period_s: float
-    moments: tuple[Moment, ...]
+    states: tuple[TrueState, ...]
 
-    def runs(self) -> Iterator[tuple[Moment, ...]]:
+    def runs(self) -> Iterator[tuple[TrueState, ...]]:
         """The pairs with a drogue that follow each other without a gap."""
-        run: list[Moment] = []
-        for moment in self.moments:
-            gap = run and moment.time_s - run[-1].time_s > _GAP_PERIODS * self.period_s
-            if run and (gap or moment.left_from_drogue is None):
+        run: list[TrueState] = []
+        for state in self.states:
+            gap = run and state.time_s - run[-1].time_s > _GAP_PERIODS * self.period_s
+            if run and (gap or state.left_from_drogue is None):
                 yield tuple(run)
                 run = []
-            if moment.left_from_drogue is not None:
-                run.append(moment)
+            if state.left_from_drogue is not None:
+                run.append(state)
         if run:
             yield tuple(run)
 
 
-def moment(record: PairRecord) -> Moment | None:
-    """A record as a moment of its sequence; None where it belongs to none."""
+def true_state(record: PairRecord) -> TrueState | None:
+    """A record as the true state of a pair in its sequence; None where it belongs to none."""
     if record.sequence_id is None:
         return None
     frame, pose, velocity = record.frame, record.left_from_drogue, None
@@ -118,7 +118,7 @@ def moment(record: PairRecord) -> Moment | None:
         # Derivative of `FrameSpec.left_from_drogue_at` at mid-exposure.
         velocity = pose.rotate(drogue[:3]) - camera[:3] - np.cross(camera[3:], pose.translation_m)
     views = dict(zip(EYES, (record.views.left, record.views.right), strict=True))
-    return Moment(
+    return TrueState(
         frame_index=record.frame_index,
         sequence_id=record.sequence_id,
         time_s=record.time_s,
@@ -133,21 +133,21 @@ def moment(record: PairRecord) -> Moment | None:
     )
 
 
-def true_sequences(moments: Iterable[Moment | None]) -> tuple[TrueSequence, ...]:
+def true_sequences(states: Iterable[TrueState | None]) -> tuple[TrueSequence, ...]:
     """The sequences of a dataset by their numbers; single pairs are left out.
 
     Raises:
         ValueError: two pairs of a sequence have one time.
     """
-    by_id: dict[int, list[Moment]] = {}
-    for one in moments:
+    by_id: dict[int, list[TrueState]] = {}
+    for one in states:
         if one is not None:
             by_id.setdefault(one.sequence_id, []).append(one)
     return tuple(_sequence(number, by_id[number]) for number in sorted(by_id) if len(by_id[number]) > 1)
 
 
-def _sequence(number: int, moments: list[Moment]) -> TrueSequence:
-    ordered = sorted(moments, key=lambda one: one.time_s)
+def _sequence(number: int, states: list[TrueState]) -> TrueSequence:
+    ordered = sorted(states, key=lambda one: one.time_s)
     steps = np.diff([one.time_s for one in ordered])
     if not (steps > 0).all():
         at = ordered[int(np.argmin(steps))].frame_index
@@ -224,13 +224,13 @@ MOTION_PARTS: Parts = {"velocity": slice(0, 3), "rate": slice(3, 6), "motion": s
 """Of errors and covariances of a motion."""
 
 
-def _run_motions(run: Sequence[Moment], period_s: float) -> dict[int, TrueMotion]:
+def _run_motions(run: Sequence[TrueState], period_s: float) -> dict[int, TrueMotion]:
     # Near the ends a spline's derivative is not known as well.
     margin = pairs_per_knot(period_s)
     if len(run) <= 2 * margin:
         return {}
-    times = np.array([moment.time_s for moment in run])
-    poses = [moment.left_from_drogue for moment in run if moment.left_from_drogue is not None]
+    times = np.array([state.time_s for state in run])
+    poses = [state.left_from_drogue for state in run if state.left_from_drogue is not None]
     places = np.array([pose.translation_m for pose in poses])
     velocity = smoothing_spline(times, places, period_s).derivative()(times)
     # Rates from pair to pair belong to the middle between them; turns of any size are well defined there.
@@ -243,5 +243,5 @@ def _run_motions(run: Sequence[Moment], period_s: float) -> dict[int, TrueMotion
     }
 
 
-def _vibration(moment: Moment, velocity_m_s: Array) -> Array | None:
-    return None if moment.instant_velocity_m_s is None else moment.instant_velocity_m_s - velocity_m_s
+def _vibration(state: TrueState, velocity_m_s: Array) -> Array | None:
+    return None if state.instant_velocity_m_s is None else state.instant_velocity_m_s - velocity_m_s

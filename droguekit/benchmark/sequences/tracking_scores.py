@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from datasets_manifest.types.estimates import Estimate, Region
 from datasets_manifest.types.records import PixelBox
 from droguekit.benchmark.confidence_intervals import mean_interval, rate_interval, root_mean_square
-from droguekit.benchmark.results.detection_result import FoundBox, center_box, clipped_box, corner_box
+from droguekit.benchmark.results.detection_result import DetectedBox, center_box, clipped_box, corner_box
 from droguekit.benchmark.results.sequence_result import (
     EyeTracking,
-    Losses,
     OverlapRow,
     Reacquisition,
     SourceTracking,
     Tracking,
+    TrackLosses,
 )
-from droguekit.benchmark.sequences.sequence_latency import worked_s
-from droguekit.benchmark.sequences.sequence_truth import Sight, TrueSequence
+from droguekit.benchmark.sequences.sequence_latency import processing_time_s
+from droguekit.benchmark.sequences.sequence_truth import TrueSequence, Visibility
 from geometry.boxes import intersection_over_union
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
@@ -72,11 +72,11 @@ def _shares(passed: NDArray[np.bool_]) -> Array:
     return shares
 
 
-LEAST_FOLLOWED_OVERLAP = 0.1
+LEAST_TRACKED_OVERLAP = 0.1
 """A box that overlaps the true one by less has lost the drogue (our choice)."""
 LEAST_FOUND_OVERLAP = 0.5
 """From which overlap on a box has the drogue again, as a detector's."""
-SOON_FRAMES = 3
+REACQUISITION_LIMIT_FRAMES = 3
 """Within which a drogue should be found again."""
 
 
@@ -95,7 +95,7 @@ class EyeTrack:
     Attributes:
         sequence_id, period_s: of the sequence.
         frame_index: (n,) of the pairs.
-        sights: of the drogue in each image.
+        visibilities: of the drogue in each image.
         found, truth: (n, 4) boxes, nan where there is none. [px]
         sources: of each found box; None without one.
     """
@@ -103,7 +103,7 @@ class EyeTrack:
     sequence_id: int
     period_s: float
     frame_index: tuple[int, ...]
-    sights: tuple[Sight, ...]
+    visibilities: tuple[Visibility, ...]
     found: Array
     truth: Array
     sources: tuple[str | None, ...]
@@ -111,7 +111,7 @@ class EyeTrack:
     @property
     def seen(self) -> NDArray[np.bool_]:
         """(n,) whether the drogue is to be found."""
-        return np.array([sight == "seen" for sight in self.sights])
+        return np.array([visibility == "seen" for visibility in self.visibilities])
 
     @property
     def overlap(self) -> Array:
@@ -138,14 +138,14 @@ def both_eyes_tracking(by_eye: Mapping[Eye, Sequence[EyeTrack]]) -> EyeTracking:
     return _track_scores([track for eye in EYES for track in by_eye[eye]], worse, "both eyes")
 
 
-def _track_scores(tracks: Sequence[EyeTrack], losses: Losses | None, key: str) -> EyeTracking:
+def _track_scores(tracks: Sequence[EyeTrack], losses: TrackLosses | None, key: str) -> EyeTracking:
     boxed = [box is not None for track in tracks for box in track.sources]
-    hidden = [sight == "hidden" for track in tracks for sight in track.sights]
+    hidden = [visibility == "hidden" for track in tracks for visibility in track.visibilities]
     found = [(track.overlap >= LEAST_FOUND_OVERLAP).tolist() for track in tracks]
     return EyeTracking(
         overlap=overlap_row(tracks, lambda track: track.seen, key),
         losses=losses,
-        reacquisition=reacquisition((track.sights, hits) for track, hits in zip(tracks, found, strict=True)),
+        reacquisition=reacquisition((track.visibilities, hits) for track, hits in zip(tracks, found, strict=True)),
         hidden=sum(hidden),
         hidden_with_box=sum(h and b for h, b in zip(hidden, boxed, strict=True)),
     )
@@ -184,30 +184,30 @@ def overlap_row(
     )
 
 
-def reacquisition(courses: Iterable[tuple[Sequence[Sight], Sequence[bool]]]) -> Reacquisition:
+def reacquisition(courses: Iterable[tuple[Sequence[Visibility], Sequence[bool]]]) -> Reacquisition:
     """How soon answers come after the drogue was hidden, or had no answer beside the sun.
 
     Args:
         courses: for each sequence what was to be seen frame by frame, and whether there was an answer.
     """
-    delays = [delay for sights, answers in courses for delay in _delays(sights, answers)]
+    delays = [delay for visibilities, answers in courses for delay in _delays(visibilities, answers)]
     came = [delay for delay in delays if delay is not None]
     return Reacquisition(
         n=len(delays),
         found=len(came),
-        within_3=sum(delay <= SOON_FRAMES for delay in came),
+        within_3=sum(delay <= REACQUISITION_LIMIT_FRAMES for delay in came),
         median_frames=float(np.median(came)) if came else None,
         max_frames=max(came, default=None),
     )
 
 
-def _delays(sights: Sequence[Sight], answers: Sequence[bool]) -> Iterator[int | None]:
+def _delays(visibilities: Sequence[Visibility], answers: Sequence[bool]) -> Iterator[int | None]:
     """Of each re-appearance, the frames until an answer, or None where none came before the drogue hid again."""
     hidden, since = False, None
-    for k, (sight, answer) in enumerate(zip(sights, answers, strict=True)):
-        if sight == "seen" and hidden:
+    for k, (visibility, answer) in enumerate(zip(visibilities, answers, strict=True)):
+        if visibility == "seen" and hidden:
             hidden, since = False, k
-        elif sight == "hidden" or (sight == "dazzled" and not answer):
+        elif visibility == "hidden" or (visibility == "dazzled" and not answer):
             if since is not None:
                 yield None
             hidden, since = True, None
@@ -218,13 +218,13 @@ def _delays(sights: Sequence[Sight], answers: Sequence[bool]) -> Iterator[int | 
         yield None
 
 
-def _losses(tracks: Sequence[EyeTrack]) -> Losses | None:
+def _losses(tracks: Sequence[EyeTrack]) -> TrackLosses | None:
     seen_s = sum(float(track.seen.sum()) * track.period_s for track in tracks)
     if not seen_s:
         return None
     count = sum(_losses_of(track) for track in tracks)
-    lost = np.concatenate([track.overlap[track.seen] < LEAST_FOLLOWED_OVERLAP for track in tracks])
-    return Losses(
+    lost = np.concatenate([track.overlap[track.seen] < LEAST_TRACKED_OVERLAP for track in tracks])
+    return TrackLosses(
         minutes=seen_s / 60,
         count=count,
         per_minute=60 * count / seen_s,
@@ -235,27 +235,27 @@ def _losses(tracks: Sequence[EyeTrack]) -> Losses | None:
 
 def _losses_of(track: EyeTrack) -> int:
     count, followed = 0, False
-    for sight, overlap in zip(track.sights, track.overlap, strict=True):
-        if sight in ("hidden", "dazzled"):
+    for visibility, overlap in zip(track.visibilities, track.overlap, strict=True):
+        if visibility in ("hidden", "dazzled"):
             followed = False
-        elif sight == "seen":
-            held = bool(overlap >= LEAST_FOLLOWED_OVERLAP)
+        elif visibility == "seen":
+            held = bool(overlap >= LEAST_TRACKED_OVERLAP)
             count += followed and not held
             followed = held
     return count
 
 
 def _eye_track(sequence: TrueSequence, eye: Eye, boxes: Mapping[tuple[int, Eye], SourcedBox]) -> EyeTrack:
-    moments = sequence.moments
-    camera = moments[0].rig.camera
+    states = sequence.states
+    camera = states[0].rig.camera
     size_px = (camera.width_px, camera.height_px)
-    on_image = [_on_image(boxes.get((moment.frame_index, eye)), size_px) for moment in moments]
-    truths = [moment.eyes[eye].box_px for moment in moments]
+    on_image = [_on_image(boxes.get((state.frame_index, eye)), size_px) for state in states]
+    truths = [state.eyes[eye].box_px for state in states]
     return EyeTrack(
         sequence_id=sequence.sequence_id,
         period_s=sequence.period_s,
-        frame_index=tuple(moment.frame_index for moment in moments),
-        sights=tuple(moment.eyes[eye].sight for moment in moments),
+        frame_index=tuple(state.frame_index for state in states),
+        visibilities=tuple(state.eyes[eye].visibility for state in states),
         found=np.array([NO_BOX if box is None else box.box_px for box in on_image], dtype=np.float64),
         truth=np.array([NO_BOX if box is None else box for box in truths], dtype=np.float64),
         sources=tuple(None if box is None else box.source for box in on_image),
@@ -277,7 +277,7 @@ StageTimes = Mapping[int, Mapping[str, float]]
 _BOX_STAGES = frozenset({"detect", "track", "correct"})
 
 
-def track_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> Tracking:
+def score_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> Tracking:
     """Scores of the regions that a method reports; one that reports none has lost the drogue everywhere.
 
     Args:
@@ -294,8 +294,8 @@ def track_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Est
     return _tracking(sequences, boxes, {i: estimate.stage_s for i, estimate in estimates.items()})
 
 
-def track_found_boxes(
-    sequences: Sequence[TrueSequence], found: Iterable[FoundBox], threshold: float
+def score_detected_boxes(
+    sequences: Sequence[TrueSequence], found: Iterable[DetectedBox], threshold: float
 ) -> Tracking | None:
     """Scores of a file of boxes: of each image the best one, if it scores at least the threshold.
 
@@ -331,7 +331,7 @@ def _source_tracking(source: str, tracks: Sequence[EyeTrack], stages_s: StageTim
         index for track in tracks for index, own in zip(track.frame_index, is_own(track).tolist(), strict=True) if own
     }
     told = [stages_s[index] for index in sorted(pairs & stages_s.keys())]
-    times_ms = [1e3 * work_s for work_s in map(worked_s, told) if work_s is not None]
+    times_ms = [1e3 * work_s for work_s in map(processing_time_s, told) if work_s is not None]
     box_ms = [
         1e3 * sum(spent_s for stage, spent_s in stages.items() if stage in _BOX_STAGES)
         for stages in told

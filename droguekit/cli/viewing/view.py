@@ -44,7 +44,7 @@ def view(
         raise ValueError("view: rerun is not installed; pip install 'droguekit[viz]'") from error
     from datasets_manifest.types.estimates import read_estimates
     from droguekit.batch.progress import progress_report
-    from droguekit.benchmark.poses.pose_errors import by_method
+    from droguekit.benchmark.poses.pose_errors import estimates_by_method
     from droguekit.visualization.rerun_viewer.recording import open_pairs
     from droguekit.visualization.rerun_viewer.session import view_pairs
 
@@ -55,7 +55,11 @@ def view(
     chosen = [index for index in source.frame_indices if index in wanted]
     if not chosen:
         raise ValueError(f"--frames: the dataset holds none of these pairs, got {frames}")
-    answers = {} if estimates is None else by_method(read_estimates(estimates), source.frame_indices, str(estimates))
+    answers = (
+        {}
+        if estimates is None
+        else estimates_by_method(read_estimates(estimates), source.frame_indices, str(estimates))
+    )
     summary = view_pairs(source, chosen, answers, save, progress_report())
     for fault in summary.faults:
         typer.echo(fault, err=True)

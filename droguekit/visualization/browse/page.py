@@ -23,7 +23,7 @@ from datasets_manifest.storage.storage import Location, absolute
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.worker_pool import is_accident, run_tasks
-from droguekit.benchmark.poses.pose_errors import by_method
+from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from droguekit.visualization.browse.pairs import (
     LIGHTS,
     DatasetFacts,
@@ -224,7 +224,7 @@ def write_browse(
     indices = source.frame_indices()
     if not indices:
         raise ValueError(f"{dataset}: holds no pairs yet")
-    answers = {} if estimates is None else by_method(_lean(estimates), indices, str(estimates))
+    answers = {} if estimates is None else estimates_by_method(_lean(estimates), indices, str(estimates))
     with opened_page(out):
         return _write(source, out, answers, workers, report)
 

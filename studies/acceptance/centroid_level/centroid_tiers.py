@@ -14,7 +14,7 @@ from droguekit.batch.progress import ProgressReport
 from droguekit.benchmark.confidence_intervals import CONFIDENCE, rms_upper_limit
 from droguekit.benchmark.poses.cramer_rao import FacingRing
 from geometry.stereo import paper_rig
-from studies.acceptance.acceptance_table import BarRow, at_most, between, worst
+from studies.acceptance.acceptance_table import AcceptanceRow, at_most, between, worst
 from studies.acceptance.centroid_level.drawn_frames import (
     AS_BUILT,
     CLEAN,
@@ -38,7 +38,7 @@ from studies.acceptance.centroid_level.monte_carlo import (
     CellResult,
     run_cells,
 )
-from studies.acceptance.confidence_limits import Limited, nees_limits, paired_ratio_limit, paired_rms_ratio_limit
+from studies.acceptance.confidence_limits import ValueWithLimit, nees_limits, paired_ratio_limit, paired_rms_ratio_limit
 
 # Where the ring's radius outweighs all else, knowing of it or not changes nothing: the ratio is 1, and its limit above.
 _NEVER_WORSE = 1.01
@@ -46,8 +46,8 @@ _NEVER_WORSE = 1.01
 Results = Mapping[Cell, CellResult]
 
 
-def bars_tier_c(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[BarRow]:
-    """Run what is not there yet, and compare it with bars 5, 6, 7, 9 and 10.
+def measure_tier_c(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[AcceptanceRow]:
+    """Run what is not there yet, and compare it with criteria 5, 6, 7, 9 and 10.
 
     Args:
         out: keeps finished cells.
@@ -95,7 +95,9 @@ def toleranced_cells(tolerances: Tolerances, seed: int, draws: int) -> list[Cell
     ]
 
 
-def _nrms_rows(bar: str, quantity: str, part: slice, bars: tuple[float, float], results: Results) -> list[BarRow]:
+def _nrms_rows(
+    bar: str, quantity: str, part: slice, bars: tuple[float, float], results: Results
+) -> list[AcceptanceRow]:
     """The worst component, pooled over all cells and in the worst cell."""
     values = np.array([result.nrms[part] for result in results.values()])
     counts = np.array([result.n for result in results.values()])
@@ -113,7 +115,7 @@ def _nrms_rows(bar: str, quantity: str, part: slice, bars: tuple[float, float], 
     ]
 
 
-def _without_hub_rows(results: Results) -> list[BarRow]:
+def _without_hub_rows(results: Results) -> list[AcceptanceRow]:
     """Attitude where the tilt has a sign, and how often it is mirrored where it has none."""
     clear = [(cell, r) for cell, r in results.items() if r.clear_nrms is not None and r.clear_n]
     rows = []
@@ -130,14 +132,14 @@ def _without_hub_rows(results: Results) -> list[BarRow]:
     return rows
 
 
-def _flip_gap(result: CellResult) -> Limited:
+def _flip_gap(result: CellResult) -> ValueWithLimit:
     """Distance of the flip rate from the law; its limit counts the binomial error of the rate under the law."""
     gap = abs(result.flips / result.n - result.flip_law)
     error = np.sqrt(result.flip_law * (1 - result.flip_law) / result.n)
     return gap, gap + float(norm.ppf(CONFIDENCE) * error)
 
 
-def _nees_row(quantity: str, results: list[CellResult]) -> BarRow:
+def _nees_row(quantity: str, results: list[CellResult]) -> AcceptanceRow:
     counts = np.array([result.nees_n for result in results])
     values = np.array([result.nees or 0.0 for result in results])
     freedom = 5 * int(counts.sum())
@@ -146,7 +148,7 @@ def _nees_row(quantity: str, results: list[CellResult]) -> BarRow:
     )
 
 
-def _predicted_row(quantity: str, results: Results) -> BarRow:
+def _predicted_row(quantity: str, results: Results) -> AcceptanceRow:
     rig = paper_rig()
     rows = []
     for cell, result in results.items():
@@ -160,7 +162,7 @@ def _predicted_row(quantity: str, results: Results) -> BarRow:
     return at_most("10", quantity, 1.20, (ratio, limit), next(iter(results.values())).n, where)
 
 
-def _never_worse_row(results: Results) -> BarRow:
+def _never_worse_row(results: Results) -> AcceptanceRow:
     """Z of the method that knows the tolerances against the better of stereo alone and itself without knowing them."""
     rows = []
     for cell, result in results.items():
@@ -192,10 +194,10 @@ _BAD = {
 }
 
 
-def bars_tier_d(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[BarRow]:
-    """Run what is not there yet, and compare it with bars 11 and 12.
+def measure_tier_d(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[AcceptanceRow]:
+    """Run what is not there yet, and compare it with criteria 11 and 12.
 
-    Arguments and errors as `tier_c.bars_tier_c`.
+    Arguments and errors as `measure_tier_c`.
     """
 
     def robust(method: str, markers: int, sigma_px: float, corruption: Corruption) -> Cell:
@@ -224,7 +226,7 @@ def bars_tier_d(out: Path, seed: int, draws: int | None, report: ProgressReport)
     ]
 
 
-def _against_clean(counts: tuple[int, ...], bad: int, bar: float, cell: CellMaker, results: Results) -> BarRow:
+def _against_clean(counts: tuple[int, ...], bad: int, bar: float, cell: CellMaker, results: Results) -> AcceptanceRow:
     """Mean position error of the robust method with bad markers over that with good ones, worst case."""
     rows = []
     for markers in counts:
@@ -238,7 +240,7 @@ def _against_clean(counts: tuple[int, ...], bad: int, bar: float, cell: CellMake
     return at_most("11", quantity, bar, (ratio, limit), _n(results), where)
 
 
-def _order(method: str, sigmas_px: tuple[float, ...], cell: CellMaker, results: Results) -> BarRow:
+def _order(method: str, sigmas_px: tuple[float, ...], cell: CellMaker, results: Results) -> AcceptanceRow:
     """Eight markers better than seven, seven better than five, with one bad marker."""
     rows = []
     for sigma in sigmas_px:
@@ -250,7 +252,7 @@ def _order(method: str, sigmas_px: tuple[float, ...], cell: CellMaker, results: 
     return at_most("12", quantity, 1.0, (ratio, limit), few.n, where)
 
 
-def _literal(cell: CellMaker, results: Results) -> BarRow:
+def _literal(cell: CellMaker, results: Results) -> AcceptanceRow:
     """The baseline over the literal reading: below 1 when the literal one brings nothing."""
     rows = [
         (
@@ -264,7 +266,7 @@ def _literal(cell: CellMaker, results: Results) -> BarRow:
     return at_most("12", quantity, 1.0, (ratio, limit), _n(results), where)
 
 
-def mean_ratio(above: CellResult, below: CellResult) -> Limited:
+def mean_ratio(above: CellResult, below: CellResult) -> ValueWithLimit:
     """Ratio of mean position errors in the same poses, with its upper limit."""
     return paired_ratio_limit(above.position_sums_m, below.position_sums_m)
 

@@ -33,7 +33,7 @@ from studies.acceptance.centroid_level.drawn_frames import (
     draw_shifts,
     ellipse_centers_px,
 )
-from studies.acceptance.centroid_level.solvers import Measured, Solved, solve
+from studies.acceptance.centroid_level.solvers import MeasuredFrames, SolvedFrames, solve
 from studies.acceptance.finished_results import code_fingerprint
 
 # Central differences: their error goes with the square of the step, that of rounding with its inverse; both stay near
@@ -162,7 +162,7 @@ class Cell:
         return f"{self.distance_m[0]:g}-{self.distance_m[1]:g} m, {self.draws} draws"
 
 
-class DepthRival(BaseModel):
+class DepthAlternative(BaseModel):
     """Another way to the depth, on the same draws.
 
     Attributes:
@@ -206,8 +206,8 @@ class CellResult(BaseModel):
     nees: float | None
     flips: int
     flip_law: float
-    stereo: DepthRival
-    untold: DepthRival | None
+    stereo: DepthAlternative
+    untold: DepthAlternative | None
 
     @property
     def position_mean_m(self) -> float:
@@ -249,7 +249,7 @@ def _result(cell: Cell) -> CellResult:
     untold = None
     if cell.stated != EXACT:
         plain = solve(cell.method, replace(measured, tolerances=EXACT))
-        untold = _rival(plain.poses.translations_m[:, 2] - depth, errors[:, 2])
+        untold = _alternative(plain.poses.translations_m[:, 2] - depth, errors[:, 2])
     return CellResult(
         n=cell.draws,
         fixes=int(solved.fixed.sum()),
@@ -262,12 +262,12 @@ def _result(cell: Cell) -> CellResult:
         nees=float(squares.mean()) / 5 if len(squares) else None,
         flips=int(mirrored.sum()),
         flip_law=float(norm.sf(sizes).mean()),
-        stereo=_rival(np.nan_to_num(stereo_m, nan=0.0) - depth, errors[:, 2]),
+        stereo=_alternative(np.nan_to_num(stereo_m, nan=0.0) - depth, errors[:, 2]),
         untold=untold,
     )
 
 
-def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> Measured:
+def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> MeasuredFrames:
     key = f"{cell.stream}, {cell.markers} markers, {cell.sigma_px:g} px, {cell.corruption}, {cell.tolerances}"
     true = draw_features(seeded_generator(cell.seed, key, "features"), layout, cell.tolerances, cell.draws)
     _, radii = feature_points(layout)
@@ -278,7 +278,7 @@ def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> Measured:
     hub_sigma_px = HUB_NOISE_FACTOR * cell.sigma_px
     count = layout.count
     shifts = draw_shifts(seeded_generator(cell.seed, key, "shifts"), cell.corruption, cell.draws, count)
-    return Measured(
+    return MeasuredFrames(
         rig=paper_rig(),
         layout=layout,
         markers_px=exact[:, :, :count] + cell.sigma_px * noise[:, :, :count] + shifts,
@@ -299,12 +299,12 @@ def _tilt_scales(layout: MarkerLayout, cell: Cell, poses: Poses) -> Array:
     return scales
 
 
-def _rival(others: Array, own: Array) -> DepthRival:
+def _alternative(others: Array, own: Array) -> DepthAlternative:
     z_rms_m = _rms(others)
-    return DepthRival(z_rms_m=z_rms_m, correlation=float(np.mean(others * own)) / (z_rms_m * _rms(own)))
+    return DepthAlternative(z_rms_m=z_rms_m, correlation=float(np.mean(others * own)) / (z_rms_m * _rms(own)))
 
 
-def _squares(solved: Solved, errors: Array) -> Array:
+def _squares(solved: SolvedFrames, errors: Array) -> Array:
     if solved.covariances is None:
         return np.zeros(0)
     chosen = solved.fixed

@@ -20,7 +20,7 @@ BATCHED = ("joint", "joint-hub")
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredFrames:
     """Measured centres of many frames.
 
     Attributes:
@@ -41,7 +41,7 @@ class Measured:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class SolvedFrames:
     """What a method made of many frames.
 
     Attributes:
@@ -58,7 +58,7 @@ class Solved:
     fixed: NDArray[np.bool_]
 
 
-def solve(method: str, measured: Measured) -> Solved:
+def solve(method: str, measured: MeasuredFrames) -> SolvedFrames:
     """Poses of all frames by one method.
 
     Raises:
@@ -67,7 +67,7 @@ def solve(method: str, measured: Measured) -> Solved:
     return _batched(method, measured) if method in BATCHED else _one_by_one(method, measured)
 
 
-def hub_edges(measured: Measured) -> tuple[Array, Array]:
+def hub_edges(measured: MeasuredFrames) -> tuple[Array, Array]:
     """Pixels (n, 2, 2, 2) and covariances (2, 2, 2, 2) of the hub's edges, of which only the outer one is measured.
 
     A single edge keeps the noise of the hub one number, as it is in the bound.
@@ -78,7 +78,7 @@ def hub_edges(measured: Measured) -> tuple[Array, Array]:
     return pixels, np.broadcast_to(np.eye(2) * measured.hub_sigma_px**2, (2, 2, 2, 2))
 
 
-def observations(measured: Measured) -> list[Observation]:
+def observations(measured: MeasuredFrames) -> list[Observation]:
     """Every frame as pose methods take it."""
     cov = np.broadcast_to(np.eye(2) * measured.sigma_px**2, (2, measured.layout.count, 2, 2))
     hub, hub_cov = (None, None) if measured.hub_px is None else hub_edges(measured)
@@ -96,7 +96,7 @@ def observations(measured: Measured) -> list[Observation]:
     ]
 
 
-def _batched(method: str, measured: Measured) -> Solved:
+def _batched(method: str, measured: MeasuredFrames) -> SolvedFrames:
     pixels = measured.markers_px
     cov = np.broadcast_to(np.eye(2) * measured.sigma_px**2, (2, measured.layout.count, 2, 2))
     if method == "joint-hub":
@@ -104,7 +104,7 @@ def _batched(method: str, measured: Measured) -> Solved:
         pixels, cov = np.concatenate([pixels, hub], axis=2), np.concatenate([cov, hub_cov], axis=1)
     found = solve_joint_batch(measured.rig, measured.layout, pixels, cov, measured.tolerances)
     features = stack_features(measured.rig, measured.layout, pixels, cov, measured.tolerances)
-    return Solved(Poses(found.rotations, found.translations_m), _best(features), found.covariances, found.sound)
+    return SolvedFrames(Poses(found.rotations, found.translations_m), _best(features), found.covariances, found.sound)
 
 
 def _best(features: Features) -> Poses:
@@ -114,7 +114,7 @@ def _best(features: Features) -> Poses:
     return Poses(both.rotations[chosen], both.translations_m[chosen])
 
 
-def _one_by_one(method: str, measured: Measured) -> Solved:
+def _one_by_one(method: str, measured: MeasuredFrames) -> SolvedFrames:
     solver = pose_method(method)
     count = len(measured.markers_px)
     rotations, places = np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), np.zeros((count, 3))
@@ -131,4 +131,4 @@ def _one_by_one(method: str, measured: Measured) -> Solved:
         else:
             covariances[index] = solution.covariance
     poses = Poses(rotations, places)
-    return Solved(poses, poses, covariances if known else None, fixed)
+    return SolvedFrames(poses, poses, covariances if known else None, fixed)

@@ -1,4 +1,4 @@
-"""How long centroids and estimators take on one thread (bar 16)."""
+"""How long centroids and estimators take on one thread (criterion 16)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from nav.pair_measurement import Sighting
 from nav.pose.joint import joint
 from nav.pose.pose_method import Observation, Solution
 from nav.pose.pose_methods import pose_method
-from studies.acceptance.acceptance_table import BarRow, at_most
+from studies.acceptance.acceptance_table import AcceptanceRow, at_most
 from studies.acceptance.centroid_level.drawn_frames import Corruption, draw_poses, draw_shifts, ellipse_centers_px
 from studies.acceptance.centroid_level.monte_carlo import DOCKING_RANGE_M
-from studies.acceptance.centroid_level.solvers import Measured, observations, solve
+from studies.acceptance.centroid_level.solvers import MeasuredFrames, observations, solve
 
 _SIGMA_PX = 0.1
 _SINGLE_FRAMES, _BATCH_FRAMES = 100, 1000
@@ -34,7 +34,7 @@ _MOST_CENTROIDS_MS = {10.0: 8.0, 2.0: 40.0}
 _REPEATS = 5
 
 
-def bars_speed(dataset: Path, seed: int, draws: int | None, report: ProgressReport) -> list[BarRow]:
+def measure_speed(dataset: Path, seed: int, draws: int | None, report: ProgressReport) -> list[AcceptanceRow]:
     """Time the centroids, and single, batched and robust adjustment, on one thread.
 
     Args:
@@ -96,7 +96,7 @@ def _slowest(times_ms: list[float]) -> float:
     return max(times_ms[len(times_ms) // 10 :])
 
 
-def _batched_ms(method: str, measured: Measured) -> float:
+def _batched_ms(method: str, measured: MeasuredFrames) -> float:
     """Time a frame, when caches are warm."""
     solve(method, measured)
     started = perf_counter()
@@ -104,7 +104,7 @@ def _batched_ms(method: str, measured: Measured) -> float:
     return 1e3 * (perf_counter() - started) / len(measured.markers_px)
 
 
-def _single_ms(method: str, measured: Measured, count: int) -> list[float]:
+def _single_ms(method: str, measured: MeasuredFrames, count: int) -> list[float]:
     solver: Callable[..., object] = pose_method(method)
     times = []
     for observation in observations(measured)[:count]:
@@ -114,7 +114,7 @@ def _single_ms(method: str, measured: Measured, count: int) -> list[float]:
     return times
 
 
-def _measured(seed: int, count: int, corruption: Corruption) -> Measured:
+def _measured(seed: int, count: int, corruption: Corruption) -> MeasuredFrames:
     rig, drogue = paper_rig(), load_drogue("red-8")
     layout = marker_layout(drogue)
     poses = draw_poses(seeded_generator(seed, "speed", "poses"), rig, drogue.rim_radius_m, DOCKING_RANGE_M, count)
@@ -122,4 +122,4 @@ def _measured(seed: int, count: int, corruption: Corruption) -> Measured:
     pixels = pixels + _SIGMA_PX * seeded_generator(seed, "speed", "noise").standard_normal(pixels.shape)
     shifts = draw_shifts(seeded_generator(seed, "speed", "shifts"), corruption, count, layout.count)
     markers = pixels[:, :, : layout.count] + shifts
-    return Measured(rig, layout, markers, pixels[:, :, layout.count], _SIGMA_PX, _SIGMA_PX)
+    return MeasuredFrames(rig, layout, markers, pixels[:, :, layout.count], _SIGMA_PX, _SIGMA_PX)

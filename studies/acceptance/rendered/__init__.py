@@ -1,1 +1,1 @@
-"""Tiers A, B, E and docking: bars on rendered pairs and flights."""
+"""Tiers A, B, E and docking: criteria on rendered pairs and flights."""

@@ -11,10 +11,10 @@ import numpy as np
 from datasets_manifest.recipe.recipe import FrameCounts, Recipe
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
-from droguekit.benchmark.sequences.tracking_scores import SOON_FRAMES, reacquisition
-from studies.acceptance.acceptance_table import BESIDE, GOAL, BarRow, at_most, between, not_measured, worst
+from droguekit.benchmark.sequences.tracking_scores import REACQUISITION_LIMIT_FRAMES, reacquisition
+from studies.acceptance.acceptance_table import COMPARISON, GOAL, AcceptanceRow, at_most, between, not_measured, worst
 from studies.acceptance.confidence_limits import (
-    Limited,
+    ValueWithLimit,
     block_mean_limit,
     block_percentile_limit,
     block_rms_limit,
@@ -35,8 +35,8 @@ _NEIGHBOURS = 25
 _FOUND_FRACTION = 0.1
 
 
-def approach_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
-    """Bars 17 to 21 on every method; those of all but our best one stand beside.
+def approach_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
+    """Criteria 17 to 21 on every method; those of all but our best one stand beside.
 
     Args:
         title: of the data.
@@ -46,12 +46,15 @@ def approach_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
     rows = []
     for name, pairs in scores.items():
         beside = is_beside or name != BEST
-        rows += [*_accuracy_rows(f"{title}, {name}", pairs, beside), _modesty_row(f"{title}, {name}", pairs, beside)]
+        rows += [
+            *_accuracy_rows(f"{title}, {name}", pairs, beside),
+            _overconfidence_row(f"{title}, {name}", pairs, beside),
+        ]
     return rows
 
 
-def condition_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
-    """Bars 22 and 23 by family, and beside them the same of our best method by number of markers."""
+def condition_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
+    """Criteria 22 and 23 by family, and beside them the same of our best method by number of markers."""
     rows = []
     for name, pairs in scores.items():
         for family, bar in CONDITIONS.items():
@@ -62,25 +65,26 @@ def condition_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
     for count in sorted({pair.pair.truth.layout.count for pair in in_view}):
         alike, label = [p for p in in_view if p.pair.truth.layout.count == count], f"{title}, {BEST}, {count} markers"
         rows += [
-            _unfixed_row(BESIDE, label, alike, max(CONDITIONS.values())),
+            _unfixed_row(COMPARISON, label, alike, max(CONDITIONS.values())),
             _bound_row(label, alike, True),
         ]
     return rows
 
 
-def lost_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
-    """Bars 24 and 25: poses of what is not seen, and how soon they come back; and 21 on what is seen in part or glared.
+def lost_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
+    """Criteria 24 and 25: poses of a hidden drogue, and how soon poses return; and 21 on partly seen or dazzled pairs.
 
-    They judge filtered poses too: a filter may neither invent poses nor keep a receiver waiting for new ones.
+    They judge filtered poses too: a filter may neither invent poses nor delay new ones.
     """
     rows = []
     for name, pairs in scores.items():
         label, beside = f"{title}, {name}", is_beside or name not in (BEST, FILTERED)
-        hidden = [pair for pair in pairs if pair.pair.sight == "hidden"]
+        hidden = [pair for pair in pairs if pair.pair.visibility == "hidden"]
         found = reacquisition(
-            ([pair.pair.sight for pair in flight], [_has_found(pair) for pair in flight]) for flight in _flights(pairs)
+            ([pair.pair.visibility for pair in flight], [_has_found(pair) for pair in flight])
+            for flight in _flights(pairs)
         )
-        soon = f"{label}: re-appearances not re-acquired within {SOON_FRAMES} pairs"
+        soon = f"{label}: re-appearances not re-acquired within {REACQUISITION_LIMIT_FRAMES} pairs"
         late = found.n - found.within_3
         rows += [
             _count_row(_bar("24", beside), soon, late, found.n),
@@ -90,12 +94,12 @@ def lost_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
                 sum(p.error is not None for p in hidden),
                 len(hidden),
             ),
-            _modesty_row(label, pairs, beside),
+            _overconfidence_row(label, pairs, beside),
         ]
     return rows
 
 
-def bound_ratio(pairs: Iterable[ScoredPair]) -> tuple[str, Limited, int] | None:
+def bound_ratio(pairs: Iterable[ScoredPair]) -> tuple[str, ValueWithLimit, int] | None:
     """The component that is worst against its bound: name, root mean square ratio with its limit, number of poses."""
     known = [pair for pair in pairs if pair.over_bound is not None]
     if not known:
@@ -106,7 +110,7 @@ def bound_ratio(pairs: Iterable[ScoredPair]) -> tuple[str, Limited, int] | None:
     return COMPONENTS[worst], limits[worst], len(known)
 
 
-def _accuracy_rows(label: str, pairs: Sequence[ScoredPair], beside: bool) -> list[BarRow]:
+def _accuracy_rows(label: str, pairs: Sequence[ScoredPair], beside: bool) -> list[AcceptanceRow]:
     seen = [pair for pair in pairs if pair.pair.in_view]
     fixed = [pair for pair in seen if pair.error is not None]
     mean, p99 = f"{label}: mean position error [mm]", f"{label}: 99th percentile of position error [mm]"
@@ -132,7 +136,7 @@ def _accuracy_rows(label: str, pairs: Sequence[ScoredPair], beside: bool) -> lis
     return [*rows, unfixed]
 
 
-def _unfixed_row(bar: str, label: str, seen: Sequence[ScoredPair], high: float) -> BarRow:
+def _unfixed_row(bar: str, label: str, seen: Sequence[ScoredPair], high: float) -> AcceptanceRow:
     quantity = f"{label}: share of pairs in view without a pose"
     if not seen:
         return not_measured(bar, quantity, high, "no pair has four markers and the hub in view")
@@ -140,7 +144,7 @@ def _unfixed_row(bar: str, label: str, seen: Sequence[ScoredPair], high: float) 
     return at_most(bar, quantity, high, block_share_limit(missing, [pair.pair.sequence_id for pair in seen]), len(seen))
 
 
-def _bound_row(label: str, seen: Sequence[ScoredPair], beside: bool) -> BarRow:
+def _bound_row(label: str, seen: Sequence[ScoredPair], beside: bool) -> AcceptanceRow:
     quantity, bar = f"{label}: error over its bound, worst component, RMS", _bar("23", beside)
     ratio = bound_ratio(seen)
     if ratio is None:
@@ -150,22 +154,25 @@ def _bound_row(label: str, seen: Sequence[ScoredPair], beside: bool) -> BarRow:
     return at_most(bar, quantity, 1.5, measured, n, note)
 
 
-def _modesty_row(label: str, pairs: Sequence[ScoredPair], beside: bool) -> BarRow:
-    """Bar 21: of what is not in view, either a reason, or a wider covariance, or a pose as good as in view."""
+def _overconfidence_row(label: str, pairs: Sequence[ScoredPair], beside: bool) -> AcceptanceRow:
+    """Criterion 21: of what is not in view, either a reason, or a wider covariance, or a pose as good as in view."""
     others = [pair for pair in pairs if not pair.pair.in_view]
     seen = [pair for pair in pairs if pair.pair.in_view and pair.sd_m is not None]
-    bold, quantity = sum(_is_bold(pair, seen) for pair in others), f"{label}: pairs out of view answered without care"
+    bold, quantity = (
+        sum(_is_overconfident(pair, seen) for pair in others),
+        f"{label}: pairs out of view answered without care",
+    )
     if not others:
         # What never happened was never answered wrongly.
         return at_most(_bar("21", beside), quantity, 0.0, (0.0, 0.0), 0, "all pairs are in view")
     return _count_row(_bar("21", beside), quantity, bold, len(others))
 
 
-def _is_bold(pair: ScoredPair, seen: Sequence[ScoredPair]) -> bool:
+def _is_overconfident(pair: ScoredPair, seen: Sequence[ScoredPair]) -> bool:
     """Whether an answer to a pair out of view is neither reasoned, nor modest, nor exact all the same."""
     if pair.error is None:
         return not pair.reason
-    if 1e3 * pair.position_m <= _P99_MM and pair.pair.sight != "hidden":
+    if 1e3 * pair.position_m <= _P99_MM and pair.pair.visibility != "hidden":
         return False
     if pair.sd_m is None or not seen:
         return True
@@ -173,7 +180,7 @@ def _is_bold(pair: ScoredPair, seen: Sequence[ScoredPair]) -> bool:
     return pair.sd_m <= float(np.median([other.sd_m for other in nearest]))
 
 
-def _count_row(bar: str, quantity: str, count: int, n: int) -> BarRow:
+def _count_row(bar: str, quantity: str, count: int, n: int) -> AcceptanceRow:
     """A number of events of which none may happen."""
     if n == 0:
         return not_measured(bar, quantity, 0.0, "there was no occasion")
@@ -190,7 +197,7 @@ def _flights(pairs: Sequence[ScoredPair]) -> list[list[ScoredPair]]:
 
 
 def _bar(number: str, beside: bool) -> str:
-    return BESIDE if beside else number
+    return COMPARISON if beside else number
 
 
 def _failures(seen: Sequence[ScoredPair]) -> str:
@@ -207,11 +214,14 @@ _FEWEST_FIXES = 2
 _SPEEDS = ((5.0, np.inf, 30.0, "beyond 5 m"), (1.8, 2.2, 70.0, "at 2 m"))
 
 
-def bench_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
-    """Bar 26: mean absolute errors at the worst station of a bench, each of which must have poses, and their share."""
+def bench_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
+    """Criterion 26: mean absolute errors at the worst station of a bench, and the share of pairs without a pose.
+
+    Every station must have poses.
+    """
     rows = []
     for name, pairs in scores.items():
-        bar = BESIDE if is_beside or name != BEST else "26"
+        bar = COMPARISON if is_beside or name != BEST else "26"
         fixed = [pair for pair in pairs if pair.error is not None]
         missing = len(pairs) - len(fixed)
         failed = f"; {missing} of {len(pairs)} pairs without a pose" if missing else ""
@@ -235,8 +245,8 @@ def bench_rows(title: str, scores: Scores, is_beside: bool) -> list[BarRow]:
     return rows
 
 
-def speed_rows(title: str, pairs: Sequence[ScoredPair], is_beside: bool) -> list[BarRow]:
-    """Bar 27: median time of all stages of a pair, by distance; no pose takes its time too."""
+def processing_time_rows(title: str, pairs: Sequence[ScoredPair], is_beside: bool) -> list[AcceptanceRow]:
+    """Criterion 27: median time of all stages of a pair, by distance; no pose takes its time too."""
     rows = []
     for low_m, high_m, bar_ms, where in _SPEEDS:
         told = [
@@ -244,7 +254,7 @@ def speed_rows(title: str, pairs: Sequence[ScoredPair], is_beside: bool) -> list
             for pair in pairs
             if pair.work_s is not None and low_m <= pair.pair.distance_m <= high_m
         ]
-        bar, quantity = BESIDE if is_beside else "27", f"{title}: median time of a pair {where} [ms]"
+        bar, quantity = COMPARISON if is_beside else "27", f"{title}: median time of a pair {where} [ms]"
         if not told:
             rows.append(not_measured(bar, quantity, bar_ms, "no pair there tells its time"))
             continue
@@ -257,7 +267,7 @@ def _station_m(pair: ScoredPair) -> float:
     return round(pair.pair.distance_m, 3)
 
 
-def _mean_error(pairs: Sequence[ScoredPair], axis: int) -> Limited:
+def _mean_error(pairs: Sequence[ScoredPair], axis: int) -> ValueWithLimit:
     errors = []
     for pair in pairs:
         if pair.error is not None:
@@ -269,17 +279,17 @@ def _mean_error(pairs: Sequence[ScoredPair], axis: int) -> Limited:
 # Of recipes without sequences, the bench's: ten sets at each of its nine stations.
 _BENCH_PART = 90
 
-Rows = Callable[[str, Scores, bool], list[BarRow]]
+Rows = Callable[[str, Scores, bool], list[AcceptanceRow]]
 
 
 @dataclass(frozen=True)
 class FlightData:
-    """One recipe that bars are measured on.
+    """One recipe that criteria are measured on.
 
     Attributes:
         recipe: name of a shipped one, or a file.
         parts: how many sequences, or parts of 90 pairs of a bench, a full measurement takes.
-        rows: which bars.
+        rows: which criteria.
         follows: whether tracker and filter have something to follow.
         times: whether the run time of a pair is told.
         compares: whether all methods there are stand beside, on the same pairs.
@@ -325,7 +335,7 @@ _LAG_S, _LOSSES_PER_MINUTE = 0.02, 1.0
 _NEES = (0.85, 1.20)
 
 
-def following_rows(title: str, scores: Scores, result: BenchmarkResult) -> list[BarRow]:
+def tracking_filter_rows(title: str, scores: Scores, result: BenchmarkResult) -> list[AcceptanceRow]:
     """Goals of tracker and filter on one dataset; those that nothing was measured for are left out.
 
     Args:
@@ -358,10 +368,10 @@ def following_rows(title: str, scores: Scores, result: BenchmarkResult) -> list[
                 high_s = max(abs(end) for end in lag.interval or (lag.lag_s,))
                 quantity = f"{label}: lag of {component} [s]"
                 rows.append(at_most(GOAL, quantity, _LAG_S, (abs(lag.lag_s), high_s), sequences.count))
-    return [*rows, *_worth_rows(title, scores)]
+    return [*rows, *_filter_gain_rows(title, scores)]
 
 
-def _worth_rows(title: str, scores: Scores) -> list[BarRow]:
+def _filter_gain_rows(title: str, scores: Scores) -> list[AcceptanceRow]:
     """Mean position error of filtered poses over that of measured ones, on the same pairs in view."""
     if not {BEST, FILTERED} <= set(scores):
         return []

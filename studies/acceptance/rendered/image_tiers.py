@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from droguekit.benchmark.confidence_intervals import ratio_intervals, rms_upper_limit
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
-from droguekit.benchmark.results.benchmark_result import BenchmarkResult, BinRow
+from droguekit.benchmark.results.benchmark_result import BenchmarkResult, PoseBin
 from geometry.se3 import Array
-from studies.acceptance.acceptance_table import BarRow, at_most, between, not_measured, worst
+from studies.acceptance.acceptance_table import AcceptanceRow, at_most, between, not_measured, worst
 from studies.acceptance.confidence_limits import (
+    absolute_mean_limit,
     mean_limit,
     nees_limits,
     percentile_limit,
     rms_limit,
     rms_ratio_limit,
     share_limit,
-    size_of_mean_limit,
 )
 from studies.acceptance.rendered.scored_frames import (
     BEST,
@@ -38,11 +38,23 @@ from studies.acceptance.rendered.scored_frames import (
 NEAR_M, FAR_M = 1.7, 40.0
 
 
-@dataclass(frozen=True)
-class Light:
-    """One dataset of a tier: what to call it, and which level of light."""
+class LightLevel(StrEnum):
+    """Which of the two datasets of a tier: in daylight or at dusk."""
 
-    name: Literal["day", "dusk"]
+    DAY = "day"
+    DUSK = "dusk"
+
+
+@dataclass(frozen=True)
+class ImageScores:
+    """One dataset of a tier.
+
+    Attributes:
+        light: level of light.
+        scores: of every frame, by method.
+    """
+
+    light: LightLevel
     scores: Mapping[str, Frames]
 
     @property
@@ -52,15 +64,15 @@ class Light:
 
     def title(self, quantity: str) -> str:
         """A quantity with the light in front."""
-        return f"{self.name}: {quantity}"
+        return f"{self.light}: {quantity}"
 
 
-def centroid_bound_rows(light: Light) -> list[BarRow]:
-    """Bar 1."""
+def centroid_bound_rows(images: ImageScores) -> list[AcceptanceRow]:
+    """Criterion 1."""
     rows = []
     for low_m, high_m, bar in ((NEAR_M, 20.0, 1.25), (30.0, FAR_M, 1.40)):
-        quantity = light.title(f"centroid RMS / its Cramer-Rao bound, {low_m:g} to {high_m:g} m")
-        frames = between_m(light.best, low_m, high_m).values()
+        quantity = images.title(f"centroid RMS / its Cramer-Rao bound, {low_m:g} to {high_m:g} m")
+        frames = between_m(images.best, low_m, high_m).values()
         ratios = [_over_bound(frame.markers) for frame in frames]
         values = np.concatenate([np.zeros((0, 2)), *ratios])
         rows.append(
@@ -69,32 +81,32 @@ def centroid_bound_rows(light: Light) -> list[BarRow]:
     return rows
 
 
-def centroid_rows(light: Light) -> list[BarRow]:
-    """Bars 2 and 3: absolute errors of centroids, in day also their bias."""
+def centroid_rows(images: ImageScores) -> list[AcceptanceRow]:
+    """Criteria 2 and 3: absolute errors of centroids, in day also their bias."""
     bars = (
         ((10.0, 0.015), (20.0, 0.025), (FAR_M, 0.035))
-        if light.name == "day"
+        if images.light == "day"
         else ((10.0, 0.02), (20.0, 0.03), (FAR_M, 0.04))
     )
-    number, low_m, rows = "2" if light.name == "day" else "3", NEAR_M, []
+    number, low_m, rows = "2" if images.light == "day" else "3", NEAR_M, []
     for high_m, bar in bars:
-        quantity = light.title(f"centroid RMS, {low_m:g} to {high_m:g} m [px]")
-        offsets = stacked_px(between_m(light.best, low_m, high_m))
+        quantity = images.title(f"centroid RMS, {low_m:g} to {high_m:g} m [px]")
+        offsets = stacked_px(between_m(images.best, low_m, high_m))
         rows.append(
             at_most(number, quantity, bar, rms_limit(offsets), offsets.size)
             if len(offsets)
             else _none(number, quantity, bar)
         )
         low_m = 1.02 * high_m
-    if light.name == "day":
-        rows += _bias_rows(light)
+    if images.light == "day":
+        rows += _bias_rows(images)
     return rows
 
 
-def chain_rows(light: Light, bar: float) -> list[BarRow]:
-    """Bar 4: our centroids against the paper's, on the frames where both have some."""
-    quantity = light.title(f"centroid RMS / that of '{CHAIN}', 5 m and beyond")
-    ours, theirs = (between_m(light.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
+def chain_rows(images: ImageScores, bar: float) -> list[AcceptanceRow]:
+    """Criterion 4: our centroids against the paper's, on the frames where both have some."""
+    quantity = images.title(f"centroid RMS / that of '{CHAIN}', 5 m and beyond")
+    ours, theirs = (between_m(images.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
     common = [i for i in ours if len(ours[i].markers.offset_px) and len(theirs[i].markers.offset_px)]
     if not common:
         return [_none("4", quantity, bar)]
@@ -105,39 +117,40 @@ def chain_rows(light: Light, bar: float) -> list[BarRow]:
     return [at_most("4", quantity, bar, rms_ratio_limit(sizes[0], sizes[1]), len(common))]
 
 
-def absolute_rows(light: Light) -> list[BarRow]:
-    """Bars 13 and 14."""
-    near = between_m(light.best, NEAR_M, 10.0)
-    errors, bar_mm = pose_array(near), 0.3 if light.name == "day" else 0.5
-    quantity = light.title("mean position error, 1.7 to 10 m [mm]")
+def absolute_rows(images: ImageScores) -> list[AcceptanceRow]:
+    """Criteria 13 and 14."""
+    near = between_m(images.best, NEAR_M, 10.0)
+    errors, bar_mm = pose_array(near), 0.3 if images.light == "day" else 0.5
+    quantity = images.title("mean position error, 1.7 to 10 m [mm]")
     if not len(errors):
         return [_none("13", quantity, bar_mm)]
     position_mm = 1e3 * np.linalg.norm(errors[:, :3], axis=1)
     rows = [at_most("13", quantity, bar_mm, mean_limit(position_mm), len(errors), _failures(near))]
     for column, name in ((3, "pitch"), (4, "yaw")):
-        title = light.title(f"99th percentile of {name} error, 1.7 to 10 m [deg]")
+        title = images.title(f"99th percentile of {name} error, 1.7 to 10 m [deg]")
         rows.append(at_most("14", title, 0.15, percentile_limit(errors[:, column], 99.0), len(errors)))
-    far = pose_array(between_m(light.best, FAR_M, FAR_M))
-    if light.name == "day" and len(far):
+    far = pose_array(between_m(images.best, FAR_M, FAR_M))
+    if images.light == "day" and len(far):
         for column, name in ((3, "pitch"), (4, "yaw")):
             rows.append(
-                at_most("14", light.title(f"{name} RMSE at 40 m [deg]"), 0.3, rms_limit(far[:, column]), len(far))
+                at_most("14", images.title(f"{name} RMSE at 40 m [deg]"), 0.3, rms_limit(far[:, column]), len(far))
             )
     return rows
 
 
-def paper_rows(light: Light) -> list[BarRow]:
-    """Bar 15, by the bootstrap of paired frames."""
-    bar = 1 / 15 if light.name == "day" else 1 / 12
-    quantity = light.title(f"mean position error / that of '{CHAIN}', 5 m and beyond")
-    ours, theirs = (between_m(light.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
+def paper_rows(images: ImageScores) -> list[AcceptanceRow]:
+    """Criterion 15, by the bootstrap of paired frames."""
+    bar = 1 / 15 if images.light == "day" else 1 / 12
+    quantity = images.title(f"mean position error / that of '{CHAIN}', 5 m and beyond")
+    ours, theirs = (between_m(images.scores[name], 5.0, FAR_M) for name in (BEST, CHAIN))
     common = [i for i in ours if ours[i].pose is not None and theirs[i].pose is not None]
     if len(common) < 2:
         return [_none("15", quantity, bar)]
     above, below = (
         np.linalg.norm(pose_array({i: frames[i] for i in common})[:, :3], axis=1)[:, None] for frames in (ours, theirs)
     )
-    (ends,) = ratio_intervals(above, below, common, f"bars, {light.name}")
+    # The key of the random stream: another one would draw other resamples.
+    (ends,) = ratio_intervals(above, below, common, f"bars, {images.light}")
     ratio = float(above.mean() / below.mean())
     return [at_most("15", quantity, bar, (ratio, ratio if ends is None else ends[1]), len(common))]
 
@@ -152,49 +165,53 @@ _GOALS = {
 }
 
 
-def goal_rows(light: Light) -> list[BarRow]:
+def goal_rows(images: ImageScores) -> list[AcceptanceRow]:
     """What is aimed at by distance."""
     rows = []
     for station, (z_m, transverse_m, angle_deg) in _GOALS.items():
-        frames = {i: f for i, f in between_m(light.best, station, station).items() if f.pose is not None}
+        frames = {i: f for i, f in between_m(images.best, station, station).items() if f.pose is not None}
         errors = pose_array(frames)
         if not len(errors):
             continue
         across = np.array([frame.transverse_m for frame in frames.values()])
         where = f"at {station:g} m"
         rows += [
-            at_most("goal", light.title(f"Z RMSE {where} [mm]"), 1e3 * z_m, rms_limit(1e3 * errors[:, 2]), len(errors)),
+            at_most(
+                "goal", images.title(f"Z RMSE {where} [mm]"), 1e3 * z_m, rms_limit(1e3 * errors[:, 2]), len(errors)
+            ),
             at_most(
                 "goal",
-                light.title(f"transverse RMSE {where} [mm]"),
+                images.title(f"transverse RMSE {where} [mm]"),
                 1e3 * transverse_m,
                 rms_limit(1e3 * across),
                 len(errors),
             ),
             at_most(
-                "goal", light.title(f"pitch, yaw RMSE {where} [deg]"), angle_deg, rms_limit(errors[:, 3:]), len(errors)
+                "goal", images.title(f"pitch, yaw RMSE {where} [deg]"), angle_deg, rms_limit(errors[:, 3:]), len(errors)
             ),
         ]
     return rows
 
 
-def _bias_rows(light: Light) -> list[BarRow]:
+def _bias_rows(images: ImageScores) -> list[AcceptanceRow]:
     """Mean residuals; every frame's mean is one independent number."""
     rows = []
-    seen = {i: f for i, f in light.best.items() if len(f.markers.offset_px)}
+    seen = {i: f for i, f in images.best.items() if len(f.markers.offset_px)}
     for axis, name in enumerate("uv"):
         blocks = np.array([f.markers.offset_px[:, axis].mean() for f in seen.values()])
-        title = light.title(f"|mean centroid residual| in {name} [px]")
+        title = images.title(f"|mean centroid residual| in {name} [px]")
         rows.append(
-            at_most("2", title, 0.005, size_of_mean_limit(blocks), len(blocks))
+            at_most("2", title, 0.005, absolute_mean_limit(blocks), len(blocks))
             if len(blocks)
             else _none("2", title, 0.005)
         )
     for low_m, high_m, bar in ((NEAR_M, 20.0, 0.002), (30.0, FAR_M, 0.006)):
-        title = light.title(f"|mean radial centroid residual|, {low_m:g} to {high_m:g} m [px]")
+        title = images.title(f"|mean radial centroid residual|, {low_m:g} to {high_m:g} m [px]")
         blocks = np.array([f.markers.outward_px.mean() for f in between_m(seen, low_m, high_m).values()])
         rows.append(
-            at_most("2", title, bar, size_of_mean_limit(blocks), len(blocks)) if len(blocks) else _none("2", title, bar)
+            at_most("2", title, bar, absolute_mean_limit(blocks), len(blocks))
+            if len(blocks)
+            else _none("2", title, bar)
         )
     return rows
 
@@ -211,7 +228,7 @@ def _failures(frames: Frames) -> str:
     return f"{missing} of {len(frames)} pairs without a pose" if missing else ""
 
 
-def _none(bar: str, quantity: str, high: float) -> BarRow:
+def _none(bar: str, quantity: str, high: float) -> AcceptanceRow:
     return not_measured(bar, quantity, high, "nothing was measured there")
 
 
@@ -220,8 +237,8 @@ _POSITION, _ATTITUDE = COMPONENTS[:3], COMPONENTS[3:]
 _LEEWAY = 1.02
 
 
-def tier_a_rows(name: str, result: BenchmarkResult) -> list[BarRow]:
-    """Bars 5, 6 and 9."""
+def normalized_error_rows(name: str, result: BenchmarkResult) -> list[AcceptanceRow]:
+    """Criteria 5, 6 and 9."""
     bins = result.methods[BEST].bins
     flips = [(row.sight_flips.flips, row.sight_flips.n) for row in bins]
     hits, n = sum(f for f, _ in flips), sum(n for _, n in flips)
@@ -231,7 +248,7 @@ def tier_a_rows(name: str, result: BenchmarkResult) -> list[BarRow]:
         *_pooled_and_worst("6", f"{name}: pitch, yaw NRMS, hub", _ATTITUDE, (1.10, 1.25), bins),
     ]
     if n:
-        # The bar is no flip at all among these; the limit says what rate that excludes.
+        # The criterion is no flip at all among these; the limit says what rate that excludes.
         shown = at_most("6", flip_title, 0.0, (float(hits), float(hits)), n)
         rows.append(shown.model_copy(update={"note": f"rate below {share_limit(hits, n)[1]:.2g} (95 %)"}))
     else:
@@ -244,15 +261,15 @@ def tier_a_rows(name: str, result: BenchmarkResult) -> list[BarRow]:
     return [*rows, between("9", title, (0.85, 1.20), limits, nees.n)]
 
 
-def tier_b_rows(name: str, result: BenchmarkResult) -> list[BarRow]:
-    """Bar 8."""
+def normalized_near_rows(name: str, result: BenchmarkResult) -> list[AcceptanceRow]:
+    """Criterion 8."""
     bins = [row for row in result.methods[BEST].bins if row.high_m <= _LEEWAY * 20.0]
     return [_pooled("8", f"{name}: pose NRMS, 1.7 to 20 m, pooled", COMPONENTS, 1.30, bins)]
 
 
 def _pooled_and_worst(
-    bar: str, quantity: str, names: Sequence[str], bars: tuple[float, float], bins: Sequence[BinRow]
-) -> list[BarRow]:
+    bar: str, quantity: str, names: Sequence[str], bars: tuple[float, float], bins: Sequence[PoseBin]
+) -> list[AcceptanceRow]:
     cells = [
         (
             f"{row.low_m:g} to {row.high_m:g} m, {name}",
@@ -272,7 +289,7 @@ def _pooled_and_worst(
     return [pooled, at_most(bar, title, bars[1], (value, limit), fewest, where)]
 
 
-def _pooled(bar: str, quantity: str, names: Sequence[str], high: float, bins: Sequence[BinRow]) -> BarRow:
+def _pooled(bar: str, quantity: str, names: Sequence[str], high: float, bins: Sequence[PoseBin]) -> AcceptanceRow:
     """The worst component over all bins together."""
     known = [row.normalized for row in bins if row.normalized is not None]
     if not known:
@@ -288,7 +305,7 @@ def _pooled(bar: str, quantity: str, names: Sequence[str], high: float, bins: Se
 class TierData:
     """What was made of one dataset of a tier."""
 
-    light: Literal["day", "dusk"]
+    light: LightLevel
     dataset: Path
     estimates: Path
     result: BenchmarkResult
@@ -299,39 +316,39 @@ def recipe_of(tier: str, light: str) -> str:
     return f"pose-tier-{tier}" if light == "day" else f"pose-tier-{tier}-{light}"
 
 
-def tier_a_bars(data: TierData) -> list[BarRow]:
-    """Bars 1, 4, 5, 6 and 9 on one dataset.
+def tier_a_rows(data: TierData) -> list[AcceptanceRow]:
+    """Criteria 1, 4, 5, 6 and 9 on one dataset.
 
     Raises:
         ValueError: estimates that cannot be read, or that lack a method.
     """
-    light = _light(data)
+    images = _image_scores(data)
     return [
-        *centroid_bound_rows(light),
-        *chain_rows(light, 1 / 5 if data.light == "day" else 1 / 2.5),
-        *tier_a_rows(data.light, data.result),
+        *centroid_bound_rows(images),
+        *chain_rows(images, 1 / 5 if data.light == "day" else 1 / 2.5),
+        *normalized_error_rows(data.light, data.result),
     ]
 
 
-def tier_b_bars(data: TierData) -> list[BarRow]:
-    """Bars 2, 3, 4, 8, 13, 14 and 15 on one dataset, and in daylight what is aimed at by distance.
+def tier_b_rows(data: TierData) -> list[AcceptanceRow]:
+    """Criteria 2, 3, 4, 8, 13, 14 and 15 on one dataset, and in daylight what is aimed at by distance.
 
     Raises:
         ValueError: estimates that cannot be read, or that lack a method.
     """
-    light, day = _light(data), data.light == "day"
+    images, day = _image_scores(data), data.light == "day"
     return [
-        *centroid_rows(light),
-        *chain_rows(light, 1 / 4 if day else 1 / 3),
-        *tier_b_rows(data.light, data.result),
-        *absolute_rows(light),
-        *paper_rows(light),
-        *(goal_rows(light) if day else []),
+        *centroid_rows(images),
+        *chain_rows(images, 1 / 4 if day else 1 / 3),
+        *normalized_near_rows(data.light, data.result),
+        *absolute_rows(images),
+        *paper_rows(images),
+        *(goal_rows(images) if day else []),
     ]
 
 
-IMAGE_TIERS: dict[str, Callable[[TierData], list[BarRow]]] = {"a": tier_a_bars, "b": tier_b_bars}
+IMAGE_TIERS: dict[str, Callable[[TierData], list[AcceptanceRow]]] = {"a": tier_a_rows, "b": tier_b_rows}
 
 
-def _light(data: TierData) -> Light:
-    return Light(data.light, score_frames(data.dataset, data.estimates, METHODS))
+def _image_scores(data: TierData) -> ImageScores:
+    return ImageScores(data.light, score_frames(data.dataset, data.estimates, METHODS))

@@ -12,7 +12,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import PoseEstimate, read_estimates
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
-from droguekit.benchmark.poses.pose_errors import by_method, pose_error
+from droguekit.benchmark.poses.pose_errors import estimates_by_method, pose_error
 from geometry.se3 import Array
 from studies.acceptance.rendered.centroid_bounds import center_bounds_px
 
@@ -64,7 +64,7 @@ def score_frames(dataset: Path, estimates: Path, methods: Iterable[str]) -> dict
         ValueError: a dataset or estimates that cannot be read, or a method that is not among them.
     """
     data = Dataset(dataset)
-    found = by_method(read_estimates(estimates), data.frame_indices, str(estimates))
+    found = estimates_by_method(read_estimates(estimates), data.frame_indices, str(estimates))
     missing = [name for name in methods if name not in found]
     if missing:
         raise ValueError(f"{estimates}: has no method {missing[0]!r}; there are {', '.join(found)}")

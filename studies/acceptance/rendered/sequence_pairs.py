@@ -1,4 +1,4 @@
-"""Pairs of sequences, scored one by one against the records: what the bars of whole flights rest on."""
+"""Pairs of sequences, scored one by one against the records: what the criteria of whole flights rest on."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estim
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
 from droguekit.benchmark.poses.cramer_rao import component_deviations
 from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
-from droguekit.benchmark.poses.pose_errors import by_method, pose_error
+from droguekit.benchmark.poses.pose_errors import estimates_by_method, pose_error
 from droguekit.benchmark.poses.reference import build_reference
-from droguekit.benchmark.sequences.sequence_latency import worked_s
-from droguekit.benchmark.sequences.sequence_truth import Sight, moment
+from droguekit.benchmark.sequences.sequence_latency import processing_time_s
+from droguekit.benchmark.sequences.sequence_truth import Visibility, true_state
 from geometry.se3 import Array
 from studies.acceptance.rendered.scored_frames import BEST
 
@@ -36,7 +36,7 @@ class TruePair:
         family: of its conditions.
         truth: of the drogue.
         in_view: whether both images show four markers and the hub, if the drogue has one, and no sun outshines them.
-        sight: of the pair; `seen` for a single one.
+        visibility: of the pair; `seen` for a single one.
     """
 
     frame_index: int
@@ -44,7 +44,7 @@ class TruePair:
     family: str
     truth: DrogueTruth
     in_view: bool
-    sight: Sight
+    visibility: Visibility
 
     @property
     def distance_m(self) -> float:
@@ -89,7 +89,7 @@ def score_pairs(dataset: Path, estimates: Path) -> dict[str, list[ScoredPair]]:
         ValueError: a dataset or estimates that cannot be read.
     """
     data = Dataset(dataset)
-    found = by_method(read_estimates(estimates), data.frame_indices, str(estimates))
+    found = estimates_by_method(read_estimates(estimates), data.frame_indices, str(estimates))
     pairs = [pair for pair in (_true_pair(data, index) for index in data.frame_indices) if pair is not None]
     bounds = _bounds(pairs, found)
     return {
@@ -100,10 +100,10 @@ def score_pairs(dataset: Path, estimates: Path) -> dict[str, list[ScoredPair]]:
 
 def _true_pair(data: Dataset, index: int) -> TruePair | None:
     record = data.record(index)
-    truth, flown = drogue_truth(record), moment(record)
+    truth, flown = drogue_truth(record), true_state(record)
     if truth is None:
         return None
-    sight: Sight = "seen" if flown is None else flown.sight
+    visibility: Visibility = "seen" if flown is None else flown.visibility
     markers = truth.visible[:, : truth.layout.count].sum(axis=1)
     in_view = bool((markers >= _FEWEST_MARKERS).all() and truth.visible[:, truth.layout.count :].all())
     return TruePair(
@@ -111,8 +111,8 @@ def _true_pair(data: Dataset, index: int) -> TruePair | None:
         sequence_id=index if record.sequence_id is None else record.sequence_id,
         family=record.conditions.family,
         truth=truth,
-        in_view=in_view and sight != "dazzled",
-        sight=sight,
+        in_view=in_view and visibility != "dazzled",
+        visibility=visibility,
     )
 
 
@@ -135,7 +135,7 @@ def _bounds(pairs: Sequence[TruePair], methods: Mapping[str, Mapping[int, Estima
 
 
 def _scored(pair: TruePair, answer: Estimate | None, bound: Array | None) -> ScoredPair:
-    work_s = None if answer is None else worked_s(answer.stage_s)
+    work_s = None if answer is None else processing_time_s(answer.stage_s)
     if not isinstance(answer, PoseEstimate):
         reason = "" if answer is None else answer.reason
         return ScoredPair(pair, None, None, None, reason, work_s)

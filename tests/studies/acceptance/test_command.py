@@ -1,4 +1,4 @@
-"""`droguekit bars` on flights: from a recipe to the table, resumed, and what is refused."""
+"""The acceptance study on flights: from a recipe to the table, resumed, and what is refused."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from droguekit.cli.main import WRONG_INPUT
 from nav.runner import method_names
 from studies.acceptance.__main__ import run_command
 from studies.acceptance.acceptance_run import (
-    BarsOrder,
-    FlightOrder,
-    flight_bars,
+    AcceptanceOptions,
+    FlightOptions,
+    measure_flight_tier,
+    measure_tier,
     plan_flights,
     plan_images,
-    run_bars,
 )
-from studies.acceptance.acceptance_table import BarRow
+from studies.acceptance.acceptance_table import AcceptanceRow
 from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS, FlightData, approach_rows, lost_rows, part_length
 from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
@@ -82,23 +82,23 @@ attitude_sd_deg = 10
 """
 
 
-def order(engines: tuple[str, ...] = (), **changes: object) -> BarsOrder:
-    return BarsOrder("docking", 3, engines=engines, workers=0, flights=FlightOrder(**changes))  # type: ignore[arg-type]
+def options(engines: tuple[str, ...] = (), **changes: object) -> AcceptanceOptions:
+    return AcceptanceOptions("docking", 3, engines=engines, workers=0, flights=FlightOptions(**changes))  # type: ignore[arg-type]
 
 
-def rows_of(title: str, scores: object, is_beside: bool) -> list[BarRow]:
+def rows_of(title: str, scores: object, is_beside: bool) -> list[AcceptanceRow]:
     return [*approach_rows(title, scores, is_beside), *lost_rows(title, scores, is_beside)]  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FlightData, list[BarRow]]:
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, FlightData, list[AcceptanceRow]]:
     folder = tmp_path_factory.mktemp("bars")
     (folder / "small.toml").write_text(RECIPE)
     data = FlightData(str(folder / "small.toml"), 2, rows_of, times=True, compares=True)
-    return folder, data, flight_bars(order(), [data], folder / "out", PlainProgress(io.StringIO()))
+    return folder, data, measure_flight_tier(options(), [data], folder / "out", PlainProgress(io.StringIO()))
 
 
-def test_flights_are_rendered_navigated_and_judged(measured: tuple[Path, FlightData, list[BarRow]]) -> None:
+def test_flights_are_rendered_navigated_and_judged(measured: tuple[Path, FlightData, list[AcceptanceRow]]) -> None:
     folder, _, rows = measured
     made = folder / "out" / "analytic" / "small-flights"
     # More sequences than the recipe has, each of the others in a scene of its own.
@@ -120,7 +120,7 @@ def test_flights_are_rendered_navigated_and_judged(measured: tuple[Path, FlightD
     assert beside.bar == "beside" and beside.measured is not None
 
 
-def test_scores_are_those_of_the_records(measured: tuple[Path, FlightData, list[BarRow]]) -> None:
+def test_scores_are_those_of_the_records(measured: tuple[Path, FlightData, list[AcceptanceRow]]) -> None:
     folder, _, _ = measured
     made = folder / "out" / "analytic" / "small-flights"
     frames = Dataset(made / "dataset")
@@ -144,11 +144,11 @@ def test_scores_are_those_of_the_records(measured: tuple[Path, FlightData, list[
 
 
 def test_what_is_there_is_kept(
-    measured: tuple[Path, FlightData, list[BarRow]],
+    measured: tuple[Path, FlightData, list[AcceptanceRow]],
 ) -> None:
     folder, data, rows = measured
     told = io.StringIO()
-    again = flight_bars(order(), [data], folder / "out", PlainProgress(told))
+    again = measure_flight_tier(options(), [data], folder / "out", PlainProgress(told))
     assert again == rows
     assert told.getvalue().count("is there already") == 3 and "40 of 40 pairs are there already" in told.getvalue()
 
@@ -160,7 +160,7 @@ def test_what_is_there_is_kept(
         ({"recipes": ("docking-10m",), "sequences": 0}, r"--sequences: must be at least 1, got 0"),
         ({"recipes": ("docking-10m",), "rigs": ("stereo",)}, r"--rig stereo: .*no rig named 'stereo'"),
         ({"recipes": ("docking-10m",), "engines": ("povray",)}, r"no engine named 'povray'"),
-        # What is wrong may come late in the order.
+        # What is wrong may come late among the options.
         ({"recipes": ("docking-10m",), "engines": ("analytic", "povray")}, r"no engine named 'povray'"),
         ({"recipes": ("docking-10m",), "rigs": ("rgb-ideal", "stereo")}, r"no rig named 'stereo'"),
         ({"recipes": ("docking-10m", "drogue-lost"), "engines": ("analytic",)}, r"draws no obstacles"),
@@ -168,24 +168,29 @@ def test_what_is_there_is_kept(
         ({"recipes": ("drogue-lost",), "engines": ("analytic",)}, r"--engine analytic: .*draws no obstacles"),
     ],
 )
-def test_wrong_orders_are_named(tmp_path: Path, changes: dict[str, object], fault: str) -> None:
+def test_wrong_options_are_named(tmp_path: Path, changes: dict[str, object], fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
-        run_bars(order(**changes), tmp_path / "out", PlainProgress(io.StringIO()))
+        measure_tier(options(**changes), tmp_path / "out", PlainProgress(io.StringIO()))
     assert not (tmp_path / "out").exists()
 
 
 def test_pairs_that_cannot_be_made_are_a_fault(tmp_path: Path) -> None:
     (tmp_path / "turned.toml").write_text(TURNED)
-    data, turned = FlightData(str(tmp_path / "turned.toml"), 2, approach_rows), BarsOrder("docking", 10, workers=0)
-    with pytest.raises(ValueError, match=r"2 pairs could not be made, pair 2 the first: .*; bars count every pair"):
-        flight_bars(turned, [data], tmp_path / "out", PlainProgress(io.StringIO()))
+    data, turned = (
+        FlightData(str(tmp_path / "turned.toml"), 2, approach_rows),
+        AcceptanceOptions("docking", 10, workers=0),
+    )
+    with pytest.raises(
+        ValueError, match=r"2 pairs could not be made, pair 2 the first: .*; the criteria count every pair"
+    ):
+        measure_flight_tier(turned, [data], tmp_path / "out", PlainProgress(io.StringIO()))
     assert not list((tmp_path / "out").rglob("bars.json")) and not list((tmp_path / "out").rglob("estimates.jsonl"))
 
 
 def test_the_first_sequences_are_those_of_the_full_measurement() -> None:
     for tier in FLIGHT_TIERS.values():
         for (data, few), (_, full) in zip(
-            plan_flights(order(sequences=1), tier), plan_flights(order(), tier), strict=True
+            plan_flights(options(sequences=1), tier), plan_flights(options(), tier), strict=True
         ):
             assert (
                 few.source.recipe.model_dump_json() == full.source.recipe.model_dump_json() and few.names == full.names
@@ -197,17 +202,17 @@ def test_the_first_sequences_are_those_of_the_full_measurement() -> None:
 
 
 def test_tier_b_has_a_dataset_for_each_engine_that_is_named() -> None:
-    tier_b = BarsOrder("b", 3, pairs_per_station=2, engines=("mitsuba", "blender"))
+    tier_b = AcceptanceOptions("b", 3, pairs_per_station=2, engines=("mitsuba", "blender"))
     plans = [plan for _, plan in plan_images(tier_b)]
     assert [plan.names for plan in plans] == [(e, light) for e in tier_b.engines for light in ("day", "dusk")]
     assert [plan.source.recipe.render.engine for plan in plans] == ["mitsuba", "mitsuba", "blender", "blender"]
-    assert [plan.names for _, plan in plan_images(BarsOrder("b", 3))] == [("day",), ("dusk",)]
+    assert [plan.names for _, plan in plan_images(AcceptanceOptions("b", 3))] == [("day",), ("dusk",)]
 
 
 def test_one_light_alone_has_the_dataset_that_it_has_beside_the_other() -> None:
     (_, (_, beside)), ((light, alone),) = (
-        plan_images(BarsOrder("a", 3)),
-        plan_images(BarsOrder("a", 3, lights=("dusk",))),
+        plan_images(AcceptanceOptions("a", 3)),
+        plan_images(AcceptanceOptions("a", 3, lights=("dusk",))),
     )
     assert light == "dusk" and (alone.names, alone.count) == (beside.names, beside.count)
     assert alone.source.recipe.model_dump_json() == beside.source.recipe.model_dump_json()
@@ -215,8 +220,8 @@ def test_one_light_alone_has_the_dataset_that_it_has_beside_the_other() -> None:
 
 @pytest.mark.slow
 def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> None:
-    tier_b = BarsOrder("b", 3, pairs_per_station=1, engines=("analytic",), workers=0)
-    table = run_bars(tier_b, tmp_path, PlainProgress(io.StringIO()))
+    tier_b = AcceptanceOptions("b", 3, pairs_per_station=1, engines=("analytic",), workers=0)
+    table = measure_tier(tier_b, tmp_path, PlainProgress(io.StringIO()))
     assert table.rows and all(row.quantity.startswith("analytic, ") for row in table.rows)
     assert (tmp_path / "analytic" / "day" / "benchmark.json").exists()
 
@@ -224,7 +229,9 @@ def test_rows_of_tier_b_name_the_engine_that_was_asked_for(tmp_path: Path) -> No
 def test_centroids_are_timed_on_pairs_that_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("studies.acceptance.acceptance_run._TIMED_PAIRS", 1)
     told = io.StringIO()
-    tables = [run_bars(BarsOrder("speed", 3, draws=2, workers=0), tmp_path, PlainProgress(told)) for _ in range(2)]
+    tables = [
+        measure_tier(AcceptanceOptions("speed", 3, draws=2, workers=0), tmp_path, PlainProgress(told)) for _ in range(2)
+    ]
     assert "9 of 9 pairs are there already" in told.getvalue()
     for table in tables:
         measured = {row.quantity: row.measured for row in table.rows}

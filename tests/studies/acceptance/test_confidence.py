@@ -1,4 +1,4 @@
-"""Limits of the bars against scipy's own tests and against what they promise."""
+"""Limits of the criteria against scipy's own tests and against what they promise."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from studies.acceptance import confidence_limits
-from studies.acceptance.acceptance_table import BarTable, at_most, between, not_measured
+from studies.acceptance.acceptance_table import AcceptanceTable, at_most, between, not_measured
 
 
 def rng(stream: int) -> np.random.Generator:
@@ -97,8 +97,8 @@ def test_a_bar_is_met_when_its_limit_is_and_not_when_only_its_value_is() -> None
 
 def test_the_table_counts_numbered_bars_and_shows_all() -> None:
     rows = (at_most("5", "five", 1, (2, 3), 4), at_most("goal", "aim", 1, (2, 3), 4), at_most("6", "six", 1, (0, 0), 4))
-    table = BarTable(tier="a", seed=1, code_version="0", rows=rows)
+    table = AcceptanceTable(tier="a", seed=1, code_version="0", rows=rows)
     assert table.missed == 1
     assert "1 of 2 bars are met" in table.to_markdown()
     assert [line.split()[0] for line in table.to_lines()] == ["bar", "5", "goal", "6"]
-    assert BarTable.model_validate_json(table.to_json()) == table
+    assert AcceptanceTable.model_validate_json(table.to_json()) == table

@@ -1,4 +1,4 @@
-"""Bars on whole flights: their arithmetic on answers whose errors are known, and the data that they are measured on."""
+"""Criteria on whole flights: their arithmetic on estimates of known errors, and the data that they use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from geometry.se3 import RigidTransform
 from geometry.stereo import paper_rig
 from scenes.drogue_appearance import drogue_of_scene
 from scenes.sampler import recipe_of_scene, scene_of_frame
-from studies.acceptance.acceptance_table import BarRow
+from studies.acceptance.acceptance_table import AcceptanceRow
 from studies.acceptance.rendered.flight_tiers import (
     FLIGHT_TIERS,
     approach_rows,
@@ -24,7 +24,7 @@ from studies.acceptance.rendered.flight_tiers import (
     condition_rows,
     lost_rows,
     part_length,
-    speed_rows,
+    processing_time_rows,
     with_parts,
 )
 from studies.acceptance.rendered.scored_frames import BEST, CHAIN
@@ -56,8 +56,8 @@ def flight(count: int = 200, **changes: object) -> list[ScoredPair]:
     return [answer(true_pair(index, **changes)) for index in range(count)]
 
 
-def by_bar(rows: list[BarRow]) -> dict[str, list[BarRow]]:
-    found: dict[str, list[BarRow]] = {}
+def by_bar(rows: list[AcceptanceRow]) -> dict[str, list[AcceptanceRow]]:
+    found: dict[str, list[AcceptanceRow]] = {}
     for row in rows:
         found.setdefault(row.bar, []).append(row)
     return found
@@ -108,7 +108,7 @@ def test_what_is_out_of_view_must_be_reasoned_modest_or_exact(
 
 
 def test_a_pose_of_a_hidden_drogue_is_never_exact() -> None:
-    hidden = answer(true_pair(1000, in_view=False, sight="hidden"), 0.1, sd_m=0.9e-3)
+    hidden = answer(true_pair(1000, in_view=False, visibility="hidden"), 0.1, sd_m=0.9e-3)
     (row,) = by_bar(approach_rows("data", {BEST: [*flight(), hidden]}, False))["21"]
     assert row.measured == 1
 
@@ -142,7 +142,7 @@ def test_losing_the_drogue(delay: int, poses: int, late: int) -> None:
     for index in range(100):
         hidden = 20 <= index % 50 < 40
         found = not hidden and not (40 <= index % 50 < 40 + delay)
-        pair = true_pair(index, sight="hidden" if hidden else "seen")
+        pair = true_pair(index, visibility="hidden" if hidden else "seen")
         pairs.append(answer(pair, 0.3 if found or index in range(25, 25 + poses) else None))
     rows = by_bar(lost_rows("data", {BEST: pairs, FILTERED: pairs, CHAIN: pairs}, False))
     # A filter is judged as well.
@@ -153,16 +153,16 @@ def test_losing_the_drogue(delay: int, poses: int, late: int) -> None:
     assert [len(rows[bar]) for bar in ("21", "24", "25", "beside")] == [2, 2, 2, 3]
 
 
-@pytest.mark.parametrize("sight", ["dazzled", "partly"])
-def test_a_wrong_pose_beside_the_sun_or_of_a_part_is_counted(sight: str) -> None:
-    wrong = answer(true_pair(1000, in_view=False, sight=sight), 50.0, sd_m=0.9e-3)
+@pytest.mark.parametrize("visibility", ["dazzled", "partly"])
+def test_a_wrong_pose_beside_the_sun_or_of_a_part_is_counted(visibility: str) -> None:
+    wrong = answer(true_pair(1000, in_view=False, visibility=visibility), 50.0, sd_m=0.9e-3)
     (row,) = by_bar(lost_rows("data", {FILTERED: [*flight(), wrong]}, False))["21"]
     assert (row.measured, row.n, row.met) == (1, 1, False)
 
 
 def test_a_pose_that_is_far_off_has_not_found_the_drogue_again() -> None:
     pairs = [
-        answer(true_pair(k, sight="hidden" if k < 5 else "seen"), None if k < 5 else 600.0 if k < 20 else 1.0)
+        answer(true_pair(k, visibility="hidden" if k < 5 else "seen"), None if k < 5 else 600.0 if k < 20 else 1.0)
         for k in range(30)
     ]
     assert by_bar(lost_rows("data", {BEST: pairs}, False))["24"][0].measured == 1
@@ -196,12 +196,12 @@ def test_a_station_of_the_bench_without_poses_is_not_left_out(fixes: int) -> Non
 def test_speed_is_the_median_by_distance_without_or_with_a_pose() -> None:
     far = [answer(true_pair(k, distance_m=7.0), work_s=0.025) for k in range(30)]
     near = [answer(true_pair(k, distance_m=2.0), None, work_s=0.090) for k in range(30)]
-    rows = speed_rows("data", far + near, False)
+    rows = processing_time_rows("data", far + near, False)
     assert [(row.measured, row.met) for row in rows] == [(pytest.approx(25.0), True), (pytest.approx(90.0), False)]
-    assert speed_rows("data", far, True)[1].measured is None
+    assert processing_time_rows("data", far, True)[1].measured is None
     # What is independent is a flight: one of four that is slow throughout.
     flights = [answer(true_pair(k, distance_m=7.0), work_s=0.025 if k < 150 else 0.050) for k in range(200)]
-    assert speed_rows("data", flights, False)[0].limit_high == pytest.approx(50.0)
+    assert processing_time_rows("data", flights, False)[0].limit_high == pytest.approx(50.0)
 
 
 def test_tiers_name_recipes_that_ship_and_can_have_as_many_parts() -> None:

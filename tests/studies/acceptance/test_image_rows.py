@@ -1,4 +1,4 @@
-"""Bars on images: their arithmetic on frames whose errors are known, and the recipes that they render."""
+"""Criteria on images: their arithmetic on frames whose errors are known, and the recipes that they render."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from studies.acceptance.centroid_level.monte_carlo import STATIONS_M
 from studies.acceptance.finished_results import is_navigated, mark_navigated
 from studies.acceptance.rendered import image_tiers
 from studies.acceptance.rendered.centroid_bounds import contrast_from_snr
-from studies.acceptance.rendered.image_tiers import Light, recipe_of
+from studies.acceptance.rendered.image_tiers import ImageScores, recipe_of
 from studies.acceptance.rendered.scored_frames import BEST, CHAIN, FrameErrors, MarkerErrors
 
 PER_STATION = 30
@@ -30,9 +30,9 @@ def frames(sigma_px: float, pose_scale: float, stream: int, outward_px: float = 
     return found
 
 
-def light(name: str = "day", **changes: dict[int, FrameErrors]) -> Light:
+def light(name: str = "day", **changes: dict[int, FrameErrors]) -> ImageScores:
     scores = {BEST: frames(0.012, 0.1, 1), CHAIN: frames(0.06, 2.0, 2), **changes}
-    return Light(name, scores)  # type: ignore[arg-type]
+    return ImageScores(name, scores)  # type: ignore[arg-type]
 
 
 def test_centroids_over_their_bound() -> None:

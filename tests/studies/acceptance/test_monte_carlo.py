@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from studies.acceptance.centroid_level.centroid_tiers import bars_tier_c, bars_tier_d
+from studies.acceptance.centroid_level.centroid_tiers import measure_tier_c, measure_tier_d
 from studies.acceptance.centroid_level.drawn_frames import Corruption
 from studies.acceptance.centroid_level.monte_carlo import CELLS_FILE, Cell, run_cell, run_cells
 
@@ -88,7 +88,7 @@ def test_a_file_of_something_else_is_an_error(tmp_path: Path, text: str) -> None
 
 
 def test_tier_c_runs_through(tmp_path: Path) -> None:
-    rows = bars_tier_c(tmp_path, 1, 20, Listener())
+    rows = measure_tier_c(tmp_path, 1, 20, Listener())
     assert [row.bar for row in rows] == ["5", "5", "6", "6", "7", "7", "9", "9", "10", "10", "10"]
     assert all(row.measured is not None and row.n > 0 for row in rows)
     # Over 2000 draws a pooled ratio is within 1.6 % of one; four of these, and a start of flips.
@@ -96,7 +96,7 @@ def test_tier_c_runs_through(tmp_path: Path) -> None:
 
 
 def test_tier_d_runs_through(tmp_path: Path) -> None:
-    rows = bars_tier_d(tmp_path, 1, 4, Listener())
+    rows = measure_tier_d(tmp_path, 1, 4, Listener())
     assert [row.bar for row in rows] == ["11", "11", "11", "12", "12", "12"]
     assert all(row.measured is not None and row.n > 0 for row in rows)
 

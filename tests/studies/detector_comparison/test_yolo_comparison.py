@@ -18,9 +18,9 @@ from datasets_manifest.recipe.recipe import RecipeSource, load_recipe, parse_rec
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.detection.detection_scores import DetectorRun, score_detections
+from droguekit.benchmark.detection.detection_scores import DetectorOutput, score_detections
 from droguekit.benchmark.detection.detection_truth import read_detection_truth
-from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorPass
+from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorRunner
 from droguekit.cli.main import DONE, run
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
@@ -274,8 +274,8 @@ def test_ablations_are_scored_by_the_benchmark_and_one_view_finds_the_same_boxes
     ablation = AblationOptions(nowhere, screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
     rows = measured_networks(ablation, {"eca-asff": file, ONE_VIEW: file}, lambda line: None)
     truth = read_detection_truth(screen_dataset)
-    boxes = list(DetectorPass(screen_dataset, lambda drogue: OnnxDetector(file)).boxes(LEAST_SCORE, lambda: None))
-    overall = score_detections(truth, {"mine": DetectorRun(boxes)}, "test").result.detectors["mine"].overall
+    boxes = list(DetectorRunner(screen_dataset, lambda drogue: OnnxDetector(file)).boxes(LEAST_SCORE, lambda: None))
+    overall = score_detections(truth, {"mine": DetectorOutput(boxes)}, "test").result.detectors["mine"].overall
     assert {box.image_id for box in boxes} > {image.image_id for image in truth.images if image.split == "test"}
     for row in rows.values():
         # The same numbers from batches of other sizes.

@@ -9,7 +9,7 @@ import pytest
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PairRecord
-from studies.paper.docking_experiment import chosen_scores, frames_in_view
+from studies.paper.docking_experiment import frames_in_view, subset_scores
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_pairs_are_chosen_by_what_both_eyes_see(record: PairRecord) -> None:
 def test_scores_are_those_of_the_chosen_pairs() -> None:
     errors = {k: np.array([0.003 * (k + 1), 0.004 * (k + 1), 0.0, 0.1 * k, -0.2]) for k in range(4)}
     errors[9] = np.full(5, 100.0)
-    scores = chosen_scores(errors, [0, 1, 2, 3, 7], "test")
+    scores = subset_scores(errors, [0, 1, 2, 3, 7], "test")
     # 3, 4, 5: the lengths are 5, 10, 15 and 20 mm; pair 7 has no pose and pair 9 does not count.
     assert scores.mean_m == pytest.approx(0.0125)
     assert scores.fix_fraction == pytest.approx(0.8)
@@ -55,5 +55,5 @@ def test_scores_are_those_of_the_chosen_pairs() -> None:
 
 
 def test_without_a_pose_there_is_nothing_to_tell() -> None:
-    scores = chosen_scores({}, [1, 2], "test")
+    scores = subset_scores({}, [1, 2], "test")
     assert (scores.fix_fraction, scores.mean_m, scores.largest_m) == (0.0, None, None)

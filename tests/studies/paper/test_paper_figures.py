@@ -11,7 +11,7 @@ import pytest
 
 from datasets_manifest.storage.reader import Dataset
 from studies.paper.corpus_figures import CorpusBoxes, place_panel, shape_panel, size_panel
-from studies.paper.docking_experiment import Run
+from studies.paper.docking_experiment import DockingRun
 from studies.paper.pose_figures import PITCH, X, error_series, length_series, truth_series
 from studies.paper.published_results import CONTENDERS, present, style_of
 
@@ -19,10 +19,10 @@ METHODS = present(["joint-hub", "paper"])
 COUNT = 40
 
 
-def make_run(errors: np.ndarray, others: np.ndarray | None = None) -> Run:
+def make_run(errors: np.ndarray, others: np.ndarray | None = None) -> DockingRun:
     truth = np.linspace([0.1, 0.0, 10.0], [0.0, 0.1, 1.7], COUNT)
     other = errors if others is None else others
-    return Run(0, np.arange(COUNT), truth, {"joint-hub": errors, "paper": other})
+    return DockingRun(0, np.arange(COUNT), truth, {"joint-hub": errors, "paper": other})
 
 
 def title_of(svg: str) -> str:
@@ -83,7 +83,9 @@ def test_poses_outside_the_panel_of_the_truth_are_counted() -> None:
 def test_far_larger_errors_are_counted_instead_of_flattening_the_rest() -> None:
     # One in two hundred: below the percentile that is shown.
     run = make_run(np.full((COUNT, 5), 1e-3))
-    many = Run(0, np.arange(200), np.zeros((200, 3)), {"joint-hub": np.resize(run.errors["paper"], (200, 5)).copy()})
+    many = DockingRun(
+        0, np.arange(200), np.zeros((200, 3)), {"joint-hub": np.resize(run.errors["paper"], (200, 5)).copy()}
+    )
     many.errors["joint-hub"][17, 0] = 1.0
     assert "1 larger not shown" in title_of(error_series("f", many, METHODS[:1], X))
     assert "not shown" not in title_of(error_series("f", run, METHODS, X))

@@ -19,7 +19,7 @@ from droguekit.benchmark.results.detection_result import (
     PairTimes,
 )
 from droguekit.cli.main import COMMANDS, DONE, WRONG_INPUT, load_command, run
-from studies.paper.paper_report import ReportInputs, left_out
+from studies.paper.paper_report import ReportInputs, missing_parts
 
 WriteEstimates = Callable[..., Path]
 VOID = {"meta", "img", "link", "br", "hr"}
@@ -138,8 +138,8 @@ def test_names_of_files_cannot_break_the_page(bench: Path, estimates_of: WriteEs
 
 
 def test_commands_that_are_told_exist() -> None:
-    commands = [unescape(command) for part in left_out(ReportInputs()) for command in part.commands]
-    commands += [f"droguekit report {part.option}" for part in left_out(ReportInputs())]
+    commands = [unescape(command) for part in missing_parts(ReportInputs()) for command in part.commands]
+    commands += [f"droguekit report {part.option}" for part in missing_parts(ReportInputs())]
     assert len(commands) >= 8
     for command in commands:
         program, name, *words = command.split()
