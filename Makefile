@@ -20,7 +20,7 @@ demo: ## render a small dataset, navigate on it blind, and report how accurate t
 
 docs: ## build the documentation into out/docs (installs mkdocs-material)
 	@scripts/setup docs
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "docs: open $(CURDIR)/out/docs/index.html"
 
 # Three for two cores: tests of commands and pages wait for other processes much of their time.
@@ -46,7 +46,7 @@ lint: setup ## formatting, style, types, walls between the packages, links of th
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/mypy
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (an hour; installs Blender; goes on where it stopped)
 	@scripts/setup all

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -109,9 +111,8 @@ def test_every_test_named_for_the_paper_exists() -> None:
     assert named and named <= there
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/reference/benchmark.md"])
-def test_tables_of_methods_name_their_centroids(page: str) -> None:
-    rows = re.findall(r"^\| (`[a-z]+[^|]*) \|.* \| (binary|edge) \|$", text(page), re.MULTILINE)
+def test_the_table_of_methods_names_their_centroids() -> None:
+    rows = re.findall(r"^\| (`[a-z]+[^|]*) \|.* \| (binary|edge) \|$", text("docs/reference/methods.md"), re.MULTILINE)
     centroids = {name: kind for names, kind in rows for name in re.findall(r"`([^`]+)`", names)}
     assert centroids == {name: "binary" if name in BINARY_METHODS else "edge" for name in method_names()}
 
@@ -120,11 +121,65 @@ def test_tables_of_methods_name_their_centroids(page: str) -> None:
     "recipe", sorted((REPOSITORY / "datasets_manifest/recipes").glob("*.toml")), ids=lambda p: p.stem
 )
 def test_recipes_that_ship_are_documented(recipe: Path) -> None:
-    assert f"`{recipe.stem}`" in text("README.md")
+    assert f"`{recipe.stem}`" in text("docs/reference/recipes.md")
 
 
 def test_methods_and_drogues_that_ship_are_documented() -> None:
-    table = text("docs/reference/benchmark.md")
+    table = text("docs/reference/methods.md")
     assert [name for name in method_names() if f"| `{name}` |" not in table] == []
     drogues = text("docs/how-to/add-a-drogue.md")
     assert [name for name in PRESETS if f"`{name}`" not in drogues] == []
+
+
+def test_commands_that_ship_are_documented() -> None:
+    page = text("docs/reference/commands.md")
+    assert [name for name in COMMANDS if f"| `{name}` |" not in page] == []
+
+
+def test_readme_is_short() -> None:
+    assert len(text("README.md").splitlines()) <= 110
+
+
+@pytest.mark.parametrize(
+    "study", sorted(path.parent for path in REPOSITORY.glob("studies/*/__init__.py")), ids=lambda p: p.name
+)
+def test_studies_say_what_they_ask_and_what_they_found(study: Path) -> None:
+    readme = (study / "README.md").read_text(encoding="utf-8")
+    assert all(f"**{part}.**" in readme for part in ("Question", "Method", "How to run", "Results"))
+    if study.name == "publish":  # its results are the published manifests
+        return
+    # Every section of results is dated and names its command, commit, machine and seed.
+    results = (study / "RESULTS.md").read_text(encoding="utf-8")
+    heads = re.findall(r"^\| date \| commit \|.*$", results, re.MULTILINE)
+    assert heads and all("command" in head and "machine" in head for head in heads)
+
+
+def test_citation_names_this_version() -> None:
+    yaml = pytest.importorskip("yaml", reason="PyYAML comes with mkdocs: pip install 'droguekit[docs]'")
+    citation = yaml.safe_load(text("CITATION.cff"))
+    version = tomllib.loads(text("pyproject.toml"))["project"]["version"]
+    assert {"cff-version", "message", "title", "authors", "license"} <= citation.keys()
+    assert citation["version"] == version
+    assert f"## [{version}] - {citation['date-released'].isoformat()}" in text("CHANGELOG.md")
+
+
+def test_the_workflow_and_the_hooks_are_what_they_should_be() -> None:
+    yaml = pytest.importorskip("yaml", reason="PyYAML comes with mkdocs: pip install 'droguekit[docs]'")
+    (job,) = yaml.safe_load(text(".github/workflows/ci.yml"))["jobs"].values()
+    assert job["strategy"]["matrix"]["python-version"] == ["3.11"] and len(job["strategy"]["matrix"]["os"]) >= 2
+    assert "bash .ci/run" in [step.get("run") for step in job["steps"]]
+    (local,) = yaml.safe_load(text(".pre-commit-config.yaml"))["repos"]
+    assert [hook["id"] for hook in local["hooks"]] == ["ruff", "ruff-format", "lint-imports", "mypy"]
+
+
+def test_the_pages_build_without_a_warning_and_fetch_nothing(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="mkdocs is missing: pip install 'droguekit[docs]'")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    built = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stdout + built.stderr
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) >= len(PAGES)
+    fetched = re.compile(
+        r"""<(?:script|img|iframe)[^>]*\ssrc="?https?:|<link[^>]*rel="?stylesheet[^>]*href="?https?:"""
+    )
+    assert [page.name for page in pages if fetched.search(page.read_text(encoding="utf-8"))] == []

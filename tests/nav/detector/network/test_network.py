@@ -188,7 +188,7 @@ def test_complexity_of_layers_worked_by_hand():
 
 
 def test_the_documented_sizes_are_right():
-    page = (Path(__file__).resolve().parents[4] / "docs/reference/detectors.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[4] / "docs/explanation/detector-network.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([ls])` (\w+) (\w+) \| ([\d,]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.MULTILINE)
     assert rows
     for variant, attention, fusion, parameters, *gflops in rows:
