@@ -107,7 +107,7 @@ def test_the_example_of_a_method_finds_a_pose() -> None:
 
 def test_every_test_named_for_the_paper_exists() -> None:
     named = set(re.findall(r"`(test_\w+)`", text("docs/explanation/paper.md")))
-    there = set(re.findall(r"^def (test_\w+)", "".join(p.read_text() for p in REPOSITORY.glob("tests/*/*.py")), re.M))
+    there = set(re.findall(r"^def (test_\w+)", "".join(p.read_text() for p in REPOSITORY.glob("tests/**/*.py")), re.M))
     assert named and named <= there
 
 
