@@ -1,4 +1,4 @@
-"""Where the drogue goes against the probe: closure, predicted miss distance, time to contact."""
+"""Docking quantities of a pose with its motion: closure speed, predicted miss distance, time to contact."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
 from nav.filtering.pose_filter import FilterState
 
-# Straight motion tells nothing of what comes later; 40 m at 1.6 m/s take 25 s. [s]
-_LONGEST_WAY_S = 60.0
+# Straight motion predicts no longer than this; 40 m at 1.6 m/s take 25 s. [s]
+_LONGEST_PREDICTION_S = 60.0
 _PLACE, _TURN, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
 def capture_radius_m(drogue: DrogueParameters) -> float:
-    """How far from the axis a probe's tip may be and still enter the opening without touching the face. [m]
+    """Largest distance from the axis at which a probe's tip enters the opening without touching the face. [m]
 
     The radius of the opening less that of the probe's nozzle, which is as wide as the hub's inner edge, the coupling's
     mouth; on a drogue without a hub, as the coupling.
@@ -27,24 +27,24 @@ def capture_radius_m(drogue: DrogueParameters) -> float:
     return drogue.face_inner_radius_m - nozzle_m
 
 
-def docking_of(
+def docking_quantities(
     state: FilterState | PoseEstimate,
     rig: StereoRig,
     drogue: DrogueParameters,
     capture_m: float | None = None,
 ) -> Docking | None:
-    """The drogue as the probe sees it.
+    """Position, closure, miss distance and time of contact of the drogue relative to the probe's tip.
 
-    The way ahead is straight: the velocity stays, and so does the attitude, which swings to and fro and whose rate says
-    nothing of the time of contact. With the rim's centre t, the axis n, the velocity v and the tip p in the left
+    The prediction is a straight line: velocity and attitude stay constant, since the attitude swings and its present
+    rate does not predict it. With the rim's centre t, the axis n, the velocity v and the tip p in the left
     camera, contact is after `T = n.(t - p) / -(n.v)`, and the miss is the length of `t + T v - p`, which lies in the
-    rim plane. Deviations are of first order, and those of this straight way: what hose and air do until then is not in
-    them.
+    rim plane. Standard deviations are of first order, and those of the straight line: they do not include the motion
+    that hose and air add until contact.
 
     Args:
-        state: of a filter, or an estimate; one without motion tells the place only.
+        state: of a filter, or an estimate; an estimate without motion gives the position only.
         rig: with the probe's tip.
-        drogue: what is docked to.
+        drogue: its capture radius and dimensions.
         capture_m: capture radius; None for `capture_radius_m` of the drogue. [m]
 
     Returns:
@@ -102,12 +102,12 @@ def _velocity(state: FilterState | PoseEstimate) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class _Contact:
-    """When the tip comes to the rim plane and where the rim's centre is from it then.
+    """Time at which the tip reaches the rim plane, and the rim's centre relative to it then.
 
     Attributes:
         time_s: [s]
         miss_m: (3,) in the left camera's axes. [m]
-        jacobian: (3, 12) derivative of that by pose, velocity and rate.
+        jacobian: (3, 12) derivative of `miss_m` by pose, velocity and rate.
     """
 
     time_s: float
@@ -116,11 +116,11 @@ class _Contact:
 
 
 def _contact(left_from_drogue: RigidTransform, velocity_m_s: Array, tip_m: Array) -> _Contact | None:
-    """What lies ahead of a tip at (3,) in the left camera; None unless they close."""
+    """The predicted contact with a tip at (3,) in the left camera; None unless tip and drogue approach each other."""
     axis = left_from_drogue.rotation[:, 2]
     apart = left_from_drogue.translation_m - tip_m
     ahead_m, closing_m_s = float(axis @ apart), -float(axis @ velocity_m_s)
-    if ahead_m < 0 or closing_m_s <= 0 or ahead_m > _LONGEST_WAY_S * closing_m_s:
+    if ahead_m < 0 or closing_m_s <= 0 or ahead_m > _LONGEST_PREDICTION_S * closing_m_s:
         return None
     contact_s = ahead_m / closing_m_s
     miss = apart + contact_s * velocity_m_s
@@ -136,7 +136,7 @@ def _contact(left_from_drogue: RigidTransform, velocity_m_s: Array, tip_m: Array
 
 
 def _length_sd(vector: Array, covariance: Array) -> float:
-    """Standard deviation of a vector's length, of first order; the largest of any direction where it has no length."""
+    """First-order standard deviation of a vector's length; the largest of any direction for a vector near zero."""
     length = float(np.linalg.norm(vector))
     along = vector / length if length > 0 else vector
     largest = float(np.linalg.eigvalsh(covariance)[-1])

@@ -16,27 +16,27 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_centroids import NOTHING, Centroids, box_window, window_centroids
+from nav.centroids.binary_centroids import NO_CENTROIDS, BinaryCentroids, box_window, window_centroids
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detector
-from nav.lens_correction import ideal_centroids
+from nav.lens_correction import undistort_centroids
 from nav.matching.marker_channel import OTHERS_WEIGHTS, PLAIN, marker_channel, marker_color
-from nav.pair_measurement import Sighting, estimate_pose, regions_of
+from nav.pair_measurement import PairMeasurement, estimate_pose, regions_of
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, Solution, StatedTolerances
 from nav.refinement import refine
-from nav.stereo_correspondence import correspond, no_ring
+from nav.stereo_correspondence import correspond, explain_no_match
 from nav.tracking.rim_boxes import rim_boxes
 
 Result = TypeVar("Result")
 
 
-def for_each_eye(work: Callable[[Eye], Result], eyes: Collection[Eye]) -> dict[Eye, Result]:
-    """What `work` gives for each eye; of two eyes the second is worked on in a thread of its own.
+def map_views(work: Callable[[Eye], Result], eyes: Collection[Eye]) -> dict[Eye, Result]:
+    """Apply a function to each eye; the second eye runs in a thread of its own.
 
-    OpenCV, and numpy on large arrays, let the other thread run meanwhile.
+    OpenCV, and numpy on large arrays, release the interpreter lock meanwhile.
 
     Raises:
-        Exception: whatever `work` raises.
+        Exception: any exception that `work` raises.
     """
     first, *others = eyes
     waiting = {eye: _other_thread().submit(work, eye) for eye in others}
@@ -49,14 +49,14 @@ def _other_thread() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, thread_name_prefix="other-eye")
 
 
-# Sources of regions that no tracker has followed: the detector, or the other eye where that alone had found the drogue.
+# Sources of regions that are not a tracker's: the detector, or a prediction from the other eye.
 DETECTOR, OTHER_EYE = "detector", "other eye"
 NOT_DETECTED = NoFixReason("no drogue detected in the left image, nor in the right one")
-# To hand a smaller box to another thread takes as long as to work on it.
-_WORTH_A_THREAD_PX2 = 1e5
+# For smaller boxes the handover to another thread takes as long as the work itself.
+_LEAST_THREADED_AREA_PX2 = 1e5
 CentroidChoice = Literal["own", "binary", "edge"]
 CENTROID_CHOICES: tuple[CentroidChoice, ...] = ("own", "binary", "edge")
-# What the paper and the methods that it compares itself with measure on.
+# The methods of the seed paper and of those that it compares itself with.
 BINARY_METHODS = frozenset(
     {"paper", "paper-literal", "circle-fit", "mono-circle", "mean-plane", "disparity-plane", "constant"}
 )
@@ -82,26 +82,26 @@ class Navigator:
 
     @property
     def detector(self) -> Detector:
-        """What looks for the drogue in whole images."""
+        """The detector that finds the drogue in whole images."""
         return self._detector
 
-    def observe(self, images: StereoImages) -> Sighting:
-        """Look for the drogue in the whole images, and measure its markers there."""
+    def observe(self, images: StereoImages) -> PairMeasurement:
+        """Detect the drogue in the whole images and measure its markers."""
         fault = self._wrong_size(images)
         if fault is not None:
-            return Sighting(fault, {})
+            return PairMeasurement(fault, {})
         start = perf_counter()
         regions = regions_of(self._detector.detect(images), DETECTOR)
         stage_s = {"detect": perf_counter() - start}
-        sighting = self.measure(images, regions)
-        return self._with_other_eye(images, replace(sighting, stage_s={**stage_s, **sighting.stage_s}))
+        measurement = self.measure(images, regions)
+        return self._with_other_eye(images, replace(measurement, stage_s={**stage_s, **measurement.stage_s}))
 
-    def _with_other_eye(self, images: StereoImages, sighting: Sighting) -> Sighting:
-        """What both eyes show, where only one did: its pose of the ring says where the other one must see it."""
-        observation = sighting.observation
+    def _with_other_eye(self, images: StereoImages, measurement: PairMeasurement) -> PairMeasurement:
+        """Where only one eye shows the ring of markers, measure the other where the ring's pose predicts it."""
+        observation = measurement.observation
         if isinstance(observation, NoFixReason) or observation.seen.any(axis=1).all():
-            return sighting
-        one = sighting.with_rough()
+            return measurement
+        one = measurement.with_rough()
         if not isinstance(one.rough, Solution):
             return one
         boxes = rim_boxes(self._rig, self._rim_radius_m, one.rough.left_from_drogue)
@@ -114,11 +114,11 @@ class Navigator:
         spent_s = one.stage_s | {stage: one.stage_s.get(stage, 0.0) + s for stage, s in again.stage_s.items()}
         return replace(again if again.markers > one.markers else one, stage_s=spent_s)
 
-    def measure(self, images: StereoImages, regions: tuple[Region, ...]) -> Sighting:
-        """Measure the markers of one pair by the binary chain, where somebody has found the drogue, and match them."""
+    def measure(self, images: StereoImages, regions: tuple[Region, ...]) -> PairMeasurement:
+        """Measure the markers in these regions of one pair by the binary chain, and match them."""
         fault = self._wrong_size(images)
         if fault is not None or not regions:
-            return Sighting(fault or NOT_DETECTED, {})
+            return PairMeasurement(fault or NOT_DETECTED, {})
         best = self._matched(images, regions, PLAIN)
         has_others = self._color is not None and images.left.ndim == 3
         for weight in OTHERS_WEIGHTS[1:] if has_others else ():
@@ -126,7 +126,7 @@ class Navigator:
                 break
             again = self._matched(images, regions, weight)
             spent_s = {stage: best.stage_s[stage] + again.stage_s[stage] for stage in best.stage_s}
-            best = replace(max(best, again, key=lambda sighting: sighting.markers), stage_s=spent_s)
+            best = replace(max(best, again, key=lambda measurement: measurement.markers), stage_s=spent_s)
         return best
 
     def _wrong_size(self, images: StereoImages) -> NoFixReason | None:
@@ -136,62 +136,64 @@ class Navigator:
         got, want = ("x".join(map(str, size)) for size in (images.size_px, size_px))
         return NoFixReason(f"the images are {got} px, the rig's {want} px")
 
-    def _matched(self, images: StereoImages, regions: tuple[Region, ...], others_weight: float) -> Sighting:
+    def _matched(self, images: StereoImages, regions: tuple[Region, ...], others_weight: float) -> PairMeasurement:
         """Binary centroids within the regions, matched."""
         start = perf_counter()
         boxes = {region.eye: region.box_xywh_px for region in regions}
 
-        def centroids_of(eye: Eye) -> Centroids:
+        def centroids_of(eye: Eye) -> BinaryCentroids:
             window = box_window(images.size_px, boxes[eye])
             if window[0] == window[2] or window[1] == window[3]:
-                return NOTHING
+                return NO_CENTROIDS
             channel = marker_channel(images, eye, self._color, others_weight, window)
-            return ideal_centroids(window_centroids(channel, window[:2], self._layout), self._rig, eye)
+            return undistort_centroids(window_centroids(channel, window[:2], self._layout), self._rig, eye)
 
         larger = max(box[2] * box[3] for box in boxes.values())
         centroids = (
-            for_each_eye(centroids_of, boxes)
-            if larger > _WORTH_A_THREAD_PX2
+            map_views(centroids_of, boxes)
+            if larger > _LEAST_THREADED_AREA_PX2
             else {eye: centroids_of(eye) for eye in boxes}
         )
         measured = perf_counter()
-        left, right = (centroids.get(eye, NOTHING) for eye in EYES)
+        left, right = (centroids.get(eye, NO_CENTROIDS) for eye in EYES)
         observation = correspond(left, right, self._rig, self._layout)
         if isinstance(observation, Observation):
             observation = replace(observation, tolerances=self._tolerances)
         stage_s = {"centroids": measured - start, "correspond": perf_counter() - measured}
-        return Sighting(observation, stage_s, others_weight, self._blind_eye(centroids, observation), regions)
+        return PairMeasurement(observation, stage_s, others_weight, self._blind_eye(centroids, observation), regions)
 
-    def _blind_eye(self, centroids: dict[Eye, Centroids], observation: Observation | NoFixReason) -> str:
-        """Why one eye shows nothing where only the other one does; else empty."""
+    def _blind_eye(self, centroids: dict[Eye, BinaryCentroids], observation: Observation | NoFixReason) -> str:
+        """Why one eye shows no markers where the other one does; else empty."""
         if isinstance(observation, NoFixReason) or observation.seen.any(axis=1).all():
             return ""
         eye = EYES[int(np.argmin(observation.seen.any(axis=1)))]
-        return no_ring(centroids[eye], eye) if eye in centroids else f"no drogue detected in the {eye} image"
+        return explain_no_match(centroids[eye], eye) if eye in centroids else f"no drogue detected in the {eye} image"
 
     def estimate(self, frame_index: int, images: StereoImages, methods: Sequence[str]) -> list[Estimate]:
-        """Answers of every method on the same measurements, in the order of `methods`.
+        """Estimates by every method from the same measurements, in the order of `methods`.
 
         Raises:
             ValueError: a method that does not exist.
         """
-        return self.answer(frame_index, images, self.observe(images), methods)
+        return self.estimate_measured(frame_index, images, self.observe(images), methods)
 
-    def answer(self, frame_index: int, images: StereoImages, rough: Sighting, methods: Sequence[str]) -> list[Estimate]:
-        """As `estimate`, on what was measured already."""
+    def estimate_measured(
+        self, frame_index: int, images: StereoImages, rough: PairMeasurement, methods: Sequence[str]
+    ) -> list[Estimate]:
+        """As `estimate`, from markers that were measured already."""
         wants_edges = {method: self._wants_edges(method) for method in methods}
         fine = self.refine(images, rough) if any(wants_edges.values()) else rough
         return [estimate_pose(frame_index, fine if wants_edges[method] else rough, method) for method in methods]
 
-    def refine(self, images: StereoImages, sighting: Sighting) -> Sighting:
-        """The same markers by the edge model, with the hub."""
-        sighting = sighting.with_rough()
-        if isinstance(sighting.observation, NoFixReason) or not isinstance(sighting.rough, Solution):
-            return sighting
+    def refine(self, images: StereoImages, measurement: PairMeasurement) -> PairMeasurement:
+        """Measure the same markers by the edge model, and the hub."""
+        measurement = measurement.with_rough()
+        if isinstance(measurement.observation, NoFixReason) or not isinstance(measurement.rough, Solution):
+            return measurement
         start = perf_counter()
-        observation = refine(images, self._color, sighting.observation, sighting.rough, sighting.others_weight)
+        observation = refine(images, self._color, measurement.observation, measurement.rough, measurement.others_weight)
         return replace(
-            sighting, observation=observation, stage_s={**sighting.stage_s, "refine": perf_counter() - start}
+            measurement, observation=observation, stage_s={**measurement.stage_s, "refine": perf_counter() - start}
         )
 
     def _wants_edges(self, method: str) -> bool:

@@ -1,4 +1,4 @@
-"""What was measured in one pair, and one method's answer to it."""
+"""The measurement of one stereo pair, and the estimate that a pose method makes of it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from datasets_manifest.types.estimates import Estimate, Feature, Mode, NoFix, Po
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import StereoDetection
-from nav.lens_correction import real_observation_px
+from nav.lens_correction import distort_observation
 from nav.matching.marker_channel import PLAIN
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason, Observation, Solution
 from nav.pose.pose_methods import pose_method
@@ -21,16 +21,16 @@ from nav.refinement import rough_pose
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """What was measured in one pair.
+class PairMeasurement:
+    """The markers measured in one pair.
 
     Attributes:
         observation: the matched markers, or why there are none.
         stage_s: seconds by stage. [s]
-        others_weight: of the channel that it was measured in, see `nav.matching.marker_channel`.
-        blind_eye: why one eye shows nothing, where only the other one does.
-        regions: where it was looked for.
-        rough: the pose of the markers as they were first found, once somebody has asked for it.
+        others_weight: weight of the other colours in the channel, see `nav.matching.marker_channel`.
+        blind_eye: why one eye shows no markers, where only the other one does.
+        regions: where the markers were searched.
+        rough: the pose from the binary centroids, None until `with_rough` computes it.
     """
 
     observation: Observation | NoFixReason
@@ -42,12 +42,12 @@ class Sighting:
 
     @property
     def markers(self) -> tuple[int, int]:
-        """How many markers both eyes measured, and how many measurements there are."""
+        """Number of markers measured in both eyes, and number of all measurements."""
         seen = self.observation
         return (0, 0) if isinstance(seen, NoFixReason) else (int(seen.paired.sum()), int(seen.seen.sum()))
 
-    def with_rough(self) -> Sighting:
-        """The same with the rough pose."""
+    def with_rough(self) -> PairMeasurement:
+        """This measurement with the rough pose, computed at most once."""
         if self.rough is not None:
             return self
         start = perf_counter()
@@ -57,7 +57,7 @@ class Sighting:
 
 
 def regions_of(found: StereoDetection, source: str) -> tuple[Region, ...]:
-    """Boxes as regions, with who found them."""
+    """Boxes as regions, with the name of their source."""
     found_by_eye = ((eye, found.of(eye)) for eye in EYES)
     return tuple(
         Region(eye=eye, box_xywh_px=one.box_xywh_px, source=source, score=min(1.0, max(0.0, one.score)))
@@ -66,33 +66,33 @@ def regions_of(found: StereoDetection, source: str) -> tuple[Region, ...]:
     )
 
 
-def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate:
-    """One method's answer to what was measured.
+def estimate_pose(frame_index: int, measurement: PairMeasurement, method: str) -> Estimate:
+    """Estimate the pose from a measurement by one method.
 
     Raises:
         ValueError: a method that does not exist.
     """
     solve = pose_method(method)
-    observation = sighting.observation
+    observation = measurement.observation
     if isinstance(observation, NoFixReason):
         return NoFix(
             frame_index=frame_index,
             method=method,
             reason=observation.reason,
-            stage_s=sighting.stage_s,
-            regions=sighting.regions,
+            stage_s=measurement.stage_s,
+            regions=measurement.regions,
         )
     start = perf_counter()
     solution = solve(observation)
-    stage_s = {**sighting.stage_s, "pose": perf_counter() - start}
+    stage_s = {**measurement.stage_s, "pose": perf_counter() - start}
     if isinstance(solution, NoFixReason):
         return NoFix(
             frame_index=frame_index,
             method=method,
-            reason=f"{solution.reason}: {sighting.blind_eye}" if sighting.blind_eye else solution.reason,
+            reason=f"{solution.reason}: {measurement.blind_eye}" if measurement.blind_eye else solution.reason,
             features=_features(observation, np.zeros_like(observation.seen), None),
             stage_s=stage_s,
-            regions=sighting.regions,
+            regions=measurement.regions,
         )
     return PoseEstimate(
         frame_index=frame_index,
@@ -102,28 +102,28 @@ def estimate_pose(frame_index: int, sighting: Sighting, method: str) -> Estimate
         modes=tuple(Mode(left_from_drogue=mode.left_from_drogue, weight=mode.weight) for mode in solution.modes),
         features=_features(observation, solution.used, solution.used_hub),
         stage_s=stage_s,
-        regions=sighting.regions,
+        regions=measurement.regions,
     )
 
 
 def _features(
     observation: Observation, used: NDArray[np.bool_], used_hub: NDArray[np.bool_] | None
 ) -> tuple[Feature, ...]:
-    """Markers of both eyes, then the hub's outer edge, where the images show them."""
+    """Per eye the markers and then the hub's outer edge, at their places in the delivered images."""
     features = []
     assert observation.hub_cov_px2 is not None
-    markers_px, hub_px = real_observation_px(observation)
+    markers_px, hub_px = distort_observation(observation)
     for eye in range(len(EYES)):
         for index in np.flatnonzero(observation.seen[eye]):
-            place = markers_px[eye, index], observation.cov_px2[eye, index]
-            features.append(_feature(EYES[eye], int(index), place, bool(used[eye, index])))
+            measured = markers_px[eye, index], observation.cov_px2[eye, index]
+            features.append(_feature(EYES[eye], int(index), measured, bool(used[eye, index])))
         if observation.hub_seen[eye, OUTER_EDGE]:
-            place = hub_px[eye, OUTER_EDGE], observation.hub_cov_px2[eye, OUTER_EDGE]
+            measured = hub_px[eye, OUTER_EDGE], observation.hub_cov_px2[eye, OUTER_EDGE]
             hub_used = used_hub is not None and bool(used_hub[eye, OUTER_EDGE])
-            features.append(_feature(EYES[eye], "hub", place, hub_used))
+            features.append(_feature(EYES[eye], "hub", measured, hub_used))
     return tuple(features)
 
 
-def _feature(eye: Eye, index: int | Literal["hub"], place: tuple[Array, Array], used: bool) -> Feature:
-    (x, y), ((a, b), (c, d)) = place[0].tolist(), place[1].tolist()
+def _feature(eye: Eye, index: int | Literal["hub"], measured: tuple[Array, Array], used: bool) -> Feature:
+    (x, y), ((a, b), (c, d)) = measured[0].tolist(), measured[1].tolist()
     return Feature(eye=eye, index=index, center_px=(x, y), cov_px2=((a, b), (c, d)), used=used)

@@ -18,11 +18,11 @@ from nav.centroids.centroid_uncertainty import NoiseModel
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.discs import LARGEST_SCALE
 from nav.centroids.ellipses import Ellipses, outline_shapes, shape_radii
-from nav.centroids.face_background import SEEN_BESIDE_PX, Surroundings
+from nav.centroids.face_background import VISIBLE_MARGIN_PX, FaceBackground
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
-from nav.centroids.motion_blur import Travel
+from nav.centroids.motion_blur import ImageMotion
 from nav.centroids.outline_pixels import WHOLE_RADIUS_PX
-from nav.lens_correction import ideal_places, real_places
+from nav.lens_correction import distort_points, undistort_points
 from nav.matching.marker_channel import PLAIN, balancing_weight
 from nav.pose.joint import joint
 from nav.pose.monocular import mono_lm
@@ -65,19 +65,19 @@ def refine(
     radius_px = rig.camera.fx_px * layout.radius_m / depth_m
     sizes = np.broadcast_to(radius_px * np.eye(2), (layout.count, 2, 2))
     seen = zip(EYES, observation.pixels_px, strict=True)
-    rough_px = np.stack([real_places(rig, eye, places, sizes) for eye, places in seen])
+    rough_px = np.stack([distort_points(rig, eye, places, sizes) for eye, places in seen])
     discs = Ellipses(eyes, rough_px[eyes, index], marker_shapes(rig, layout, rough.left_from_drogue)[eyes, index])
     likely = [rough.modes[0], *(mode for mode in rough.modes[1:] if mode.weight >= _LEAST_WEIGHT)]
     hubs = [hub for mode in likely for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
-    around = _surroundings(layout, index, radius_px / layout.radius_m)
-    narrow = around is not None and around.margin_px <= SEEN_BESIDE_PX
+    around = _face_background(layout, index, radius_px / layout.radius_m)
+    narrow = around is not None and around.margin_px <= VISIBLE_MARGIN_PX
     if narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
         middles_px = np.stack([rig.image(rough.left_from_drogue.translation_m, eye) for eye in EYES])
         # An eye that shows no markers has no say: far outside of the image there is nothing to weigh.
         middles_px[~observation.seen.any(axis=1)] = -1e6
         rim_px = radius_px * layout.face_outer_radius_m / layout.radius_m
         others_weight = balancing_weight(images, color, middles_px, rim_px, others_weight)
-    signals = marker_signals(images, color, _together([discs, *hubs]), others_weight)
+    signals = marker_signals(images, color, _concatenate([discs, *hubs]), others_weight)
     fits = fit_discs(signals, discs, around)
     good = fits.accepted
     left_over = np.bincount(eyes[good], minlength=len(EYES))[observation.seen.any(axis=1)]
@@ -90,12 +90,12 @@ def refine(
     shapes = np.full_like(cov, np.nan)
     shapes[eyes[good], index[good]] = fits.ellipses.shapes_px[good]
     for side, eye in enumerate(EYES):
-        pixels[side], cov[side] = ideal_places(rig, eye, pixels[side], shapes[side], cov[side])
+        pixels[side], cov[side] = undistort_points(rig, eye, pixels[side], shapes[side], cov[side])
     refined = replace(observation, pixels_px=pixels, cov_px2=cov)
     return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.travel)
 
 
-def _surroundings(layout: MarkerLayout, index: NDArray[np.int64], scale_px_per_m: float) -> Surroundings | None:
+def _face_background(layout: MarkerLayout, index: NDArray[np.int64], scale_px_per_m: float) -> FaceBackground | None:
     """The face around the markers, where the drogue has one."""
     places_m = layout.centers_m[:, :2]
     edges_m = layout.face_inner_radius_m, layout.face_outer_radius_m
@@ -103,7 +103,7 @@ def _surroundings(layout: MarkerLayout, index: NDArray[np.int64], scale_px_per_m
         return None
     out_m = np.hypot(places_m[:, 0], places_m[:, 1])
     margin_m = min((edges_m[1] - out_m).min(), (out_m - edges_m[0]).min()) - layout.radius_m
-    return Surroundings(places_m[index], edges_m, float(margin_m * scale_px_per_m))
+    return FaceBackground(places_m[index], edges_m, float(margin_m * scale_px_per_m))
 
 
 def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> Array:
@@ -144,7 +144,7 @@ def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> li
     ]
 
 
-def _together(groups: list[Ellipses]) -> Ellipses:
+def _concatenate(groups: list[Ellipses]) -> Ellipses:
     return Ellipses(
         np.concatenate([group.eyes for group in groups]),
         np.concatenate([group.centers_px for group in groups]),
@@ -156,7 +156,7 @@ def _with_hub(
     observation: Observation,
     signals: tuple[MarkerSignal, MarkerSignal],
     noise: NoiseModel,
-    travel: Travel | None,
+    travel: ImageMotion | None,
 ) -> Observation:
     """The hub's outer edge, looked for where the markers' pose shows it, and where its mirror image would."""
     solution = joint(observation)
@@ -164,7 +164,7 @@ def _with_hub(
         return observation
     collar_factor = observation.layout.collar_radius_m / observation.layout.hub_outer_radius_m
     found: list[tuple[AnnulusFits, Array]] = []
-    for edges in _hub_places(observation, solution):
+    for edges in _hub_candidates(observation, solution):
         outer, inner = edges[OUTER_EDGE], edges[INNER_EDGE]
         found.append((fit_annuli(signals, outer, inner, noise, collar_factor, travel), outer.shapes_px))
         if found[-1][0].certain:
@@ -179,11 +179,11 @@ def _with_hub(
     cov[fits.accepted, OUTER_EDGE] = fits.cov_px2[fits.accepted]
     shapes = np.stack([shapes_px] * HUB_EDGES, axis=1)
     for side, eye in enumerate(EYES):
-        pixels[side], cov[side] = ideal_places(observation.rig, eye, pixels[side], shapes[side], cov[side])
+        pixels[side], cov[side] = undistort_points(observation.rig, eye, pixels[side], shapes[side], cov[side])
     return replace(observation, hub_px=pixels, hub_cov_px2=cov)
 
 
-def _hub_places(observation: Observation, solution: Solution) -> Iterator[list[Ellipses]]:
+def _hub_candidates(observation: Observation, solution: Solution) -> Iterator[list[Ellipses]]:
     """The hub's edges by each pose that is likely enough, the likeliest first, unless it shows them at the same place.
 
     The light on a hub is uneven: a fit that begins where it is not may end on part of it, or on something else.

@@ -1,7 +1,8 @@
-"""Pairs in the order of time: where the drogue is, its markers, its pose by every method, and its motion.
+"""Stereo pairs in the order of time: regions, markers, the pose by every method, and its filtered motion.
 
-Nothing is known of the pairs but their images, time stamps, rig and drogue: another sequence begins where time stamps
-jump. No pair in which the drogue is not seen gets a pose, whatever a filter or a smoother could tell from other pairs.
+The navigator gets the images, time stamps, rig and drogue of each pair and nothing else. A jump of the time stamps
+begins a new sequence. A pair in which the drogue is not seen gets no pose, even where a filter or a smoother could
+predict one from other pairs.
 """
 
 from __future__ import annotations
@@ -16,30 +17,30 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import StereoRig
 from nav.detector.detector import Detector
-from nav.docking import docking_of
+from nav.docking import docking_quantities
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.smoother import SMOOTHER_SUFFIX
 from nav.navigator import CentroidChoice, Navigator
-from nav.pair_measurement import Sighting
+from nav.pair_measurement import PairMeasurement
 from nav.tracked_observer import TrackedObserver
 from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
 
 
 @dataclass(frozen=True)
 class SequenceSettings:
-    """What is asked of navigation.
+    """What navigation measures and how.
 
     Attributes:
         methods: names of pose methods.
         centroids: see `Navigator`.
         tracker: name of the tracker, or None where the detector looks at every pair.
-        redetect_every: the detector checks the tracker at every so many pairs.
-        filtered: whether each method also gets filtered estimates, under its name with `+filter`.
-        smoothed: whether each method also gets smoothed ones, under its name with `+smoother`.
-        capture_radius_m: of the docking quantities, which filtered and smoothed estimates have; None for the drogue's
-            own, see `nav.docking.capture_radius_m`. [m]
-        motion: of the filters.
+        redetect_every: the detector checks the tracker every this many pairs.
+        filtered: whether to add filtered estimates of each method, named with the suffix `+filter`.
+        smoothed: whether to add smoothed estimates of each method, named with the suffix `+smoother`.
+        capture_radius_m: of the docking quantities of filtered and smoothed estimates; None for the drogue's own, see
+            `nav.docking.capture_radius_m`. [m]
+        motion: settings of the filters.
     """
 
     methods: tuple[str, ...]
@@ -57,40 +58,40 @@ class SequenceSettings:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All names under which there are estimates."""
+        """Names of all estimates: methods with and without suffixes."""
         suffixes = ["", *([FILTER_SUFFIX] if self.filtered else []), *([SMOOTHER_SUFFIX] if self.smoothed else [])]
         return tuple(method + suffix for method in self.methods for suffix in suffixes)
 
 
 @dataclass(frozen=True, eq=False)
-class SoughtPair:
-    """A pair whose markers were looked for.
+class MeasuredPair:
+    """A pair whose markers were measured roughly, before its pose is estimated.
 
     Attributes:
         pair: the pair.
-        navigator: of its rig and drogue.
-        sighting: what was found.
+        navigator: for its rig and drogue.
+        measurement: the markers found.
         begins: whether it is the first of a sequence.
     """
 
     pair: BlindPair
     navigator: Navigator
-    sighting: Sighting
+    measurement: PairMeasurement
     begins: bool
 
 
 @dataclass(frozen=True, eq=False)
-class PairAnswers:
-    """All answers to one pair.
+class PairEstimates:
+    """All estimates of one pair.
 
     Attributes:
         frame_index: of the pair.
         time_s: of its images. [s]
-        rig, drogue: as the pair's.
+        rig, drogue: of the pair.
         begins: whether it is the first of a sequence.
-        estimates: of every method as it measured, in their order, and then the filtered ones.
+        estimates: of every method in their order, and then the filtered ones.
         stage_s: seconds by stage, of all methods together. [s]
-        latency_s: from the moment at which the pair came until these answers, where pairs come at a rate. [s]
+        latency_s: from the arrival of the pair to these estimates, where pairs arrive at a rate. [s]
     """
 
     frame_index: int
@@ -104,24 +105,24 @@ class PairAnswers:
 
 
 @dataclass(frozen=True)
-class LatePair:
-    """A pair that came while older ones were worked on, and had to make way for a newer one."""
+class SkippedPair:
+    """A pair that was dropped because a newer one arrived before its turn came."""
 
     frame_index: int
 
 
 class SequenceNavigator:
-    """Goes through pairs in two stages, `seek` and `solve`.
+    """Processes pairs in two stages, `measure` and `estimate`.
 
-    Each stage must be given the pairs in their order. What `seek` does to a pair does not depend on what `solve` did to
-    those before it, so that both may be at work at the same time, on different pairs.
+    Each stage needs the pairs in their order. `measure` does not depend on what `estimate` did with earlier pairs, so
+    the two stages may run at the same time on different pairs.
     """
 
     def __init__(self, settings: SequenceSettings, make_detector: Callable[[DrogueParameters], Detector]) -> None:
-        """Begin before the first pair.
+        """Prepare for the first pair.
 
         Raises:
-            ValueError: no such tracker, or nonsense among the settings.
+            ValueError: the settings name a tracker that does not exist.
         """
         self._settings = settings
         self._make_detector = make_detector
@@ -133,15 +134,15 @@ class SequenceNavigator:
         self._filters: dict[str, PoseFilter] = {}
 
     @property
-    def seeks_by_detector(self) -> bool:
-        """Whether the detector looks at every pair, and no tracker follows."""
+    def detects_every_pair(self) -> bool:
+        """Whether the detector runs on every pair, without a tracker."""
         return self._tracker is None
 
-    def answer(self, pair: BlindPair) -> PairAnswers:
-        """Both stages of the next pair."""
-        return self.solve(self.seek(pair))
+    def process(self, pair: BlindPair) -> PairEstimates:
+        """Run both stages on the next pair."""
+        return self.estimate(self.measure(pair))
 
-    def seek(self, pair: BlindPair) -> SoughtPair:
+    def measure(self, pair: BlindPair) -> MeasuredPair:
         """Find the drogue in the next pair, and measure its markers roughly."""
         scene, time_s = (pair.rig, pair.drogue), pair.images.time_s
         is_same = self._scene is not None and scene[0] is self._scene[0] and scene[1] == self._scene[1]
@@ -154,24 +155,26 @@ class SequenceNavigator:
         elif begins and self._observer is not None:
             self._observer.reset()
         observe = self._navigator.observe if self._observer is None else self._observer.observe
-        return SoughtPair(pair, self._navigator, observe(pair.images), begins)
+        return MeasuredPair(pair, self._navigator, observe(pair.images), begins)
 
-    def solve(self, sought: SoughtPair) -> PairAnswers:
-        """The pose by every method, and its motion."""
-        pair, settings = sought.pair, self._settings
-        measured = sought.navigator.answer(pair.frame_index, pair.images, sought.sighting, settings.methods)
-        if sought.begins and settings.filtered:
+    def estimate(self, measured: MeasuredPair) -> PairEstimates:
+        """Estimate the pose by every method, and its motion."""
+        pair, settings = measured.pair, self._settings
+        estimates = measured.navigator.estimate_measured(
+            pair.frame_index, pair.images, measured.measurement, settings.methods
+        )
+        if measured.begins and settings.filtered:
             order = marker_layout(pair.drogue).symmetry_order
             self._filters = {method: PoseFilter(settings.motion, order) for method in settings.methods}
-        filtered = [self._filtered(pair, estimate) for estimate in measured] if settings.filtered else []
-        return PairAnswers(
+        filtered = [self._filtered(pair, estimate) for estimate in estimates] if settings.filtered else []
+        return PairEstimates(
             frame_index=pair.frame_index,
             time_s=pair.images.time_s,
             rig=pair.rig,
             drogue=pair.drogue,
-            begins=sought.begins,
-            estimates=(*measured, *filtered),
-            stage_s=_together(measured, filtered),
+            begins=measured.begins,
+            estimates=(*estimates, *filtered),
+            stage_s=_total_stage_times(estimates, filtered),
         )
 
     def _observer_of(self, navigator: Navigator, pair: BlindPair) -> TrackedObserver | None:
@@ -182,7 +185,7 @@ class SequenceNavigator:
         return TrackedObserver(navigator, self._tracker, pair.rig, pair.drogue, every, settings.motion)
 
     def _filtered(self, pair: BlindPair, measured: Estimate) -> Estimate:
-        """What the filter makes of a fix; no fix, and one that it does not believe, stay without a pose."""
+        """The filtered estimate; without a pose where there is no fix or the filter rejects it."""
         method = measured.method + FILTER_SUFFIX
         if isinstance(measured, NoFix):
             return measured.model_copy(update={"method": method})
@@ -198,14 +201,14 @@ class SequenceNavigator:
                 stage_s=stage_s,
                 regions=measured.regions,
             )
-        docking = docking_of(update.state, pair.rig, pair.drogue, self._settings.capture_radius_m)
+        docking = docking_quantities(update.state, pair.rig, pair.drogue, self._settings.capture_radius_m)
         estimate = update.state.to_estimate(pair.frame_index, method, measured)
         stage_s = {**measured.stage_s, "filter": perf_counter() - start}
         return estimate.model_copy(update={"docking": docking, "stage_s": stage_s})
 
 
-def _together(measured: Sequence[Estimate], filtered: Sequence[Estimate]) -> dict[str, float]:
-    """Seconds by stage of a pair: what methods share counts once, what each needs for itself adds up. [s]"""
+def _total_stage_times(measured: Sequence[Estimate], filtered: Sequence[Estimate]) -> dict[str, float]:
+    """Seconds by stage of a pair: stages that the methods share count once, each method's own add up. [s]"""
     total: dict[str, float] = {}
     for estimate in measured:
         for stage, spent_s in estimate.stage_s.items():

@@ -1,10 +1,10 @@
-"""Which region of which image is which marker.
+"""Assigns the regions of both images to the drogue's markers.
 
-In each image the drogue's ring is found among the regions (`nav.matching.ring_matching`), which orders the markers up
-to the layout's symmetry and leaves gaps where one is missing; an image that shows too few of them for a ring by itself
-is looked at where the other one's ring must be, and where the images' edges cut the ring, what they leave of it is
-enough where both images show the same. Then every turn of the right image's order against the left's is
-tried, and the one with the smallest epipolar and disparity cost is taken.
+First the drogue's ring is found among the regions of each image (`nav.matching.ring_matching`). That orders the markers
+up to the layout's symmetry, with gaps for missing ones. An image with too few markers for a ring of its own is searched
+where the other image's ring predicts it. Where the image's edge cuts the ring, the remaining part is enough if both
+images show it. Then every rotation of the right image's order against the left's is tried, and the one with the
+smallest epipolar and disparity cost is taken.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from nav.centroids.binary_centroids import Centroids
+from nav.centroids.binary_centroids import BinaryCentroids
 from nav.matching.ring_matching import (
     FEW,
     RingMatch,
@@ -29,7 +29,7 @@ from nav.matching.ring_matching import (
 )
 from nav.pose.pose_method import NoFixReason, Observation
 
-# The best turn must explain the pairs within this share of the gap between neighbours; a wrong turn misses by a gap.
+# The best rotation must fit the pairs within this share of the gap between neighbours; a wrong one is off by a gap.
 _LARGEST_COST_FRACTION = 0.35
 # Where both images show a part of the ring only, the pairs must fit better. Drawn ones, tilted by up to 20 degrees,
 # have 0.033 of the gap at most.
@@ -45,17 +45,19 @@ _AREA_FACTOR = 1.5
 
 @dataclass(frozen=True, eq=False)
 class _EyeMarkers:
-    """Markers of one eye in the layout's order; nan where one was not found."""
+    """Markers of one eye in the layout's order; NaN where one was not found."""
 
     centers_px: Array
     cov_px2: Array
 
-    def turned(self, permutation: NDArray[np.int64]) -> _EyeMarkers:
-        """The same markers, named after another turn of the layout."""
+    def reordered(self, permutation: NDArray[np.int64]) -> _EyeMarkers:
+        """The same markers in the order of a layout rotated onto itself."""
         return _EyeMarkers(self.centers_px[permutation], self.cov_px2[permutation])
 
 
-def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayout) -> Observation | NoFixReason:
+def correspond(
+    left: BinaryCentroids, right: BinaryCentroids, rig: StereoRig, layout: MarkerLayout
+) -> Observation | NoFixReason:
     """Match regions of both eyes with each other and with the drogue's markers.
 
     The roll that the layout's symmetry leaves open is the one nearest to zero.
@@ -67,20 +69,20 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
         layout: the drogue's markers.
 
     Returns:
-        What the estimators work on, with one eye's places empty where only the other shows a ring; or why there is
-        nothing to work on.
+        The observation for the pose methods, with NaN for an eye that shows no ring; or the reason why neither eye
+        shows one.
     """
-    rings = _rings(left, right, rig, layout)
+    rings = _match_rings(left, right, rig, layout)
     permutations = symmetry_permutations(layout)
     if rings[0] is None and rings[1] is None:
-        return NoFixReason(f"{no_ring(left, 'left')}, and {no_ring(right, 'right')}")
+        return NoFixReason(f"{explain_no_match(left, 'left')}, and {explain_no_match(right, 'right')}")
     if rings[0] is None or rings[1] is None:
         eye, ring, centroids = (1, rings[1], right) if rings[0] is None else (0, rings[0], left)
         assert ring is not None
-        only = _markers(centroids, ring).turned(permutations[_turn_nearest_to_zero(ring, layout)])
-        return Observation(rig, layout, *_beside_nothing(only, eye))
-    upright = permutations[_turn_nearest_to_zero(rings[0], layout)]
-    first = _markers(left, rings[0]).turned(upright)
+        only = _markers(centroids, ring).reordered(permutations[_rotation_nearest_to_zero(ring, layout)])
+        return Observation(rig, layout, *_one_eye_arrays(only, eye))
+    upright = permutations[_rotation_nearest_to_zero(rings[0], layout)]
+    first = _markers(left, rings[0]).reordered(upright)
     second = _markers(right, rings[1])
     disparity_px = rig.baseline_m * rings[0].scale_px_per_m
     costs = _costs_px(first.centers_px, second.centers_px[permutations], disparity_px)
@@ -89,29 +91,37 @@ def correspond(left: Centroids, right: Centroids, rig: StereoRig, layout: Marker
     is_part = max(rings[0].count, rings[1].count) < least_markers(layout)
     if costs[best] > (_LARGEST_COST_FRACTION_OF_PARTS if is_part else _LARGEST_COST_FRACTION) * gap_px:
         return NoFixReason(f"the rings of both images do not belong together: they differ by {costs[best]:.1f} px")
-    return Observation(rig, layout, *_without_bad_pairs(first, second.turned(permutations[best])))
+    return Observation(rig, layout, *_without_bad_pairs(first, second.reordered(permutations[best])))
 
 
-def _rings(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayout) -> list[RingMatch | None]:
-    """The ring in each image; where only one shows it by itself, the other is looked at where it must be."""
+def _match_rings(
+    left: BinaryCentroids, right: BinaryCentroids, rig: StereoRig, layout: MarkerLayout
+) -> list[RingMatch | None]:
+    """The ring in each image; where only one image shows it by itself, the other is searched where it must be."""
     rings = [centroids.ring or match_ring(centroids.blobs, layout) for centroids in (left, right)]
     if rings[0] is None and rings[1] is None:
-        return _cut_rings(left, right, rig, layout)
-    return _seen_by_other_eye(rings, (left, right), rig, layout, FEW)
+        return _match_cut_rings(left, right, rig, layout)
+    return _match_missing_eye(rings, (left, right), rig, layout, FEW)
 
 
-def _cut_rings(left: Centroids, right: Centroids, rig: StereoRig, layout: MarkerLayout) -> list[RingMatch | None]:
+def _match_cut_rings(
+    left: BinaryCentroids, right: BinaryCentroids, rig: StereoRig, layout: MarkerLayout
+) -> list[RingMatch | None]:
     """The part of the ring that the images' edges leave, in both images or in none."""
     size_px = rig.camera.width_px, rig.camera.height_px
     parts = [match_cut_ring(centroids.blobs, layout, size_px) for centroids in (left, right)]
-    parts = _seen_by_other_eye(parts, (left, right), rig, layout, _FEWEST_BESIDE_A_CUT_RING)
+    parts = _match_missing_eye(parts, (left, right), rig, layout, _FEWEST_BESIDE_A_CUT_RING)
     return [None, None] if parts[0] is None or parts[1] is None else parts
 
 
-def _seen_by_other_eye(
-    rings: list[RingMatch | None], seen: tuple[Centroids, Centroids], rig: StereoRig, layout: MarkerLayout, least: int
+def _match_missing_eye(
+    rings: list[RingMatch | None],
+    seen: tuple[BinaryCentroids, BinaryCentroids],
+    rig: StereoRig,
+    layout: MarkerLayout,
+    least: int,
 ) -> list[RingMatch | None]:
-    """The same; where only one shows a ring, with at least so many markers of the other where it says that they are."""
+    """The rings, completed where only one image shows one by at least this many markers where it predicts them."""
     found = list(rings)
     for eye, toward_px in ((0, 1.0), (1, -1.0)):
         other = rings[1 - eye]
@@ -122,21 +132,21 @@ def _seen_by_other_eye(
     return found
 
 
-def no_ring(centroids: Centroids, eye: Eye) -> str:
-    """Why there are no markers of an eye."""
+def explain_no_match(centroids: BinaryCentroids, eye: Eye) -> str:
+    """The reason why an eye has no markers."""
     return f"no ring of markers among {len(centroids.blobs)} regions of the {eye} image"
 
 
-def _beside_nothing(only: _EyeMarkers, eye: int) -> tuple[Array, Array]:
-    """Centres (2, N, 2) and covariances (2, N, 2, 2) of one eye, nan for the other."""
+def _one_eye_arrays(only: _EyeMarkers, eye: int) -> tuple[Array, Array]:
+    """Centres (2, N, 2) and covariances (2, N, 2, 2) with one eye's markers and NaN for the other eye."""
     pixels = np.full((len(EYES), *only.centers_px.shape), np.nan)
     covariances = np.full((len(EYES), *only.cov_px2.shape), np.nan)
     pixels[eye], covariances[eye] = only.centers_px, only.cov_px2
     return pixels, covariances
 
 
-def _markers(centroids: Centroids, ring: RingMatch) -> _EyeMarkers:
-    """The ring's regions in the layout's order, without those of an odd size."""
+def _markers(centroids: BinaryCentroids, ring: RingMatch) -> _EyeMarkers:
+    """The ring's regions in the layout's order, without those whose area is an outlier."""
     found = ring.blob_of_marker >= 0
     blob = ring.blob_of_marker[found]
     areas = centroids.blobs.areas_px2[blob]
@@ -148,12 +158,12 @@ def _markers(centroids: Centroids, ring: RingMatch) -> _EyeMarkers:
     return _EyeMarkers(centers, covariances)
 
 
-def _turn_nearest_to_zero(ring: RingMatch, layout: MarkerLayout) -> int:
-    """Which of the layout's turns brings the ring's roll nearest to zero."""
+def _rotation_nearest_to_zero(ring: RingMatch, layout: MarkerLayout) -> int:
+    """Index of the layout's rotation that brings the ring's roll nearest to zero."""
     linear = ring.affine[:, :2]
     roll = np.arctan2(linear[1, 0] - linear[0, 1], linear[0, 0] + linear[1, 1])
     order = layout.symmetry_order
-    # Naming markers by a turn of 2 pi k / order takes that much from the roll.
+    # Renumbering the markers by a rotation of 2 pi k / order subtracts that much from the roll.
     return int(np.round(roll * order / (2 * np.pi))) % order
 
 
@@ -178,7 +188,7 @@ def _smallest_gap_m(layout: MarkerLayout) -> float:
 
 
 def _without_bad_pairs(left: _EyeMarkers, right: _EyeMarkers) -> tuple[Array, Array]:
-    """Centres (2, N, 2) and covariances (2, N, 2, 2), nan for pairs whose rows differ more than those of the others."""
+    """Centres (2, N, 2) and covariances (2, N, 2, 2), NaN for pairs whose row difference is an outlier."""
     rows_px = left.centers_px[:, 1] - right.centers_px[:, 1]
     both = np.isfinite(rows_px)
     sigma_px = np.sqrt(left.cov_px2[:, 1, 1] + right.cov_px2[:, 1, 1])

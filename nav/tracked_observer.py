@@ -1,4 +1,4 @@
-"""Markers of pair after pair where a tracker says that the drogue is; the detector begins, checks and begins again."""
+"""Markers of a sequence of pairs in the boxes of a tracker, which the detector starts, checks and restarts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nav.detector.detector import StereoDetection
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
 from nav.navigator import DETECTOR, Navigator
-from nav.pair_measurement import Sighting, regions_of
+from nav.pair_measurement import PairMeasurement, regions_of
 from nav.pose.pose_method import Solution
 from nav.tracking.rim_boxes import rim_boxes
 from nav.tracking.tracker import Tracker, is_same_place
@@ -23,11 +23,11 @@ _NOWHERE = StereoDetection(None, None)
 
 
 class TrackedObserver:
-    """Observes the pairs of one sequence after the other, with one drogue and one rig.
+    """Measures the pairs of one sequence after the other, with one drogue and one rig.
 
-    The tracker is told where a filter of the markers' rough poses expects the drogue's rim, and afterwards where the
-    pair's own rough pose shows it. The detector looks at a pair where nothing is followed, an eye that should see the
-    drogue has lost it, or the tracker's boxes show no ring of markers; and at every N-th pair that is followed.
+    For each pair the tracker gets the drogue's rim as a filter of the rough poses predicts it, and afterwards the rim
+    by the pair's own rough pose. The detector runs when no drogue is tracked, when an eye that should see the drogue
+    has lost it, when the tracker's boxes show no ring of markers, and at every N-th tracked pair.
     """
 
     def __init__(
@@ -39,14 +39,14 @@ class TrackedObserver:
         redetect_every: int,
         settings: FilterSettings,
     ) -> None:
-        """Follow nothing yet.
+        """Create an observer that tracks nothing yet.
 
         Args:
-            navigator: measures, and has the detector.
-            tracker: follows.
+            navigator: measures markers, and holds the detector.
+            tracker: follows the drogue's box in each eye.
             rig, drogue: of all pairs.
-            redetect_every: the detector checks after so many pairs without it.
-            settings: of the filter that says where the drogue is to be expected.
+            redetect_every: the detector checks the tracker after this many pairs without detection.
+            settings: of the filter that predicts the drogue's rim.
         """
         self._navigator, self._tracker = navigator, tracker
         self._rig, self._rim_radius_m = rig, drogue.rim_radius_m
@@ -56,70 +56,70 @@ class TrackedObserver:
         self._since_detection = 0
 
     def reset(self) -> None:
-        """Forget everything: another sequence begins."""
+        """Forget the current sequence before another one begins."""
         self._filter.reset()
         self._is_following = False
 
-    def observe(self, images: StereoImages) -> Sighting:
+    def observe(self, images: StereoImages) -> PairMeasurement:
         """Measure the markers of the next pair in time."""
         if not self._is_following:
-            sighting = self._navigator.observe(images)
-            return self._learned(images, sighting, True)
+            measurement = self._navigator.observe(images)
+            return self._updated(images, measurement, True)
         start = perf_counter()
         state = self._filter.predict(images.time_s)
         expected = _NOWHERE if state is None else rim_boxes(self._rig, self._rim_radius_m, state.left_from_drogue)
         followed = regions_of(self._tracker.follow(images, expected), self._tracker.name)
         stage_s = {"track": perf_counter() - start}
-        sighting = _timed(self._navigator.measure(images, followed), stage_s)
+        measurement = _with_stage_times(self._navigator.measure(images, followed), stage_s)
         self._since_detection += 1
         expected_eyes = [eye for eye in EYES if state is None or expected.of(eye) is not None]
-        has_lost = len(followed) < len(expected_eyes) or sighting.markers[1] == 0
+        has_lost = len(followed) < len(expected_eyes) or measurement.markers[1] == 0
         if has_lost or self._since_detection >= self._redetect_every:
-            return self._checked(images, sighting, followed)
-        return self._learned(images, sighting, False)
+            return self._checked(images, measurement, followed)
+        return self._updated(images, measurement, False)
 
-    def _checked(self, images: StereoImages, tracked: Sighting, followed: tuple[Region, ...]) -> Sighting:
-        """What the detector's boxes show, where they show more than those of the tracker."""
+    def _checked(self, images: StereoImages, tracked: PairMeasurement, followed: tuple[Region, ...]) -> PairMeasurement:
+        """The measurement in the detector's boxes where they show more markers than the tracker's."""
         start = perf_counter()
         found = regions_of(self._navigator.detector.detect(images), DETECTOR)
-        tracked = _timed(tracked, {"detect": perf_counter() - start})
+        tracked = _with_stage_times(tracked, {"detect": perf_counter() - start})
         self._since_detection = 0
         by_eye: dict[Eye, Region] = {region.eye: region for region in followed}
         is_new = any(
             region.eye not in by_eye or not is_same_place(region.box_xywh_px, by_eye[region.eye].box_xywh_px)
             for region in found
         )
-        # At the same place a tracker's box may still cut markers off which the detector's has within.
+        # At the same place the tracker's box may cut off markers that the detector's box contains.
         shows_less = tracked.markers[0] == 0 and bool(found)
         if not (is_new or shows_less):
-            return self._learned(images, tracked, False)
+            return self._updated(images, tracked, False)
         merged = by_eye | {region.eye: region for region in found}
-        again = _timed(
+        again = _with_stage_times(
             self._navigator.measure(images, tuple(merged[eye] for eye in EYES if eye in merged)), tracked.stage_s
         )
         if again.markers > tracked.markers:
-            return self._learned(images, again, True)
-        return self._learned(images, replace(tracked, stage_s=again.stage_s), False)
+            return self._updated(images, again, True)
+        return self._updated(images, replace(tracked, stage_s=again.stage_s), False)
 
-    def _learned(self, images: StereoImages, sighting: Sighting, is_new: bool) -> Sighting:
-        """The same, after filter and tracker have learned from it.
+    def _updated(self, images: StereoImages, measurement: PairMeasurement, is_new: bool) -> PairMeasurement:
+        """Update filter and tracker with a measurement, and return it with its rough pose.
 
         Args:
             images: the pair.
-            sighting: in it.
-            is_new: whether the tracker is to begin anew.
+            measurement: of the pair.
+            is_new: whether the tracker starts anew.
         """
-        sighting = sighting.with_rough()
-        if not isinstance(sighting.rough, Solution):
+        measurement = measurement.with_rough()
+        if not isinstance(measurement.rough, Solution):
             self._is_following = False
-            return sighting
+            return measurement
         start = perf_counter()
-        rough = _estimate(sighting.rough)
+        rough = _estimate(measurement.rough)
         if not self._filter.update(images.time_s, rough).accepted:
-            # The ring of markers is where it was seen, however it came there.
+            # The filter rejects the ring that was measured: the measurement counts, and the filter starts from it.
             self._filter.reset()
             self._filter.update(images.time_s, rough)
-        boxes = rim_boxes(self._rig, self._rim_radius_m, sighting.rough.left_from_drogue)
+        boxes = rim_boxes(self._rig, self._rim_radius_m, measurement.rough.left_from_drogue)
         if boxes == _NOWHERE:
             self._is_following = False
         elif is_new or not self._is_following:
@@ -127,13 +127,13 @@ class TrackedObserver:
             self._is_following, self._since_detection = True, 0
         else:
             self._tracker.correct(images, boxes)
-        return _timed(sighting, {"correct": perf_counter() - start})
+        return _with_stage_times(measurement, {"correct": perf_counter() - start})
 
 
-def _timed(sighting: Sighting, stage_s: dict[str, float]) -> Sighting:
-    """The same with times of further stages, which may have run before."""
-    stages = stage_s | {stage: stage_s.get(stage, 0.0) + spent_s for stage, spent_s in sighting.stage_s.items()}
-    return replace(sighting, stage_s=stages)
+def _with_stage_times(measurement: PairMeasurement, stage_s: dict[str, float]) -> PairMeasurement:
+    """A measurement with the times of further stages added, which may have run before."""
+    stages = stage_s | {stage: stage_s.get(stage, 0.0) + spent_s for stage, spent_s in measurement.stage_s.items()}
+    return replace(measurement, stage_s=stages)
 
 
 def _estimate(rough: Solution) -> PoseEstimate:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from datasets_manifest.types.estimates import Estimate
     from droguekit.batch.progress import ProgressReport
-    from nav.sequence_navigator import LatePair, PairAnswers, SequenceSettings
+    from nav.sequence_navigator import PairEstimates, SequenceSettings, SkippedPair
 
 
 _SCHEMA = 1
@@ -190,7 +190,7 @@ def navigate_dataset(
     from datasets_manifest.storage.blind import BlindDataset
     from datasets_manifest.types.estimates import write_estimates
     from droguekit.numerical_threads import one_thread
-    from nav.runner import with_smoothed
+    from nav.runner import add_smoothed
 
     options = NavigationOptions() if options is None else options
     settings = _settings(methods, options)
@@ -199,8 +199,8 @@ def navigate_dataset(
     tally = None if options.rate_hz is None else LatencyTally(options.rate_hz)
     fixes: Counter[str] = Counter()
 
-    def counted(answers: Iterable[PairAnswers | LatePair]) -> Iterator[Estimate]:
-        for estimate in with_smoothed(_told(answers, tally, report), settings):
+    def counted(answers: Iterable[PairEstimates | SkippedPair]) -> Iterator[Estimate]:
+        for estimate in add_smoothed(_told(answers, tally, report), settings):
             fixes[estimate.method] += estimate.status == "fix"
             yield estimate
 
@@ -254,23 +254,23 @@ def _settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSet
 
 def _answers(
     blind: BlindDataset, settings: SequenceSettings, options: NavigationOptions
-) -> Generator[PairAnswers | LatePair]:
+) -> Generator[PairEstimates | SkippedPair]:
     """Answers to all pairs, as fast as can be or as they come."""
     from nav.detector.detector_registry import DEFAULT_DETECTOR
     from nav.realtime.pipeline import MonotonicClock, replay
-    from nav.runner import answers_of, open_navigator
+    from nav.runner import open_navigator, process_dataset
 
     navigator = open_navigator(settings, DEFAULT_DETECTOR if options.detector is None else options.detector)
     if options.rate_hz is None:
-        return answers_of(blind, navigator)
+        return process_dataset(blind, navigator)
     return replay(blind, navigator, options.rate_hz, MonotonicClock())
 
 
 def _told(
-    answers: Iterable[PairAnswers | LatePair], tally: LatencyTally | None, report: ProgressReport
-) -> Iterator[PairAnswers | LatePair]:
+    answers: Iterable[PairEstimates | SkippedPair], tally: LatencyTally | None, report: ProgressReport
+) -> Iterator[PairEstimates | SkippedPair]:
     """The same, while progress and latencies are told; what happens until the next one is asked for is their output."""
-    from nav.sequence_navigator import LatePair
+    from nav.sequence_navigator import SkippedPair
 
     for each in answers:
         start = perf_counter()
@@ -278,7 +278,7 @@ def _told(
         report.advance()
         if tally is None:
             continue
-        if isinstance(each, LatePair):
+        if isinstance(each, SkippedPair):
             tally.late()
         elif each.latency_s is not None:
             tally.worked_on(each.latency_s, {**each.stage_s, "output": perf_counter() - start})

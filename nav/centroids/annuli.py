@@ -18,28 +18,28 @@ from nav.centroids.blurred_edges import (
     ANNULUS_OUTER,
     ANNULUS_WIDTH,
     START_WIDTH_PX,
-    add_box_pictures,
+    add_box_responses,
     draw_annuli,
     edge_widths,
     ellipse_parameters,
     parameter_shapes,
 )
-from nav.centroids.centroid_uncertainty import NoiseModel, beyond_linear, measure_noise, residual_spread
+from nav.centroids.centroid_uncertainty import NoiseModel, measure_noise, residual_spread, widen_for_nonlinearity
 from nav.centroids.disc_fit import FIRST_SMALL_STEP_PX, SECOND_SMALL_STEP_PX
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.face_background import without_glare
+from nav.centroids.face_background import pixels_without_glare
 from nav.centroids.marker_signal import MarkerSignal
-from nav.centroids.motion_blur import Travel, moving, share_outside_along
-from nav.centroids.outline_pixels import PixelSet, annulus_pixels, edge_distances
-from nav.centroids.pixel_response import BOX_PICTURES
+from nav.centroids.motion_blur import ImageMotion, blurred_share_outside, motion_blurred
+from nav.centroids.outline_pixels import OutlinePixels, annulus_pixels, edge_distances
+from nav.centroids.pixel_response import RESPONSE_BOXES
 from nav.numerics.compiled import Array32
-from nav.numerics.least_squares_loops import tie_rows
+from nav.numerics.least_squares_loops import constrain_jacobian
 from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations, evaluate, minimise
 
-SLOPE_TURNS = 5
+SLOPE_HARMONICS = 5
 
 
-def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
+def annulus_model(pixels: OutlinePixels, turns: Array32, beyond: Array32) -> Model:
     """`I = b (1 - So) + A(azimuth) (So - Si) + b' Si + k(azimuth) F`.
 
     Args:
@@ -59,7 +59,7 @@ def annulus_model(pixels: PixelSet, turns: Array32, beyond: Array32) -> Model:
     return model
 
 
-def shares_of(fit: Minimum, ties: Array) -> tuple[Array32, Array32]:
+def area_shares(fit: Minimum, ties: Array) -> tuple[Array32, Array32]:
     """(N, K) how much of each pixel lies on the annulus, and how much in the hole.
 
     They are the derivatives by the annulus's mean light and by the hole's, whose parameters are free ones.
@@ -69,14 +69,14 @@ def shares_of(fit: Minimum, ties: Array) -> tuple[Array32, Array32]:
     return np.ascontiguousarray(between), np.ascontiguousarray(in_hole)
 
 
-def light_above(parameters: Array, turns: Array32) -> Array32:
+def light_above_background(parameters: Array, turns: Array32) -> Array32:
     """(N, K) the annulus's light above the background. [DN]"""
     rest = parameters[:, ANNULUS_BACKGROUND:].astype(np.float32)
     light: Array32 = np.matmul(rest[:, None, ANNULUS_AMPLITUDE - ANNULUS_BACKGROUND :], turns)[:, 0]
     return light - rest[:, 0, None]
 
 
-def azimuth_basis(pixels: PixelSet, order: int) -> Array32:
+def azimuth_harmonics(pixels: OutlinePixels, order: int) -> Array32:
     """(N, 2 order + 1, K): one, then cosines and sines of multiples of the azimuth."""
     angle = np.arctan2(pixels.y_px, pixels.x_px)
     rows = [np.ones_like(angle)]
@@ -85,18 +85,18 @@ def azimuth_basis(pixels: PixelSet, order: int) -> Array32:
     return np.stack(rows, axis=1)
 
 
-def radial_slopes(pixels: PixelSet, turns: Array32, outer: Ellipses, inner: Ellipses) -> Array32:
+def radial_slopes(pixels: OutlinePixels, turns: Array32, outer: Ellipses, inner: Ellipses) -> Array32:
     """(N, 5, K): the first two orders of the azimuth, growing outwards from nothing in the annulus's middle.
 
     Without them a slope of light across the annulus, steeper at the outer edge than at the inner one, moves both.
     """
     middle = ((outer.radii_px + inner.radii_px) / 2).astype(np.float32)[:, None]
     outwards = np.hypot(pixels.x_px, pixels.y_px) / middle - 1
-    slopes: Array32 = outwards[:, None] * turns[:, :SLOPE_TURNS]
+    slopes: Array32 = outwards[:, None] * turns[:, :SLOPE_HARMONICS]
     return slopes
 
 
-def annulus_start(pixels: PixelSet, outer: Ellipses, inner: Ellipses, turn_count: int) -> Array:
+def initial_annulus_parameters(pixels: OutlinePixels, outer: Ellipses, inner: Ellipses, turn_count: int) -> Array:
     """(N, P) parameters of the predicted edges with the mean levels outside, on and within the annulus."""
     parameters = np.zeros((len(outer), ANNULUS_AMPLITUDE + turn_count))
     shift = inner.centers_px - outer.centers_px
@@ -117,7 +117,7 @@ def annulus_start(pixels: PixelSet, outer: Ellipses, inner: Ellipses, turn_count
     return parameters
 
 
-def tied_to_pose(start: Array, thin: bool) -> Array:
+def pose_constraints(start: Array, thin: bool) -> Array:
     """(N, P, Q) how the model's parameters follow the free ones.
 
     A common shift of both edges is free, and the size of each, or of thin annuli of both; their shapes are not.
@@ -131,7 +131,7 @@ def tied_to_pose(start: Array, thin: bool) -> Array:
     return np.concatenate([moved, rest], axis=2)
 
 
-def in_free_parameters(model: Model, start: Array, ties: Array) -> Model:
+def constrained_model(model: Model, start: Array, ties: Array) -> Model:
     """The model in its free parameters, counted from the start."""
     # Both ellipses follow the first few; all others are free themselves.
     tied = ties.shape[2] - (ties.shape[1] - ANNULUS_WIDTH)
@@ -140,19 +140,21 @@ def in_free_parameters(model: Model, start: Array, ties: Array) -> Model:
     def in_free(free: Array) -> tuple[Array32, Array32]:
         values, jacobian = model(start + np.einsum("npq,nq->np", ties, free))
         by_free = np.empty((len(jacobian), ties.shape[2], jacobian.shape[2]), np.float32)
-        tie_rows(jacobian, across, by_free)
+        constrain_jacobian(jacobian, across, by_free)
         return values, by_free
 
     return in_free
 
 
-def all_parameters(start: Array, ties: Array, fit: Minimum) -> Array:
+def expand_parameters(start: Array, ties: Array, fit: Minimum) -> Array:
     """(N, P) the model's parameters where a fit in the free ones, and what else follows them, ended."""
     parameters: Array = start + np.einsum("npq,nq->np", ties, fit.parameters[:, : ties.shape[2]])
     return parameters
 
 
-def response_pictures(pixels: PixelSet, parameters: Array, shares: tuple[Array32, Array32], light: Array32) -> Array32:
+def response_images(
+    pixels: OutlinePixels, parameters: Array, shares: tuple[Array32, Array32], light: Array32
+) -> Array32:
     """(N, 3, K) what edges of pixel boxes show beyond Gaussian ones, at both edges of an annulus. [DN]
 
     Args:
@@ -162,15 +164,15 @@ def response_pictures(pixels: PixelSet, parameters: Array, shares: tuple[Array32
         light: (N, K) of the annulus above the background.
     """
     hole = (parameters[:, ANNULUS_HOLE] - parameters[:, ANNULUS_BACKGROUND]).astype(np.float32)[:, None]
-    pictures = np.zeros((len(parameters), BOX_PICTURES, pixels.x_px.shape[1]), np.float32)
+    pictures = np.zeros((len(parameters), RESPONSE_BOXES, pixels.x_px.shape[1]), np.float32)
     between, in_hole = shares
     for place, inside, step in ((ANNULUS_OUTER, between + in_hole, light), (ANNULUS_INNER, in_hole, hole - light)):
         ellipses = parameters[:, place].astype(np.float32)
-        add_box_pictures(ellipses, pixels.x_px, pixels.y_px, pixels.present, inside, step, pictures)
+        add_box_responses(ellipses, pixels.x_px, pixels.y_px, pixels.present, inside, step, pictures)
     return pictures
 
 
-def starting_with_pictures(fit: Minimum, pictures: Array32) -> Minimum:
+def start_with_response(fit: Minimum, pictures: Array32) -> Minimum:
     """Where a fit of the model without pictures (N, S, K) ended, as a start of that with them: there are none yet."""
     jacobian = np.concatenate([fit.jacobian, pictures], axis=1)
     normal = NormalEquations(jacobian, fit.residuals, fit.normal.weights)
@@ -178,7 +180,7 @@ def starting_with_pictures(fit: Minimum, pictures: Array32) -> Minimum:
     return Minimum(parameters, fit.residuals, jacobian, normal)
 
 
-def with_pictures(model: Model, pictures: Array32) -> Model:
+def with_response(model: Model, pictures: Array32) -> Model:
     """The model with given pictures (N, S, K) added, in amounts that are its last parameters."""
     count = pictures.shape[1]
 
@@ -264,7 +266,7 @@ def fit_annuli(
     inner: Ellipses,
     noise: NoiseModel,
     collar_factor: float = 0.0,
-    travel: Travel | None = None,
+    travel: ImageMotion | None = None,
 ) -> AnnulusFits:
     """Fit every annulus of both eyes.
 
@@ -288,19 +290,19 @@ def fit_annuli(
     ways = None if travel is None else travel.of(outer)
     gathered = annulus_pixels(signals, outer, inner, 0.0 if travel is None else travel.spread_px(outer))
     pixels, beyond = _within_collar(gathered, signals[0], (outer, inner), collar_factor, ways)
-    turns = azimuth_basis(pixels, _ORDER_THIN if thin else _ORDER)
-    start = annulus_start(pixels, outer, inner, turns.shape[1])
+    turns = azimuth_harmonics(pixels, _ORDER_THIN if thin else _ORDER)
+    start = initial_annulus_parameters(pixels, outer, inner, turns.shape[1])
     first = _first_fit(pixels, (turns, beyond), start, thin, ways)
-    rough = all_parameters(start, tied_to_pose(start, thin), first)
+    rough = expand_parameters(start, pose_constraints(start, thin), first)
     if not thin and _unevenness(rough) > _UNEVEN_SHARE:
         turns = np.concatenate([turns, radial_slopes(pixels, turns, outer, inner)], axis=1)
-        start = np.pad(rough, ((0, 0), (0, SLOPE_TURNS)))
+        start = np.pad(rough, ((0, 0), (0, SLOPE_HARMONICS)))
         first = _first_fit(pixels, (turns, beyond), start, thin, ways)
-    ties = tied_to_pose(start, thin)
-    model = in_free_parameters(_drawn(pixels, (turns, beyond), ways), start, ties)
+    ties = pose_constraints(start, thin)
+    model = constrained_model(_annulus_model_of(pixels, (turns, beyond), ways), start, ties)
     final, weights, edge_factor = _weighted_fit(pixels, turns, (start, ties), model, first, ways is None)
-    parameters = all_parameters(start, ties, final)
-    between, light = shares_of(final, ties)[0], light_above(parameters, turns)
+    parameters = expand_parameters(start, ties, final)
+    between, light = area_shares(final, ties)[0], light_above_background(parameters, turns)
     contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
     uneven = _sector_chi2(final, weights, pixels, contrast)
     if edge_factor < 1:
@@ -309,7 +311,7 @@ def fit_annuli(
         uneven = np.maximum(uneven, _sector_chi2(final, judged, pixels, contrast))
     inflation = 1 + _SHADOW_FACTOR * np.maximum(uneven - _EVEN_SECTOR_CHI2, 0)
     # The first two free parameters are the common shift.
-    cov = beyond_linear(final.covariance()[:, :2, :2] * edge_factor * inflation[:, None, None])
+    cov = widen_for_nonlinearity(final.covariance()[:, :2, :2] * edge_factor * inflation[:, None, None])
     on_it = pixels.present * (between > 0.5)
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
@@ -317,23 +319,23 @@ def fit_annuli(
     return AnnulusFits(centers, cov, contrast, lit, inflation, reasons)
 
 
-def _drawn(pixels: PixelSet, light: tuple[Array32, Array32], ways: Array | None) -> Model:
+def _annulus_model_of(pixels: OutlinePixels, light: tuple[Array32, Array32], ways: Array | None) -> Model:
     still = annulus_model(pixels, *light)
-    return still if ways is None else moving(still, ways, (ANNULUS_OUTER.start, ANNULUS_INNER.start))
+    return still if ways is None else motion_blurred(still, ways, (ANNULUS_OUTER.start, ANNULUS_INNER.start))
 
 
 def _first_fit(
-    pixels: PixelSet, light: tuple[Array32, Array32], start: Array, thin: bool, ways: Array | None
+    pixels: OutlinePixels, light: tuple[Array32, Array32], start: Array, thin: bool, ways: Array | None
 ) -> Minimum:
     """The fit of equal weights, for the noise by what each pixel sees; `light` is that on the annulus and beyond."""
-    ties = tied_to_pose(start, thin)
-    model = in_free_parameters(_drawn(pixels, light, ways), start, ties)
+    ties = pose_constraints(start, thin)
+    model = constrained_model(_annulus_model_of(pixels, light, ways), start, ties)
     begin = evaluate(model, pixels.values, pixels.present, np.zeros((len(start), ties.shape[2])))
     return minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
 
 
 def _weighted_fit(
-    pixels: PixelSet, turns: Array32, shape: tuple[Array, Array], model: Model, first: Minimum, is_still: bool
+    pixels: OutlinePixels, turns: Array32, shape: tuple[Array, Array], model: Model, first: Minimum, is_still: bool
 ) -> tuple[Minimum, Array32, float]:
     """The fit of inverse variances, with the pixels' response, the weights, and the factor of `NoiseModel` in them.
 
@@ -346,14 +348,16 @@ def _weighted_fit(
         first: fit of equal weights.
         is_still: whether edges are so sharp that the pixels' response shows.
     """
-    parameters, ties = all_parameters(*shape, first), shape[1]
+    parameters, ties = expand_parameters(*shape, first), shape[1]
     if is_still:
-        pictures = response_pictures(pixels, parameters, shares_of(first, ties), light_above(parameters, turns))
-        model = with_pictures(model, pictures)
-        begin = starting_with_pictures(first, pictures)
+        pictures = response_images(
+            pixels, parameters, area_shares(first, ties), light_above_background(parameters, turns)
+        )
+        model = with_response(model, pictures)
+        begin = start_with_response(first, pictures)
         first = minimise(model, pixels.values, pixels.present, begin, _RESPONSE_STEPS, FIRST_SMALL_STEP_PX)
-        parameters = all_parameters(*shape, first)
-    between, light = shares_of(first, ties)[0], light_above(parameters, turns)
+        parameters = expand_parameters(*shape, first)
+    between, light = area_shares(first, ties)[0], light_above_background(parameters, turns)
     leverages = np.minimum(first.leverages(first.covariance(), pixels.present), _MOST_LEVERAGE)
     contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
     noise = measure_noise(first.residuals**2 / (1 - leverages), pixels.present, between, contrast)
@@ -362,7 +366,7 @@ def _weighted_fit(
     return final, weights, noise.edge_factor
 
 
-def _sector_chi2(fit: Minimum, weights: Array32, pixels: PixelSet, contrast: Array) -> Array:
+def _sector_chi2(fit: Minimum, weights: Array32, pixels: OutlinePixels, contrast: Array) -> Array:
     return residual_spread(fit.residuals, weights, pixels, _SECTORS, contrast, fit.parameters.shape[1]).sector_chi2
 
 
@@ -374,8 +378,12 @@ def _unevenness(parameters: Array) -> float:
 
 
 def _within_collar(
-    pixels: PixelSet, signal: MarkerSignal, edges: tuple[Ellipses, Ellipses], collar_factor: float, ways: Array | None
-) -> tuple[PixelSet, Array32]:
+    pixels: OutlinePixels,
+    signal: MarkerSignal,
+    edges: tuple[Ellipses, Ellipses],
+    collar_factor: float,
+    ways: Array | None,
+) -> tuple[OutlinePixels, Array32]:
     """The pixels without those beyond the collar, and the share of what lies beyond it in each."""
     if collar_factor == 0:
         return pixels, np.zeros_like(pixels.x_px)
@@ -383,7 +391,7 @@ def _within_collar(
 
     def beyond(nearer_px: float) -> Array32:
         factor = np.maximum(collar_factor - nearer_px / outer.radii_px, 0.5)[:, None, None]
-        return share_outside_along(factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX, ways)
+        return blurred_share_outside(factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX, ways)
 
     shares = beyond(0.0)
     if not signal.shows_glare:
@@ -391,12 +399,12 @@ def _within_collar(
     to_outer = edge_distances(outer.shapes_px, pixels.x_px, pixels.y_px)
     # Into the annulus from either edge; the hole is as dark as the collar.
     inwards = np.minimum(to_outer, (outer.radii_px - inner.radii_px).astype(np.float32)[:, None] - to_outer)
-    clear = without_glare(pixels, signal, inwards, beyond)
+    clear = pixels_without_glare(pixels, signal, inwards, beyond)
     return pixels.only(shares < _MOST_BEYOND if clear is None else clear), shares
 
 
 def _reasons(
-    pixels: PixelSet,
+    pixels: OutlinePixels,
     parameters: Array,
     on_it: Array32,
     light: Array32,

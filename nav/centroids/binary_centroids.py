@@ -36,7 +36,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Centroids:
+class BinaryCentroids:
     """Measured centres of bright regions in one image.
 
     Attributes:
@@ -50,12 +50,12 @@ class Centroids:
     ring: RingMatch | None = None
 
 
-NOTHING = Centroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
+NO_CENTROIDS = BinaryCentroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
 
 
 def binary_centroids(
     channel: Pixels, box_xywh_px: tuple[float, float, float, float], layout: MarkerLayout
-) -> Centroids:
+) -> BinaryCentroids:
     """As `window_centroids`, of the window of a box.
 
     Args:
@@ -67,7 +67,7 @@ def binary_centroids(
     return window_centroids(channel[top:bottom, left:right], (left, top), layout)
 
 
-def window_centroids(channel: Pixels, corner_px: tuple[int, int], layout: MarkerLayout) -> Centroids:
+def window_centroids(channel: Pixels, corner_px: tuple[int, int], layout: MarkerLayout) -> BinaryCentroids:
     """Centres of mass of the regions above Otsu's threshold in a part of an image.
 
     Where that does not show all markers that the part's edge leaves whole, Otsu's thresholds of its brighter
@@ -84,13 +84,13 @@ def window_centroids(channel: Pixels, corner_px: tuple[int, int], layout: Marker
     Source: the seed paper, section 3.2; Otsu, doi:10.1109/TSMC.1979.4310076.
     """
     if min(channel.shape) < _LEAST_SIDE_PX:
-        return NOTHING
+        return NO_CENTROIDS
     blobs, opened, ring = _best_regions(channel, layout)
     moved = Blobs(blobs.centers_px + np.array(corner_px), blobs.areas_px2)
     variance = quantisation_variance_px2(moved.radii_px)
     if opened:
         variance = variance + morphology_variance_px2(moved.radii_px)
-    return Centroids(moved, variance[:, None, None] * np.eye(2), None if ring is None else ring.moved(corner_px))
+    return BinaryCentroids(moved, variance[:, None, None] * np.eye(2), None if ring is None else ring.moved(corner_px))
 
 
 def _otsu(levels: Pixels) -> float:

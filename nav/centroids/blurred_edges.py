@@ -339,7 +339,7 @@ def _add_box_row(
 
 
 @compiled
-def add_box_pictures(
+def add_box_responses(
     ellipses: Array32,
     x: Array32,
     y: Array32,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.centroids.outline_pixels import PixelSet
+from nav.centroids.outline_pixels import OutlinePixels
 from nav.numerics.compiled import Array32, compiled
 from nav.numerics.levenberg_marquardt import Minimum
 
@@ -212,7 +212,7 @@ class ResidualSpread:
 
 
 def residual_spread(
-    residuals: Array32, weights: Array32, pixels: PixelSet, sectors: int, contrast: Array, fitted: int
+    residuals: Array32, weights: Array32, pixels: OutlinePixels, sectors: int, contrast: Array, fitted: int
 ) -> ResidualSpread:
     """Residuals summed over the patch and over sectors.
 
@@ -266,7 +266,7 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
     return float((found[usual].sum() + _PRIOR_PIECES) / (expected[usual].sum() + _PRIOR_PIECES))
 
 
-def beyond_linear(cov_px2: Array) -> Array:
+def widen_for_nonlinearity(cov_px2: Array) -> Array:
     """Covariances of centres, widened by what the derivatives at the solution do not tell of faint discs.
 
     Where the noise moves a centre by a fifth of a pixel, a third of an edge's width, its square is twice what they say;

@@ -13,27 +13,27 @@ from nav.centroids.blurred_edges import DISC_BACKGROUND, DISC_LEVEL, DISC_WIDTH,
 from nav.centroids.centroid_uncertainty import (
     SECTORS,
     NoiseModel,
-    beyond_linear,
     edge_noise_factor,
     measure_noise,
     residual_spread,
+    widen_for_nonlinearity,
 )
 from nav.centroids.discs import (
     DiscFits,
     contrasts,
     disc_model,
-    disc_start,
-    located,
+    initial_disc_parameters,
+    initialize_from_moments,
     merged,
     rejection_reasons,
-    unfitted,
+    unfitted_discs,
 )
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.face_background import Surroundings, on_the_face, seen_beside_px, shares_beyond
+from nav.centroids.face_background import FaceBackground, background_shares, pixels_on_face, visible_margin_px
 from nav.centroids.marker_signal import MarkerSignal
-from nav.centroids.motion_blur import Travel, fit_travel, moving, seen_travel
-from nav.centroids.outline_pixels import PixelSet, disc_pixels
-from nav.centroids.pixel_response import without_pixel_response
+from nav.centroids.motion_blur import ImageMotion, detect_motion, fit_motion, motion_blurred
+from nav.centroids.outline_pixels import OutlinePixels, disc_pixels
+from nav.centroids.pixel_response import correct_pixel_response
 from nav.numerics.compiled import Array32
 from nav.numerics.levenberg_marquardt import Minimum, Model, evaluate, minimise
 
@@ -58,7 +58,9 @@ _MOST_MOVED = 9.2
 _MOST_DARK_SHARE = 0.6
 
 
-def with_even_others(fit: Minimum, pixels: PixelSet, noise: NoiseModel, contrast: Array) -> tuple[Minimum, PixelSet]:
+def restore_even_colors(
+    fit: Minimum, pixels: OutlinePixels, noise: NoiseModel, contrast: Array
+) -> tuple[Minimum, OutlinePixels]:
     """Put back what the difference of colours took off, where that was nothing but noise.
 
     The difference keeps sky and shadows out, at the price of the other colours' noise. Near by, a disc's window holds
@@ -103,7 +105,7 @@ _CAUCHY_SIGMA = 2.385
 _ON_THE_DISC = 0.05
 
 
-def fit_discs(signals: Sequence[MarkerSignal], discs: Ellipses, around: Surroundings | None = None) -> DiscFits:
+def fit_discs(signals: Sequence[MarkerSignal], discs: Ellipses, around: FaceBackground | None = None) -> DiscFits:
     """Fit every disc of both eyes.
 
     Args:
@@ -119,7 +121,7 @@ def fit_discs(signals: Sequence[MarkerSignal], discs: Ellipses, around: Surround
     shaded = discs.radii_px >= _LEAST_RADIUS_FOR_SHADING_PX
     if len(discs) and shaded.all() == shaded.any():
         return _fit_group(signals, discs, bool(shaded[0]), around)
-    fits = unfitted(discs)
+    fits = unfitted_discs(discs)
     for index in (np.flatnonzero(~shaded), np.flatnonzero(shaded)):
         if len(index):
             seen = None if around is None else around.take(index)
@@ -127,29 +129,31 @@ def fit_discs(signals: Sequence[MarkerSignal], discs: Ellipses, around: Surround
     return fits
 
 
-def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, around: Surroundings | None) -> DiscFits:
+def _fit_group(
+    signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, around: FaceBackground | None
+) -> DiscFits:
     """Fit discs that are all modelled alike."""
     plain = not signals[0].is_difference
-    start = located(signals, discs)
+    start = initialize_from_moments(signals, discs)
     pixels, model, first = _first_fit(signals, start, shaded, around, None)
-    travel = None if plain else seen_travel(first, pixels, start)
+    travel = None if plain else detect_motion(first, pixels, start)
     if travel is not None:
         # What the first fit made of moving discs may lie pixels beside them: all begins anew.
         moved, still, fit = _first_fit(signals, start, shaded, around, travel)
-        travel = fit_travel(still, moved, fit.parameters, travel, start)
+        travel = fit_motion(still, moved, fit.parameters, travel, start)
     if travel is not None:
         pixels, still, first = _first_fit(signals, start, shaded, around, travel)
-        model = moving(still, travel.of(start), (0,))
+        model = motion_blurred(still, travel.of(start), (0,))
     # The derivative by the disc's level is the share of light from within.
     inside = np.ascontiguousarray(first.jacobian[:, DISC_LEVEL])
     if not plain and travel is None:
-        first, beyond_gaussian = without_pixel_response(first, pixels, inside, contrasts(first))
+        first, beyond_gaussian = correct_pixel_response(first, pixels, inside, contrasts(first))
         pixels = replace(pixels, values=pixels.values - beyond_gaussian)
     # What the linear steps so far change are places and residuals, not leverages.
     leverages = np.minimum(first.leverages(first.covariance(), pixels.present), np.float32(0.9))
     lead_noise = noise = _noise(first, leverages, pixels, inside)
     if shaded and not plain:
-        first, pixels = with_even_others(first, pixels, lead_noise, contrasts(first))
+        first, pixels = restore_even_colors(first, pixels, lead_noise, contrasts(first))
         noise = _noise(first, leverages, pixels, inside)
     weights = pixels.present / noise.variances(inside, contrasts(first).astype(np.float32)[:, None])
     final = _weighted(model, pixels, first, weights, plain)
@@ -158,7 +162,7 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
     contrast = contrasts(final)
     spread = residual_spread(final.residuals, judged, pixels, SECTORS, contrast, final.parameters.shape[1])
     factor = edge_noise_factor(final, judged, pixels.x_px, pixels.y_px)
-    cov = beyond_linear(final.covariance()[:, :2, :2] * factor * spread.inflation[:, None, None])
+    cov = widen_for_nonlinearity(final.covariance()[:, :2, :2] * factor * spread.inflation[:, None, None])
     reasons = rejection_reasons(discs, pixels, final, inside, cov, noise, spread)
     return DiscFits(
         _fitted(discs, pixels, final, reasons),
@@ -175,21 +179,25 @@ def _fit_group(signals: Sequence[MarkerSignal], discs: Ellipses, shaded: bool, a
 
 
 def _first_fit(
-    signals: Sequence[MarkerSignal], start: Ellipses, shaded: bool, around: Surroundings | None, travel: Travel | None
-) -> tuple[PixelSet, Model, Minimum]:
+    signals: Sequence[MarkerSignal],
+    start: Ellipses,
+    shaded: bool,
+    around: FaceBackground | None,
+    travel: ImageMotion | None,
+) -> tuple[OutlinePixels, Model, Minimum]:
     """The pixels of discs, the model of still ones, and the fit of equal weights, of moving ones where they move."""
     plain, ways = not signals[0].is_difference, None if travel is None else travel.of(start)
     spread_px = 0.0 if travel is None else travel.spread_px(start)
     pixels, further = disc_pixels(signals, start, blur_px=spread_px), None
-    if around is not None and around.margin_px <= seen_beside_px(signals[0]) + spread_px:
-        further = shares_beyond(around, start, pixels, START_WIDTH_PX, ways)
+    if around is not None and around.margin_px <= visible_margin_px(signals[0]) + spread_px:
+        further = background_shares(around, start, pixels, START_WIDTH_PX, ways)
         if further is not None:
-            pixels = on_the_face(around, start, pixels, further, ways, signals[0])
+            pixels = pixels_on_face(around, start, pixels, further, ways, signals[0])
     sloped = plain or (shaded and bool(start.radii_px.min() >= _LEAST_RADIUS_FOR_SLOPE_BESIDE_PX))
     still = disc_model(pixels, sloped, shaded, further)
-    model = still if ways is None else moving(still, ways, (0,))
+    model = still if ways is None else motion_blurred(still, ways, (0,))
     count = 2 * sloped + 2 * shaded + (0 if further is None else further.shape[1])
-    begin = evaluate(model, pixels.values, pixels.present, disc_start(pixels, start.shapes_px, count))
+    begin = evaluate(model, pixels.values, pixels.present, initial_disc_parameters(pixels, start.shapes_px, count))
     first = minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
     if around is None or further is None or shaded:
         return pixels, still, first
@@ -197,16 +205,16 @@ def _first_fit(
     # do.
     found = _fitted(start, pixels, first, (None,) * len(start))
     width_px = float(np.median(first.parameters[:, DISC_WIDTH]))
-    still = disc_model(pixels, sloped, shaded, shares_beyond(around, found, pixels, width_px, ways))
-    model = still if ways is None else moving(still, ways, (0,))
+    still = disc_model(pixels, sloped, shaded, background_shares(around, found, pixels, width_px, ways))
+    model = still if ways is None else motion_blurred(still, ways, (0,))
     return pixels, still, evaluate(model, pixels.values, pixels.present, first.parameters)
 
 
-def _noise(fit: Minimum, leverages: Array32, pixels: PixelSet, inside: Array32) -> NoiseModel:
+def _noise(fit: Minimum, leverages: Array32, pixels: OutlinePixels, inside: Array32) -> NoiseModel:
     return measure_noise(fit.residuals**2 / (1 - leverages), pixels.present, inside, contrasts(fit))
 
 
-def _weighted(model: Model, pixels: PixelSet, first: Minimum, weights: Array32, robust: bool) -> Minimum:
+def _weighted(model: Model, pixels: OutlinePixels, first: Minimum, weights: Array32, robust: bool) -> Minimum:
     """Fit with inverse variances; on a plain picture, where a bright sky may enter the window, with Cauchy's loss."""
     if not robust:
         return minimise(model, pixels.values, weights, first, _SECOND_STEPS, SECOND_SMALL_STEP_PX)
@@ -217,7 +225,7 @@ def _weighted(model: Model, pixels: PixelSet, first: Minimum, weights: Array32, 
     return fit
 
 
-def _fitted(discs: Ellipses, pixels: PixelSet, fit: Minimum, reasons: tuple[str | None, ...]) -> Ellipses:
+def _fitted(discs: Ellipses, pixels: OutlinePixels, fit: Minimum, reasons: tuple[str | None, ...]) -> Ellipses:
     """Fitted outlines of accepted discs, initial ones of the others."""
     good = np.array([reason is None for reason in reasons], dtype=np.bool_)
     centers, shapes = discs.centers_px.copy(), discs.shapes_px.copy()

@@ -24,8 +24,8 @@ from nav.centroids.blurred_edges import (
 from nav.centroids.centroid_uncertainty import NoiseModel, ResidualSpread
 from nav.centroids.ellipses import Ellipses, are_positive, moment_shapes, shape_radii
 from nav.centroids.marker_signal import MarkerSignal
-from nav.centroids.motion_blur import Travel
-from nav.centroids.outline_pixels import WHOLE_RADIUS_PX, PixelSet, coarse_pixels, edge_distances
+from nav.centroids.motion_blur import ImageMotion
+from nav.centroids.outline_pixels import WHOLE_RADIUS_PX, OutlinePixels, coarse_pixels, edge_distances
 from nav.numerics.compiled import Array32
 from nav.numerics.levenberg_marquardt import Minimum, Model
 
@@ -33,7 +33,7 @@ from nav.numerics.levenberg_marquardt import Minimum, Model
 _CLEAR_PX = 1.0
 
 
-def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, further: Array32 | None = None) -> Model:
+def disc_model(pixels: OutlinePixels, slope_outside: bool, slope_inside: bool, further: Array32 | None = None) -> Model:
     """`I = (b + g.x) (1 - S) + (A + h.x) S + k.F`.
 
     Args:
@@ -56,7 +56,7 @@ def disc_model(pixels: PixelSet, slope_outside: bool, slope_inside: bool, furthe
     return model
 
 
-def disc_start(pixels: PixelSet, shapes_px: Array, further_count: int) -> Array:
+def initial_disc_parameters(pixels: OutlinePixels, shapes_px: Array, further_count: int) -> Array:
     """(N, P) parameters of the initial outlines with the mean levels on either side of them, all further ones zero."""
     parameters = np.zeros((len(shapes_px), DISC_FIXED_COUNT + further_count))
     parameters[:, :ELLIPSE_PARAMETER_COUNT] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
@@ -99,7 +99,7 @@ class DiscFits:
     inflation: Array
     reasons: tuple[str | None, ...]
     noise: NoiseModel | None
-    travel: Travel | None = None
+    travel: ImageMotion | None = None
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
@@ -107,7 +107,7 @@ class DiscFits:
         return np.array([reason is None for reason in self.reasons], dtype=np.bool_)
 
 
-def unfitted(discs: Ellipses) -> DiscFits:
+def unfitted_discs(discs: Ellipses) -> DiscFits:
     """Discs as they were, to be replaced by `merged`."""
     count = len(discs)
     nothing = np.zeros(count)
@@ -156,7 +156,7 @@ LARGEST_SCALE = 1.6
 
 def rejection_reasons(
     discs: Ellipses,
-    pixels: PixelSet,
+    pixels: OutlinePixels,
     fit: Minimum,
     inside: Array32,
     cov_px2: Array,
@@ -187,7 +187,7 @@ def rejection_reasons(
     return tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
 
 
-def located(signals: Sequence[MarkerSignal], discs: Ellipses) -> Ellipses:
+def initialize_from_moments(signals: Sequence[MarkerSignal], discs: Ellipses) -> Ellipses:
     """Initial outlines of large discs from second moments, since a circle misses a tilted disc's edge by pixels."""
     if discs.radii_px.max() <= WHOLE_RADIUS_PX:
         return discs

@@ -12,8 +12,8 @@ from geometry.se3 import Array
 from nav.centroids.blurred_edges import START_WIDTH_PX
 from nav.centroids.ellipses import Ellipses, plane_shapes
 from nav.centroids.marker_signal import OUTER_DIFFERENCE_PX, MarkerSignal
-from nav.centroids.motion_blur import share_outside_along
-from nav.centroids.outline_pixels import PixelSet, edge_distances
+from nav.centroids.motion_blur import blurred_share_outside
+from nav.centroids.outline_pixels import OutlinePixels, edge_distances
 from nav.numerics.compiled import Array32
 
 # Of a glaring sky a hundredth in a pixel is as much as a faint marker's noise.
@@ -26,8 +26,8 @@ _LEAST_LEFT, _EDGE_PX = 0.5, 1.5
 _CLEAR_PX = 1.0
 
 
-def without_glare(
-    pixels: PixelSet, signal: MarkerSignal, inwards_px: Array32, near: Callable[[float], Array32]
+def pixels_without_glare(
+    pixels: OutlinePixels, signal: MarkerSignal, inwards_px: Array32, near: Callable[[float], Array32]
 ) -> NDArray[np.bool_] | None:
     """Which pixels hardly see what lies beyond a dark face, where it glares; None where it does not.
 
@@ -66,11 +66,11 @@ _MOST_BEYOND = 0.5
 # A window lies about the rough place, and what begins a blur beyond its end is seen in it. [px]
 _BESIDE_WINDOW_PX = 2.0
 # So near a disc in a difference of colours of the same place. [px]
-SEEN_BESIDE_PX = OUTER_DIFFERENCE_PX + _BESIDE_WINDOW_PX
+VISIBLE_MARGIN_PX = OUTER_DIFFERENCE_PX + _BESIDE_WINDOW_PX
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class FaceBackground:
     """The face of the drogue by the places of the fitted markers on it.
 
     Attributes:
@@ -83,19 +83,24 @@ class Surroundings:
     edges_m: tuple[float, float]
     margin_px: float = 0.0
 
-    def take(self, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Surroundings:
+    def take(self, index: np.ndarray[tuple[int], np.dtype[np.int64]]) -> FaceBackground:
         """Those of some discs."""
         return replace(self, places_m=self.places_m[index])
 
 
-def seen_beside_px(signal: MarkerSignal) -> float:
+def visible_margin_px(signal: MarkerSignal) -> float:
     """What begins this near a disc may be seen in its window. [px]"""
     return signal.outer_px + signal.beside_px + _BESIDE_WINDOW_PX
 
 
-def on_the_face(
-    around: Surroundings, discs: Ellipses, pixels: PixelSet, further: Array32, ways: Array | None, signal: MarkerSignal
-) -> PixelSet:
+def pixels_on_face(
+    around: FaceBackground,
+    discs: Ellipses,
+    pixels: OutlinePixels,
+    further: Array32,
+    ways: Array | None,
+    signal: MarkerSignal,
+) -> OutlinePixels:
     """The pixels without those that see too much of what lies beyond the face.
 
     Args:
@@ -108,19 +113,19 @@ def on_the_face(
         return pixels.only(chosen)
 
     def beyond(nearer_px: float) -> Array32:
-        shares = shares_beyond(around, discs, pixels, START_WIDTH_PX, ways, nearer_px) if nearer_px else further
+        shares = background_shares(around, discs, pixels, START_WIDTH_PX, ways, nearer_px) if nearer_px else further
         assert shares is not None
         most: Array32 = shares.max(axis=1)
         return most
 
-    clear = without_glare(pixels, signal, edge_distances(discs.shapes_px, pixels.x_px, pixels.y_px), beyond)
+    clear = pixels_without_glare(pixels, signal, edge_distances(discs.shapes_px, pixels.x_px, pixels.y_px), beyond)
     return pixels.only(chosen if clear is None else clear)
 
 
-def shares_beyond(
-    around: Surroundings,
+def background_shares(
+    around: FaceBackground,
     discs: Ellipses,
-    pixels: PixelSet,
+    pixels: OutlinePixels,
     width_px: float,
     ways: Array | None,
     nearer_px: float = 0.0,
@@ -158,7 +163,7 @@ def shares_beyond(
         shapes[:, mine] = np.multiply.outer(edges_m, shape)[:, None]
     x = pixels.x_px - middles[:, :1].astype(np.float32)
     y = pixels.y_px - middles[:, 1:].astype(np.float32)
-    in_opening = 1 - share_outside_along(shapes[0], x, y, width_px, ways)
-    beyond_rim = share_outside_along(shapes[1], x, y, width_px, ways)
+    in_opening = 1 - blurred_share_outside(shapes[0], x, y, width_px, ways)
+    beyond_rim = blurred_share_outside(shapes[1], x, y, width_px, ways)
     shares: Array32 = np.stack([in_opening, beyond_rim], axis=1)
     return shares

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.images import Pixels, StereoImages
 from geometry.stereo import EYES, Eye
 from nav.centroids.ellipses import Ellipses
-from nav.matching.marker_channel import PLAIN, marker_channel, signed_lead
+from nav.matching.marker_channel import PLAIN, color_difference, marker_channel
 from nav.numerics.compiled import Array32
 
 # Room around an outline: the widest window about it, of one that moves by 30 px while the shutter is open, and what an
@@ -117,7 +117,7 @@ def _image_signal(
     full = 2**images.bits - 1
     is_difference = color is not None and image.ndim == 3
     if color is not None and image.ndim == 3:
-        values: Pixels | Array32 = signed_lead(cut, "left", color, others_weight)
+        values: Pixels | Array32 = color_difference(cut, "left", color, others_weight)
     else:
         values = marker_channel(cut, "left", color, others_weight)
     if part.ndim == 3:

@@ -13,8 +13,8 @@ import numpy as np
 from geometry.se3 import Array
 from nav.centroids.blurred_edges import DISC_WIDTH, ELLIPSE_PARAMETER_COUNT, blurred_step, edge_widths
 from nav.centroids.ellipses import Ellipses
-from nav.centroids.outline_pixels import PixelSet, edge_distances
-from nav.centroids.pixel_response import least_of_all, reduced_equations
+from nav.centroids.outline_pixels import OutlinePixels, edge_distances
+from nav.centroids.pixel_response import reduced_equations, solve_shared
 from nav.numerics.compiled import Array32
 from nav.numerics.least_squares_loops import add_rows
 from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations
@@ -32,7 +32,7 @@ _ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Travel:
+class ImageMotion:
     """How outlines move on the images while the shutter is open, forwards or backwards alike.
 
     Each eye's outlines move as one, and may turn and grow about their middle meanwhile.
@@ -60,7 +60,7 @@ class Travel:
         return float(np.hypot(*self.of(outlines)[:, :2].T).max(initial=0.0)) / 2
 
 
-def steps_along(ways: Array) -> tuple[Array, Array]:
+def motion_steps(ways: Array) -> tuple[Array, Array]:
     """(T, N, 3) parts of ways (N, 3), from their middles, and (T,) shares of them."""
     longest_px = float(np.hypot(*ways[:, :2].T).max(initial=0.0))
     count = max(1, int(np.ceil(longest_px / _STEP_PX)))
@@ -74,11 +74,13 @@ def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: floa
     return blurred_step(distance * np.float32(-np.sqrt(0.5) / width_px))[0]
 
 
-def share_outside_along(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float, ways: Array | None) -> Array32:
+def blurred_share_outside(
+    shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float, ways: Array | None
+) -> Array32:
     """As `share_outside`, of ellipses that move by (N, 3), or stand still."""
     if ways is None:
         return share_outside(shapes_px, x_px, y_px, width_px)
-    steps = steps_along(ways)[0].astype(np.float32)[..., None]
+    steps = motion_steps(ways)[0].astype(np.float32)[..., None]
     total = np.zeros_like(x_px)
     for along_x, along_y, growth in steps.transpose(0, 2, 1, 3):
         scale = 1 - growth
@@ -86,7 +88,7 @@ def share_outside_along(shapes_px: Array, x_px: Array32, y_px: Array32, width_px
     return total / np.float32(len(steps))
 
 
-def moving(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Model:
+def motion_blurred(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Model:
     """A model of still outlines, of moving ones.
 
     Args:
@@ -94,12 +96,12 @@ def moving(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Model:
         ways: (N, 3).
         ellipses: where the parameters of each outline's ellipses begin.
     """
-    steps = steps_along(ways)[0]
+    steps = motion_steps(ways)[0]
 
     def moved(parameters: Array) -> tuple[Array32, Array32]:
-        total, slopes = model(_further_on(parameters, steps[0], ellipses))
+        total, slopes = model(_moved_by(parameters, steps[0], ellipses))
         for step in steps[1:]:
-            picture, jacobian = model(_further_on(parameters, step, ellipses))
+            picture, jacobian = model(_moved_by(parameters, step, ellipses))
             total += picture
             slopes += jacobian
         scale = np.float32(1 / len(steps))
@@ -108,7 +110,7 @@ def moving(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Model:
     return moved
 
 
-def _further_on(parameters: Array, step: Array, ellipses: tuple[int, ...]) -> Array:
+def _moved_by(parameters: Array, step: Array, ellipses: tuple[int, ...]) -> Array:
     """Parameters (N, P) of outlines a step (N, 3) further on."""
     there = parameters.copy()
     for first in ellipses:
@@ -118,7 +120,7 @@ def _further_on(parameters: Array, step: Array, ellipses: tuple[int, ...]) -> Ar
     return there
 
 
-def seen_travel(fit: Minimum, pixels: PixelSet, discs: Ellipses) -> Travel | None:
+def detect_motion(fit: Minimum, pixels: OutlinePixels, discs: Ellipses) -> ImageMotion | None:
     """How outlines moved, roughly, from what the fit of still ones with even blur left; None where they stood still.
 
     Along its way an outline is blurred, across it is not: what is left changes with twice the azimuth. To first order
@@ -139,7 +141,7 @@ def seen_travel(fit: Minimum, pixels: PixelSet, discs: Ellipses) -> Travel | Non
     freedom = np.maximum(pixels.present.sum() - fit.parameters.size, 1)
     noise_dn2 = float((fit.residuals**2 * pixels.present).sum() / freedom)
     all_normal = normal.sum(axis=0)
-    across, along = least_of_all(all_normal, gradient.sum(axis=0))
+    across, along = solve_shared(all_normal, gradient.sum(axis=0))
     variance, direction = np.hypot(across, along), np.arctan2(along, across) / 2
     length_px = np.sqrt(variance / _BOX_VARIANCE)
     sigma = np.sqrt(noise_dn2 / np.maximum(np.diag(all_normal).min(), np.finfo(np.float32).tiny))
@@ -150,10 +152,12 @@ def seen_travel(fit: Minimum, pixels: PixelSet, discs: Ellipses) -> Travel | Non
         middles[eye] = discs.centers_px[discs.eyes == eye].mean(axis=0)
     # Both eyes see the same way, but for what the distance changes.
     way = length_px * np.array([np.cos(direction), np.sin(direction)])
-    return Travel(middles, np.tile(way, (2, 1)), np.zeros((2, 2)))
+    return ImageMotion(middles, np.tile(way, (2, 1)), np.zeros((2, 2)))
 
 
-def fit_travel(model: Model, pixels: PixelSet, start: Array, travel: Travel, discs: Ellipses) -> Travel | None:
+def fit_motion(
+    model: Model, pixels: OutlinePixels, start: Array, travel: ImageMotion, discs: Ellipses
+) -> ImageMotion | None:
     """The ways of moving discs, in Gauss-Newton steps of them and of the discs at once; None where that leads astray.
 
     Args:
@@ -175,28 +179,28 @@ def fit_travel(model: Model, pixels: PixelSet, start: Array, travel: Travel, dis
         steps = np.zeros((2, 4))
         for eye in np.unique(discs.eyes):
             mine = discs.eyes == eye
-            steps[eye] = least_of_all(normal[mine].sum(axis=0), gradient[mine].sum(axis=0))
+            steps[eye] = solve_shared(normal[mine].sum(axis=0), gradient[mine].sum(axis=0))
         left = fit.residuals.copy()
         add_rows(np.ascontiguousarray(shared), (-steps[discs.eyes]).astype(np.float32), left)
         parameters = fit.given(left, pixels.present).parameters
-        travel = Travel(travel.middles_px, travel.means_px + steps[:, :2], travel.turns + steps[:, 2:] / size_px)
+        travel = ImageMotion(travel.middles_px, travel.means_px + steps[:, :2], travel.turns + steps[:, 2:] / size_px)
         # Not a number is not within.
         if not np.hypot(*travel.of(discs)[:, :2].T).max() < _MOST_TRAVEL_PX:
             return None
     return travel
 
 
-def _evaluate_moving(model: Model, pixels: PixelSet, parameters: Array, ways: Array) -> tuple[Minimum, Array32]:
+def _evaluate_moving(model: Model, pixels: OutlinePixels, parameters: Array, ways: Array) -> tuple[Minimum, Array32]:
     """The picture of moving discs, and (N, 2, K) its derivatives by their ways along x and y."""
     values, jacobian = np.zeros_like(pixels.values), None
     by_way = np.zeros((len(parameters), 2, pixels.values.shape[1]), np.float32)
-    for step, share in zip(*steps_along(ways), strict=True):
-        picture, slopes = model(_further_on(parameters, step, (0,)))
+    for step, share in zip(*motion_steps(ways), strict=True):
+        picture, slopes = model(_moved_by(parameters, step, (0,)))
         values += picture
         by_way += np.float32(share) * slopes[:, :2]
         jacobian = slopes if jacobian is None else jacobian + slopes
     assert jacobian is not None
-    scale = np.float32(1 / len(steps_along(ways)[1]))
+    scale = np.float32(1 / len(motion_steps(ways)[1]))
     jacobian *= scale
     residuals = pixels.values - scale * values
     normal = NormalEquations(jacobian, residuals, pixels.present)

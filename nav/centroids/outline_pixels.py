@@ -122,7 +122,7 @@ _Picture = Array32 | Pixels | NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class PixelSet:
+class OutlinePixels:
     """Pixels of N outlines.
 
     Attributes:
@@ -144,7 +144,7 @@ class PixelSet:
     truncated: NDArray[np.bool_]
     others: Array32 | None = None
 
-    def only(self, chosen: NDArray[np.bool_]) -> PixelSet:
+    def only(self, chosen: NDArray[np.bool_]) -> OutlinePixels:
         """The same outlines with padding for the pixels that were not chosen, (N, K)."""
         return replace(self, present=self.present * chosen)
 
@@ -172,7 +172,7 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
 
 def disc_pixels(
     signals: Sequence[MarkerSignal], discs: Ellipses, everything: bool = False, blur_px: float = 0.0
-) -> PixelSet:
+) -> OutlinePixels:
     """Pixels in and around discs whose edges a motion spreads by `blur_px` to either side.
 
     With `everything`, those far from the edge of large discs too.
@@ -181,12 +181,14 @@ def disc_pixels(
     return _gather(signals, discs, thin=1 if whole else _thin_cells(signals), blur_px=blur_px)
 
 
-def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> PixelSet:
+def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> OutlinePixels:
     """One in four by four of the pixels in and around discs."""
     return _gather(signals, discs, every=_thin_cells(signals))
 
 
-def annulus_pixels(signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses, blur_px: float = 0.0) -> PixelSet:
+def annulus_pixels(
+    signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses, blur_px: float = 0.0
+) -> OutlinePixels:
     """Pixels on and around annuli, `blur_px` as above; of the hole only what lies near its edge."""
     return _gather(signals, outer, thin=_thin_cells(signals), holes=inner, blur_px=blur_px)
 
@@ -203,7 +205,7 @@ def _gather(
     thin: int = 1,
     holes: Ellipses | None = None,
     blur_px: float = 0.0,
-) -> PixelSet:
+) -> OutlinePixels:
     """Pixels in and around outlines, not in their holes.
 
     Args:
@@ -249,7 +251,7 @@ def _gather(
     values = taken([signal.values for signal in signals])
     own = [signal.own for signal in signals if signal.own is not None]
     column, row = cells % size, cells // size
-    return PixelSet(
+    return OutlinePixels(
         np.where(present, starts[:, :1] + offsets[column], np.float32(0)),
         np.where(present, starts[:, 1:] + offsets[row], np.float32(0)),
         values,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from geometry.se3 import Array
-from nav.centroids.blurred_edges import ELLIPSE_PARAMETER_COUNT, add_box_pictures
-from nav.centroids.outline_pixels import PixelSet
+from nav.centroids.blurred_edges import ELLIPSE_PARAMETER_COUNT, add_box_responses
+from nav.centroids.outline_pixels import OutlinePixels
 from nav.numerics.compiled import Array32
-from nav.numerics.least_squares_loops import add_rows, couplings, normal_equations
+from nav.numerics.least_squares_loops import add_rows, normal_equations, weighted_products
 from nav.numerics.levenberg_marquardt import Minimum
 
 # Of a normal matrix with unit diagonal: what light too dim cannot tell apart is shared out.
@@ -29,8 +29,8 @@ def reduced_equations(fit: Minimum, pictures: Array32, weights: Array32) -> tupl
     count, shared = fit.parameters.shape[1], pictures.shape[1]
     pictures = np.ascontiguousarray(pictures)
     coupled, slopes = np.empty((len(weights), count, shared)), np.empty((len(weights), count, 1))
-    couplings(fit.jacobian, pictures, weights, coupled)
-    couplings(fit.jacobian, fit.residuals[:, None], weights, slopes)
+    weighted_products(fit.jacobian, pictures, weights, coupled)
+    weighted_products(fit.jacobian, fit.residuals[:, None], weights, slopes)
     normal, gradient = np.empty((len(weights), shared, shared)), np.empty((len(weights), shared))
     normal_equations(pictures, fit.residuals, weights, normal, gradient)
     taken = np.matmul(fit.covariance(), coupled)
@@ -39,7 +39,7 @@ def reduced_equations(fit: Minimum, pictures: Array32, weights: Array32) -> tupl
     return normal, gradient
 
 
-def least_of_all(normal: Array, gradient: Array) -> Array:
+def solve_shared(normal: Array, gradient: Array) -> Array:
     """(S,) amounts that solve summed equations."""
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float32).tiny))
     unit = normal * scale[:, None] * scale + _RIDGE * np.eye(len(scale))
@@ -48,10 +48,12 @@ def least_of_all(normal: Array, gradient: Array) -> Array:
 
 
 # The pixel's own box, those beside it, and those across its corners.
-BOX_PICTURES = 3
+RESPONSE_BOXES = 3
 
 
-def without_pixel_response(fit: Minimum, pixels: PixelSet, inside: Array32, contrast: Array) -> tuple[Minimum, Array32]:
+def correct_pixel_response(
+    fit: Minimum, pixels: OutlinePixels, inside: Array32, contrast: Array
+) -> tuple[Minimum, Array32]:
     """A fit of Gaussian edges, corrected for the frame's own shape of edges.
 
     The edge is a mixture of the Gaussian, of the pixel's own box, and of the boxes beside it and across its corners.
@@ -69,12 +71,12 @@ def without_pixel_response(fit: Minimum, pixels: PixelSet, inside: Array32, cont
         The fit after one linear step with the shares free, and (N, K) what the data have beyond Gaussian edges.
     """
     weights = pixels.present
-    shapes = np.zeros((len(weights), BOX_PICTURES, weights.shape[1]), np.float32)
+    shapes = np.zeros((len(weights), RESPONSE_BOXES, weights.shape[1]), np.float32)
     steps = np.repeat(contrast.astype(np.float32)[:, None], weights.shape[1], axis=1)
     ellipses = fit.parameters[:, :ELLIPSE_PARAMETER_COUNT].astype(np.float32)
-    add_box_pictures(ellipses, pixels.x_px, pixels.y_px, weights, inside, steps, shapes)
+    add_box_responses(ellipses, pixels.x_px, pixels.y_px, weights, inside, steps, shapes)
     normal, gradient = reduced_equations(fit, shapes, weights)
-    shares = least_of_all(normal.sum(axis=0), gradient.sum(axis=0))
+    shares = solve_shared(normal.sum(axis=0), gradient.sum(axis=0))
     beyond = np.zeros_like(weights)
     add_rows(shapes, np.tile(shares.astype(np.float32), (len(weights), 1)), beyond)
     return fit.given(fit.residuals - beyond, weights), beyond

@@ -74,10 +74,10 @@ def marker_channel(
     if color is None:
         return np.asarray(cv2.min(cv2.min(planes[0], planes[1]), planes[2]))
     first, second = (planes[index] for index in range(3) if index != color)
-    return _lead(planes[color], cv2.max(first, second), others_weight)
+    return _color_excess(planes[color], cv2.max(first, second), others_weight)
 
 
-def signed_lead(images: StereoImages, eye: Eye, color: int, others_weight: float = PLAIN) -> NDArray[np.float32]:
+def color_difference(images: StereoImages, eye: Eye, color: int, others_weight: float = PLAIN) -> NDArray[np.float32]:
     """As `marker_channel` of a colour image, below zero where another colour leads.
 
     Light of a blue sky that the lens spreads over a marker's edge takes from the marker's lead; cut off at zero it
@@ -122,7 +122,7 @@ def balancing_weight(images: StereoImages, color: int, middles_px: Array, rim_px
     return float(np.clip(own / others, *_WEIGHTS)) if others > 0 else usual
 
 
-def _lead(own: Pixels, others: Pixels, others_weight: float) -> Pixels:
+def _color_excess(own: Pixels, others: Pixels, others_weight: float) -> Pixels:
     """`max(own - weight others, 0)` in the integers of the image."""
     if others_weight == PLAIN:
         return np.asarray(cv2.subtract(own, others))
@@ -162,10 +162,12 @@ def _from_mosaic(mosaic: Pixels, color: int, others_weight: float) -> Pixels:
     green = cv2.addWeighted(first_green, 0.5, second_green, 0.5, 0)
     planes = (np.ascontiguousarray(even[0::2, 0::2]), green, np.ascontiguousarray(even[1::2, 1::2]))
     first, second = (planes[index] for index in range(3) if index != color)
-    difference = _lead(planes[color], cv2.max(first, second), others_weight)
+    difference = _color_excess(planes[color], cv2.max(first, second), others_weight)
     if color != _GREEN:
         beside = _brightest_beside((planes[0], first_green, second_green, planes[2]), color)
-        difference = np.where(_lead(planes[color], beside, others_weight) > 0, difference, difference.dtype.type(0))
+        difference = np.where(
+            _color_excess(planes[color], beside, others_weight) > 0, difference, difference.dtype.type(0)
+        )
     shift = -_SITE_OFFSET_PX[color] / 2
     full_to_site = np.array([[0.5, 0.0, shift], [0.0, 0.5, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

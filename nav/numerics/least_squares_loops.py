@@ -48,7 +48,7 @@ def normal_equations(jacobian: Array32, residuals: Array32, weights: Array32, no
 
 
 @compiled
-def couplings(left: Array32, right: Array32, weights: Array32, coupled: Array) -> None:
+def weighted_products(left: Array32, right: Array32, weights: Array32, coupled: Array) -> None:
     """Fill (N, P, Q) sums of products of rows (N, P, K) and (N, Q, K) with weights (N, K)."""
     weighted = np.empty_like(weights[0])
     for n in range(len(left)):
@@ -96,7 +96,7 @@ def weighted_squares(residuals: Array32, weights: Array32) -> Array:
 
 
 @compiled
-def tie_rows(jacobian: Array32, ties: Array32, tied: Array32) -> None:
+def constrain_jacobian(jacobian: Array32, ties: Array32, tied: Array32) -> None:
     """Fill derivatives (N, Q, K) by free parameters, which the first R of others (N, P, K) follow by ties (N, T, R)."""
     count, followers = ties.shape[1], ties.shape[2]
     for n in range(len(jacobian)):

@@ -12,10 +12,10 @@ from geometry.se3 import Array
 from nav.numerics.compiled import Array32
 from nav.numerics.least_squares_loops import (
     add_rows,
-    couplings,
     damped_steps,
     leverages,
     normal_equations,
+    weighted_products,
     weighted_squares,
 )
 
@@ -97,7 +97,7 @@ class Minimum:
     def given(self, residuals: Array32, weights: Array32) -> Minimum:
         """Where one undamped step ends from here if the residuals were these; (N, K) each."""
         gradient = np.empty((*self.parameters.shape, 1))
-        couplings(self.jacobian, residuals[:, None], weights, gradient)
+        weighted_products(self.jacobian, residuals[:, None], weights, gradient)
         step = np.matmul(self.covariance(), gradient)[..., 0]
         left = residuals.copy()
         add_rows(self.jacobian, -step.astype(np.float32), left)

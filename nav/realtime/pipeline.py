@@ -20,7 +20,7 @@ from typing import Generic, Protocol, TypeVar
 
 from datasets_manifest.storage.blind import BlindPair
 from nav.realtime.warm_up import warm_up_jit
-from nav.sequence_navigator import LatePair, PairAnswers, SequenceNavigator, SoughtPair
+from nav.sequence_navigator import MeasuredPair, PairEstimates, SequenceNavigator, SkippedPair
 
 Item = TypeVar("Item")
 # Capacity of the queue of answers; when it is full the stages block, and pairs become late.
@@ -165,14 +165,14 @@ class _MeasuredPair:
 
     late: tuple[int, ...]
     arrival: _ArrivedPair
-    pair: SoughtPair
+    pair: MeasuredPair
     started_s: float
     finished_s: float
 
 
 def replay(
     source: PairStream, navigator: SequenceNavigator, rate_hz: float, clock: Clock
-) -> Generator[PairAnswers | LatePair]:
+) -> Generator[PairEstimates | SkippedPair]:
     """Replay stereo pairs at a rate, and yield the answers to all of them.
 
     Args:
@@ -201,13 +201,13 @@ class _Replay:
         self._stop = threading.Event()
         self._arrived_pairs: LatestItemQueue[_ArrivedPair] = LatestItemQueue()
         self._measured_pairs: SingleItemQueue[_MeasuredPair] = SingleItemQueue()
-        self._answers: Queue[PairAnswers | LatePair | BaseException | None] = Queue(_WAITING_ANSWERS)
+        self._answers: Queue[PairEstimates | SkippedPair | BaseException | None] = Queue(_WAITING_ANSWERS)
 
-    def answers(self) -> Generator[PairAnswers | LatePair]:
+    def answers(self) -> Generator[PairEstimates | SkippedPair]:
         """See `replay`."""
         workers = (
             (self._measure_stage, self._estimate_stage)
-            if self._navigator.seeks_by_detector
+            if self._navigator.detects_every_pair
             else (self._combined_stage,)
         )
         stages = (self._read_stage, *workers)
@@ -234,7 +234,7 @@ class _Replay:
         except BaseException as error:
             self._emit(error)
 
-    def _emit(self, answer: PairAnswers | LatePair | BaseException | None) -> None:
+    def _emit(self, answer: PairEstimates | SkippedPair | BaseException | None) -> None:
         while not self._stop.is_set():
             with contextlib.suppress(Full):
                 self._answers.put(answer, timeout=_POLL_S)
@@ -281,17 +281,17 @@ class _Replay:
 
     def _measure(self, late: tuple[int, ...], arrival: _ArrivedPair) -> _MeasuredPair:
         started_s = self._clock.now_s()
-        pair = self._navigator.seek(arrival.pair)
+        pair = self._navigator.measure(arrival.pair)
         return _MeasuredPair(late, arrival, pair, started_s, finished_s=self._clock.now_s())
 
     def _emit_with_late(self, measured: _MeasuredPair) -> None:
         for frame_index in measured.late:
-            self._emit(LatePair(frame_index))
+            self._emit(SkippedPair(frame_index))
         self._emit(self._estimate(measured))
 
-    def _estimate(self, measured: _MeasuredPair) -> PairAnswers:
+    def _estimate(self, measured: _MeasuredPair) -> PairEstimates:
         arrival, taken_s = measured.arrival, self._clock.now_s()
-        answers = self._navigator.solve(measured.pair)
+        answers = self._navigator.estimate(measured.pair)
         around_s = {
             "read": arrival.read_s,
             "wait": measured.started_s - arrival.arrived_s,

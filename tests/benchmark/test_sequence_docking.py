@@ -23,7 +23,7 @@ from droguekit.benchmark.sequences.docking_errors import (
 )
 from droguekit.benchmark.sequences.filter_errors import SequenceData
 from droguekit.benchmark.sequences.sequence_truth import TrueSequence, true_sequences, true_state
-from nav.docking import capture_radius_m, docking_of
+from nav.docking import capture_radius_m, docking_quantities
 
 TIP_LEFT_M = np.array([0.45, 0.35, 1.0])
 """Of the paper's rig: 1 m forward, 0.45 right, 0.35 down."""
@@ -106,7 +106,7 @@ def test_answers_from_the_true_motion_err_by_what_was_put_in(build: SimpleNamesp
                 covariance=1e-6 * np.eye(6),
             ),
         )
-        docking = docking_of(told, build.rig, record.frame.drogue)
+        docking = docking_quantities(told, build.rig, record.frame.drogue)
         assert docking is not None
         forward, right, down = docking.mouth_from_tip_m
         moved = docking.model_copy(update={"mouth_from_tip_m": (forward, right + 0.005, down)})
@@ -201,7 +201,7 @@ def test_navigation_tells_the_radius_it_was_asked_for(build: SimpleNamespace) ->
     )
     drogue = record.frame.drogue
     for asked_m, radius_m in ((0.3, 0.3), (None, capture_radius_m(drogue))):
-        docking = docking_of(told, build.rig, drogue, asked_m)
+        docking = docking_quantities(told, build.rig, drogue, asked_m)
         assert docking is not None and docking.capture_radius_m == radius_m
 
 

@@ -10,7 +10,7 @@ from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
-from nav.docking import capture_radius_m, docking_of
+from nav.docking import capture_radius_m, docking_quantities
 from nav.filtering.pose_filter import FilterState
 
 TIP_M = np.array([1.0, 0.45, 0.35])
@@ -38,7 +38,7 @@ def _spread(scale: float) -> Array:
 
 
 def test_straight_ahead() -> None:
-    docking = docking_of(_state(_ahead_of_tip([0.03, -0.04, 3.0]), np.array([0, 0, -0.6])), RIG, DROGUE)
+    docking = docking_quantities(_state(_ahead_of_tip([0.03, -0.04, 3.0]), np.array([0, 0, -0.6])), RIG, DROGUE)
     assert docking is not None
     # Forward is the camera's z, right its x, down its y.
     np.testing.assert_allclose(docking.mouth_from_tip_m, [3.0, 0.03, -0.04], atol=1e-12)
@@ -54,7 +54,7 @@ def test_it_is_told_in_the_axes_of_the_body() -> None:
     body_from_left = RigidTransform(turn @ FRD_FROM_OPTICAL.rotation, np.array([0.5, 0.2, -0.1]))
     rig = StereoRig(RIG.camera, 0.3, body_from_left, TIP_M)
     place, velocity = np.array([0.4, 0.1, 6.0]), np.array([0.1, 0.0, -0.7])
-    docking = docking_of(_state(place, velocity, spread=_spread(0.01)), rig, DROGUE)
+    docking = docking_quantities(_state(place, velocity, spread=_spread(0.01)), rig, DROGUE)
     assert docking is not None
     np.testing.assert_allclose(docking.mouth_from_tip_m, body_from_left.apply(place) - TIP_M, atol=1e-12)
     assert docking.closure_m_s == pytest.approx(-(body_from_left.rotation @ velocity)[0])
@@ -65,7 +65,7 @@ def test_it_is_told_in_the_axes_of_the_body() -> None:
 def test_the_miss_is_where_the_tip_pierces_the_rim_plane() -> None:
     place, velocity = _ahead_of_tip([0.4, 0.1, 4.0]), np.array([-0.05, 0.02, -0.8])
     state = _state(place, velocity, np.array([0.2, -0.3, 0.5]))
-    docking = docking_of(state, RIG, DROGUE, 0.3)
+    docking = docking_quantities(state, RIG, DROGUE, 0.3)
     assert docking is not None and docking.contact_s is not None and docking.miss_m is not None
     then = RigidTransform(state.left_from_drogue.rotation, place + docking.contact_s * velocity)
     tip_in_drogue = then.inverse().apply(TIP_LEFT_M)
@@ -77,7 +77,7 @@ def test_the_miss_is_where_the_tip_pierces_the_rim_plane() -> None:
 def test_its_deviation_is_that_of_drawn_motions() -> None:
     place, velocity = _ahead_of_tip([0.6, -0.3, 2.0]), np.array([0.4, 0.3, -0.8])
     tilt, spread = np.array([0.15, -0.1, 0.0]), _spread(0.003)
-    docking = docking_of(_state(place, velocity, tilt, spread), RIG, DROGUE)
+    docking = docking_quantities(_state(place, velocity, tilt, spread), RIG, DROGUE)
     assert docking is not None and docking.miss_sd_m is not None
     draws = np.random.default_rng(5).multivariate_normal(np.zeros(12), spread, 4000)
     turn = Rotation.from_rotvec(tilt)
@@ -90,7 +90,7 @@ def test_its_deviation_is_that_of_drawn_motions() -> None:
 
 
 def test_where_nothing_misses_the_deviation_is_the_largest() -> None:
-    docking = docking_of(_state(_ahead_of_tip([0, 0, 2.0]), np.array([0, 0, -1.0])), RIG, DROGUE)
+    docking = docking_quantities(_state(_ahead_of_tip([0, 0, 2.0]), np.array([0, 0, -1.0])), RIG, DROGUE)
     assert docking is not None and docking.miss_m == 0
     assert docking.miss_sd_m == pytest.approx(1e-4 * 5**0.5)
 
@@ -101,7 +101,7 @@ def test_where_nothing_misses_the_deviation_is_the_largest() -> None:
     ids=["opens", "stands", "is past", "hardly closes", "closes in 75 s"],
 )
 def test_no_contact_unless_they_close(ahead_m: float, speed_m_s: float) -> None:
-    docking = docking_of(_state(_ahead_of_tip([0, 0, ahead_m]), np.array([0, 0, speed_m_s])), RIG, DROGUE)
+    docking = docking_quantities(_state(_ahead_of_tip([0, 0, ahead_m]), np.array([0, 0, speed_m_s])), RIG, DROGUE)
     assert docking is not None and docking.closure_m_s == pytest.approx(-speed_m_s)
     assert docking.contact_s is docking.miss_m is docking.miss_sd_m is docking.captured is None
 
@@ -109,11 +109,11 @@ def test_no_contact_unless_they_close(ahead_m: float, speed_m_s: float) -> None:
 def test_an_estimate_tells_what_it_knows() -> None:
     state = _state(_ahead_of_tip([0.1, 0.0, 3.0]), np.array([0, 0, -0.6]))
     estimate = state.to_estimate(0, "joint+filter")
-    assert docking_of(estimate, RIG, DROGUE) == docking_of(state, RIG, DROGUE)
-    still = docking_of(estimate.model_copy(update={"motion": None}), RIG, DROGUE)
+    assert docking_quantities(estimate, RIG, DROGUE) == docking_quantities(state, RIG, DROGUE)
+    still = docking_quantities(estimate.model_copy(update={"motion": None}), RIG, DROGUE)
     assert still is not None and still.closure_m_s is None and still.miss_m is None
     bare = PoseEstimate(frame_index=0, method="paper", left_from_drogue=estimate.left_from_drogue)
-    assert docking_of(bare, RIG, DROGUE) is None
+    assert docking_quantities(bare, RIG, DROGUE) is None
 
 
 def test_capture_radius() -> None:
@@ -121,8 +121,8 @@ def test_capture_radius() -> None:
     assert capture_radius_m(DROGUE) == pytest.approx(0.16)
     assert capture_radius_m(DROGUE.model_copy(update={"hub": None})) == pytest.approx(0.125)
     state = _state(_ahead_of_tip([0.17, 0.0, 3.0]), np.array([0, 0, -0.6]))
-    answers = [docking_of(state, RIG, DROGUE, radius) for radius in (None, 0.2)]
+    answers = [docking_quantities(state, RIG, DROGUE, radius) for radius in (None, 0.2)]
     assert [answer.captured for answer in answers if answer is not None] == [False, True]
     for radius in (0.0, -1.0, np.nan):
         with pytest.raises(ValueError, match="capture_m"):
-            docking_of(state, RIG, DROGUE, radius)
+            docking_quantities(state, RIG, DROGUE, radius)

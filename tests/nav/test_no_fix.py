@@ -14,7 +14,7 @@ from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
 from nav.navigator import Navigator
-from nav.pair_measurement import Sighting, estimate_pose
+from nav.pair_measurement import PairMeasurement, estimate_pose
 from nav.pose.pose_method import NoFixReason, Observation
 from nav.pose.pose_methods import METHODS, pose_method
 
@@ -142,9 +142,9 @@ def test_images_of_another_size_than_the_rigs(size):
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_flat_images(level):
     image = np.full((960, 1280, 3), level, np.uint8)
-    sighting = Navigator(RIG, DROGUE).observe(StereoImages(image, image, 0.0, 1e-3))
-    assert isinstance(sighting.observation, NoFixReason)
-    assert "no drogue detected in the left image, nor in the right one" in sighting.observation.reason
+    measurement = Navigator(RIG, DROGUE).observe(StereoImages(image, image, 0.0, 1e-3))
+    assert isinstance(measurement.observation, NoFixReason)
+    assert "no drogue detected in the left image, nor in the right one" in measurement.observation.reason
 
 
 @pytest.mark.parametrize("blind", EYES)
@@ -188,8 +188,8 @@ def test_pictures_without_a_drogue(draw, make_pose, kind):
 
 
 def test_a_reason_of_the_method_keeps_the_features(make_pose):
-    sighting = Sighting(broken(make_pose, on_one_line), {"detect": 0.01})
-    estimate = estimate_pose(3, sighting, "joint")
+    measurement = PairMeasurement(broken(make_pose, on_one_line), {"detect": 0.01})
+    estimate = estimate_pose(3, measurement, "joint")
     assert isinstance(estimate, NoFix)
     assert len(estimate.features) == 16
     assert not any(feature.used for feature in estimate.features)

@@ -15,7 +15,7 @@ from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detection, StereoDetection
 from nav.filtering.motion_model import FilterSettings
 from nav.navigator import Navigator
-from nav.runner import open_navigator, with_smoothed
+from nav.runner import add_smoothed, open_navigator
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings
 from nav.tracked_observer import TrackedObserver
 from nav.tracking.tracker import tracker_names
@@ -69,7 +69,7 @@ def answers_by_method(pairs, settings, detector=None):
     shown = CountedDetector(PRESETS["red-8"])
     navigator = SequenceNavigator(settings, lambda drogue: shown)
     found = {name: [] for name in settings.names}
-    for estimate in with_smoothed((navigator.answer(pair) for pair in pairs), settings):
+    for estimate in add_smoothed((navigator.process(pair) for pair in pairs), settings):
         found[estimate.method].append(estimate)
     return found, shown
 
@@ -184,7 +184,7 @@ def restamped(pairs, times_s):
 def test_sequences_begin_where_time_stamps_jump(steady):
     pairs = restamped(steady[:8], [0.0, 0.04, 1.04, 2.05, 2.09, 2.09, 1.0, 1.04])
     navigator = open_navigator(SequenceSettings(("constant",)), DETECTOR)
-    begins = [navigator.seek(pair).begins for pair in pairs]
+    begins = [navigator.measure(pair).begins for pair in pairs]
     assert begins == [True, False, False, True, False, True, True, False]
 
 
@@ -204,7 +204,7 @@ def test_another_drogue_begins_another_sequence(steady):
     smaller = PRESETS["red-8"].model_copy(update={"marker_radius_m": 0.049})
     pairs = [*steady[:2], replace(steady[2], drogue=smaller)]
     navigator = open_navigator(SequenceSettings(("constant",), tracker="bernoulli"), DETECTOR)
-    assert [navigator.seek(pair).begins for pair in pairs] == [True, False, True]
+    assert [navigator.measure(pair).begins for pair in pairs] == [True, False, True]
 
 
 @pytest.mark.parametrize(

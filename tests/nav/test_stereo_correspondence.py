@@ -10,7 +10,7 @@ from drogue_models.presets import PRESETS
 from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
-from nav.centroids.binary_centroids import Centroids, quantisation_variance_px2
+from nav.centroids.binary_centroids import BinaryCentroids, quantisation_variance_px2
 from nav.matching.blobs import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
 from nav.pose.pose_method import NoFixReason
@@ -19,7 +19,7 @@ from nav.stereo_correspondence import correspond
 RIG = paper_rig()
 
 
-def centroids(layout, place, eye, rng, hidden=(), false_discs=()) -> Centroids:
+def centroids(layout, place, eye, rng, hidden=(), false_discs=()) -> BinaryCentroids:
     """Centres of the visible markers and the hub with their noise in a random order; false ones as (dx, dy, factor)."""
     kept = [i for i in range(layout.count) if i not in hidden]
     centers = project_disc_centers(RIG, place, layout.centers_m, layout.radius_m, eye)[kept]
@@ -34,7 +34,7 @@ def centroids(layout, place, eye, rng, hidden=(), false_discs=()) -> Centroids:
     variance = quantisation_variance_px2(np.sqrt(areas / np.pi))
     centers = centers + np.sqrt(variance)[:, None] * rng.standard_normal(centers.shape)
     order = rng.permutation(len(areas))
-    return Centroids(Blobs(centers[order], areas[order]), variance[order, None, None] * np.eye(2))
+    return BinaryCentroids(Blobs(centers[order], areas[order]), variance[order, None, None] * np.eye(2))
 
 
 def worst_match_px(observation, layout, place) -> float:

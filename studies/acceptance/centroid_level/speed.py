@@ -19,7 +19,7 @@ from droguekit.benchmark.poses.cramer_rao import feature_points
 from droguekit.numerical_threads import one_thread
 from geometry.stereo import paper_rig
 from nav.navigator import Navigator
-from nav.pair_measurement import Sighting
+from nav.pair_measurement import PairMeasurement
 from nav.pose.joint import joint
 from nav.pose.pose_method import Observation, Solution
 from nav.pose.pose_methods import pose_method
@@ -81,7 +81,7 @@ def _centroids_ms(dataset: Path, z_m: float) -> tuple[float, int]:
     return float(np.median(times)), len(times)
 
 
-def _edges_ms(navigator: Navigator, images: StereoImages, rough: Sighting) -> float:
+def _edges_ms(navigator: Navigator, images: StereoImages, rough: PairMeasurement) -> float:
     """Time of the edge fits of one pair, without that of the pose between the markers' and the hub's."""
     started = perf_counter()
     fine = navigator.refine(images, rough).observation

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import shapely
 
-from nav.centroids.annuli import AnnulusFits, annulus_model, annulus_start, azimuth_basis, fit_annuli
+from nav.centroids.annuli import AnnulusFits, annulus_model, azimuth_harmonics, fit_annuli, initial_annulus_parameters
 from nav.centroids.centroid_uncertainty import NoiseModel
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
-from nav.centroids.motion_blur import Travel
+from nav.centroids.motion_blur import ImageMotion
 from nav.centroids.outline_pixels import annulus_pixels
 from render.analytic_engine.pixel_coverage import pixel_coverage
 from render.camera.optics import blur
@@ -190,7 +190,7 @@ def test_annuli_that_move_are_as_good_as_their_covariance(outer_px, way):
     for _ in range(30):
         signals, outer, inner = draw_annuli(outer_px, rng, way=way)
         # The two senses of a way look alike.
-        travel = Travel(outer.centers_px, -np.tile(way, (2, 1)), np.zeros((2, 2)))
+        travel = ImageMotion(outer.centers_px, -np.tile(way, (2, 1)), np.zeros((2, 2)))
         fits = fit_annuli(signals, off(outer, 0.1), off(inner, 0.1), NOISE, travel=travel)
         error = fits.centers_px - outer.centers_px
         normalized.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.cov_px2), error) / 2)
@@ -213,9 +213,9 @@ def test_derivatives_are_those_of_the_picture():
     rng = np.random.default_rng(5)
     signals, outer, inner = draw_annuli(12.0, rng)
     pixels = annulus_pixels(signals, outer, inner)
-    turns = azimuth_basis(pixels, 4)
+    turns = azimuth_harmonics(pixels, 4)
     model = annulus_model(pixels, turns, rng.random(pixels.x_px.shape).astype(np.float32))
-    parameters = annulus_start(pixels, outer, inner, turns.shape[1])
+    parameters = initial_annulus_parameters(pixels, outer, inner, turns.shape[1])
     parameters[:, -8:] = rng.normal(0, 5, (2, 8))
     _, jacobian = model(parameters)
     for place in range(parameters.shape[1]):

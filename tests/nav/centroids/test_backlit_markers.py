@@ -77,13 +77,13 @@ def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(make_pose, sensor,
     place = make_pose(0.06, 0.01, z_m, 6, -5, 10)
     # From 20 mm behind the markers the face seems to end a pixel earlier than the layout says, at 5 m.
     images = seen_by(sensor, place, rng, face_behind_m=face_behind_m)
-    sighting = measured(images, place)
-    assert not isinstance(sighting.observation, NoFixReason), sighting.observation.reason
-    assert sighting.observation.paired.all()
+    measurement = measured(images, place)
+    assert not isinstance(measurement.observation, NoFixReason), measurement.observation.reason
+    assert measurement.observation.paired.all()
     truth = np.stack([project_disc_centers(RIG, place, LAYOUT.centers_m, LAYOUT.radius_m, eye) for eye in EYES])
     # Of black and white pixels 0.05 px at 10 m; the dim side towards the sky adds as much.
-    assert np.sqrt(np.mean((sighting.observation.pixels_px - truth) ** 2)) < 0.15
-    fine = NAVIGATOR.refine(images, sighting).observation
+    assert np.sqrt(np.mean((measurement.observation.pixels_px - truth) ** 2)) < 0.15
+    fine = NAVIGATOR.refine(images, measurement).observation
     assert fine.seen.all()
     error, cov = (fine.pixels_px - truth).reshape(-1, 2), fine.cov_px2.reshape(-1, 2, 2)
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 2
@@ -100,7 +100,7 @@ def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(make_pose, sensor,
     assert np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).sum() < 24
     # Of such noise 0.02 px; with sky among its pixels it was off by 0.09 px at 10 m.
     assert np.abs(error).max() < 0.06
-    (estimate,) = NAVIGATOR.answer(0, images, sighting, ["joint-hub"])
+    (estimate,) = NAVIGATOR.estimate_measured(0, images, measurement, ["joint-hub"])
     assert isinstance(estimate, PoseEstimate)
     # The depth of such centroids, 0.3 mm/px and 0.03 px at 10 m with the square of the distance; five deviations.
     error_m = np.linalg.norm(estimate.left_from_drogue.translation_m - place.translation_m)

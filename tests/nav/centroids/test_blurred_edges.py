@@ -43,5 +43,5 @@ def test_pixels_that_see_no_edge_get_no_picture_whatever_the_outline_is():
     pictures, inside = np.zeros((2, 3, 50), np.float32), np.full((2, 50), np.nan, np.float32)
     inside[1] = 1.0
     ellipses = np.array([5 * [np.nan], [0.0, 0.0, np.nan, 0.1, 0.0]], np.float32)
-    blurred_edges.add_box_pictures(ellipses, x, y, np.ones_like(x), inside, ones, pictures)
+    blurred_edges.add_box_responses(ellipses, x, y, np.ones_like(x), inside, ones, pictures)
     assert not pictures.any()

@@ -14,7 +14,7 @@ from nav.centroids.blurred_edges import START_WIDTH_PX, ellipse_parameters
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.discs import disc_model
 from nav.centroids.ellipses import circles
-from nav.centroids.face_background import Surroundings, shares_beyond
+from nav.centroids.face_background import FaceBackground, background_shares
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.outline_pixels import disc_pixels
 from studies.acceptance.rendered.centroid_bounds import center_bound_px
@@ -184,7 +184,7 @@ def draw_face(rng, sky_e, radius_px=2.8, margin_px=0.55, noisy=True):
         signals.append(MarkerSignal(values, values >= 1e4, (0.0, 0.0), 1, True))
         centers.append(middle + ring_px * places)
     truth = circles(np.repeat([0, 1], count), np.concatenate(centers), np.full(2 * count, radius_px))
-    around = Surroundings(np.tile(places, (2, 1)), (edges[0] / ring_px, edges[1] / ring_px))
+    around = FaceBackground(np.tile(places, (2, 1)), (edges[0] / ring_px, edges[1] / ring_px))
     return signals, truth, around, np.tile(places, (2, 1))
 
 
@@ -211,7 +211,7 @@ def test_shares_beyond_the_face_follow_the_markers():
     rng = np.random.default_rng(14)
     signals, truth, around, _ = draw_face(rng, 0.0, noisy=False)
     pixels = disc_pixels(signals, truth)
-    shares = shares_beyond(around, truth, pixels, START_WIDTH_PX, None)
+    shares = background_shares(around, truth, pixels, START_WIDTH_PX, None)
     assert shares is not None
     places = np.stack([pixels.x_px, pixels.y_px], axis=-1) + pixels.origins_px[:, None]
     for eye in range(2):
@@ -223,7 +223,7 @@ def test_shares_beyond_the_face_follow_the_markers():
         for share, edge, sign in zip(np.moveaxis(shares[mine], 1, 0), around.edges_m, (-1, 1), strict=True):
             np.testing.assert_array_equal((share > 0.5), sign * (out_px - edge * ring_px) > 0)
     few = truth.take(np.array([0, 1, 8, 9]))
-    assert shares_beyond(around.take(np.array([0, 1, 8, 9])), few, disc_pixels(signals, few), 0.5, None) is None
+    assert background_shares(around.take(np.array([0, 1, 8, 9])), few, disc_pixels(signals, few), 0.5, None) is None
 
 
 @pytest.mark.parametrize("color", [0, 2])
@@ -257,7 +257,7 @@ def test_drawn_drogue_is_measured_at_its_ellipse_centres(draw, make_pose, kind, 
     truth = np.concatenate([project_disc_centers(rig, place, layout.centers_m, layout.radius_m, eye) for eye in EYES])
     radius = rig.camera.fx_px * layout.radius_m / z_m
     start = circles(np.repeat([0, 1], 8), truth + rng.normal(0, 0.1, truth.shape), np.full(16, radius))
-    around = Surroundings(np.tile(layout.centers_m[:, :2], (2, 1)), (layout.face_inner_radius_m, drogue.rim_radius_m))
+    around = FaceBackground(np.tile(layout.centers_m[:, :2], (2, 1)), (layout.face_inner_radius_m, drogue.rim_radius_m))
     fits = fit_discs(marker_signals(images, 0, start), start, around if z_m > 5 else None)
     assert fits.accepted.all()
     # The drawing has no lens: at 5 px across its edges within one pixel do not look like the blurred ones of the model.

@@ -10,7 +10,7 @@ import pytest
 from nav.centroids.blurred_edges import DISC_LEVEL
 from nav.centroids.centroid_uncertainty import SECTORS, NoiseModel, residual_spread
 from nav.centroids.disc_fit import fit_discs
-from nav.centroids.discs import contrasts, disc_model, disc_start, rejection_reasons
+from nav.centroids.discs import contrasts, disc_model, initial_disc_parameters, rejection_reasons
 from nav.centroids.outline_pixels import disc_pixels
 from nav.numerics.levenberg_marquardt import evaluate
 from studies.acceptance.rendered.centroid_bounds import center_bound_px
@@ -51,7 +51,10 @@ def test_an_outline_turned_inside_out_is_no_disc():
     signals, truth = draw_discs(10.0, DAY, rng)
     pixels = disc_pixels(signals, truth)
     fit = evaluate(
-        disc_model(pixels, False, False), pixels.values, pixels.present, disc_start(pixels, truth.shapes_px, 0)
+        disc_model(pixels, False, False),
+        pixels.values,
+        pixels.present,
+        initial_disc_parameters(pixels, truth.shapes_px, 0),
     )
     inside, noise = fit.jacobian[:, DISC_LEVEL], NoiseModel(50.0, 0.02, 0.0)
     cov = np.tile(1e-4 * np.eye(2), (len(truth), 1, 1))

@@ -7,10 +7,10 @@ import pytest
 
 from nav.centroids import disc_fit
 from nav.centroids.disc_fit import fit_discs
-from nav.centroids.discs import disc_model, disc_start
+from nav.centroids.discs import disc_model, initial_disc_parameters
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
-from nav.centroids.motion_blur import moving
+from nav.centroids.motion_blur import motion_blurred
 from nav.centroids.outline_pixels import disc_pixels
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, rough_start
 
@@ -92,8 +92,8 @@ def test_derivatives_are_those_of_the_moving_picture():
     rng = np.random.default_rng(9)
     signals, truth = draw_moving(12.0, DAY, rng, (4.0, 2.0))
     pixels = disc_pixels(signals, truth, blur_px=2.5)
-    model = moving(disc_model(pixels, False, True), np.tile([4.0, 2.0, 0.01], (len(truth), 1)), (0,))
-    parameters = disc_start(pixels, truth.shapes_px, 2)
+    model = motion_blurred(disc_model(pixels, False, True), np.tile([4.0, 2.0, 0.01], (len(truth), 1)), (0,))
+    parameters = initial_disc_parameters(pixels, truth.shapes_px, 2)
     parameters[:, -2:] = rng.normal(0, 1, (len(truth), 2))
     _, jacobian = model(parameters)
     for place in range(parameters.shape[1]):

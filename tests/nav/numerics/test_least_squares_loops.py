@@ -22,7 +22,7 @@ def test_sums_of_least_squares_are_those_of_numpy():
     np.testing.assert_allclose(normal, np.einsum("npk,nk,nqk->npq", exact, weights, exact), **close)
     np.testing.assert_allclose(gradient, np.einsum("npk,nk,nk->np", exact, weights, residuals), **close)
     coupled, others = np.empty((5, 7, 2)), float32(rng, 5, 2, 300)
-    least_squares_loops.couplings(jacobian, others, weights, coupled)
+    least_squares_loops.weighted_products(jacobian, others, weights, coupled)
     np.testing.assert_allclose(coupled, np.einsum("npk,nk,nqk->npq", exact, weights, others), **close)
     np.testing.assert_allclose(
         least_squares_loops.weighted_squares(residuals, weights),

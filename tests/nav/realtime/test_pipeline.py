@@ -12,8 +12,8 @@ from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from nav.detector.color_blob import ColorBlobDetector
 from nav.realtime.pipeline import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
-from nav.runner import LATE, open_navigator, with_smoothed
-from nav.sequence_navigator import LatePair, SequenceNavigator, SequenceSettings
+from nav.runner import LATE, add_smoothed, open_navigator
+from nav.sequence_navigator import SequenceNavigator, SequenceSettings, SkippedPair
 
 RATE_HZ = 25.0
 PATIENCE_S = 60.0
@@ -94,7 +94,7 @@ def stepped(pairs, settings, read_s=None):
     navigator = open_navigator(settings, "color-blob")
     for each in replay(DatasetInMemory(pairs, clock, read_s), navigator, RATE_HZ, clock):
         answers.append(each)
-        if not isinstance(each, LatePair):
+        if not isinstance(each, SkippedPair):
             clock.answered()
     return answers
 
@@ -103,7 +103,7 @@ def stepped(pairs, settings, read_s=None):
 def test_threads_change_no_estimate_of_pairs_that_are_worked_on_in_order(pairs, tracker):
     settings = SequenceSettings(("joint-hub", "paper"), tracker=tracker, filtered=True)
     navigator = open_navigator(settings, "color-blob")
-    alone = [navigator.answer(pair) for pair in pairs]
+    alone = [navigator.process(pair) for pair in pairs]
     staged = stepped(pairs, settings)
     assert [answers.frame_index for answers in staged] == list(range(len(pairs)))
     for one, other in zip(alone, staged, strict=True):
@@ -119,7 +119,7 @@ def test_of_pairs_that_came_while_one_was_read_the_newest_is_worked_on(pairs):
     # Pair 1 is read when pair 3 has come, which could not be read before pair 4 comes; pair 5 when the last one has.
     answers = stepped(pairs, SequenceSettings(("constant",)), {1: 3.2 / RATE_HZ, 5: 10 / RATE_HZ})
     assert [each.frame_index for each in answers] == list(range(7))
-    assert [each.frame_index for each in answers if isinstance(each, LatePair)] == [2, 3]
+    assert [each.frame_index for each in answers if isinstance(each, SkippedPair)] == [2, 3]
 
 
 def test_latency_counts_from_the_moment_at_which_a_pair_came(pairs):
@@ -135,7 +135,7 @@ def test_latency_counts_from_the_moment_at_which_a_pair_came(pairs):
 
 def test_smoothed_estimates_have_no_latency_for_they_come_when_the_sequence_is_over(pairs):
     settings = SequenceSettings(("joint", "constant"), smoothed=True)
-    estimates = list(with_smoothed(stepped(pairs[:3], settings), settings))
+    estimates = list(add_smoothed(stepped(pairs[:3], settings), settings))
     assert sum(isinstance(e, PoseEstimate) for e in estimates if e.method == "joint+smoother") == 3
     for estimate in estimates:
         assert (estimate.latency_s is None) == estimate.method.endswith("+smoother")
@@ -165,12 +165,12 @@ def test_a_pair_that_waits_while_a_newer_one_comes_is_late(pairs):
     settings = SequenceSettings(("constant",), filtered=True, smoothed=True)
     navigator = SequenceNavigator(settings, lambda drogue: HeldDetector(drogue, came))
     answers = list(replay(Source(pairs[:5]), navigator, RATE_HZ, SteppedClock(in_turn=False)))
-    late = [each.frame_index for each in answers if isinstance(each, LatePair)]
+    late = [each.frame_index for each in answers if isinstance(each, SkippedPair)]
     assert [each.frame_index for each in answers] == list(range(5))
     # Whichever the detector held: when it was done, all but the newest of the others had waited, or pair 3 was it.
     assert 4 not in late
     assert len(late) >= 2
-    estimates = list(with_smoothed(answers, settings))
+    estimates = list(add_smoothed(answers, settings))
     for name in settings.names:
         mine = [estimate for estimate in estimates if estimate.method == name]
         assert sorted(estimate.frame_index for estimate in mine) == list(range(5))
