@@ -1,1 +1,1 @@
-"""The drogue's box from pair to pair, without the detector."""
+"""Trackers, which follow the drogue's box from pair to pair without the detector."""

@@ -18,35 +18,35 @@ from geometry.se3 import Array
 from nav.detector.detector import Detection
 from nav.matching.blobs import Blobs, disc_like_blobs
 from nav.tracking.box_motion import BoxMotion
-from nav.tracking.region import Box, EyeImage, ImageRegion, box_center, box_size, grown, image_region, moved
+from nav.tracking.region import Box, EyeImage, ImageRegion, box_center, box_size, expand_box, image_region, move_box
 
-# The box is looked at with so many pixels across it, not enlarged: in colour, and in grey, where only the narrow dark
-# margin around a marker keeps it from running together with the sky.
+# The box is resampled to at most this many pixels across it, never enlarged: in colour, and in grey, where only the
+# narrow dark margin around a marker separates it from the sky.
 _GRID, _GREY_GRID = 128, 256
 _LEAST_AREA, _MOST_SPOTS = 5.0, 40
-# Spots of one drogue have one size, up to blur and tilt.
+# Largest ratio of sizes of one drogue's spots, which differ by blur and tilt.
 _SIZE_FACTOR = 1.6
 _LEAST_SPOTS = 4
-# They lie far apart in the box, unlike what noise makes of one lamp: largest distance from the middle, in box sides.
+# Distances of the spots from the box's centre, in box sides; spots that noise makes of one lamp lie closer.
 _LEAST_SPREAD, _MOST_SPREAD = 0.25, 0.55
-# The same share of a drogue's markers as the ring search asks for, see `nav.matching.ring_matching`.
-_LEAST_SHARE = 0.6
-# A spot lies where it is expected within this many of its radii, and the box's size has changed by no more.
-_NEAR_RADII = 1.0
+# Smallest share of the spots that must be found, as in the ring search of `nav.matching.ring_matching`.
+_SMALLEST_SHARE = 0.6
+# Tolerance on the position of a spot in its radii, and on the size of the box as a log-scale.
+_TOLERANCE_RADII = 1.0
 _LARGEST_LOG_SCALE = 0.15
 _SCALES = (1.0, 0.94, 1.06)
-# Below so many levels there is only quantisation noise.
+# Thresholds below this are in the quantisation noise. [DN]
 _LEAST_LEVEL = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Constellation:
-    """Spots of one drogue.
+class MarkerConstellation:
+    """Positions of a drogue's bright spots in its box.
 
     Attributes:
-        plane: in which of `_planes` they stand out.
-        places: (S, 2) from the box's middle, in box sides.
-        radius: of each, in box sides.
+        plane: index of the plane in `_color_planes` that shows them.
+        places: (S, 2) from the box's centre. [box sides]
+        radius: of each. [box sides]
     """
 
     plane: int
@@ -54,82 +54,84 @@ class Constellation:
     radius: float
 
     def find(self, image: EyeImage, box: Box, reach_px: float) -> tuple[Box, float] | None:
-        """The box that carries its spots onto those of an image.
+        """Fit the constellation to the spots of an image.
 
         Args:
-            image: of the eye that the constellation was learned in.
-            box: where it is expected.
-            reach_px: how far from there it may be. [px]
+            image: of the eye in which the constellation was learned.
+            box: the predicted box.
+            reach_px: largest distance from the prediction. [px]
 
         Returns:
-            The box and the share of spots that are there; None where these are too few.
+            The fitted box and the share of spots that were found; None where these are too few.
         """
-        region = image_region(image, grown(box, reach_px + 0.1 * box[2], reach_px + 0.1 * box[3]), _step_px(image, box))
+        region = image_region(
+            image, expand_box(box, reach_px + 0.1 * box[2], reach_px + 0.1 * box[3]), _step_px(image, box)
+        )
         if region is None:
             return None
         best: tuple[Box, float] | None = None
-        for blobs in _spots(_planes(region.pixels)[self.plane]):
-            found = self._fit(region, blobs, box)
+        for blobs in _spots(_color_planes(region.pixels)[self.plane]):
+            found = self._match(region, blobs, box)
             if found is not None and (best is None or found[1] > best[1]):
                 best = found
             if best is not None and best[1] == 1:
                 break
         return best
 
-    def _fit(self, region: ImageRegion, blobs: Blobs, box: Box) -> tuple[Box, float] | None:
+    def _match(self, region: ImageRegion, blobs: Blobs, box: Box) -> tuple[Box, float] | None:
         radius_px = self.radius * box_size(box)
         radii_px = blobs.radii_px * float(np.sqrt(region.step_px.prod()))
-        alike = (radii_px < _SIZE_FACTOR * radius_px) & (radius_px < _SIZE_FACTOR * radii_px)
-        spots = region.image(blobs.centers_px[alike])
-        if len(spots) < max(_LEAST_SPOTS, _LEAST_SHARE * len(self.places)):
+        similar = (radii_px < _SIZE_FACTOR * radius_px) & (radius_px < _SIZE_FACTOR * radii_px)
+        spots = region.to_image(blobs.centers_px[similar])
+        if len(spots) < max(_LEAST_SPOTS, _SMALLEST_SHARE * len(self.places)):
             return None
         side = np.array(box[2:])
-        near = _NEAR_RADII * radius_px
-        shift, scale, hits = self._best_shift(spots, box, near)
+        tolerance_px = _TOLERANCE_RADII * radius_px
+        shift, scale, matches = self._best_match(spots, box, tolerance_px)
         for _ in range(2):
             expected = box_center(box) + shift + scale * self.places * side
             gaps = np.linalg.norm(expected[:, None] - spots, axis=2)
-            hit, partner = gaps.min(axis=1) < near, gaps.argmin(axis=1)
-            hits = int(hit.sum())
-            if hits < max(_LEAST_SPOTS, _LEAST_SHARE * len(self.places)):
+            matched, partner = gaps.min(axis=1) < tolerance_px, gaps.argmin(axis=1)
+            matches = int(matched.sum())
+            if matches < max(_LEAST_SPOTS, _SMALLEST_SHARE * len(self.places)):
                 return None
-            shift, scale = _similarity(self.places[hit] * side, spots[partner[hit]] - box_center(box))
+            shift, scale = _similarity(self.places[matched] * side, spots[partner[matched]] - box_center(box))
         if not abs(np.log(max(scale, 1e-6))) < 2 * _LARGEST_LOG_SCALE:
             return None
-        return moved(box, box_center(box) + shift, scale), hits / len(self.places)
+        return move_box(box, box_center(box) + shift, scale), matches / len(self.places)
 
-    def _best_shift(self, spots: Array, box: Box, near: float) -> tuple[Array, float, int]:
-        """The move that carries most places onto spots, of those that carry one place onto one spot."""
+    def _best_match(self, spots: Array, box: Box, tolerance_px: float) -> tuple[Array, float, int]:
+        """Shift, scale and number of matches of the best hypothesis; each aligns one position with one spot."""
         best: tuple[Array, float, int] = np.zeros(2), 1.0, -1
         nearest = np.inf
         for scale in _SCALES:
             places = box_center(box) + scale * self.places * np.array(box[2:])
             shifts = (spots[:, None] - places).reshape(-1, 2)
             gaps = np.linalg.norm((places + shifts[:, None])[:, :, None] - spots, axis=3).min(axis=2)
-            counts = (gaps < near).sum(axis=1)
-            error = np.minimum(gaps, near).sum(axis=1)
+            counts = (gaps < tolerance_px).sum(axis=1)
+            error = np.minimum(gaps, tolerance_px).sum(axis=1)
             index = int(np.lexsort((error, -counts))[0])
             if (int(counts[index]), -float(error[index])) > (best[2], -nearest):
                 best, nearest = (shifts[index], scale, int(counts[index])), float(error[index])
         return best
 
 
-def learn_constellation(image: EyeImage, box: Box) -> Constellation | None:
-    """What stands in a box like markers: most spots of one size that lie apart; None where there are too few."""
-    region = image_region(image, grown(box, 0.08 * box[2], 0.08 * box[3]), _step_px(image, box))
+def learn_constellation(image: EyeImage, box: Box) -> MarkerConstellation | None:
+    """The largest set of spots in a box that have one size and lie apart as markers do; None with too few spots."""
+    region = image_region(image, expand_box(box, 0.08 * box[2], 0.08 * box[3]), _step_px(image, box))
     if region is None:
         return None
-    best: Constellation | None = None
-    for plane, picture in enumerate(_planes(region.pixels)):
-        for blobs in _spots(picture):
-            places = (region.image(blobs.centers_px) - box_center(box)) / box[2:]
+    best: MarkerConstellation | None = None
+    for plane, plane_image in enumerate(_color_planes(region.pixels)):
+        for blobs in _spots(plane_image):
+            places = (region.to_image(blobs.centers_px) - box_center(box)) / box[2:]
             radii = blobs.radii_px * float(np.sqrt(region.step_px.prod())) / box_size(box)
             for radius in radii:
-                kept = (radii < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * radii)
+                members = (radii < _SIZE_FACTOR * radius) & (radius < _SIZE_FACTOR * radii)
                 spread = np.hypot(*places.T)
-                kept &= (spread > _LEAST_SPREAD) & (spread < _MOST_SPREAD)
-                if kept.sum() >= max(_LEAST_SPOTS, 1 + (0 if best is None else len(best.places))):
-                    best = Constellation(plane, places[kept], float(np.median(radii[kept])))
+                members &= (spread > _LEAST_SPREAD) & (spread < _MOST_SPREAD)
+                if members.sum() >= max(_LEAST_SPOTS, 1 + (0 if best is None else len(best.places))):
+                    best = MarkerConstellation(plane, places[members], float(np.median(radii[members])))
     return best
 
 
@@ -137,26 +139,26 @@ def _step_px(image: EyeImage, box: Box) -> float:
     return max(1.0, box_size(box) / (_GRID if image.pixels.ndim == 3 else _GREY_GRID))
 
 
-def _planes(pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    """Pictures in which markers may stand out: how much each colour leads the others, and the brightness."""
+def _color_planes(pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+    """Images in which markers may stand out: each colour minus the larger other one, and the smallest of the three."""
     if pixels.shape[2] == 1:
         return [pixels[:, :, 0]]
     red, green, blue = cv2.split(pixels)
     pairs = ((red, green, blue), (green, red, blue), (blue, red, green))
-    leads = [np.asarray(cv2.subtract(own, cv2.max(one, other)), dtype=np.uint8) for own, one, other in pairs]
-    return [*leads, np.asarray(cv2.min(cv2.min(red, green), blue), dtype=np.uint8)]
+    differences = [np.asarray(cv2.subtract(own, cv2.max(one, other)), dtype=np.uint8) for own, one, other in pairs]
+    return [*differences, np.asarray(cv2.min(cv2.min(red, green), blue), dtype=np.uint8)]
 
 
-def _spots(picture: NDArray[np.uint8]) -> Iterator[Blobs]:
-    """Disc-like regions above Otsu's threshold, and above those of its brighter and its darker class."""
-    level = _otsu(picture.ravel())
-    for part in (None, picture[picture > level], picture[picture <= level]):
+def _spots(plane_image: NDArray[np.uint8]) -> Iterator[Blobs]:
+    """Disc-like regions above Otsu's threshold, and above Otsu's thresholds of its brighter and darker class."""
+    level = _otsu(plane_image.ravel())
+    for part in (None, plane_image[plane_image > level], plane_image[plane_image <= level]):
         if part is not None and not part.size:
             continue
-        at = level if part is None else _otsu(part)
-        if at < _LEAST_LEVEL:
+        threshold = level if part is None else _otsu(part)
+        if threshold < _LEAST_LEVEL:
             continue
-        mask: NDArray[np.uint8] = (picture > at).view(np.uint8)
+        mask: NDArray[np.uint8] = (plane_image > threshold).view(np.uint8)
         blobs = disc_like_blobs(mask, _LEAST_AREA, _MOST_SPOTS)
         if len(blobs) >= _LEAST_SPOTS:
             yield blobs
@@ -167,16 +169,16 @@ def _otsu(levels: NDArray[np.uint8]) -> float:
 
 
 def _similarity(places: Array, spots: Array) -> tuple[Array, float]:
-    """Shift and scale without turn that carry (S, 2) places onto spots best."""
+    """Least-squares shift and scale, without rotation, from (S, 2) positions to spots."""
     from_middle = places - places.mean(axis=0)
     scale = float((from_middle * (spots - spots.mean(axis=0))).sum() / (from_middle**2).sum())
     shift: Array = spots.mean(axis=0) - scale * places.mean(axis=0)
     return shift, scale
 
 
-# Markers may be off by so many standard deviations of the prediction, and never by more than this. [px]
+# Largest distance from the prediction: in its standard deviations, and at most the sum of pixels and box sides.
 _REACH_SD, _MOST_REACH_PX, _MOST_REACH = 3.0, 100.0, 0.5
-# A better box that is off by more than this, in box sides, is no longer what the spots were learned in.
+# A correction by more than this, in box sides, learns the spots anew.
 _SAME_BOX = 0.02
 
 
@@ -185,16 +187,16 @@ class PosePredictEyeTracker:
 
     _box: Box
     _motion: BoxMotion
-    _spots: Constellation | None
+    _spots: MarkerConstellation | None
 
     def __init__(self, image: EyeImage, box: Box) -> None:
         self._restart(image, box)
 
-    def look(self, image: EyeImage, predicted: Box | None, sd_px: float | None) -> Detection | None:
+    def locate(self, image: EyeImage, predicted: Box | None, sd_px: float | None) -> Detection | None:
         """See `EyeTracker`."""
         if self._spots is None:
             return None
-        expected = self._motion.expect(image.time_s, predicted, sd_px)
+        expected = self._motion.predict(image.time_s, predicted, sd_px)
         most = _MOST_REACH_PX + _MOST_REACH * box_size(expected.box)
         found = self._spots.find(image, expected.box, min(_REACH_SD * float(expected.sd[:2].max()), most))
         return None if found is None else Detection(*found)
@@ -207,8 +209,8 @@ class PosePredictEyeTracker:
 
     def correct(self, image: EyeImage, box: Box) -> None:
         """See `EyeTracker`."""
-        off = np.abs(np.subtract(box, self._box)).max() / box_size(box)
-        if off > _SAME_BOX or self._spots is None:
+        change = np.abs(np.subtract(box, self._box)).max() / box_size(box)
+        if change > _SAME_BOX or self._spots is None:
             self._restart(image, box)
         else:
             self._motion.update(box, image.time_s)

@@ -1,4 +1,4 @@
-"""The piece of an image that a tracker looks at, brought to a size that does not grow with the drogue."""
+"""Boxes, and the region of an image around one, resampled to a size that does not grow with the drogue."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from geometry.stereo import Eye
 Box = tuple[float, float, float, float]
 """x, y of the low corner, width, height in pixel-centre coordinates. [px]"""
 
-# Where a pixel of the piece stands for many of the image, so many along each axis are averaged; more cost time only.
+# A pixel of a shrunk region is the mean of at most this many image pixels along each axis; more only cost time.
 _AVERAGED = 3
-# 12 bits to 8 by a square root, under which shot noise is even and a dark scene keeps its steps.
+# 12 bits to 8 by a square root, which makes shot noise uniform and keeps the levels of dark scenes.
 _TO_8_BIT: NDArray[np.uint8] = np.round(np.sqrt(np.arange(4096) / 4095) * 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
 class EyeImage:
-    """What one eye saw.
+    """Image of one eye.
 
     Attributes:
         pixels: (H, W, 3) or (H, W), as in `StereoImages`.
@@ -35,13 +35,13 @@ class EyeImage:
 
 
 def eye_image(images: StereoImages, eye: Eye) -> EyeImage:
-    """One eye's part of a pair."""
+    """One eye's image of a pair."""
     return EyeImage(images.left if eye == "left" else images.right, images.time_s)
 
 
 @dataclass(frozen=True, eq=False)
 class ImageRegion:
-    """A piece of an image on a grid of its own.
+    """A region of an image, resampled to its own grid.
 
     Attributes:
         pixels: (h, w, C) of 8 bit; C is 3, or 1 of a mono image.
@@ -58,14 +58,14 @@ class ImageRegion:
         """Columns and rows."""
         return int(self.pixels.shape[1]), int(self.pixels.shape[0])
 
-    def grid(self, points_px: Array) -> Array:
-        """(..., 2) columns and rows of (..., 2) places in the image."""
-        places: Array = (points_px - self.origin_px) / self.step_px
-        return places
+    def to_grid(self, points_px: Array) -> Array:
+        """(..., 2) columns and rows in the region of (..., 2) image points."""
+        grid_points: Array = (points_px - self.origin_px) / self.step_px
+        return grid_points
 
-    def image(self, places: Array) -> Array:
-        """(..., 2) places in the image of (..., 2) columns and rows. [px]"""
-        points: Array = self.origin_px + places * self.step_px
+    def to_image(self, grid_points: Array) -> Array:
+        """(..., 2) image points of (..., 2) columns and rows in the region. [px]"""
+        points: Array = self.origin_px + grid_points * self.step_px
         return points
 
     def grey(self) -> NDArray[np.uint8]:
@@ -80,8 +80,8 @@ def image_region(image: EyeImage, window: Box, step_px: float) -> ImageRegion | 
 
     Args:
         image: of one eye.
-        window: what to look at.
-        step_px: image pixels that one pixel of the region stands for; below 1 the image is enlarged. [px]
+        window: the region's outline.
+        step_px: image pixels per pixel of the region; below 1 the image is enlarged. [px]
     """
     height, width = image.pixels.shape[:2]
     left, top = max(0, int(np.floor(window[0] + 0.5))), max(0, int(np.floor(window[1] + 0.5)))
@@ -91,38 +91,40 @@ def image_region(image: EyeImage, window: Box, step_px: float) -> ImageRegion | 
         return None
     stride = max(1, int(step_px / _AVERAGED))
     part = np.ascontiguousarray(image.pixels[top:bottom:stride, left:right:stride])
-    taken = np.array([part.shape[1], part.shape[0]])
-    size = np.maximum(1, np.round(taken * stride / step_px)).astype(int)
-    shrink = taken / size
+    part_size = np.array([part.shape[1], part.shape[0]])
+    size = np.maximum(1, np.round(part_size * stride / step_px)).astype(int)
+    shrink_factor = part_size / size
     flags = cv2.INTER_AREA if step_px > 1 else cv2.INTER_LINEAR
     pixels = np.asarray(cv2.resize(part, (int(size[0]), int(size[1])), interpolation=flags))
     if pixels.dtype == np.uint16:
         pixels = _TO_8_BIT[np.minimum(pixels, len(_TO_8_BIT) - 1)]
-    origin = np.array([left, top]) + (0.5 * shrink - 0.5) * stride
-    return ImageRegion(pixels.reshape(size[1], size[0], -1).astype(np.uint8, copy=False), origin, shrink * stride)
+    origin = np.array([left, top]) + (0.5 * shrink_factor - 0.5) * stride
+    return ImageRegion(
+        pixels.reshape(size[1], size[0], -1).astype(np.uint8, copy=False), origin, shrink_factor * stride
+    )
 
 
 def box_center(box: Box) -> Array:
-    """(2,) its middle. [px]"""
+    """(2,) centre of a box. [px]"""
     return np.array([box[0] + box[2] / 2, box[1] + box[3] / 2])
 
 
-def box_around(center_px: Array, width_px: float, height_px: float) -> Box:
-    """The box of a middle and a size."""
+def box_from_center(center_px: Array, width_px: float, height_px: float) -> Box:
+    """The box with a centre and a size."""
     x, y = float(center_px[0]), float(center_px[1])
     return x - width_px / 2, y - height_px / 2, width_px, height_px
 
 
 def box_size(box: Box) -> float:
-    """Side of the square of its area. [px]"""
+    """Side of the square with the area of a box. [px]"""
     return float(np.sqrt(box[2] * box[3]))
 
 
-def grown(box: Box, margin_x_px: float, margin_y_px: float) -> Box:
-    """The box with a margin on every side."""
+def expand_box(box: Box, margin_x_px: float, margin_y_px: float) -> Box:
+    """The box, enlarged by a margin on every side."""
     return box[0] - margin_x_px, box[1] - margin_y_px, box[2] + 2 * margin_x_px, box[3] + 2 * margin_y_px
 
 
-def moved(box: Box, center_px: Array, scale: float) -> Box:
-    """The box about another middle, its sides multiplied."""
-    return box_around(center_px, box[2] * scale, box[3] * scale)
+def move_box(box: Box, center_px: Array, scale: float) -> Box:
+    """The box, moved to a centre and scaled."""
+    return box_from_center(center_px, box[2] * scale, box[3] * scale)

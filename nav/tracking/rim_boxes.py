@@ -1,4 +1,4 @@
-"""Where a pose lets the drogue's rim be seen."""
+"""Image boxes around the drogue's rim in a pose."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from geometry.stereo import Eye, StereoRig
 from nav.detector.detector import Detection, StereoDetection
 
 _OUTLINE_POINTS = 32
-# Of a drogue of which the image shows less, too few markers are left.
-_LEAST_SHARE_IN_IMAGE = 0.5
-# A box smaller than this on an image is none.
-_LEAST_SIDE_PX = 3.0
+# With less of the box on the image, too few markers are left.
+_SMALLEST_VISIBLE_SHARE = 0.5
+# Smaller boxes are discarded.
+_SMALLEST_SIDE_PX = 3.0
 
 
 def rim_boxes(rig: StereoRig, rim_radius_m: float, left_from_drogue: RigidTransform) -> StereoDetection:
-    """Boxes around the rim in both images; None for an eye that sees less than half of it."""
+    """Boxes around the rim in both images; None for an eye whose image shows less than half of the box."""
     outline_m = disc_outline(left_from_drogue, np.zeros(3), rim_radius_m, _OUTLINE_POINTS)
     if not outline_m[:, 2].min() > 0:
         return StereoDetection(None, None)
@@ -33,6 +33,6 @@ def _detection(
     box = (left, top, right - left, bottom - top)
     size_px = (rig.camera.width_px, rig.camera.height_px)
     inside = intersection_area(box, (-0.5, -0.5, *size_px))
-    # Far outside a lens's view its polynomial may end in no number, of which neither holds.
-    is_seen = min(box[2:]) >= _LEAST_SIDE_PX and inside >= _LEAST_SHARE_IN_IMAGE * box[2] * box[3]
-    return Detection(box, 1.0) if is_seen else None
+    # Far outside the field of view the lens polynomial may overflow to nan, for which both comparisons are false.
+    is_visible = min(box[2:]) >= _SMALLEST_SIDE_PX and inside >= _SMALLEST_VISIBLE_SHARE * box[2] * box[3]
+    return Detection(box, 1.0) if is_visible else None

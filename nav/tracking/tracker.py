@@ -9,6 +9,16 @@ from geometry.boxes import intersection_over_union
 from nav.detector.detector import StereoDetection
 from nav.tracking.eye_tracker import StereoTracker
 
+BERNOULLI, FLOW, MIL, POSE_PREDICT = "bernoulli", "flow", "mil", "pose-predict"
+REDETECT_EVERY = 25
+"""The detector checks a tracker after this many pairs: once a second at the seed paper's 25 pairs a second."""
+# A longer time between two pairs separates two sequences. [s]
+_LONGEST_GAP_S = 1.0
+# Boxes with a smaller intersection over union show different things.
+_SAME_PLACE_IOU = 0.5
+
+PixelBox = tuple[float, float, float, float]
+
 
 class Tracker(Protocol):
     """Follows one drogue through the pairs of a sequence, in both eyes."""
@@ -16,7 +26,7 @@ class Tracker(Protocol):
     name: str
 
     def start(self, images: StereoImages, found: StereoDetection) -> None:
-        """Begin anew with the boxes of a pair.
+        """Start anew with the boxes of a pair.
 
         Args:
             images: the pair.
@@ -29,8 +39,7 @@ class Tracker(Protocol):
 
         Args:
             images: the next pair in time.
-            predicted: boxes where the motion so far lets the drogue be expected; None for an eye of which nothing is
-                known.
+            predicted: boxes where a motion estimate expects the drogue; None for an eye without a prediction.
 
         Returns:
             The boxes; None for an eye in which the drogue is lost.
@@ -38,16 +47,13 @@ class Tracker(Protocol):
         ...
 
     def correct(self, images: StereoImages, found: StereoDetection) -> None:
-        """Learn from boxes of the pair of the last `follow` that are better than its answer, such as a pose's.
+        """Learn from boxes of the last `follow`'s pair that are better than its answer, such as those of a pose.
 
         Args:
             images: that pair.
-            found: better boxes; None for an eye of which nothing better is known.
+            found: better boxes; None for an eye without one.
         """
         ...
-
-
-BERNOULLI, FLOW, MIL, POSE_PREDICT = "bernoulli", "flow", "mil", "pose-predict"
 
 
 def tracker_names() -> tuple[str, ...]:
@@ -80,18 +86,8 @@ def open_tracker(name: str) -> Tracker:
     raise ValueError(f"tracker: must be one of {', '.join(tracker_names())}, got {name!r}")
 
 
-PixelBox = tuple[float, float, float, float]
-
-# A longer time between two pairs parts two sequences. [s]
-_LONGEST_GAP_S = 1.0
-REDETECT_EVERY = 25
-"""The detector checks a tracker after so many pairs without it: a second at the seed paper's 25 pairs a second."""
-# Boxes that overlap by less show different things.
-_SAME_PLACE = 0.5
-
-
 def begins_sequence(last_s: float | None, now_s: float) -> bool:
-    """Whether a pair is the first of a sequence: its time stamp does not follow the last one's, or only after a gap.
+    """Whether a pair is the first of a sequence: its time is not after the last pair's, or a gap separates them.
 
     Args:
         last_s: time of the pair before; None where there is none. [s]
@@ -101,5 +97,5 @@ def begins_sequence(last_s: float | None, now_s: float) -> bool:
 
 
 def is_same_place(one: PixelBox, other: PixelBox) -> bool:
-    """Whether two boxes of one image show the same thing."""
-    return bool(intersection_over_union(one, other) >= _SAME_PLACE)
+    """Whether two boxes of one image overlap enough to show the same thing."""
+    return bool(intersection_over_union(one, other) >= _SAME_PLACE_IOU)

@@ -19,7 +19,7 @@ def test_constant_velocity_is_expected_exactly_in_the_end() -> None:
     motion = BoxMotion(box_at(100, 200, 40), 0.0)
     for index in range(1, 60):
         motion.update(box_at(100 + 12 * index, 200 - 7 * index, 40 * 1.02**index), index * PERIOD_S)
-    expected = motion.expect(60 * PERIOD_S).box
+    expected = motion.predict(60 * PERIOD_S).box
     # What is left of the first guess after 59 boxes is far below a thousandth of a pixel.
     np.testing.assert_allclose(expected, box_at(100 + 12 * 60, 200 - 7 * 60, 40 * 1.02**60), atol=1e-3)
 
@@ -35,7 +35,7 @@ def test_errors_of_prediction_are_as_large_as_it_says() -> None:
             dt = PERIOD_S / steps
             state += np.array([state[1] * dt, np.sqrt(acceleration * dt) * rng.standard_normal()])
         measured = state[0] + noise_px * np.sqrt(2) * rng.standard_normal()
-        expected = motion.expect(index * PERIOD_S)
+        expected = motion.predict(index * PERIOD_S)
         ratios.append((measured - box_center(expected.box)[0]) / expected.sd[0])
         motion.update(box_at(measured, 0, 160), index * PERIOD_S)
     # Noise is a hundredth of 160 * sqrt(1/2) px and 0.3 px; the variance of 1500 squares of unit variance scatters by
@@ -45,9 +45,9 @@ def test_errors_of_prediction_are_as_large_as_it_says() -> None:
 
 def test_what_is_not_seen_becomes_uncertain_and_keeps_its_shape() -> None:
     motion = BoxMotion(box_at(100, 200, 40), 1.0)
-    sds = np.array([motion.expect(1.0 + gap).sd for gap in (0.0, 0.04, 0.2, 1.0)])
+    sds = np.array([motion.predict(1.0 + gap).sd for gap in (0.0, 0.04, 0.2, 1.0)])
     assert (np.diff(sds, axis=0) > 0).all()
-    later = motion.expect(2.0).box
+    later = motion.predict(2.0).box
     assert later[2] / later[3] == pytest.approx(2.0)
     assert box_size(later) == pytest.approx(40 / np.sqrt(2))
-    np.testing.assert_array_equal(motion.expect(0.0).box, motion.expect(1.0).box)
+    np.testing.assert_array_equal(motion.predict(0.0).box, motion.predict(1.0).box)

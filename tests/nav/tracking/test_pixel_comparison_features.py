@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.se3 import Array
-from nav.tracking.pixel_comparison_features import PairTests
+from nav.tracking.pixel_comparison_features import PixelComparisonFeatures
 from nav.tracking.region import EyeImage, ImageRegion, box_center, image_region
 from tests.support.painted_sequences import Look, Place, film
 
@@ -22,8 +22,8 @@ def whole(place: Place, look: Look) -> ImageRegion:
     return region
 
 
-def learned_at(place: Place, look: Look) -> PairTests:
-    return PairTests(whole(place, look), place.box("left"), 256, np.random.default_rng(1))
+def learned_at(place: Place, look: Look) -> PixelComparisonFeatures:
+    return PixelComparisonFeatures(whole(place, look), place.box("left"), 256, np.random.default_rng(1))
 
 
 def at(*offsets_px: tuple[float, float]) -> Array:

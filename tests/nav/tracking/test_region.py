@@ -25,8 +25,8 @@ def test_a_spot_stays_where_it_is(step_px: float) -> None:
     rows, columns = np.mgrid[: region.size[1], : region.size[0]]
     middle = np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
     # Rounding to 8 bits, and the spot's tails beyond the window.
-    np.testing.assert_allclose(region.image(middle), (217.3, 140.8), atol=0.06)
-    np.testing.assert_allclose(region.grid(region.image(middle)), middle, atol=1e-9)
+    np.testing.assert_allclose(region.to_image(middle), (217.3, 140.8), atol=0.06)
+    np.testing.assert_allclose(region.to_grid(region.to_image(middle)), middle, atol=1e-9)
 
 
 def test_twelve_bits_become_eight_by_a_square_root() -> None:
