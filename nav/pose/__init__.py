@@ -1,1 +1,1 @@
-"""From matched features to a pose: one interface, many methods."""
+"""Pose methods: from matched features to a pose, behind one interface."""

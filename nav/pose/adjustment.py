@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geometry.se3 import Array
-from nav.pose.adjustment_loops import Shared, adjust_frames, linearise_frames, predict_centers
+from nav.pose.adjustment_loops import SharedInputs, adjust_frames, linearise_frames, predict_centers
 from nav.pose.features import Features
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class AdjustmentState:
     """Poses that are being adjusted, one for each frame of some features.
 
     Attributes:
@@ -27,9 +27,9 @@ class State:
     departures: Array
 
     @staticmethod
-    def nominal(features: Features, rotations: Array, translations_m: Array) -> State:
+    def nominal(features: Features, rotations: Array, translations_m: Array) -> AdjustmentState:
         """Poses of a drogue and rig exactly as built."""
-        return State(rotations, translations_m, np.zeros((len(rotations), features.departures)))
+        return AdjustmentState(rotations, translations_m, np.zeros((len(rotations), features.departures)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Loss:
     tilt_prior_rad: float = np.inf
 
 
-SQUARES = Loss()
+SQUARED_LOSS = Loss()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Linearised:
         return information
 
 
-def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Linearised:
+def linearise(features: Features, state: AdjustmentState, loss: Loss = SQUARED_LOSS) -> Linearised:
     """Residuals of every frame's features in its pose.
 
     The shift of a disc's ellipse centre is in the residuals and not in the derivatives, where it hardly matters.
@@ -83,52 +83,52 @@ def linearise(features: Features, state: State, loss: Loss = SQUARES) -> Lineari
     count, free = len(state.rotations), features.departures
     rows = 2 * features.measured.shape[2] * features.measured.shape[3] + 2 * np.isfinite(loss.tilt_prior_rad) + free
     result = Linearised(np.empty((count, 6 + free, rows)), np.empty((count, rows)), np.empty(count))
-    places = (_plain(array) for array in (state.rotations, state.translations_m, state.departures))
-    linearise_frames(shared_of(features, loss), *arrays_of(features), *places, *vars(result).values())
+    places = (_contiguous(array) for array in (state.rotations, state.translations_m, state.departures))
+    linearise_frames(shared_inputs(features, loss), *frame_inputs(features), *places, *vars(result).values())
     return result
 
 
-def predicted_px(features: Features, rotations: Array, translations_m: Array) -> Array:
+def project_features(features: Features, rotations: Array, translations_m: Array) -> Array:
     """(S, E, F, 2) ellipse centres that poses of the nominal drogue would show. [px]"""
     pixels = np.empty((len(rotations), len(features.eye_x_m), len(features.points_m), 2))
-    predict_centers(shared_of(features, SQUARES), _plain(rotations), _plain(translations_m), pixels)
+    predict_centers(shared_inputs(features, SQUARED_LOSS), _contiguous(rotations), _contiguous(translations_m), pixels)
     return pixels
 
 
-def shared_of(features: Features, loss: Loss) -> Shared:
+def shared_inputs(features: Features, loss: Loss) -> SharedInputs:
     """What the compiled loops take that all frames have in common."""
     camera = features.camera
-    return Shared(
+    return SharedInputs(
         float(camera.fx_px),
         float(camera.fy_px),
         float(camera.cx_px),
         float(camera.cy_px),
-        _plain(features.eye_x_m),
-        _plain(features.points_m),
-        _plain(features.radii_m),
-        _plain(features.shifts_m),
+        _contiguous(features.eye_x_m),
+        _contiguous(features.points_m),
+        _contiguous(features.radii_m),
+        _contiguous(features.shifts_m),
         float(features.disparity_sigma_px),
         float(loss.huber_sigmas),
         float(loss.tilt_prior_rad),
     )
 
 
-def arrays_of(features: Features) -> tuple[Array, Array]:
+def frame_inputs(features: Features) -> tuple[Array, Array]:
     """What they take of each frame: measurements (5, B, E, F), and couplings (4, B, F) or none (4, B, 0)."""
     coupling = features.coupling
     if coupling is None:
         coupling = np.empty((4, features.frames, 0))
-    return _plain(features.measured), _plain(coupling)
+    return _contiguous(features.measured), _contiguous(coupling)
 
 
-def _plain(array: Array) -> Array:
+def _contiguous(array: Array) -> Array:
     """As loops are compiled for: they would be compiled anew for another layout, or for what is not to be written."""
     plain: Array = np.require(array, requirements=["C", "W"])
     return plain
 
 
 @dataclass(frozen=True, eq=False)
-class Adjusted:
+class AdjustedPoses:
     """Poses that each start led to.
 
     Attributes:
@@ -146,7 +146,7 @@ class Adjusted:
     information: Array
 
 
-def adjust(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARES) -> Adjusted:
+def adjust(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARED_LOSS) -> AdjustedPoses:
     """Minimise the whitened reprojection error over all measurements.
 
     A step that raises the cost is shortened, so a start never ends worse than it began.
@@ -158,7 +158,7 @@ def adjust(features: Features, rotations: Array, translations_m: Array, loss: Lo
         loss: how residuals count.
     """
     count, size = len(rotations), 6 + features.departures
-    result = Adjusted(
+    result = AdjustedPoses(
         np.array(rotations, np.float64, order="C"),
         np.array(translations_m, np.float64, order="C"),
         np.zeros((count, features.departures)),
@@ -166,13 +166,13 @@ def adjust(features: Features, rotations: Array, translations_m: Array, loss: Lo
         np.empty((count, size, size)),
     )
     places = (result.rotations, result.translations_m, result.departures)
-    adjust_frames(shared_of(features, loss), *arrays_of(features), *places, result.costs, result.information)
+    adjust_frames(shared_inputs(features, loss), *frame_inputs(features), *places, result.costs, result.information)
     return result
 
 
 def information_at(features: Features, rotations: Array, translations_m: Array) -> Array:
     """(S, K, K) information that the features of S frames hold in given poses; see `Adjusted`."""
-    return linearise(features, State.nominal(features, rotations, translations_m)).information
+    return linearise(features, AdjustmentState.nominal(features, rotations, translations_m)).information
 
 
 def inverse_information(information: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -11,7 +11,7 @@ from nav.numerics.compiled import compiled
 from nav.numerics.least_squares_loops import solve_damped
 
 
-class Shared(NamedTuple):
+class SharedInputs(NamedTuple):
     """What all frames of some features have in common, and how residuals count; see `Features` and `Loss`."""
 
     fx_px: float
@@ -29,7 +29,7 @@ class Shared(NamedTuple):
 
 @compiled
 def _place(
-    shared: Shared, feature: int, rotation: Array, translation_m: Array, departures: Array
+    shared: SharedInputs, feature: int, rotation: Array, translation_m: Array, departures: Array
 ) -> tuple[float, float, float, float, float, float, float]:
     """A feature's arm from the drogue's origin, its depth, and the point whose image is its ellipse's centre. [m]
 
@@ -53,7 +53,7 @@ def _place(
 
 
 @compiled
-def predict_centers(shared: Shared, rotations: Array, translations_m: Array, pixels_px: Array) -> None:
+def predict_centers(shared: SharedInputs, rotations: Array, translations_m: Array, pixels_px: Array) -> None:
     """Fill (S, E, F, 2) ellipse centres that poses of the nominal drogue would show."""
     nominal = np.zeros(len(shared.shifts_m))
     for s in range(len(rotations)):
@@ -66,7 +66,7 @@ def predict_centers(shared: Shared, rotations: Array, translations_m: Array, pix
 
 @compiled
 def _fill_feature(
-    shared: Shared,
+    shared: SharedInputs,
     measured: tuple[float, float, float, float, float],
     eye: int,
     place: tuple[float, float, float, float, float, float, float],
@@ -132,7 +132,7 @@ def _weigh(columns: tuple[int, int], threshold: float, jacobian: Array, residual
 
 @compiled
 def _add_priors(
-    shared: Shared, rotation: Array, departures: Array, column: int, jacobian: Array, residuals: Array
+    shared: SharedInputs, rotation: Array, departures: Array, column: int, jacobian: Array, residuals: Array
 ) -> float:
     """Residuals of the tilt, where it has a prior, and of the departures; half the sum of their squares."""
     at = column
@@ -157,7 +157,7 @@ def _add_priors(
 
 @compiled
 def linearise_frame(
-    shared: Shared,
+    shared: SharedInputs,
     measured: Array,
     coupling: Array,
     rotation: Array,
@@ -202,7 +202,7 @@ def linearise_frame(
 
 @compiled
 def linearise_frames(
-    shared: Shared,
+    shared: SharedInputs,
     measured: Array,
     coupling: Array,
     rotations: Array,
@@ -302,7 +302,7 @@ def _turn(rotation: Array, x: float, y: float, z: float, turned: Array) -> None:
 
 @compiled
 def adjust_frames(
-    shared: Shared,
+    shared: SharedInputs,
     measured: Array,
     coupling: Array,
     rotations: Array,

@@ -31,12 +31,12 @@ def whiten(pixels_px: Array, cov_px2: Array) -> Array:
     cov = np.broadcast_to(cov_px2, (*pixels_px.shape, 2))
     # Not measured is nan; comparisons with nan are false, so the roots below are taken of sound numbers only.
     seen = np.isfinite(pixels_px).all(axis=-1) & (cov[..., 0, 0] > 0)
-    a, b, c = _factors(cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1], seen)
+    a, b, c = _whitening_factors(cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1], seen)
     measured: Array = np.where(c > 0, np.stack([pixels_px[..., 0], pixels_px[..., 1], a, b, c]), 0.0)
     return measured
 
 
-def whiten_displaced(
+def whiten_with_displacement(
     camera: PinholeCamera, measured: Array, depths_m: Array, displacement_m: Array
 ) -> tuple[Array, Array]:
     """The same where each feature may also stand apart from its place, by one displacement that both eyes see.
@@ -57,17 +57,17 @@ def whiten_displaced(
     slopes = np.stack([(u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px])
     scale = displacement_m / depths_m[:, None]
     out, coupling = measured.copy(), np.zeros((4, *scale.shape))
-    first = _add(measured[2:, :, 0], _shared(camera, scale, slopes[:, :, 0], slopes[:, :, 0]))
+    first = _add_covariance(measured[2:, :, 0], _shared_covariance(camera, scale, slopes[:, :, 0], slopes[:, :, 0]))
     out[2:, :, 0] = first
     if u.shape[1] == 1:
         return out, coupling
     # M = K L^T with K the covariance of the second eye with the first and L the first's whitening matrix.
-    (uu, uv), (vu, vv) = _shared(camera, scale, slopes[:, :, 1], slopes[:, :, 0])
+    (uu, uv), (vu, vv) = _shared_covariance(camera, scale, slopes[:, :, 1], slopes[:, :, 0])
     l_a, l_b, l_c = first
     m = [[uu * l_a, uu * l_b + uv * l_c], [vu * l_a, vu * l_b + vv * l_c]]
-    own = _shared(camera, scale, slopes[:, :, 1], slopes[:, :, 1])
+    own = _shared_covariance(camera, scale, slopes[:, :, 1], slopes[:, :, 1])
     rest = [[own[i][j] - m[i][0] * m[j][0] - m[i][1] * m[j][1] for j in range(2)] for i in range(2)]
-    second = _add(measured[2:, :, 1], rest)
+    second = _add_covariance(measured[2:, :, 1], rest)
     out[2:, :, 1] = second
     r_a, r_b, r_c = second
     coupling[0], coupling[1] = -r_a * m[0][0], -r_a * m[0][1]
@@ -75,7 +75,7 @@ def whiten_displaced(
     return out, coupling
 
 
-def _shared(camera: PinholeCamera, scale: Array, row: Array, column: Array) -> list[list[Array]]:
+def _shared_covariance(camera: PinholeCamera, scale: Array, row: Array, column: Array) -> list[list[Array]]:
     """Covariance that a displacement of both brings: 2x2 entries (B, F) of `scale^2 T T^T`. [px^2]
 
     A displacement `d` at depth z moves an image by `f / z (d_x - d_z x / z)`, and likewise in y.
@@ -87,17 +87,17 @@ def _shared(camera: PinholeCamera, scale: Array, row: Array, column: Array) -> l
     ]
 
 
-def _add(factors: Array, more: list[list[Array]]) -> Array:
+def _add_covariance(factors: Array, more: list[list[Array]]) -> Array:
     """(3, B, F) entries a, b, c of the whitening matrix of a covariance, given by its own, plus another one."""
     a, b, c = factors
     seen = c > 0
     safe_a, safe_c = np.where(seen, a, 1.0), np.where(seen, c, 1.0)
     # [[a, 0], [b, c]]^-1 = [[1 / a, 0], [-b / (a c), 1 / c]] is the covariance's lower factor.
     p, q, r = 1 / safe_a, -np.where(seen, b, 0.0) / (safe_a * safe_c), 1 / safe_c
-    return _factors(p * p + more[0][0], p * q + more[0][1], q * q + r * r + more[1][1], seen)
+    return _whitening_factors(p * p + more[0][0], p * q + more[0][1], q * q + r * r + more[1][1], seen)
 
 
-def _factors(first: Array, across: Array, second: Array, seen: NDArray[np.bool_]) -> Array:
+def _whitening_factors(first: Array, across: Array, second: Array, seen: NDArray[np.bool_]) -> Array:
     """Entries a, b, c of the whitening matrices of covariances `[[first, across], [across, second]]`, else zero."""
     first = np.where(seen, first, 1.0)
     across = np.where(seen, across, 0.0)
@@ -195,14 +195,16 @@ def stack_features(
         points,
         radii,
         is_marker,
-        _shifts(layout, points, is_marker, tolerances),
+        _departure_shifts(layout, points, is_marker, tolerances),
         tolerances.disparity_px if pixels_px.shape[1] == 2 else 0.0,
         whiten(pixels_px, cov_px2),
     )
     if tolerances.placement_m == 0:
         return features
     displacement = np.where(is_marker, tolerances.placement_m, 0.0)
-    measured, coupling = whiten_displaced(rig.camera, features.measured, _depths(features), displacement)
+    measured, coupling = whiten_with_displacement(
+        rig.camera, features.measured, _approximate_depths(features), displacement
+    )
     return replace(features, measured=measured, coupling=coupling)
 
 
@@ -223,7 +225,9 @@ def left_features(observation: Observation) -> Features:
     return stack_features(observation.rig, observation.layout, pixels, cov, observation.tolerances)
 
 
-def _shifts(layout: MarkerLayout, points_m: Array, is_marker: NDArray[np.bool_], tolerances: StatedTolerances) -> Array:
+def _departure_shifts(
+    layout: MarkerLayout, points_m: Array, is_marker: NDArray[np.bool_], tolerances: StatedTolerances
+) -> Array:
     """(G, F, 3) see `Features`. [m]"""
     if tolerances.ring_radius_m > 0 and layout.ring_radius_m is None:
         raise ValueError("ring_radius_m: the markers lie on no circle about the origin, leave its tolerance 0")
@@ -243,7 +247,7 @@ def _shifts(layout: MarkerLayout, points_m: Array, is_marker: NDArray[np.bool_],
     return np.array(shifts).reshape(-1, len(points_m), 3)
 
 
-def _depths(features: Features) -> Array:
+def _approximate_depths(features: Features) -> Array:
     """(B,) depths by the markers' spread in all images; a tilt of 10 degrees adds 0.8 %, infinite without any. [m]"""
     seen = features.seen[..., features.is_marker].astype(np.float64)
     total = np.maximum(seen.sum(axis=2, keepdims=True), 1)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from geometry.se3 import Array, RigidTransform
-from nav.pose.adjustment import Adjusted, Loss, State, adjust, linearise, predicted_px
+from nav.pose.adjustment import AdjustedPoses, AdjustmentState, Loss, adjust, linearise, project_features
 from nav.pose.features import Features, observed_features
-from nav.pose.joint_batch import JointBatch, solve_features, solve_from, two_fold_start
-from nav.pose.observation_checks import fault, hub_fault
+from nav.pose.joint_batch import JointBatch, adjust_both_tilts, solve_features, two_fold_starts
+from nav.pose.observation_checks import hub_fault, stereo_fault
 from nav.pose.pose_method import NoFixReason, Observation, PoseMode, Solution
 
 # Matched features miss their places by this share of a marker's own radius only when they are not the drogue's.
@@ -25,7 +25,7 @@ def joint(observation: Observation) -> Solution | NoFixReason:
 
     See `nav.pose.joint_batch` for what is reported where the markers do not tell which way the drogue is tilted.
     """
-    return fault(observation) or solve_one(observed_features(observation, with_hub=False), observation.seen)
+    return stereo_fault(observation) or solve_one(observed_features(observation, with_hub=False), observation.seen)
 
 
 def joint_hub(observation: Observation) -> Solution | NoFixReason:
@@ -34,7 +34,7 @@ def joint_hub(observation: Observation) -> Solution | NoFixReason:
     The hub lies behind the rim plane, so it tells the sign of the tilt. Without it the answer is that of `joint`, with
     that method's wide covariance, and a note.
     """
-    reason = fault(observation) or hub_fault(observation)
+    reason = stereo_fault(observation) or hub_fault(observation)
     if reason is not None:
         return reason
     note = hub_note(observation)
@@ -56,7 +56,7 @@ def solve_one(
     batch = solve_features(features)
     if not batch.sound[0]:
         return NoFixReason("the adjustment found no pose in front of the cameras")
-    reason = misfit(features, batch.mode_rotations[0, 0], batch.mode_translations_m[0, 0])
+    reason = misfit_reason(features, batch.mode_rotations[0, 0], batch.mode_translations_m[0, 0])
     if reason is not None:
         return reason
     pose = RigidTransform(batch.rotations[0], batch.translations_m[0])
@@ -74,9 +74,9 @@ def _modes(batch: JointBatch) -> tuple[PoseMode, ...]:
     )
 
 
-def misfit(features: Features, rotation: Array, translation_m: Array) -> NoFixReason | None:
+def misfit_reason(features: Features, rotation: Array, translation_m: Array) -> NoFixReason | None:
     """Why one frame's features cannot be the drogue's in a pose, or None when they can."""
-    predicted = predicted_px(features, rotation[None], translation_m[None])
+    predicted = project_features(features, rotation[None], translation_m[None])
     squares = ((predicted - features.measured[:2].transpose(1, 2, 3, 0)) ** 2).sum(axis=-1)[features.seen]
     radius_px = features.camera.fx_px * features.radii_m[0] / translation_m[2]
     miss_px = float(np.sqrt(squares.mean()))
@@ -102,16 +102,16 @@ def joint_robust(observation: Observation) -> Solution | NoFixReason:
     The set whose pose explains the features best, each counted up to a limit, tells which are wrong; the answer is that
     of `joint-hub` (or `joint`, where no hub was measured) without them. An edge of the hub counts as a feature.
     """
-    reason = fault(observation) or hub_fault(observation)
+    reason = stereo_fault(observation) or hub_fault(observation)
     if reason is not None:
         return reason
     features = observed_features(observation, with_hub=True)
     good = _inliers(features)
     count = observation.layout.count
-    markers = int((good & _measured(features))[:count].sum())
+    markers = int((good & _measured_features(features))[:count].sum())
     if not good.all() and markers < _LEAST_INLIERS:
         return NoFixReason(f"only {markers} markers agree with each other, {_LEAST_INLIERS} are needed")
-    used, used_hub = observation.seen & good[:count], observation.hub_seen & _hub_part(good, count)
+    used, used_hub = observation.seen & good[:count], observation.hub_seen & _hub_inliers(good, count)
     paired = used.all(axis=0)
     if paired.sum() < 3:
         return NoFixReason(f"only {int(paired.sum())} markers that both eyes see agree with each other, 3 are needed")
@@ -121,34 +121,34 @@ def joint_robust(observation: Observation) -> Solution | NoFixReason:
     return solve_one(features.without(~good), used, used_hub if used_hub.any() else None, note)
 
 
-def _hub_part(good: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
+def _hub_inliers(good: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     return good[count:] if len(good) > count else np.zeros(2, dtype=bool)
 
 
 def _inliers(features: Features) -> NDArray[np.bool_]:
     """(F,) which features agree with the pose that most of them share; unmeasured ones count as agreeing."""
-    found = solve_from(features, *two_fold_start(features), _HUBER)
+    found = adjust_both_tilts(features, *two_fold_starts(features), _HUBER)
     best = int(np.argmin(found.costs))
-    first = _chi2(features.take(np.zeros(2, dtype=np.int64)), found)[best]
+    first = _feature_chi2(features.take(np.zeros(2, dtype=np.int64)), found)[best]
     if (first < _LARGEST_CHI2).all():
         return np.ones(len(first), dtype=bool)
-    sets = features.take(np.zeros(2 * len(_left_out(features)), dtype=np.int64))
-    mask = np.repeat(_left_out(features), 2, axis=0)
+    sets = features.take(np.zeros(2 * len(_leave_out_sets(features)), dtype=np.int64))
+    mask = np.repeat(_leave_out_sets(features), 2, axis=0)
     fewer = sets.without(mask)
-    starts = two_fold_start(fewer.take(slice(0, None, 2)))
+    starts = two_fold_starts(fewer.take(slice(0, None, 2)))
     tried = adjust(fewer, starts[0].reshape(-1, 3, 3), starts[1].reshape(-1, 3))
-    chi2 = np.vstack([_chi2(sets, tried), first])
+    chi2 = np.vstack([_feature_chi2(sets, tried), first])
     scores = np.minimum(chi2, _LARGEST_CHI2).sum(axis=1)
     inliers: NDArray[np.bool_] = chi2[np.argmin(scores)] < _LARGEST_CHI2
-    if (inliers & features.is_marker & _measured(features)).sum() < _LEAST_INLIERS:
+    if (inliers & features.is_marker & _measured_features(features)).sum() < _LEAST_INLIERS:
         least = int(np.argmin(np.where(mask, 0.0, chi2[:-1]).sum(axis=1)))
         kept: NDArray[np.bool_] = ~mask[least]
-        if _explains(features, kept, chi2[least]):
+        if _is_consistent(features, kept, chi2[least]):
             return kept
     return inliers
 
 
-def _explains(features: Features, kept: NDArray[np.bool_], chi2: Array) -> bool:
+def _is_consistent(features: Features, kept: NDArray[np.bool_], chi2: Array) -> bool:
     """Whether the residuals of the kept features are together no larger than by chance.
 
     Among four markers, one in 500 is cut off by chance though all are right; their sum then tells.
@@ -157,9 +157,9 @@ def _explains(features: Features, kept: NDArray[np.bool_], chi2: Array) -> bool:
     return freedom > 0 and float(chdtrc(freedom, chi2[kept].sum())) > _LEAST_CHANCE
 
 
-def _left_out(features: Features) -> NDArray[np.bool_]:
+def _leave_out_sets(features: Features) -> NDArray[np.bool_]:
     """(L, F) every choice of one measured feature to leave out, and of two where enough remain."""
-    measured = np.flatnonzero(_measured(features))
+    measured = np.flatnonzero(_measured_features(features))
     choices: list[tuple[int, ...]] = [(int(i),) for i in measured]
     if len(measured) >= _LEAST_FOR_TWO_OUT:
         choices += combinations(measured.tolist(), 2)
@@ -169,16 +169,16 @@ def _left_out(features: Features) -> NDArray[np.bool_]:
     return mask
 
 
-def _chi2(features: Features, adjusted: Adjusted) -> Array:
+def _feature_chi2(features: Features, adjusted: AdjustedPoses) -> Array:
     """(S, F) squared residuals of every feature in both eyes, in variances; infinite where they are no numbers."""
-    state = State(adjusted.rotations, adjusted.translations_m, adjusted.departures)
+    state = AdjustmentState(adjusted.rotations, adjusted.translations_m, adjusted.departures)
     size = 2 * features.measured.shape[2] * len(features.points_m)
     residuals = linearise(features, state).residuals[:, :size]
     squares = (residuals.reshape(len(residuals), -1, len(features.points_m)) ** 2).sum(axis=1)
     return np.where(np.isfinite(squares), squares, np.inf)
 
 
-def _measured(features: Features) -> NDArray[np.bool_]:
+def _measured_features(features: Features) -> NDArray[np.bool_]:
     """(F,) which features any eye of the first frame measured."""
     seen: NDArray[np.bool_] = features.seen[0].any(axis=0)
     return seen

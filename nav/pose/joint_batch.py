@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from geometry.stereo import StereoRig
-from nav.pose.adjustment import SQUARES, Adjusted, Loss, adjust, information_at, inverse_information
+from nav.pose.adjustment import SQUARED_LOSS, AdjustedPoses, Loss, adjust, information_at, inverse_information
 from nav.pose.features import Features, stack_features
 from nav.pose.pose_method import EXACT, StatedTolerances
 
@@ -24,7 +24,7 @@ from nav.pose.pose_method import EXACT, StatedTolerances
 _RIDGE_FRACTION = 1e-12
 
 
-def two_fold_start(features: Features) -> tuple[Array, Array]:
+def two_fold_starts(features: Features) -> tuple[Array, Array]:
     """Both weak-perspective poses of the ring's markers that every eye measured.
 
     The affine map from the rim plane to the image, averaged over the eyes, is scale times the first two columns of the
@@ -53,11 +53,11 @@ def two_fold_start(features: Features) -> tuple[Array, Array]:
     third = np.sqrt(np.maximum(0.0, 1 - (flat**2).sum(axis=1)))
     third[:, 1] = -np.copysign(third[:, 1], flat[:, 0, 0] * flat[:, 0, 1] + flat[:, 1, 0] * flat[:, 1, 1])
     both[:, 0, 2], both[:, 1, 2] = third, -third
-    rotations = sight_rotations(direction)[:, None] @ _orthonormal(both)
+    rotations = line_of_sight_rotations(direction)[:, None] @ _orthonormal(both)
     return rotations, np.repeat(translation[:, None], 2, axis=1)
 
 
-def sight_rotations(directions: Array) -> Array:
+def line_of_sight_rotations(directions: Array) -> Array:
     """(B, 3, 3) smallest rotations that carry the optical axis onto (B, 3) directions with positive z."""
     sight = directions / np.sqrt((directions**2).sum(axis=1, keepdims=True))
     x, y, z = sight.T
@@ -166,13 +166,13 @@ def solve_joint_batch(
 def solve_features(features: Features) -> JointBatch:
     """As `solve_joint_batch`, from stacked features."""
     frames = np.arange(features.frames)
-    found = _Pairs.of(solve_from(features, *two_fold_start(features)))
+    found = _TiltPairs.of(adjust_both_tilts(features, *two_fold_starts(features)))
     order = np.argsort(found.costs, axis=1, kind="stable")
     found = found.ordered(order)
     best_rotation, best_translation = found.rotations[:, 0], found.translations_m[:, 0]
     covariance, sound = inverse_information(found.information[:, 0])
     sound &= np.isfinite(found.costs[:, 0]) & (best_rotation[:, 2, 2] > 0) & (best_translation[:, 2] > 0)
-    weights = _weights(found, TILT_PRIOR_RAD)
+    weights = _mode_weights(found, TILT_PRIOR_RAD)
     reliable = _tilt_sign_reliable(features, best_rotation, best_translation) | ~sound
 
     rotations, translations = best_rotation.copy(), best_translation.copy()
@@ -180,11 +180,11 @@ def solve_features(features: Features) -> JointBatch:
     if len(doubtful):
         prior = Loss(tilt_prior_rad=TILT_PRIOR_RAD)
         starts = (found.rotations[doubtful], found.translations_m[doubtful])
-        drawn = _Pairs.of(solve_from(features.take(doubtful), *starts, prior))
-        shares = _weights(drawn, np.inf)
+        drawn = _TiltPairs.of(adjust_both_tilts(features.take(doubtful), *starts, prior))
+        shares = _mode_weights(drawn, np.inf)
         order = np.argsort(-shares, axis=1, kind="stable")
         drawn, shares = drawn.ordered(order), np.take_along_axis(shares, order, axis=1)
-        mean = _mixture(drawn, shares)
+        mean = _mixture_mean(drawn, shares)
         rotations[doubtful], translations[doubtful], covariance[doubtful] = mean
         found.replace(doubtful, drawn)
         weights[doubtful] = shares
@@ -201,14 +201,16 @@ def solve_features(features: Features) -> JointBatch:
     )
 
 
-def solve_from(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARES) -> Adjusted:
+def adjust_both_tilts(
+    features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARED_LOSS
+) -> AdjustedPoses:
     """Adjust (B, 2) starts; the results lie frame by frame, two after each other."""
     twice = features.take(np.repeat(np.arange(features.frames), 2))
     return adjust(twice, rotations.reshape(-1, 3, 3), translations_m.reshape(-1, 3), loss)
 
 
 @dataclass(frozen=True, eq=False)
-class _Pairs:
+class _TiltPairs:
     """What both starts of B frames led to, (B, 2, ...)."""
 
     rotations: Array
@@ -217,25 +219,25 @@ class _Pairs:
     information: Array
 
     @staticmethod
-    def of(adjusted: Adjusted) -> _Pairs:
+    def of(adjusted: AdjustedPoses) -> _TiltPairs:
         size = adjusted.information.shape[-1]
-        return _Pairs(
+        return _TiltPairs(
             adjusted.rotations.reshape(-1, 2, 3, 3),
             adjusted.translations_m.reshape(-1, 2, 3),
             adjusted.costs.reshape(-1, 2),
             adjusted.information.reshape(-1, 2, size, size),
         )
 
-    def ordered(self, order: NDArray[np.int64]) -> _Pairs:
+    def ordered(self, order: NDArray[np.int64]) -> _TiltPairs:
         rows = np.arange(len(order))[:, None]
-        return _Pairs(*(values[rows, order] for values in vars(self).values()))
+        return _TiltPairs(*(values[rows, order] for values in vars(self).values()))
 
-    def replace(self, frames: NDArray[np.int64], other: _Pairs) -> None:
+    def replace(self, frames: NDArray[np.int64], other: _TiltPairs) -> None:
         for mine, theirs in zip(vars(self).values(), vars(other).values(), strict=True):
             mine[frames] = theirs
 
 
-def _weights(pairs: _Pairs, prior_rad: float) -> Array:
+def _mode_weights(pairs: _TiltPairs, prior_rad: float) -> Array:
     """(B, 2) shares of the posterior by Laplace's approximation, `exp(-cost) |information|^(-1/2)` times a tilt prior.
 
     A pose behind the cameras has no share, and neither has the second of two equal poses.
@@ -257,7 +259,7 @@ def _weights(pairs: _Pairs, prior_rad: float) -> Array:
 def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Array) -> NDArray[np.bool_]:
     """(B,) whether the tilt against the line of sight exceeds three deviations that it would have at zero."""
     middle = np.array([features.eye_x_m.mean(), 0.0, 0.0])
-    frontal = sight_rotations(translations_m - middle)
+    frontal = line_of_sight_rotations(translations_m - middle)
     covariance, determined = inverse_information(information_at(features, frontal, translations_m))
     variance = (covariance[:, 3, 3] + covariance[:, 4, 4]) / 2
     # 1 - cos loses small tilts to rounding; the cross product does not.
@@ -266,7 +268,7 @@ def _tilt_sign_reliable(features: Features, rotations: Array, translations_m: Ar
     return reliable
 
 
-def _mixture(pairs: _Pairs, weights: Array) -> tuple[Array, Array, Array]:
+def _mixture_mean(pairs: _TiltPairs, weights: Array) -> tuple[Array, Array, Array]:
     """Mean rotations (B, 3, 3), translations (B, 3) and covariances (B, 6, 6) of two weighted Gaussians each."""
     count, size = len(weights), pairs.information.shape[-1]
     first = pairs.rotations[:, 0]

@@ -12,7 +12,7 @@ from geometry.stereo import EYES, StereoRig
 from nav.pose.pose_method import Observation
 
 
-def eye_points(rig: StereoRig, centers_m: Array, rotations: Array, translations_m: Array) -> Array:
+def points_in_eyes(rig: StereoRig, centers_m: Array, rotations: Array, translations_m: Array) -> Array:
     """Marker centres in each eye's own frame.
 
     Args:
@@ -30,15 +30,15 @@ def eye_points(rig: StereoRig, centers_m: Array, rotations: Array, translations_
     return eyes
 
 
-def predict_px(rig: StereoRig, layout: MarkerLayout, rotations: Array, translations_m: Array) -> Array:
+def project_markers(rig: StereoRig, layout: MarkerLayout, rotations: Array, translations_m: Array) -> Array:
     """(S, 2, N, 2) centres of the markers' image ellipses in both eyes; arguments as for `eye_points`. [px]"""
-    points = eye_points(rig, layout.centers_m, rotations, translations_m)
+    points = points_in_eyes(rig, layout.centers_m, rotations, translations_m)
     normals = np.broadcast_to(rotations[:, None, None, :, 2], points.shape)
     return rig.camera.project(ellipse_center_points(points, normals, layout.radius_m))
 
 
-def triangulate_pairs(observation: Observation) -> tuple[NDArray[np.int64], Array]:
-    """Indices (K,) of the markers that both eyes measured, and their places (K, 3) in the left camera frame. [m]"""
+def triangulate_markers(observation: Observation) -> tuple[NDArray[np.int64], Array]:
+    """Indices (K,) of the markers that both eyes measured, and their positions (K, 3) in the left camera frame. [m]"""
     index = np.flatnonzero(observation.paired)
     left, right = observation.pixels_px[:, index]
     return index, observation.rig.triangulate(left, right)
@@ -50,21 +50,21 @@ def plane_normal(points_m: Array) -> Array:
     return normal if normal[2] >= 0 else -normal
 
 
-def rotations_with_axis(axes: Array) -> Array:
-    """(S, 3, 3) attitudes of roll zero whose z axis is each of (S, 3) unit vectors."""
+def rotations_from_axes(axes: Array) -> Array:
+    """(S, 3, 3) attitudes with roll zero and each of (S, 3) unit vectors as z axis."""
     pitch, yaw = angles_from_axis(axes)
     x = np.stack([np.cos(yaw), np.zeros_like(yaw), -np.sin(yaw)], axis=-1)
     y = np.stack([np.sin(yaw) * np.sin(pitch), np.cos(pitch), np.cos(yaw) * np.sin(pitch)], axis=-1)
     return np.stack([x, y, axes], axis=-1)
 
 
-def with_best_roll(unrolled: Array, points_m: Array, origins_m: Array, centers_m: Array) -> Array:
-    """Attitudes turned about their axis so that the markers lie in the points' directions.
+def align_roll(unrolled: Array, points_m: Array, origins_m: Array, centers_m: Array) -> Array:
+    """Roll attitudes about their axis so that the markers point in the directions of the triangulated points.
 
     Args:
         unrolled: (S, 3, 3) attitudes.
         points_m: (K, 3) triangulated markers.
-        origins_m: (S, 3) places of the drogue.
+        origins_m: (S, 3) positions of the drogue.
         centers_m: (K, 3) the same markers in the drogue frame.
 
     Returns:
@@ -80,11 +80,11 @@ def with_best_roll(unrolled: Array, points_m: Array, origins_m: Array, centers_m
     return rolled
 
 
-def used_pairs(observation: Observation) -> NDArray[np.bool_]:
-    """(2, N) mask of the measurements that both eyes made."""
+def paired_mask(observation: Observation) -> NDArray[np.bool_]:
+    """(2, N) mask of the measurements of markers that both eyes measured."""
     return np.stack([observation.paired, observation.paired])
 
 
-def used_left(observation: Observation) -> NDArray[np.bool_]:
-    """(2, N) mask of the measurements that the left eye made."""
+def left_mask(observation: Observation) -> NDArray[np.bool_]:
+    """(2, N) mask of the left eye's measurements."""
     return np.stack([observation.seen[0], np.zeros(observation.layout.count, dtype=bool)])

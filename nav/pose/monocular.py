@@ -24,27 +24,37 @@ import numpy as np
 
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES
-from nav.pose.adjustment import Adjusted, State, adjust, information_at, inverse_information, linearise
+from nav.pose.adjustment import AdjustedPoses, AdjustmentState, adjust, information_at, inverse_information, linearise
 from nav.pose.features import Features, left_features, stack_features
-from nav.pose.joint import misfit, solve_one
-from nav.pose.marker_geometry import predict_px, rotations_with_axis, used_left, with_best_roll
+from nav.pose.joint import misfit_reason, solve_one
+from nav.pose.marker_geometry import align_roll, left_mask, project_markers, rotations_from_axes
 from nav.pose.observation_checks import eye_fault, hub_fault
 from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, PoseMode, Solution
 
 _LEFT, _RIGHT = range(2)
+# Three image points have up to four poses.
+_LEAST_FOR_PNP = 4
+# Five points determine a conic.
+_LEAST_FOR_CONIC = 5
+# The ellipse has no information on positions along it. Standard deviations are this many times larger along it, which
+# leaves the markers enough weight to determine the roll and nothing else.
+_ALONG_SIGMAS = 100.0
+# The shift of the discs' ellipse centres depends on the pose, but only weakly on its errors.
+_PASSES = 3
 
 
 def solve_with_one_eye(observation: Observation, least: int, solve: PoseMethod) -> Solution | NoFixReason:
-    """The answer of a method that looks at the left eye alone, from the left or else from the right eye.
+    """Apply a method for the left eye to the left eye, or to the right one where the left shows too few markers.
 
     Args:
-        observation: what both eyes measured, or one of them.
-        least: how many markers the method needs.
-        solve: is given the chosen eye's measurements as the left eye's, and answers in that eye's frame.
+        observation: measurements of both eyes, or of one.
+        least: number of markers that the method needs.
+        solve: the method; it gets the chosen eye's measurements as the left eye's, and returns a pose in that eye's
+            frame.
 
     Returns:
-        The pose in the left camera frame. Bad numbers in an eye that shows enough are a reason for none: they say that
-        something is wrong with what was measured, and the other eye's may be wrong too.
+        The pose in the left camera frame. There is none where an eye with enough markers has invalid numbers, even if
+        the other eye has not: its measurements may be wrong too.
     """
     counts = observation.seen.sum(axis=1)
     eye = _RIGHT if counts[_LEFT] < least <= counts[_RIGHT] else _LEFT
@@ -54,38 +64,38 @@ def solve_with_one_eye(observation: Observation, least: int, solve: PoseMethod) 
     reason = eye_fault(observation, eye, least)
     if reason is not None:
         return reason
-    answer = solve(_alone(observation, eye))
+    answer = solve(_as_left_eye(observation, eye))
     if isinstance(answer, NoFixReason) or eye == _LEFT:
         return answer
-    return _from_right(answer, observation)
+    return _to_left_frame(answer, observation)
 
 
-def _alone(observation: Observation, eye: int) -> Observation:
-    """One eye's measurements in the left eye's place, and nothing in the right one's."""
+def _as_left_eye(observation: Observation, eye: int) -> Observation:
+    """The observation with one eye's measurements as the left eye's, and none in the right eye."""
     assert observation.hub_px is not None
     assert observation.hub_cov_px2 is not None
 
-    def first(values: Array) -> Array:
+    def as_left(values: Array) -> Array:
         return np.stack([values[eye], np.full_like(values[eye], np.nan)])
 
     return replace(
         observation,
-        pixels_px=first(observation.pixels_px),
-        cov_px2=first(observation.cov_px2),
-        hub_px=first(observation.hub_px),
-        hub_cov_px2=first(observation.hub_cov_px2),
+        pixels_px=as_left(observation.pixels_px),
+        cov_px2=as_left(observation.cov_px2),
+        hub_px=as_left(observation.hub_px),
+        hub_cov_px2=as_left(observation.hub_cov_px2),
     )
 
 
-def _from_right(solution: Solution, observation: Observation) -> Solution:
-    """A solution in the right eye's frame as one in the left eye's.
+def _to_left_frame(solution: Solution, observation: Observation) -> Solution:
+    """Transform a solution from the right camera frame to the left one.
 
-    Both eyes look along the same axes, so that the covariance of small turns and shifts stays as it is, but for what is
-    not known of the right eye against the left one.
+    The axes of both frames are parallel, so the covariance stays the same, except for the stated tolerance of the
+    disparity.
     """
     offset_m = observation.rig.eye_offset_m(EYES[_RIGHT])
 
-    def moved(pose: RigidTransform) -> RigidTransform:
+    def in_left_frame(pose: RigidTransform) -> RigidTransform:
         return RigidTransform(pose.rotation, pose.translation_m + offset_m)
 
     covariance = solution.covariance
@@ -96,52 +106,55 @@ def _from_right(solution: Solution, observation: Observation) -> Solution:
     return replace(
         solution,
         covariance=covariance,
-        left_from_drogue=moved(solution.left_from_drogue),
+        left_from_drogue=in_left_frame(solution.left_from_drogue),
         used=solution.used[::-1].copy(),
-        modes=tuple(replace(mode, left_from_drogue=moved(mode.left_from_drogue)) for mode in solution.modes),
+        modes=tuple(replace(mode, left_from_drogue=in_left_frame(mode.left_from_drogue)) for mode in solution.modes),
         used_hub=None if solution.used_hub is None else solution.used_hub[::-1].copy(),
     )
 
 
-# Three image points have up to four poses.
-LEAST_MARKERS = 4
-
-
 def mono_lm(observation: Observation) -> Solution | NoFixReason:
-    """As `joint`, of the markers in one eye; depth comes from the ring's known radius."""
-    return solve_with_one_eye(observation, LEAST_MARKERS, _solve_lm)
+    """Method `mono-lm`: as `joint`, from the markers in one eye; depth comes from the known radius of the ring."""
+    return solve_with_one_eye(observation, _LEAST_FOR_PNP, _solve_by_adjustment)
 
 
-def _solve_lm(observation: Observation) -> Solution | NoFixReason:
-    return solve_one(left_features(observation), used_left(observation))
+def _solve_by_adjustment(observation: Observation) -> Solution | NoFixReason:
+    return solve_one(left_features(observation), left_mask(observation))
 
 
 def mono_ippe(observation: Observation) -> Solution | NoFixReason:
-    """Both poses of IPPE, each refined by Levenberg-Marquardt; without that it misses the bound by 2 below 5 m."""
-    return solve_with_one_eye(observation, LEAST_MARKERS, partial(_solve_pnp, flag=cv2.SOLVEPNP_IPPE, refine=True))
+    """Method `mono-ippe`: both poses of IPPE, refined by Levenberg-Marquardt.
+
+    Without the refinement the errors are twice the Cramer-Rao bound below 5 m.
+    """
+    return solve_with_one_eye(
+        observation, _LEAST_FOR_PNP, partial(_solve_by_opencv, flag=cv2.SOLVEPNP_IPPE, refine=True)
+    )
 
 
 def mono_sqpnp(observation: Observation) -> Solution | NoFixReason:
-    """The minima that SQPnP knows of, as they are."""
-    return solve_with_one_eye(observation, LEAST_MARKERS, partial(_solve_pnp, flag=cv2.SOLVEPNP_SQPNP, refine=False))
+    """Method `mono-sqpnp`: the minima that SQPnP finds, without refinement."""
+    return solve_with_one_eye(
+        observation, _LEAST_FOR_PNP, partial(_solve_by_opencv, flag=cv2.SOLVEPNP_SQPNP, refine=False)
+    )
 
 
-def _solve_pnp(observation: Observation, flag: int, refine: bool) -> Solution | NoFixReason:
+def _solve_by_opencv(observation: Observation, flag: int, refine: bool) -> Solution | NoFixReason:
     measured = observation.pixels_px[0, observation.seen[0]]
-    poses = _poses(observation, measured, flag, refine)
+    poses = _pnp_poses(observation, measured, flag, refine)
     if not poses:
         return NoFixReason("the solver found no pose in front of the camera")
-    corrected = [_poses(observation, measured - _disc_shift_px(observation, pose), flag, refine) for pose in poses]
-    # The pose that belongs to a correction is the one nearest to that which made it.
+    corrected = [_pnp_poses(observation, measured - _disc_shift_px(observation, pose), flag, refine) for pose in poses]
+    # Of the poses from corrected points, take the one nearest to the pose that the correction was computed from.
     poses = [
         min(found, key=lambda other: float(np.linalg.norm(other.rotation - pose.rotation))) if found else pose
         for pose, found in zip(poses, corrected, strict=True)
     ]
-    return _best_of(observation, poses)
+    return _best_pose(observation, poses)
 
 
-def _poses(observation: Observation, pixels_px: Array, flag: int, refine: bool) -> list[RigidTransform]:
-    """Poses in front of the camera that OpenCV finds, the best first."""
+def _pnp_poses(observation: Observation, pixels_px: Array, flag: int, refine: bool) -> list[RigidTransform]:
+    """OpenCV's poses in front of the camera, the best first."""
     points = np.ascontiguousarray(observation.layout.centers_m[observation.seen[0]])
     camera, pixels = observation.rig.camera.matrix(), np.ascontiguousarray(pixels_px)
     poses = []
@@ -154,32 +167,32 @@ def _poses(observation: Observation, pixels_px: Array, flag: int, refine: bool) 
             if np.isfinite(rotation).all() and np.isfinite(place).all() and place[2] > 0 and rotation[2, 2] > 0:
                 poses.append(RigidTransform(rotation, place))
     except cv2.error:
-        # OpenCV asserts on layouts that it cannot solve, such as points of one pose twice.
+        # OpenCV raises on layouts that it cannot solve, such as points that occur twice.
         return []
     return poses
 
 
 def _disc_shift_px(observation: Observation, pose: RigidTransform) -> Array:
-    """(K, 2) from the images of the seen discs' centres to the centres of their images. [px]"""
+    """(K, 2) offsets from the images of the measured discs' centres to the centres of their ellipses. [px]"""
     rotation, translation = pose.rotation[None], pose.translation_m[None]
-    ellipses = predict_px(observation.rig, observation.layout, rotation, translation)[0, 0]
+    ellipses = project_markers(observation.rig, observation.layout, rotation, translation)[0, 0]
     points = observation.rig.project(pose.apply(observation.layout.centers_m), "left")
     shift: Array = (ellipses - points)[observation.seen[0]]
     return shift
 
 
-def _best_of(observation: Observation, poses: list[RigidTransform]) -> Solution | NoFixReason:
-    """The pose with the lowest reprojection cost, its covariance, and all as modes with Laplace weights."""
+def _best_pose(observation: Observation, poses: list[RigidTransform]) -> Solution | NoFixReason:
+    """The pose with the lowest reprojection cost, its covariance, and all poses as modes with Laplace weights."""
     features = left_features(observation).take(np.zeros(len(poses), dtype=np.int64))
     rotations = np.stack([pose.rotation for pose in poses])
     translations = np.stack([pose.translation_m for pose in poses])
-    costs = linearise(features, State.nominal(features, rotations, translations)).costs
+    costs = linearise(features, AdjustmentState.nominal(features, rotations, translations)).costs
     order = np.flatnonzero(np.isfinite(costs))
     order = order[np.argsort(costs[order], kind="stable")]
     if not len(order):
         return NoFixReason("the solver found no pose in front of the camera")
     best = int(order[0])
-    reason = misfit(features.take(slice(0, 1)), rotations[best], translations[best])
+    reason = misfit_reason(features.take(slice(0, 1)), rotations[best], translations[best])
     if reason is not None:
         return reason
     information = information_at(features, rotations, translations)
@@ -189,7 +202,7 @@ def _best_of(observation: Observation, poses: list[RigidTransform]) -> Solution 
     weights /= weights.sum()
     modes = tuple(PoseMode(poses[i], float(costs[i]), float(weight)) for i, weight in zip(order, weights, strict=True))
     covariance = covariances[best] if determined[best] else None
-    return Solution(poses[best], used_left(observation), covariance, modes)
+    return Solution(poses[best], left_mask(observation), covariance, modes)
 
 
 def conic_through(points: Array) -> Array | None:
@@ -202,7 +215,7 @@ def conic_through(points: Array) -> Array | None:
     size = np.sqrt(((points - mean) ** 2).mean())
     if not size > 0:
         return None
-    # Centred and scaled points keep the six columns of one size.
+    # Points are centred and scaled, so that the six columns have similar norms.
     x, y = ((points - mean) / size).T
     design = np.column_stack([x * x, 2 * x * y, y * y, 2 * x, 2 * y, np.ones_like(x)])
     a, b, c, d, e, f = np.linalg.svd(design)[2][5]
@@ -217,7 +230,7 @@ def conic_through(points: Array) -> Array | None:
 
 
 def circle_poses(conic: Array, radius_m: float) -> tuple[Array, Array]:
-    """Both circles of a known radius whose image is an ellipse.
+    """Both circles of a known radius that have an ellipse as their image.
 
     Args:
         conic: (3, 3) in normalised image coordinates (rays with z = 1), with eigenvalues of signs + + -.
@@ -242,46 +255,37 @@ def circle_poses(conic: Array, radius_m: float) -> tuple[Array, Array]:
     return centers, np.where(normals[:, 2:] < 0, -normals, normals)
 
 
-# Five points fix a conic.
-_LEAST_FOR_CONIC = 5
-# The ellipse says nothing about where along it a marker lies. Markers count by this many deviations less in that
-# direction, which leaves them enough to fix the roll and nothing else.
-_ALONG = 100.0
-# The shift of the discs' ellipse centres needs the pose, and hardly depends on its errors.
-_PASSES = 3
-
-
 def mono_circle(observation: Observation) -> Solution | NoFixReason:
-    """Pose from the ellipse through one eye's markers and the ring's radius."""
-    return solve_with_one_eye(observation, _LEAST_FOR_CONIC, _solve_ellipse)
+    """Method `mono-circle`: pose from the ellipse through one eye's markers and the ring's radius."""
+    return solve_with_one_eye(observation, _LEAST_FOR_CONIC, _solve_by_ellipse)
 
 
-def _solve_ellipse(observation: Observation) -> Solution | NoFixReason:
+def _solve_by_ellipse(observation: Observation) -> Solution | NoFixReason:
     reason = hub_fault(observation)
     if reason is not None:
         return reason
     radius_m = observation.layout.ring_radius_m
     if radius_m is None:
         return NoFixReason("an ellipse needs all markers on one circle about the drogue's origin")
-    starts = _closed_form(observation, radius_m)
+    starts = _poses_from_ellipse(observation, radius_m)
     if starts is None:
         return NoFixReason("the markers lie on no ellipse")
     rotations, translations = starts
-    adjusted = adjust(_across_only(observation, rotations, translations), rotations, translations)
+    adjusted = adjust(_features_across_ellipse(observation, rotations, translations), rotations, translations)
     best = int(np.argmin(_branch_costs(observation, adjusted)))
     covariance, determined = inverse_information(adjusted.information[best : best + 1])
     rotation, translation = adjusted.rotations[best], adjusted.translations_m[best]
     if not (determined[0] and translation[2] > 0 and rotation[2, 2] > 0):
         return NoFixReason("the ellipse gives no pose in front of the camera")
-    reason = misfit(left_features(observation), rotation, translation)
+    reason = misfit_reason(left_features(observation), rotation, translation)
     if reason is not None:
         return reason
     used_hub = np.stack([observation.hub_seen[0], [False, False]])
-    return Solution(RigidTransform(rotation, translation), used_left(observation), covariance[0], used_hub=used_hub)
+    return Solution(RigidTransform(rotation, translation), left_mask(observation), covariance[0], used_hub=used_hub)
 
 
-def _closed_form(observation: Observation, radius_m: float) -> tuple[Array, Array] | None:
-    """(2, 3, 3) rotations and (2, 3) translations of both circles, or None where there is no ellipse. [m]"""
+def _poses_from_ellipse(observation: Observation, radius_m: float) -> tuple[Array, Array] | None:
+    """(2, 3, 3) rotations and (2, 3) translations of both circles in closed form, or None without an ellipse. [m]"""
     seen = observation.seen[0]
     places, measured = observation.layout.centers_m[seen], observation.pixels_px[0, seen]
     shifts = np.zeros((2, *measured.shape))
@@ -293,23 +297,23 @@ def _closed_form(observation: Observation, radius_m: float) -> tuple[Array, Arra
             if conic is None:
                 return None
             both_centers, normals = circle_poses(conic, radius_m)
-            # The two solutions swap when the ellipse's axes do; the branch is the one on the same side as before.
+            # The two solutions swap when the ellipse's axes do; take the one whose normal is nearest to the last one.
             side = branch if not shifts.any() else int(np.argmax(normals @ rotations[branch, :, 2]))
             center, normal = both_centers[side], normals[side]
             depth = (center @ normal) / (rays @ normal)
-            unrolled = rotations_with_axis(normal[None])
-            rotations[branch] = with_best_roll(unrolled, rays * depth[:, None], center[None], places)[0]
+            unrolled = rotations_from_axes(normal[None])
+            rotations[branch] = align_roll(unrolled, rays * depth[:, None], center[None], places)[0]
             centers[branch] = center
         if not (np.isfinite(rotations).all() and np.isfinite(centers).all()):
             return None
-        ellipses = predict_px(observation.rig, observation.layout, rotations, centers)[:, 0, seen]
+        ellipses = project_markers(observation.rig, observation.layout, rotations, centers)[:, 0, seen]
         points = observation.rig.camera.project(np.einsum("sij,nj->sni", rotations, places) + centers[:, None])
         shifts = ellipses - points
     return rotations, centers
 
 
-def _across_only(observation: Observation, rotations: Array, translations_m: Array) -> Features:
-    """Two frames, one a branch: the left eye's markers with little weight along the ellipse."""
+def _features_across_ellipse(observation: Observation, rotations: Array, translations_m: Array) -> Features:
+    """The left eye's markers for two frames, one for each pose, with little weight along the ellipse."""
     layout, camera = observation.layout, observation.rig.camera
     along_ring = np.cross([0.0, 0.0, 1.0], layout.centers_m)
     points = np.einsum("sij,nj->sni", rotations, layout.centers_m) + translations_m[:, None]
@@ -318,14 +322,14 @@ def _across_only(observation: Observation, rotations: Array, translations_m: Arr
     tangent *= [camera.fx_px, camera.fy_px]
     tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), np.finfo(np.float64).tiny)
     variance = np.einsum("sni,nij,snj->sn", tangent, observation.cov_px2[0], tangent)
-    wide = (_ALONG**2 * variance)[..., None, None] * tangent[..., :, None] * tangent[..., None, :]
+    wide = (_ALONG_SIGMAS**2 * variance)[..., None, None] * tangent[..., :, None] * tangent[..., None, :]
     pixels = np.stack([observation.pixels_px[:1]] * 2)
     cov = observation.cov_px2[0] + wide
     return stack_features(observation.rig, layout, pixels, cov[:, None], observation.tolerances)
 
 
-def _branch_costs(observation: Observation, adjusted: Adjusted) -> Array:
-    """(2,) costs of the hub's edges in the left eye where they were measured, else of the markers' places."""
+def _branch_costs(observation: Observation, adjusted: AdjustedPoses) -> Array:
+    """(2,) costs of the hub's edges in the left eye where they were measured, else of the markers."""
     assert observation.hub_px is not None
     assert observation.hub_cov_px2 is not None
     pixels = np.concatenate([observation.pixels_px[0], observation.hub_px[0]])
@@ -337,4 +341,4 @@ def _branch_costs(observation: Observation, adjusted: Adjusted) -> Array:
         pixels, cov = pixels[:count], cov[:count]
     both = np.stack([pixels[None]] * 2)
     features = stack_features(observation.rig, observation.layout, both, np.stack([cov[None]] * 2))
-    return linearise(features, State.nominal(features, adjusted.rotations, adjusted.translations_m)).costs
+    return linearise(features, AdjustmentState.nominal(features, adjusted.rotations, adjusted.translations_m)).costs

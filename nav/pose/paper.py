@@ -25,15 +25,15 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES
 from nav.pose.marker_geometry import (
-    eye_points,
+    align_roll,
+    paired_mask,
     plane_normal,
-    predict_px,
-    rotations_with_axis,
-    triangulate_pairs,
-    used_pairs,
-    with_best_roll,
+    points_in_eyes,
+    project_markers,
+    rotations_from_axes,
+    triangulate_markers,
 )
-from nav.pose.observation_checks import fault
+from nav.pose.observation_checks import stereo_fault
 from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
 
 # Threshold of the Huber loss: twice the centroids' standard deviation, and no less than a good centroid's error.
@@ -45,7 +45,7 @@ _LARGEST_DEPTH_STEP = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Triples:
+class TripleCircles:
     """Circles through three points each.
 
     Attributes:
@@ -61,7 +61,7 @@ class Triples:
     members: NDArray[np.int64]
 
 
-def triple_circles(points_m: Array) -> Triples:
+def triple_circles(points_m: Array) -> TripleCircles:
     """Circles through all C(K, 3) triples of (K, 3) points; nan for three points on a line."""
     triples = np.array(list(combinations(range(len(points_m)), 3)))
     p, a, b = (points_m[triples[:, column]] for column in range(3))
@@ -73,11 +73,11 @@ def triple_circles(points_m: Array) -> Triples:
     offset = (np.cross(across, a) * b2 + np.cross(b, across) * a2) / (2 * across2)
     normals = across / np.sqrt(across2)
     normals = np.where(normals[:, 2:] < 0, -normals, normals)
-    return Triples(p + offset, normals, (offset**2).sum(axis=1), triples)
+    return TripleCircles(p + offset, normals, (offset**2).sum(axis=1), triples)
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class PoseCandidates:
     """What the three-sphere construction offers for a pose.
 
     Attributes:
@@ -98,17 +98,17 @@ class Candidates:
 
     def pose_at(self, origin_m: Array) -> RigidTransform:
         """Pose at a place, with the attitude of the plane through all markers."""
-        unrolled = rotations_with_axis(plane_normal(self.points_m)[None])
-        rotation = with_best_roll(unrolled, self.points_m, origin_m[None], self.layout.centers_m)[0]
+        unrolled = rotations_from_axes(plane_normal(self.points_m)[None])
+        rotation = align_roll(unrolled, self.points_m, origin_m[None], self.layout.centers_m)[0]
         return RigidTransform(rotation, origin_m)
 
 
-def three_sphere_candidates(observation: Observation) -> Candidates | NoFixReason:
+def three_sphere_candidates(observation: Observation) -> PoseCandidates | NoFixReason:
     """All candidates in front of the cameras; at least one."""
     ring_radius_m = observation.layout.ring_radius_m
     if ring_radius_m is None:
         return NoFixReason("the paper's method needs all markers on one circle about the drogue's origin")
-    index, points = triangulate_pairs(observation)
+    index, points = triangulate_markers(observation)
     layout = MarkerLayout(observation.layout.centers_m[index], observation.layout.radius_m, None)
     circles = triple_circles(points)
     # The spheres about three markers meet twice on the circle's axis; noise leaves no real root where it is negative.
@@ -118,9 +118,9 @@ def three_sphere_candidates(observation: Observation) -> Candidates | NoFixReaso
     if not sound.any():
         return NoFixReason("no three markers give a place in front of the cameras")
     origins, axes = origins[sound], circles.normals[sound]
-    rotations = with_best_roll(rotations_with_axis(axes), points, origins, layout.centers_m)
+    rotations = align_roll(rotations_from_axes(axes), points, origins, layout.centers_m)
     pixels = observation.pixels_px[:, index]
-    return Candidates(points, layout, pixels, origins, rotations, circles.members[sound])
+    return PoseCandidates(points, layout, pixels, origins, rotations, circles.members[sound])
 
 
 def huber_threshold_px(observation: Observation) -> float:
@@ -128,29 +128,29 @@ def huber_threshold_px(observation: Observation) -> float:
     return max(_HUBER_SIGMAS * observation.sigma_px, _LEAST_HUBER_PX)
 
 
-def reprojection_scores(observation: Observation, candidates: Candidates) -> Array:
+def reprojection_scores(observation: Observation, candidates: PoseCandidates) -> Array:
     """(T,) Huber losses of all markers in both eyes; infinite for a candidate that cannot be projected. [px^2]"""
     huber_px = huber_threshold_px(observation)
     # A nearly edge-on candidate can put a marker behind a camera; its prediction is then infinite or nan, never best.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        predicted = predict_px(observation.rig, candidates.layout, candidates.rotations, candidates.origins_m)
+        predicted = project_markers(observation.rig, candidates.layout, candidates.rotations, candidates.origins_m)
         residuals = np.linalg.norm(predicted - candidates.pixels_px, axis=-1)
-        scores: Array = np.where(np.isfinite(residuals), _huber(residuals, huber_px), np.inf).sum(axis=(1, 2))
+        scores: Array = np.where(np.isfinite(residuals), _huber_loss(residuals, huber_px), np.inf).sum(axis=(1, 2))
     return scores
 
 
 def paper(observation: Observation) -> Solution | NoFixReason:
     """Pose by the three-sphere construction and visual reprojection."""
-    return _solve(observation, step_in_depth=False)
+    return _solve_three_spheres(observation, step_in_depth=False)
 
 
 def paper_with_step(observation: Observation) -> Solution | NoFixReason:
     """As `paper`, with the place then moved along its line of sight; for comparison."""
-    return _solve(observation, step_in_depth=True)
+    return _solve_three_spheres(observation, step_in_depth=True)
 
 
-def _solve(observation: Observation, step_in_depth: bool) -> Solution | NoFixReason:
-    reason = fault(observation)
+def _solve_three_spheres(observation: Observation, step_in_depth: bool) -> Solution | NoFixReason:
+    reason = stereo_fault(observation)
     if reason is not None:
         return reason
     candidates = three_sphere_candidates(observation)
@@ -161,26 +161,26 @@ def _solve(observation: Observation, step_in_depth: bool) -> Solution | NoFixRea
     if step_in_depth:
         start = RigidTransform(candidates.rotations[best], origin)
         huber_px = huber_threshold_px(observation)
-        origin = _depth_steps(observation, candidates.layout, candidates.pixels_px, huber_px, start)
+        origin = _refine_depth(observation, candidates.layout, candidates.pixels_px, huber_px, start)
         if not (np.isfinite(origin).all() and origin[2] > 0):
             return NoFixReason("the step in depth left the space in front of the cameras")
-    return Solution(candidates.pose_at(origin), used_pairs(observation))
+    return Solution(candidates.pose_at(origin), paired_mask(observation))
 
 
-def _huber(residuals_px: Array, threshold_px: float) -> Array:
+def _huber_loss(residuals_px: Array, threshold_px: float) -> Array:
     """Huber's loss of residual norms. [px^2]"""
     return np.where(residuals_px <= threshold_px, residuals_px**2 / 2, threshold_px * (residuals_px - threshold_px / 2))
 
 
-def _depth_steps(
+def _refine_depth(
     observation: Observation, layout: MarkerLayout, pixels_px: Array, huber_px: float, start: RigidTransform
 ) -> Array:
     """(3,) origin moved along its line of sight by Huber-weighted Gauss-Newton steps (the paper's eqs. 14-16). [m]"""
     camera, rotation = observation.rig.camera, start.rotation[None]
     origin = start.translation_m.copy()
     for _ in range(_DEPTH_STEPS):
-        residuals = predict_px(observation.rig, layout, rotation, origin[None])[0] - pixels_px
-        points = eye_points(observation.rig, layout.centers_m, rotation, origin[None])[0]
+        residuals = project_markers(observation.rig, layout, rotation, origin[None])[0] - pixels_px
+        points = points_in_eyes(observation.rig, layout.centers_m, rotation, origin[None])[0]
         direction = origin / origin[2]
         slope_x = camera.fx_px / points[..., 2] * (direction[0] - points[..., 0] / points[..., 2])
         slope_y = camera.fy_px / points[..., 2] * (direction[1] - points[..., 1] / points[..., 2])
@@ -219,7 +219,7 @@ def paper_reading(e_v: RowReading) -> PoseMethod:
     score = _SCORES[e_v]
 
     def method(observation: Observation) -> Solution | NoFixReason:
-        reason = fault(observation)
+        reason = stereo_fault(observation)
         if reason is not None:
             return reason
         candidates = three_sphere_candidates(observation)
@@ -232,7 +232,7 @@ def paper_reading(e_v: RowReading) -> PoseMethod:
         # Where the score does not choose, chance does, keyed by the measurements so that it always does the same.
         rng = np.random.default_rng(crc32(candidates.pixels_px.tobytes()))
         chosen = int(rng.choice(equal))
-        return Solution(candidates.pose_at(candidates.origins_m[chosen]), used_pairs(observation))
+        return Solution(candidates.pose_at(candidates.origins_m[chosen]), paired_mask(observation))
 
     return method
 
@@ -242,31 +242,31 @@ def paper_literal(observation: Observation) -> Solution | NoFixReason:
     return paper_reading("literal")(observation)
 
 
-def _row_difference(observation: Observation, candidates: Candidates) -> Array:
+def _row_differences(observation: Observation, candidates: PoseCandidates) -> Array:
     left, right = (observation.rig.project(candidates.origins_m, eye)[:, 1] for eye in EYES)
     scores: Array = (left - right) ** 2 / 2
     return scores
 
 
-def _own_rows(observation: Observation, candidates: Candidates) -> Array:
+def _measured_row_differences(observation: Observation, candidates: PoseCandidates) -> Array:
     rows = candidates.pixels_px[0, :, 1] - candidates.pixels_px[1, :, 1]
     scores: Array = (rows[candidates.members] ** 2).sum(axis=1)
     return scores
 
 
-def _center_per_eye(observation: Observation, candidates: Candidates) -> Array | NoFixReason:
+def _center_distances(observation: Observation, candidates: PoseCandidates) -> Array | NoFixReason:
     if len(candidates.points_m) < _LEAST_FOR_HOMOGRAPHY:
         return NoFixReason(f"the rim's centre in one image needs {_LEAST_FOR_HOMOGRAPHY} markers in both eyes")
     scores = np.zeros(len(candidates.origins_m))
     for eye, pixels in zip(EYES, candidates.pixels_px, strict=True):
-        center = _projective_center(candidates.layout.centers_m[:, :2], pixels)
+        center = _homography_center(candidates.layout.centers_m[:, :2], pixels)
         if center is None:
             return NoFixReason(f"the markers of the {eye} eye show no centre")
         scores += ((observation.rig.project(candidates.origins_m, eye) - center) ** 2).sum(axis=1)
     return scores
 
 
-def _projective_center(places_m: Array, pixels_px: Array) -> Array | None:
+def _homography_center(places_m: Array, pixels_px: Array) -> Array | None:
     """(2,) image of the origin under the homography that carries (K, 2) places to (K, 2) pixels. [px]"""
     mean = pixels_px.mean(axis=0)
     size = np.sqrt(((pixels_px - mean) ** 2).mean())
@@ -284,9 +284,9 @@ def _projective_center(places_m: Array, pixels_px: Array) -> Array | None:
     return center
 
 
-_SCORES: dict[str, Callable[[Observation, Candidates], Array | NoFixReason]] = {
-    "literal": _row_difference,
-    "own_vdiff": _own_rows,
-    "center_per_eye": _center_per_eye,
+_SCORES: dict[str, Callable[[Observation, PoseCandidates], Array | NoFixReason]] = {
+    "literal": _row_differences,
+    "own_vdiff": _measured_row_differences,
+    "center_per_eye": _center_distances,
     "full_reproj": reprojection_scores,
 }

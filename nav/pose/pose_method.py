@@ -15,19 +15,19 @@ from geometry.stereo import StereoRig
 
 @dataclass(frozen=True)
 class StatedTolerances:
-    """Standard deviations about the nominal dimensions; 0, the default, stands for exactly as built.
+    """Standard deviations of the drogue and rig about their nominal dimensions; 0, the default, means exactly as built.
 
-    Least-squares methods count with them: what all markers share becomes an unknown of its own with this prior, what
-    each marker has for itself adds to the covariance of its two images.
+    Least-squares methods use them: an error that all markers share becomes an unknown with this prior; an independent
+    error of each marker is added to the covariance of its two images.
 
     Attributes:
         ring_radius_m: of the circle through the markers.
-        ellipticity: difference of that circle's axes over their mean, along an unknown direction. Of this size, not a
+        ellipticity: difference of that circle's axes over their mean, along an unknown direction; its size, not a
             standard deviation.
         placement_m: of every marker along each axis.
-        hub_lateral_m: of the hub along both axes across the drogue's.
-        disparity_px: of the right eye's columns. A yaw of the right camera by an angle moves them by the focal length
-            in pixels times the angle, an error of its principal point by itself.
+        hub_lateral_m: of the hub along both axes perpendicular to the drogue's.
+        disparity_px: of the right eye's columns. A yaw error of the right camera shifts them by the focal length in
+            pixels times the angle, an error of its principal point by that error.
     """
 
     ring_radius_m: float = 0.0
@@ -61,9 +61,9 @@ class Observation:
         pixels_px: (2, N, 2) centres in the left and the right eye, nan where a marker was not measured.
         cov_px2: (2, N, 2, 2) their covariances.
         hub_px: (2, 2, 2) ellipse centres of the hub's inner and outer edge in each eye, nan where not measured; None
-            stands for no hub at all.
+            for no hub.
         hub_cov_px2: (2, 2, 2, 2) their covariances; None where `hub_px` is None.
-        tolerances: how far drogue and rig may depart from `layout` and `rig`.
+        tolerances: of the true drogue and rig about `layout` and `rig`.
     """
 
     rig: StereoRig
@@ -116,19 +116,19 @@ class Observation:
 
     @property
     def sigma_px(self) -> float:
-        """Root mean square standard deviation per axis of the measured centres. [px]"""
+        """Root mean square of the standard deviations per axis of the measured centres. [px]"""
         variances = np.diagonal(self.cov_px2[self.seen], axis1=1, axis2=2)
         return float(np.sqrt(variances.mean()))
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMode:
-    """One pose that explains the images.
+    """One of the poses that explain the images.
 
     Attributes:
         left_from_drogue: the pose.
         cost: half the sum of squared residuals in units of their standard deviations, priors included.
-        weight: its share of the posterior.
+        weight: its posterior probability.
     """
 
     left_from_drogue: RigidTransform
@@ -138,15 +138,15 @@ class PoseMode:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A pose.
+    """Result of a pose method.
 
     Attributes:
-        left_from_drogue: modulo the layout's symmetry.
-        used: (2, N) the measurements of markers on which it rests.
+        left_from_drogue: the pose, modulo the layout's symmetry.
+        used: (2, N) the measurements of markers that it uses.
         covariance: (6, 6) in the tangent `datasets_manifest.types.estimates.TANGENT`, or None.
-        modes: the best first, where the method knows of several.
-        used_hub: (2, 2) the measurements of the hub's edges on which it rests, or None for a method without hub.
-        note: what the user should know of this answer, in one sentence; empty when there is nothing.
+        modes: all poses that the method found, the best first; empty where it finds only one.
+        used_hub: (2, 2) the measurements of the hub's edges that it uses, or None for a method without hub.
+        note: a remark for the user in one sentence, or empty.
     """
 
     left_from_drogue: RigidTransform

@@ -1,7 +1,7 @@
-"""Pose methods by name: our own, and those that other packages register.
+"""Pose methods by name: built-in ones, and those that other packages register.
 
-A package offers a method by an entry point of the group `droguekit.pose_estimators`, whose name is the method's and
-whose object is a function as `nav.pose.pose_method.PoseMethod`.
+A package registers a method by an entry point of the group `droguekit.pose_estimators`: the entry point's name is the
+method's, and its object is a function of the type `nav.pose.pose_method.PoseMethod`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ METHODS: dict[str, PoseMethod] = {
 
 
 def method_names() -> tuple[str, ...]:
-    """Our own methods, then other packages', by name.
+    """Names of the built-in methods, then of other packages' in alphabetical order.
 
     Raises:
         ValueError: a package registers a name that is taken.
     """
-    return (*METHODS, *sorted(_others()))
+    return (*METHODS, *sorted(_registered()))
 
 
 def pose_method(name: str) -> PoseMethod:
@@ -50,23 +50,23 @@ def pose_method(name: str) -> PoseMethod:
     """
     if name in METHODS:
         return METHODS[name]
-    others = _others()
+    others = _registered()
     if name not in others:
         raise ValueError(f"method: there is no pose method named {name!r}; there are {', '.join([*METHODS, *others])}")
-    return _loaded(others[name])
+    return _load(others[name])
 
 
-def _others() -> dict[str, EntryPoint]:
+def _registered() -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     for entry in entry_points(group=ENTRY_POINT_GROUP):
-        # One installation seen along two paths is one method.
+        # An installation that is found along two paths is one method.
         if entry.name in METHODS or found.get(entry.name, entry).value != entry.value:
             raise ValueError(f"method: {entry.value} registers {entry.name!r}, which is taken; rename its entry point")
         found[entry.name] = entry
     return dict(sorted(found.items()))
 
 
-def _loaded(entry: EntryPoint) -> PoseMethod:
+def _load(entry: EntryPoint) -> PoseMethod:
     try:
         solve = entry.load()
     except (ImportError, AttributeError) as error:

@@ -16,7 +16,7 @@ from nav.centroids.ellipses import circles
 from nav.centroids.marker_signal import MarkerSignal
 from nav.pose.features import stack_features
 from nav.pose.joint import solve_one
-from nav.pose.marker_geometry import predict_px
+from nav.pose.marker_geometry import project_markers
 
 _RADII_PX = 12.0, 8.0
 _SIDE_PX, _MIDDLE_PX = 40, 20.0
@@ -33,7 +33,7 @@ def warm_up_jit() -> None:
     """
     _fit_edges()
     rig, layout = paper_rig(), marker_layout(PRESETS["red-8"])
-    pixels = predict_px(rig, layout, np.eye(3)[None], np.array([[0.1, 0.1, _DISTANCE_M]]))
+    pixels = project_markers(rig, layout, np.eye(3)[None], np.array([[0.1, 0.1, _DISTANCE_M]]))
     solve_one(stack_features(rig, layout, pixels, np.eye(2)), np.ones(pixels.shape[1:3], dtype=bool))
 
 

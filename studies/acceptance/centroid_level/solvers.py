@@ -11,7 +11,7 @@ from drogue_models.marker_layout import MarkerLayout
 from geometry.se3 import Array
 from geometry.stereo import StereoRig
 from nav.pose.features import Features, stack_features
-from nav.pose.joint_batch import solve_from, solve_joint_batch, two_fold_start
+from nav.pose.joint_batch import adjust_both_tilts, solve_joint_batch, two_fold_starts
 from nav.pose.pose_method import EXACT, NoFixReason, Observation, StatedTolerances
 from nav.pose.pose_methods import pose_method
 from studies.acceptance.centroid_level.drawn_frames import Poses
@@ -109,7 +109,7 @@ def _batched(method: str, measured: MeasuredFrames) -> SolvedFrames:
 
 def _best(features: Features) -> Poses:
     """Of the two poses that both starts lead to, the one with the smaller residuals."""
-    both = solve_from(features, *two_fold_start(features))
+    both = adjust_both_tilts(features, *two_fold_starts(features))
     chosen = 2 * np.arange(features.frames) + both.costs.reshape(-1, 2).argmin(axis=1)
     return Poses(both.rotations[chosen], both.translations_m[chosen])
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from nav.pose.adjustment import Loss, State, adjust, linearise, predicted_px
+from nav.pose.adjustment import AdjustmentState, Loss, adjust, linearise, project_features
 from nav.pose.features import stack_features
 from nav.pose.pose_method import StatedTolerances
 
@@ -34,7 +34,7 @@ def test_residuals_are_those_of_opencv_whitened(draw_poses):
     draws = draw_poses(np.random.default_rng(70), 6, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, radii_count=0.0)
     rotations, translations = poses_of(draws)
-    residuals = linearise(features, State.nominal(features, rotations, translations)).residuals
+    residuals = linearise(features, AdjustmentState.nominal(features, rotations, translations)).residuals
     camera, points = draws.rig.camera, features.points_m
     matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]])
     root = np.linalg.inv(np.linalg.cholesky(np.array([[1.0, 0.3], [0.3, 2.0]]) * SIGMA_PX**2))
@@ -46,7 +46,7 @@ def test_residuals_are_those_of_opencv_whitened(draw_poses):
             found = residuals[s].reshape(2, 2, len(points))[:, eye].T
             # Rounding of pixels of 1e3, in whitening units of a tenth of a pixel.
             np.testing.assert_allclose(found, expected, atol=1e-8)
-            np.testing.assert_allclose(predicted_px(features, rotations, translations)[s, eye], seen, atol=1e-9)
+            np.testing.assert_allclose(project_features(features, rotations, translations)[s, eye], seen, atol=1e-9)
 
 
 @pytest.mark.parametrize("tolerances", [None, STATED])
@@ -56,14 +56,16 @@ def test_derivatives_by_the_pose_are_those_of_the_residuals(draw_poses, toleranc
     features = features_of(draws, 0.0, tolerances)
     rotations, translations = poses_of(draws)
     departures = np.full((5, features.departures), 0.3)
-    now = linearise(features, State(rotations, translations, departures), loss).jacobian
+    now = linearise(features, AdjustmentState(rotations, translations, departures), loss).jacobian
     step = 1e-5
     for k in range(6):
         sides = []
         for sign in (1, -1):
             move = sign * step * np.eye(6)[k]
             turn = cv2.Rodrigues(move[3:])[0]
-            sides.append(linearise(features, State(turn @ rotations, translations + move[:3], departures), loss))
+            sides.append(
+                linearise(features, AdjustmentState(turn @ rotations, translations + move[:3], departures), loss)
+            )
         slope = (sides[0].residuals - sides[1].residuals) / (2 * step)
         # Third derivatives times the step's square; rounding of 1e4 deviations over the step.
         np.testing.assert_allclose(now[:, k], slope, atol=1e-8 * np.abs(slope).max() + 1e-6)
@@ -74,7 +76,7 @@ def test_costs_are_sums_over_residuals(draw_poses, loss):
     draws = draw_poses(np.random.default_rng(72), 8, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 1.0, STATED)
     rotations, translations = poses_of(draws)
-    state = State(rotations, translations, np.full((8, features.departures), -0.2))
+    state = AdjustmentState(rotations, translations, np.full((8, features.departures), -0.2))
     plain = linearise(features, state).residuals
     sizes = np.sqrt((plain[:, :40].reshape(8, 2, 2, 10) ** 2).sum(axis=1)).reshape(8, -1)
     k = min(loss.huber_sigmas, 1e9)
@@ -95,7 +97,7 @@ def test_adjusted_poses_are_minima(draw_poses, loss):
     draws = draw_poses(np.random.default_rng(73), 12, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 1.0, STATED)
     found = adjust(features, *poses_of(draws), loss)
-    at = linearise(features, State(found.rotations, found.translations_m, found.departures), loss)
+    at = linearise(features, AdjustmentState(found.rotations, found.translations_m, found.departures), loss)
     np.testing.assert_allclose(at.costs, found.costs, rtol=1e-9)
     np.testing.assert_allclose(at.information, found.information, rtol=1e-9, atol=1e-9 * at.information.max())
     gradient = np.einsum("skm,sm->sk", at.jacobian, at.residuals)
@@ -120,10 +122,10 @@ def test_a_feature_that_no_eye_measured_tells_nothing(draw_poses):
     whole = features_of(draws, 1.0, STATED)
     mask = np.arange(10) == 3
     rotations, translations = poses_of(draws)
-    less = linearise(whole.without(mask), State.nominal(whole, rotations, translations))
+    less = linearise(whole.without(mask), AdjustmentState.nominal(whole, rotations, translations))
     rows = np.zeros(40, dtype=bool).reshape(4, 10)
     rows[:, 3] = True
     blind = np.append(rows.ravel(), np.zeros(whole.departures, dtype=bool))
     assert not less.residuals[:, blind].any() and not less.jacobian[:, :, blind].any()
-    full = linearise(whole, State.nominal(whole, rotations, translations))
+    full = linearise(whole, AdjustmentState.nominal(whole, rotations, translations))
     np.testing.assert_array_equal(less.residuals[:, ~blind], full.residuals[:, ~blind])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drogue_models.marker_layout import MarkerLayout
-from nav.pose.baselines import circle_center, circle_fit, disparity_plane, mean_plane
+from nav.pose.baselines import circle_fit, disparity_plane, fit_circle_center, mean_plane
 from nav.pose.monocular import circle_poses, conic_through
 from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.pose_methods import METHODS
@@ -55,8 +55,8 @@ def test_conic_through_points_of_a_circle():
 def test_circle_centre_is_exact_and_robust_to_its_start():
     angle = np.linspace(0, 2 * np.pi, 5, endpoint=False)
     points = np.column_stack([3 + 0.2 * np.cos(angle), -1 + 0.2 * np.sin(angle)])
-    np.testing.assert_allclose(circle_center(points), [3, -1], atol=1e-12)
-    assert circle_center(np.column_stack([np.arange(5.0), 2 * np.arange(5.0)])) is None
+    np.testing.assert_allclose(fit_circle_center(points), [3, -1], atol=1e-12)
+    assert fit_circle_center(np.column_stack([np.arange(5.0), 2 * np.arange(5.0)])) is None
 
 
 @pytest.mark.parametrize("name", [*MONO, "circle-fit", "disparity-plane"])

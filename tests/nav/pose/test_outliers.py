@@ -7,7 +7,7 @@ import pytest
 
 from nav.pose.baselines import mean_plane
 from nav.pose.joint import joint, joint_robust
-from nav.pose.paper import _row_difference, paper, paper_literal, paper_reading, three_sphere_candidates
+from nav.pose.paper import _row_differences, paper, paper_literal, paper_reading, three_sphere_candidates
 from nav.pose.pose_method import NoFixReason, Solution, StatedTolerances
 
 
@@ -155,7 +155,7 @@ def test_the_literal_score_is_zero_for_every_candidate(draw_poses):
     draws = draw_poses(np.random.default_rng(38), 20, (1.7, 10.0), 0.3)
     for index in range(20):
         observation = draws.observation(index)
-        scores = _row_difference(observation, three_sphere_candidates(observation))
+        scores = _row_differences(observation, three_sphere_candidates(observation))
         # Both rows come from the same y and z.
         assert len(scores) == 56
         assert scores.max() == 0

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nav.pose.adjustment import State, linearise
-from nav.pose.features import stack_features, whiten, whiten_displaced
+from nav.pose.adjustment import AdjustmentState, linearise
+from nav.pose.features import stack_features, whiten, whiten_with_displacement
 from nav.pose.joint import joint_hub, joint_robust
 from nav.pose.joint_batch import solve_joint_batch
 from nav.pose.pose_method import EXACT, StatedTolerances
@@ -31,7 +31,7 @@ def features_of(draws, tolerances, eyes: int = 2):
 def state_of(draws, features, departures):
     rotations = np.array([place.rotation for place in draws.places])
     translations = np.array([place.translation_m for place in draws.places])
-    return State(rotations, translations, departures * np.ones((len(rotations), features.departures)))
+    return AdjustmentState(rotations, translations, departures * np.ones((len(rotations), features.departures)))
 
 
 @pytest.mark.parametrize("eyes", [1, 2])
@@ -42,7 +42,7 @@ def test_a_displaced_feature_has_the_covariance_of_both_eyes_together(draw_poses
     cov = roots @ np.swapaxes(roots, -1, -2) + 1e-3 * np.eye(2)
     depths, displacement = np.array([2.0, 3.0, 5.0, 9.0]), np.append(np.full(8, 3e-4), [0, 0])
     camera = draws.rig.camera
-    measured, coupling = whiten_displaced(camera, whiten(draws.pixels_px[:, :eyes], cov), depths, displacement)
+    measured, coupling = whiten_with_displacement(camera, whiten(draws.pixels_px[:, :eyes], cov), depths, displacement)
     for frame in range(4):
         for feature in range(10):
             whole, matrix, slopes = np.zeros((2 * eyes,) * 2), np.zeros((2 * eyes,) * 2), []
