@@ -14,7 +14,7 @@ from nav.pose.features import Features
 
 @dataclass(frozen=True, eq=False)
 class AdjustmentState:
-    """Poses that are being adjusted, one for each frame of some features.
+    """Unknowns of the adjustment: one pose, and the departures from nominal, for each frame of some features.
 
     Attributes:
         rotations: (S, 3, 3) `left_from_drogue`.
@@ -28,17 +28,18 @@ class AdjustmentState:
 
     @staticmethod
     def nominal(features: Features, rotations: Array, translations_m: Array) -> AdjustmentState:
-        """Poses of a drogue and rig exactly as built."""
+        """Poses of a drogue and rig exactly as built, without departures."""
         return AdjustmentState(rotations, translations_m, np.zeros((len(rotations), features.departures)))
 
 
 @dataclass(frozen=True, eq=False)
 class Loss:
-    """How residuals count.
+    """Loss function and tilt prior.
 
     Attributes:
-        huber_sigmas: where the loss of a feature's residual turns from square to linear, in standard deviations.
-        tilt_prior_rad: standard deviation of the axis' x and y components about the camera's axis.
+        huber_sigmas: threshold of Huber's loss on a feature's residual, in standard deviations; infinite for squares.
+        tilt_prior_rad: standard deviation of the prior on the x and y components of the drogue's axis; infinite for
+            none.
     """
 
     huber_sigmas: float = np.inf
@@ -50,13 +51,13 @@ SQUARED_LOSS = Loss()
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Residuals and derivatives.
+    """Whitened residuals and their derivatives.
 
     Attributes:
         jacobian: (S, K, M) derivatives of M weighted residuals with respect to translation [m], rotation vector [rad]
             and the departures.
         residuals: (S, M), in standard deviations.
-        costs: (S,) half the sum of squares, by Huber's loss where one is set; infinite where it is not a number.
+        costs: (S,) half the sum of squares, or of Huber's losses; infinite where it is nan.
     """
 
     jacobian: Array
@@ -71,50 +72,57 @@ class Linearised:
 
 
 def linearise(features: Features, state: AdjustmentState, loss: Loss = SQUARED_LOSS) -> Linearised:
-    """Residuals of every frame's features in its pose.
+    """Residuals and derivatives of every frame's features in its pose.
 
-    The shift of a disc's ellipse centre is in the residuals and not in the derivatives, where it hardly matters.
+    The residuals contain the shift of a disc's ellipse centre; the derivatives neglect it.
 
     Args:
         features: S frames.
         state: S poses.
-        loss: how residuals count.
+        loss: loss function and tilt prior.
     """
-    count, free = len(state.rotations), features.departures
-    rows = 2 * features.measured.shape[2] * features.measured.shape[3] + 2 * np.isfinite(loss.tilt_prior_rad) + free
-    result = Linearised(np.empty((count, 6 + free, rows)), np.empty((count, rows)), np.empty(count))
-    places = (_contiguous(array) for array in (state.rotations, state.translations_m, state.departures))
-    linearise_frames(shared_inputs(features, loss), *frame_inputs(features), *places, *vars(result).values())
+    count, departure_count = len(state.rotations), features.departures
+    rows = (
+        2 * features.measured.shape[2] * features.measured.shape[3]
+        + 2 * np.isfinite(loss.tilt_prior_rad)
+        + departure_count
+    )
+    result = Linearised(
+        jacobian=np.empty((count, 6 + departure_count, rows)), residuals=np.empty((count, rows)), costs=np.empty(count)
+    )
+    unknowns = (_contiguous(state.rotations), _contiguous(state.translations_m), _contiguous(state.departures))
+    outputs = (result.jacobian, result.residuals, result.costs)
+    linearise_frames(shared_inputs(features, loss), *frame_inputs(features), *unknowns, *outputs)
     return result
 
 
 def project_features(features: Features, rotations: Array, translations_m: Array) -> Array:
-    """(S, E, F, 2) ellipse centres that poses of the nominal drogue would show. [px]"""
+    """(S, E, F, 2) predicted ellipse centres of the nominal drogue in poses. [px]"""
     pixels = np.empty((len(rotations), len(features.eye_x_m), len(features.points_m), 2))
     predict_centers(shared_inputs(features, SQUARED_LOSS), _contiguous(rotations), _contiguous(translations_m), pixels)
     return pixels
 
 
 def shared_inputs(features: Features, loss: Loss) -> SharedInputs:
-    """What the compiled loops take that all frames have in common."""
+    """Inputs of the compiled loops that all frames share."""
     camera = features.camera
     return SharedInputs(
-        float(camera.fx_px),
-        float(camera.fy_px),
-        float(camera.cx_px),
-        float(camera.cy_px),
-        _contiguous(features.eye_x_m),
-        _contiguous(features.points_m),
-        _contiguous(features.radii_m),
-        _contiguous(features.shifts_m),
-        float(features.disparity_sigma_px),
-        float(loss.huber_sigmas),
-        float(loss.tilt_prior_rad),
+        fx_px=float(camera.fx_px),
+        fy_px=float(camera.fy_px),
+        cx_px=float(camera.cx_px),
+        cy_px=float(camera.cy_px),
+        eye_x_m=_contiguous(features.eye_x_m),
+        points_m=_contiguous(features.points_m),
+        radii_m=_contiguous(features.radii_m),
+        shifts_m=_contiguous(features.shifts_m),
+        disparity_sigma_px=float(features.disparity_sigma_px),
+        huber_sigmas=float(loss.huber_sigmas),
+        tilt_prior_rad=float(loss.tilt_prior_rad),
     )
 
 
 def frame_inputs(features: Features) -> tuple[Array, Array]:
-    """What they take of each frame: measurements (5, B, E, F), and couplings (4, B, F) or none (4, B, 0)."""
+    """Inputs of the loops for each frame: measurements (5, B, E, F), and couplings (4, B, F), or (4, B, 0) for none."""
     coupling = features.coupling
     if coupling is None:
         coupling = np.empty((4, features.frames, 0))
@@ -122,21 +130,21 @@ def frame_inputs(features: Features) -> tuple[Array, Array]:
 
 
 def _contiguous(array: Array) -> Array:
-    """As loops are compiled for: they would be compiled anew for another layout, or for what is not to be written."""
+    """The array as C-contiguous and writeable; the loops would be compiled anew for any other kind of array."""
     plain: Array = np.require(array, requirements=["C", "W"])
     return plain
 
 
 @dataclass(frozen=True, eq=False)
 class AdjustedPoses:
-    """Poses that each start led to.
+    """Results of an adjustment, one for each start.
 
     Attributes:
         rotations: (S, 3, 3) `left_from_drogue`.
         translations_m: (S, 3).
-        departures: (S, G) from the nominal drogue and rig, see `State`.
-        costs: (S,) half the sum of squared whitened residuals, with priors.
-        information: (S, K, K) in the tangent of `datasets_manifest.types.estimates`, and the departures.
+        departures: (S, G) from the nominal drogue and rig, see `AdjustmentState`.
+        costs: (S,) half the sum of squared whitened residuals, priors included.
+        information: (S, K, K) of the pose, in the tangent of `datasets_manifest.types.estimates`, and the departures.
     """
 
     rotations: Array
@@ -149,47 +157,52 @@ class AdjustedPoses:
 def adjust(features: Features, rotations: Array, translations_m: Array, loss: Loss = SQUARED_LOSS) -> AdjustedPoses:
     """Minimise the whitened reprojection error over all measurements.
 
-    A step that raises the cost is shortened, so a start never ends worse than it began.
+    A step that raises the cost is shortened, so the result never has a higher cost than the start.
 
     Args:
-        features: S frames, in each at least three markers that are not on a line.
+        features: S frames, each with at least three markers that are not collinear.
         rotations: (S, 3, 3) starts.
         translations_m: (S, 3).
-        loss: how residuals count.
+        loss: loss function and tilt prior.
     """
     count, size = len(rotations), 6 + features.departures
     result = AdjustedPoses(
-        np.array(rotations, np.float64, order="C"),
-        np.array(translations_m, np.float64, order="C"),
-        np.zeros((count, features.departures)),
-        np.empty(count),
-        np.empty((count, size, size)),
+        rotations=np.array(rotations, np.float64, order="C"),
+        translations_m=np.array(translations_m, np.float64, order="C"),
+        departures=np.zeros((count, features.departures)),
+        costs=np.empty(count),
+        information=np.empty((count, size, size)),
     )
-    places = (result.rotations, result.translations_m, result.departures)
-    adjust_frames(shared_inputs(features, loss), *frame_inputs(features), *places, result.costs, result.information)
+    unknowns = (result.rotations, result.translations_m, result.departures)
+    adjust_frames(shared_inputs(features, loss), *frame_inputs(features), *unknowns, result.costs, result.information)
     return result
 
 
 def information_at(features: Features, rotations: Array, translations_m: Array) -> Array:
-    """(S, K, K) information that the features of S frames hold in given poses; see `Adjusted`."""
+    """(S, K, K) information of the features of S frames in given poses; see `AdjustedPoses`."""
     return linearise(features, AdjustmentState.nominal(features, rotations, translations_m)).information
 
 
 def inverse_information(information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Covariances of the pose.
+    """Covariances of poses from their information.
 
     Args:
-        information: (S, K, K), K = 6 or more; whatever follows the pose is marginalised.
+        information: (S, K, K), K >= 6; unknowns after the pose are marginalised.
 
     Returns:
-        (S, 6, 6) covariances, (S,) whether the measurements determine the whole pose; the covariance of others is zero.
+        (S, 6, 6) covariances, and (S,) whether the measurements determine the whole pose; the covariance is zero where
+        they do not.
     """
-    # Metres and radians differ in size: judge the eigenvalues of the scaled matrix.
+    # Eigenvalues are compared after scaling, since metres and radians differ in size.
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    sound = (np.isfinite(information).all(axis=(1, 2)) & (diagonal > 0).all(axis=1))[:, None]
-    scale = np.sqrt(np.where(sound, diagonal, 1.0))
-    outer = scale[:, :, None] * scale[:, None, :]
-    values, vectors = np.linalg.eigh(np.where(sound[..., None], information / outer, np.eye(information.shape[1])))
-    sound = sound[:, 0] & (values[:, 0] > np.finfo(np.float64).eps)
-    inverse = (vectors / np.where(sound, values.T, np.inf).T[:, None, :]) @ np.swapaxes(vectors, 1, 2) / outer
-    return inverse[:, :6, :6], sound
+    determined = (np.isfinite(information).all(axis=(1, 2)) & (diagonal > 0).all(axis=1))[:, None]
+    scale = np.sqrt(np.where(determined, diagonal, 1.0))
+    scale_product = scale[:, :, None] * scale[:, None, :]
+    values, vectors = np.linalg.eigh(
+        np.where(determined[..., None], information / scale_product, np.eye(information.shape[1]))
+    )
+    determined = determined[:, 0] & (values[:, 0] > np.finfo(np.float64).eps)
+    inverse = (
+        (vectors / np.where(determined, values.T, np.inf).T[:, None, :]) @ np.swapaxes(vectors, 1, 2) / scale_product
+    )
+    return inverse[:, :6, :6], determined

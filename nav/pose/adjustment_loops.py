@@ -10,9 +10,22 @@ from geometry.se3 import Array
 from nav.numerics.compiled import compiled
 from nav.numerics.least_squares_loops import solve_damped
 
+_ITERATIONS = 20
+# Keeps the normal equations of a frontal, far drogue solvable; far below the information of any marker.
+_DAMPING_FRACTION = 1e-9
+_LARGEST_TURN_RAD = 0.35
+# The sine of a smaller angle equals the angle in float64.
+_SMALLEST_ANGLE_RAD = 1e-9
+_LARGEST_MOVE_FRACTION = 0.3
+_LARGEST_DEPARTURE_SIGMAS = 10.0
+# A step that would lower the cost by less moves no parameter by more than 5e-5 deviations; it is taken as the last one.
+_CONVERGED = 1e-9
+# A start whose steps had to be shortened to this share is at its minimum within rounding.
+_LEAST_REACH = 1e-4
+
 
 class SharedInputs(NamedTuple):
-    """What all frames of some features have in common, and how residuals count; see `Features` and `Loss`."""
+    """Inputs that all frames share: cameras, drogue, priors and loss; see `Features` and `Loss`."""
 
     fx_px: float
     fy_px: float
@@ -27,11 +40,48 @@ class SharedInputs(NamedTuple):
     tilt_prior_rad: float
 
 
+class _Position(NamedTuple):
+    """Position of a feature in the left camera frame. [m]
+
+    Attributes:
+        arm_x, arm_y, arm_z: from the drogue's origin to the feature.
+        depth: of the feature.
+        center_x, center_y, center_z: the point whose image is the centre of the feature's ellipse.
+    """
+
+    arm_x: float
+    arm_y: float
+    arm_z: float
+    depth: float
+    center_x: float
+    center_y: float
+    center_z: float
+
+
+class _Measured(NamedTuple):
+    """A measured feature in one eye: its pixel, and the entries of its whitening matrix `[[a, 0], [b, c]]`."""
+
+    u_px: float
+    v_px: float
+    a: float
+    b: float
+    c: float
+
+
+class _Coupling(NamedTuple):
+    """Matrix, by rows, by which the first eye's whitened residuals add to the second's; see `Features`."""
+
+    u_by_u: float
+    u_by_v: float
+    v_by_u: float
+    v_by_v: float
+
+
 @compiled
-def _place(
+def _feature_position(
     shared: SharedInputs, feature: int, rotation: Array, translation_m: Array, departures: Array
-) -> tuple[float, float, float, float, float, float, float]:
-    """A feature's arm from the drogue's origin, its depth, and the point whose image is its ellipse's centre. [m]
+) -> _Position:
+    """Position of a feature of the drogue in a pose.
 
     The ellipse centre is the image of `t - (r^2 / t_z) (e_z - n_z n)` (geometry.circles).
     """
@@ -49,7 +99,7 @@ def _place(
     center_x = arm_x + translation_m[0] + scale * rotation[0, 2] * rotation[2, 2]
     center_y = arm_y + translation_m[1] + scale * rotation[1, 2] * rotation[2, 2]
     center_z = depth + scale * (rotation[2, 2] * rotation[2, 2] - 1)
-    return arm_x, arm_y, arm_z, depth, center_x, center_y, center_z
+    return _Position(arm_x, arm_y, arm_z, depth, center_x, center_y, center_z)
 
 
 @compiled
@@ -58,27 +108,29 @@ def predict_centers(shared: SharedInputs, rotations: Array, translations_m: Arra
     nominal = np.zeros(len(shared.shifts_m))
     for s in range(len(rotations)):
         for f in range(len(shared.points_m)):
-            place = _place(shared, f, rotations[s], translations_m[s], nominal)
+            position = _feature_position(shared, f, rotations[s], translations_m[s], nominal)
+            x, y, z = position.center_x, position.center_y, position.center_z
             for e in range(len(shared.eye_x_m)):
-                pixels_px[s, e, f, 0] = shared.fx_px * (place[4] - shared.eye_x_m[e]) / place[6] + shared.cx_px
-                pixels_px[s, e, f, 1] = shared.fy_px * place[5] / place[6] + shared.cy_px
+                pixels_px[s, e, f, 0] = shared.fx_px * (x - shared.eye_x_m[e]) / z + shared.cx_px
+                pixels_px[s, e, f, 1] = shared.fy_px * y / z + shared.cy_px
 
 
 @compiled
 def _fill_feature(
     shared: SharedInputs,
-    measured: tuple[float, float, float, float, float],
+    measured: _Measured,
     eye: int,
-    place: tuple[float, float, float, float, float, float, float],
+    position: _Position,
     rotation: Array,
     shifts_m: Array,
     columns: tuple[int, int],
     jacobian: Array,
     residuals: Array,
 ) -> None:
-    """Both residuals of one feature in one eye, and their derivatives by the pose and the shared shifts."""
-    u, v, a, b, c = measured
-    arm_x, arm_y, arm_z, _, center_x, center_y, z = place
+    """Fill both residuals of one feature in one eye, and their derivatives by the pose and the shared departures."""
+    u, v, a, b, c = measured.u_px, measured.v_px, measured.a, measured.b, measured.c
+    arm_x, arm_y, arm_z = position.arm_x, position.arm_y, position.arm_z
+    center_x, center_y, z = position.center_x, position.center_y, position.center_z
     to_x, to_y = shared.fx_px * (center_x - shared.eye_x_m[eye]) / z, shared.fy_px * center_y / z
     off_u, off_v = to_x + shared.cx_px - u, to_y + shared.cy_px - v
     for row in range(2):
@@ -88,7 +140,7 @@ def _fill_feature(
         by_x, by_y = by_u * shared.fx_px / z, by_v * shared.fy_px / z
         by_z = -(by_u * to_x + by_v * to_y) / z
         jacobian[0, column], jacobian[1, column], jacobian[2, column] = by_x, by_y, by_z
-        # The derivative by the turn is the cross product of the arm and that by the place.
+        # The derivative by the rotation vector is the cross product of the arm and the derivative by the translation.
         jacobian[3, column] = arm_y * by_z - arm_z * by_y
         jacobian[4, column] = arm_z * by_x - arm_x * by_z
         jacobian[5, column] = arm_x * by_y - arm_y * by_x
@@ -102,20 +154,18 @@ def _fill_feature(
 
 
 @compiled
-def _couple(
-    coupling: tuple[float, float, float, float], first: tuple[int, int], second: tuple[int, int], rows: Array
-) -> None:
-    """Add the first eye's whitened columns, times the coupling by rows, to the second's."""
+def _add_coupling(coupling: _Coupling, first: tuple[int, int], second: tuple[int, int], rows: Array) -> None:
+    """Add the first eye's whitened columns, times the coupling, to the second's columns."""
     for k in range(len(rows)):
         row = rows[k]
         one, other = row[first[0]], row[first[1]]
-        row[second[0]] += coupling[0] * one + coupling[1] * other
-        row[second[1]] += coupling[2] * one + coupling[3] * other
+        row[second[0]] += coupling.u_by_u * one + coupling.u_by_v * other
+        row[second[1]] += coupling.v_by_u * one + coupling.v_by_v * other
 
 
 @compiled
-def _weigh(columns: tuple[int, int], threshold: float, jacobian: Array, residuals: Array) -> float:
-    """Weigh a feature by the root of Huber's weight; its cost by Huber's loss."""
+def _apply_huber_weight(columns: tuple[int, int], threshold: float, jacobian: Array, residuals: Array) -> float:
+    """Multiply a feature's residuals and derivatives by the root of its Huber weight; returns its Huber loss."""
     one, other = columns
     square = residuals[one] ** 2 + residuals[other] ** 2
     norm = np.sqrt(square)
@@ -134,7 +184,7 @@ def _weigh(columns: tuple[int, int], threshold: float, jacobian: Array, residual
 def _add_priors(
     shared: SharedInputs, rotation: Array, departures: Array, column: int, jacobian: Array, residuals: Array
 ) -> float:
-    """Residuals of the tilt, where it has a prior, and of the departures; half the sum of their squares."""
+    """Fill the residuals of the priors on tilt (where it has one) and departures; returns half their sum of squares."""
     at = column
     if np.isfinite(shared.tilt_prior_rad):
         x, y, z = (
@@ -166,7 +216,7 @@ def linearise_frame(
     jacobian: Array,
     residuals: Array,
 ) -> float:
-    """Fill residuals (M,) and derivatives (K, M) of one pose; its cost, infinite where it is not a number.
+    """Fill residuals (M,) and derivatives (K, M) of one pose; returns its cost, infinite where it is nan.
 
     Args:
         measured: (5, E, F) of the frame.
@@ -178,24 +228,28 @@ def linearise_frame(
     in_front = True
     cost = 0.0
     for f in range(count):
-        place = _place(shared, f, rotation, translation_m, departures)
-        in_front &= place[3] > 0
+        position = _feature_position(shared, f, rotation, translation_m, departures)
+        in_front &= position.depth > 0
         for e in range(eyes):
-            own = (measured[0, e, f], measured[1, e, f], measured[2, e, f], measured[3, e, f], measured[4, e, f])
-            if own[2] == 0:
+            own = _Measured(
+                measured[0, e, f], measured[1, e, f], measured[2, e, f], measured[3, e, f], measured[4, e, f]
+            )
+            if own.a == 0:
                 continue
             columns = (e * count + f, (eyes + e) * count + f)
-            _fill_feature(shared, own, e, place, rotation, shared.shifts_m[:, f], columns, jacobian, residuals)
+            _fill_feature(shared, own, e, position, rotation, shared.shifts_m[:, f], columns, jacobian, residuals)
             if e == 1 and shared.disparity_sigma_px > 0:
-                for column, by_u in ((columns[0], own[2]), (columns[1], own[3])):
+                for column, by_u in ((columns[0], own.a), (columns[1], own.b)):
                     jacobian[-1, column] = shared.disparity_sigma_px * by_u
                     residuals[column] += jacobian[-1, column] * departures[-1]
             if e == 1 and coupling.shape[1] > 0:
-                by = (coupling[0, f], coupling[1, f], coupling[2, f], coupling[3, f])
-                _couple(by, (f, eyes * count + f), columns, jacobian)
-                _couple(by, (f, eyes * count + f), columns, residuals.reshape(1, -1))
+                by = _Coupling(coupling[0, f], coupling[1, f], coupling[2, f], coupling[3, f])
+                _add_coupling(by, (f, eyes * count + f), columns, jacobian)
+                _add_coupling(by, (f, eyes * count + f), columns, residuals.reshape(1, -1))
         for e in range(eyes):
-            cost += _weigh((e * count + f, (eyes + e) * count + f), shared.huber_sigmas, jacobian, residuals)
+            cost += _apply_huber_weight(
+                (e * count + f, (eyes + e) * count + f), shared.huber_sigmas, jacobian, residuals
+            )
     cost += _add_priors(shared, rotation, departures, 2 * eyes * count, jacobian, residuals)
     return cost if in_front and np.isfinite(cost) else np.inf
 
@@ -231,22 +285,8 @@ def linearise_frames(
         )
 
 
-_ITERATIONS = 20
-# Keeps the normal equations of a frontal, far drogue solvable; far below any information a marker brings.
-_DAMPING_FRACTION = 1e-9
-_LARGEST_TURN_RAD = 0.35
-# The sine of a smaller angle is the angle, in float64.
-_SMALLEST_ANGLE_RAD = 1e-9
-_LARGEST_MOVE_FRACTION = 0.3
-_LARGEST_DEPARTURE_SIGMAS = 10.0
-# The last step would lower the cost by less, so it moves no parameter by more than 5e-5 deviations, and is still taken.
-_CONVERGED = 1e-9
-# A start whose steps had to be shortened to this share is stuck at its minimum's rounding.
-_LEAST_REACH = 1e-4
-
-
 @compiled
-def _normal(jacobian: Array, normal: Array) -> None:
+def _fill_normal_matrix(jacobian: Array, normal: Array) -> None:
     """Fill `J J^T`."""
     for p in range(len(jacobian)):
         for q in range(p + 1):
@@ -260,9 +300,9 @@ def _normal(jacobian: Array, normal: Array) -> None:
 def _find_step(
     jacobian: Array, residuals: Array, normal: Array, scale: Array, gradient: Array, root: Array, step: Array
 ) -> float:
-    """Fill a Gauss-Newton step; by how much the linearised cost would sink. Scale, gradient and root are for work."""
+    """Fill a Gauss-Newton step; returns the decrease of the linearised cost. Scratch: scale, gradient, root."""
     for k in range(len(step)):
-        # Where nothing was measured any scale will do: the step is zero there.
+        # Where nothing was measured the step is zero for any scale.
         scale[k] = 1 / np.sqrt(normal[k, k]) if normal[k, k] > 0 else 1.0
         gradient[k] = 0.0
         for m in range(len(residuals)):
@@ -275,8 +315,8 @@ def _find_step(
 
 
 @compiled
-def _limit(step: Array, depth_m: float) -> None:
-    """Shorten a step in place."""
+def _limit_step(step: Array, depth_m: float) -> None:
+    """Limit the length of a step, in place."""
     for start, limit in ((0, _LARGEST_MOVE_FRACTION * abs(depth_m)), (3, _LARGEST_TURN_RAD)):
         length = np.sqrt(step[start] ** 2 + step[start + 1] ** 2 + step[start + 2] ** 2)
         if length > limit:
@@ -287,8 +327,8 @@ def _limit(step: Array, depth_m: float) -> None:
 
 
 @compiled
-def _turn(rotation: Array, x: float, y: float, z: float, turned: Array) -> None:
-    """Fill a rotation, turned by a rotation vector: `I + sin(a) / a [v]x + 2 sin^2(a / 2) / a^2 [v]x^2` (Rodrigues)."""
+def _fill_turned(rotation: Array, x: float, y: float, z: float, turned: Array) -> None:
+    """Fill a rotation times that of a vector v, `I + sin(a) / a [v]x + 2 sin^2(a / 2) / a^2 [v]x^2` (Rodrigues)."""
     angle = max(np.sqrt(x * x + y * y + z * z), _SMALLEST_ANGLE_RAD)
     first, half = np.sin(angle) / angle, np.sin(angle / 2) / angle
     second = 2 * half * half
@@ -311,9 +351,9 @@ def adjust_frames(
     costs: Array,
     information: Array,
 ) -> None:
-    """Take S poses to minima of their costs, in place, and fill costs (S,) and information (S, K, K) there.
+    """Minimise the costs of S poses in place, and fill costs (S,) and information (S, K, K) at the minima.
 
-    Gauss-Newton; a step that raises the cost is shortened. `measured` and `coupling` are those of `linearise_frames`.
+    Gauss-Newton; a step that raises the cost is shortened. `measured` and `coupling` are as in `linearise_frames`.
     """
     count, free = departures.shape
     size = 6 + free
@@ -332,10 +372,10 @@ def adjust_frames(
         for _ in range(_ITERATIONS):
             if not np.isfinite(cost):
                 break
-            _normal(jacobian[now], normal)
+            _fill_normal_matrix(jacobian[now], normal)
             gain = _find_step(jacobian[now], residuals[now], normal, scale, gradient, root, step)
-            _limit(step, translations_m[s, 2])
-            _turn(rotations[s], reach * step[3], reach * step[4], reach * step[5], turned)
+            _limit_step(step, translations_m[s, 2])
+            _fill_turned(rotations[s], reach * step[3], reach * step[4], reach * step[5], turned)
             for k in range(3):
                 moved[k] = translations_m[s, k] + reach * step[k]
             for k in range(free):
@@ -351,4 +391,4 @@ def adjust_frames(
             if gain < _CONVERGED or reach < _LEAST_REACH:
                 break
         costs[s] = cost
-        _normal(jacobian[now], information[s])
+        _fill_normal_matrix(jacobian[now], information[s])

@@ -17,111 +17,20 @@ from geometry.stereo import EYES, StereoRig
 from nav.pose.pose_method import EXACT, Observation, StatedTolerances
 
 
-def whiten(pixels_px: Array, cov_px2: Array) -> Array:
-    """Pixels, and for each the whitening matrix `[[a, 0], [b, c]]` of its own covariance.
-
-    Args:
-        pixels_px: (B, E, F, 2), nan where nothing was measured.
-        cov_px2: (B, E, F, 2, 2) or what broadcasts to it.
-
-    Returns:
-        (5, B, E, F) horizontal and vertical pixel, a, b, c; all zero where nothing was measured, or where the
-        covariance is not positive.
-    """
-    cov = np.broadcast_to(cov_px2, (*pixels_px.shape, 2))
-    # Not measured is nan; comparisons with nan are false, so the roots below are taken of sound numbers only.
-    seen = np.isfinite(pixels_px).all(axis=-1) & (cov[..., 0, 0] > 0)
-    a, b, c = _whitening_factors(cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1], seen)
-    measured: Array = np.where(c > 0, np.stack([pixels_px[..., 0], pixels_px[..., 1], a, b, c]), 0.0)
-    return measured
-
-
-def whiten_with_displacement(
-    camera: PinholeCamera, measured: Array, depths_m: Array, displacement_m: Array
-) -> tuple[Array, Array]:
-    """The same where each feature may also stand apart from its place, by one displacement that both eyes see.
-
-    Args:
-        camera: of both eyes.
-        measured: as from `whiten`, of one eye or two.
-        depths_m: (B,) of the drogue.
-        displacement_m: (F,) standard deviation along each axis.
-
-    Returns:
-        `measured` with other matrices, and (4, B, F) entries of the matrices `X`, by rows, that are to be added to the
-        second eye's whitened residuals as `X @ (those of the first)`; zero with one eye.
-
-    Source: block Cholesky factor of the covariance of the feature's four coordinates.
-    """
-    u, v = measured[:2]
-    slopes = np.stack([(u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px])
-    scale = displacement_m / depths_m[:, None]
-    out, coupling = measured.copy(), np.zeros((4, *scale.shape))
-    first = _add_covariance(measured[2:, :, 0], _shared_covariance(camera, scale, slopes[:, :, 0], slopes[:, :, 0]))
-    out[2:, :, 0] = first
-    if u.shape[1] == 1:
-        return out, coupling
-    # M = K L^T with K the covariance of the second eye with the first and L the first's whitening matrix.
-    (uu, uv), (vu, vv) = _shared_covariance(camera, scale, slopes[:, :, 1], slopes[:, :, 0])
-    l_a, l_b, l_c = first
-    m = [[uu * l_a, uu * l_b + uv * l_c], [vu * l_a, vu * l_b + vv * l_c]]
-    own = _shared_covariance(camera, scale, slopes[:, :, 1], slopes[:, :, 1])
-    rest = [[own[i][j] - m[i][0] * m[j][0] - m[i][1] * m[j][1] for j in range(2)] for i in range(2)]
-    second = _add_covariance(measured[2:, :, 1], rest)
-    out[2:, :, 1] = second
-    r_a, r_b, r_c = second
-    coupling[0], coupling[1] = -r_a * m[0][0], -r_a * m[0][1]
-    coupling[2], coupling[3] = -(r_b * m[0][0] + r_c * m[1][0]), -(r_b * m[0][1] + r_c * m[1][1])
-    return out, coupling
-
-
-def _shared_covariance(camera: PinholeCamera, scale: Array, row: Array, column: Array) -> list[list[Array]]:
-    """Covariance that a displacement of both brings: 2x2 entries (B, F) of `scale^2 T T^T`. [px^2]
-
-    A displacement `d` at depth z moves an image by `f / z (d_x - d_z x / z)`, and likewise in y.
-    """
-    fx, fy = scale * camera.fx_px, scale * camera.fy_px
-    return [
-        [fx * fx * (1 + row[0] * column[0]), fx * fy * row[0] * column[1]],
-        [fx * fy * row[1] * column[0], fy * fy * (1 + row[1] * column[1])],
-    ]
-
-
-def _add_covariance(factors: Array, more: list[list[Array]]) -> Array:
-    """(3, B, F) entries a, b, c of the whitening matrix of a covariance, given by its own, plus another one."""
-    a, b, c = factors
-    seen = c > 0
-    safe_a, safe_c = np.where(seen, a, 1.0), np.where(seen, c, 1.0)
-    # [[a, 0], [b, c]]^-1 = [[1 / a, 0], [-b / (a c), 1 / c]] is the covariance's lower factor.
-    p, q, r = 1 / safe_a, -np.where(seen, b, 0.0) / (safe_a * safe_c), 1 / safe_c
-    return _whitening_factors(p * p + more[0][0], p * q + more[0][1], q * q + r * r + more[1][1], seen)
-
-
-def _whitening_factors(first: Array, across: Array, second: Array, seen: NDArray[np.bool_]) -> Array:
-    """Entries a, b, c of the whitening matrices of covariances `[[first, across], [across, second]]`, else zero."""
-    first = np.where(seen, first, 1.0)
-    across = np.where(seen, across, 0.0)
-    rest = np.where(seen, second, 1.0) - across**2 / first
-    seen = seen & (rest > 0)
-    a = 1 / np.sqrt(first)
-    c = 1 / np.sqrt(np.where(seen, rest, 1.0))
-    factors: Array = np.where(seen, np.stack([a, -across / first * c, c]), 0.0)
-    return factors
-
-
 @dataclass(frozen=True, eq=False)
 class Features:
-    """B frames, E eyes and F features: the N markers, and after them the hub's inner and outer edge where it is used.
+    """Features of B frames in E eyes: F are the N markers and, where it is used, the hub's inner and outer edge.
 
     Attributes:
         camera: of every eye.
-        eye_x_m: (E,) places of the eyes along x of the left camera.
+        eye_x_m: (E,) positions of the eyes along x of the left camera.
         points_m: (F, 3) centres in the drogue frame.
         radii_m: (F,) of the disc or edge.
         is_marker: (F,).
         shifts_m: (G, F, 3) displacements of the centres by one standard deviation of each departure from the nominal
             drogue that several features share.
-        disparity_sigma_px: standard deviation of the second eye's columns; a departure too, after those, where above 0.
+        disparity_sigma_px: standard deviation of the second eye's columns; where above 0 it is one more departure,
+            after those.
         measured: (5, B, E, F) horizontal and vertical pixel, and the entries `a, b, c` of the whitening matrix
             `[[a, 0], [b, c]]`; all zero where a feature was not measured.
         coupling: (4, B, F) matrices by which the first eye's whitened residuals add to the second's; None for none.
@@ -154,12 +63,12 @@ class Features:
         return seen
 
     def take(self, frames: NDArray[np.int64] | slice) -> Features:
-        """The features of some frames, in that order; a frame may appear often."""
+        """The features of some frames, in that order; a frame may be repeated."""
         coupling = None if self.coupling is None else self.coupling[:, frames]
         return replace(self, measured=self.measured[:, frames], coupling=coupling)
 
     def without(self, mask: NDArray[np.bool_]) -> Features:
-        """The same frames without the features of `mask`, (B, F) or (F,), in any eye."""
+        """The same frames without the features of a mask, (B, F) or (F,), in all eyes."""
         coupling = None if self.coupling is None else np.where(mask, 0.0, self.coupling)
         return replace(self, measured=np.where(mask[..., None, :], 0.0, self.measured), coupling=coupling)
 
@@ -167,7 +76,7 @@ class Features:
 def stack_features(
     rig: StereoRig, layout: MarkerLayout, pixels_px: Array, cov_px2: Array, tolerances: StatedTolerances = EXACT
 ) -> Features:
-    """Features of many frames from plain arrays.
+    """Features of many frames from arrays of measurements.
 
     Args:
         rig: the stereo rig.
@@ -190,14 +99,14 @@ def stack_features(
         radii = np.append(radii, [layout.hub_inner_radius_m, layout.hub_outer_radius_m])
     is_marker = np.arange(count) < layout.count
     features = Features(
-        rig.camera,
-        np.array([rig.eye_offset_m(eye)[0] for eye in EYES[: pixels_px.shape[1]]]),
-        points,
-        radii,
-        is_marker,
-        _departure_shifts(layout, points, is_marker, tolerances),
-        tolerances.disparity_px if pixels_px.shape[1] == 2 else 0.0,
-        whiten(pixels_px, cov_px2),
+        camera=rig.camera,
+        eye_x_m=np.array([rig.eye_offset_m(eye)[0] for eye in EYES[: pixels_px.shape[1]]]),
+        points_m=points,
+        radii_m=radii,
+        is_marker=is_marker,
+        shifts_m=_departure_shifts(layout, points, is_marker, tolerances),
+        disparity_sigma_px=tolerances.disparity_px if pixels_px.shape[1] == 2 else 0.0,
+        measured=whiten(pixels_px, cov_px2),
     )
     if tolerances.placement_m == 0:
         return features
@@ -209,7 +118,7 @@ def stack_features(
 
 
 def observed_features(observation: Observation, with_hub: bool) -> Features:
-    """The features of one stereo pair."""
+    """Features of one stereo pair."""
     pixels, cov = observation.pixels_px, observation.cov_px2
     if with_hub and observation.hub_seen.any():
         assert observation.hub_px is not None
@@ -220,7 +129,7 @@ def observed_features(observation: Observation, with_hub: bool) -> Features:
 
 
 def left_features(observation: Observation) -> Features:
-    """The markers of the left eye alone."""
+    """Markers of the left eye only."""
     pixels, cov = observation.pixels_px[None, :1], observation.cov_px2[None, :1]
     return stack_features(observation.rig, observation.layout, pixels, cov, observation.tolerances)
 
@@ -236,8 +145,8 @@ def _departure_shifts(
     shifts: list[Array] = []
     if layout.ring_radius_m is not None and tolerances.ring_radius_m > 0:
         shifts.append(tolerances.ring_radius_m / layout.ring_radius_m * ring)
-    # Longer by e along the direction d, shorter across: e / 2 (x cos 2d + y sin 2d, x sin 2d - y cos 2d). Over all
-    # directions, both e cos 2d and e sin 2d have a standard deviation of e / sqrt 2.
+    # Longer by e along the direction d, shorter across it: e / 2 (x cos 2d + y sin 2d, x sin 2d - y cos 2d). Over
+    # all directions, both e cos 2d and e sin 2d have a standard deviation of e / sqrt 2.
     stretch = tolerances.ellipticity / np.sqrt(8)
     if stretch > 0:
         shifts += [stretch * np.column_stack([x, -y, none]), stretch * np.column_stack([y, x, none])]
@@ -248,7 +157,10 @@ def _departure_shifts(
 
 
 def _approximate_depths(features: Features) -> Array:
-    """(B,) depths by the markers' spread in all images; a tilt of 10 degrees adds 0.8 %, infinite without any. [m]"""
+    """(B,) depths from the markers' spread in the images; infinite without markers. [m]
+
+    A tilt of 10 degrees adds 0.8 %.
+    """
     seen = features.seen[..., features.is_marker].astype(np.float64)
     total = np.maximum(seen.sum(axis=2, keepdims=True), 1)
 
@@ -262,3 +174,95 @@ def _approximate_depths(features: Features) -> Array:
     slopes2 = spread(u / features.camera.fx_px) + spread(v / features.camera.fy_px)
     depths: Array = np.sqrt((spread(x) + spread(y)) / np.where(slopes2 > 0, slopes2, 1.0))
     return np.where((slopes2 > 0) & (depths > 0), depths, np.inf)
+
+
+def whiten(pixels_px: Array, cov_px2: Array) -> Array:
+    """Pixels, and for each the whitening matrix `[[a, 0], [b, c]]` of its own covariance.
+
+    Args:
+        pixels_px: (B, E, F, 2), nan where nothing was measured.
+        cov_px2: (B, E, F, 2, 2) or what broadcasts to it.
+
+    Returns:
+        (5, B, E, F) horizontal and vertical pixel, a, b, c; all zero where nothing was measured, or where the
+        covariance is not positive.
+    """
+    cov = np.broadcast_to(cov_px2, (*pixels_px.shape, 2))
+    # Missing measurements are nan and fail these comparisons, so the roots below are of finite numbers only.
+    seen = np.isfinite(pixels_px).all(axis=-1) & (cov[..., 0, 0] > 0)
+    a, b, c = _whitening_factors(cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 1], seen)
+    measured: Array = np.where(c > 0, np.stack([pixels_px[..., 0], pixels_px[..., 1], a, b, c]), 0.0)
+    return measured
+
+
+def whiten_with_displacement(
+    camera: PinholeCamera, measured: Array, depths_m: Array, displacement_m: Array
+) -> tuple[Array, Array]:
+    """Whiten features that also have random displacements from their nominal positions, the same in both eyes.
+
+    Args:
+        camera: of both eyes.
+        measured: as from `whiten`, of one eye or two.
+        depths_m: (B,) of the drogue.
+        displacement_m: (F,) standard deviation along each axis.
+
+    Returns:
+        `measured` with new matrices, and (4, B, F) entries, by rows, of the matrices `X`. `X @ r` with the first eye's
+        whitened residuals `r` must be added to the second eye's; `X` is zero with one eye.
+
+    Source: block Cholesky factor of the covariance of the feature's four coordinates.
+    """
+    u, v = measured[:2]
+    slopes = np.stack([(u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px])
+    scale = displacement_m / depths_m[:, None]
+    out, coupling = measured.copy(), np.zeros((4, *scale.shape))
+    first = _add_covariance(measured[2:, :, 0], _shared_covariance(camera, scale, slopes[:, :, 0], slopes[:, :, 0]))
+    out[2:, :, 0] = first
+    if u.shape[1] == 1:
+        return out, coupling
+    # M = K L^T with K the covariance of the second eye with the first and L the first's whitening matrix.
+    (uu, uv), (vu, vv) = _shared_covariance(camera, scale, slopes[:, :, 1], slopes[:, :, 0])
+    l_a, l_b, l_c = first
+    m = [[uu * l_a, uu * l_b + uv * l_c], [vu * l_a, vu * l_b + vv * l_c]]
+    own = _shared_covariance(camera, scale, slopes[:, :, 1], slopes[:, :, 1])
+    rest = [[own[i][j] - m[i][0] * m[j][0] - m[i][1] * m[j][1] for j in range(2)] for i in range(2)]
+    second = _add_covariance(measured[2:, :, 1], rest)
+    out[2:, :, 1] = second
+    r_a, r_b, r_c = second
+    coupling[0], coupling[1] = -r_a * m[0][0], -r_a * m[0][1]
+    coupling[2], coupling[3] = -(r_b * m[0][0] + r_c * m[1][0]), -(r_b * m[0][1] + r_c * m[1][1])
+    return out, coupling
+
+
+def _shared_covariance(camera: PinholeCamera, scale: Array, row: Array, column: Array) -> list[list[Array]]:
+    """Covariance of two images of one random displacement: 2x2 entries (B, F) of `scale^2 T T^T`. [px^2]
+
+    A displacement `d` at depth z moves an image by `f / z (d_x - d_z x / z)`, and likewise in y.
+    """
+    fx, fy = scale * camera.fx_px, scale * camera.fy_px
+    return [
+        [fx * fx * (1 + row[0] * column[0]), fx * fy * row[0] * column[1]],
+        [fx * fy * row[1] * column[0], fy * fy * (1 + row[1] * column[1])],
+    ]
+
+
+def _add_covariance(factors: Array, more: list[list[Array]]) -> Array:
+    """(3, B, F) entries a, b, c of the whitening matrix of the sum of two covariances; the first by its own entries."""
+    a, b, c = factors
+    seen = c > 0
+    safe_a, safe_c = np.where(seen, a, 1.0), np.where(seen, c, 1.0)
+    # [[a, 0], [b, c]]^-1 = [[1 / a, 0], [-b / (a c), 1 / c]] is the covariance's lower factor.
+    p, q, r = 1 / safe_a, -np.where(seen, b, 0.0) / (safe_a * safe_c), 1 / safe_c
+    return _whitening_factors(p * p + more[0][0], p * q + more[0][1], q * q + r * r + more[1][1], seen)
+
+
+def _whitening_factors(first: Array, across: Array, second: Array, seen: NDArray[np.bool_]) -> Array:
+    """Entries a, b, c of the whitening matrices of covariances `[[first, across], [across, second]]`, else zero."""
+    first = np.where(seen, first, 1.0)
+    across = np.where(seen, across, 0.0)
+    rest = np.where(seen, second, 1.0) - across**2 / first
+    seen = seen & (rest > 0)
+    a = 1 / np.sqrt(first)
+    c = 1 / np.sqrt(np.where(seen, rest, 1.0))
+    factors: Array = np.where(seen, np.stack([a, -across / first * c, c]), 0.0)
+    return factors

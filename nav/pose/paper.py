@@ -36,12 +36,23 @@ from nav.pose.marker_geometry import (
 from nav.pose.observation_checks import stereo_fault
 from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
 
+# What the score of a candidate compares:
+#   literal         rows of the candidate's one reprojected point in both eyes;
+#   own_vdiff       measured rows in both eyes of the candidate's three markers;
+#   center_per_eye  the candidate with the rim's centre in each image, from a homography;
+#   full_reproj     all markers in both eyes, by Huber's loss; the selection of method `paper`.
+RowReading = Literal["literal", "own_vdiff", "center_per_eye", "full_reproj"]
+
 # Threshold of the Huber loss: twice the centroids' standard deviation, and no less than a good centroid's error.
 _HUBER_SIGMAS = 2.0
 _LEAST_HUBER_PX = 0.05
 _DEPTH_STEPS = 5
 # No step changes the distance by more than this share of it.
 _LARGEST_DEPTH_STEP = 0.3
+# Four points determine a homography.
+_LEAST_FOR_HOMOGRAPHY = 4
+# A candidate's rows differ by the rounding of float64 pixels, which must not decide between equal scores. [px^2]
+_SAME_SCORE_PX2 = 1e-18
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +89,14 @@ def triple_circles(points_m: Array) -> TripleCircles:
 
 @dataclass(frozen=True, eq=False)
 class PoseCandidates:
-    """What the three-sphere construction offers for a pose.
+    """Poses from the three-sphere construction.
 
     Attributes:
         points_m: (K, 3) triangulated markers.
-        layout: the same markers.
+        layout: of the same K markers.
         pixels_px: (2, K, 2) their measured centres.
         origins_m: (T, 3) far intersections of the spheres about three markers each.
-        rotations: (T, 3, 3) attitudes of those markers' planes.
+        rotations: (T, 3, 3) attitudes of the planes through those markers.
         members: (T, 3) indices of those markers among the K.
     """
 
@@ -97,7 +108,7 @@ class PoseCandidates:
     members: NDArray[np.int64]
 
     def pose_at(self, origin_m: Array) -> RigidTransform:
-        """Pose at a place, with the attitude of the plane through all markers."""
+        """Pose with a given origin, and the attitude of the plane through all markers."""
         unrolled = rotations_from_axes(plane_normal(self.points_m)[None])
         rotation = align_roll(unrolled, self.points_m, origin_m[None], self.layout.centers_m)[0]
         return RigidTransform(rotation, origin_m)
@@ -111,7 +122,7 @@ def three_sphere_candidates(observation: Observation) -> PoseCandidates | NoFixR
     index, points = triangulate_markers(observation)
     layout = MarkerLayout(observation.layout.centers_m[index], observation.layout.radius_m, None)
     circles = triple_circles(points)
-    # The spheres about three markers meet twice on the circle's axis; noise leaves no real root where it is negative.
+    # The spheres about three markers meet twice on the circle's axis; with noise the discriminant may be negative.
     discriminant = ring_radius_m**2 - circles.radii2_m2
     origins = circles.centers_m + circles.normals * np.sqrt(np.maximum(discriminant, 0))[:, None]
     sound = np.isfinite(origins).all(axis=1) & (origins[:, 2] > ring_radius_m)
@@ -124,14 +135,14 @@ def three_sphere_candidates(observation: Observation) -> PoseCandidates | NoFixR
 
 
 def huber_threshold_px(observation: Observation) -> float:
-    """Where the loss of the paper's visual reprojection turns from square to linear. [px]"""
+    """Threshold of Huber's loss in the paper's visual reprojection. [px]"""
     return max(_HUBER_SIGMAS * observation.sigma_px, _LEAST_HUBER_PX)
 
 
 def reprojection_scores(observation: Observation, candidates: PoseCandidates) -> Array:
     """(T,) Huber losses of all markers in both eyes; infinite for a candidate that cannot be projected. [px^2]"""
     huber_px = huber_threshold_px(observation)
-    # A nearly edge-on candidate can put a marker behind a camera; its prediction is then infinite or nan, never best.
+    # In a nearly edge-on candidate a marker may lie behind a camera: its prediction is infinite or nan, and never best.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         predicted = project_markers(observation.rig, candidates.layout, candidates.rotations, candidates.origins_m)
         residuals = np.linalg.norm(predicted - candidates.pixels_px, axis=-1)
@@ -140,12 +151,12 @@ def reprojection_scores(observation: Observation, candidates: PoseCandidates) ->
 
 
 def paper(observation: Observation) -> Solution | NoFixReason:
-    """Pose by the three-sphere construction and visual reprojection."""
+    """Method `paper`: three-sphere construction and visual reprojection."""
     return _solve_three_spheres(observation, step_in_depth=False)
 
 
 def paper_with_step(observation: Observation) -> Solution | NoFixReason:
-    """As `paper`, with the place then moved along its line of sight; for comparison."""
+    """As `paper`, with the position then refined along its line of sight; for comparison."""
     return _solve_three_spheres(observation, step_in_depth=True)
 
 
@@ -175,7 +186,7 @@ def _huber_loss(residuals_px: Array, threshold_px: float) -> Array:
 def _refine_depth(
     observation: Observation, layout: MarkerLayout, pixels_px: Array, huber_px: float, start: RigidTransform
 ) -> Array:
-    """(3,) origin moved along its line of sight by Huber-weighted Gauss-Newton steps (the paper's eqs. 14-16). [m]"""
+    """(3,) origin, refined along its line of sight by Huber-weighted Gauss-Newton steps (the paper's eqs. 14-16). [m]"""
     camera, rotation = observation.rig.camera, start.rotation[None]
     origin = start.translation_m.copy()
     for _ in range(_DEPTH_STEPS):
@@ -192,21 +203,8 @@ def _refine_depth(
     return origin
 
 
-# What the score of a candidate compares:
-#   literal         rows of the candidate's one reprojected point in both eyes;
-#   own_vdiff       measured rows in both eyes of the candidate's three markers;
-#   center_per_eye  the candidate with the rim's centre that each image shows by itself, from a homography;
-#   full_reproj     all markers in both eyes, by Huber's loss; the selection of method `paper`.
-RowReading = Literal["literal", "own_vdiff", "center_per_eye", "full_reproj"]
-
-# Four points fix a homography.
-_LEAST_FOR_HOMOGRAPHY = 4
-# A candidate's rows differ by the rounding of float64 pixels; equal scores must not be told apart by it. [px^2]
-_SAME_SCORE_PX2 = 1e-18
-
-
 def paper_reading(e_v: RowReading) -> PoseMethod:
-    """The paper's method with a reading of its score.
+    """The paper's method with one reading of its score.
 
     Args:
         e_v: what the score compares.
@@ -229,7 +227,7 @@ def paper_reading(e_v: RowReading) -> PoseMethod:
         if isinstance(scores, NoFixReason):
             return scores
         equal = np.flatnonzero(scores <= scores.min() + _SAME_SCORE_PX2)
-        # Where the score does not choose, chance does, keyed by the measurements so that it always does the same.
+        # Candidates with equal scores are drawn from, seeded by the measurements, so that results are reproducible.
         rng = np.random.default_rng(crc32(candidates.pixels_px.tobytes()))
         chosen = int(rng.choice(equal))
         return Solution(candidates.pose_at(candidates.origins_m[chosen]), paired_mask(observation))
@@ -238,7 +236,7 @@ def paper_reading(e_v: RowReading) -> PoseMethod:
 
 
 def paper_literal(observation: Observation) -> Solution | NoFixReason:
-    """Pose by the three-sphere construction and the score of eq. 13 as printed."""
+    """Method `paper-literal`: three-sphere construction and the score of eq. 13 as printed."""
     return paper_reading("literal")(observation)
 
 
