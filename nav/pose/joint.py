@@ -15,7 +15,7 @@ from nav.pose.joint_batch import JointBatch, adjust_both_tilts, solve_features, 
 from nav.pose.observation_checks import hub_fault, stereo_fault
 from nav.pose.pose_method import NoFixReason, Observation, PoseMode, Solution
 
-# Largest root mean square residual of the drogue's features: a share of a marker's radius, and at least this many pixels.
+# Largest root mean square residual of a drogue's features: a share of a marker's radius, and at least these pixels.
 _LARGEST_MISS_FRACTION = 0.5
 _LEAST_MISS_PX = 3.0
 _HUBER = Loss(huber_sigmas=2.0)

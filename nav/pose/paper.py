@@ -186,7 +186,7 @@ def _huber_loss(residuals_px: Array, threshold_px: float) -> Array:
 def _refine_depth(
     observation: Observation, layout: MarkerLayout, pixels_px: Array, huber_px: float, start: RigidTransform
 ) -> Array:
-    """(3,) origin, refined along its line of sight by Huber-weighted Gauss-Newton steps (the paper's eqs. 14-16). [m]"""
+    """(3,) origin, refined along its line of sight by Huber-weighted Gauss-Newton steps (the paper's 14-16). [m]"""
     camera, rotation = observation.rig.camera, start.rotation[None]
     origin = start.translation_m.copy()
     for _ in range(_DEPTH_STEPS):
@@ -227,7 +227,7 @@ def paper_reading(e_v: RowReading) -> PoseMethod:
         if isinstance(scores, NoFixReason):
             return scores
         equal = np.flatnonzero(scores <= scores.min() + _SAME_SCORE_PX2)
-        # Candidates with equal scores are drawn from, seeded by the measurements, so that results are reproducible.
+        # Ties are broken at random, seeded by the measurements so that results are reproducible.
         rng = np.random.default_rng(crc32(candidates.pixels_px.tobytes()))
         chosen = int(rng.choice(equal))
         return Solution(candidates.pose_at(candidates.origins_m[chosen]), paired_mask(observation))

@@ -1,4 +1,4 @@
-"""Residuals, derivatives and minima of poses against OpenCV, finite differences and numpy."""
+"""Residuals, derivatives and minima of poses against OpenCV, finite differences, numpy and scipy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
+from geometry.circles import project_disc_centers
+from geometry.se3 import RigidTransform
+from geometry.stereo import EYES
 from nav.pose.adjustment import AdjustmentState, Loss, adjust, linearise, project_features
 from nav.pose.features import stack_features
 from nav.pose.pose_method import StatedTolerances
@@ -105,6 +110,40 @@ def test_adjusted_poses_are_minima(draw_poses, loss):
     gain = np.einsum("sk,sk->s", gradient, np.linalg.solve(at.information, gradient[..., None])[..., 0]) / 2
     # 1e-5 are 0.004 deviations, to which Huber's weights converge within the number of steps.
     assert gain.max() < 1e-5
+
+
+def minimum_by_scipy(draws, features, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation, translation and cost of the least-squares pose, from the true pose as start."""
+    true = draws.places[index]
+    root = np.linalg.inv(np.linalg.cholesky(np.array([[1.0, 0.3], [0.3, 2.0]]) * SIGMA_PX**2))
+
+    def moved(step):
+        return RigidTransform(Rotation.from_rotvec(step[3:]).as_matrix() @ true.rotation, true.translation_m + step[:3])
+
+    def residuals(step):
+        seen = [project_disc_centers(draws.rig, moved(step), features.points_m, features.radii_m, eye) for eye in EYES]
+        return ((np.array(seen) - draws.pixels_px[index]) @ root.T).ravel()
+
+    found = least_squares(residuals, np.zeros(6), jac="3-point", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    pose = moved(found.x)
+    return pose.rotation, pose.translation_m, float(found.cost)
+
+
+# Points: the last step is taken where it would lower the cost by less than 1e-9, from within sqrt(2e-9) = 4.5e-5
+# deviations of the minimum. Discs: the derivatives neglect the shift of the ellipse centres, of a relative size of
+# (0.075 m / 1.7 m)^2 = 2e-3; times the root of 40 residuals of one deviation this is 0.012 deviations.
+@pytest.mark.parametrize(("radii_count", "sigmas"), [(0.0, 1e-4), (1.0, 0.02)])
+def test_adjusted_poses_are_those_of_scipy(draw_poses, radii_count, sigmas):
+    draws = draw_poses(np.random.default_rng(76), 6, (1.7, 10.0), SIGMA_PX)
+    features = features_of(draws, radii_count)
+    found = adjust(features, *poses_of(draws))
+    for index in range(len(draws.places)):
+        rotation, translation_m, cost = minimum_by_scipy(draws, features, index)
+        turn = Rotation.from_matrix(found.rotations[index] @ rotation.T).as_rotvec()
+        error = np.append(found.translations_m[index] - translation_m, turn)
+        assert np.sqrt(error @ found.information[index] @ error) < sigmas
+        # A cost is quadratic about its minimum; rounding of pixels of 1e3 in deviations of 0.1 px is below 1e-9.
+        assert 0 <= found.costs[index] - cost + 1e-9 < sigmas**2 / 2 + 2e-9
 
 
 def test_what_lies_behind_the_cameras_costs_without_end_and_is_left_alone(draw_poses):
