@@ -257,17 +257,11 @@ def propagate(
         transition[POSITION, RATE] = -skew(state.velocity_m_s) * duration_s**2 / 2
         transition[VELOCITY, VELOCITY] = turn
         transition[VELOCITY, RATE] = -skew(velocity) @ transition[ATTITUDE, RATE]
-    air_noise = factor * _white_acceleration_noise(
-        apparent_pose_covariance(
-            state.translation_m, settings.acceleration_m2_s3, settings.swing_rad2_s3, settings.camera_rad2_s3
-        ),
-        duration_s,
-    )
+    air_noise = factor * _air_noise(state.translation_m, duration_s, settings)
     noise = air_noise.copy()
     if turn_rad2_s3 > 0:
-        noise += _white_acceleration_noise(
-            apparent_pose_covariance(state.translation_m, 0.0, 0.0, turn_rad2_s3), duration_s
-        )
+        turn_density = apparent_pose_covariance(state.translation_m, 0.0, 0.0, turn_rad2_s3)
+        noise += _white_acceleration_noise(turn_density, duration_s)
     noise[VIBRATION, VIBRATION] = (1 - kept_vibration**2) * vibration_covariance(state.translation_m, settings)
     propagated = replace(
         state,
@@ -290,6 +284,14 @@ def vibration_covariance(translation_m: Array, settings: FilterSettings) -> Arra
         max(sd, _SMALLEST_VIBRATION) ** 2 for sd in (settings.vibration_m, settings.vibration_rad)
     )
     return apparent_pose_covariance(translation_m, position_variance, 0.0, attitude_variance)
+
+
+def _air_noise(translation_m: Array, duration_s: float, settings: FilterSettings) -> Array:
+    """(18, 18) process noise of the accelerations of the settings, for a drogue at (3,)."""
+    density = apparent_pose_covariance(
+        translation_m, settings.acceleration_m2_s3, settings.swing_rad2_s3, settings.camera_rad2_s3
+    )
+    return _white_acceleration_noise(density, duration_s)
 
 
 def _white_acceleration_noise(density: Array, duration_s: float) -> Array:

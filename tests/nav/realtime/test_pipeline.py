@@ -178,7 +178,7 @@ def test_a_pair_that_waits_while_a_newer_one_comes_is_late(pairs):
         assert told_late == late
 
 
-def test_a_pair_that_cannot_be_read_ends_the_play_with_its_reason(pairs):
+def test_a_pair_that_cannot_be_read_ends_the_replay_with_its_reason(pairs):
     clock = SteppedClock()
     source = DatasetInMemory(pairs, damaged={2})
     answers = []
@@ -200,7 +200,7 @@ class FaultyDetector(ColorBlobDetector):
 
 
 @pytest.mark.parametrize("tracker", [None, "flow"])
-def test_a_fault_in_a_stage_ends_the_play_and_all_threads(pairs, tracker):
+def test_a_fault_in_a_stage_ends_the_replay_and_all_threads(pairs, tracker):
     clock = SteppedClock(in_turn=False)
     settings = SequenceSettings(("constant",), tracker=tracker, redetect_every=1)
     navigator = SequenceNavigator(settings, FaultyDetector)
