@@ -76,7 +76,7 @@ def _within(values: list[float], degrees: int) -> None:
 
 
 @pytest.mark.parametrize("learns", [False, True])
-def test_errors_and_innovations_are_as_large_as_their_covariances(
+def test_errors_and_innovations_match_their_covariances(
     rng: np.random.Generator, measure: Measure, covariance: Array, learns: bool
 ) -> None:
     settings = FilterSettings(long_term_excess=0, start_speed_m_s=0.5, noise_scale_variance_per_s=0.05 if learns else 0)
@@ -102,7 +102,7 @@ def test_errors_and_innovations_are_as_large_as_their_covariances(
 
 
 @pytest.mark.parametrize("factor", [0.1, 8.0])
-def test_rougher_and_calmer_air_is_learned(
+def test_the_process_noise_scale_adapts_to_rough_and_calm_air(
     rng: np.random.Generator, measure: Measure, covariance: Array, factor: float
 ) -> None:
     assumed = FilterSettings(long_term_excess=0, start_speed_m_s=0.5)

@@ -1,4 +1,4 @@
-"""The defaults suit the motion that recipes make: true poses of a docking run in moderate air, with drawn noise."""
+"""Default settings with the motion that recipes make: a docking run in moderate air, with drawn noise."""
 
 from collections.abc import Callable
 

@@ -48,7 +48,7 @@ def test_the_transition_is_the_derivative_of_the_step(
     np.testing.assert_allclose(transition, np.stack(columns, axis=1), atol=DERIVATIVE)
 
 
-def test_the_measurement_jacobian_is_the_derivative_of_the_seen_pose(
+def test_the_measurement_jacobian_is_the_derivative_of_the_apparent_pose(
     rng: np.random.Generator, covariance: Array
 ) -> None:
     state = _state(rng)
@@ -70,7 +70,7 @@ def test_two_steps_are_one(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(once.error_to(twice), 0, atol=1e-14)
 
 
-def test_a_shaking_camera_moves_the_drogue_as_geometry_says() -> None:
+def test_vibration_moves_the_drogue_as_geometry_says() -> None:
     pose = RigidTransform(Rotation.random(random_state=1).as_matrix(), np.array([2.0, -1.0, 10.0]))
     settings = FilterSettings(vibration_m=0.003, vibration_rad=0.002)
     step, columns = 1e-6, []
@@ -101,7 +101,7 @@ def test_the_noise_is_that_of_accelerations_in_small_steps(rng: np.random.Genera
     np.testing.assert_allclose(drawn / scale, expected / scale, atol=0.045)
 
 
-def test_what_stands_still_outside_runs_on_a_circle_about_a_turning_camera(rng: np.random.Generator) -> None:
+def test_a_static_point_moves_on_a_circle_about_a_turning_camera(rng: np.random.Generator) -> None:
     rate, duration_s = np.array([0.1, -0.8, 0.2]), 0.04
     position = np.array([1.0, -0.5, 8.0])
     state = replace(_state(rng), translation_m=position, velocity_m_s=np.cross(rate, position), rate_rad_s=rate)
@@ -113,7 +113,7 @@ def test_what_stands_still_outside_runs_on_a_circle_about_a_turning_camera(rng: 
     np.testing.assert_allclose(seen.translation_m, turn @ position, atol=6e-5)
 
 
-def test_a_turn_adds_what_the_camera_makes_and_that_is_not_the_airs(rng: np.random.Generator) -> None:
+def test_a_turn_adds_camera_noise_that_does_not_scale_with_the_air(rng: np.random.Generator) -> None:
     state = replace(_state(rng), rate_rad_s=np.zeros(3))
     calm, rough = propagate(state, 0.04, FilterSettings()), propagate(state, 0.04, FilterSettings(), 3.0)
     turned = propagate(state, 0.04, FilterSettings(), 1.0, 0.5)
@@ -124,7 +124,7 @@ def test_a_turn_adds_what_the_camera_makes_and_that_is_not_the_airs(rng: np.rand
     np.testing.assert_allclose(rough.noise - calm.noise, 2 * calm.air_noise, atol=1e-18)
 
 
-def test_at_a_first_fix_the_camera_may_turn(covariance: Array) -> None:
+def test_the_initial_covariance_allows_for_a_turning_camera(covariance: Array) -> None:
     position, turn = np.array([0.2, 0.1, 6.0]), np.array([0.3, -0.5, 0.2])
     settings = FilterSettings(start_speed_m_s=1e-6, start_rate_rad_s=1e-6, start_turn_rad_s=0.7)
     speeds = initial_state(RigidTransform(np.eye(3), position), covariance, settings).reported_covariance[6:, 6:]
@@ -133,7 +133,7 @@ def test_at_a_first_fix_the_camera_may_turn(covariance: Array) -> None:
     assert seen @ np.linalg.solve(speeds, seen) == pytest.approx(turn @ turn / 0.7**2, rel=1e-6)
 
 
-def test_a_first_fix_tells_the_pose_as_well_as_it_was_measured(covariance: Array) -> None:
+def test_the_initial_pose_covariance_is_that_of_the_measurement(covariance: Array) -> None:
     pose = RigidTransform(Rotation.random(random_state=2).as_matrix(), np.array([0.2, 0.1, 6.0]))
     state = initial_state(pose, covariance, FilterSettings())
     np.testing.assert_allclose(state.reported_covariance[:6, :6], covariance, atol=1e-15)

@@ -37,7 +37,7 @@ def _same(one: FilterState | None, other: FilterState | None, atol: float = 0.0)
     return bool(np.abs(away).max() <= atol and np.allclose(one.covariance, other.covariance, rtol=1e-12, atol=atol))
 
 
-def test_nothing_is_told_before_the_first_fix_and_after_coasting(measure: Measure, covariance: Array) -> None:
+def test_there_is_no_state_before_the_first_fix_and_after_coasting(measure: Measure, covariance: Array) -> None:
     fixes = PoseFilter(SETTINGS, ORDER)
     assert fixes.predict(0.0) is None
     first = fixes.update(3.0, measure(_pose(0), covariance))
@@ -51,7 +51,7 @@ def test_nothing_is_told_before_the_first_fix_and_after_coasting(measure: Measur
     assert fixes.predict(60.0) is None
 
 
-def test_prediction_changes_nothing_and_grows_less_sure(measure: Measure, covariance: Array) -> None:
+def test_prediction_does_not_change_the_filter_and_its_covariance_grows(measure: Measure, covariance: Array) -> None:
     fixes = _flown(measure, covariance)
     end_s = 39 * PERIOD_S
     before = fixes.predict(end_s)
@@ -96,7 +96,7 @@ def test_a_late_fix_is_as_good_as_one_in_time(
 
 
 @pytest.mark.parametrize("age", [0, 3])
-def test_what_comes_twice_counts_once(measure: Measure, covariance: Array, age: int) -> None:
+def test_a_repeated_estimate_is_refused(measure: Measure, covariance: Array, age: int) -> None:
     fixes = _flown(measure, covariance)
     before, time_s = fixes.predict(1.6), (39 - age) * PERIOD_S
     again = fixes.update(time_s, measure(_pose(time_s), covariance))
@@ -104,7 +104,7 @@ def test_what_comes_twice_counts_once(measure: Measure, covariance: Array, age: 
     assert _same(fixes.predict(1.6), before)
 
 
-def test_a_clock_that_is_set_back_is_believed_at_last(measure: Measure, covariance: Array) -> None:
+def test_a_clock_that_is_set_back_restarts_the_filter(measure: Measure, covariance: Array) -> None:
     fixes = _flown(measure, covariance)
     assert fixes.update(1e9, measure(_pose(0), covariance)).accepted
     answers = [
@@ -116,7 +116,7 @@ def test_a_clock_that_is_set_back_is_believed_at_last(measure: Measure, covarian
     assert "too late" in answers[0].reason and answers[refused].reason == "first fix"
 
 
-def test_an_outlier_is_stopped_and_a_real_jump_believed_at_last(measure: Measure, covariance: Array) -> None:
+def test_an_outlier_is_rejected_and_a_persistent_jump_accepted(measure: Measure, covariance: Array) -> None:
     fixes = _flown(measure, covariance)
     time_s = 40 * PERIOD_S
     jump = RigidTransform(np.eye(3), np.array([0.5, 0.0, 0.0]))
@@ -134,7 +134,7 @@ def test_an_outlier_is_stopped_and_a_real_jump_believed_at_last(measure: Measure
     assert abs(answers[-1].state.left_from_drogue.translation_m[0] - 0.6) < 0.01
 
 
-def test_outliers_that_disagree_do_not_start_anew(
+def test_outliers_that_disagree_do_not_restart_the_filter(
     measure: Measure, covariance: Array, rng: np.random.Generator
 ) -> None:
     fixes = _flown(measure, covariance)
@@ -158,7 +158,7 @@ def test_equivalent_rolls_are_one(measure: Measure, covariance: Array, rng: np.r
         assert _same(one.state, other.state, atol=1e-9)
 
 
-def test_roll_goes_on_beyond_one_markers_turn(measure: Measure, covariance: Array) -> None:
+def test_roll_is_continuous_beyond_one_markers_turn(measure: Measure, covariance: Array) -> None:
     fixes, rate = PoseFilter(SETTINGS, ORDER), 2.0
     for index in range(100):
         roll = rate * index * PERIOD_S % (2 * np.pi / ORDER)
@@ -189,14 +189,14 @@ def _ambiguous(time_s: float, share: float, covariance: Array) -> PoseEstimate:
     )
 
 
-def test_a_mode_gets_its_own_covariance_back(covariance: Array) -> None:
+def test_mode_covariances_are_recovered_from_the_mixture(covariance: Array) -> None:
     fix = measurement_from_estimate(_ambiguous(0.0, 0.4, covariance), ORDER, 1e-3)
     assert isinstance(fix, PoseMeasurement) and fix.weights == pytest.approx((0.6, 0.4))
     # Rounding of a spread that is 1000 times the covariance.
     np.testing.assert_allclose(fix.covariance, covariance, atol=1e-12)
 
 
-def test_two_hypotheses_live_until_one_is_right(covariance: Array) -> None:
+def test_both_hypotheses_are_kept_until_one_is_refuted(covariance: Array) -> None:
     fixes = PoseFilter(SETTINGS, ORDER)
     first = fixes.update(0.0, _ambiguous(0.0, 0.45, covariance)).state
     assert first is not None and len(first.modes) == 2
@@ -214,7 +214,7 @@ def test_two_hypotheses_live_until_one_is_right(covariance: Array) -> None:
     assert sure is not None and len(sure.modes) == 1
 
 
-def test_the_wrong_first_guess_is_given_up(measure: Measure, covariance: Array) -> None:
+def test_a_wrong_first_mode_is_dropped(measure: Measure, covariance: Array) -> None:
     fixes = PoseFilter(SETTINGS, ORDER)
     for index in range(10):
         fixes.update(index * PERIOD_S, _ambiguous(index * PERIOD_S, 0.47, covariance))
@@ -236,7 +236,7 @@ def test_the_wrong_first_guess_is_given_up(measure: Measure, covariance: Array) 
         ({"left_from_drogue": RigidTransform(np.eye(3), np.array([0, 0, 1e200]))}, "farther than"),
     ],
 )
-def test_what_cannot_be_filtered_is_skipped(
+def test_invalid_estimates_are_refused(
     measure: Measure, covariance: Array, change: dict[str, object], reason: str
 ) -> None:
     fixes = _flown(measure, covariance)
@@ -246,7 +246,7 @@ def test_what_cannot_be_filtered_is_skipped(
     assert _same(update.state, before) and _same(fixes.predict(1.6), before)
 
 
-def test_numbers_that_are_none(measure: Measure, covariance: Array) -> None:
+def test_invalid_numbers_are_errors(measure: Measure, covariance: Array) -> None:
     fixes = _flown(measure, covariance)
     for time_s in (np.nan, np.inf):
         with pytest.raises(ValueError, match="time_s: must be finite"):
@@ -268,7 +268,9 @@ def test_numbers_that_are_none(measure: Measure, covariance: Array) -> None:
 
 
 @pytest.mark.slow
-def test_it_stays_sound_over_ten_thousand_fixes(measure: Measure, covariance: Array, rng: np.random.Generator) -> None:
+def test_covariances_stay_valid_over_ten_thousand_fixes(
+    measure: Measure, covariance: Array, rng: np.random.Generator
+) -> None:
     settings = FilterSettings(vibration_m=0, vibration_rad=0, max_delay_s=0)
     fixes = PoseFilter(settings, ORDER)
     scales = 10.0 ** rng.uniform(-4, 1, 10_000)
@@ -283,7 +285,7 @@ def test_it_stays_sound_over_ten_thousand_fixes(measure: Measure, covariance: Ar
             np.testing.assert_allclose(update.state.covariance, update.state.covariance.T)
 
 
-def test_a_state_becomes_an_ordinary_estimate(measure: Measure, covariance: Array) -> None:
+def test_a_state_becomes_an_estimate(measure: Measure, covariance: Array) -> None:
     state = _flown(measure, covariance).predict(1.6)
     assert state is not None
     seen = NoFix(frame_index=40, method="joint", reason="no drogue detected", stage_s={"detect": 0.1}, latency_s=0.2)

@@ -1,4 +1,4 @@
-"""A receiver that turns aside by 30 degrees within 0.85 s and looks at the drogue again at once."""
+"""A receiver that turns by 30 degrees and back within 0.85 s."""
 
 from collections.abc import Callable
 
@@ -50,7 +50,7 @@ def estimates(rng: np.random.Generator, measure: Measure, covariance: Array) -> 
     return [measure(_pose(time_s), covariance / 400, rng, index) for index, time_s in enumerate(TIMES)]
 
 
-def test_no_fix_is_lost(estimates: list[PoseEstimate]) -> None:
+def test_no_fix_is_rejected_in_a_turn(estimates: list[PoseEstimate]) -> None:
     answers = _answers(estimates, FilterSettings())
     assert all(answer.accepted for answer in answers)
     states = [answer.state for answer in answers if answer.state is not None]
@@ -69,14 +69,14 @@ def test_no_fix_is_lost(estimates: list[PoseEstimate]) -> None:
     assert np.abs(away[-10:]).max() < 0.05 and states[-1].covariance[6, 6] < 2 * states[20].covariance[6, 6]
 
 
-def test_without_turns_in_the_model_fixes_are_lost(estimates: list[PoseEstimate]) -> None:
+def test_without_turns_in_the_model_fixes_are_rejected(estimates: list[PoseEstimate]) -> None:
     answers = _answers(estimates, FilterSettings(turns_per_s=0))
     assert sum(not answer.accepted for answer in answers) > 5
 
 
 @pytest.mark.parametrize("offset_m", [[0.5, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 1.0]])
 @pytest.mark.parametrize("wrong", [20, 35, 45])
-def test_outliers_are_no_turns(
+def test_outliers_are_not_taken_for_turns(
     estimates: list[PoseEstimate], wrong: int, offset_m: list[float], covariance: Array, measure: Measure
 ) -> None:
     jump = RigidTransform(np.eye(3), np.array(offset_m))
@@ -85,7 +85,7 @@ def test_outliers_are_no_turns(
     assert [index for index, answer in enumerate(answers) if not answer.accepted] == [wrong]
 
 
-def test_the_smoother_goes_through_it(estimates: list[PoseEstimate]) -> None:
+def test_the_smoother_follows_a_turn(estimates: list[PoseEstimate]) -> None:
     smoothed: list[Estimate] = smooth(TIMES, estimates, FilterSettings(), 8)
     for estimate, time_s in zip(smoothed, TIMES, strict=True):
         assert isinstance(estimate, PoseEstimate)
@@ -93,7 +93,7 @@ def test_the_smoother_goes_through_it(estimates: list[PoseEstimate]) -> None:
         assert np.abs(estimate.left_from_drogue.translation_m - _pose(time_s).translation_m).max() < 2.5e-3
 
 
-def test_it_is_found_again_in_the_middle_of_a_turn(estimates: list[PoseEstimate]) -> None:
+def test_the_filter_restarts_in_the_middle_of_a_turn(estimates: list[PoseEstimate]) -> None:
     fixes = PoseFilter(FilterSettings(), 8)
     answers = [fixes.update(TIMES[index], estimates[index]) for index in (*range(20), *range(55, 80))]
     assert "gap" in answers[20].reason and all(answer.accepted for answer in answers)

@@ -1,4 +1,4 @@
-"""The smoother against batch least squares, and what it does with gaps, outliers and ambiguity."""
+"""The smoother against batch least squares, and with gaps, outliers and ambiguity."""
 
 from collections.abc import Callable
 
@@ -66,7 +66,7 @@ def _batch(times: Array, depths: Array, sd_m: float, settings: FilterSettings) -
     return (told @ solved).reshape(count, 2), covariance
 
 
-def test_it_is_batch_least_squares_on_a_line(rng: np.random.Generator, measure: Measure) -> None:
+def test_the_smoother_is_batch_least_squares_on_a_line(rng: np.random.Generator, measure: Measure) -> None:
     settings = FilterSettings(long_term_excess=0, vibration_m=0.004, vibration_s=0.05, noise_scale_variance_per_s=0)
     sd_m = 0.01
     times = np.cumsum(rng.choice([0.03, 0.04, 0.11], 25))
@@ -95,7 +95,7 @@ def _swinging(time_s: float) -> RigidTransform:
     return RigidTransform(attitude, np.array([0.3 * np.sin(1.6 * time_s), 0.1, 8 - 0.6 * time_s]))
 
 
-def test_it_is_nearer_than_the_filter_and_that_than_the_fixes(
+def test_the_smoother_beats_the_filter_which_beats_the_fixes(
     rng: np.random.Generator, measure: Measure, covariance: Array
 ) -> None:
     settings = FilterSettings(vibration_m=0, vibration_rad=0)
@@ -164,7 +164,7 @@ def test_pairs_without_a_fix_change_nothing_elsewhere(
         assert np.abs(pose_difference(one.left_from_drogue, other.left_from_drogue)).max() < 1e-4
 
 
-def test_in_a_gap_accelerations_last(measure: Measure, covariance: Array) -> None:
+def test_accelerations_are_correlated_over_a_gap(measure: Measure, covariance: Array) -> None:
     times = [index * 0.04 for index in range(30)]
     estimates: list[Estimate] = [
         _no_fix(index) if 10 <= index < 18 else measure(_swinging(time), covariance, None, index)
@@ -182,7 +182,7 @@ def test_in_a_gap_accelerations_last(measure: Measure, covariance: Array) -> Non
     assert variances[1] > 2.5 * variances[0]
 
 
-def test_what_comes_later_decides_between_hypotheses(measure: Measure, covariance: Array) -> None:
+def test_later_fixes_decide_between_hypotheses(measure: Measure, covariance: Array) -> None:
     times = [index * 0.04 for index in range(20)]
 
     def pose(time_s: float, tilt_rad: float) -> RigidTransform:
@@ -204,7 +204,7 @@ def test_what_comes_later_decides_between_hypotheses(measure: Measure, covarianc
         assert np.abs(pose_difference(estimate.left_from_drogue, pose(time, 0.1))[3:]).max() < 0.002
 
 
-def test_bad_times_and_nothing(measure: Measure, covariance: Array) -> None:
+def test_invalid_times_and_empty_sequences(measure: Measure, covariance: Array) -> None:
     two = [measure(_swinging(0), covariance)] * 2
     for times in ([0.0], [1.0, 0.0], [1.0, 1.0], [0.0, np.nan]):
         with pytest.raises(ValueError, match="times_s"):

@@ -77,7 +77,7 @@ def test_methods_are_exact_without_noise(make_pose, count, z_m):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 2.0, 5.0])
-def test_joint_knows_that_the_image_of_a_disc_is_not_centred_on_the_image_of_its_centre(make_pose, z_m):
+def test_joint_models_the_shift_of_ellipse_centres(make_pose, z_m):
     place = make_pose(0.1, 0.02, z_m, 10, 10, 3)
     solution = solved(joint, observe(ring(8), place, 0.05))
     # Ignoring the shift costs 0.28 mm at 1.5 m and 0.1 mm at 5 m; with it only the convergence limit remains.

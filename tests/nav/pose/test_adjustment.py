@@ -146,7 +146,7 @@ def test_adjusted_poses_are_those_of_scipy(draw_poses, radii_count, sigmas):
         assert 0 <= found.costs[index] - cost + 1e-9 < sigmas**2 / 2 + 2e-9
 
 
-def test_what_lies_behind_the_cameras_costs_without_end_and_is_left_alone(draw_poses):
+def test_a_pose_behind_the_cameras_has_infinite_cost_and_is_not_adjusted(draw_poses):
     draws = draw_poses(np.random.default_rng(74), 2, 3.0, SIGMA_PX)
     features = features_of(draws)
     rotations, translations = poses_of(draws)
@@ -156,7 +156,7 @@ def test_what_lies_behind_the_cameras_costs_without_end_and_is_left_alone(draw_p
     np.testing.assert_array_equal(found.translations_m[0], translations[0])
 
 
-def test_a_feature_that_no_eye_measured_tells_nothing(draw_poses):
+def test_an_unmeasured_feature_has_no_residuals(draw_poses):
     draws = draw_poses(np.random.default_rng(75), 3, 4.0, SIGMA_PX)
     whole = features_of(draws, 1.0, STATED)
     mask = np.arange(10) == 3

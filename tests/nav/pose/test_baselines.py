@@ -1,4 +1,4 @@
-"""Circle fits, planes and single-eye methods: closed forms, exactness, and the error laws that are known of them."""
+"""Circle fits, planes and monocular methods: closed forms, exactness, and known error laws."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_exact_without_noise(draw_poses, name):
 
 @pytest.mark.parametrize("z_m", [2.0, 5.0])
 @pytest.mark.parametrize("name", ["mono-ippe", "mono-sqpnp", "mono-lm"])
-def test_single_eye_methods_reach_the_bound_of_one_eye(draw_poses, name, z_m):
+def test_monocular_methods_reach_the_bound_of_one_eye(draw_poses, name, z_m):
     draws = draw_poses(np.random.default_rng(54), 250, z_m, 0.05, tilt_deg=(6.0, 10.0))
     left = type(draws)(draws.rig, draws.layout, 0.05, draws.places, draws.exact_px[:, :1], draws.pixels_px[:, :1])
     ratios = []

@@ -1,4 +1,4 @@
-"""The joint adjustment at centroid level: how near its errors are to the bound, and whether its covariances say so."""
+"""The joint adjustment at centroid level: errors against the Cramer-Rao bound, and consistency of its covariances."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_every_edge_of_the_hub_has_its_own_ellipse_centre(draw_poses):
         assert solution.note == ""
 
 
-def test_without_a_measured_hub_the_answer_is_that_of_joint_and_says_so(draw_poses):
+def test_without_a_measured_hub_the_solution_is_that_of_joint_with_a_note(draw_poses):
     draws = draw_poses(np.random.default_rng(18), 5, 15.0, 0.1)
     for index in range(5):
         plain, without = joint(draws.observation(index)), joint_hub(draws.observation(index, hub=False))
@@ -190,7 +190,7 @@ def test_one_edge_in_one_eye_is_enough_for_the_sign(draw_poses):
 
 
 @pytest.mark.parametrize(("sigma_px", "fixed_mm", "prior_mm"), [(0.02, 16.1, 3.8), (0.1, 17.1, 13.4)])
-def test_a_prior_on_the_rings_radius_mends_a_drogue_that_is_not_as_built(draw_poses, sigma_px, fixed_mm, prior_mm):
+def test_a_prior_on_the_rings_radius_corrects_for_a_wrong_radius(draw_poses, sigma_px, fixed_mm, prior_mm):
     draws = draw_poses(np.random.default_rng(21), 1000, 10.0, sigma_px, ring_sigma_m=5e-4)
     fixed, free = solve(draws, hub=False), solve(draws, hub=False, tolerances=StatedTolerances(5e-4))
     errors_fixed, errors_free = errors_of(draws, fixed), errors_of(draws, free)

@@ -1,4 +1,4 @@
-"""Measurements that cannot carry a pose, for the methods of one eye and those that use the hub."""
+"""Invalid measurements, for monocular methods and those that use the hub."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def reason_of(method, observation) -> str:
 
 
 @pytest.mark.parametrize("method", MONO)
-def test_the_left_eye_is_enough(draws, method):
+def test_the_left_eye_suffices(draws, method):
     def right_eye_lost(pixels, cov, hub, hub_cov):
         pixels[1], hub[1] = np.nan, np.nan
 
@@ -52,7 +52,7 @@ def test_the_left_eye_is_enough(draws, method):
 
 @pytest.mark.parametrize("method", MONO)
 @pytest.mark.parametrize("left_over", [0, 3])
-def test_the_right_eye_takes_over(draws, method, left_over):
+def test_the_right_eye_replaces_the_left_one(draws, method, left_over):
     def left_eye_lost(pixels, cov, hub, hub_cov):
         pixels[0, left_over:], hub[0] = np.nan, np.nan
 
@@ -141,7 +141,7 @@ def not_a_number(pixels, cov, hub, hub_cov):
         (not_a_number, "marker 2 of the left eye has no positive covariance"),
     ],
 )
-def test_reasons_of_single_eye_methods(draws, method, change, reason):
+def test_reasons_of_monocular_methods(draws, method, change, reason):
     assert reason in reason_of(method, changed(draws, change))
 
 
@@ -174,7 +174,7 @@ def bad_measurements() -> st.SearchStrategy[tuple[str, int, int, float]]:
 @pytest.mark.parametrize("method", METHODS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(bad=bad_measurements())
-def test_no_pose_from_measurements_that_cannot_carry_one(draws, method, bad):
+def test_invalid_measurements_give_no_pose(draws, method, bad):
     kind, eye, marker, number = bad
 
     def spoilt(pixels, cov, hub, hub_cov):
@@ -215,7 +215,7 @@ def test_reasons_of_a_bad_hub(draws, method):
     assert "hub edge 1 of the left eye has no positive covariance" in reason_of(method, changed(draws, no_covariance))
 
 
-def test_another_thing_taken_for_the_hub(draws):
+def test_a_wrong_feature_as_the_hub(draws):
     def elsewhere(pixels, cov, hub, hub_cov):
         hub += 300.0
 
@@ -223,7 +223,7 @@ def test_another_thing_taken_for_the_hub(draws):
     assert isinstance(METHODS["joint-robust"](changed(draws, elsewhere)), Solution)
 
 
-def test_robust_says_when_too_few_agree(draws):
+def test_joint_robust_needs_enough_inliers(draws):
     def scattered(pixels, cov, hub, hub_cov):
         pixels += np.random.default_rng(72).uniform(-15, 15, pixels.shape)
 

@@ -1,4 +1,4 @@
-"""Other people's pose methods, found by the entry point that their package registers."""
+"""Pose methods of other packages, registered by entry points."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def install(tmp_path, monkeypatch):
     return write
 
 
-def test_our_own_methods():
+def test_built_in_methods():
     assert list(METHODS) == NAMES.split()
     assert names_of_runner() == method_names()
     assert method_names()[: len(METHODS)] == tuple(METHODS)
@@ -93,7 +93,7 @@ def test_a_method_that_cannot_be_loaded(install, line, fault):
         pose_method("broken")
 
 
-def test_a_method_that_answers_something_else(install, draw_poses):
+def test_a_method_that_returns_another_type(install, draw_poses):
     install("nothing = other_estimators:nothing")
     observation = draw_poses(np.random.default_rng(82), 1, 5.0, 0.1).observation(0)
     with pytest.raises(ValueError, match="method: 'nothing' must answer Solution or NoFixReason, got NoneType"):

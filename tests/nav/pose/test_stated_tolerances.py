@@ -1,4 +1,4 @@
-"""Drogues and rigs that are not exactly as built, and estimators that are told how far they may depart."""
+"""Drogues and rigs that depart from nominal, and methods that know the tolerances."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def state_of(draws, features, departures):
 
 
 @pytest.mark.parametrize("eyes", [1, 2])
-def test_a_displaced_feature_has_the_covariance_of_both_eyes_together(draw_poses, eyes):
+def test_a_displaced_feature_has_the_joint_covariance_of_both_eyes(draw_poses, eyes):
     draws = draw_poses(np.random.default_rng(60), 4, (1.7, 10.0), 0.1)
     rng = np.random.default_rng(61)
     roots = rng.normal(0, 0.1, (4, eyes, 10, 2, 2))
@@ -75,7 +75,7 @@ def test_derivatives_are_those_of_the_residuals(draw_poses, tolerances):
         np.testing.assert_allclose(now, slope, atol=2e-3 * max(1.0, np.abs(slope).max()))
 
 
-def test_a_marker_that_one_eye_lost_counts_by_itself(draw_poses):
+def test_a_marker_in_one_eye_has_its_own_covariance(draw_poses):
     draws = draw_poses(np.random.default_rng(63), 1, 3.0, 0.1)
     for lost in (0, 1):
         pixels = draws.pixels_px.copy()
@@ -102,7 +102,7 @@ def toleranced(draws, rng, tolerances):
 
 @pytest.mark.parametrize("tolerances", [STATED, *EACH])
 @pytest.mark.parametrize("features", [8, 10])
-def test_covariances_hold_what_is_stated(draw_poses, tolerances, features):
+def test_covariances_include_the_stated_tolerances(draw_poses, tolerances, features):
     rng = np.random.default_rng(64)
     draws = draw_poses(rng, 120, (1.7, 6.0), 0.03, tilt_deg=(6.0, 10.0))
     pixels = toleranced(draws, rng, tolerances)[:, :, :features]
@@ -118,7 +118,7 @@ def test_covariances_hold_what_is_stated(draw_poses, tolerances, features):
     assert np.mean(squares) == pytest.approx(1.0, abs=0.19)
 
 
-def test_one_eye_has_no_disparity_to_be_wrong(draw_poses):
+def test_one_eye_has_no_disparity_tolerance(draw_poses):
     draws = draw_poses(np.random.default_rng(65), 3, 5.0, 0.1)
     for index in range(3):
         exact, told = (
@@ -129,7 +129,7 @@ def test_one_eye_has_no_disparity_to_be_wrong(draw_poses):
         np.testing.assert_allclose(exact.covariance, told.covariance, rtol=1e-6, atol=1e-15)
 
 
-def test_a_displaced_marker_is_no_wrong_one(draw_poses):
+def test_a_displaced_marker_is_no_outlier(draw_poses):
     rng = np.random.default_rng(66)
     draws = draw_poses(rng, 5, 2.0, 0.02)
     pixels = toleranced(draws, rng, STATED)
@@ -143,7 +143,7 @@ def test_a_displaced_marker_is_no_wrong_one(draw_poses):
         assert np.flatnonzero(~wrong.used.all(axis=0)).tolist() == [3]
 
 
-def test_tiny_tolerances_are_none(draw_poses):
+def test_tiny_tolerances_change_nothing(draw_poses):
     draws = draw_poses(np.random.default_rng(67), 3, 5.0, 0.1)
     tiny = StatedTolerances(1e-9, 1e-9, 1e-9, 1e-9, 1e-9)
     for index in range(3):

@@ -1,4 +1,4 @@
-"""Pairs that come at a rate: what is worked on, what is late, and that threads change no answer and never stay."""
+"""Replay at a rate: which pairs are processed, which are late, and that threads change no answer and always end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PATIENCE_S = 60.0
 
 
 class DatasetInMemory:
-    """Pairs as `BlindDataset` has them; reading one may take time by the test's clock, or fail."""
+    """Pairs as in a `BlindDataset`; reading one may take time on the test's clock, or fail."""
 
     def __init__(self, pairs, clock=None, read_s=None, damaged=()):
         self._pairs, self._clock, self._read_s, self._damaged = pairs, clock, read_s or {}, damaged
@@ -35,9 +35,9 @@ class DatasetInMemory:
 
 
 class SteppedClock:
-    """Time goes on only when somebody waits for it or `advance` is called, never while a pair is worked on.
+    """A clock that advances only by waiting or by `advance`, never while a pair is processed.
 
-    With `in_turn`, it does so when all pairs that have come are answered.
+    With `in_turn`, it advances only when all pairs that have arrived are answered.
     """
 
     def __init__(self, in_turn=True):
@@ -88,7 +88,7 @@ def no_thread_stays():
 
 
 def stepped(pairs, settings, read_s=None):
-    """All answers to pairs that a stepped clock lets come."""
+    """All answers to pairs that arrive by a stepped clock."""
     clock = SteppedClock()
     answers = []
     navigator = open_navigator(settings, "color-blob")
@@ -100,7 +100,7 @@ def stepped(pairs, settings, read_s=None):
 
 
 @pytest.mark.parametrize("tracker", [None, "bernoulli"])
-def test_threads_change_no_estimate_of_pairs_that_are_worked_on_in_order(pairs, tracker):
+def test_threads_do_not_change_estimates_of_pairs_in_order(pairs, tracker):
     settings = SequenceSettings(("joint-hub", "paper"), tracker=tracker, filtered=True)
     navigator = open_navigator(settings, "color-blob")
     alone = [navigator.process(pair) for pair in pairs]
@@ -115,14 +115,14 @@ def test_threads_change_no_estimate_of_pairs_that_are_worked_on_in_order(pairs, 
             np.testing.assert_allclose([f.center_px for f in a.features], [f.center_px for f in b.features], atol=1e-9)
 
 
-def test_of_pairs_that_came_while_one_was_read_the_newest_is_worked_on(pairs):
+def test_after_a_slow_read_only_the_newest_pair_is_processed(pairs):
     # Pair 1 is read when pair 3 has come, which could not be read before pair 4 comes; pair 5 when the last one has.
     answers = stepped(pairs, SequenceSettings(("constant",)), {1: 3.2 / RATE_HZ, 5: 10 / RATE_HZ})
     assert [each.frame_index for each in answers] == list(range(7))
     assert [each.frame_index for each in answers if isinstance(each, SkippedPair)] == [2, 3]
 
 
-def test_latency_counts_from_the_moment_at_which_a_pair_came(pairs):
+def test_latency_starts_at_the_arrival_of_a_pair(pairs):
     answers = stepped(pairs[:3], SequenceSettings(("constant",), filtered=True), {0: 0.01, 1: 0.06, 2: 0.02})
     # Pair 1 came 0.04 s after pair 0, and was read 0.06 s after it; pair 2 was read before it came.
     assert [each.latency_s for each in answers] == pytest.approx([0.0, 0.02, 0.0])
@@ -133,7 +133,7 @@ def test_latency_counts_from_the_moment_at_which_a_pair_came(pairs):
         assert all(estimate.stage_s["read"] == each.stage_s["read"] for estimate in each.estimates)
 
 
-def test_smoothed_estimates_have_no_latency_for_they_come_when_the_sequence_is_over(pairs):
+def test_smoothed_estimates_have_no_latency(pairs):
     settings = SequenceSettings(("joint", "constant"), smoothed=True)
     estimates = list(add_smoothed(stepped(pairs[:3], settings), settings))
     assert sum(isinstance(e, PoseEstimate) for e in estimates if e.method == "joint+smoother") == 3
@@ -153,7 +153,7 @@ class HeldDetector(ColorBlobDetector):
         return super().detect(images)
 
 
-def test_a_pair_that_waits_while_a_newer_one_comes_is_late(pairs):
+def test_a_waiting_pair_is_late_when_a_newer_one_arrives(pairs):
     came = threading.Event()
 
     class Source(DatasetInMemory):
@@ -178,7 +178,7 @@ def test_a_pair_that_waits_while_a_newer_one_comes_is_late(pairs):
         assert told_late == late
 
 
-def test_a_pair_that_cannot_be_read_ends_the_replay_with_its_reason(pairs):
+def test_an_unreadable_pair_ends_the_replay_with_its_error(pairs):
     clock = SteppedClock()
     source = DatasetInMemory(pairs, damaged={2})
     answers = []
@@ -208,7 +208,7 @@ def test_a_fault_in_a_stage_ends_the_replay_and_all_threads(pairs, tracker):
         list(replay(DatasetInMemory(pairs), navigator, RATE_HZ, clock))
 
 
-def test_whoever_stops_listening_stops_the_threads(pairs):
+def test_closing_the_generator_stops_the_threads(pairs):
     clock = MonotonicClock()
     # The second pair would come after an hour.
     answers = replay(
@@ -224,53 +224,53 @@ def test_no_pairs_have_no_answers():
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -25.0, float("inf"), float("nan")])
-def test_a_rate_that_is_none_is_refused(rate_hz):
+def test_an_invalid_rate_is_an_error(rate_hz):
     navigator = SequenceNavigator(SequenceSettings(("constant",)), lambda drogue: ColorBlobDetector(PRESETS["red-8"]))
     with pytest.raises(ValueError, match="rate_hz: must be positive and finite"):
         replay(DatasetInMemory([]), navigator, rate_hz, SteppedClock())
 
 
-def test_the_newest_thing_takes_the_place_of_older_ones():
-    place = LatestItemQueue()
-    place.put(0, "thing 0")
-    place.skip(1)
-    assert place.take() == ((), "thing 0")
-    place.skip(2)
-    place.put(3, "thing 3")
-    assert place.take() == ((1, 2), "thing 3")
-    place.put(4, "thing 4")
-    place.skip(5)
-    place.put(6, "thing 6")
-    place.put(7, "thing 7")
-    place.close()
-    assert place.take() == ((4, 5, 6), "thing 7")
-    assert place.take() is None
+def test_the_newest_item_replaces_older_ones():
+    queue = LatestItemQueue()
+    queue.put(0, "item 0")
+    queue.skip(1)
+    assert queue.take() == ((), "item 0")
+    queue.skip(2)
+    queue.put(3, "item 3")
+    assert queue.take() == ((1, 2), "item 3")
+    queue.put(4, "item 4")
+    queue.skip(5)
+    queue.put(6, "item 6")
+    queue.put(7, "item 7")
+    queue.close()
+    assert queue.take() == ((4, 5, 6), "item 7")
+    assert queue.take() is None
 
 
-def test_a_handover_gives_what_it_holds_before_it_says_that_there_is_no_more():
-    place = SingleItemQueue()
-    assert place.wait_free()
-    place.put("last")
-    place.close()
-    assert not place.wait_free()
-    assert place.take() == "last"
-    assert place.take() is None
+def test_a_closed_queue_returns_its_item_first():
+    queue = SingleItemQueue()
+    assert queue.wait_free()
+    queue.put("last")
+    queue.close()
+    assert not queue.wait_free()
+    assert queue.take() == "last"
+    assert queue.take() is None
 
 
-def test_whoever_brings_the_next_thing_waits_until_the_place_is_free():
-    place, brought = SingleItemQueue(), []
+def test_the_producer_waits_until_the_queue_is_empty():
+    queue, produced = SingleItemQueue(), []
 
-    def bring():
+    def produce():
         for number in range(20):
-            if place.wait_free():
-                brought.append(number)
-                place.put(number)
+            if queue.wait_free():
+                produced.append(number)
+                queue.put(number)
 
-    thread = threading.Thread(target=bring)
+    thread = threading.Thread(target=produce)
     thread.start()
     for number in range(20):
-        assert place.take() == number
-        assert len(brought) <= number + 2
+        assert queue.take() == number
+        assert len(produced) <= number + 2
     thread.join(PATIENCE_S)
-    place.close()
-    assert place.take() is None
+    queue.close()
+    assert queue.take() is None

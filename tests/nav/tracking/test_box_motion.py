@@ -1,4 +1,4 @@
-"""The filter that expects the next box."""
+"""The Kalman filter that predicts the next box."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def box_at(x: float, y: float, size: float) -> tuple[float, float, float, float]
     return x - size / 2, y - size / 4, size, size / 2
 
 
-def test_constant_velocity_is_expected_exactly_in_the_end() -> None:
+def test_predictions_converge_for_constant_velocity() -> None:
     motion = BoxMotion(box_at(100, 200, 40), 0.0)
     for index in range(1, 60):
         motion.update(box_at(100 + 12 * index, 200 - 7 * index, 40 * 1.02**index), index * PERIOD_S)
@@ -24,7 +24,7 @@ def test_constant_velocity_is_expected_exactly_in_the_end() -> None:
     np.testing.assert_allclose(expected, box_at(100 + 12 * 60, 200 - 7 * 60, 40 * 1.02**60), atol=1e-3)
 
 
-def test_errors_of_prediction_are_as_large_as_it_says() -> None:
+def test_prediction_errors_match_their_standard_deviations() -> None:
     """A box that is pushed at random, as often and as hard as the filter believes, and measured with its noise."""
     rng = np.random.default_rng(3)
     acceleration, noise_px = 1.0e6, np.hypot(0.01 * 80, 0.3)
@@ -43,7 +43,7 @@ def test_errors_of_prediction_are_as_large_as_it_says() -> None:
     assert np.mean(np.square(ratios[50:])) == pytest.approx(1.0, abs=0.2)
 
 
-def test_what_is_not_seen_becomes_uncertain_and_keeps_its_shape() -> None:
+def test_without_measurements_uncertainty_grows_and_the_shape_stays() -> None:
     motion = BoxMotion(box_at(100, 200, 40), 1.0)
     sds = np.array([motion.predict(1.0 + gap).sd for gap in (0.0, 0.04, 0.2, 1.0)])
     assert (np.diff(sds, axis=0) > 0).all()

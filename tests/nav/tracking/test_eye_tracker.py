@@ -1,4 +1,4 @@
-"""Both eyes of a tracker: they help each other, and must agree."""
+"""Consistency of the two eyes of a stereo tracker."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_an_eye_whose_box_is_beside_the_image_is_not_followed(name: str) -> None
 
 
 @pytest.mark.parametrize("fooled", EYES)
-def test_an_eye_that_is_drawn_to_something_alike_is_called_back_by_the_other(fooled: str) -> None:
+def test_an_eye_on_a_lookalike_is_corrected_by_the_other(fooled: str) -> None:
     """The drogue jumps, and in one eye something like it stands where the drogue was expected."""
     places = [Place(250, 240, 60)] * 4 + [Place(325, 240, 60), Place(327, 240, 60)]
     pairs = film(places)
@@ -64,7 +64,7 @@ def test_an_eye_that_is_drawn_to_something_alike_is_called_back_by_the_other(foo
         assert least_overlap(tracker, images, place) > 0.9
 
 
-def test_an_eye_that_looked_twice_at_a_pair_missed_once() -> None:
+def test_two_searches_of_one_pair_are_one_miss() -> None:
     """Four misses of the right eye, each with a second look after the left one's box, do not make it give up."""
     places = [Place(300 + 2 * index, 240, 60) for index in range(8)]
     pairs, without = film(places), film([replace(place, hidden=True) for place in places])

@@ -1,4 +1,4 @@
-"""OpenCV's MIL behind our interface: boxes that it cannot take, the image's edge, and what happens once it is lost."""
+"""OpenCV's MIL as a tracker: boxes that it cannot start with, the image's edge, and loss."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def left_box(place: Place) -> StereoDetection:
     return StereoDetection(Detection(place.box("left"), 1.0), None)
 
 
-def test_it_keeps_the_size_that_it_began_with() -> None:
+def test_mil_keeps_its_initial_size() -> None:
     places = [Place(320 + 3 * index, 240, 60 * 1.01**index) for index in range(8)]
     pairs = film(places)
     tracker = open_tracker("mil")
@@ -29,7 +29,7 @@ def test_it_keeps_the_size_that_it_began_with() -> None:
 
 
 @pytest.mark.parametrize("size", [4, 5, 520, 700])
-def test_a_box_that_opencv_cannot_begin_with_is_lost(size: float) -> None:
+def test_a_box_that_opencv_cannot_start_with_is_lost(size: float) -> None:
     place = Place(320, 240, size)
     pairs = film([place] * 2)
     tracker = open_tracker("mil")
@@ -38,14 +38,14 @@ def test_a_box_that_opencv_cannot_begin_with_is_lost(size: float) -> None:
 
 
 @pytest.mark.parametrize(("x", "y"), [(20, 240), (320, 465), (622, 462)])
-def test_a_box_over_the_edge_is_followed_about_its_own_middle(x: float, y: float) -> None:
+def test_a_box_over_the_edge_is_followed_about_its_own_centre(x: float, y: float) -> None:
     """A fifth of the box or more is not on the image."""
     places = [Place(x, y, 80), Place(x + 1, y, 80)]
     # MIL is off by some pixels of its grid, 1.25 px each: 6 px each way leave this.
     assert after_the_first(places) > 0.7
 
 
-def test_once_lost_a_correction_to_the_old_place_begins_anew() -> None:
+def test_after_a_loss_a_correction_restarts_mil() -> None:
     """While nothing is there MIL wanders off, and does not say so."""
     assert after_a_correction() > 0.7
 

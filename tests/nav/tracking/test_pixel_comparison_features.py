@@ -34,7 +34,7 @@ def at(*offsets_px: tuple[float, float]) -> Array:
 @pytest.mark.parametrize(
     "look", [Look(), Look(ground=True), Look(light=0.1, noise_dn=1.5)], ids=["sky", "ground", "dark"]
 )
-def test_the_drogue_scores_one_and_everything_else_much_less(look: Look) -> None:
+def test_the_drogue_scores_one_and_all_else_much_less(look: Look) -> None:
     tests = learned_at(PLACE, look)
     # Expected is the mean over misplacements by a thirty-second of the box, 3 px, each way; sizes are not varied here.
     steps = [-3, 0, 3]
@@ -47,12 +47,12 @@ def test_the_drogue_scores_one_and_everything_else_much_less(look: Look) -> None
     assert tests.scores(whole(PLACE, look), BOX, elsewhere).max() < 0.5
 
 
-def test_where_it_stood_there_is_nothing_once_it_is_gone() -> None:
+def test_the_score_drops_when_the_drogue_is_gone() -> None:
     gone = Place(PLACE.x, PLACE.y, PLACE.size, hidden=True)
     assert learned_at(PLACE, Look()).scores(whole(gone, Look()), BOX, at((0, 0)))[0] < 0
 
 
-def test_the_score_has_no_unit_of_light() -> None:
+def test_the_score_is_invariant_to_gain() -> None:
     """A picture of two thirds of the light, as a meter may leave it."""
     dimmer = learned_at(PLACE, Look()).scores(whole(PLACE, Look(light=0.67)), BOX, at((0, 0)))
     assert dimmer[0] > 0.8
@@ -64,7 +64,7 @@ def test_a_candidate_beyond_the_image_has_no_score() -> None:
     assert scores[0] == -np.inf and np.isfinite(scores[1])
 
 
-def test_what_is_learned_again_and_again_stays_a_chance() -> None:
+def test_pass_rates_stay_within_their_bounds() -> None:
     """Beta posteriors with forgetting: two hundred equal answers are no certainty, and a new look is accepted."""
     tests, dark = learned_at(PLACE, Look()), whole(PLACE, Look(light=0.2))
     before = tests.scores(dark, BOX, at((0, 0)))[0]

@@ -1,4 +1,4 @@
-"""Pieces of images: places must survive the change of grid."""
+"""Resampled image regions: points must keep their positions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def spot(x: float, y: float, sigma: float, bits: int = 8) -> EyeImage:
 
 
 @pytest.mark.parametrize("step_px", [0.5, 1.0, 1.7, 4.0, 9.3])
-def test_a_spot_stays_where_it_is(step_px: float) -> None:
+def test_resampling_keeps_a_spot_in_place(step_px: float) -> None:
     region = image_region(spot(217.3, 140.8, 20), (100, 40, 230, 210), step_px)
     assert region is not None
     np.testing.assert_allclose(region.step_px, step_px, rtol=0.03)
@@ -38,7 +38,7 @@ def test_twelve_bits_become_eight_by_a_square_root() -> None:
     assert light.pixels.max() == 255
 
 
-def test_outside_the_image_there_is_nothing() -> None:
+def test_there_is_no_region_outside_the_image() -> None:
     image = spot(200, 150, 20)
     assert image_region(image, (500, 10, 50, 50), 1.0) is None
     edge = image_region(image, (390, -20, 50, 50), 1.0)

@@ -1,4 +1,4 @@
-"""Boxes around a rim against closed forms, and how much two boxes share."""
+"""Boxes around a rim against closed forms, and overlaps of boxes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_rim_behind_the_eyes_or_too_far_away_has_no_box(place):
     assert (found.left, found.right) == (None, None)
 
 
-def test_a_rim_where_the_lens_has_no_number_has_no_box():
+def test_a_rim_where_the_lens_polynomial_overflows_has_no_box():
     lens = Lens(CAMERA, BrownConrady(k1=0.1, k3=0.1))
     rig = replace(RIG, lenses=(lens, lens))
     with np.errstate(over="ignore", invalid="ignore"):

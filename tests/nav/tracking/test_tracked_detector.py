@@ -1,4 +1,4 @@
-"""A detector that starts a tracker, and starts it again."""
+"""A detector that starts and restarts a tracker."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def overlaps(found: StereoDetection, place: Place) -> list[float]:
 
 
 @pytest.mark.parametrize("name", ["bernoulli", "flow", "pose-predict"])
-def test_the_detector_looks_once_while_the_drogue_is_followed(name: str) -> None:
+def test_the_detector_runs_once_while_the_drogue_is_followed(name: str) -> None:
     following, detector = tracked(name)
     places = [Place(300 + 5 * index, 240, 80) for index in range(8)]
     for images, place in zip(film(places), places, strict=True):
@@ -50,7 +50,7 @@ def test_the_detector_looks_once_while_the_drogue_is_followed(name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["bernoulli", "flow", "mil", "pose-predict"])
-def test_two_seconds_behind_something(name: str) -> None:
+def test_the_drogue_is_found_again_after_two_seconds_of_occlusion(name: str) -> None:
     following, _ = tracked(name)
     places = [Place(300, 200 + index, 80, hidden=4 <= index < 54) for index in range(58)]
     pairs = zip(film(places), places, strict=True)
@@ -74,7 +74,7 @@ def test_the_eye_that_is_blinded_is_found_again_while_the_other_is_followed() ->
     assert detector.asked <= 7
 
 
-def test_a_gap_in_time_begins_a_new_sequence() -> None:
+def test_a_gap_in_time_starts_a_new_sequence() -> None:
     following, detector = tracked()
     first, second = Place(200, 150, 60), Place(450, 300, 90)
     pairs = film([first] * 3) + film([second] * 2, start_s=10.0) + film([first], start_s=0.0)
@@ -102,7 +102,7 @@ def test_pairs_of_one_time_are_no_sequence() -> None:
     ]
 
 
-def test_another_kind_of_image_begins_anew() -> None:
+def test_another_image_format_restarts_the_tracker() -> None:
     """The tests of colours and the template of three channels mean nothing in grey, nor those of 12 bits in 8."""
     following, detector = tracked()
     place = Place(300, 240, 120)
@@ -116,7 +116,7 @@ def test_another_kind_of_image_begins_anew() -> None:
     assert detector.asked == 5
 
 
-def test_a_false_first_box_is_not_followed_for_ever() -> None:
+def test_a_false_first_box_is_corrected_by_a_later_detection() -> None:
     """Something like the drogue, but smaller, is taken for it once; then the detector looks a second later."""
     true, false = Place(430, 240, 120), Place(150, 240, 60)
     pair, other = film([true])[0], film([false])[0]
@@ -140,7 +140,7 @@ def test_a_false_first_box_is_not_followed_for_ever() -> None:
     assert detector.asked == 2
 
 
-def test_where_there_is_nothing_the_detector_looks_every_time() -> None:
+def test_without_a_drogue_the_detector_runs_at_every_pair() -> None:
     following, detector = tracked()
     for images in film([Place(300, 240, 80, hidden=True)] * 3):
         assert following.detect(images) == StereoDetection(None, None)
@@ -156,7 +156,7 @@ def test_candidates_are_the_answer_by_score() -> None:
     assert following.candidates(pairs[1], 1.01) == {"left": (), "right": ()}
 
 
-def test_one_drogue_one_memory() -> None:
+def test_the_factory_keeps_the_tracker_of_one_drogue() -> None:
     known, other = load_drogue("red-8"), load_drogue("red-7")
     of = tracked_detector_factory(ColorBlobDetector, "bernoulli")
     first = of(known)

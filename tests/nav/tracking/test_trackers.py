@@ -1,4 +1,4 @@
-"""Every tracker on painted sequences: it stays on the drogue, and says when it is gone."""
+"""Every tracker on painted sequences: it follows the drogue, and detects its loss."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def overlaps(tracker: Tracker, pairs: list[StereoImages], places: list[Place]) -
 
 
 @pytest.mark.parametrize(("name", "size"), [("bernoulli", 16), ("bernoulli", 60), ("flow", 60), ("pose-predict", 60)])
-def test_sixty_pixels_a_frame(name: str, size: float) -> None:
+def test_motion_of_sixty_pixels_per_frame(name: str, size: float) -> None:
     places = swing(size, 16)
     steps = np.hypot(*np.diff([(place.x, place.y) for place in places], axis=0).T)
     assert steps.max() > 60
@@ -63,13 +63,13 @@ def test_an_approach_from_16_to_700_px_ends_beyond_the_image() -> None:
     assert found.min() > 0.7
 
 
-def test_bernoulli_follows_what_has_eight_pixels() -> None:
+def test_bernoulli_follows_a_drogue_of_eight_pixels() -> None:
     places = swing(8, 12)
     # A fifth of a pixel each way.
     assert overlaps(open_tracker("bernoulli"), film(places), places).min() > 0.9
 
 
-def test_bernoulli_before_fields_that_pass_by() -> None:
+def test_bernoulli_ignores_a_moving_background() -> None:
     places = swing(60, 16)
     assert overlaps(open_tracker("bernoulli"), film(places, Look(ground=True)), places).min() > ALL_MARKERS_INSIDE
 
@@ -86,7 +86,7 @@ def test_a_mono_image_is_followed(name: str, size: float) -> None:
     # MIL sits on the fields where the drogue was, and fields look like the fields that it saw around and through it.
     [(name, ground) for name in tracker_names() for ground in (False, True) if (name, ground) != ("mil", True)],
 )
-def test_what_is_hidden_has_no_box(name: str, ground: bool) -> None:
+def test_a_hidden_drogue_has_no_box(name: str, ground: bool) -> None:
     places = [Place(300 + 4 * index, 240 + 2 * index, 70, hidden=index >= 6) for index in range(20)]
     look = Look(ground=ground, noise_dn=1.5)
     found = overlaps(open_tracker(name), film(places, look), places)
@@ -97,7 +97,7 @@ def test_what_is_hidden_has_no_box(name: str, ground: bool) -> None:
 
 
 @pytest.mark.parametrize("name", ["bernoulli", "flow", "pose-predict"])
-def test_what_leaves_the_image_has_no_box(name: str) -> None:
+def test_a_drogue_that_leaves_the_image_has_no_box(name: str) -> None:
     places = [Place(480 + 15 * index, 240, 80) for index in range(20)]
     found = overlaps(open_tracker(name), film(places), places)
     inside = [place.x + place.size / 2 < 640 for place in places[1:]]
@@ -154,7 +154,7 @@ def test_a_prediction_replaces_the_tracker_s_own(name: str) -> None:
     assert found is not None and overlap(found.box_xywh_px, places[2].box("left")) > 0.9
 
 
-def test_an_eye_that_lost_the_drogue_looks_where_the_other_sees_it() -> None:
+def test_an_eye_that_lost_the_drogue_searches_where_the_other_sees_it() -> None:
     """Something hides it from the right eye while it turns back."""
     places = [Place(200 + 20 * index, 240, 60) for index in range(5)]
     places += [Place(280 - 25 * index, 240, 60) for index in range(1, 7)]
