@@ -1,4 +1,4 @@
-"""A receiver that turns by 30 degrees and back within 0.85 s."""
+"""A receiver that turns by 30 degrees within 0.85 s, and back."""
 
 from collections.abc import Callable
 
