@@ -15,20 +15,20 @@ from datasets_manifest.types.frame import FrameSpec
 from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye, StereoRig
-from scenes.environment_radiance import Surroundings, surroundings
+from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.sky.night import EXTINCTION_MAG, star_catalogue
 
 _FAR_M = 1e9
-# Towards the horizon the air takes the rest.
+# Nearer to the horizon the air hides stars.
 _LOWEST_SINE = 0.02
 
 
 def add_stars(sky: NDArray[np.float32], rig: StereoRig, eye: Eye, rotation: NDArray[np.float64]) -> None:
-    """Add stars to a picture of the sky, in place.
+    """Add stars to an image of the sky, in place; each lights the four pixels around it.
 
     Args:
         sky: (H, W, 3) radiance. [cd/m2]
-        rig, eye: give the projection.
+        rig, eye: for the projection.
         rotation: (3, 3) `world_from_left`.
     """
     camera = rig.camera
@@ -58,9 +58,9 @@ _COARSE_STEP_PX = 8
 _MOST_BLUR_SAMPLES = 8
 # By day stars drown in the sky. [deg]
 _STARS_BELOW_DEG = -5.0
-# The air's own light varies over tens of degrees.
+# Airlight varies over tens of degrees.
 _AIR_STEP_PX = 32
-_MOST_PLACES = 32_000
+_MOST_REMAP_ROWS = 32_000
 
 
 def _directions(camera: PinholeCamera, rotation: NDArray[np.float64], u: NDArray, v: NDArray) -> NDArray[np.float32]:  # type: ignore[type-arg]
@@ -75,15 +75,15 @@ def _directions(camera: PinholeCamera, rotation: NDArray[np.float64], u: NDArray
     return out
 
 
-def _directions_through(lens: Lens, rotation: NDArray[np.float64], step_px: int) -> NDArray[np.float32]:
-    """The same through the pixels of a real eye; `step_px` as in `_real_rays`."""
-    directions: NDArray[np.float32] = np.einsum("ij,hwj->hwi", rotation.astype(np.float32), _real_rays(lens, step_px))
+def _lens_directions(lens: Lens, rotation: NDArray[np.float64], step_px: int) -> NDArray[np.float32]:
+    """The same through the pixels of an eye with a lens; `step_px` as in `_lens_rays`."""
+    directions: NDArray[np.float32] = np.einsum("ij,hwj->hwi", rotation.astype(np.float32), _lens_rays(lens, step_px))
     return directions
 
 
 @lru_cache(maxsize=4)
-def _real_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
-    """(h, w, 3) unit directions in the eye's ideal axes, through every pixel or the places of `_grid_px`."""
+def _lens_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
+    """(h, w, 3) unit directions in the rectified axes of the eye, through every pixel or the grid of `_grid_px`."""
     camera = lens.camera
     u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))
     rays = lens.rays(np.stack(np.meshgrid(u, v), axis=-1))
@@ -92,60 +92,61 @@ def _real_rays(lens: Lens, step_px: int) -> NDArray[np.float32]:
 
 
 def _grid_px(size_px: int, step_px: int) -> NDArray[np.float64]:
-    """Coordinates of all pixels, or of the middles of squares of so many, one before the first and one behind. [px]"""
+    """Coordinates of all pixels, or of the centres of squares of pixels with one more at either end. [px]"""
     if step_px == 1:
         return np.arange(size_px, dtype=float)
     return (np.arange(-(-size_px // step_px) + 2) - 0.5) * step_px - 0.5
 
 
 def _sharp_background(
-    around: Surroundings, rig: StereoRig, eye: Eye, rotation: NDArray[np.float64]
+    ambient: EnvironmentRadiance, rig: StereoRig, eye: Eye, rotation: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     camera, lens, step = rig.camera, rig.lens(eye), _COARSE_STEP_PX
 
     def through(step_px: int) -> NDArray[np.float32]:
         if lens is not None:
-            return _directions_through(lens, rotation, step_px)
+            return _lens_directions(lens, rotation, step_px)
         u, v = (_grid_px(size, step_px) for size in (camera.width_px, camera.height_px))
         return _directions(camera, rotation, u, v)
 
     window = slice(step, step + camera.height_px), slice(step, step + camera.width_px)
     sky, horizon = (
         np.maximum(cv2.resize(image, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)[window], 0.0)
-        for image in around.clear_radiance(through(step))
+        for image in ambient.clear_radiance(through(step))
     )
-    if around.environment.sun_elevation_deg < _STARS_BELOW_DEG:
+    if ambient.environment.sun_elevation_deg < _STARS_BELOW_DEG:
         add_stars(sky, rig, eye, rotation)
     directions = through(1)
-    image = around.radiance(directions, sky, horizon)
-    around.add_discs(image, directions)
+    image = ambient.radiance(directions, sky, horizon)
+    ambient.add_discs(image, directions)
     return image
 
 
-def air_before(frame: FrameSpec, pixel: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What the air in front of things does at pixel centres, the same in both eyes.
+def air_in_front(frame: FrameSpec, pixel: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Airlight and extinction along pixel centres, the same in both eyes.
 
     Args:
-        frame: with its air, at mid-exposure.
+        frame: gives air and camera at mid-exposure.
         pixel: (P,) flat indices.
 
     Returns:
-        (P, 3) radiance of endless air in the pixel's direction [cd/m2], and (P,) optical depth per planar depth. [1/m]
+        (P, 3) radiance of infinitely deep air in the pixel's direction [cd/m2], and (P,) optical depth per planar
+        depth. [1/m]
     """
-    around, camera, step = surroundings(frame.environment), frame.rig.camera, _AIR_STEP_PX
+    ambient, camera, step = environment_radiance(frame.environment), frame.rig.camera, _AIR_STEP_PX
     columns, rows = camera.width_px // step + 2, camera.height_px // step + 2
     rotation = frame.world_from_left.rotation
-    coarse = around.airlight(_directions(camera, rotation, np.arange(columns) * step, np.arange(rows) * step))
+    coarse = ambient.airlight(_directions(camera, rotation, np.arange(columns) * step, np.arange(rows) * step))
     v, u = (index.astype(np.float32) for index in np.divmod(pixel, camera.width_px))
     scale = np.float32(1 / step)
-    # remap takes no more than 2^15 rows or columns of places.
+    # remap takes at most 2^15 rows or columns.
     light = np.empty((len(pixel), 3), dtype=np.float32)
-    for first in range(0, len(pixel), _MOST_PLACES):
-        part = slice(first, first + _MOST_PLACES)
+    for first in range(0, len(pixel), _MOST_REMAP_ROWS):
+        part = slice(first, first + _MOST_REMAP_ROWS)
         places = (u[part] * scale)[:, None], (v[part] * scale)[:, None]
         light[part] = cv2.remap(coarse, *places, cv2.INTER_LINEAR)[:, 0]
     x, y = (u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px
-    per_depth = around.extinction_per_m * np.sqrt(1.0 + x * x + y * y)
+    per_depth = ambient.extinction_per_m * np.sqrt(1.0 + x * x + y * y)
     return light, per_depth.astype(np.float32)
 
 
@@ -156,18 +157,18 @@ def backgrounds(frame: FrameSpec) -> dict[Eye, NDArray[np.float32]]:
 
 
 def background(frame: FrameSpec, eye: Eye = "left") -> NDArray[np.float32]:
-    """What an eye sees where nothing stands before the surroundings; ideal eyes see the same.
+    """What an eye sees of the environment where no object is in front of it; ideal eyes see the same.
 
     Returns:
-        (H, W, 3) radiance at pixel centres, averaged over the exposure when the camera turns. [cd/m2]
+        (H, W, 3) radiance at pixel centres, averaged over the exposure while the camera turns. [cd/m2]
     """
-    around = surroundings(frame.environment)
+    ambient = environment_radiance(frame.environment)
     turn_px = float(np.linalg.norm(frame.left_twist_per_s[3:])) * frame.exposure.time_s * frame.rig.camera.fx_px
     samples = int(np.clip(np.ceil(2 * turn_px), 1, _MOST_BLUR_SAMPLES)) if turn_px > 0.1 else 1
     total: NDArray[np.float32] | None = None
     for index in range(samples):
         offset_s = ((index + 0.5) / samples - 0.5) * frame.exposure.time_s
-        image = _sharp_background(around, frame.rig, eye, frame.world_from_left_at(offset_s).rotation)
+        image = _sharp_background(ambient, frame.rig, eye, frame.world_from_left_at(offset_s).rotation)
         total = image if total is None else total + image
     assert total is not None
     return total / np.float32(samples)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import EYES, Eye
-from render.background import air_before
+from render.background import air_in_front
 from render.engine import EyeRadiance
 
 # Two float32 distances along one ray to one plane differ by a few roundings; hub and face are 0.25 m apart.
 _SEAM_DEPTH_FRACTION = 1e-5
-# How far from an edge the depth is looked for of what reaches over it.
+# A pixel on an edge takes the depth of the nearest surface within this distance.
 _NEAREST_PX = 2
 
 
@@ -39,52 +39,91 @@ class TracedEye:
     radiance_cd_m2: NDArray[np.float32]
     coverage: NDArray[np.float32]
 
-    def lit_by(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> TracedEye:
+    @classmethod
+    def untraced(
+        cls,
+        part_id: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        normal: NDArray[np.float32],
+        amodal_px: dict[int, int],
+    ) -> TracedEye:
+        """Passes alone, no pixel traced yet."""
+        return cls(
+            part_id=part_id,
+            depth_m=depth_m,
+            normal=normal,
+            amodal_px=amodal_px,
+            pixel=np.zeros(0, dtype=np.int64),
+            radiance_cd_m2=np.zeros((0, 3), dtype=np.float32),
+            coverage=np.zeros(0, dtype=np.float32),
+        )
+
+    @classmethod
+    def empty(cls, height_px: int, width_px: int) -> TracedEye:
+        """Passes of an eye that sees nothing but the sky."""
+        shape = (height_px, width_px)
+        return cls.untraced(
+            part_id=np.zeros(shape, dtype=np.uint8),
+            depth_m=np.full(shape, np.inf, dtype=np.float32),
+            normal=np.zeros((*shape, 3), dtype=np.float32),
+            amodal_px={},
+        )
+
+    def with_light(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> TracedEye:
         """The same passes with these pixels, and their (P, 4) radiance and coverage."""
         return replace(self, pixel=pixel, radiance_cd_m2=light[:, :3], coverage=light[:, 3])
 
-    def put_behind_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Let the air between parts and camera take its share of their light and add its own, in place.
+    def apply_air(self, air: NDArray[np.float32], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Attenuate the light of parts by the air in front of them and add the air's own light, in place.
 
-        A pixel on an edge has the depth of its nearest neighbour; the drogue's own depth matters little to the haze.
+        A pixel on an edge takes the depth of its nearest neighbour; haze hardly varies over the depth of the drogue.
 
         Args:
-            air: (P, 3) radiance of endless air in the direction of each traced pixel. [cd/m2]
+            air: (P, 3) radiance of infinitely deep air in the direction of each traced pixel. [cd/m2]
             optical_depth_per_m: (P,) optical depth per planar depth. [1/m]
 
         Returns:
-            (P, 1) the share of their light that is left.
+            (P, 1) the share of the parts' light that the air transmits.
         """
-        clear = self.clear_share(self.pixel, optical_depth_per_m)
+        clear = self.air_transmittance(self.pixel, optical_depth_per_m)
         self.radiance_cd_m2 = self.radiance_cd_m2 * clear + self.coverage[:, None] * (1.0 - clear) * air
         return clear
 
-    def clear_share(self, pixel: NDArray[np.int64], optical_depth_per_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(P, 1) share that the air leaves of the light of parts in pixels; see `put_behind_air`."""
+    def air_transmittance(
+        self, pixel: NDArray[np.int64], optical_depth_per_m: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """(P, 1) share of the light of parts that the air in front of pixels transmits; see `apply_air`."""
         if not len(pixel):
             return np.zeros((0, 1), dtype=np.float32)
         width = self.depth_m.shape[1]
         first, end = max(int(pixel.min()) // width - _NEAREST_PX, 0), int(pixel.max()) // width + _NEAREST_PX + 1
-        around = np.ones((2 * _NEAREST_PX + 1, 2 * _NEAREST_PX + 1), dtype=np.uint8)
-        # What OpenCV takes to be beyond the image is finite otherwise.
-        eroded = cv2.erode(self.depth_m[first:end], around, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
+        neighbours = np.ones((2 * _NEAREST_PX + 1, 2 * _NEAREST_PX + 1), dtype=np.uint8)
+        # By default OpenCV pads the image with finite numbers.
+        eroded = cv2.erode(self.depth_m[first:end], neighbours, borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
         nearest = eroded.reshape(-1)[pixel - first * width]
         share: NDArray[np.float32] = np.exp(-optical_depth_per_m * np.where(np.isfinite(nearest), nearest, 0.0))
         return share[:, None]
 
-    def pixels_over(self, behind: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(P, 3) radiance of the traced pixels over the surroundings `behind` (H, W, 3)."""
-        through: NDArray[np.float32] = (1.0 - self.coverage)[:, None] * behind.reshape(-1, 3)[self.pixel]
+    def composited_pixels(self, background: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(P, 3) radiance of the traced pixels over a (H, W, 3) background. [cd/m2]"""
+        through: NDArray[np.float32] = (1.0 - self.coverage)[:, None] * background.reshape(-1, 3)[self.pixel]
         return self.radiance_cd_m2 + through
 
-    def over(self, behind: NDArray[np.float32]) -> EyeRadiance:
-        """The traced pixels over the surroundings `behind` (H, W, 3)."""
-        radiance = behind.copy()
+    def composite_over(self, background: NDArray[np.float32]) -> EyeRadiance:
+        """The whole image: traced pixels over a (H, W, 3) background. [cd/m2]"""
+        radiance = background.copy()
         flat = radiance.reshape(-1, 3)
-        flat[self.pixel] = self.pixels_over(behind)
-        coverage = np.zeros(behind.shape[:2], dtype=np.float32)
+        flat[self.pixel] = self.composited_pixels(background)
+        coverage = np.zeros(background.shape[:2], dtype=np.float32)
         coverage.reshape(-1)[self.pixel] = self.coverage
-        return EyeRadiance(radiance, coverage, self.part_id, self.depth_m, self.normal, self.amodal_px)
+        return EyeRadiance(
+            radiance_cd_m2=radiance,
+            coverage=coverage,
+            part_id=self.part_id,
+            depth_m=self.depth_m,
+            normal=self.normal,
+            amodal_px=self.amodal_px,
+        )
 
 
 def amodal_counts(
@@ -93,13 +132,13 @@ def amodal_counts(
     alone_id: NDArray[np.uint8],
     alone_depth_m: NDArray[np.float32],
 ) -> dict[int, int]:
-    """Pixel centres that each marker and the hub would cover if nothing stood before it.
+    """Number of pixel centres that each marker and the hub would cover if nothing occluded it.
 
-    A ray along the seam between a feature and the part that it is set into may fall to either; both lie at one depth,
-    and then the whole scene's verdict counts, so that an unoccluded feature has exactly as many as are seen of it.
+    A ray along the seam between a feature and the part that surrounds it may hit either. Both lie at one depth;
+    then the hit in the whole scene counts, so that an unoccluded feature has as many amodal as visible pixels.
 
     Args:
-        part_id, depth_m: what the pixel centres see, and how far.
+        part_id, depth_m: what the pixel centres see, and its depth.
         alone_id, alone_depth_m: the same with markers and hub alone; of equal shape.
     """
     feature = (part_id >= FIRST_MARKER_ID) | (part_id == Part.HUB)
@@ -110,53 +149,56 @@ def amodal_counts(
 
 
 def inside_one_part(part_id: NDArray[np.uint8], reach_px: int = 1) -> NDArray[np.bool_]:
-    """(H, W) pixels from which all within `reach_px` see the same part: what spreads there is noise and no edge."""
+    """(H, W) pixels around which all within `reach_px` see the same part: differences there are noise, not edges."""
     kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
     alone: NDArray[np.bool_] = (cv2.erode(part_id, kernel) == cv2.dilate(part_id, kernel)) & (part_id > 0)
     return alone
 
 
 @dataclass(frozen=True, eq=False)
-class InPicture:
-    """Both eyes of one frame; flat indices of the right eye come after all of the left.
+class Compositor:
+    """Composites samples of both eyes of one frame; flat indices of the right eye come after all of the left's.
 
     Attributes:
-        frame: with its air.
+        frame: gives the air.
         eyes: passes at mid-exposure.
-        behind: (H, W, 3) surroundings of each eye. [cd/m2]
+        background: (H, W, 3) by eye. [cd/m2]
     """
 
     frame: FrameSpec
     eyes: dict[Eye, TracedEye]
-    behind: dict[Eye, NDArray[np.float32]]
+    background: dict[Eye, NDArray[np.float32]]
 
     def radiance(
         self, pixel: NDArray[np.int64], light: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(P, S, 3) radiance in the picture, and (P, 1) the share that the air leaves of parts' light.
+        """Radiance of samples behind the air and over the background.
 
         Args:
             pixel: (P,) flat indices.
-            light: (P, S, 4) radiance and coverage of parts alone, by some samples of each pixel.
+            light: (P, S, 4) radiance and coverage of parts alone, for S samples of each pixel.
+
+        Returns:
+            (P, S, 3) radiance [cd/m2], and (P, 1) share of the parts' light that the air transmits.
         """
         shown, clear = np.empty((*light.shape[:2], 3), dtype=np.float32), np.empty((len(pixel), 1), dtype=np.float32)
         for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
-            air, optical_depth_per_m = air_before(self.frame, own_pixel)
-            clear[own] = self.eyes[eye].clear_share(own_pixel, optical_depth_per_m)
-            behind = self.behind[eye].reshape(-1, 3)[own_pixel]
-            # What a sample shows if it meets a part, less what it shows if it meets none.
+            air, optical_depth_per_m = air_in_front(self.frame, own_pixel)
+            clear[own] = self.eyes[eye].air_transmittance(own_pixel, optical_depth_per_m)
+            behind = self.background[eye].reshape(-1, 3)[own_pixel]
+            # What a sample shows if it hits a part, less what it shows if it misses.
             of_part = (1.0 - clear[own]) * air - behind
             shown[own] = light[own, :, :3] * clear[own, None] + light[own, :, 3:] * of_part[:, None] + behind[:, None]
         return shown, clear
 
     def shows(self, parts: NDArray[np.uint8], pixel: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(P,) whether the pixels' centres see one of the parts that a table by part id marks."""
+        """(P,) whether the pixels' centres see one of the parts that a (256,) table by part id marks."""
         shows = np.zeros(len(pixel), dtype=np.bool_)
         for eye, (own, own_pixel) in zip(EYES, self.by_eye(pixel), strict=True):
             shows[own] = parts[self.eyes[eye].part_id.reshape(-1)[own_pixel]] > 0
         return shows
 
     def by_eye(self, pixel: NDArray[np.int64]) -> list[tuple[NDArray[np.bool_], NDArray[np.int64]]]:
-        """For each eye (P,) which pixels are its own, and their indices in it."""
+        """For each eye, (P,) which pixels are its own, and their flat indices in its image."""
         size = self.eyes[EYES[0]].part_id.size
         return [(pixel // size == index, pixel[pixel // size == index] - index * size) for index in range(len(EYES))]

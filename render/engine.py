@@ -1,4 +1,4 @@
-"""What every engine delivers, and how to get one by name."""
+"""The interface of render engines, their result types, and loading an engine by name."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
 
 ENTRY_POINT_GROUP = "droguekit.engines"
-"""Where other packages name their engines: classes that are made without arguments."""
+"""Entry points of other packages for their engines: classes whose constructor takes no arguments."""
 
 _OURS = ("mitsuba", "analytic", "blender")
 
 
 class EngineUnavailableError(ValueError):
-    """An engine that is unknown or not installed; says what to do."""
+    """An engine is unknown or not installed; the message says what to do."""
 
 
 @dataclass(frozen=True, eq=False)
 class EyeRadiance:
-    """What one eye would see with a perfect lens, and the passes of its pixel centres.
+    """What one eye sees through a perfect lens, and the passes of its pixel centres.
 
     Attributes:
         radiance_cd_m2: (H, W, 3) float32, linear Rec. 709, scaled so that 0.2126 R + 0.7152 G + 0.0722 B is the
@@ -33,7 +33,7 @@ class EyeRadiance:
         part_id: (H, W) uint8, `drogue_models.parts`, by the ray through the pixel centre at mid-exposure.
         depth_m: (H, W) float32, planar depth along that ray, inf for the sky. [m]
         normal: (H, W, 3) float32, unit normal in the eye's frame along that ray, 0 for the sky.
-        amodal_px: by part id (markers and hub), the pixel centres it would cover if nothing stood before it.
+        amodal_px: by part id (markers and hub), number of pixel centres it would cover if nothing occluded it.
     """
 
     radiance_cd_m2: NDArray[np.float32]
@@ -49,7 +49,7 @@ class StereoRadiance:
     """Both eyes of one frame.
 
     Attributes:
-        engine, engine_version: what made it, down to the variant.
+        engine, engine_version: what rendered it, down to the variant.
         monte_carlo_noise_fraction: root mean square error of luminance by the engine's sampling, over root mean square
             luminance, on the pixels of the drogue; 0 for an engine without sampling.
         stage_s: CPU seconds by stage. [s]
@@ -67,7 +67,7 @@ class StereoRadiance:
 
 
 class RenderEngine(Protocol):
-    """Makes radiance. One engine lives in one process and is reused for many frames."""
+    """Renders radiance. One engine lives in one process and renders many frames."""
 
     name: str
     version: str
@@ -83,7 +83,7 @@ def engine_names() -> tuple[str, ...]:
 
 
 def engine_notice(name: str) -> str | None:
-    """What the user should know before the engine starts, in one line: that it will be slow, and why.
+    """A line for the user before the engine starts: that it will be slow, and why; None otherwise.
 
     Raises:
         ValueError: the engine's packages are missing.
@@ -124,7 +124,7 @@ def load_engine(name: str) -> RenderEngine:
 
 
 def _others() -> dict[str, EntryPoint]:
-    """Engines of other packages; a name of ours stays ours."""
+    """Engines of other packages; they cannot replace an engine that ships with this version."""
     return {entry.name: entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name not in _OURS}
 
 

@@ -20,7 +20,7 @@ _EDGE_PX = 1.2
 
 
 def dirt_map(seed: int, dirt_fraction: float) -> NDArray[np.float32]:
-    """Where dirt covers a square around a disc.
+    """Where dirt covers the square around a disc.
 
     Args:
         seed: of the pattern.
@@ -39,11 +39,11 @@ def dirt_map(seed: int, dirt_fraction: float) -> NDArray[np.float32]:
 
 
 SMOOTH_PARTS = (Part.RIM, Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
-"""Parts with interpolated normals, which those with edges too must have creases for; others have flat faces."""
+"""Parts with interpolated normals, whose meshes need creases at sharp edges; other parts have flat faces."""
 
 
 def surface_condition(frame: FrameSpec, part_id: int) -> SurfaceCondition:
-    """State of a marker or the hub; other parts age as one, see `even_reflectance_rgb`."""
+    """State of a marker or the hub; all other parts age together, see `clean_reflectance_rgb`."""
     if frame.condition is None:
         return AS_NEW
     if part_id == Part.HUB:
@@ -51,7 +51,7 @@ def surface_condition(frame: FrameSpec, part_id: int) -> SurfaceCondition:
     return frame.condition.of_marker(part_id - FIRST_MARKER_ID) if part_id >= FIRST_MARKER_ID else AS_NEW
 
 
-def even_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
+def clean_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
     """(3,) diffuse reflectance of a part of the drogue, the hose or the tanker, without its dirt.
 
     Raises:
@@ -68,23 +68,23 @@ def even_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
 
 
 def reflectance_map(frame: FrameSpec, part_id: int) -> NDArray[np.float32]:
-    """(64, 64, 3) reflectance over the square around a marker or the hub; row 0 is the low y end."""
+    """(64, 64, 3) reflectance with dirt over the square around a marker or the hub; row 0 is the low y end."""
     condition = surface_condition(frame, part_id)
     dirt = dirt_map(condition.dirt_seed, condition.dirt_fraction)[..., None]
-    paint = even_reflectance_rgb(frame, part_id)
+    paint = clean_reflectance_rgb(frame, part_id)
     result: NDArray[np.float32] = (paint * (1.0 - dirt) + np.array(DIRT_RGB) * dirt).astype(np.float32)
     return result
 
 
 def mean_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
-    """(3,) diffuse reflectance of a part, its dirt spread evenly over it."""
+    """(3,) diffuse reflectance of a part, with its dirt spread evenly."""
     dirt = surface_condition(frame, part_id).dirt_fraction
-    mean: NDArray[np.float64] = even_reflectance_rgb(frame, part_id) * (1.0 - dirt) + np.array(DIRT_RGB) * dirt
+    mean: NDArray[np.float64] = clean_reflectance_rgb(frame, part_id) * (1.0 - dirt) + np.array(DIRT_RGB) * dirt
     return mean
 
 
 def lamp_radiance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
-    """(3,) radiance of a self-lit marker, 0 for anything else. [cd/m2]"""
+    """(3,) radiance that a marker emits, 0 for all other parts. [cd/m2]"""
     if frame.drogue is None or part_id < FIRST_MARKER_ID or frame.drogue.marker_luminance_cd_m2 == 0:
         return np.zeros(3)
     color = np.array(frame.drogue.marker_emission_rgb)
@@ -94,17 +94,17 @@ def lamp_radiance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
 
 
 def missing_parts(frame: FrameSpec) -> set[int]:
-    """Part ids of the markers, and maybe the hub, that have come off."""
+    """Part ids of the markers, and possibly the hub, that have come off."""
     return {part for part in _features(frame) if surface_condition(frame, part).missing}
 
 
 def dirty_parts(frame: FrameSpec) -> set[int]:
-    """Part ids of the markers, and maybe the hub, whose paint dirt makes uneven."""
+    """Part ids of the markers, and possibly the hub, that have dirt."""
     return {part for part in _features(frame) if not surface_condition(frame, part).is_clean}
 
 
 def _features(frame: FrameSpec) -> list[int]:
-    """Part ids of hub and markers, of a drogue that has a condition."""
+    """Part ids of hub and markers of a drogue whose condition is not as new."""
     if frame.drogue is None or frame.condition is None:
         return []
     return [int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)]

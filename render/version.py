@@ -1,3 +1,3 @@
-"""The version of the pixels: changed whenever the same recipe and frame give other pixels than before."""
+"""The version of the pixels: it changes whenever the same recipe and frame give other pixels than before."""
 
 RENDER_VERSION = "8"

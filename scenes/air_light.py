@@ -30,7 +30,7 @@ class LayeredAir:
         self._environment = environment
         self._sky = sky
 
-    def seen_from(self, environment: Environment) -> LayeredAir:
+    def moved_to(self, environment: Environment) -> LayeredAir:
         """The same air from another place: other clouds stand before sun and moon; what is a mean over them stays.
 
         Args:

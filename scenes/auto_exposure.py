@@ -1,4 +1,4 @@
-"""The automatic exposure."""
+"""Automatic exposure."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from datasets_manifest.types.frame import Exposure, Sensor
 from drogue_models.parameters import WHITE_PAINT
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
-from scenes.environment_radiance import Surroundings, surroundings
+from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.sky.light import luminance
 
 _METER_COLUMNS, _METER_ROWS = 16, 12
-_DARKEST_CD_M2 = 1e-9  # a millionth of a starlit sky; both limits are reached long before
+_DARKEST_CD_M2 = 1e-9  # a millionth of a starlit sky; the limits of time and gain are reached long before
 
 
-def meter(
+def automatic_exposure(
     law: ExposureLaw, environment: Environment, camera: PinholeCamera, world_from_left: RigidTransform, sensor: Sensor
 ) -> Exposure:
-    """Exposure that puts what the law's meter looks at, see `ExposureLaw`, at its level.
+    """Exposure that brings the luminance that the law meters, see `ExposureLaw`, to the law's level.
 
-    Time comes first, for it makes signal; gain only makes up for what the limits of time leave.
+    A longer time comes first, because it collects more light; gain only makes up for what the limits of time leave.
     """
     gain = law.auto_gain
     if law.time_s is not None and gain.low == gain.high:
         return Exposure(time_s=law.time_s, f_number=law.f_number, gain=gain.low)
-    around = surroundings(environment)
-    plate = around.plate_illuminance_lux(-world_from_left.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
+    ambient = environment_radiance(environment)
+    plate = ambient.plate_illuminance_lux(-world_from_left.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
     brightest = max(float(luminance(plate)), _DARKEST_CD_M2)
     if law.auto_meter == "view":
-        brightest = max(brightest, _mean_luminance(around, camera, world_from_left))
+        brightest = max(brightest, _mean_luminance(ambient, camera, world_from_left))
     one_second = Exposure(time_s=1.0, f_number=law.f_number)
     wanted_s = law.auto_level_fraction * sensor.full_well_e / (sensor.electrons_per_cd_m2(one_second) * brightest)
     time_s = law.time_s
@@ -42,12 +42,12 @@ def meter(
     return Exposure(time_s=time_s, f_number=law.f_number, gain=gain_used)
 
 
-def _mean_luminance(around: Surroundings, camera: PinholeCamera, world_from_left: RigidTransform) -> float:
-    """Of what the camera would see without a drogue. [cd/m2]"""
+def _mean_luminance(ambient: EnvironmentRadiance, camera: PinholeCamera, world_from_left: RigidTransform) -> float:
+    """Mean luminance of the camera's view without a drogue. [cd/m2]"""
     u, v = np.meshgrid(
         (np.arange(_METER_COLUMNS) + 0.5) * camera.width_px / _METER_COLUMNS,
         (np.arange(_METER_ROWS) + 0.5) * camera.height_px / _METER_ROWS,
     )
     rays = world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1)))
-    view = around.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
+    view = ambient.radiance((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
     return float(luminance(view).mean())

@@ -12,7 +12,7 @@ from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters, ReflectanceRgb
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
-from scenes.environment import draw
+from scenes.environment import sample_uniform
 
 # Fewer cannot be told from anything else, and three fix a pose.
 _FEWEST_MARKERS = 3
@@ -45,7 +45,7 @@ def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) 
     markers = tuple(_sample_surface(rng, ranges, bool(gone)) for gone in missing)
     hub = _sample_surface(rng, ranges, False)
     condition = DrogueCondition(
-        markers=markers, hub=hub, body_reflectance_fraction=draw(rng, ranges.body_reflectance_fraction)
+        markers=markers, hub=hub, body_reflectance_fraction=sample_uniform(rng, ranges.body_reflectance_fraction)
     )
     as_new = DrogueCondition(markers=(SurfaceCondition(),) * drogue.marker_count)
     return None if condition == as_new else condition
@@ -53,8 +53,8 @@ def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) 
 
 def _sample_surface(rng: np.random.Generator, ranges: AppearanceRanges, missing: bool) -> SurfaceCondition:
     dirty, failed = rng.random(2) < (ranges.dirty_marker_fraction, ranges.failed_lamp_fraction)
-    dirt, lamp = draw(rng, ranges.dirt_fraction), draw(rng, ranges.lamp_fraction)
-    seed, reflectance = int(rng.integers(2**31)), draw(rng, ranges.marker_reflectance_fraction)
+    dirt, lamp = sample_uniform(rng, ranges.dirt_fraction), sample_uniform(rng, ranges.lamp_fraction)
+    seed, reflectance = int(rng.integers(2**31)), sample_uniform(rng, ranges.marker_reflectance_fraction)
     return SurfaceCondition(
         missing=missing,
         reflectance_fraction=reflectance,

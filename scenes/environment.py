@@ -22,7 +22,7 @@ from scenes.sky.equirectangular_sky import load_map
 _GROUND_SPREAD, _GROUND_TINT = 0.25, 0.06
 
 
-def draw(rng: np.random.Generator, limits: Range) -> float:
+def sample_uniform(rng: np.random.Generator, limits: Range) -> float:
     """A uniform draw; one number is used up even when both ends are equal."""
     return float(rng.uniform(limits.low, limits.high))
 
@@ -34,11 +34,11 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
     """
     rng = frame_generator(seed, scene_id, "environment")
     sky = {
-        "sun_elevation_deg": draw(rng, ranges.sun_elevation_deg),
-        "sun_azimuth_deg": draw(rng, ranges.sun_azimuth_deg),
-        "turbidity": draw(rng, ranges.turbidity),
-        "visibility_m": draw(rng, ranges.visibility_m),
-        "altitude_m": draw(rng, ranges.altitude_m),
+        "sun_elevation_deg": sample_uniform(rng, ranges.sun_elevation_deg),
+        "sun_azimuth_deg": sample_uniform(rng, ranges.sun_azimuth_deg),
+        "turbidity": sample_uniform(rng, ranges.turbidity),
+        "visibility_m": sample_uniform(rng, ranges.visibility_m),
+        "altitude_m": sample_uniform(rng, ranges.altitude_m),
     }
     ground = ranges.ground[int(rng.integers(len(ranges.ground)))]
     ground_texture_seed = int(rng.integers(2**31))
@@ -56,7 +56,7 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
         ground=ground,
         ground_reflectance_rgb=_sample_reflectance(ground_rng, ground),
         ground_texture_seed=ground_texture_seed,
-        wind_speed_m_s=draw(ground_rng, ranges.wind_speed_m_s),
+        wind_speed_m_s=sample_uniform(ground_rng, ranges.wind_speed_m_s),
         clouds=tuple(layer for layer in layers if layer is not None),
         mist=sample_mist(frame_generator(seed, scene_id, "mist"), ranges.mist),
         moon=sample_moon(frame_generator(seed, scene_id, "moon"), ranges.moon),
@@ -74,7 +74,7 @@ def _mapped(environment: Environment, ranges: EnvironmentMapRanges, rng: np.rand
         folder=ranges.folder,
         cd_m2_per_unit=ranges.cd_m2_per_unit,
         horizontal_illuminance_lux=ranges.horizontal_illuminance_lux,
-        rotation_deg=draw(rng, ranges.rotation_deg),
+        rotation_deg=sample_uniform(rng, ranges.rotation_deg),
     )
     changes: dict[str, object] = {"clouds": (), "mist": None, "moon": None, "map": environment_map}
     light = load_map(environment_map)
@@ -95,13 +95,13 @@ def sample_cloud(rng: np.random.Generator, shape_rng: np.random.Generator, cloud
     """A cloud layer, or none; how thick it is and how it is drawn out comes from `shape_rng`."""
     layer = CloudLayer(
         kind=clouds.kind,
-        height_above_camera_m=draw(rng, clouds.height_above_camera_m),
-        cover_fraction=draw(rng, clouds.cover_fraction),
-        feature_size_m=draw(rng, clouds.feature_size_m),
-        optical_depth=draw(rng, clouds.optical_depth),
+        height_above_camera_m=sample_uniform(rng, clouds.height_above_camera_m),
+        cover_fraction=sample_uniform(rng, clouds.cover_fraction),
+        feature_size_m=sample_uniform(rng, clouds.feature_size_m),
+        optical_depth=sample_uniform(rng, clouds.optical_depth),
         texture_seed=int(rng.integers(2**31)),
-        thickness_m=draw(shape_rng, clouds.thickness_m),
-        heading_deg=draw(shape_rng, clouds.heading_deg),
+        thickness_m=sample_uniform(shape_rng, clouds.thickness_m),
+        heading_deg=sample_uniform(shape_rng, clouds.heading_deg),
     )
     return layer if rng.random() < clouds.scene_fraction else None
 
@@ -109,9 +109,9 @@ def sample_cloud(rng: np.random.Generator, shape_rng: np.random.Generator, cloud
 def sample_mist(rng: np.random.Generator, ranges: MistRanges) -> Mist | None:
     """Mist around the camera, or none."""
     mist = Mist(
-        visibility_m=draw(rng, ranges.visibility_m),
-        above_m=draw(rng, ranges.above_m),
-        below_m=draw(rng, ranges.below_m),
+        visibility_m=sample_uniform(rng, ranges.visibility_m),
+        above_m=sample_uniform(rng, ranges.above_m),
+        below_m=sample_uniform(rng, ranges.below_m),
     )
     return mist if rng.random() < ranges.scene_fraction else None
 
@@ -119,8 +119,8 @@ def sample_mist(rng: np.random.Generator, ranges: MistRanges) -> Mist | None:
 def sample_moon(rng: np.random.Generator, ranges: MoonRanges) -> Moon | None:
     """A moon, or none."""
     moon = Moon(
-        elevation_deg=draw(rng, ranges.elevation_deg),
-        azimuth_deg=draw(rng, ranges.azimuth_deg),
-        phase_angle_deg=draw(rng, ranges.phase_angle_deg),
+        elevation_deg=sample_uniform(rng, ranges.elevation_deg),
+        azimuth_deg=sample_uniform(rng, ranges.azimuth_deg),
+        phase_angle_deg=sample_uniform(rng, ranges.phase_angle_deg),
     )
     return moon if rng.random() < ranges.scene_fraction else None

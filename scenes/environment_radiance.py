@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.air_light import HORIZON_ELEVATION_RAD, LayeredAir
-from scenes.clouds.cloud_layers import band_limited, see_cloud
-from scenes.clouds.ray_march import enlarge
+from scenes.clouds.cloud_layers import band_limited, render_cloud_layer
+from scenes.clouds.ray_march import upsample
 from scenes.ground.ground_radiance import Ground
 from scenes.ground.sea import GroundLight
 from scenes.ground_view import FARTHEST_M, pixel_angle_rad
@@ -29,7 +29,7 @@ _LIGHT_MAP_HEIGHT_PX = 128
 _CLOUD_STEP_PX, _MANY_RAYS = 2, 60_000
 
 
-class Surroundings:
+class EnvironmentRadiance:
     """Radiance by direction for one environment.
 
     Attributes:
@@ -43,7 +43,7 @@ class Surroundings:
         self.sky = ClearSky(environment)
         self.air = LayeredAir(environment, self.sky)
 
-    def seen_from(self, environment: Environment) -> Surroundings:
+    def moved_to(self, environment: Environment) -> EnvironmentRadiance:
         """The same surroundings from another place.
 
         Ground and clouds move, and with them the share of the sun's beam that gets through; the light map stays that
@@ -53,9 +53,9 @@ class Surroundings:
             environment: the same, with another `camera_offset_m`.
         """
         # Made here, so that it does not matter who asked first.
-        own = {"ground": self.ground.seen_from(environment), "light_map": self.light_map}
+        own = {"ground": self.ground.moved_to(environment), "light_map": self.light_map}
         moved = copy(self)
-        moved.environment, moved.air = environment, self.air.seen_from(environment)
+        moved.environment, moved.air = environment, self.air.moved_to(environment)
         vars(moved).update(own)
         return moved
 
@@ -178,14 +178,14 @@ class Surroundings:
         many = directions.shape[0] * directions.shape[1] >= _MANY_RAYS
         every = _CLOUD_STEP_PX if many else 1
         chosen, behind_air = directions[::every, ::every], air[::every, ::every]
-        seen = see_cloud(layer, chosen, self.air.light_on(layer), every, self.environment.camera_offset_m)
+        seen = render_cloud_layer(layer, chosen, self.air.light_on(layer), every, self.environment.camera_offset_m)
         clear = np.exp(seen.distance_m * np.float32(-self.environment.extinction_per_m))[..., None]
         light = behind_air + clear * (seen.radiance - behind_air)
         # Light times opacity is interpolated: light where there is no cloud means nothing.
         layered: Radiance = np.concatenate([light * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
         if not many:
             return layered
-        return enlarge(band_limited(layered, layer, chosen), every, (directions.shape[0], directions.shape[1]))
+        return upsample(band_limited(layered, layer, chosen), every, (directions.shape[0], directions.shape[1]))
 
     @cached_property
     def light_map(self) -> Radiance:
@@ -230,7 +230,7 @@ def _rows_with(mask: NDArray[np.bool_]) -> slice:
     return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
 
 
-class MappedSurroundings(Surroundings):
+class MappedEnvironmentRadiance(EnvironmentRadiance):
     """Radiance by direction as a user's map has it: sky, ground and sun of an environment are not used."""
 
     def __init__(self, environment: Environment) -> None:
@@ -239,12 +239,12 @@ class MappedSurroundings(Surroundings):
         self._light = load_map(environment.map)
         self._coarse = self._light.shrunk(_LIGHT_MAP_HEIGHT_PX)
 
-    def seen_from(self, environment: Environment) -> Surroundings:
+    def moved_to(self, environment: Environment) -> EnvironmentRadiance:
         """The same: a map has no depth."""
         return self
 
     def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
-        """Coarse radiance, and endless air at the same azimuth; see `Surroundings.clear_radiance`."""
+        """Coarse radiance, and endless air at the same azimuth; see `EnvironmentRadiance.clear_radiance`."""
         return self._coarse.radiance(directions), self.airlight(directions)
 
     def radiance(
@@ -275,7 +275,7 @@ class MappedSurroundings(Surroundings):
         return self.plate_illuminance_lux(np.array([0.0, 0.0, 1.0]))
 
     def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
-        """Radiance of endless air: the map's own horizon at the same azimuth; see `Surroundings.airlight`."""
+        """Radiance of endless air: the map's own horizon at the same azimuth; see `EnvironmentRadiance.airlight`."""
         level = np.array(directions, dtype=np.float32)
         length = np.maximum(np.hypot(level[..., 0], level[..., 1]), np.float32(1e-9))
         level[..., :2] /= length[..., None]
@@ -285,23 +285,23 @@ class MappedSurroundings(Surroundings):
 
 # A recipe visits its scenes in turn; one takes half a megabyte.
 @lru_cache(maxsize=128)
-def _cached(key: str, folder: Path | None) -> Surroundings:
+def _cached(key: str, folder: Path | None) -> EnvironmentRadiance:
     environment = Environment.model_validate_json(key)
     if environment.map is None:
-        return Surroundings(environment)
+        return EnvironmentRadiance(environment)
     placed = environment.map.model_copy(update={"folder": folder})
-    return MappedSurroundings(environment.model_copy(update={"map": placed}))
+    return MappedEnvironmentRadiance(environment.model_copy(update={"map": placed}))
 
 
 # Engine, background and glare of one pair ask in turn.
 @lru_cache(maxsize=2)
-def _passing(key: str, folder: Path | None) -> Surroundings:
+def _passing(key: str, folder: Path | None) -> EnvironmentRadiance:
     environment = Environment.model_validate_json(key)
     still = environment.model_copy(update={"camera_offset_m": (0.0, 0.0)})
-    return _cached(still.model_dump_json(), folder).seen_from(environment)
+    return _cached(still.model_dump_json(), folder).moved_to(environment)
 
 
-def surroundings(environment: Environment) -> Surroundings:
+def environment_radiance(environment: Environment) -> EnvironmentRadiance:
     """The surroundings of an environment; the same object for equal environments, as frames share scenes.
 
     Raises:

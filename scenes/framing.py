@@ -9,7 +9,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
-from scenes.environment import draw
+from scenes.environment import sample_uniform
 
 _MOST_TRIES = 1000
 _OUTLINE_POINTS = 72
@@ -17,7 +17,7 @@ _OUTLINE_POINTS = 72
 _MARGIN_PX = 1.5
 
 
-def outline(drogue: DrogueParameters) -> Array:
+def outline_points_m(drogue: DrogueParameters) -> Array:
     """(M, 3) points of the drogue frame around everything that must be in view: rim, and back end. [m]"""
     angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(_OUTLINE_POINTS)], axis=-1)
@@ -31,7 +31,7 @@ def outline(drogue: DrogueParameters) -> Array:
     )
 
 
-def room_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[float, float, float, float] | None:
+def origin_bounds_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[float, float, float, float] | None:
     """Where the drogue's origin may lie at one depth.
 
     Args:
@@ -71,10 +71,13 @@ def sample_pose(rng: np.random.Generator, recipe: Recipe, points_m: Array, depth
     """
     for _ in range(_MOST_TRIES):
         pitch, yaw, roll = np.radians(
-            [draw(rng, limits) for limits in (recipe.pose.pitch_deg, recipe.pose.yaw_deg, recipe.pose.roll_deg)]
+            [
+                sample_uniform(rng, limits)
+                for limits in (recipe.pose.pitch_deg, recipe.pose.yaw_deg, recipe.pose.roll_deg)
+            ]
         )
         rotation = rotation_from_angles(pitch, yaw, roll)
-        room = room_m(recipe.rig, points_m @ rotation.T, depth_m)
+        room = origin_bounds_m(recipe.rig, points_m @ rotation.T, depth_m)
         place = rng.random(2)
         if room is None:
             continue

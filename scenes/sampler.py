@@ -14,20 +14,39 @@ from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
-from scenes.auto_exposure import meter
+from scenes.auto_exposure import automatic_exposure
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_bystanders
 from scenes.environment import environment_of_scene
-from scenes.flight.frame_kinematics import Moment, sample_suspension
+from scenes.flight.frame_kinematics import FrameKinematics, sample_suspension
 from scenes.flight.receiver import sample_attitude
-from scenes.flight.sequence import moment_of_sequence
-from scenes.framing import outline, sample_distance_m, sample_pose
+from scenes.flight.sequence import sequence_kinematics
+from scenes.framing import outline_points_m, sample_distance_m, sample_pose
+
+SplitName = Literal["train", "val", "test"]
+SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
+FRAME_PERIOD_S = 0.04  # 25 pairs per second
+
+
+def scene_of_frame(recipe: Recipe, frame_index: int) -> int:
+    """The scene of a frame: every run of as many frames as there are scenes visits each scene once.
+
+    All frames of a sequence belong to one scene; every run of as many sequences as there are scenes visits each once.
+    The order is drawn for each run, unless the recipe takes scenes in turn.
+    """
+    scenes, unit = recipe.frames.scenes, frame_index
+    if recipe.sequence is not None:
+        unit = frame_index // recipe.sequence.frames_per_sequence
+    if recipe.frames.in_turn:
+        return unit % scenes
+    order = frame_generator(recipe.seed, unit // scenes, "scene order").permutation(scenes)
+    return int(order[unit % scenes])
 
 
 def family_of_scene(recipe: Recipe, scene_id: int) -> Family | None:
     """The family of a scene, or None in a recipe without families.
 
-    Every family gets its share of the scenes, rounded by largest remainders, and which ones is drawn, unless they come
-    in turn.
+    Every family gets its share of the scenes, rounded by largest remainders. Which scenes is drawn, unless families
+    are taken in turn.
     """
     if not recipe.families:
         return None
@@ -40,7 +59,7 @@ def family_of_scene(recipe: Recipe, scene_id: int) -> Family | None:
 
 
 def scenes_per_family(recipe: Recipe) -> list[int]:
-    """How many scenes each family gets."""
+    """Number of scenes of each family."""
     scenes = recipe.frames.scenes
     weights = np.array([family.weight for family in recipe.families])
     shares = weights / weights.sum() * scenes
@@ -51,7 +70,7 @@ def scenes_per_family(recipe: Recipe) -> list[int]:
 
 
 def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
-    """The recipe as it holds for one scene: with the name and the conditions of its family."""
+    """The recipe for one scene: with the name and the ranges of its family."""
     family = family_of_scene(recipe, scene_id)
     if family is None:
         return recipe
@@ -63,35 +82,6 @@ def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
         "exposure": family.exposure,
     }
     return recipe.model_copy(update=changes)
-
-
-def sample_reading_m(rangefinder: Rangefinder, seed: int, frame_index: int, distance_m: float) -> float:
-    """The reading at one distance: the same offset in all frames of a dataset, noise of each frame's own. [m]"""
-    offset_m = frame_generator(seed, 0, "rangefinder offset").uniform(-1.0, 1.0) * rangefinder.offset_m
-    noise_m = frame_generator(seed, frame_index, "rangefinder noise").standard_normal() * rangefinder.noise_m
-    reading_m, step_m = distance_m + offset_m + noise_m, rangefinder.resolution_m
-    # Decimal digits rather than a multiple of a step that float64 cannot hold.
-    return float(np.round(step_m * np.rint(reading_m / step_m), 12)) if step_m > 0 else float(reading_m)
-
-
-SplitName = Literal["train", "val", "test"]
-SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
-FRAME_PERIOD_S = 0.04  # 25 pairs a second
-
-
-def scene_of_frame(recipe: Recipe, frame_index: int) -> int:
-    """Which scene a frame belongs to: every run of as many frames as there are scenes visits each once.
-
-    All frames of a sequence belong to one scene: every run of as many sequences as there are scenes visits each once.
-    The order is drawn for each run, unless the recipe has them in turn.
-    """
-    scenes, unit = recipe.frames.scenes, frame_index
-    if recipe.sequence is not None:
-        unit = frame_index // recipe.sequence.frames_per_sequence
-    if recipe.frames.in_turn:
-        return unit % scenes
-    order = frame_generator(recipe.seed, unit // scenes, "scene order").permutation(scenes)
-    return int(order[unit % scenes])
 
 
 def split_of_scenes(recipe: Recipe) -> dict[int, SplitName]:
@@ -110,58 +100,59 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     """Everything about one frame.
 
     Args:
-        recipe: what dataset to make.
+        recipe: of the dataset.
         frame_index: in [0, count).
 
     Raises:
-        ValueError: an index outside the recipe, or a pose that cannot be framed.
+        ValueError: an index outside the recipe, or no pose keeps the drogue in view.
     """
     if not 0 <= frame_index < recipe.frames.count:
         raise ValueError(f"frame: must be in [0, {recipe.frames.count}), got {frame_index}")
     seed = recipe.seed
     scene_id = scene_of_frame(recipe, frame_index)
-    recipe = recipe_of_scene(recipe, scene_id)
-    environment = environment_of_scene(seed, scene_id, recipe.environment)
-    drogue = drogue_of_scene(recipe, scene_id)
-    moment = _moment_of_frame(recipe, drogue, frame_index)
-    pose = moment.left_from_drogue
-    if moment.sequence_id is not None:
-        environment = _where_it_flies(environment, moment)
-    # What stands beside a sequence stays there all along.
-    stands = frame_index if moment.sequence_id is None else moment.sequence_id
-    bystanders = sample_bystanders(frame_generator(seed, stands, "bystanders"), recipe, pose)
+    scene_recipe = recipe_of_scene(recipe, scene_id)
+    environment = environment_of_scene(seed, scene_id, scene_recipe.environment)
+    drogue = drogue_of_scene(scene_recipe, scene_id)
+    kinematics = _frame_kinematics(scene_recipe, drogue, frame_index)
+    pose = kinematics.left_from_drogue
+    if kinematics.sequence_id is not None:
+        environment = _environment_of_sequence(environment, kinematics)
+    # Other objects stay the same throughout a sequence.
+    key = frame_index if kinematics.sequence_id is None else kinematics.sequence_id
+    bystanders = sample_bystanders(frame_generator(seed, key, "bystanders"), scene_recipe, pose)
+    rig, sensor = scene_recipe.rig, scene_recipe.sensor
     return FrameSpec(
         seed=seed,
         frame_index=frame_index,
         scene_id=scene_id,
-        family=recipe.family,
-        sequence_id=moment.sequence_id,
-        time_s=moment.time_s,
+        family=scene_recipe.family,
+        sequence_id=kinematics.sequence_id,
+        time_s=kinematics.time_s,
         drogue=None if pose is None else drogue,
-        sought=drogue if pose is None and recipe.target.variants else None,
-        condition=None if pose is None else condition_of_scene(recipe, scene_id, drogue),
-        bystanders=bystanders if moment.obstacle is None else (*bystanders, moment.obstacle),
-        board=_place_board(recipe, frame_index),
+        sought=drogue if pose is None and scene_recipe.target.variants else None,
+        condition=None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue),
+        bystanders=bystanders if kinematics.obstacle is None else (*bystanders, kinematics.obstacle),
+        board=_placed_board(scene_recipe, frame_index),
         left_from_drogue=pose,
-        world_from_left=moment.world_from_left,
-        left_twist_per_s=moment.left_twist_per_s,
-        drogue_twist_per_s=moment.drogue_twist_per_s,
-        left_from_tanker=moment.left_from_tanker,
-        hose_nodes_left_m=moment.hose_nodes_left_m,
-        rig=recipe.rig,
-        sensor=recipe.sensor,
-        exposure=meter(recipe.exposure, environment, recipe.rig.camera, moment.world_from_left, recipe.sensor),
+        world_from_left=kinematics.world_from_left,
+        left_twist_per_s=kinematics.left_twist_per_s,
+        drogue_twist_per_s=kinematics.drogue_twist_per_s,
+        left_from_tanker=kinematics.left_from_tanker,
+        hose_nodes_left_m=kinematics.hose_nodes_left_m,
+        rig=rig,
+        sensor=sensor,
+        exposure=automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor),
         environment=environment,
-        rangefinder_reading_m=_read_distance_m(recipe, frame_index, pose),
-        loss=moment.loss,
+        rangefinder_reading_m=_rangefinder_reading_m(scene_recipe, frame_index, pose),
+        loss=kinematics.loss,
     )
 
 
-def _where_it_flies(environment: Environment, moment: Moment) -> Environment:
-    """A scene's environment from the place of a sequence's pair, with the sun where the sequence needs it."""
-    changes: dict[str, object] = {"camera_offset_m": moment.camera_offset_m}
-    if moment.sun_deg is not None:
-        changes |= {"sun_elevation_deg": moment.sun_deg[0], "sun_azimuth_deg": moment.sun_deg[1]}
+def _environment_of_sequence(environment: Environment, kinematics: FrameKinematics) -> Environment:
+    """A scene's environment at the camera's position in a sequence, with the sun where a glare needs it."""
+    changes: dict[str, object] = {"camera_offset_m": kinematics.camera_offset_m}
+    if kinematics.sun_deg is not None:
+        changes |= {"sun_elevation_deg": kinematics.sun_deg[0], "sun_azimuth_deg": kinematics.sun_deg[1]}
     return environment.model_copy(update=changes)
 
 
@@ -169,31 +160,31 @@ def sample_left_from_drogue(recipe: Recipe, frame_index: int) -> RigidTransform 
     """The pose of `sample_frame` alone, without light and exposure; None without a drogue.
 
     Raises:
-        ValueError: a pose that cannot be framed.
+        ValueError: no pose keeps the drogue in view.
     """
     scene_id = scene_of_frame(recipe, frame_index)
-    recipe = recipe_of_scene(recipe, scene_id)
-    drogue = drogue_of_scene(recipe, scene_id)
-    if recipe.sequence is not None:
-        return moment_of_sequence(recipe, recipe.sequence, drogue, frame_index).left_from_drogue
-    return _pose_of_frame(recipe, drogue, frame_index)
+    scene_recipe = recipe_of_scene(recipe, scene_id)
+    drogue = drogue_of_scene(scene_recipe, scene_id)
+    if scene_recipe.sequence is not None:
+        return sequence_kinematics(scene_recipe, scene_recipe.sequence, drogue, frame_index).left_from_drogue
+    return _pose_of_frame(scene_recipe, drogue, frame_index)
 
 
-def _moment_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> Moment:
-    """Where everything is in one frame; the recipe is that of the scene."""
-    if recipe.sequence is not None:
-        return moment_of_sequence(recipe, recipe.sequence, drogue, frame_index)
-    seed = recipe.seed
-    rotation = sample_attitude(frame_generator(seed, frame_index, "receiver"), recipe.pose)
+def _frame_kinematics(scene_recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> FrameKinematics:
+    """Poses and motion of one frame."""
+    if scene_recipe.sequence is not None:
+        return sequence_kinematics(scene_recipe, scene_recipe.sequence, drogue, frame_index)
+    seed = scene_recipe.seed
+    rotation = sample_attitude(frame_generator(seed, frame_index, "receiver"), scene_recipe.pose)
     world_from_left = RigidTransform(rotation, np.zeros(3))
-    left_from_drogue = _pose_of_frame(recipe, drogue, frame_index)
+    left_from_drogue = _pose_of_frame(scene_recipe, drogue, frame_index)
     left_from_tanker, nodes = None, None
     if left_from_drogue is not None:
         left_from_tanker, nodes = sample_suspension(
             frame_generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
         )
-    left_twist, drogue_twist = _sample_motion(frame_generator(seed, frame_index, "motion"), recipe)
-    return Moment(
+    left_twist, drogue_twist = _sample_twists(frame_generator(seed, frame_index, "motion"), scene_recipe)
+    return FrameKinematics(
         sequence_id=None,
         time_s=frame_index * FRAME_PERIOD_S,
         left_from_drogue=left_from_drogue,
@@ -205,34 +196,58 @@ def _moment_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int)
     )
 
 
-def _pose_of_frame(recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> RigidTransform | None:
-    """`left_from_drogue`, or None without a drogue; the recipe is that of the scene."""
-    if frame_generator(recipe.seed, frame_index, "empty").random() < recipe.frames.empty_fraction:
+def _pose_of_frame(scene_recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> RigidTransform | None:
+    """`left_from_drogue`, or None without a drogue."""
+    if frame_generator(scene_recipe.seed, frame_index, "empty").random() < scene_recipe.frames.empty_fraction:
         return None
-    distance_m = sample_distance_m(frame_generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
-    return sample_pose(frame_generator(recipe.seed, frame_index, "pose"), recipe, outline(drogue), distance_m)
+    distance_m = sample_distance_m(
+        frame_generator(scene_recipe.seed, frame_index, "distance"), scene_recipe.distance, frame_index
+    )
+    return sample_pose(
+        frame_generator(scene_recipe.seed, frame_index, "pose"), scene_recipe, outline_points_m(drogue), distance_m
+    )
 
 
-def _place_board(recipe: Recipe, frame_index: int) -> PlacedBoard | None:
-    """The calibration board of a frame, or None in a recipe without one."""
-    if recipe.board is None:
+def _placed_board(scene_recipe: Recipe, frame_index: int) -> PlacedBoard | None:
+    """The calibration board of a frame, or None without one."""
+    if scene_recipe.board is None:
         return None
-    distance_m = sample_distance_m(frame_generator(recipe.seed, frame_index, "distance"), recipe.distance, frame_index)
-    pose = sample_pose(frame_generator(recipe.seed, frame_index, "pose"), recipe, recipe.board.outline_m(), distance_m)
-    return PlacedBoard(shape=recipe.board, left_from_board=pose)
+    distance_m = sample_distance_m(
+        frame_generator(scene_recipe.seed, frame_index, "distance"), scene_recipe.distance, frame_index
+    )
+    pose = sample_pose(
+        frame_generator(scene_recipe.seed, frame_index, "pose"),
+        scene_recipe,
+        scene_recipe.board.outline_m(),
+        distance_m,
+    )
+    return PlacedBoard(shape=scene_recipe.board, left_from_board=pose)
 
 
-def _read_distance_m(recipe: Recipe, frame_index: int, left_from_drogue: RigidTransform | None) -> float | None:
-    """What the recipe's rangefinder reads, or None without one or without a drogue."""
-    if recipe.rangefinder is None or left_from_drogue is None:
+def _rangefinder_reading_m(
+    scene_recipe: Recipe, frame_index: int, left_from_drogue: RigidTransform | None
+) -> float | None:
+    """Reading of the rangefinder, or None without one or without a drogue."""
+    if scene_recipe.rangefinder is None or left_from_drogue is None:
         return None
-    return sample_reading_m(recipe.rangefinder, recipe.seed, frame_index, float(left_from_drogue.translation_m[2]))
+    return sample_rangefinder_m(
+        scene_recipe.rangefinder, scene_recipe.seed, frame_index, float(left_from_drogue.translation_m[2])
+    )
 
 
-def _sample_motion(rng: np.random.Generator, recipe: Recipe) -> tuple[Array, Array]:
+def sample_rangefinder_m(rangefinder: Rangefinder, seed: int, frame_index: int, distance_m: float) -> float:
+    """Reading of a laser rangefinder: the same offset in all frames of a dataset, and noise of each frame. [m]"""
+    offset_m = frame_generator(seed, 0, "rangefinder offset").uniform(-1.0, 1.0) * rangefinder.offset_m
+    noise_m = frame_generator(seed, frame_index, "rangefinder noise").standard_normal() * rangefinder.noise_m
+    reading_m, step_m = distance_m + offset_m + noise_m, rangefinder.resolution_m
+    # Rounded to decimal digits, because float64 cannot represent multiples of most steps.
+    return float(np.round(step_m * np.rint(reading_m / step_m), 12)) if step_m > 0 else float(reading_m)
+
+
+def _sample_twists(rng: np.random.Generator, scene_recipe: Recipe) -> tuple[Array, Array]:
     """(6,) twists of the left camera and of the drogue. [m/s, rad/s]"""
     draws = rng.uniform(-1.0, 1.0, 12)
-    rate = np.radians(recipe.pose.rate_deg_s)
+    rate = np.radians(scene_recipe.pose.rate_deg_s)
     left = np.concatenate([np.zeros(3), draws[3:6] * rate])
-    drogue = np.concatenate([draws[6:9] * recipe.pose.speed_m_s, draws[9:12] * rate])
+    drogue = np.concatenate([draws[6:9] * scene_recipe.pose.speed_m_s, draws[9:12] * rate])
     return left, drogue

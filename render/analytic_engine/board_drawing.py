@@ -1,4 +1,4 @@
-"""A calibration board with exact coverage of every pixel by its squares, through whatever lens the eye has."""
+"""A calibration board with exact coverage of every pixel by its squares, through any lens."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
 from geometry.se3 import Array
 from geometry.stereo import Eye
-from render.analytic_engine.flat_drogue import PlateLight
+from render.analytic_engine.flat_drogue import FlatSurfaceLight
 from render.analytic_engine.pixel_coverage import pixel_coverage
 from render.analytic_engine.ring_passes import PixelPasses, empty_passes
 from render.engine import EyeRadiance
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 
-# A lens bends lines. An edge of 150 px, at twice the curvature of a strong lens (2e-4 / px), bulges by 0.6 px over its
-# length, and by 0.6 / 64^2 = 1.4e-4 px over each of this many pieces.
+# A lens curves lines. An edge of 150 px, at twice the curvature of a strong lens (2e-4 / px), deviates by 0.6 px from a
+# straight line, and by 0.6 / 64^2 = 1.4e-4 px over each of this many pieces.
 _PIECES_PER_SQUARE = 64
 
 
-def board_eye(frame: FrameSpec, placed: PlacedBoard, eye: Eye, behind: NDArray[np.float32]) -> EyeRadiance:
-    """What one eye sees of a frame with a board.
+def board_eye(frame: FrameSpec, placed: PlacedBoard, eye: Eye, background: NDArray[np.float32]) -> EyeRadiance:
+    """Radiance and passes of one eye in a frame with a board.
 
     Args:
-        frame: for rig, light and air.
+        frame: gives rig, light and air.
         placed: the frame's board.
         eye: which eye.
-        behind: (H, W, 3) radiance of the surroundings. [cd/m2]
+        background: (H, W, 3) radiance. [cd/m2]
 
     Raises:
         ValueError: part of the board is not in front of the camera, or it shows its back.
@@ -40,24 +40,27 @@ def board_eye(frame: FrameSpec, placed: PlacedBoard, eye: Eye, behind: NDArray[n
         raise ValueError(f"left_from_board: all of it must be in front of the camera, got {corners_m[:, 2].min():g} m")
     if (pose.translation_m - frame.rig.eye_offset_m(eye)) @ pose.rotation[:, 2] <= 0:
         raise ValueError("left_from_board: the board must show its squares to both eyes; its z axis points away")
-    light, depth_m = PlateLight(frame, surroundings(frame.environment), pose), float(pose.translation_m[2])
+    light, depth_m = (
+        FlatSurfaceLight(frame, environment_radiance(frame.environment), pose),
+        float(pose.translation_m[2]),
+    )
     white, black = (
-        light.seen(np.full(3, reflectance), 0.0, depth_m).astype(np.float32)
+        light.radiance(np.full(3, reflectance), 0.0, depth_m).astype(np.float32)
         for reflectance in (placed.shape.white_reflectance, placed.shape.black_reflectance)
     )
-    image = behind.copy()
-    coverage = np.zeros(behind.shape[:2], dtype=np.float32)
+    image = background.copy()
+    coverage = np.zeros(background.shape[:2], dtype=np.float32)
     height_px, width_px = coverage.shape
     plate = pixel_coverage([_plate_area(frame, placed, eye)], width_px, height_px)
     if plate is not None:
         share = plate.share.astype(np.float32)
         window = plate.rows, plate.columns
         coverage[window] = share
-        image[window] += share[..., None] * (white - behind[window])
+        image[window] += share[..., None] * (white - background[window])
     squares = pixel_coverage([_black_area(frame, placed, eye)], width_px, height_px)
     if squares is not None:
         image[squares.rows, squares.columns] += squares.share.astype(np.float32)[..., None] * (black - white)
-    return EyeRadiance(image, coverage, **vars(_passes(frame, placed, eye, plate is not None)))
+    return EyeRadiance(radiance_cd_m2=image, coverage=coverage, **vars(_passes(frame, placed, eye, plate is not None)))
 
 
 def _plate_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> shapely.Polygon:
@@ -68,7 +71,7 @@ def _plate_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> shapely.Poly
 
 
 def _black_area(frame: FrameSpec, placed: PlacedBoard, eye: Eye) -> shapely.MultiPolygon:
-    """Every other square, from the one in the low corner on; they touch in the inner corners alone."""
+    """Every other square, starting at the lower corner; the squares touch only at the inner corners."""
     corners_m = _black_squares_m(placed.shape)
     edges_m = _divided(corners_m, np.roll(corners_m, -1, axis=1), _pieces(frame, eye))
     edges_px = frame.rig.image(placed.left_from_board.apply(edges_m.reshape(-1, 3)), eye)
@@ -79,8 +82,8 @@ def _black_squares_m(board: CalibrationBoard) -> Array:
     """(S, 4, 3) corners of the black squares, around each. [m]"""
     grid = board.grid_m()
     row, column = np.nonzero(np.indices((board.rows, board.columns)).sum(axis=0) % 2 == 0)
-    around = ((0, 0), (0, 1), (1, 1), (1, 0))
-    return np.stack([grid[row + down, column + right] for down, right in around], axis=1)
+    corners = ((0, 0), (0, 1), (1, 1), (1, 0))
+    return np.stack([grid[row + down, column + right] for down, right in corners], axis=1)
 
 
 def _pieces(frame: FrameSpec, eye: Eye) -> int:

@@ -18,7 +18,7 @@ from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
 from render.surfaces import lamp_radiance_rgb, mean_reflectance_rgb
-from scenes.environment_radiance import Surroundings
+from scenes.environment_radiance import EnvironmentRadiance
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class FlatRing:
 
 @dataclass(frozen=True)
 class FlatDrogue:
-    """What the analytic engine draws of a drogue.
+    """The rings that the analytic engine draws of a drogue.
 
     Attributes:
         behind: coupling and hub, behind the opening.
-        front: rim and face, which hide what lies behind them. The rim's torus is the ring of its equator. The face is
-            drawn at its back and at its front: what is seen through both is what its thickness lets through.
+        front: rim and face, which hide what lies behind them. The rim's torus is drawn as the ring of its equator. The
+            face is drawn at its back and at its front, so that its thickness hides what it should.
         markers: on the face.
     """
 
@@ -54,7 +54,7 @@ class FlatDrogue:
 
     @property
     def back_to_front(self) -> tuple[FlatRing, ...]:
-        """All rings; a later one hides an earlier one."""
+        """All rings; later ones hide earlier ones."""
         return self.behind + self.front + self.markers
 
 
@@ -79,54 +79,54 @@ def flat_drogue(drogue: DrogueParameters, gone: Collection[int] = ()) -> FlatDro
     return FlatDrogue(tuple(behind), tuple(front), tuple(markers))
 
 
-def ring_radiance(frame: FrameSpec, around: Surroundings, rings: tuple[FlatRing, ...]) -> dict[int, Array]:
+def ring_radiance(frame: FrameSpec, ambient: EnvironmentRadiance, rings: tuple[FlatRing, ...]) -> dict[int, Array]:
     """Radiance of each ring at the camera, the same all over it.
 
-    Light falls on every ring as on the open rim plane, `L = reflectance E / pi`, lamps add their own, and the air takes
-    its share over the way to the ring's centre and adds its own. Rings with one part id stand for one
-    part; the last one counts.
+    Every ring receives the light of the open rim plane, `L = reflectance E / pi`; lamps add their own. The air
+    attenuates it over the distance to the ring's centre and adds airlight. Rings with one part id stand for one part;
+    the last one counts.
 
     Returns:
         (3,) luminance-scaled linear Rec. 709 by part id. [cd/m2]
     """
     pose = frame.left_from_drogue
     assert pose is not None
-    plate = PlateLight(frame, around, pose)
+    plate = FlatSurfaceLight(frame, ambient, pose)
     return {
-        ring.part: plate.seen(
+        ring.part: plate.radiance(
             mean_reflectance_rgb(frame, ring.part), lamp_radiance_rgb(frame, ring.part), pose.apply(ring.center_m)[2]
         )
         for ring in rings
     }
 
 
-class PlateLight:
-    """Light on a flat thing that faces the camera, and what the air leaves of what it sends back."""
+class FlatSurfaceLight:
+    """Light on a flat surface that faces the camera, and its radiance behind the air."""
 
-    def __init__(self, frame: FrameSpec, around: Surroundings, pose: RigidTransform) -> None:
-        """Light on a plate whose pose in the left camera has its axis along z; either side may face the camera."""
+    def __init__(self, frame: FrameSpec, ambient: EnvironmentRadiance, pose: RigidTransform) -> None:
+        """Compute the light on a plate across the z axis of a pose in the left camera; either side may face it."""
         towards_camera = -np.sign(pose.translation_m @ pose.rotation[:, 2]) * pose.rotation[:, 2]
-        self._illuminance_lux = around.plate_illuminance_lux(frame.world_from_left.rotate(towards_camera))
+        self._illuminance_lux = ambient.plate_illuminance_lux(frame.world_from_left.rotate(towards_camera))
         towards_plate = pose.translation_m / np.linalg.norm(pose.translation_m)
-        self._air = around.airlight(frame.world_from_left.rotate(towards_plate)).astype(np.float64)
-        self._extinction_per_depth = around.extinction_per_m / towards_plate[2]
+        self._air = ambient.airlight(frame.world_from_left.rotate(towards_plate)).astype(np.float64)
+        self._extinction_per_depth = ambient.extinction_per_m / towards_plate[2]
 
-    def seen(self, reflectance_rgb: Array, lamp_cd_m2: Array | float, depth_m: float) -> Array:
-        """(3,) radiance at the camera of a surface with a (3,) reflectance and light of its own. [cd/m2]"""
+    def radiance(self, reflectance_rgb: Array, lamp_cd_m2: Array | float, depth_m: float) -> Array:
+        """(3,) radiance at the camera of a surface with a (3,) reflectance that may emit light too. [cd/m2]"""
         sent = reflectance_rgb * self._illuminance_lux / np.pi + lamp_cd_m2
         clear = np.exp(-self._extinction_per_depth * depth_m)
         radiance: Array = sent * clear + self._air * (1.0 - clear)
         return radiance
 
 
-# How far a polygon of the disc's area may stand from the circle: a pixel's coverage errs by as much.
+# Largest distance between the circle and a polygon of equal area: the error of a pixel's coverage is no larger.
 _OUTLINE_ERROR_PX = 1e-4
 _FEWEST_SIDES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class EyeView:
-    """One eye and where the drogue is for it.
+    """One eye and the pose of the drogue.
 
     Attributes:
         rig, eye: which camera.
@@ -144,15 +144,15 @@ class EyeView:
 
     @property
     def sees_front(self) -> bool:
-        """Whether the eye looks at the mouth; from behind the rim plane a flat drogue shows its dark back only."""
+        """Whether the eye looks into the mouth; from behind the rim plane a flat drogue shows only its dark back."""
         origin = self.left_from_drogue.translation_m - self.rig.eye_offset_m(self.eye)
         return bool(origin @ self.left_from_drogue.rotation[:, 2] > 0)
 
 
-def seen_areas(flat: FlatDrogue, view: EyeView) -> dict[int, Any]:
-    """Areas to paint one over the other, by part id: shapely polygons in pixel coordinates.
+def visible_areas(flat: FlatDrogue, view: EyeView) -> dict[int, Any]:
+    """Areas to paint one over another, by part id: shapely polygons in pixel coordinates.
 
-    All of the front goes by the face's id. Coupling and hub are cut where the front hides them; the hub lies inside the
+    The whole front has the face's id. Coupling and hub are clipped where the front hides them. The hub lies inside the
     coupling and the markers inside the front, whose areas have no holes for them.
 
     Raises:
@@ -178,8 +178,8 @@ def _ring_area(ring: FlatRing, view: EyeView) -> Any:
 def _outline_px(ring: FlatRing, radius_m: float, view: EyeView) -> Array:
     """(N, 2) corners of the image of a regular polygon with the disc's area. [px]
 
-    A chord of one N-th of a circle of radius R falls short of it by `R pi^2 / (2 N^2)`, two thirds of that when the
-    areas are equal.
+    A chord over one N-th of a circle of radius R deviates from it by `R pi^2 / (2 N^2)`, and by two thirds of that when
+    the areas are equal.
     """
     nearest_m = view.center_m(ring)[2] - radius_m * np.hypot(*view.left_from_drogue.rotation[2, :2])
     if nearest_m <= 0:

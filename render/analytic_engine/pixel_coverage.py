@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import Array
 
-# Sums of signed areas leave pixels wholly inside or outside within some 1e-12 of 1 or 0.
+# Sums of signed areas leave pixels that are wholly inside or outside within some 1e-12 of 1 or 0.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class PixelCoverage:
-    """Coverage of the pixels of a rectangle of the image; 0 outside.
+    """Coverage of the pixels of a rectangle of the image; coverage is 0 outside.
 
     Attributes:
         rows, columns: where it lies in the image.
@@ -60,14 +60,14 @@ def pixel_coverage(areas: Sequence[Any], width_px: int, height_px: int) -> Pixel
     # A piece on the window's far side lies in no pixel of it and covers nothing to its right.
     pixel = np.clip(np.floor(middle).astype(np.int64), 0, size - 1)
     into = middle[:, 0] - pixel[:, 0]
-    # One column more takes what would run on beyond the last one.
+    # One more column takes what belongs beyond the last one.
     flat = pixel[:, 1] * (size[0] + 1) + pixel[:, 0]
     cells = (size[0] + 1) * size[1]
     change = np.bincount(flat, rise * (1.0 - into), cells) + np.bincount(flat + 1, rise * into, cells)
     share = change.reshape(size[1], size[0] + 1).cumsum(axis=1)[:, :-1] / len(areas)
     share[np.abs(share) < _ROUNDING] = 0.0
     share[np.abs(share - 1.0) < _ROUNDING] = 1.0
-    return PixelCoverage(slice(low[1], low[1] + size[1]), slice(low[0], low[0] + size[0]), share)
+    return PixelCoverage(rows=slice(low[1], low[1] + size[1]), columns=slice(low[0], low[0] + size[0]), share=share)
 
 
 def _edges(area: Any) -> tuple[Array, Array]:
@@ -116,19 +116,19 @@ _NO_AREA = shapely.Polygon()
 
 
 def paint(
-    moments: Sequence[dict[int, Any]], radiance: dict[int, Array], behind: NDArray[np.float32]
+    moments: Sequence[dict[int, Any]], radiance: dict[int, Array], background: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Parts over the surroundings.
+    """Paint parts over the background.
 
     Args:
-        moments: areas by part id (see `outlines.seen_areas`), at evenly spaced moments of the exposure.
+        moments: areas by part id (see `flat_drogue.visible_areas`), at evenly spaced moments of the exposure.
         radiance: (3,) radiance by part id. [cd/m2]
-        behind: (H, W, 3) radiance of the surroundings. [cd/m2]
+        background: (H, W, 3) radiance. [cd/m2]
 
     Returns:
         (H, W, 3) radiance [cd/m2], and (H, W) share of each pixel that parts cover.
     """
-    height_px, width_px = behind.shape[:2]
+    height_px, width_px = background.shape[:2]
     coverage = np.zeros((height_px, width_px), dtype=np.float32)
     painted = []
     for part in dict.fromkeys(part for areas in moments for part in areas):
@@ -138,13 +138,13 @@ def paint(
             painted.append((part, covered.rows, covered.columns, share))
             if _painted_on(part) == Part.SKY:
                 coverage[covered.rows, covered.columns] += share
-    image = behind.copy()
+    image = background.copy()
     for part, rows, columns, _ in painted:
         if _painted_on(part) == Part.SKY:
-            # Windows may overlap: the pixels are weighted anew from the surroundings.
+            # Windows may overlap, so that each weights the background again.
             open_share = 1.0 - coverage[rows, columns]
             for channel in range(3):
-                np.multiply(behind[rows, columns, channel], open_share, out=image[rows, columns, channel])
+                np.multiply(background[rows, columns, channel], open_share, out=image[rows, columns, channel])
     for part, rows, columns, share in painted:
         under = _painted_on(part)
         adds = (radiance[part] - (radiance[under] if under != Part.SKY else 0.0)).astype(np.float32)
@@ -155,7 +155,7 @@ def paint(
 
 
 def _painted_on(part: int) -> int:
-    """The part whose light a part replaces."""
+    """The part that another part is painted on."""
     if part == Part.HUB:
         return int(Part.COUPLING)
     return int(Part.FACE) if part >= FIRST_MARKER_ID else int(Part.SKY)

@@ -19,13 +19,13 @@ from render.analytic_engine.flat_drogue import EyeView, FlatDrogue, FlatRing, fl
 from render.surfaces import missing_parts
 
 _OUTLINE_POINTS = 128
-# Chords of the outline fall short of the circle by 3e-4 of its radius.
+# Covers the chords of the outline, which deviate from the circle by 3e-4 of its radius.
 _MARGIN_PX = 2
 
 
 @dataclass(frozen=True, eq=False)
 class RingPixels:
-    """A window of the image and what of it a ring covers.
+    """A window of the image and its pixels that a ring covers.
 
     Attributes:
         rows, columns: where the window lies.
@@ -48,7 +48,7 @@ def _pixel_rays(lens: Lens) -> Array:
 
 
 def lens_ring_pixels(ring: FlatRing, view: EyeView, lens: Lens) -> RingPixels | None:
-    """Window around a ring, or None where it lies beside the image."""
+    """The pixel centres, of an eye with a lens, whose rays hit a ring; None for a ring outside the image."""
     outline_px = view.rig.image(
         disc_outline(view.left_from_drogue, ring.center_m, ring.outer_radius_m, _OUTLINE_POINTS), view.eye
     )
@@ -69,7 +69,7 @@ def lens_ring_pixels(ring: FlatRing, view: EyeView, lens: Lens) -> RingPixels | 
 
 @dataclass(frozen=True, eq=False)
 class PixelPasses:
-    """The passes of `EyeRadiance` that pixel centres decide."""
+    """The passes of `EyeRadiance` that follow from the pixel centres."""
 
     part_id: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
@@ -87,14 +87,16 @@ class _RowSpans:
 
 
 def empty_passes(camera: PinholeCamera) -> PixelPasses:
-    """Passes of an eye that sees nothing but its surroundings."""
+    """Passes of an eye that sees nothing but the background."""
     shape = (camera.height_px, camera.width_px)
     depth = np.full(shape, np.inf, dtype=np.float32)
-    return PixelPasses(np.zeros(shape, np.uint8), depth, np.zeros((*shape, 3), np.float32), {})
+    return PixelPasses(
+        part_id=np.zeros(shape, np.uint8), depth_m=depth, normal=np.zeros((*shape, 3), np.float32), amodal_px={}
+    )
 
 
 def pixel_passes(flat: FlatDrogue, view: EyeView) -> PixelPasses:
-    """What the rays through the pixel centres of one eye meet first."""
+    """What the rays through the pixel centres of one eye hit first."""
     passes = empty_passes(view.rig.camera)
     axis = view.left_from_drogue.rotation[:, 2]
     lens = view.rig.lens(view.eye)
@@ -117,7 +119,7 @@ def pixel_passes(flat: FlatDrogue, view: EyeView) -> PixelPasses:
 
 
 def _ideal_ring_pixels(ring: FlatRing, view: EyeView) -> RingPixels | None:
-    """The pixel centres of an ideal eye whose rays meet a ring, or None where there are none."""
+    """The pixel centres of an ideal eye whose rays hit a ring, or None where none does."""
     spans = _disc_spans(ring, ring.outer_radius_m, view)
     if not len(spans.first):
         return None
@@ -146,13 +148,13 @@ def _plane_depth_m(
 def _disc_spans(ring: FlatRing, radius_m: float, view: EyeView) -> _RowSpans:
     """The pixel centres on the image whose rays meet a disc.
 
-    The ray x meets the plane at `x (t.n) / (x.n)`, and lies within the radius of t where
+    The ray x hits the plane at `x (t.n) / (x.n)`, and lies within the radius of t where
     `|x (t.n) - t (x.n)|^2 <= r^2 (x.n)^2`: a conic in the image, solved for the two columns of every row.
     """
     camera, axis, center_m = view.rig.camera, view.left_from_drogue.rotation[:, 2], view.center_m(ring)
     reach = (center_m @ axis) * np.eye(3) - np.outer(center_m, axis)
     quadric = reach.T @ reach - radius_m**2 * np.outer(axis, axis)
-    # Pixels are counted from the disc's centre, where nothing cancels.
+    # Coordinates relative to the disc's centre avoid cancellation.
     middle = camera.project(center_m)
     matrix = camera.matrix()
     matrix[:2, 2] -= middle
@@ -176,7 +178,7 @@ def _disc_spans(ring: FlatRing, radius_m: float, view: EyeView) -> _RowSpans:
 
 
 def flat_part_masks(frame: FrameSpec, eye: Eye) -> dict[int, NDArray[np.bool_]]:
-    """(H, W) by part id, the pixel centres whose rays would meet the part's rings if these stood alone.
+    """(H, W) by part id, the pixel centres whose rays would hit the part's rings if nothing occluded them.
 
     Empty for a frame without a drogue.
     """

@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 
 from render.blender_engine.blender_scene import BlenderScene, set_threads
-from render.blender_engine.messages import LIGHT, CameraPath, Picture, RealEye, Window
+from render.blender_engine.messages import LIGHT, CameraPath, DistortedEye, ImageWindow, PictureRequest
 
 # Newton's method doubles the digits with each step; float32 has seven.
 _SHADER = """
@@ -46,16 +46,16 @@ shader real_eye(output point position = 0.0, output vector direction = 0.0, outp
 """
 
 
-def set_real_eye(camera: Any, window: Window, eye: RealEye, folder: Path) -> None:
-    """Make a Blender camera see the window of a real eye's image."""
+def set_distorted_eye(camera: Any, window: ImageWindow, eye: DistortedEye, folder: Path) -> None:
+    """Make a Blender camera render a window of the image of an eye with a lens."""
     camera.type, camera.custom_mode = "CUSTOM", "INTERNAL"
-    bytecode = _compiled(_source(window, eye), folder)
+    bytecode = _compiled(_shader_source(window, eye), folder)
     digest = hashlib.md5(bytecode.encode(), usedforsecurity=False).hexdigest()
     if camera.custom_bytecode_hash != digest:
         camera.custom_bytecode, camera.custom_bytecode_hash = bytecode, digest
 
 
-def _source(window: Window, eye: RealEye) -> str:
+def _shader_source(window: ImageWindow, eye: DistortedEye) -> str:
     numbers = {
         "left": window.left_px,
         "top": window.top_px,
@@ -71,12 +71,12 @@ def _source(window: Window, eye: RealEye) -> str:
 
 @lru_cache(maxsize=64)
 def _compiled(source: str, folder: Path) -> str:
-    """Bytecode of a shader.
+    """Bytecode of the lens shader.
 
     Raises:
         RuntimeError: this Blender cannot compile it.
     """
-    # Part of `bpy`, and there once that is loaded.
+    # Part of `bpy`; importable once `bpy` is loaded.
     cycles: Any = importlib.import_module("_cycles")
     text, result = folder / "real_eye.osl", folder / "real_eye.oso"
     text.write_text(source, encoding="ascii")
@@ -85,37 +85,37 @@ def _compiled(source: str, folder: Path) -> str:
     return result.read_text(encoding="ascii")
 
 
-# Only the lens's ratio to the sensor's width counts, and Blender has no narrow sensors but lenses of any length.
+# Only the ratio of focal length to sensor width counts. Blender limits the sensor width, not the focal length.
 _SENSOR_WIDTH_MM = 36.0
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5
-# The filter is a coarse table: a sample meant for the centre misses it by up to a thousandth of the width.
+# Blender tabulates the filter coarsely: a sample at the centre is off by up to a thousandth of its width.
 _NARROWEST_FILTER_PX = 0.01
 _MIDDLE_FRAME = 1
 
 
-def take_picture(scene: BlenderScene, order: Picture) -> None:
+def render_picture(scene: BlenderScene, request: PictureRequest) -> None:
     """Render and write one picture as EXR of 32-bit floats."""
-    target = scene.scenes[order.kind]
-    _set_lens(scene.camera.data, order)
-    _set_path(scene.camera, order.path)
-    _set_output(target, order)
-    _set_sampling(target, order)
-    target.render.use_motion_blur = len(order.path.positions_m) > 1
+    target = scene.scenes[request.kind]
+    _set_lens(scene.camera.data, request)
+    _set_path(scene.camera, request.path)
+    _set_output(target, request)
+    _set_sampling(target, request)
+    target.render.use_motion_blur = len(request.path.positions_m) > 1
     target.frame_set(_MIDDLE_FRAME)
     bpy.ops.render.render(write_still=True, scene=target.name)
 
 
-def _set_lens(camera: Any, order: Picture) -> None:
-    window = order.window
+def _set_lens(camera: Any, request: PictureRequest) -> None:
+    window = request.window
     camera.clip_start, camera.clip_end = _NEAREST_M, _FARTHEST_M
     if window.eye is not None:
-        set_real_eye(camera, window, window.eye, Path(order.file).parent)
+        set_distorted_eye(camera, window, window.eye, Path(request.file).parent)
         return
     camera.type = "PERSP"
     camera.sensor_fit = "HORIZONTAL"
     camera.sensor_width = _SENSOR_WIDTH_MM
     camera.lens = _SENSOR_WIDTH_MM * window.focal_px / window.width_px
-    # From the middle of the window to the principal point; both shifts count in widths.
+    # From the middle of the window to the principal point, in units of the window's width.
     to_right = window.center_px[0] - (window.left_px + (window.width_px - 1) / 2)
     to_down = window.center_px[1] - (window.top_px + (window.height_px - 1) / 2)
     camera.shift_x, camera.shift_y = -to_right / window.width_px, to_down / window.width_px
@@ -127,7 +127,7 @@ def _set_path(camera: Any, path: CameraPath) -> None:
     if count == 1:
         camera.location, camera.rotation_quaternion = path.positions_m[0], path.quaternions[0]
         return
-    # 2^n + 1 moments, and Blender looks at the camera at exactly these.
+    # Blender evaluates the camera at exactly these 2^n + 1 moments.
     camera.cycles.motion_steps = int(np.log2(count - 1))
     moments = _MIDDLE_FRAME + np.linspace(-0.5, 0.5, count)
     for moment, position, quaternion in zip(moments, path.positions_m, path.quaternions, strict=True):
@@ -136,10 +136,10 @@ def _set_path(camera: Any, path: CameraPath) -> None:
         camera.keyframe_insert("rotation_quaternion", frame=moment)
 
 
-def _set_output(scene: Any, order: Picture) -> None:
+def _set_output(scene: Any, request: PictureRequest) -> None:
     render = scene.render
     render.engine = "CYCLES"
-    render.resolution_x, render.resolution_y = order.window.width_px, order.window.height_px
+    render.resolution_x, render.resolution_y = request.window.width_px, request.window.height_px
     render.resolution_percentage = 100
     render.film_transparent = True
     render.use_persistent_data = True
@@ -150,26 +150,26 @@ def _set_output(scene: Any, order: Picture) -> None:
     settings.media_type = "MULTI_LAYER_IMAGE"
     settings.file_format = "OPEN_EXR_MULTILAYER"
     settings.color_depth, settings.exr_codec = "32", "NONE"
-    render.filepath = order.file
+    render.filepath = request.file
 
 
-def _set_sampling(scene: Any, order: Picture) -> None:
+def _set_sampling(scene: Any, request: PictureRequest) -> None:
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_auto_tile = False
     cycles.sampling_pattern = "TABULATED_SOBOL"
-    first, count = order.samples
+    first, count = request.samples
     cycles.samples = first + count
     cycles.use_sample_subset = True
     cycles.sample_offset, cycles.sample_subset_length = first, count
-    cycles.seed = order.seed
-    # Nothing is cut off or ended by lot: what is left out would be missing from the mean or add noise.
+    cycles.seed = request.seed
+    # No clamping and no Russian roulette: they would bias the mean or add noise.
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
     cycles.light_sampling_threshold = cycles.blur_glossy = 0.0
-    cycles.min_light_bounces = cycles.max_bounces = order.bounces
-    cycles.diffuse_bounces = cycles.glossy_bounces = order.bounces
+    cycles.min_light_bounces = cycles.max_bounces = request.bounces
+    cycles.diffuse_bounces = cycles.glossy_bounces = request.bounces
     cycles.use_light_tree = False
-    if order.kind == LIGHT:
+    if request.kind == LIGHT:
         cycles.pixel_filter_type = "BOX"
     else:
         cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", _NARROWEST_FILTER_PX

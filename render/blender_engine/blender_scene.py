@@ -18,15 +18,15 @@ from render.blender_engine.messages import (
     NORMAL_PASS,
     PASSES,
     FrameSetup,
-    Light,
-    Look,
     PartMesh,
-    StageThings,
+    StageLight,
+    StageObjects,
+    SurfaceAppearance,
 )
 
 
-class Surface:
-    """The surface of one thing.
+class SurfaceMaterial:
+    """The material of one object: matt, with an even colour or a map, possibly with a sheen, possibly emitting.
 
     Attributes:
         material: Blender's.
@@ -34,7 +34,7 @@ class Surface:
 
     def __init__(self, name: str, has_map: bool) -> None:
         self.material = bpy.data.materials.new(name)
-        # Lamps count where a path meets them, as in the other engine.
+        # Lamps count where a path hits them, as in the Mitsuba engine.
         self.material.cycles.emission_sampling = "NONE"
         nodes, links = self.material.node_tree.nodes, self.material.node_tree.links
         nodes.clear()
@@ -55,18 +55,18 @@ class Surface:
         links.new(self._emission.outputs["Emission"], both.inputs[1])
         links.new(both.outputs["Shader"], output.inputs["Surface"])
 
-    def set(self, look: Look, unit_cd_m2: float) -> None:
-        """Give the surface a look."""
+    def set(self, appearance: SurfaceAppearance, unit_cd_m2: float) -> None:
+        """Set what the surface reflects and emits."""
         if self._map is not None:
-            replace_image(self._map, look.reflectance)
+            replace_image(self._map, appearance.reflectance)
         else:
-            self._diffuse.inputs["Color"].default_value = (*look.reflectance.tolist(), 1.0)
-        fraction, roughness = look.sheen or (0.0, 1.0)
+            self._diffuse.inputs["Color"].default_value = (*appearance.reflectance.tolist(), 1.0)
+        fraction, roughness = appearance.sheen or (0.0, 1.0)
         self._sheen.inputs["Fac"].default_value = fraction
         # Blender's roughness is the root of the distribution's width.
         self._facets.inputs["Roughness"].default_value = roughness**0.5
-        strength = float(look.emission_cd_m2.max())
-        color = look.emission_cd_m2 / strength if strength > 0 else np.zeros(3)
+        strength = float(appearance.emission_cd_m2.max())
+        color = appearance.emission_cd_m2 / strength if strength > 0 else np.zeros(3)
         self._emission.inputs["Color"].default_value = (*color.tolist(), 1.0)
         self._emission.inputs["Strength"].default_value = strength / unit_cd_m2
 
@@ -75,7 +75,7 @@ def replace_image(node: Any, rgb: NDArray[np.floating[Any]]) -> None:
     """Give an image node a new image.
 
     Args:
-        node: shows it.
+        node: of Blender, which shows an image.
         rgb: (h, w, 3), its first row at the bottom.
     """
     before = node.image
@@ -102,8 +102,8 @@ class BlenderScene:
 
     def __init__(self) -> None:
         first = bpy.data.scenes[0]
-        for thing in [*first.objects]:
-            bpy.data.objects.remove(thing)
+        for item in [*first.objects]:
+            bpy.data.objects.remove(item)
         first.name = LIGHT
         self.scenes: dict[str, Any] = {LIGHT: first}
         for kind in (PASSES, FEATURES):
@@ -114,8 +114,8 @@ class BlenderScene:
         self._sun.rotation_mode = "QUATERNION"
         self._sun.data.angle = 0.0
         self._sky = _Sky()
-        self._things: dict[str, Any] = {}
-        self._surfaces: dict[str, Surface] = {}
+        self._objects: dict[str, Any] = {}
+        self._surfaces: dict[str, SurfaceMaterial] = {}
         probe = _probe_material()
         for kind, scene in self.scenes.items():
             scene.collection.objects.link(self.camera)
@@ -130,31 +130,31 @@ class BlenderScene:
                 layer.aovs.add().name = NORMAL_PASS
 
     def set_frame(self, setup: FrameSetup) -> None:
-        """Put everything where and how a frame has it."""
+        """Set objects, surfaces and lights as a frame has them."""
         if setup.stage is not None:
-            self._replace_things(setup.stage)
+            self._replace_objects(setup.stage)
         for name, vertices_m in setup.moved_m.items():
-            mesh = self._things[name].data
+            mesh = self._objects[name].data
             mesh.vertices.foreach_set("co", vertices_m.ravel())
             mesh.update()
-        for name, look in setup.looks.items():
-            self._surfaces[name].set(look, setup.light.unit_cd_m2)
+        for name, appearance in setup.appearances.items():
+            self._surfaces[name].set(appearance, setup.light.unit_cd_m2)
         self._set_light(setup.light)
 
-    def _replace_things(self, stage: StageThings) -> None:
-        bpy.data.batch_remove([*self._things.values(), *self.scenes[FEATURES].collection.objects.values()[1:]])
+    def _replace_objects(self, stage: StageObjects) -> None:
+        bpy.data.batch_remove([*self._objects.values(), *self.scenes[FEATURES].collection.objects.values()[1:]])
         bpy.data.batch_remove([*bpy.data.meshes, *(surface.material for surface in self._surfaces.values())])
-        self._things, self._surfaces = {}, {}
-        for name, part in stage.things.items():
-            self._things[name] = _mesh_object(name, part)
-            self._surfaces[name] = Surface(name, part.map_places is not None)
-            self._things[name].data.materials.append(self._surfaces[name].material)
+        self._objects, self._surfaces = {}, {}
+        for name, part in stage.objects.items():
+            self._objects[name] = _mesh_object(name, part)
+            self._surfaces[name] = SurfaceMaterial(name, part.map_uv is not None)
+            self._objects[name].data.materials.append(self._surfaces[name].material)
             for kind in (LIGHT, PASSES):
-                self.scenes[kind].collection.objects.link(self._things[name])
+                self.scenes[kind].collection.objects.link(self._objects[name])
         for name, part in stage.features.items():
             self.scenes[FEATURES].collection.objects.link(_mesh_object(name, part))
 
-    def _set_light(self, light: Light) -> None:
+    def _set_light(self, light: StageLight) -> None:
         self._sky.set(light)
         # A sun lamp shines along its own -z.
         towards, _ = Rotation.align_vectors([light.to_sun], [[0.0, 0.0, 1.0]])
@@ -165,19 +165,19 @@ class BlenderScene:
 
 
 def set_threads(scene: Any) -> None:
-    """Let Cycles take two threads: if it may take but one, TBB keeps another awake that does nothing, at work or idle.
+    """Let Cycles use two threads: with one, TBB keeps a second thread awake that does nothing.
 
-    Both on one core take no more CPU time than one alone; pixels stay the same.
+    Two threads on one core take no more CPU time than one; pixels stay the same.
     """
     scene.render.threads_mode, scene.render.threads = "FIXED", 2
 
 
 class _Sky:
-    """The map around everything, in the stage's axes."""
+    """The sky map, in the stage's axes."""
 
     def __init__(self) -> None:
         self.world = bpy.data.worlds.new("sky")
-        # The sky is where paths end, as in the other engine: it is so even that no lot needs to be drawn for it.
+        # Paths end in the sky, as in the Mitsuba engine; it is too even to be worth sampling as a light.
         self.world.cycles.sampling_method = "NONE"
         nodes, links = self.world.node_tree.nodes, self.world.node_tree.links
         nodes.clear()
@@ -191,8 +191,8 @@ class _Sky:
         links.new(self._texture.outputs["Color"], background.inputs["Color"])
         links.new(background.outputs["Background"], output.inputs["Surface"])
 
-    def set(self, light: Light) -> None:
-        """Replace the map and turn it."""
+    def set(self, light: StageLight) -> None:
+        """Replace the map and its rotation."""
         # Blender's map runs from the nadir up; its middle column looks along +x, and the next ones turn to -y.
         turned = np.roll(light.sky[::-1, ::-1], -light.sky.shape[1] // 2, axis=1)
         replace_image(self._texture, turned)
@@ -210,23 +210,23 @@ def _mesh_object(name: str, part: PartMesh) -> Any:
     mesh.polygons.add(count)
     mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
     mesh.polygons.foreach_set("use_smooth", np.full(count, part.smooth))
-    if part.map_places is not None:
+    if part.map_uv is not None:
         layer = mesh.uv_layers.new(name="map")
-        layer.uv.foreach_set("vector", part.map_places[part.faces.ravel()].ravel())
+        layer.uv.foreach_set("vector", part.map_uv[part.faces.ravel()].ravel())
     mesh.update()
-    thing = bpy.data.objects.new(name, mesh)
-    thing.pass_index = part.part_id
-    # Lifts shadow rays off coarse smooth meshes; here the meshes are fine, and the other engine does nothing like it.
-    thing.cycles.shadow_terminator_geometry_offset = 0.0
-    return thing
+    item = bpy.data.objects.new(name, mesh)
+    item.pass_index = part.part_id
+    # Moves shadow rays off coarse smooth meshes; these meshes are fine, and the Mitsuba engine does nothing similar.
+    item.cycles.shadow_terminator_geometry_offset = 0.0
+    return item
 
 
 def _probe_material() -> Any:
-    """A surface that writes the normal of its face, and where paths end."""
+    """A material that writes the normal of its face, and at which paths end."""
     material = bpy.data.materials.new("probe")
     nodes, links = material.node_tree.nodes, material.node_tree.links
     nodes.clear()
-    # One that neither shines nor reflects would be taken for a hole.
+    # A material that neither emits nor reflects would count as a hole.
     output, shine = nodes.new("ShaderNodeOutputMaterial"), nodes.new("ShaderNodeEmission")
     geometry, written = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeOutputAOV")
     written.aov_name = NORMAL_PASS

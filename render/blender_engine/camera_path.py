@@ -1,4 +1,4 @@
-"""Which part of the image a picture covers, and where its camera is while the shutter is open."""
+"""The image window of a picture, and the path of its camera while the shutter is open."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from datasets_manifest.types.frame import FrameSpec
 from geometry.distortion import Lens
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import Eye, StereoRig
-from render.blender_engine.messages import CameraPath, RealEye, Window
-from render.camera.exposure_motion import NEAREST_M, window_of
+from render.blender_engine.messages import CameraPath, DistortedEye, ImageWindow
+from render.camera.exposure_motion import NEAREST_M, image_window
 
 _SHARP_BELOW_PX = 0.05
 _MOMENTS = 5
@@ -23,8 +23,8 @@ class EyePath:
 
     Attributes:
         middle: `stage_from_eye` at mid-exposure.
-        still: the camera at mid-exposure.
-        moving: the camera at five moments, or at one when nothing moves by a twentieth of a pixel.
+        still: camera path of mid-exposure alone.
+        moving: camera path of five moments, or of one when nothing moves by a twentieth of a pixel.
     """
 
     def __init__(self, frame: FrameSpec, eye: Eye, corners_m: NDArray[np.float32]) -> None:
@@ -38,24 +38,24 @@ class EyePath:
         self.still, self.moving = _camera_path([self.middle]), _camera_path(self._poses)
 
     def _moves(self, poses: list[RigidTransform], corners_m: NDArray[np.float32]) -> bool:
-        """Whether any corner's image is elsewhere when the shutter opens or closes than in the middle."""
+        """Whether any corner's image when the shutter opens or closes differs from that at mid-exposure."""
         seen = [poses[index].inverse().apply(corners_m) for index in (0, _MOMENTS // 2, -1)]
         front = np.min([points[:, 2] for points in seen], axis=0) > NEAREST_M
         opened, middle, closed = (self._camera.project(points[front]) for points in seen)
         return bool(max(np.abs(end - middle).max(initial=0.0) for end in (opened, closed)) >= _SHARP_BELOW_PX)
 
-    def window(self, corners_m: NDArray[np.float32]) -> Window | None:
-        """What of the image holds the parts with these corners while the shutter is open; None when nothing does.
+    def window(self, corners_m: NDArray[np.float32]) -> ImageWindow | None:
+        """The image window of parts with these corners while the shutter is open; None outside the image.
 
         Args:
             corners_m: (V, 3) in the stage's axes. [m]
         """
-        window = window_of(self._rig, self._poses, corners_m)
+        window = image_window(self._rig, self._poses, corners_m)
         return None if window is None else _window(self._rig, self._eye, *window)
 
 
-def holds(outer: Window | None, inner: Window) -> bool:
-    """Whether one window holds all of another."""
+def contains(outer: ImageWindow | None, inner: ImageWindow) -> bool:
+    """Whether one window contains another; an absent one contains nothing."""
     return (
         outer is not None
         and outer.left_px <= inner.left_px
@@ -65,24 +65,32 @@ def holds(outer: Window | None, inner: Window) -> bool:
     )
 
 
-def _real_eye(rig: StereoRig, eye: Eye) -> RealEye | None:
-    """None for a pinhole with square pixels."""
+def _distorted_eye(rig: StereoRig, eye: Eye) -> DistortedEye | None:
+    """The lens model of an eye, or None for a pinhole with square pixels."""
     camera, lens = rig.camera, rig.lens(eye)
     if lens is None and camera.fx_px == camera.fy_px:
         return None
     real = lens or Lens(camera)
-    return RealEye(
-        (real.camera.fx_px, real.camera.fy_px),
-        tuple(real.distortion.coefficients().tolist()),
-        tuple(real.ideal_from_real.ravel().tolist()),
+    return DistortedEye(
+        focal_px=(real.camera.fx_px, real.camera.fy_px),
+        distortion=tuple(real.distortion.coefficients().tolist()),
+        ideal_from_real=tuple(real.ideal_from_real.ravel().tolist()),
     )
 
 
-def _window(rig: StereoRig, eye: Eye, first: NDArray[np.int_], end: NDArray[np.int_]) -> Window:
+def _window(rig: StereoRig, eye: Eye, first: NDArray[np.int_], end: NDArray[np.int_]) -> ImageWindow:
     lens = rig.lens(eye)
     camera = rig.camera if lens is None else lens.camera
     left, top, width, height = (int(value) for value in (*first, *(end - first)))
-    return Window(left, top, width, height, camera.fx_px, (camera.cx_px, camera.cy_px), _real_eye(rig, eye))
+    return ImageWindow(
+        left_px=left,
+        top_px=top,
+        width_px=width,
+        height_px=height,
+        focal_px=camera.fx_px,
+        center_px=(camera.cx_px, camera.cy_px),
+        eye=_distorted_eye(rig, eye),
+    )
 
 
 def _camera_path(poses: list[RigidTransform]) -> CameraPath:
@@ -92,4 +100,4 @@ def _camera_path(poses: list[RigidTransform]) -> CameraPath:
     for index in range(1, len(quaternions)):
         if quaternions[index] @ quaternions[index - 1] < 0:
             quaternions[index] *= -1
-    return CameraPath(np.stack([pose.translation_m for pose in poses]), quaternions)
+    return CameraPath(positions_m=np.stack([pose.translation_m for pose in poses]), quaternions=quaternions)

@@ -1,4 +1,4 @@
-"""What the engine and Blender's process tell each other: plain arrays, made here, drawn there."""
+"""Messages from the engine to Blender's process: plain arrays, made by the engine, rendered by the process."""
 
 from __future__ import annotations
 
@@ -8,42 +8,42 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# The three pictures of a frame: light on everything, what the pixel centres meet, and the same with features alone.
+# Kinds of pictures: radiance of everything, passes of the pixel centres, and the same passes with features alone.
 LIGHT, PASSES, FEATURES = "light", "passes", "features"
 NORMAL_PASS = "face_normal"
-# Cycles sends the first sample of every pixel through the pixel's centre, and only the others to random places in its
-# box: the first one is what passes of pixel centres need, and would favour what lies at the centre in light.
+# Cycles sends the first sample of a pixel through its centre, and only the others to random places in its box. Passes
+# of pixel centres need the first sample; in radiance it would favour what lies at the centre.
 CENTER_SAMPLE = 0
 FIRST_RANDOM_SAMPLE = 1
 
 
 @dataclass(frozen=True, eq=False)
 class PartMesh:
-    """One thing as Blender shall draw it, in the stage's axes.
+    """The mesh of one object, in the stage's axes.
 
     Attributes:
         part_id: `drogue_models.parts`.
         vertices_m: (V, 3) float32. [m]
         faces: (F, 3) int32, counter-clockwise seen from outside.
         smooth: whether normals are interpolated over the faces.
-        map_places: (V, 2) float32 places in the reflectance map, 0 to 1 from its first column and row, or None.
+        map_uv: (V, 2) float32 texture coordinates, 0 to 1 from first column and row of the reflectance map, or None.
     """
 
     part_id: int
     vertices_m: NDArray[np.float32]
     faces: NDArray[np.int32]
     smooth: bool
-    map_places: NDArray[np.float32] | None = None
+    map_uv: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What a thing's surface sends back and gives off.
+class SurfaceAppearance:
+    """What the surface of an object reflects and emits.
 
     Attributes:
         reflectance: (3,) diffuse reflectance, or (h, w, 3) of it as a map.
-        emission_cd_m2: (3,) radiance of its own. [cd/m2]
-        sheen: share of the light that microfacets mirror, and their roughness; None for matt paint.
+        emission_cd_m2: (3,) emitted radiance. [cd/m2]
+        sheen: share of the light that microfacets reflect, and their roughness; None for matt paint.
     """
 
     reflectance: NDArray[np.floating[Any]]
@@ -52,27 +52,27 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
-class StageThings:
-    """All that stands on the stage, by name.
+class StageObjects:
+    """All objects on the stage, by name.
 
     Attributes:
-        things: in light.
-        features: the visible faces of markers and hub alone, for their amodal pixels.
+        objects: of the lit scene.
+        features: the visible faces of markers and hub alone, for their amodal pixel counts.
     """
 
-    things: dict[str, PartMesh]
+    objects: dict[str, PartMesh]
     features: dict[str, PartMesh]
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
-    """Sky, and sun or moon.
+class StageLight:
+    """Sky, and sun or moon, as lights of the stage.
 
     Attributes:
-        sky: (H, 2H, 3) map: row 0 is the zenith, column 0 looks along +x, the next ones turn towards +y. [unit]
+        sky: (H, 2H, 3) map: row 0 is the zenith, column 0 appearances along +x, the next ones turn towards +y. [unit]
         world_from_stage: (3, 3) rotation.
         to_sun: (3,) direction in the stage's axes.
-        sun: (3,) illuminance of a facing plane. [unit times sr]
+        sun: (3,) illuminance of a plane that faces it. [unit times sr]
         unit_cd_m2: the radiance that Blender's numbers count in, so that they stay near 1 by day and night. [cd/m2]
     """
 
@@ -85,19 +85,19 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class FrameSetup:
-    """What is set up once for all pictures of a frame.
+    """What all pictures of a frame share.
 
     Attributes:
-        stage: its things, or None when they are those of the last frame.
-        moved_m: (V, 3) vertices of those that have moved against the stage, by name. [m]
-        looks: of all things, by name.
+        stage: the objects, or None when they are those of the last frame.
+        moved_m: (V, 3) vertices of the objects that move on the stage, by name. [m]
+        appearances: of all objects, by name.
         light: sky and sun.
     """
 
-    stage: StageThings | None
+    stage: StageObjects | None
     moved_m: dict[str, NDArray[np.float32]]
-    looks: dict[str, Look]
-    light: Light
+    appearances: dict[str, SurfaceAppearance]
+    light: StageLight
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +114,8 @@ class CameraPath:
 
 
 @dataclass(frozen=True)
-class RealEye:
-    """An eye that is no pinhole with square pixels.
+class DistortedEye:
+    """An eye that is not a pinhole with square pixels: its lens distorts.
 
     Attributes:
         focal_px: of either axis. [px]
@@ -129,14 +129,14 @@ class RealEye:
 
 
 @dataclass(frozen=True)
-class Window:
-    """The part of the image that a picture covers, as a camera of its own.
+class ImageWindow:
+    """A part of an eye's image, rendered by a camera of its own.
 
     Attributes:
         left_px, top_px, width_px, height_px: in the whole image. [px]
-        focal_px: of both axes of a pinhole. [px]
+        focal_px: focal length, the same for both axes of a pinhole. [px]
         center_px: principal point in the whole image, (0, 0) the centre of the top-left pixel. [px]
-        eye: how it differs from a pinhole with square pixels, or None. Blender's depth then is along the ray.
+        eye: its lens, or None for a pinhole with square pixels. With a lens, Blender's depth is along the ray.
     """
 
     left_px: int
@@ -145,25 +145,25 @@ class Window:
     height_px: int
     focal_px: float
     center_px: tuple[float, float]
-    eye: RealEye | None = None
+    eye: DistortedEye | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """One rendering.
+class PictureRequest:
+    """One picture to render.
 
     Attributes:
         kind: `LIGHT`, `PASSES` or `FEATURES`.
-        window: what of the image.
+        window: part of the image.
         path: the camera; one moment unless something moves.
-        samples: first and number of this picture's samples in the pixels' sequence.
-        bounces: how often light may be thrown on after the first surface.
+        samples: first sample of the pixels' sequence to take, and how many.
+        bounces: how many surfaces after the first may reflect light.
         seed: of the sequence.
-        file: where it is written, without `.exr`.
+        file: path of the result, without `.exr`.
     """
 
     kind: str
-    window: Window
+    window: ImageWindow
     path: CameraPath
     samples: tuple[int, int]
     bounces: int

@@ -18,7 +18,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from render.blender_engine.messages import NORMAL_PASS, FrameSetup, Picture, Window
+from render.blender_engine.messages import NORMAL_PASS, FrameSetup, ImageWindow, PictureRequest
 
 _MEMORY_FOLDER = Path("/dev/shm")
 _GRACE_S = 5.0
@@ -41,14 +41,14 @@ def bpy_version() -> str:
 
 
 class BlenderProcess:
-    """One Blender.
+    """A running Blender process.
 
     Attributes:
-        folder: for pictures; in memory where the system has a place for that.
-        start_cpu_s: what starting cost. [s]
+        folder: for pictures; in memory where the system allows it.
+        start_cpu_s: CPU time of its start. [s]
 
     Raises:
-        ValueError: Blender cannot be loaded here; says what is missing.
+        ValueError: Blender cannot be loaded; the message says what is missing.
     """
 
     def __init__(self) -> None:
@@ -58,56 +58,56 @@ class BlenderProcess:
         self._log = self.folder / "log.txt"
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                # -P: a file that lies where the user works must not stand in for a module of Blender's.
+                # -P: a file in the working folder must not replace one of Blender's modules.
                 [sys.executable, "-P", "-m", "render.blender_engine.worker", str(self.folder)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                # Who kills the engine's whole group would kill it too before it has tidied up; it ends with its input.
+                # A signal to the engine's process group must not kill it before it cleans up; it ends with its input.
                 start_new_session=True,
-                # The user's own start-up file and add-ons must not change pictures.
+                # The user's start-up file and add-ons must not change pictures.
                 env={**os.environ, "BLENDER_USER_RESOURCES": str(self.folder)},
             )
         self._end = weakref.finalize(self, _end, self._process, self.folder)
         try:
-            self.start_cpu_s = self._answer()
+            self.start_cpu_s = self._read_answer()
         except (BlenderEndedError, ValueError) as error:
             self.close()
             raise ValueError(f"engine blender: cannot be loaded: {error}; droguekit doctor says more") from error
 
-    def ask(self, order: FrameSetup | Picture) -> float:
-        """Have an order carried out.
+    def ask(self, request: FrameSetup | PictureRequest) -> float:
+        """Send a request and wait until it is done.
 
         Returns:
-            CPU time that it took. [s]
+            Its CPU time. [s]
 
         Raises:
-            BlenderEndedError: the process is gone.
-            ValueError: Blender refused.
+            BlenderEndedError: the process has ended.
+            ValueError: Blender reported an error.
         """
         assert self._process.stdin is not None
         try:
-            pickle.dump(order, self._process.stdin)
+            pickle.dump(request, self._process.stdin)
             self._process.stdin.flush()
         except OSError as error:
-            raise BlenderEndedError(self._last_words()) from error
-        return self._answer()
+            raise BlenderEndedError(self._exit_reason()) from error
+        return self._read_answer()
 
     def close(self) -> None:
-        """End the process, in the middle of a picture too, and remove its folder."""
+        """End the process, even in the middle of a picture, and remove its folder."""
         self._end()
 
-    def _answer(self) -> float:
+    def _read_answer(self) -> float:
         assert self._process.stdout is not None
         try:
             answer = pickle.load(self._process.stdout)
         except (EOFError, pickle.UnpicklingError) as error:
-            raise BlenderEndedError(self._last_words()) from error
+            raise BlenderEndedError(self._exit_reason()) from error
         if "error" in answer:
             raise ValueError(str(answer["error"]))
         return float(answer["cpu_s"])
 
-    def _last_words(self) -> str:
+    def _exit_reason(self) -> str:
         try:
             status = self._process.wait(_GRACE_S)
         except subprocess.TimeoutExpired:
@@ -117,13 +117,13 @@ class BlenderProcess:
 
 
 def _end(process: subprocess.Popen[bytes], folder: Path) -> None:
-    """Close the orders, on which the process ends at once; remove what it may have left."""
+    """Close the process's input, on which it ends at once, and remove its folder."""
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
             try:
                 pipe.close()
             except OSError:
-                continue  # what was still to be sent has no reader any more
+                continue  # unsent data has no reader any more
     try:
         process.wait(_GRACE_S)
     except subprocess.TimeoutExpired:
@@ -132,13 +132,13 @@ def _end(process: subprocess.Popen[bytes], folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-# Blender's depth where there is nothing is 1e10.
+# Blender gives rays that miss a depth of 1e10.
 _NOTHING_M = 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class CenterPixels:
-    """What the pixel centres of a window meet.
+    """What the rays through the pixel centres of a window hit.
 
     Attributes:
         part_id: (h, w) uint8, 0 for nothing.
@@ -173,14 +173,14 @@ def read_passes(path: Path) -> CenterPixels:
     depth = found["Depth.Z"]
     normal = np.stack([found[f"{NORMAL_PASS}.{axis}"] for axis in "RGB"], axis=-1)
     return CenterPixels(
-        part_id,
-        np.where(depth < _NOTHING_M, depth, np.inf).astype(np.float32),
-        normal,
+        part_id=part_id,
+        depth_m=np.where(depth < _NOTHING_M, depth, np.inf).astype(np.float32),
+        normal=normal,
     )
 
 
-def place(whole: NDArray[Any], window: Window, values: NDArray[Any]) -> None:
-    """Put a window's pixels into the image, in place."""
+def paste(whole: NDArray[Any], window: ImageWindow, values: NDArray[Any]) -> None:
+    """Write a window's pixels into the whole image, in place."""
     rows = slice(window.top_px, window.top_px + window.height_px)
     columns = slice(window.left_px, window.left_px + window.width_px)
     whole[rows, columns] = values

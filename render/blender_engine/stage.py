@@ -1,4 +1,4 @@
-"""What stands in a frame, as plain arrays in the axes in which all of it stands still: the stage's."""
+"""The objects of a frame as plain arrays, in the axes of the stage, in which they stand still."""
 
 from __future__ import annotations
 
@@ -11,58 +11,60 @@ from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name, part_satin
 from drogue_models.solids import with_creases
 from drogue_models.tanker import tanker_mesh
-from render.blender_engine.messages import FrameSetup, Light, Look, PartMesh, StageThings
+from render.blender_engine.messages import FrameSetup, PartMesh, StageLight, StageObjects, SurfaceAppearance
 from render.surfaces import (
     SMOOTH_PARTS,
+    clean_reflectance_rgb,
     dirty_parts,
-    even_reflectance_rgb,
     lamp_radiance_rgb,
     missing_parts,
     reflectance_map,
     surface_condition,
 )
-from scenes.environment_radiance import Surroundings
+from scenes.environment_radiance import EnvironmentRadiance
 
 
 class Stage:
-    """The things of the last frame: meshes that stay are sent to Blender once.
+    """The objects of the last frame: meshes that stay the same are sent to Blender once.
 
     Attributes:
         drogue_m: (V, 3) vertices of the drogue's own parts. [m]
-        around_m: (V, 3) vertices of every other thing. [m]
+        context_m: (V, 3) vertices of each other object. [m]
     """
 
     def __init__(self) -> None:
         self._key: str | None = None
         self.drogue_m: NDArray[np.float32] = np.zeros((0, 3), dtype=np.float32)
-        self.around_m: list[NDArray[np.float32]] = []
+        self.context_m: list[NDArray[np.float32]] = []
 
-    def set_frame(self, frame: FrameSpec, around: Surroundings) -> FrameSetup:
-        """What Blender has to be told for this frame."""
+    def set_frame(self, frame: FrameSpec, ambient: EnvironmentRadiance) -> FrameSetup:
+        """The setup that Blender needs for this frame."""
         moved = _moved_meshes(frame)
         key = _stage_key(frame, moved)
         stage = None
         if key != self._key:
             fixed = _fixed_meshes(frame)
-            stage = StageThings(
-                {name: _part_mesh(frame, part, mesh) for name, (part, mesh) in (fixed | moved).items()},
-                {
+            stage = StageObjects(
+                objects={name: _part_mesh(frame, part, mesh) for name, (part, mesh) in (fixed | moved).items()},
+                features={
                     f"alone_{name}": _part_mesh(frame, part, _front_faces(mesh))
                     for name, (part, mesh) in fixed.items()
                     if part == Part.HUB or part >= FIRST_MARKER_ID
                 },
             )
-            corners = [stage.things[name].vertices_m for name in fixed]
+            corners = [stage.objects[name].vertices_m for name in fixed]
             self.drogue_m = np.concatenate(corners) if corners else np.zeros((0, 3), dtype=np.float32)
-            self._looks = {name: part for name, (part, _) in fixed.items()}
+            self._part_of_name = {name: part for name, (part, _) in fixed.items()}
             self._key = key
         vertices = {name: np.asarray(mesh.vertices, dtype=np.float32) for name, (_, mesh) in moved.items()}
-        self.around_m = [*vertices.values()]
-        looks = {name: _look(frame, part) for name, part in self._looks.items()} | _moved_looks(frame, moved)
-        return FrameSetup(stage, vertices, looks, _light(frame, around))
+        self.context_m = [*vertices.values()]
+        appearances = {
+            name: _appearance(frame, part) for name, part in self._part_of_name.items()
+        } | _moved_appearances(frame, moved)
+        return FrameSetup(stage=stage, moved_m=vertices, appearances=appearances, light=_light(frame, ambient))
 
     def forget(self) -> None:
-        """Send everything again: Blender's process is a new one."""
+        """Send everything again with the next frame, because Blender's process is a new one."""
         self._key = None
 
 
@@ -101,13 +103,13 @@ def _stage_key(frame: FrameSpec, moved: _Meshes) -> str:
 
 
 def _front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """What of a flat feature can be seen from the front; its side walls are sunk in the part around it."""
+    """The front of a flat feature; its side walls are sunk in the part around it."""
     return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
 
 
 def _part_mesh(frame: FrameSpec, part: int, mesh: trimesh.Trimesh) -> PartMesh:
     vertices = np.asarray(mesh.vertices, dtype=np.float32)
-    places = None
+    map_uv = None
     if not surface_condition(frame, part).is_clean:
         assert frame.drogue is not None
         if part == Part.HUB:
@@ -116,33 +118,41 @@ def _part_mesh(frame: FrameSpec, part: int, mesh: trimesh.Trimesh) -> PartMesh:
         else:
             center_m = np.asarray(frame.drogue.marker_positions_m[part - FIRST_MARKER_ID])
             radius_m = frame.drogue.marker_radius_m
-        places = ((vertices[:, :2] - center_m) / (2 * radius_m) + 0.5).astype(np.float32)
-    return PartMesh(part, vertices, np.asarray(mesh.faces, dtype=np.int32), part in SMOOTH_PARTS, places)
+        map_uv = ((vertices[:, :2] - center_m) / (2 * radius_m) + 0.5).astype(np.float32)
+    return PartMesh(
+        part_id=part,
+        vertices_m=vertices,
+        faces=np.asarray(mesh.faces, dtype=np.int32),
+        smooth=part in SMOOTH_PARTS,
+        map_uv=map_uv,
+    )
 
 
-def _look(frame: FrameSpec, part: int) -> Look:
+def _appearance(frame: FrameSpec, part: int) -> SurfaceAppearance:
     clean = surface_condition(frame, part).is_clean
-    reflectance = even_reflectance_rgb(frame, part) if clean else reflectance_map(frame, part)
+    reflectance = clean_reflectance_rgb(frame, part) if clean else reflectance_map(frame, part)
     satin = None if frame.drogue is None else part_satin(frame.drogue, part)
     sheen = None if satin is None else (satin.sheen_fraction, satin.roughness)
-    return Look(reflectance, lamp_radiance_rgb(frame, part), sheen)
+    return SurfaceAppearance(reflectance=reflectance, emission_cd_m2=lamp_radiance_rgb(frame, part), sheen=sheen)
 
 
-def _moved_looks(frame: FrameSpec, moved: _Meshes) -> dict[str, Look]:
-    looks = {name: _look(frame, part) for name, (part, _) in moved.items() if name in ("hose", "tanker")}
+def _moved_appearances(frame: FrameSpec, moved: _Meshes) -> dict[str, SurfaceAppearance]:
+    appearances = {name: _appearance(frame, part) for name, (part, _) in moved.items() if name in ("hose", "tanker")}
     for index, bystander in enumerate(frame.bystanders):
-        looks[f"bystander_{index}"] = Look(np.array(bystander.reflectance_rgb), np.zeros(3))
-    return looks
+        appearances[f"bystander_{index}"] = SurfaceAppearance(
+            reflectance=np.array(bystander.reflectance_rgb), emission_cd_m2=np.zeros(3)
+        )
+    return appearances
 
 
-def _light(frame: FrameSpec, around: Surroundings) -> Light:
+def _light(frame: FrameSpec, ambient: EnvironmentRadiance) -> StageLight:
     world_from_stage = (frame.world_from_left @ frame.left_from_stage_at(0.0)).rotation
-    light_map = around.light_map
+    light_map = ambient.light_map
     unit_cd_m2 = max(float(light_map.mean()), 1e-12)
-    return Light(
-        (light_map / np.float32(unit_cd_m2)).astype(np.float32),
-        world_from_stage,
-        world_from_stage.T @ around.beam_direction,
-        around.beam_illuminance_lux / unit_cd_m2,
-        unit_cd_m2,
+    return StageLight(
+        sky=(light_map / np.float32(unit_cd_m2)).astype(np.float32),
+        world_from_stage=world_from_stage,
+        to_sun=world_from_stage.T @ ambient.beam_direction,
+        sun=ambient.beam_illuminance_lux / unit_cd_m2,
+        unit_cd_m2=unit_cd_m2,
     )

@@ -17,7 +17,7 @@ def pose_polynomial(frame: FrameSpec, eye: Eye) -> NDArray[np.float64]:
 
     Returns:
         (3, 3, 4) coefficients c of `stage_from_eye(s) = c[0] + c[1] s + c[2] s^2`, s from -1 (shutter opens) to 1
-        (it closes); exact at both ends and the middle, the rest is of third order in the motion.
+        (it closes); exact at both ends and the middle, with an error of third order in the motion elsewhere.
     """
     half_s = frame.exposure.time_s / 2
     eye_from_left = exp_twist(np.concatenate([-frame.rig.eye_offset_m(eye), np.zeros(3)]))
@@ -28,8 +28,8 @@ def pose_polynomial(frame: FrameSpec, eye: Eye) -> NDArray[np.float64]:
     return np.stack([middle, (closed - opened) / 2, (closed + opened) / 2 - middle])
 
 
-def blur_px(frame: FrameSpec) -> float:
-    """Largest movement of the image of what is drawn from mid-exposure to either end. [px]"""
+def motion_blur_px(frame: FrameSpec) -> float:
+    """Largest motion of the image from mid-exposure to either end of the exposure. [px]"""
     half_s = frame.exposure.time_s / 2
     if frame.drogue is not None:
         places_m = frame.drogue.rim_radius_m * np.array(
@@ -42,23 +42,23 @@ def blur_px(frame: FrameSpec) -> float:
 
 
 NEAREST_M = 0.05
-"""Nearer than this a corner's projection means nothing and the whole image is taken. [m]"""
-# Beyond what the corners reach: their own rounding, and the pixel that holds them.
+"""If a corner is nearer than this, its projection is useless and the window is the whole image. [m]"""
+# Margin beyond the corners, for rounding and for the pixel that holds them.
 _MARGIN_PX = 2
 
 
-def window_of(
+def image_window(
     rig: StereoRig, poses: Iterable[RigidTransform], corners_m: NDArray[np.float64] | NDArray[np.float32]
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
-    """What of the image holds a thing while the shutter is open.
+    """The part of an eye's image that holds an object while the shutter is open.
 
     Args:
-        rig: whose eye it is.
-        poses: `stage_from_eye` at some moments.
-        corners_m: (V, 3) in the stage's axes; the thing lies within their convex hull. [m]
+        rig: gives camera and lenses.
+        poses: `stage_from_eye` at some moments of the exposure.
+        corners_m: (V, 3) in the stage's axes; the object lies within their convex hull. [m]
 
     Returns:
-        Its first column and row, and those behind its last; None when the image holds nothing of it. [px]
+        First column and row, and those after the last ones; None when the object is outside the image. [px]
     """
     camera = rig.camera
     size = np.array([camera.width_px, camera.height_px])
@@ -72,7 +72,7 @@ def window_of(
             break
         seen = camera.project(points)
         low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
-    # Where a lens moves what stands in the ideal image.
+    # A lens shifts the image of an ideal eye by up to so much.
     margin = _MARGIN_PX + np.ceil(rig.largest_shift_px())
     first = np.clip(np.floor(low) - margin, 0, size)
     end = np.clip(np.ceil(high) + margin + 1, 0, size)

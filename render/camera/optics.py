@@ -14,14 +14,14 @@ from geometry.se3 import Array
 from geometry.stereo import Eye
 from render.background import background
 from render.engine import EyeRadiance
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sky.light import SUN_RADIUS_RAD
 
-# Polished and coated glass scatters 1 / (a^2 + theta^2) around a source (the ABg law of optical
+# Polished and coated glass scatters 1 / (a^2 + theta^2) ambient a source (the ABg law of optical
 # design with g = 2); the core is our choice for a lens of several elements.
 _CORE_RAD = 0.01
 _WIDEST_RAD = np.pi / 2
-# A hood shades the front lens from suns this far outside the axis: full shade beyond the second angle.
+# A hood shades the front lens from a sun this far off the axis: completely beyond the second angle.
 _HOOD_BEGINS_RAD, _HOOD_ENDS_RAD = np.radians(25.0), np.radians(45.0)
 _DARKEST_LUX = 1.0
 
@@ -29,7 +29,7 @@ _DARKEST_LUX = 1.0
 def glare_spread_per_sr(angle_rad: NDArray[np.float32], scattered_fraction: float) -> NDArray[np.float32]:
     """Veiling luminance per illuminance of the lens, by the angle from the source. [1/sr]
 
-    Its integral over the half sphere before the lens, for small angles, is the scattered fraction.
+    Its integral over the hemisphere in front of the lens, for small angles, is the scattered fraction.
     """
     inside = np.log1p((_WIDEST_RAD / _CORE_RAD) ** 2)
     level = scattered_fraction / (np.pi * inside)
@@ -38,17 +38,17 @@ def glare_spread_per_sr(angle_rad: NDArray[np.float32], scattered_fraction: floa
 
 
 def sun_glare(frame: FrameSpec, seen: EyeRadiance) -> NDArray[np.float32] | None:
-    """(H, W, 3) veil of an eye by the sun or moon in or near its view, or None where there is none. [cd/m2]
+    """(H, W, 3) veiling glare of an eye by sun or moon in or near its view, or None without any. [cd/m2]
 
-    What stands before the disc takes its share of the glare; both eyes look along the same axes.
+    Parts in front of the disc reduce the glare; both eyes look along the same axes.
 
     Args:
         frame: gives sun, camera and attitude at mid-exposure.
-        seen: coverage counts, for what hides the sun.
+        seen: its coverage tells what hides the sun.
     """
-    around, camera = surroundings(frame.environment), frame.rig.camera
-    illuminance_lux = around.beam_illuminance_lux
-    to_sun = frame.world_from_left.inverse().rotate(around.beam_direction)
+    ambient, camera = environment_radiance(frame.environment), frame.rig.camera
+    illuminance_lux = ambient.beam_illuminance_lux
+    to_sun = frame.world_from_left.inverse().rotate(ambient.beam_direction)
     off_axis = float(np.arccos(np.clip(to_sun[2], -1.0, 1.0)))
     if off_axis >= _HOOD_ENDS_RAD or illuminance_lux.max() < _DARKEST_LUX:
         return None
@@ -67,7 +67,7 @@ def sun_glare(frame: FrameSpec, seen: EyeRadiance) -> NDArray[np.float32] | None
 
 
 def _open_share(frame: FrameSpec, seen: EyeRadiance, to_sun: NDArray[np.float64]) -> float:
-    """Share of the disc that nothing hides; 1 for a sun outside the picture."""
+    """Visible share of the disc; 1 for a sun outside the image."""
     camera = frame.rig.camera
     center = camera.project(to_sun)
     if not camera.contains(center):
@@ -81,17 +81,17 @@ def _open_share(frame: FrameSpec, seen: EyeRadiance, to_sun: NDArray[np.float64]
 
 # Beyond four sigma the Gaussian holds less than 1e-4 of the light.
 _KERNEL_REACH_SIGMA = 4.0
-# A smaller circle of blur adds less than a 500th to the variance of a pixel's own box.
+# A smaller blur circle adds less than a 500th to the variance of a pixel's own box.
 _SHARP_BELOW_PX = 0.05
 _MOST_DEFOCUS_PX = 200.0
 _CHORDS_PER_PX = 64
 
 
 def light_on_sensor(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np.float32]:
-    """(H, W, 3) what one eye's sensor receives: defocused, blurred by the point spread, veiled by glare, less losses.
+    """(H, W, 3) light on one eye's sensor: defocused, blurred by the point spread, with glare and vignetting.
 
     Returns:
-        In units of the scene's radiance on the axis. [cd/m2]
+        In units of scene radiance on the axis. [cd/m2]
     """
     image = blur(_defocused(frame, seen, eye), frame.sensor.psf_sigma_px)
     veil = sun_glare(frame, seen)
@@ -123,11 +123,11 @@ def blur(radiance: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=4)
 def transmission(camera: PinholeCamera, optics: Optics) -> NDArray[np.float32]:
-    """(H, W) share of the light on the axis that reaches each pixel.
+    """(H, W) illuminance of each pixel relative to the axis.
 
     Source: illuminance falls with cos^4 of the angle from the axis (natural vignetting, EMVA Standard 1288); the
-    barrel's share is our model, `1 - a rho^4`, rho the distance from the principal point over that of the corner
-    farthest from it.
+    mechanical falloff is our model, `1 - a rho^4`, with rho the distance from the principal point over that of the
+    farthest corner.
     """
     u = np.arange(camera.width_px) - camera.cx_px
     v = np.arange(camera.height_px) - camera.cy_px
@@ -154,9 +154,9 @@ def blur_circle_px(frame: FrameSpec, depth_m: float) -> float:
 
 
 def _defocused(frame: FrameSpec, seen: EyeRadiance, eye: Eye) -> NDArray[np.float32]:
-    """(H, W, 3) radiance with two layers out of focus: all parts by the depth of the rim's centre, and the far sky.
+    """(H, W, 3) radiance with two layers out of focus: all parts at the depth of the rim's centre, and the far sky.
 
-    A calibration board goes by its own centre. A blurred part lets through what it no longer covers:
+    A calibration board takes the depth of its own centre. The sky shows where a blurred part no longer covers it:
     `sky (1 - coverage) + parts`, each blurred by its own circle.
     """
     sky_px = blur_circle_px(frame, np.inf)
@@ -190,10 +190,10 @@ def _disc_blur(image: NDArray[np.float32], diameter_px: float) -> NDArray[np.flo
 
 @lru_cache(maxsize=8)
 def disc_kernel(diameter_px: float) -> Array:
-    """(2 k + 1, 2 k + 1) weights of an even disc of light on box-sampled pixels.
+    """(2 k + 1, 2 k + 1) weights of a uniform disc on box-sampled pixels.
 
-    Pixels spread the disc by their own box; the diameter drawn is the one whose weights have the variance of the true
-    disc, a sixteenth of its diameter squared, so that small circles blur as much as they should.
+    Pixels spread the disc by their own box. So a smaller disc is sampled, whose weights have the variance of the true
+    disc, a sixteenth of its diameter squared; small circles then blur by the right amount.
     """
     wanted = diameter_px**2 / 16.0
     low, high = 0.0, diameter_px + 2.0
@@ -207,7 +207,7 @@ def disc_kernel(diameter_px: float) -> Array:
 
 
 def _covered_by_disc(diameter_px: float) -> Array:
-    """Share of a disc in the middle of the grid that falls into each pixel, by its chords."""
+    """Share of a centred disc that falls into each pixel, integrated by its chords."""
     reach = int(np.ceil(diameter_px / 2 - 0.5)) if diameter_px > 1 else 0
     chords = (2 * reach + 1) * _CHORDS_PER_PX
     y = (np.arange(chords) + 0.5) / _CHORDS_PER_PX - reach - 0.5

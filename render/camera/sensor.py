@@ -33,16 +33,16 @@ _Loop = TypeVar("_Loop", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
-class ReadOut:
-    """How light becomes numbers.
+class SensorReadout:
+    """Conversion of light on the sensor's sites to digital numbers.
 
     Attributes:
         electrons_per_cd_m2: collected by a site of gain 1. [e- m2/cd]
         read_noise_e: standard deviation of the read noise. [e-]
         full_well_e: the most electrons that a site holds. [e-]
-        dn_per_e: of the converter. [DN/e-]
-        black_level_dn: its number in the dark.
-        adc_bits: of its numbers.
+        dn_per_e: gain of the converter. [DN/e-]
+        black_level_dn: number without light.
+        adc_bits: bits of a number.
     """
 
     electrons_per_cd_m2: float
@@ -52,15 +52,15 @@ class ReadOut:
     black_level_dn: int
     adc_bits: int
 
-    def numbers(
+    def digital_numbers(
         self, light: NDArray[np.float32], gains: NDArray[np.float32], rng: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """What the converter says.
+        """Digital numbers of the sites.
 
         Args:
-            light: that each site takes, of any shape. [cd/m2]
-            gains: of the same shape, the fixed gain of each site.
-            rng: for the noise; its bits are taken as they come.
+            light: on each site, of any shape. [cd/m2]
+            gains: fixed gain of each site, of the same shape.
+            rng: for the noise; its raw bits are used.
         """
         bits = rng.bit_generator.random_raw(-(-light.size // 2)).view(np.uint32)[: light.size]
         numbers, least_e = self._converted(light.ravel(), gains.ravel(), bits, self.electrons_per_cd_m2, 1.0)
@@ -74,14 +74,14 @@ class ReadOut:
     def _converted(
         self, light: NDArray[np.float32], gains: NDArray[np.float32], bits: NDArray[np.uint32], per: float, shot: float
     ) -> tuple[NDArray[np.uint16], float]:
-        """(N,) numbers, and the least mean number of electrons. [e-]
+        """(N,) digital numbers, and the least mean number of electrons. [e-]
 
         Args:
             light: (N,)
             gains: (N,)
             bits: (N,) random.
-            per: electrons of a site of gain 1 per light.
-            shot: share of the shot noise that is still to be added, squared.
+            per: electrons per light of a site of gain 1.
+            shot: share of the variance of shot noise to add.
         """
         numbers = np.empty(light.shape, dtype=np.uint16)
         top = 2**self.adc_bits - 1
@@ -93,11 +93,11 @@ class ReadOut:
 
 @lru_cache(maxsize=1)
 def normal_quantiles() -> NDArray[np.float32]:
-    """(65536,) quantiles of which the sum of two, drawn independently, is a standard normal variate.
+    """(65536,) quantiles; the sum of two of them, drawn independently, is a standard normal variate.
 
-    Each is close to a normal one of half the variance, up to 4.3 of its deviations, and their sum is closer still: its
-    variance is 1, its excess kurtosis -0.0004, its distribution function within 1e-5 of the normal one; beyond 4
-    deviations it has 2 % too few, beyond 5 17 %, and it ends at 6.1.
+    Each is close to a normal variate of half the variance, up to 4.3 standard deviations; their sum is closer still:
+    its variance is 1, its excess kurtosis -0.0004, its distribution function within 1e-5 of the normal one. Beyond 4
+    standard deviations it has 2 % too few, beyond 5 17 %; it ends at 6.1.
     """
     quantiles = ndtri((np.arange(2**_QUANTILE_BITS) + 0.5) / 2**_QUANTILE_BITS)
     scaled: NDArray[np.float32] = (quantiles / np.sqrt(2 * np.mean(quantiles**2))).astype(np.float32)
@@ -105,10 +105,10 @@ def normal_quantiles() -> NDArray[np.float32]:
 
 
 def _compiled(loop: _Loop) -> _Loop:
-    """Compile at the first call, once a machine where the cache can be written; sums as they stand in the code."""
+    """Compile at the first call, and cache the result where possible; no reordering of floating-point operations."""
     try:
         quick: _Loop = numba.njit(loop, cache=True, error_model="numpy", nogil=True)
-    except RuntimeError:  # neither beside the file nor at home can anything be written
+    except RuntimeError:  # no folder for the cache can be written
         quick = numba.njit(loop, error_model="numpy", nogil=True)
     return quick
 
@@ -122,7 +122,7 @@ def _convert_all(
     scales: NDArray[np.float32],
     numbers: NDArray[np.uint16],
 ) -> np.float32:
-    """Fill in `numbers`; see `ReadOut._converted`, whose `scales` these are."""
+    """Fill in `numbers`; see `SensorReadout._converted`, whose `scales` these are."""
     per, shot, read_variance_e2, dn_per_e, full_dn, offset_dn, top_dn = scales
     mask, least_e, dark = np.uint32(quantiles.size - 1), np.float32(np.inf), np.float32(0.0)
     for site in range(light.size):
@@ -142,7 +142,7 @@ _MOSAIC_SITES = ((0, 0, 0), (1, 0, 1), (1, 1, 0), (2, 1, 1))
 
 
 def dn_per_electron(sensor: Sensor, gain: float) -> float:
-    """Numbers of the converter per electron; at gain 1 a full well is the highest number. [DN/e-]"""
+    """Digital numbers per electron; at gain 1 a full well gives the highest number. [DN/e-]"""
     return float(gain * (2**sensor.adc_bits - 1 - sensor.black_level_dn) / sensor.full_well_e)
 
 
@@ -150,45 +150,46 @@ def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
     """The stereo pair of images that the sensors deliver.
 
     Args:
-        frame: names sensor, exposure and the random streams.
-        radiance: absolute radiance of both eyes.
+        frame: gives sensor, exposure and the keys of the random streams.
+        radiance: of both eyes.
     """
     sensor = frame.sensor
     images: dict[Eye, Pixels] = {}
     mosaics: dict[Eye, Pixels | None] = {}
-    read_out = ReadOut(
-        sensor.electrons_per_cd_m2(frame.exposure),
-        sensor.read_noise_e,
-        sensor.full_well_e,
-        dn_per_electron(sensor, frame.exposure.gain),
-        sensor.black_level_dn,
-        sensor.adc_bits,
+    readout = SensorReadout(
+        electrons_per_cd_m2=sensor.electrons_per_cd_m2(frame.exposure),
+        read_noise_e=sensor.read_noise_e,
+        full_well_e=sensor.full_well_e,
+        dn_per_e=dn_per_electron(sensor, frame.exposure.gain),
+        black_level_dn=sensor.black_level_dn,
+        adc_bits=sensor.adc_bits,
     )
     for index, eye in enumerate(EYES):
         seen = light_on_sensor(frame, radiance.left if eye == "left" else radiance.right, eye)
         light = _sample_sites(seen, sensor)
         gains = _pixel_gains(frame.seed, index, light.shape, sensor.prnu_fraction)
         rng = bulk_frame_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
-        numbers = read_out.numbers(light, gains, rng)
+        numbers = readout.digital_numbers(light, gains, rng)
         mosaics[eye] = _store(numbers, sensor, "linear") if sensor.color == "bayer" else None
         if sensor.color == "bayer":
             numbers = cv2.cvtColor(numbers, cv2.COLOR_BayerRGGB2RGB)
         images[eye] = _store(numbers, sensor, sensor.encoding)
+    black_level = _store(np.array([[sensor.black_level_dn]], dtype=np.uint16), sensor, sensor.encoding)
     return StereoImages(
-        images["left"],
-        images["right"],
-        frame.time_s,
-        frame.exposure.time_s,
-        sensor.output_bits,
-        sensor.encoding,
-        float(_store(np.array([[sensor.black_level_dn]], dtype=np.uint16), sensor, sensor.encoding)[0, 0]),
-        mosaics["left"],
-        mosaics["right"],
+        left=images["left"],
+        right=images["right"],
+        time_s=frame.time_s,
+        exposure_s=frame.exposure.time_s,
+        bits=sensor.output_bits,
+        encoding=sensor.encoding,
+        black_level_dn=float(black_level[0, 0]),
+        left_mosaic=mosaics["left"],
+        right_mosaic=mosaics["right"],
     )
 
 
 def _sample_sites(seen: NDArray[np.float32], sensor: Sensor) -> NDArray[np.float32]:
-    """The light that each of the sensor's sites takes: (H, W, 3), or (H, W) behind a mosaic or no filter."""
+    """Light on each site of the sensor: (H, W, 3), or (H, W) for a mosaic or a monochrome sensor."""
     if sensor.color == "rgb":
         return seen
     if sensor.color == "mono":
@@ -211,11 +212,11 @@ def _pixel_gains(seed: int, eye_index: int, shape: tuple[int, ...], spread: floa
 
 
 def _store(numbers: NDArray[np.uint16], sensor: Sensor, encoding: str) -> Pixels:
-    """Numbers of the converter as stored: linear or through the sRGB curve, in `output_bits`."""
+    """Digital numbers as stored: linear or on the sRGB curve, in `output_bits`."""
     if encoding == "linear":
         if sensor.output_bits == sensor.adc_bits:
             return numbers
-        # Scales, rounds half to even and clips in one pass; a table of all numbers takes three times as long.
+        # Scales, rounds half to even and clips in one pass; a lookup table takes three times as long.
         scaled: Pixels = cv2.convertScaleAbs(numbers, alpha=2**sensor.output_bits / 2**sensor.adc_bits)
         return scaled
     table = _gamma_table(sensor.adc_bits, sensor.output_bits, sensor.black_level_dn)
@@ -225,7 +226,7 @@ def _store(numbers: NDArray[np.uint16], sensor: Sensor, encoding: str) -> Pixels
 
 @lru_cache(maxsize=8)
 def _gamma_table(adc_bits: int, output_bits: int, black_level_dn: int) -> Pixels:
-    """Stored number for every number of the converter, through the curve.
+    """Stored number for every digital number, on the sRGB curve.
 
     Source of the curve: IEC 61966-2-1 (sRGB), on the signal above the black level.
     """

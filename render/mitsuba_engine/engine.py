@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import EYES, Eye
-from render.background import air_before, backgrounds
+from render.background import air_in_front, backgrounds
 from render.engine import EyeRadiance, StereoRadiance
 from render.mitsuba_engine.render_noise import MonteCarloNoise, measure_noise
-from render.mitsuba_engine.trace_request import OF_DROGUE, ToTrace, Traced
+from render.mitsuba_engine.trace_request import DROGUE_PARTS, TraceRequest, TraceResult
 from render.mitsuba_engine.variant import probe_variant
 from render.version import RENDER_VERSION
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 
 
 class MitsubaEngine:
-    """Path tracing of the pixels that see drogue, hose or tanker; the rest is the surroundings themselves.
+    """Path tracing of the pixels that see drogue, hose or tanker; all others show the environment itself.
 
     One process holds one engine, with one thread: results are then the same bit for bit in every run.
 
@@ -55,54 +55,70 @@ class MitsubaEngine:
 
         Args:
             frame: what to render.
-            settings: how.
+            settings: samples and depths.
 
         Raises:
-            ValueError: the rig has real lenses, which the slow variant does not know.
+            ValueError: the rig has lenses with distortion, which the scalar variant does not support.
         """
         if frame.rig.lenses is not None and self.variant.variant == "scalar_rgb":
             raise ValueError(f"rig: mitsuba as scalar_rgb draws ideal eyes only ({self.variant.reason}); use analytic")
         stage_s: dict[str, float] = {}
         started = time.process_time()
-        behind = backgrounds(frame)
+        background = backgrounds(frame)
         stage_s["sky"] = time.process_time() - started
         if frame.drogue is None and not frame.bystanders:
-            empty = {eye: _empty_eye(behind[eye]) for eye in EYES}
-            return StereoRadiance(empty["left"], empty["right"], self.name, self.version, 0.0, stage_s)
-        around = surroundings(frame.environment)
-        traced = self._tracer.trace(ToTrace(frame, settings, around, behind))
+            return self._stereo({eye: _empty_eye(background[eye]) for eye in EYES}, 0.0, None, stage_s)
+        ambient = environment_radiance(frame.environment)
+        traced = self._tracer.trace(
+            TraceRequest(frame=frame, settings=settings, ambient=ambient, background=background)
+        )
         stage_s |= traced.stage_s
         started = time.process_time()
         for eye in EYES:
-            seen, again = traced.eyes[eye], traced.again[eye]
-            seen.put_behind_air(*air_before(frame, seen.pixel))
-            traced.error_again[eye] *= again.put_behind_air(*air_before(frame, again.pixel))
-        noise = _noise(frame, traced, behind)
-        eyes = {eye: traced.eyes[eye].over(behind[eye]) for eye in EYES}
+            seen, duplicate = traced.eyes[eye], traced.duplicates[eye]
+            seen.apply_air(*air_in_front(frame, seen.pixel))
+            traced.duplicate_error[eye] *= duplicate.apply_air(*air_in_front(frame, duplicate.pixel))
+        noise = _noise(frame, traced, background)
+        eyes = {eye: traced.eyes[eye].composite_over(background[eye]) for eye in EYES}
         stage_s["composite"] = time.process_time() - started
+        return self._stereo(eyes, noise.fraction, noise.over_sensor, stage_s)
+
+    def _stereo(
+        self,
+        eyes: dict[Eye, EyeRadiance],
+        noise_fraction: float,
+        noise_over_sensor: float | None,
+        stage_s: dict[str, float],
+    ) -> StereoRadiance:
         return StereoRadiance(
-            eyes["left"], eyes["right"], self.name, self.version, noise.fraction, stage_s, noise.over_sensor
+            left=eyes["left"],
+            right=eyes["right"],
+            engine=self.name,
+            engine_version=self.version,
+            monte_carlo_noise_fraction=noise_fraction,
+            stage_s=stage_s,
+            monte_carlo_over_sensor_noise=noise_over_sensor,
         )
 
 
-def _noise(frame: FrameSpec, traced: Traced, behind: dict[Eye, NDArray[np.float32]]) -> MonteCarloNoise:
+def _noise(frame: FrameSpec, traced: TraceResult, background: dict[Eye, NDArray[np.float32]]) -> MonteCarloNoise:
     """Noise of the pixels whose centres see the drogue, edges included."""
     first, second, shared = [], [], []
     for eye in EYES:
-        seen, again = traced.eyes[eye], traced.again[eye]
-        place = np.zeros(seen.part_id.size, dtype=np.int64)
-        place[seen.pixel] = np.arange(len(seen.pixel))
-        of_drogue = OF_DROGUE[seen.part_id.reshape(-1)[again.pixel]] > 0
-        first.append(seen.pixels_over(behind[eye])[place[again.pixel[of_drogue]]])
-        second.append(again.pixels_over(behind[eye])[of_drogue])
-        shared.append(traced.error_again[eye][of_drogue])
+        seen, duplicate = traced.eyes[eye], traced.duplicates[eye]
+        row_of_pixel = np.zeros(seen.part_id.size, dtype=np.int64)
+        row_of_pixel[seen.pixel] = np.arange(len(seen.pixel))
+        of_drogue = DROGUE_PARTS[seen.part_id.reshape(-1)[duplicate.pixel]] > 0
+        first.append(seen.composited_pixels(background[eye])[row_of_pixel[duplicate.pixel[of_drogue]]])
+        second.append(duplicate.composited_pixels(background[eye])[of_drogue])
+        shared.append(traced.duplicate_error[eye][of_drogue])
     return measure_noise(frame, np.concatenate(first), np.concatenate(second), np.concatenate(shared))
 
 
-def _empty_eye(behind: NDArray[np.float32]) -> EyeRadiance:
-    shape = behind.shape[:2]
+def _empty_eye(background: NDArray[np.float32]) -> EyeRadiance:
+    shape = background.shape[:2]
     return EyeRadiance(
-        radiance_cd_m2=behind,
+        radiance_cd_m2=background,
         coverage=np.zeros(shape, dtype=np.float32),
         part_id=np.zeros(shape, dtype=np.uint8),
         depth_m=np.full(shape, np.inf, dtype=np.float32),

@@ -9,33 +9,33 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# No vector register is wider, and no kernel reads further past the end than one of them.
+# The widest vector register; kernels read at most one register past the end.
 _REGISTER_BYTES = 64
 
 
 def jit_array(kind: Any, values: ArrayLike) -> Any:
-    """A Dr.Jit array of numbers.
+    """A Dr.Jit array with a copy of NumPy data.
 
-    Dr.Jit copies nothing of a NumPy array: kernels read where it lies, in whole vector registers and so past its end,
-    which is a segmentation fault where the next page of memory belongs to nobody. Where it does not start at a multiple
-    of a register, they are also compiled anew. So the numbers are copied to where neither happens.
+    Dr.Jit does not copy a NumPy array: kernels read its memory in whole vector registers, and so past its end, which is
+    a segmentation fault where the next page is not mapped. Kernels are also compiled again where the array does not
+    start at a multiple of a register. The copy avoids both.
 
     Args:
-        kind: its type, of 4 bytes a number.
+        kind: Dr.Jit type with elements of 4 bytes.
         values: (N,) numbers.
     """
     dtype = np.float32 if dr.is_float_v(kind) else np.uint32
-    return kind(_with_room(np.asarray(values), np.dtype(dtype)))
+    return kind(_aligned_copy(np.asarray(values), np.dtype(dtype)))
 
 
 def jit_tensor(values: ArrayLike) -> mi.TensorXf:
     """A Dr.Jit tensor of the shape of `values`; see `jit_array`."""
     array = np.asarray(values)
-    return mi.TensorXf(_with_room(array.ravel(), np.dtype(np.float32)).reshape(array.shape))
+    return mi.TensorXf(_aligned_copy(array.ravel(), np.dtype(np.float32)).reshape(array.shape))
 
 
-def _with_room(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """(N,) the same numbers, from a multiple of a register on and followed by at least one register's bytes."""
+def _aligned_copy(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """(N,) copy that starts at a multiple of a register and is followed by the bytes of at least one register."""
     used = len(values) * dtype.itemsize
     memory = np.zeros(used + 2 * _REGISTER_BYTES, dtype=np.uint8)
     first = -memory.ctypes.data % _REGISTER_BYTES
@@ -44,25 +44,25 @@ def _with_room(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     return copied
 
 
-# Eight kept scenes hold up to 40 shapes each, and the features of their drogues once more.
-_NUMBERS = 1024
+# Eight cached scenes hold up to 40 shapes each, and the features of their drogues again.
+_RESERVED_NUMBERS = 1024
 
 
-def reserve_numbers() -> Any:
-    """Raise the highest number that was ever given to a shape, a paint or a lamp, before the first scene.
+def reserve_registry() -> Any:
+    """Raise the highest registry number of shapes, materials and lamps, before the first scene is built.
 
-    Calls into scenes compile how many numbers there are into their kernels, as the distance between tables. Free
-    numbers are given again, and the count falls only when the highest one is free. So kernels stay as they are while
-    scenes with other drogues and bystanders of the same kinds of paint come and go; else each new scene would compile
-    all of them anew.
+    Kernels are compiled with the number of registry entries, as the distance between their tables. Free numbers are
+    used again, and the count falls only when the highest one is free. So kernels stay valid while scenes with other
+    drogues and other objects of the same kinds of material come and go; otherwise each new scene would compile all of
+    them again.
 
     Returns:
-        The shape with the highest number, to be kept for as long as there are scenes.
+        The shape with the highest number; keep it for as long as there are scenes.
     """
     lamp = {
         "type": "rectangle",
         "bsdf": {"type": "diffuse"},
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
     }
-    # All of them have to be there at once.
-    return [mi.load_dict(lamp) for _ in range(_NUMBERS)][-1]
+    # All of them must exist at the same time.
+    return [mi.load_dict(lamp) for _ in range(_RESERVED_NUMBERS)][-1]

@@ -1,4 +1,4 @@
-"""How much of an image's noise is the renderer's own, measured on pixels that were rendered twice."""
+"""Monte-Carlo noise of the renderer, measured on pixels that were rendered twice."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from datasets_manifest.types.frame import FrameSpec
 from render.camera.sensor import MONO_WEIGHTS
 from scenes.sky.light import REC709_LUMINANCE
 
-# Every so many pixels are rendered twice: a sixteenth more work, and some dozen pairs from the smallest drogue.
-TWICE_EVERY = 16
+# One pixel in so many is rendered twice: a sixteenth more work, and some dozens of pairs on the smallest drogue.
+DUPLICATE_EVERY = 16
 
 
 @dataclass(frozen=True)
@@ -30,19 +30,19 @@ class MonteCarloNoise:
     over_sensor: float
 
 
-NO_NOISE = MonteCarloNoise(0.0, 0.0)
-"""Of an image without a drogue, and of an engine without sampling."""
+NO_NOISE = MonteCarloNoise(fraction=0.0, over_sensor=0.0)
+"""Noise of an image without a drogue, and of an engine without sampling."""
 
 
 @dataclass(frozen=True, eq=False)
 class SensorNoise:
-    """What the sensor of a frame makes of light and of its errors.
+    """How the sensor of a frame responds to light and to its errors.
 
     Attributes:
-        weights: (3, C) of the three bands in each of the sensor's channels.
+        weights: (3, C) weights of the three bands in each of the sensor's channels.
         per_cd_m2: electrons per luminance. [e- m2/cd]
         read_noise_e: standard deviation of the read noise. [e-]
-        left_by_lens: share of errors that are independent between neighbours.
+        left_by_lens: share of independent errors of neighbouring pixels that is left behind the lens.
     """
 
     weights: NDArray[np.float64]
@@ -52,7 +52,7 @@ class SensorNoise:
 
     @classmethod
     def of(cls, frame: FrameSpec) -> SensorNoise:
-        """Of a frame's sensor at its exposure."""
+        """The noise of a frame's sensor at its exposure."""
         sensor = frame.sensor
         left_by_lens = 1.0
         if sensor.psf_sigma_px > 0:
@@ -60,10 +60,15 @@ class SensorNoise:
             # Twice the square root of the kernel's energy along one axis: rows and columns.
             left_by_lens = float(np.sum(cv2.getGaussianKernel(2 * reach + 1, sensor.psf_sigma_px) ** 2))
         weights = MONO_WEIGHTS.T.astype(np.float64) if sensor.color == "mono" else np.eye(3)
-        return cls(weights, sensor.electrons_per_cd_m2(frame.exposure), sensor.read_noise_e, left_by_lens)
+        return cls(
+            weights=weights,
+            per_cd_m2=sensor.electrons_per_cd_m2(frame.exposure),
+            read_noise_e=sensor.read_noise_e,
+            left_by_lens=left_by_lens,
+        )
 
     def variance(self, mean: NDArray[np.float64]) -> float:
-        """Of shot and read noise, of (P, 3) light on average. [cd2/m4]"""
+        """Variance of shot and read noise for (P, 3) light on average. [cd2/m4]"""
         electrons = float(np.mean(np.maximum(mean @ self.weights, 0.0))) * self.per_cd_m2
         return (electrons + self.read_noise_e**2) / self.per_cd_m2**2
 
@@ -73,13 +78,13 @@ def measure_noise(
 ) -> MonteCarloNoise:
     """Noise of one estimate of pixels, from two independent ones.
 
-    The lens averages over neighbours, whose errors are independent, and so leaves a known share of them; of an error
-    that neighbours share it leaves all.
+    The lens averages over neighbours, which leaves a known share of independent errors, and all of an error that
+    neighbours have in common.
 
     Args:
-        frame: with sensor and exposure.
-        first, second: (P, 3) estimates of the same pixels, independent but for: [cd/m2]
-        shared: (P, 3) what is known of the error that both have, and their neighbours with them. [cd/m2]
+        frame: gives sensor and exposure.
+        first, second: (P, 3) estimates of the same pixels, independent apart from the shared error. [cd/m2]
+        shared: (P, 3) known error that both estimates and the neighbouring pixels have in common. [cd/m2]
     """
     if not len(first):
         return NO_NOISE
@@ -89,4 +94,4 @@ def measure_noise(
     fraction = np.sqrt(np.sum(luminance[0] ** 2 + luminance[1] ** 2) / max(np.sum(luminance[2] ** 2), 1e-30))
     sensor = SensorNoise.of(frame)
     behind_lens = np.mean((sensor.left_by_lens * error @ sensor.weights) ** 2 + (shared @ sensor.weights) ** 2)
-    return MonteCarloNoise(float(fraction), float(np.sqrt(behind_lens / sensor.variance(mean))))
+    return MonteCarloNoise(fraction=float(fraction), over_sensor=float(np.sqrt(behind_lens / sensor.variance(mean))))

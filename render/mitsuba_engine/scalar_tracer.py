@@ -1,4 +1,4 @@
-"""Tracing with Mitsuba's scalar variant, for machines without a usable LLVM: slower, through Mitsuba's own sensor."""
+"""Tracing with Mitsuba's scalar variant and its own sensor, for machines without a usable LLVM library; slower."""
 
 from __future__ import annotations
 
@@ -15,50 +15,50 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
-from render.camera.exposure_motion import blur_px, pose_polynomial
+from render.camera.exposure_motion import motion_blur_px, pose_polynomial
 from render.compositing import TracedEye, amodal_counts
 from render.mitsuba_engine.scene import DrogueScene, SceneCache
 from render.mitsuba_engine.trace_request import (
-    ASIDE,
-    OF_DROGUE,
-    SURROUND_DEPTH,
-    Plan,
-    ToTrace,
-    Traced,
+    CONTEXT_DEPTH,
+    DROGUE_PARTS,
+    OFF_CENTER,
+    SamplingPlan,
+    TraceRequest,
+    TraceResult,
+    leaked_rays,
     plan_pixels,
-    slipped_through,
 )
 from render.surfaces import dirty_parts
 
-# Motion is rendered as so many still pictures.
+# Motion blur is the mean of so many still images.
 _MOVING_SLICES = 8
 _TILE_PX = 32
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 class ScalarTracer:
-    """Holds the scene of the last drogue."""
+    """Keeps the scenes of recent drogues."""
 
     def __init__(self) -> None:
         dr.set_thread_count(1)
         self._scenes = SceneCache()
 
-    def trace(self, wanted: ToTrace) -> Traced:
+    def trace(self, request: TraceRequest) -> TraceResult:
         """Passes and radiance of both eyes."""
-        frame, settings = wanted.frame, wanted.settings
+        frame, settings = request.frame, request.settings
         stage_s = {"scene": 0.0, "passes": 0.0, "paths": 0.0}
         started = time.process_time()
-        scene = self._scenes.scene_of(frame, wanted.around)
+        scene = self._scenes.scene_of(frame, request.ambient)
         stage_s["scene"], started = time.process_time() - started, time.process_time()
-        moves_px = blur_px(frame)
-        moments = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
+        moves_px = motion_blur_px(frame)
+        times = (0.0,) if moves_px < 0.05 else (0.0, -1.0, 1.0)
         seeds = frame_generator(frame.seed, frame.frame_index, "mitsuba samples")
         eyes: dict[Eye, TracedEye] = {}
-        again: dict[Eye, TracedEye] = {}
+        duplicates: dict[Eye, TracedEye] = {}
         for eye in EYES:
             view = _View(frame, eye)
-            seen = [view.passes(scene.scene, moment) for moment in moments]
-            sunlit = [view.sunlit(scene, passes, moment) for (passes, moment) in zip(seen, moments, strict=True)]
+            seen = [view.passes(scene.scene, s) for s in times]
+            sunlit = [view.sunlit(scene, passes, s) for (passes, s) in zip(seen, times, strict=True)]
             alone = view.passes(scene.features, 0.0)
             plan = plan_pixels(
                 [part_id for part_id, _, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), dirty_parts(frame)
@@ -66,30 +66,30 @@ class ScalarTracer:
             stage_s["passes"], started = stage_s["passes"] + time.process_time() - started, time.process_time()
             slices = _MOVING_SLICES if moves_px >= 0.05 else 1
             halves = [_Half(view, scene, slices, seeds).light(plan, settings) for _ in range(2)]
-            dark, pixel = _passes_of(seen[0], alone), _in_order(plan)
+            traced, pixel = _untraced_eye(seen[0], alone), _in_order(plan)
             mean, difference = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / np.float32(np.sqrt(2))
-            eyes[eye] = dark.lit_by(pixel, mean)
-            # Differs from the mean by as much as two means of so many samples would.
-            again[eye] = dark.lit_by(pixel, mean + difference)
+            eyes[eye] = traced.with_light(pixel, mean)
+            # Differs from the mean by as much as two independent means of so many samples would.
+            duplicates[eye] = traced.with_light(pixel, mean + difference)
             stage_s["paths"], started = stage_s["paths"] + time.process_time() - started, time.process_time()
-        unknown = {eye: np.zeros((len(again[eye].pixel), 3), dtype=np.float32) for eye in EYES}
-        return Traced(eyes, again, unknown, stage_s)
+        no_error = {eye: np.zeros((len(duplicates[eye].pixel), 3), dtype=np.float32) for eye in EYES}
+        return TraceResult(eyes=eyes, duplicates=duplicates, duplicate_error=no_error, stage_s=stage_s)
 
 
-def _in_order(plan: Plan) -> NDArray[np.int64]:
-    return np.concatenate([plan.open, plan.sheltered, plan.deep, plan.deep_edges, plan.edges, plan.surround])
+def _in_order(plan: SamplingPlan) -> NDArray[np.int64]:
+    return np.concatenate([plan.open, plan.sheltered, plan.deep, plan.deep_edges, plan.edges, plan.context])
 
 
 class _Half:
-    """Traces the planned pixels of one eye with half of the samples."""
+    """Traces the planned pixels of one eye with half the samples."""
 
     def __init__(self, view: _View, scene: DrogueScene, slices: int, seeds: np.random.Generator) -> None:
         self._view, self._scene, self._slices, self._seeds = view, scene, slices, seeds
 
-    def light(self, plan: Plan, settings: RenderSettings) -> NDArray[np.float32]:
+    def light(self, plan: SamplingPlan, settings: RenderSettings) -> NDArray[np.float32]:
         """(P, 4) radiance and coverage of the pixels in the order of `_in_order`.
 
-        Mitsuba's integrator knows nothing of the sky beforehand: parts in the open take as many paths as others.
+        Mitsuba's integrator uses no known light of the sky, so that parts in the open take as many paths as others.
         """
         base = np.concatenate([plan.open, plan.sheltered])
         fine = np.concatenate([plan.deep, plan.deep_edges, plan.edges])
@@ -101,12 +101,12 @@ class _Half:
             [
                 self._mean(base, settings.samples_per_px, settings.max_depth),
                 at_fine,
-                self._mean(plan.surround, settings.surround_samples_per_px, SURROUND_DEPTH),
+                self._mean(plan.context, settings.surround_samples_per_px, CONTEXT_DEPTH),
             ]
         )
 
     def _mean(self, pixel: NDArray[np.int64], samples: int, max_depth: int) -> NDArray[np.float32]:
-        """Mean over the slices of the exposure, of which each takes at least one sample."""
+        """Mean over the slices of the exposure; each slice takes at least one sample."""
         if not len(pixel):
             return np.zeros((0, 4), dtype=np.float32)
         count = -(-samples // (2 * self._slices))
@@ -121,10 +121,10 @@ class _Half:
 _Passes = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
 
 
-def _passes_of(seen: _Passes, alone: _Passes) -> TracedEye:
-    amodal = amodal_counts(seen[0], seen[1], alone[0], alone[1])
-    nothing = np.zeros(0, dtype=np.float32)
-    return TracedEye(*seen, amodal, np.zeros(0, dtype=np.int64), nothing.reshape(0, 3), nothing)
+def _untraced_eye(seen: _Passes, alone: _Passes) -> TracedEye:
+    part_id, depth_m, normal = seen
+    amodal = amodal_counts(part_id, depth_m, alone[0], alone[1])
+    return TracedEye.untraced(part_id=part_id, depth_m=depth_m, normal=normal, amodal_px=amodal)
 
 
 class _View:
@@ -135,7 +135,7 @@ class _View:
         self._pose = pose_polynomial(frame, eye)
         self._emits = frame.drogue is not None and frame.drogue.marker_luminance_cd_m2 > 0
 
-    def _drogue_from_eye(self, s: float) -> Array:
+    def _stage_from_eye(self, s: float) -> Array:
         """(4, 4) pose at time s of the exposure, from -1 to 1."""
         pose = np.eye(4)
         pose[:3] = self._pose[0] + s * (self._pose[1] + s * self._pose[2])
@@ -145,7 +145,7 @@ class _View:
 
     def _sensor(self, s: float, sampler: dict[str, Any], pixel_format: str, crop: dict[str, int]) -> Any:
         camera = self._camera
-        to_world = self._drogue_from_eye(s) @ _MITSUBA_FROM_OPENCV
+        to_world = self._stage_from_eye(s) @ _MITSUBA_FROM_OPENCV
         return mi.load_dict(
             {
                 "type": "perspective",
@@ -178,8 +178,8 @@ class _View:
         # The integrator counts shapes from 1; 0 is no shape.
         table = np.array([0, *(int(shape.id().split("_")[1]) for shape in scene.shapes())], dtype=np.uint8)
         part_id: NDArray[np.uint8] = table[values[..., 0].astype(np.int64)]
-        pose = self._drogue_from_eye(s)
-        self._mend_leaks(scene, pose, (part_id, values))
+        pose = self._stage_from_eye(s)
+        self._repair_leaks(scene, pose, (part_id, values))
         hit = part_id > 0
         depth = np.where(hit, np.einsum("...i,i->...", values[..., 1:4] - pose[:3, 3], pose[:3, 2]), np.inf).astype(
             np.float32
@@ -189,30 +189,30 @@ class _View:
         )
         return part_id, depth, normal
 
-    def _mend_leaks(self, scene: Any, pose: Array, passes: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
-        """Look again, a little aside, where a ray slipped between two triangles into a closed part."""
+    def _repair_leaks(self, scene: Any, pose: Array, passes: tuple[NDArray[np.uint8], NDArray[np.float32]]) -> None:
+        """Trace again, a little off centre, where a ray leaked between two triangles into a closed part."""
         part_id, values = passes
         towards = values[..., 1:4] - pose[:3, 3]
-        for v, u in np.argwhere(slipped_through(part_id, values[..., 4:], towards)):
-            for place in ASIDE:
+        for v, u in np.argwhere(leaked_rays(part_id, values[..., 4:], towards)):
+            for place in OFF_CENTER:
                 ray_px = np.array([u + place[0] - 0.5, v + place[1] - 0.5])
                 direction = pose[:3, :3] @ self._camera.rays(ray_px)
                 direction /= np.linalg.norm(direction)
                 hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(pose[:3, 3].tolist()), mi.Vector3f(direction.tolist())))
-                # A ray aside that meets nothing saw the sky.
+                # An off-centre ray that misses sees the sky.
                 part_id[v, u] = int(hit.shape.id().split("_")[1]) if hit.is_valid() else 0
                 values[v, u, 1:] = [*hit.p, *hit.n]
-                if not slipped_through(part_id[v, u], values[v, u, 4:], direction):
+                if not leaked_rays(part_id[v, u], values[v, u, 4:], direction):
                     break
 
     def sunlit(self, scene: DrogueScene, passes: _Passes, s: float) -> NDArray[np.bool_]:
-        """(H, W) where surfaces of the drogue see the sun: a render under the sun alone, one ray a pixel."""
+        """(H, W) where surfaces of the drogue see the sun: one shadow ray per pixel."""
         part_id, depth, normal = passes
         sunlit = np.zeros(part_id.shape, dtype=np.bool_)
-        pose, to_sun = self._drogue_from_eye(s), np.array(scene.sun[0]).ravel()
-        rows, columns = np.nonzero((OF_DROGUE[part_id] > 0) & (normal @ (pose[:3, :3].T @ to_sun) > 0))
+        pose, to_sun = self._stage_from_eye(s), np.array(scene.sun[0]).ravel()
+        rows, columns = np.nonzero((DROGUE_PARTS[part_id] > 0) & (normal @ (pose[:3, :3].T @ to_sun) > 0))
         places = self._camera.rays(np.stack([columns, rows], axis=-1)) * depth[rows, columns, None]
-        # A little off the surface, as float32 distances of some metres need.
+        # A little off the surface, so that float32 rounding at distances of metres does not shadow it.
         starts = (places + 1e-4 * normal[rows, columns]) @ pose[:3, :3].T + pose[:3, 3]
         sun = mi.Vector3f(to_sun.tolist())
         for row, column, start in zip(rows, columns, starts, strict=True):
@@ -220,7 +220,7 @@ class _View:
         return sunlit
 
     def tiles(self, pixel: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """Places in `pixel` (P,) by square tile of the image: crops around scattered pixels would be mostly waste."""
+        """Rows of `pixel` (P,) by square tile of the image: one crop around scattered pixels would be mostly waste."""
         rows, columns = np.divmod(pixel, self._camera.width_px)
         tile = rows // _TILE_PX * self._camera.width_px + columns // _TILE_PX
         order = np.argsort(tile, kind="stable")
@@ -230,12 +230,15 @@ class _View:
     def radiance(
         self, scene: DrogueScene, what: tuple[NDArray[np.int64], float, int, int], seed: int
     ) -> NDArray[np.float32]:
-        """(P, 4) light from parts, weighted by coverage, and coverage.
+        """Light from parts, weighted by coverage, and coverage.
 
         Args:
             scene: what to render.
-            what: flat pixel indices that matter, time of the exposure, samples a pixel, longest path.
+            what: (P,) flat pixel indices, time in the exposure, samples per pixel, and longest path.
             seed: of the sampler.
+
+        Returns:
+            (P, 4) radiance and coverage.
         """
         pixel, s, count, max_depth = what
         rows, columns = np.divmod(pixel, self._camera.width_px)
@@ -250,7 +253,7 @@ class _View:
         path = {"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True}
         window = np.array(mi.render(scene.scene, sensor=sensor, integrator=mi.load_dict(path), spp=count, seed=seed))
         if self._emits:
-            # Hidden emitters come out black: their own light is added from a render of the features alone.
+            # Mitsuba renders hidden emitters black: their own light comes from a rendering of the features alone.
             direct = {"type": "path", "max_depth": 1}
             lit = mi.render(scene.features, sensor=sensor, integrator=mi.load_dict(direct), spp=count, seed=seed)
             window[..., :3] += np.array(lit)[..., :3]

@@ -1,4 +1,4 @@
-"""What a tracer is asked for and hands back for both eyes, and which pixels it has to trace."""
+"""What a tracer is given and returns for both eyes, and which pixels it has to trace."""
 
 from __future__ import annotations
 
@@ -14,44 +14,48 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import MAX_MARKERS, SURROUNDING_PARTS, Part, drogue_part_ids, marker_id
 from geometry.stereo import Eye
 from render.compositing import TracedEye, inside_one_part
-from scenes.environment_radiance import Surroundings
+from scenes.environment_radiance import EnvironmentRadiance
 
-# Next to the centre, a little farther each time and off any one line: for rays that slip through a seam at the centre.
-ASIDE = ((0.501, 0.5007), (0.496, 0.503), (0.507, 0.489))
+# Places near the pixel centre, each a little farther away and on no common line: for rays that leak through a seam
+# between two triangles exactly at the centre.
+OFF_CENTER = ((0.501, 0.5007), (0.496, 0.503), (0.507, 0.489))
 
 
-def _marked(parts: Iterable[int]) -> NDArray[np.uint8]:
+def _mask_of_parts(parts: Iterable[int]) -> NDArray[np.uint8]:
+    """(256,) 1 at the given part ids, 0 elsewhere."""
     table = np.zeros(256, dtype=np.uint8)
     table[list(parts)] = 1
     return table
 
 
-OF_DROGUE = _marked(drogue_part_ids(MAX_MARKERS))
-_MARKERS = _marked(marker_id(index) for index in range(MAX_MARKERS))
+DROGUE_PARTS = _mask_of_parts(drogue_part_ids(MAX_MARKERS))
+_MARKERS = _mask_of_parts(marker_id(index) for index in range(MAX_MARKERS))
 _DEEP_PARTS = (Part.COUPLING, Part.HUB)
-_DEEP = _marked(_DEEP_PARTS)
-# Whether most of the sky is seen from a part, by its id.
-IN_OPEN = _marked({*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS})
+_DEEP = _mask_of_parts(_DEEP_PARTS)
+# Parts from which most of the sky is visible.
+OPEN_TO_SKY = _mask_of_parts(
+    {*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS}
+)
 
 
 def parts_in(part_id: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W) where an image of part ids shows those that a table marks."""
-    # Two to three times as quick as indexing, and so are searches for what is true in place of what is not 0.
+    """(H, W) where an image of part ids shows one of the parts that a (256,) table marks."""
+    # Two to three times as fast as indexing; so is a search for True compared with one for non-zero numbers.
     marked: NDArray[np.bool_] = cv2.LUT(part_id, table) > 0
     return marked
 
 
-def slipped_through(
+def leaked_rays(
     part_id: NDArray[np.uint8], normals: NDArray[np.float32], towards: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Which rays met what no ray can see, having passed exactly between two triangles.
+    """Which rays hit a surface that no ray can reach, because they passed exactly between two triangles.
 
-    All parts are closed, so a surface that looks away from the camera is seen from inside. A marker fills its pocket
-    up to the front, so its wall is seen from within the face. A ray that grazes an edge may have met the part in other
-    company, but nothing alone: its normal is 0.
+    All parts are closed, so a surface that faces away from the camera was hit from inside. A marker fills its pocket up
+    to the front, so a hit on its side wall came from within the face. A ray that grazes an edge may hit the part with
+    some neighbour, but never nothing: its normal is 0.
 
     Args:
-        part_id: (...,) part that each ray met.
+        part_id: (...,) part that each ray hit.
         normals: (..., 3) outward normal there, in the drogue frame.
         towards: (..., 3) direction of the ray, of any length, in the drogue frame.
     """
@@ -61,54 +65,55 @@ def slipped_through(
 
 
 @dataclass(frozen=True, eq=False)
-class ToTrace:
-    """What a tracer is asked for.
+class TraceRequest:
+    """What a tracer is given.
 
     Attributes:
-        frame: with a drogue or bystanders.
-        settings: how.
-        around: what lights them.
-        behind: (H, W, 3) what each eye sees of it. [cd/m2]
+        frame: has a drogue or other objects.
+        settings: samples and depths.
+        ambient: radiance of the environment, which lights them.
+        background: (H, W, 3) by eye, what it sees of the environment. [cd/m2]
     """
 
     frame: FrameSpec
     settings: RenderSettings
-    around: Surroundings
-    behind: dict[Eye, NDArray[np.float32]]
+    ambient: EnvironmentRadiance
+    background: dict[Eye, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
-class Traced:
+class TraceResult:
     """Both eyes of one frame.
 
     Attributes:
-        eyes: what was traced.
-        again: the same passes with some pixels of the drogue, traced a second time with other samples.
-        error_again: (A, 3) by eye, known errors of the radiance of those that both share. [cd/m2]
+        eyes: passes and traced pixels.
+        duplicates: the same passes with some pixels of the drogue, traced a second time with other samples.
+        duplicate_error: (A, 3) by eye, known errors of radiance that those pixels share with their first tracing.
+            [cd/m2]
         stage_s: CPU seconds by stage. [s]
     """
 
     eyes: dict[Eye, TracedEye]
-    again: dict[Eye, TracedEye]
-    error_again: dict[Eye, NDArray[np.float32]]
+    duplicates: dict[Eye, TracedEye]
+    duplicate_error: dict[Eye, NDArray[np.float32]]
     stage_s: dict[str, float]
 
 
-SURROUND_DEPTH = 2
-"""Longest path for hose, tanker and bystanders: convex enough for light straight from sky, sun and ground."""
+CONTEXT_DEPTH = 2
+"""Longest path for hose, tanker and other objects: convex enough for direct light from sky, sun and ground."""
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Flat indices of the pixels to trace, by how many samples they need; no pixel is in two of them.
+class SamplingPlan:
+    """Flat indices of the pixels to trace, by how many samples they need; no pixel is in two groups.
 
     Attributes:
-        open: inside markers, face and rim, whose light is hardly hidden by anything.
-        sheltered: inside canopy and ribs, that light reaches by way of others.
-        deep: inside hub and coupling, few and dark, at the bottom of the basket.
-        deep_edges: elsewhere on these.
-        edges: elsewhere, where parts or their shadows or dirt may meet.
-        surround: what sees no drogue, but may see other things.
+        open: inside markers, face and rim, from which hardly any light is hidden.
+        sheltered: inside canopy and ribs, which light reaches by reflection.
+        deep: inside hub and coupling: few and dark, at the bottom of the basket.
+        deep_edges: other pixels of hub and coupling.
+        edges: other pixels of the drogue, where parts, shadows or dirt may meet.
+        context: pixels that see no drogue, but may see other objects.
     """
 
     open: NDArray[np.int64]
@@ -116,37 +121,37 @@ class Plan:
     deep: NDArray[np.int64]
     deep_edges: NDArray[np.int64]
     edges: NDArray[np.int64]
-    surround: NDArray[np.int64]
+    context: NDArray[np.int64]
 
 
 def plan_pixels(
     ids: list[NDArray[np.uint8]], sunlit: list[NDArray[np.bool_]], margin_px: int, uneven: Iterable[int]
-) -> Plan:
+) -> SamplingPlan:
     """Which pixels to trace.
 
     Args:
-        ids: (H, W) part ids of pixel centres, at one or more times of the exposure.
+        ids: (H, W) part ids at the pixel centres, at one or more times of the exposure.
         sunlit: (H, W) whether the drogue's surface there sees the sun, at the same times.
-        margin_px: how far beyond those a part may reach into other pixels.
+        margin_px: how far a part may extend beyond those centres into other pixels.
         uneven: ids of parts whose paint has edges of its own anywhere.
     """
-    even = (_marked(uneven) == 0).astype(np.uint8)
+    even = (_mask_of_parts(uneven) == 0).astype(np.uint8)
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
     drogue, covered = (np.zeros(ids[0].shape, dtype=np.bool_) for _ in range(2))
     inside = np.ones(ids[0].shape, dtype=np.bool_)
     for part_id, in_sun in zip(ids, sunlit, strict=True):
-        drogue |= parts_in(part_id, OF_DROGUE)
+        drogue |= parts_in(part_id, DROGUE_PARTS)
         covered |= part_id != Part.SKY
         # A part's sunlit and shadowed surfaces count as two.
         inside &= inside_one_part((2 * part_id + in_sun).astype(np.uint8), margin_px) & parts_in(part_id, even)
     belongs, reached = (cv2.dilate(seen.view(np.uint8), kernel) > 0 for seen in (drogue, covered))
-    of_open, of_deep = (parts_in(ids[0], table) for table in (IN_OPEN, _DEEP))
+    of_open, of_deep = (parts_in(ids[0], table) for table in (OPEN_TO_SKY, _DEEP))
     within, edges = belongs & inside, belongs & ~inside
-    return Plan(
+    return SamplingPlan(
         open=np.flatnonzero(within & of_open),
         sheltered=np.flatnonzero(within & ~of_open & ~of_deep),
         deep=np.flatnonzero(within & of_deep),
         deep_edges=np.flatnonzero(edges & of_deep),
         edges=np.flatnonzero(edges & ~of_deep),
-        surround=np.flatnonzero(reached & ~belongs),
+        context=np.flatnonzero(reached & ~belongs),
     )

@@ -60,7 +60,7 @@ def _cache_file() -> Path:
 
 
 def _works(library: Path) -> bool:
-    """Whether the LLVM variant renders with this library, from memory or by a trial in its own process."""
+    """Whether the LLVM variant renders with this library, from the cache or by a trial in its own process."""
     try:
         stamp = library.stat().st_mtime_ns
     except OSError:
@@ -84,11 +84,11 @@ def _works(library: Path) -> bool:
         works = trial.returncode == 0 and b"works" in trial.stdout
     except subprocess.TimeoutExpired:
         works = False
-    _remember({**verdicts, key: works})
+    _store_verdicts({**verdicts, key: works})
     return works
 
 
-def _remember(verdicts: dict[str, bool]) -> None:
+def _store_verdicts(verdicts: dict[str, bool]) -> None:
     """Keep the verdicts for the next process; a cache that cannot be written only costs time."""
     path = _cache_file()
     try:

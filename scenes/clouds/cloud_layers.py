@@ -50,7 +50,7 @@ class CloudLight:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenCloud:
+class CloudLayerView:
     """One layer along every ray.
 
     Attributes:
@@ -69,13 +69,13 @@ def diffuse_transmission(layer: CloudLayer) -> float:
     return 1.0 - layer.cover_fraction * (1.0 - 1.0 / (1.0 + BACK_SCATTER * layer.optical_depth))
 
 
-def see_cloud(
+def render_cloud_layer(
     layer: CloudLayer,
     directions: NDArray[np.float32],
     light: CloudLight,
     every: int = 1,
     offset_m: tuple[float, float] = (0.0, 0.0),
-) -> SeenCloud:
+) -> CloudLayerView:
     """The layer along (H, W, 3) unit directions in world axes.
 
     Args:
@@ -97,7 +97,7 @@ def see_cloud(
     frayed = 1.0 - np.exp(-met.depth * np.exp(np.float32(0.9) * np.clip(knobs, -1.0, 1.0)))
     # Far clouds set into the haze.
     opacity = frayed * np.clip(rise / np.float32(_SETTING_RISE), 0.0, 1.0)
-    return SeenCloud(
+    return CloudLayerView(
         _shade(density, directions, (place, knobs, strength, met.towards_sun), light), opacity, met.distance_m
     )
 
@@ -132,12 +132,12 @@ def band_limited(layered: Radiance, layer: CloudLayer, directions: NDArray[np.fl
 def opacity_towards(
     layer: CloudLayer, direction: NDArray[np.float64], offset_m: tuple[float, float] = (0.0, 0.0)
 ) -> float:
-    """How much of the sun's or moon's beam the layer takes on its way to the camera; see `see_cloud`."""
+    """How much of the sun's or moon's beam the layer takes on its way to the camera; see `render_cloud_layer`."""
     if direction[2] * layer.height_above_camera_m <= 0:
         return 0.0
     nothing = np.zeros(3)
     light = CloudLight(direction, nothing, nothing, nothing)
-    return float(see_cloud(layer, direction[None, None].astype(np.float32), light, 1, offset_m).opacity[0, 0])
+    return float(render_cloud_layer(layer, direction[None, None].astype(np.float32), light, 1, offset_m).opacity[0, 0])
 
 
 def _shade(
@@ -182,7 +182,7 @@ def _shade(
     return result
 
 
-def _see_cirrus(density: CloudDensity, directions: NDArray[np.float32], light: CloudLight) -> SeenCloud:
+def _see_cirrus(density: CloudDensity, directions: NDArray[np.float32], light: CloudLight) -> CloudLayerView:
     """Ice cloud without depth: thin enough for light that was scattered once, plus an even share."""
     rise = directions[..., 2] * np.float32(np.sign(density.layer.height_above_camera_m))
     near_m, _ = density.crossing(rise)
@@ -193,4 +193,4 @@ def _see_cirrus(density: CloudDensity, directions: NDArray[np.float32], light: C
     once = 0.7 * henyey_greenstein(cosine, _ICE_ASYMMETRY) + 0.3 / (4.0 * np.pi) + 0.1 / np.pi
     even = (light.sky_lux + light.ground_lux) / (2.0 * np.pi)
     radiance = once[..., None].astype(np.float32) * light.beam_lux.astype(np.float32) + even.astype(np.float32)
-    return SeenCloud(radiance.astype(np.float32), opacity, near_m)
+    return CloudLayerView(radiance.astype(np.float32), opacity, near_m)

@@ -33,7 +33,7 @@ _NOWHERE_M = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class Marched:
+class MarchResult:
     """What rays meet.
 
     Attributes:
@@ -47,7 +47,7 @@ class Marched:
     towards_sun: _Field
 
 
-def march(density: CloudDensity, directions: NDArray[np.float32], sun: NDArray[np.float64], every: int) -> Marched:
+def march(density: CloudDensity, directions: NDArray[np.float32], sun: NDArray[np.float64], every: int) -> MarchResult:
     """March (H, W, 3) unit directions.
 
     Args:
@@ -64,10 +64,10 @@ def march(density: CloudDensity, directions: NDArray[np.float32], sun: NDArray[n
     # Distance and light where there is no cloud mean nothing: both are interpolated with the cloud's weight.
     weight = 1.0 - np.exp(-coarse.depth) + np.float32(1e-3)
     stacked = np.stack([coarse.depth, weight, coarse.distance_m * weight, coarse.towards_sun * weight], axis=-1)
-    fine = enlarge(stacked, every, size)
+    fine = upsample(stacked, every, size)
     depth, distance_m, towards_sun = fine[..., 0], fine[..., 2] / fine[..., 1], fine[..., 3] / fine[..., 1]
     edges, nearest_m, last_m = _edges(coarse)
-    edge = np.flatnonzero(enlarge(edges, every, size) > 0)
+    edge = np.flatnonzero(upsample(edges, every, size) > 0)
     if len(edge):
         # Whole rows of rays, for the textures are sampled as pictures.
         padded = np.resize(edge, (-(-len(edge) // _ROW), _ROW))
@@ -76,10 +76,10 @@ def march(density: CloudDensity, directions: NDArray[np.float32], sun: NDArray[n
         near = _march_all(density, directions.reshape(-1, 3)[padded], sun, _EDGE_STEPS[kind], ends_m)
         for values, marched in ((depth, near.depth), (distance_m, near.distance_m), (towards_sun, near.towards_sun)):
             values.reshape(-1)[padded] = marched
-    return Marched(depth, distance_m, towards_sun)
+    return MarchResult(depth, distance_m, towards_sun)
 
 
-def enlarge(image: NDArray[np.float32], every: int, size: tuple[int, int]) -> NDArray[np.float32]:
+def upsample(image: NDArray[np.float32], every: int, size: tuple[int, int]) -> NDArray[np.float32]:
     """An image of every `every`-th ray, interpolated to all (H, W) of them."""
     to_coarse = np.array([[1.0 / every, 0.0, 0.0], [0.0, 1.0 / every, 0.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -89,7 +89,7 @@ def enlarge(image: NDArray[np.float32], every: int, size: tuple[int, int]) -> ND
     return large
 
 
-def _edges(coarse: Marched) -> tuple[_Field, _Field, _Field]:
+def _edges(coarse: MarchResult) -> tuple[_Field, _Field, _Field]:
     """Where edges of cloud lie, and where cloud begins.
 
     Returns:
@@ -115,7 +115,7 @@ def _march_all(
     sun: NDArray[np.float64],
     steps: int,
     ends_m: tuple[_Field, _Field] | None = None,
-) -> Marched:
+) -> MarchResult:
     """March every ray, between distances `ends_m` (H, W) where those lie inside the layer."""
     rise = directions[..., 2] * np.float32(1.0 if density.layer.is_above else -1.0)
     near_m, far_m = density.crossing(rise)
@@ -132,7 +132,7 @@ def _march_all(
             towards_sun[rows] = _depth_towards_sun(density, place, sun)
         else:
             towards_sun[rows] = 0.0
-    return Marched(depth, distance_m, towards_sun)
+    return MarchResult(depth, distance_m, towards_sun)
 
 
 def _through(

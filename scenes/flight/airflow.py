@@ -21,7 +21,7 @@ from geometry.se3 import Array
 GUST_PERIOD_S = 0.02
 _FOOT_M = 0.3048
 _KNOT_M_S = 1852 / 3600
-# Where the law near the ground ends, and the one of free air begins. [ft]
+# Heights at which the low-altitude law ends and the one of free air begins. [ft]
 _LOW_FT, _HIGH_FT = 1000.0, 2000.0
 _HIGH_SCALE_FT = 1750.0
 _LOWEST_FT = 10.0
@@ -46,7 +46,7 @@ class Dryden:
 def dryden(severity: Turbulence, altitude_m: float) -> Dryden:
     """Turbulence of a severity at an altitude above ground.
 
-    Below 1000 ft the law of low altitudes, above 2000 ft that of free air, in between straight from one to the other.
+    The low-altitude law below 1000 ft, that of free air above 2000 ft, and linear interpolation in between.
     """
     height_ft = max(altitude_m / _FOOT_M, _LOWEST_FT)
     if severity == "none":
@@ -59,7 +59,7 @@ def dryden(severity: Turbulence, altitude_m: float) -> Dryden:
 
 
 def _low_altitude(severity: Turbulence, height_ft: float) -> Array:
-    """(2, 3) standard deviations [m/s] and scales [m]; the constants want the height in feet."""
+    """(2, 3) standard deviations [m/s] and scales [m]; the constants are for heights in feet."""
     shape = 0.177 + 0.000823 * height_ft
     vertical = 0.1 * _WIND_AT_20_FT_M_S[severity]
     level = vertical / shape**0.4
@@ -68,19 +68,19 @@ def _low_altitude(severity: Turbulence, height_ft: float) -> Array:
 
 
 def sample_gusts(rng: np.random.Generator, turbulence: Dryden, airspeed_m_s: float, shape: tuple[int, int]) -> Array:
-    """Gusts at a fixed place of the formation, stationary from the first sample on.
+    """Gusts at a fixed point of the formation, stationary from the first sample on.
 
     Args:
         rng: draws them.
         turbulence: standard deviations and scales.
-        airspeed_m_s: at which the field is flown through. [m/s]
+        airspeed_m_s: speed through the field. [m/s]
         shape: (T, S) samples, `GUST_PERIOD_S` apart, of S independent sequences.
 
     Returns:
         (T, 3, S) gusts along (u), across (v) and vertical to the flight (w). [m/s]
 
     Raises:
-        ValueError: too slow for turbulence that stands still in the air.
+        ValueError: the airspeed is too low for a frozen field of turbulence.
     """
     if not any(turbulence.sd_m_s):
         return np.zeros((shape[0], 3, shape[1]))
@@ -119,7 +119,7 @@ def _second_order(noise: Array, period: float) -> Array:
     out = np.empty(noise.shape[1:])
     for k in range(len(out)):
         if k:
-            # Written out: products of so small matrices cost less than the calls of a library.
+            # Written out: for matrices this small, library calls cost more than the products.
             x, rate = state
             first, second = noise[:, k]
             state = np.stack(
@@ -158,20 +158,20 @@ def spectrum(turbulence: Dryden, airspeed_m_s: float, angular_rate_rad_s: ArrayL
 
 
 def bow_wave(points_m: Array, source_m: Array, airspeed_m_s: float, body_radius_m: float) -> Array:
-    """What a round nose adds to the velocity of the air.
+    """Velocity that a round nose adds to the air.
 
     Args:
-        points_m: (3, S, M) where. [m]
-        source_m: (3, S) places of the sources, half a radius behind the tips of the noses. [m]
+        points_m: (3, S, M) points in the air. [m]
+        source_m: (3, S) positions of the sources, half a radius behind the tips of the noses. [m]
         airspeed_m_s: of the receiver. [m/s]
-        body_radius_m: of the body far behind its nose. [m]
+        body_radius_m: radius of the body far behind its nose. [m]
 
     Returns:
-        (3, S, M) `V a^2 / 4 r / |r|^3`; inside the body no more than the airspeed, its value at the tip. [m/s]
+        (3, S, M) `V a^2 / 4 r / |r|^3`; inside the body at most the airspeed, its value at the tip. [m/s]
 
     Source: Rankine's half-body, a point source in a uniform stream; Milne-Thomson, Theoretical Hydrodynamics, ch. 15.
     """
     away = points_m - source_m[..., None]
     square = np.maximum(np.einsum("ism,ism->sm", away, away), (body_radius_m / 2) ** 2)
-    pushed: Array = (airspeed_m_s * body_radius_m**2 / 4) * away / (square * np.sqrt(square))
-    return pushed
+    added_m_s: Array = (airspeed_m_s * body_radius_m**2 / 4) * away / (square * np.sqrt(square))
+    return added_m_s

@@ -1,4 +1,4 @@
-"""Stretches of a sequence over which the cameras lose the drogue: behind a bar, by a turn aside, beside the sun."""
+"""Dropouts of a sequence, in which the cameras lose the drogue: behind a bar, by a turn aside, or beside the sun."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from drogue_models.parameters import ReflectanceRgb
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from scenes.drogue_appearance import rotation_with_z
-from scenes.environment import draw
+from scenes.environment import sample_uniform
 
-# The bar is this much wider than what it hides, for the canopy behind the rim and for what moves between the samples.
+# The bar is wider by this share, for the canopy behind the rim and for motion between the samples.
 _SPARE_FRACTION = 0.15
 _SAMPLES = 121
 _GREY_PAINT: ReflectanceRgb = (0.20, 0.21, 0.22)
 
 
 @dataclass(frozen=True)
-class LossEvent:
-    """One such stretch; times count from the sequence's start.
+class DropoutEvent:
+    """One dropout; times count from the start of the sequence.
 
     Attributes:
-        kind: what happens.
-        begin_s, end_s: between which the drogue is lost. [s]
-        onset_s: how long it takes to come, and to go. [s]
-        side: 1 or -1: from where the bar comes, to where receiver and formation turn, and where the sun stands.
-        tilt_rad: direction of the bar in the image, across which the sun stands from the drogue. [rad]
-        obstacle_distance_m: of the bar's axis from the cameras. [m]
-        turn_rad: of the receiver. [rad]
-        sun_offset_rad: of the sun from the drogue's edge. [rad]
-        sweep_rad: of the formation's heading. [rad]
+        kind: cause of the dropout.
+        begin_s, end_s: the drogue is lost between these times. [s]
+        onset_s: duration of the onset, and of the end. [s]
+        side: 1 or -1: side from which the bar comes, to which receiver and formation turn, and on which the sun stands.
+        tilt_rad: direction of the bar in the image; the sun stands across it from the drogue. [rad]
+        obstacle_distance_m: distance of the bar's axis from the cameras. [m]
+        turn_rad: angle that the receiver turns. [rad]
+        sun_offset_rad: angle between sun and edge of the drogue. [rad]
+        sweep_rad: angle that the formation's heading changes. [rad]
     """
 
     kind: DropoutKind
@@ -52,83 +52,98 @@ class LossEvent:
 
     @property
     def middle_s(self) -> float:
-        """Middle of the stretch. [s]"""
+        """Middle of the dropout. [s]"""
         return (self.begin_s + self.end_s) / 2
 
-    def away(self, time_s: float) -> float:
-        """How far it still is from happening: 1 long before, 0 while it lasts, -1 long after; smooth in between."""
+    def phase(self, time_s: float) -> float:
+        """1 before the onset, 0 during the dropout, -1 after its end; smooth in between."""
         before_s, after_s = self.begin_s - time_s, time_s - self.end_s
         late_s = max(before_s, after_s, 0.0)
         share = 0.5 - 0.5 * float(np.cos(np.pi * min(late_s / self.onset_s, 1.0)))
         return share if before_s > 0 else -share
 
-    def acts(self, time_s: float) -> bool:
-        """Whether it comes, lasts or goes at a time."""
-        return abs(self.away(time_s)) < 1
+    def is_active(self, time_s: float) -> bool:
+        """Whether the dropout or its onset or end is under way."""
+        return abs(self.phase(time_s)) < 1
 
-    def turned(self, time_s: float) -> Array:
-        """(3, 3) rotation of the receiver's eyes against where they look otherwise; the identity but for a turn."""
+    def receiver_rotation(self, time_s: float) -> Array:
+        """(3, 3) rotation of the receiver's eyes by a turn aside; otherwise the identity."""
         angle = 0.0
         if self.kind == "out-of-view":
-            angle = self.side * self.turn_rad * (1.0 - abs(self.away(time_s)))
+            angle = self.side * self.turn_rad * (1.0 - abs(self.phase(time_s)))
         cosine, sine = np.cos(angle), np.sin(angle)
         return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
     def heading_rad(self, time_s: float) -> float:
-        """Heading of the formation, from east towards north; 0 but for glare. [rad]"""
-        return self.side * self.sweep_rad * self.away(time_s) if self.kind == "glare" else 0.0
+        """Heading of the formation, from east towards north; 0 except for glare. [rad]"""
+        return self.side * self.sweep_rad * self.phase(time_s) if self.kind == "glare" else 0.0
 
-    def headed(self, time_s: float) -> Array:
+    def formation_rotation(self, time_s: float) -> Array:
         """(3, 3) rotation of the formation about the vertical by its heading."""
         heading = self.heading_rad(time_s)
         cosine, sine = np.cos(heading), np.sin(heading)
         return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
 
 
-def sample_loss(rng: np.random.Generator, ranges: DropoutRanges | None, sequence_id: int) -> LossEvent | None:
-    """What happens in a sequence, or None where nothing does; the draws do not depend on what it is."""
+def sample_dropout(rng: np.random.Generator, ranges: DropoutRanges | None, sequence_id: int) -> DropoutEvent | None:
+    """The dropout of a sequence, or None without one; the draws do not depend on its kind."""
     if ranges is None:
         return None
     kind = ranges.kinds[sequence_id % len(ranges.kinds)]
-    begin_s, lasts_s, onset_s = draw(rng, ranges.begins_s), draw(rng, ranges.lasts_s), draw(rng, ranges.onset_s)
+    begin_s, lasts_s, onset_s = (
+        sample_uniform(rng, ranges.begins_s),
+        sample_uniform(rng, ranges.lasts_s),
+        sample_uniform(rng, ranges.onset_s),
+    )
     side, tilt_rad = int(rng.choice([-1, 1])), float(rng.uniform(np.pi / 4, 3 * np.pi / 4))
-    distance_m = draw(rng, ranges.obstacle_distance_m)
-    turn, offset, sweep = np.radians([draw(rng, r) for r in (ranges.turn_deg, ranges.sun_offset_deg, ranges.sweep_deg)])
+    distance_m = sample_uniform(rng, ranges.obstacle_distance_m)
+    turn, offset, sweep = np.radians(
+        [sample_uniform(rng, r) for r in (ranges.turn_deg, ranges.sun_offset_deg, ranges.sweep_deg)]
+    )
     if kind == "none":
         return None
     end_s = begin_s + lasts_s
-    return LossEvent(
-        kind, begin_s, end_s, onset_s, side, tilt_rad, distance_m, float(turn), float(offset), float(sweep)
+    return DropoutEvent(
+        kind=kind,
+        begin_s=begin_s,
+        end_s=end_s,
+        onset_s=onset_s,
+        side=side,
+        tilt_rad=tilt_rad,
+        obstacle_distance_m=distance_m,
+        turn_rad=float(turn),
+        sun_offset_rad=float(offset),
+        sweep_rad=float(sweep),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class HidingBar:
-    """A bar that hides the drogue from both eyes all through a stretch.
+class OccludingBar:
+    """A bar that hides the drogue from both eyes throughout a dropout.
 
     Attributes:
-        event: when it does.
+        event: the dropout.
         baseline_m: of the rig. [m]
         across: (2,) direction across the bar, right and down in the image.
-        middle_m: where its axis stands then along that direction, from the axis midway between the eyes. [m]
+        middle_m: position of its axis along that direction during the dropout, from midway between the eyes. [m]
         radius_m: of the bar. [m]
     """
 
-    event: LossEvent
+    event: DropoutEvent
     baseline_m: float
     across: Array
     middle_m: float
     radius_m: float
 
     def at(self, time_s: float, camera: PinholeCamera) -> Obstacle | None:
-        """The bar at a time of the sequence, or None while it is out of sight of both eyes."""
-        away, depth_m = self.event.away(time_s), self.event.obstacle_distance_m
-        if abs(away) == 1:
+        """The bar at a time of the sequence, or None while neither eye sees it."""
+        phase, depth_m = self.event.phase(time_s), self.event.obstacle_distance_m
+        if abs(phase) == 1:
             return None
         corner = float(np.hypot(camera.width_px / 2 / camera.fx_px, camera.height_px / 2 / camera.fy_px))
-        # There the line of sight through the farthest corner just touches the bar, or passes it.
+        # At this distance the line of sight through the farthest corner just touches the bar, or misses it.
         far_m = depth_m * corner + self.radius_m * float(np.hypot(1.0, corner)) + self.baseline_m + abs(self.middle_m)
-        x_m, y_m = self.across * (self.middle_m + self.event.side * away * far_m)
+        x_m, y_m = self.across * (self.middle_m + self.event.side * phase * far_m)
         along = np.array([self.across[1], -self.across[0], 0.0])
         return Obstacle(
             kind="obstacle",
@@ -140,10 +155,10 @@ class HidingBar:
         )
 
 
-def hiding_bar(
-    event: LossEvent, points_m: Array, baseline_m: float, left_from_drogue: Callable[[float], RigidTransform]
-) -> HidingBar:
-    """A bar as thick as the drogue's way behind it asks for.
+def occluding_bar(
+    event: DropoutEvent, points_m: Array, baseline_m: float, left_from_drogue: Callable[[float], RigidTransform]
+) -> OccludingBar:
+    """A bar thick enough to hide the drogue wherever it moves during the dropout.
 
     It hides at least the strip of twice its radius through its axis: the lines of sight that touch it pass outside.
 
@@ -154,7 +169,7 @@ def hiding_bar(
         left_from_drogue: pose at a time of the sequence.
 
     Raises:
-        ValueError: the bar would reach to the lens, or not stand before all of the drogue.
+        ValueError: the bar would reach to the lens, or would not be in front of all of the drogue.
     """
     depth_m = event.obstacle_distance_m
     across = np.array([-np.sin(event.tilt_rad), np.cos(event.tilt_rad)])
@@ -168,28 +183,28 @@ def hiding_bar(
     radius_m = (high - low) / 2 * (1 + _SPARE_FRACTION)
     if radius_m > depth_m / 2:
         raise ValueError(
-            f"sequence.losses.obstacle_distance_m: a bar that hides the drogue all along has a radius of "
-            f"{radius_m:.2f} m, too much {depth_m:.2f} m before the cameras; take calmer air or a greater distance"
+            f"sequence.losses.obstacle_distance_m: a bar that hides the drogue throughout has a radius of "
+            f"{radius_m:.2f} m, too much {depth_m:.2f} m in front of the cameras; take calmer air or a greater distance"
         )
-    # While it comes and goes it passes before the drogue too.
-    acts_s = np.linspace(event.begin_s - event.onset_s, event.end_s + event.onset_s, _SAMPLES)
-    nearest_m = min(float(left_from_drogue(float(time_s)).apply(points_m)[:, 2].min()) for time_s in acts_s)
+    # During onset and end it passes in front of the drogue too.
+    active_s = np.linspace(event.begin_s - event.onset_s, event.end_s + event.onset_s, _SAMPLES)
+    nearest_m = min(float(left_from_drogue(float(time_s)).apply(points_m)[:, 2].min()) for time_s in active_s)
     if depth_m + radius_m >= nearest_m:
         raise ValueError(
             f"sequence.losses.obstacle_distance_m: a bar of {radius_m:.2f} m radius {depth_m:.2f} m before the cameras "
-            f"does not stand before all of the drogue, which comes to {nearest_m:.2f} m; take a smaller distance"
+            f"is not in front of all of the drogue, which comes to {nearest_m:.2f} m; take a smaller distance"
         )
-    return HidingBar(event, baseline_m, across, (low + high) / 2, radius_m)
+    return OccludingBar(event=event, baseline_m=baseline_m, across=across, middle_m=(low + high) / 2, radius_m=radius_m)
 
 
-def sun_beside(
-    event: LossEvent, world_from_left: RigidTransform, middle_m: Array, radius_m: float
+def sun_beside_drogue_deg(
+    event: DropoutEvent, world_from_left: RigidTransform, middle_m: Array, radius_m: float
 ) -> tuple[float, float]:
-    """Where the sun stands that comes beside the drogue.
+    """Position of a sun that stands beside the drogue.
 
     Args:
         event: a glare.
-        world_from_left: attitude of the camera in the middle of the stretch.
+        world_from_left: attitude of the camera in the middle of the dropout.
         middle_m: (3,) middle of the drogue then, in the left camera. [m]
         radius_m: of the drogue. [m]
 
@@ -197,13 +212,13 @@ def sun_beside(
         Elevation and azimuth. [deg]
 
     Raises:
-        ValueError: that is below the horizon.
+        ValueError: the position is below the horizon.
     """
     sight = middle_m / np.linalg.norm(middle_m)
     right = np.cross([0.0, 1.0, 0.0], sight)
     right /= np.linalg.norm(right)
     upwards = np.cross(sight, right) * -1.0
-    # To the left or right rather than above, where pod and wing would hide it.
+    # Rather to the left or right than above, where pod and wing would hide the sun.
     beside = event.side * np.sin(event.tilt_rad) * right + np.cos(event.tilt_rad) * upwards
     offset = event.sun_offset_rad + float(np.arcsin(radius_m / np.linalg.norm(middle_m)))
     to_sun = world_from_left.rotate(np.cos(offset) * sight + np.sin(offset) * beside)
@@ -216,9 +231,9 @@ def sun_beside(
     return elevation_deg, float(np.degrees(np.arctan2(to_sun[1], to_sun[0])))
 
 
-def flown_m(event: LossEvent, speed_m_s: float, time_s: float) -> Array:
-    """(2,) east and north of the formation from its place at the sequence's start, for one that turns. [m]"""
+def formation_displacement_m(event: DropoutEvent, speed_m_s: float, time_s: float) -> Array:
+    """(2,) east and north of a turning formation from its position at the start of the sequence. [m]"""
     middles = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * time_s
     headings = np.array([event.heading_rad(float(middle)) for middle in middles])
-    way: Array = speed_m_s * time_s * np.array([np.cos(headings).mean(), np.sin(headings).mean()])
-    return way
+    displacement: Array = speed_m_s * time_s * np.array([np.cos(headings).mean(), np.sin(headings).mean()])
+    return displacement

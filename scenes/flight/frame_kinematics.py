@@ -13,11 +13,11 @@ from geometry.se3 import Array, RigidTransform
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """One pair, without light; as in `FrameSpec`.
+class FrameKinematics:
+    """Poses and motion of one pair; fields as in `FrameSpec`.
 
     Attributes:
-        sequence_id: which sequence, or None for a single pair.
+        sequence_id: its sequence, or None for a single pair.
         time_s: mid-exposure. [s]
         left_from_drogue, left_from_tanker: poses, or None without a drogue.
         world_from_left: pose.
@@ -25,8 +25,8 @@ class Moment:
         left_twist_per_s, drogue_twist_per_s: (6,) body twists. [m/s, rad/s]
         hose_nodes_left_m: (K, 3) from the coupling to the pod, or None without a drogue. [m]
         loss: as in `FrameSpec`.
-        obstacle: a bar before the cameras, or None.
-        sun_deg: elevation and azimuth of the sun where it is not the scene's, or None. [deg]
+        obstacle: a bar in front of the cameras, or None.
+        sun_deg: elevation and azimuth of the sun if they differ from the scene's, or None. [deg]
     """
 
     sequence_id: int | None
@@ -44,12 +44,12 @@ class Moment:
 
 
 HOSE_NODES = 17
-# Equilibrium of a 15 m hose at 120 m/s from a lumped-mass model: the drogue trails so far behind and below the pod.
+# Position of the drogue behind and below the pod: equilibrium of a 15 m hose at 120 m/s in a lumped-mass model.
 _TRAIL_AFT_M, _TRAIL_BELOW_M = 14.2, 4.9
 _LATERAL_SPREAD_M = 0.6
 # The hose leaves the pod nearly level and steepens towards the drogue.
 _SLOPE_AT_POD = 0.2
-# Hose end inside the coupling's tail, so that no gap shows.
+# Length of hose inside the coupling's tail, so that no gap shows.
 HOSE_OVERLAP_M = 0.02
 # World axes of a tanker that flies east: aft, right wing, up.
 WORLD_FROM_TANKER = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -61,7 +61,7 @@ def sample_suspension(
     left_from_drogue: RigidTransform,
     world_from_left: RigidTransform,
 ) -> tuple[RigidTransform, Array]:
-    """Tanker pose and hose centre line.
+    """Tanker pose and centre line of the hose for a drogue at a given pose in steady flight.
 
     Args:
         rng: draws the lateral offset.

@@ -30,7 +30,7 @@ GRAVITY_M_S2 = 9.80665  # standard gravity
 
 @dataclass
 class HoseState:
-    """Places and velocities of all nodes; a simulation overwrites it.
+    """Positions and velocities of all nodes; a simulation overwrites it.
 
     Attributes:
         nodes_m: (3, S, N + 1) from the pod to the drogue. [m]
@@ -47,12 +47,12 @@ class HoseModel:
     """Forces and constraints of one hose."""
 
     def __init__(self, hose: HoseParameters, sequences: int = 1, links: int = LINKS) -> None:
-        """Precompute what does not change.
+        """Precompute masses and coefficients.
 
         Args:
             hose: the hose and its flight condition.
-            sequences: how many are simulated at once.
-            links: rigid links in each.
+            sequences: number of sequences simulated at once.
+            links: number of rigid links.
         """
         self.links = links
         self.link_m = hose.length_m / links
@@ -66,23 +66,23 @@ class HoseModel:
         self._drogue = half_density * np.pi / 4 * hose.drogue_diameter_m**2 * hose.drogue_drag_coefficient
         inverse = 1.0 / masses
         self._inverse_masses = inverse
-        # One tridiagonal system for all sequences; zeros part them.
+        # One tridiagonal system for all sequences, separated by zeros.
         self._diagonal = np.tile(inverse + np.concatenate([[0.0], inverse[:-1]]), sequences)
         self._beside = np.tile(np.concatenate([inverse[:-1], [0.0]]), sequences)[:-1]
         self._sequences = sequences
 
     def equilibrium(self) -> HoseState:
-        """Still hose in still air; exact for the chain of links."""
+        """Hose at rest in still air; exact for the chain of links."""
         links, tensions = self._equilibrium_links()
         nodes = np.zeros((3, self._sequences, self.links + 1))
         nodes[:, :, 1:] = np.cumsum(links, axis=1)[:, None]
         return HoseState(nodes, np.zeros_like(nodes), np.tile(tensions, (self._sequences, 1)))
 
     def check_step(self, time_step_s: float) -> None:
-        """Check that waves along the links and drag are slow against a time step.
+        """Check that a time step resolves waves along the links and drag.
 
         Raises:
-            ValueError: they are not: the hose or the drogue is too light.
+            ValueError: it does not, because the hose or the drogue is too light.
         """
         _, tensions = self._equilibrium_links()
         waves = 2 * np.sqrt(tensions.max() / (self.masses_kg[0] * self.link_m))
@@ -95,9 +95,9 @@ class HoseModel:
                 )
 
     def _equilibrium_links(self) -> tuple[Array, Array]:
-        """(3, N) vectors of the links [m] and (N,) tensions [N], from the drogue up.
+        """(3, N) vectors of the links [m] and (N,) tensions [N], solved from the drogue upwards.
 
-        Each link lies along all the force at and beyond its lower end.
+        Each link is aligned with the total force at and beyond its lower end.
         """
         wind = np.array([self.airspeed_m_s, 0.0, 0.0])
         weight = np.array([0.0, 0.0, -GRAVITY_M_S2])
@@ -149,12 +149,12 @@ class HoseModel:
         Args:
             state: is overwritten.
             air_m_s: (3, S, N + 1) velocity of the air at the nodes, in the tanker's axes. [m/s]
-            pod_m: (3, S) place of the pod's exit at the end of the step. [m]
+            pod_m: (3, S) position of the pod's exit at the end of the step. [m]
             time_step_s: [s]
         """
         nodes, velocities = state.nodes_m, state.velocities_m_s
         u = (nodes[..., 1:] - nodes[..., :-1]) / self.link_m
-        # Where the nodes would go with the tensions of the step before.
+        # Positions of the nodes with the tensions of the previous step.
         pull = state.tensions_n * u
         force = self.forces(state, air_m_s) - pull
         force[..., :-1] += pull[..., 1:]
@@ -174,10 +174,10 @@ class HoseModel:
         nodes[...] = place
 
     def _tension_change(self, u: Array, ahead: Array, time_step_s: float) -> Array:
-        """(S, N) what the tensions lack so that links have their lengths at the end of the step. [N]
+        """(S, N) change of the tensions that restores the links' lengths at the end of the step. [N]
 
-        One step of Newton's method on the squared lengths: what it leaves is of second order in a change that is itself
-        small, and the next step takes it out.
+        One step of Newton's method on the squared lengths: its error is of second order in a change that is itself
+        small, and the next step removes it.
 
         Args:
             u: (3, S, N) directions in which the tensions pull.
@@ -210,17 +210,17 @@ def _below_the_wind(angle: float) -> Array:
     return np.array([np.cos(angle), 0.0, -np.sin(angle)])
 
 
-# Share of the relative wind in the direction; the rest is the last link's. Our reconstruction.
+# Weight of the relative wind in the drogue's direction; the rest is the last link's. Our reconstruction.
 _WIND_SHARE = 0.7
 _LAG_S = 0.15
-# Slower air than this turns the drogue less than its own weight does. [m/s]
+# In slower air than this the drogue's weight counts more than the wind. [m/s]
 _WEAK_WIND_M_S = 1.0
-# A level camera that looks ahead (right, down, forward), seen from the tanker's axes (aft, right, up).
+# Axes of a level camera that looks ahead (right, down, forward) from the tanker's axes (aft, right, up).
 LEVEL_CAMERA_FROM_TANKER = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 
 
 def mouth_directions(past_m_s: Array, last_link: Array, period_s: float) -> Array:
-    """Directions from the coupling to the mouth, lagged and not of unit length.
+    """Lagged directions from the coupling to the mouth, not of unit length.
 
     Args:
         past_m_s: (T, 3) velocity of the air past the drogue. [m/s]
@@ -228,33 +228,33 @@ def mouth_directions(past_m_s: Array, last_link: Array, period_s: float) -> Arra
         period_s: of the samples. [s]
 
     Returns:
-        (T, 3) a first-order lag of what the air and the hose want, straight between the samples.
+        (T, 3) first-order lag of the direction that air and hose impose, which is linear between the samples.
     """
-    wanted = _wanted(past_m_s, last_link)
+    imposed = _imposed_directions(past_m_s, last_link)
     ratio = period_s / _LAG_S
     keep = np.exp(-ratio)
-    # Exact for an input that goes straight from sample to sample.
+    # Exact for an input that is linear between samples.
     newer = 1 - (1 - keep) / ratio
-    lagged = np.empty_like(wanted)
-    lagged[0] = wanted[0]
-    for k in range(1, len(wanted)):
-        lagged[k] = keep * lagged[k - 1] + (1 - keep - newer) * wanted[k - 1] + newer * wanted[k]
+    lagged = np.empty_like(imposed)
+    lagged[0] = imposed[0]
+    for k in range(1, len(imposed)):
+        lagged[k] = keep * lagged[k - 1] + (1 - keep - newer) * imposed[k - 1] + newer * imposed[k]
     return lagged
 
 
 def still_mouth_direction(airspeed_m_s: float, last_link: Array) -> Array:
     """(3,) unit direction from the coupling to the mouth in still air, with the hose's (3,) last link."""
-    return _wanted(np.array([airspeed_m_s, 0.0, 0.0]), last_link)
+    return _imposed_directions(np.array([airspeed_m_s, 0.0, 0.0]), last_link)
 
 
-def _wanted(past_m_s: Array, last_link: Array) -> Array:
-    """(..., 3) unit directions that air and hose want the mouth to have."""
+def _imposed_directions(past_m_s: Array, last_link: Array) -> Array:
+    """(..., 3) unit directions of the mouth that air and hose impose."""
     speed = np.linalg.norm(past_m_s, axis=-1, keepdims=True)
     wind = past_m_s / np.hypot(speed, _WEAK_WIND_M_S)
     link = last_link / np.linalg.norm(last_link, axis=-1, keepdims=True)
-    wanted: Array = _WIND_SHARE * wind + (1 - _WIND_SHARE) * link
-    wanted /= np.linalg.norm(wanted, axis=-1, keepdims=True)
-    return wanted
+    imposed: Array = _WIND_SHARE * wind + (1 - _WIND_SHARE) * link
+    imposed /= np.linalg.norm(imposed, axis=-1, keepdims=True)
+    return imposed
 
 
 def drogue_rotation(mouth: Array, roll_rad: float) -> Array:

@@ -17,21 +17,27 @@ from drogue_models.parameters import DrogueParameters
 from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, exp_twist, log_twist
-from scenes.environment import draw
+from scenes.environment import sample_uniform
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
-from scenes.flight.dropouts import HidingBar, flown_m, hiding_bar, sample_loss, sun_beside
-from scenes.flight.frame_kinematics import HOSE_OVERLAP_M, WORLD_FROM_TANKER, Moment
+from scenes.flight.dropouts import (
+    OccludingBar,
+    formation_displacement_m,
+    occluding_bar,
+    sample_dropout,
+    sun_beside_drogue_deg,
+)
+from scenes.flight.frame_kinematics import HOSE_OVERLAP_M, WORLD_FROM_TANKER, FrameKinematics
 from scenes.flight.hose_dynamics import HoseModel, drogue_rotation, still_mouth_direction
-from scenes.flight.receiver import sample_attitude, wanted_places
-from scenes.flight.trajectory import SETTLING_S, Surroundings, Trajectory, simulate
-from scenes.framing import outline
+from scenes.flight.receiver import desired_offsets_m, sample_attitude
+from scenes.flight.trajectory import SETTLING_S, SimulationInputs, Trajectory, simulate
+from scenes.framing import outline_points_m
 
 _SINES = 8
 
 
 @dataclass(frozen=True)
 class Oscillation:
-    """A sum of sines along several axes.
+    """Irregular motion as a sum of sines along several axes: known at any time, with its rate, without a time grid.
 
     Attributes:
         amplitudes: (A,) of each sine, the same for all of an axis.
@@ -51,10 +57,10 @@ class Oscillation:
 
 
 def sample_oscillation(rng: np.random.Generator, sd: ArrayLike, low_hz: float, high_hz: float) -> Oscillation:
-    """Draw one.
+    """Draw an oscillation.
 
     Args:
-        rng: draws frequencies, one in each of equal parts of the band, and phases.
+        rng: draws phases, and one frequency in each of equal parts of the band.
         sd: (A,) standard deviation of each axis.
         low_hz, high_hz: the band. [Hz]
     """
@@ -63,41 +69,44 @@ def sample_oscillation(rng: np.random.Generator, sd: ArrayLike, low_hz: float, h
     steps = (np.arange(_SINES) + rng.random(shape)) / _SINES
     rates = 2 * np.pi * (low_hz + (high_hz - low_hz) * steps)
     phases = rng.uniform(0.0, 2 * np.pi, shape)
-    return Oscillation(deviations * np.sqrt(2.0 / _SINES), rates, phases)
+    return Oscillation(amplitudes=deviations * np.sqrt(2.0 / _SINES), rates_rad_s=rates, phases_rad=phases)
 
 
-# Between the last pair of a sequence and the first of the next, so that no tracker takes them for neighbours.
+# Pause between the last pair of a sequence and the first of the next, so that no tracker takes them for neighbours.
 _PAUSE_S = 10.0
-# Bands of the tanker's and the receiver's motion; our choice.
+# Frequency bands of the motion of tanker and receiver; our choice. [Hz]
 _TANKER_HZ, _ATTITUDE_HZ, _VIBRATION_HZ = (0.05, 0.2), (0.05, 0.6), (8.0, 40.0)
-# For rates by central differences: they err by (2 pi 40 Hz 1e-5 s)^2 / 6 = 1e-6 of the fastest vibration.
+# Step of central differences for rates: its error is (2 pi 40 Hz 1e-5 s)^2 / 6 = 1e-6 of the fastest vibration.
 _HALF_DIFFERENCE_S = 1e-5
-# The foremost a drogue may be: nearer, it would be in the lens. [m]
+# Nearest that the rim may come to the left eye. [m]
 _NEAREST_M = 0.1
-# The receiver looks into the mouth, or at least not at the back.
-_MOST_TURNED_DEG = 60.0
-# Samples beyond the last pair, for the ends of splines and differences.
+# Largest angle of the drogue's axis from the camera's: the camera must see the mouth, not the back.
+_MOST_AXIS_ANGLE_DEG = 60.0
+# Samples beyond the last pair, for the ends of splines and finite differences.
 _SPARE_SAMPLES = 3
 
 
-def moment_of_sequence(recipe: Recipe, sequence: SequenceRanges, drogue: DrogueParameters, frame_index: int) -> Moment:
-    """Where everything is in one frame; the same alone, in any order and in any process.
+def sequence_kinematics(
+    recipe: Recipe, sequence: SequenceRanges, drogue: DrogueParameters, frame_index: int
+) -> FrameKinematics:
+    """Poses and motion of one frame; the same for a frame alone, in any order and in any process.
 
     Args:
         recipe: as it holds for the frame's scene.
-        sequence: its section.
-        drogue: that hangs in the scene.
+        sequence: the recipe's section on sequences.
+        drogue: of the scene.
         frame_index: of the frame.
 
     Raises:
-        ValueError: the drogue comes to the lens or turns away from it, or the air is too slow for its turbulence.
+        ValueError: the drogue comes too near to the camera or turns away from it, or the airspeed is too low for
+            turbulence.
     """
     sequence_id, place = divmod(frame_index, sequence.frames_per_sequence)
     flight = _flight(recipe.seed, sequence_id, sequence, drogue, recipe.pose, recipe.rig.baseline_m)
-    return flight.moment(place, recipe.rig.camera)
+    return flight.kinematics(place, recipe.rig.camera)
 
 
-# A recipe's frames come in order, more or less: the last sequences that were flown are enough.
+# Frames of a recipe are mostly rendered in order, so that the last two simulated sequences are enough.
 @lru_cache(maxsize=2)
 def _flight(
     seed: int, sequence_id: int, sequence: SequenceRanges, drogue: DrogueParameters, pose: PoseRanges, baseline_m: float
@@ -117,13 +126,13 @@ class Flight:
         pose: PoseRanges,
         baseline_m: float,
     ) -> None:
-        """Simulate it; every draw is keyed by the dataset's seed and the sequence.
+        """Simulate the sequence; every draw is keyed by the dataset's seed and the sequence.
 
         Args:
             seed: of the dataset.
             sequence_id: which sequence.
-            sequence: how it moves.
-            drogue: that hangs on the hose.
+            sequence: ranges of its motion.
+            drogue: at the end of the hose.
             pose: ranges of the receiver's mean attitude and the drogue's roll.
             baseline_m: of the rig. [m]
         """
@@ -131,7 +140,9 @@ class Flight:
         receiver = sequence.receiver
         tail_m = drogue.hub_depth_m + drogue.coupling_length_m - HOSE_OVERLAP_M
         self._drogue_from_tail_m = np.array([0.0, 0.0, tail_m])
-        self._roll_rad = float(np.radians(draw(frame_generator(seed, sequence_id, "drogue roll"), pose.roll_deg)))
+        self._roll_rad = float(
+            np.radians(sample_uniform(frame_generator(seed, sequence_id, "drogue roll"), pose.roll_deg))
+        )
         world_from_left = sample_attitude(frame_generator(seed, sequence_id, "receiver"), pose)
         self._tanker_from_left = WORLD_FROM_TANKER.T @ world_from_left
         shaking = frame_generator(seed, sequence_id, "receiver shake")
@@ -140,13 +151,13 @@ class Flight:
         vibration = [receiver.vibration_m] * 3 + [vibration_rad] * 3
         self._vibration = sample_oscillation(shaking, vibration, *_VIBRATION_HZ)
         self._baseline_m = baseline_m
-        self._loss = sample_loss(frame_generator(seed, sequence_id, "loss"), sequence.losses, sequence_id)
-        around, settling_s = self._surroundings(seed, baseline_m, tail_m)
+        self._dropout = sample_dropout(frame_generator(seed, sequence_id, "loss"), sequence.losses, sequence_id)
+        inputs, settling_s = self._simulation_inputs(seed, baseline_m, tail_m)
         release_m = None if sequence.release_m is None else np.array(sequence.release_m)
-        self._trajectory = Trajectory(simulate(sequence.hose, around, release_m), settling_s)
+        self._trajectory = Trajectory(simulate(sequence.hose, inputs, release_m), settling_s)
 
-    def _surroundings(self, seed: int, baseline_m: float, tail_m: float) -> tuple[Surroundings, float]:
-        """What moves hose and receiver, and how long before the first pair it begins. [s]"""
+    def _simulation_inputs(self, seed: int, baseline_m: float, tail_m: float) -> tuple[SimulationInputs, float]:
+        """What moves hose and receiver, and how long before the first pair the simulation begins. [s]"""
         sequence, receiver, sequence_id = self._sequence, self._sequence.receiver, self._id
         hose = sequence.hose
         settling_s = SETTLING_S if sequence.release_m is None else 0.0
@@ -158,33 +169,40 @@ class Flight:
         tanker = frame_generator(seed, sequence_id, "tanker motion")
         pod = sample_oscillation(tanker, [sequence.tanker_motion_m] * 3, *_TANKER_HZ)
         offsets = frame_generator(seed, sequence_id, "receiver offset")
-        offset_m = draw(offsets, receiver.offset_right_m), draw(offsets, receiver.offset_down_m)
+        offset_m = sample_uniform(offsets, receiver.offset_right_m), sample_uniform(offsets, receiver.offset_down_m)
         manoeuvre = receiver.manoeuvres[sequence_id % len(receiver.manoeuvres)]
         times = GUST_PERIOD_S * np.arange(samples) - settling_s
-        wanted = wanted_places(receiver, manoeuvre, offset_m, times) + np.array([baseline_m / 2, 0.0, 0.0])
+        desired = desired_offsets_m(receiver, manoeuvre, offset_m, times) + np.array([baseline_m / 2, 0.0, 0.0])
         links = np.diff(HoseModel(hose).equilibrium().nodes_m[:, 0], axis=-1)
         mouth = still_mouth_direction(hose.airspeed_m_s, links[:, -1])
-        from_drogue = tail_m * mouth - wanted @ self._tanker_from_left.T
+        from_drogue = tail_m * mouth - desired @ self._tanker_from_left.T
         nose_m = np.array(receiver.nose_body_m) - np.array([receiver.body_radius_m / 2, 0.0, 0.0])
         source = self._tanker_from_left @ (FRD_FROM_OPTICAL.inverse().rotate(nose_m))
-        around = Surroundings(gusts, pod.at, from_drogue[..., None], source, receiver.body_radius_m, receiver.follower)
-        return around, settling_s
+        inputs = SimulationInputs(
+            gusts_m_s=gusts,
+            pod_m=pod.at,
+            from_drogue_m=from_drogue[..., None],
+            nose_source_m=source,
+            body_radius_m=receiver.body_radius_m,
+            follower=receiver.follower,
+        )
+        return inputs, settling_s
 
-    def moment(self, place: int, camera: PinholeCamera) -> Moment:
-        """The pair at a place of the sequence.
+    def kinematics(self, place: int, camera: PinholeCamera) -> FrameKinematics:
+        """Poses and motion of the pair at a place of the sequence.
 
         Raises:
-            ValueError: the drogue comes to the lens or turns away from it.
+            ValueError: the drogue comes too near to the camera or turns away from it.
         """
         time_s = place / self._sequence.frame_rate_hz
         tanker_from_left = self.tanker_from_left(time_s)
         left_from_axes = tanker_from_left.inverse()
-        self._check_seen(time_s)
+        self._check_visible(time_s)
         nodes = self._trajectory.nodes_m(time_s)
         east_m, north_m = self._camera_offset_m(time_s, tanker_from_left.translation_m)
         pod = RigidTransform(np.eye(3), nodes[0])
         length_s = self._sequence.frames_per_sequence / self._sequence.frame_rate_hz
-        return Moment(
+        return FrameKinematics(
             sequence_id=self._id,
             time_s=self._id * (length_s + _PAUSE_S) + time_s,
             left_from_drogue=left_from_axes @ self.tanker_from_drogue(time_s),
@@ -194,25 +212,27 @@ class Flight:
             drogue_twist_per_s=_twist(self.tanker_from_drogue, time_s),
             hose_nodes_left_m=left_from_axes.apply(nodes[::-1]),
             camera_offset_m=(east_m, north_m),
-            loss=self._loss.kind if self._loss is not None and self._loss.acts(time_s) else None,
+            loss=self._dropout.kind if self._dropout is not None and self._dropout.is_active(time_s) else None,
             obstacle=None if self._bar is None else self._bar.at(time_s, camera),
             sun_deg=self._sun_deg,
         )
 
     def _world_from_tanker(self, time_s: float) -> Array:
-        """(3, 3) attitude of the formation: eastwards, unless it turns into the sun."""
-        if self._loss is None or self._loss.kind != "glare":
+        """(3, 3) attitude of the formation: it flies east, unless it turns into the sun."""
+        if self._dropout is None or self._dropout.kind != "glare":
             return WORLD_FROM_TANKER
-        headed: Array = self._loss.headed(time_s) @ WORLD_FROM_TANKER
-        return headed
+        rotation: Array = self._dropout.formation_rotation(time_s) @ WORLD_FROM_TANKER
+        return rotation
 
     def _camera_offset_m(self, time_s: float, eye_m: Array) -> tuple[float, float]:
-        """East and north of the camera from where the pod was at the sequence's start. [m]"""
+        """East and north of the camera from the pod's position at the start of the sequence. [m]"""
         speed_m_s = self._sequence.hose.airspeed_m_s
-        if self._loss is None or self._loss.kind != "glare":
+        if self._dropout is None or self._dropout.kind != "glare":
             east_m, north_m, _ = (WORLD_FROM_TANKER @ (np.array([-speed_m_s * time_s, 0.0, 0.0]) + eye_m)).tolist()
             return east_m, north_m
-        place_m = flown_m(self._loss, speed_m_s, time_s) + (self._world_from_tanker(time_s) @ eye_m)[:2]
+        place_m = (
+            formation_displacement_m(self._dropout, speed_m_s, time_s) + (self._world_from_tanker(time_s) @ eye_m)[:2]
+        )
         return float(place_m[0]), float(place_m[1])
 
     def _left_from_drogue(self, time_s: float) -> RigidTransform:
@@ -220,44 +240,44 @@ class Flight:
         return pose
 
     @cached_property
-    def _bar(self) -> HidingBar | None:
-        """What hides the drogue in this sequence."""
-        if self._loss is None or self._loss.kind != "occlusion":
+    def _bar(self) -> OccludingBar | None:
+        """The bar that occludes the drogue in this sequence, or None."""
+        if self._dropout is None or self._dropout.kind != "occlusion":
             return None
-        return hiding_bar(self._loss, outline(self._drogue), self._baseline_m, self._left_from_drogue)
+        return occluding_bar(self._dropout, outline_points_m(self._drogue), self._baseline_m, self._left_from_drogue)
 
     @cached_property
     def _sun_deg(self) -> tuple[float, float] | None:
-        """Elevation and azimuth of the sun, where this sequence needs it somewhere. [deg]"""
-        if self._loss is None or self._loss.kind != "glare":
+        """Elevation and azimuth of the sun if this sequence sets them, for glare; otherwise None. [deg]"""
+        if self._dropout is None or self._dropout.kind != "glare":
             return None
-        middle_s = self._loss.middle_s
+        middle_s = self._dropout.middle_s
         rotation = self._world_from_tanker(middle_s) @ self.tanker_from_left(middle_s).rotation
         world_from_left = RigidTransform(rotation, np.zeros(3))
         middle_m = self._left_from_drogue(middle_s).translation_m
-        return sun_beside(self._loss, world_from_left, middle_m, self._drogue.rim_radius_m)
+        return sun_beside_drogue_deg(self._dropout, world_from_left, middle_m, self._drogue.rim_radius_m)
 
     def tanker_from_left(self, time_s: float) -> RigidTransform:
-        """Pose of the left eye in axes that fly along with the tanker."""
+        """Pose of the left eye in axes that move with the tanker."""
         steady = self._steady_tanker_from_left(time_s)
-        if self._loss is None or self._loss.kind != "out-of-view":
+        if self._dropout is None or self._dropout.kind != "out-of-view":
             return steady
-        return RigidTransform(steady.rotation @ self._loss.turned(time_s), steady.translation_m)
+        return RigidTransform(steady.rotation @ self._dropout.receiver_rotation(time_s), steady.translation_m)
 
     def _steady_tanker_from_left(self, time_s: float) -> RigidTransform:
-        """The same of a receiver that does not turn aside."""
+        """The same for a receiver that does not turn aside."""
         shake = self._vibration.at(time_s)
         turn = exp_twist(np.concatenate([np.zeros(3), self._attitude.at(time_s) + shake[3:]])).rotation
         rotation = self._tanker_from_left @ turn
         return RigidTransform(rotation, self._trajectory.eye_m(time_s) + rotation @ shake[:3])
 
     def tanker_from_drogue(self, time_s: float) -> RigidTransform:
-        """Pose of the drogue in the same axes: its coupling at the end of the hose, its mouth to the air."""
+        """Pose of the drogue in the same axes: its coupling at the end of the hose, its mouth into the wind."""
         rotation = drogue_rotation(self._trajectory.mouth(time_s), self._roll_rad)
         return RigidTransform(rotation, self._trajectory.nodes_m(time_s)[-1] - rotation @ self._drogue_from_tail_m)
 
-    def _check_seen(self, time_s: float) -> None:
-        # Of a receiver that does not turn aside: which side of the drogue it sees does not depend on where it looks.
+    def _check_visible(self, time_s: float) -> None:
+        # For a receiver that does not turn aside: which side of the drogue it sees does not depend on where it looks.
         left_from_drogue = self._steady_tanker_from_left(time_s).inverse() @ self.tanker_from_drogue(time_s)
         depth_m = float(left_from_drogue.translation_m[2])
         what = f"sequence {self._id}: leaves the visible volume at {time_s:.2f} s"
@@ -266,11 +286,11 @@ class Flight:
                 f"{what}: the drogue's rim comes to {depth_m:.2f} m from the left eye; raise end_m or abort_m, or take "
                 "a faster follower or calmer air"
             )
-        turned_deg = float(np.degrees(np.arccos(np.clip(left_from_drogue.rotation[2, 2], -1, 1))))
-        if turned_deg > _MOST_TURNED_DEG:
+        axis_angle_deg = float(np.degrees(np.arccos(np.clip(left_from_drogue.rotation[2, 2], -1, 1))))
+        if axis_angle_deg > _MOST_AXIS_ANGLE_DEG:
             raise ValueError(
-                f"{what}: the drogue's axis is {turned_deg:.0f} degrees from the camera's, more than "
-                f"{_MOST_TURNED_DEG:g}; raise hose.airspeed_m_s, or tilt the camera by pose.camera_pitch_deg"
+                f"{what}: the drogue's axis is {axis_angle_deg:.0f} degrees from the camera's, more than "
+                f"{_MOST_AXIS_ANGLE_DEG:g}; raise hose.airspeed_m_s, or tilt the camera by pose.camera_pitch_deg"
             )
 
 

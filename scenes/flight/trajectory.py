@@ -1,7 +1,7 @@
-"""How hose, drogue and receiver move through one sequence, at any time of it.
+"""Motion of hose, drogue and receiver in one sequence, at any time.
 
-All is simulated from the beginning, on time grids that the asked-for times have no part in; cubic splines through the
-samples are, by definition, the truth.
+A sequence is simulated from its beginning, on time grids that do not depend on the times asked for; cubic splines
+through the samples are, by definition, the true motion.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
 from scenes.flight.hose_dynamics import LINKS, TIME_STEP_S, HoseModel, HoseState, mouth_directions
 from scenes.flight.receiver import Guidance
 
-# The first moments, in which hose and receiver forget how they began: the slowest swing dies out within a few periods.
+# Time in which hose and receiver forget their initial state: the slowest swing dies out within a few periods.
 SETTLING_S = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """What moves hose and receiver from outside; all arrays start at the first moment of the simulation.
+class SimulationInputs:
+    """External inputs that move hose and receiver; all arrays start at the beginning of the simulation.
 
     Attributes:
         gusts_m_s: (T, 3, S) along the flight, sideways to the right, and up, `GUST_PERIOD_S` apart. [m/s]
-        pod_m: (...) times [s] to (..., 3) places of the pod about its mean [m].
-        from_drogue_m: (T, 3, S) where the receiver's left eye should be from the drogue's coupling. [m]
-        nose_source_m: (3,) source of the bow wave from the left eye, in the tanker's axes. [m]
+        pod_m: function from (...) times [s] to (..., 3) positions of the pod about its mean [m].
+        from_drogue_m: (T, 3, S) desired position of the receiver's left eye relative to the drogue's coupling. [m]
+        nose_source_m: (3,) source of the bow wave relative to the left eye, in the tanker's axes. [m]
         body_radius_m: of the receiver's nose; 0 for no bow wave. [m]
         follower: the receiver's guidance.
     """
@@ -45,13 +45,13 @@ class Surroundings:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class SimulatedMotion:
     """Samples of a simulation, `GUST_PERIOD_S` apart; axes are the tanker's.
 
     Attributes:
         nodes_m: (T, 3, S, N + 1) from the pod to the drogue. [m]
         past_drogue_m_s: (T, 3, S) velocity of the air past the drogue. [m/s]
-        eye_m: (T, 3, S) receiver's left eye. [m]
+        eye_m: (T, 3, S) position of the receiver's left eye. [m]
     """
 
     nodes_m: Array
@@ -60,68 +60,70 @@ class Motion:
 
 
 def simulate(
-    hose: HoseParameters, around: Surroundings, release_m: Array | None = None, time_step_s: float = TIME_STEP_S
-) -> Motion:
+    hose: HoseParameters, inputs: SimulationInputs, release_m: Array | None = None, time_step_s: float = TIME_STEP_S
+) -> SimulatedMotion:
     """Simulate sequences from the beginning.
 
     Args:
         hose: the hose and its flight condition.
-        around: what moves it.
-        release_m: (3,) where the drogue is let go, or None for the equilibrium in still air. [m]
-        time_step_s: of the hose; a whole part of `GUST_PERIOD_S`. [s]
+        inputs: what moves hose and receiver.
+        release_m: (3,) position at which the drogue is released, or None for the equilibrium in still air. [m]
+        time_step_s: of the hose; `GUST_PERIOD_S` is a multiple of it. [s]
 
     Raises:
-        ValueError: a time step that does not fit, a hose that is too light for it, or does not reach to `release_m`.
+        ValueError: the time step does not divide `GUST_PERIOD_S`, or the hose is too light for it, or too short for
+            `release_m`.
     """
     substeps = round(GUST_PERIOD_S / time_step_s)
     if substeps < 1 or abs(substeps * time_step_s - GUST_PERIOD_S) > 1e-12:
         raise ValueError(f"time_step_s: must be a whole part of {GUST_PERIOD_S} s, got {time_step_s}")
-    samples, _, sequences = around.gusts_m_s.shape
+    samples, _, sequences = inputs.gusts_m_s.shape
     model = HoseModel(hose, sequences)
     model.check_step(time_step_s)
     still = model.equilibrium()
-    state = model.equilibrium() if release_m is None else _released(hose, release_m, sequences)
+    state = model.equilibrium() if release_m is None else _released_hose(hose, release_m, sequences)
     times = time_step_s * np.arange(samples * substeps + 1)
-    pod_m = np.broadcast_to(around.pod_m(times)[..., None], (len(times), 3, sequences))
+    pod_m = np.broadcast_to(inputs.pod_m(times)[..., None], (len(times), 3, sequences))
     state.nodes_m += pod_m[0][..., None]
     hanging_m = still.nodes_m[..., -1]
-    begin_m = hanging_m if around.follower.bandwidth_hz == 0 else state.nodes_m[..., -1]
-    guidance = Guidance(around.follower, GUST_PERIOD_S, begin_m + around.from_drogue_m[0])
-    closing_m_s = np.gradient(around.from_drogue_m, GUST_PERIOD_S, axis=0)
-    gusts = np.concatenate([around.gusts_m_s, around.gusts_m_s[-1:]])
+    begin_m = hanging_m if inputs.follower.bandwidth_hz == 0 else state.nodes_m[..., -1]
+    guidance = Guidance(inputs.follower, GUST_PERIOD_S, begin_m + inputs.from_drogue_m[0])
+    closing_m_s = np.gradient(inputs.from_drogue_m, GUST_PERIOD_S, axis=0)
+    gusts = np.concatenate([inputs.gusts_m_s, inputs.gusts_m_s[-1:]])
     nodes, past, eyes = [], [], []
     for k in range(samples):
-        if around.follower.bandwidth_hz == 0:
-            guidance.place_m = hanging_m + around.from_drogue_m[k]
+        if inputs.follower.bandwidth_hz == 0:
+            guidance.position_m = hanging_m + inputs.from_drogue_m[k]
             guidance.velocity_m_s = closing_m_s[k]
         else:
-            guidance.steer(state.nodes_m[..., -1], around.from_drogue_m[k], closing_m_s[k])
+            guidance.steer(state.nodes_m[..., -1], inputs.from_drogue_m[k], closing_m_s[k])
         for step in range(substeps):
             share = step / substeps
             gust = gusts[k] + share * (gusts[k + 1] - gusts[k])
             air = np.repeat(gust[..., None], LINKS + 1, axis=-1)
             air[0] += hose.airspeed_m_s
-            if around.body_radius_m > 0:
-                source = guidance.place_after(share * GUST_PERIOD_S) + around.nose_source_m[:, None]
-                air += bow_wave(state.nodes_m, source, hose.airspeed_m_s, around.body_radius_m)
+            if inputs.body_radius_m > 0:
+                source = guidance.position_after(share * GUST_PERIOD_S) + inputs.nose_source_m[:, None]
+                air += bow_wave(state.nodes_m, source, hose.airspeed_m_s, inputs.body_radius_m)
             if step == 0:
                 nodes.append(state.nodes_m.copy())
                 past.append(air[..., -1] - state.velocities_m_s[..., -1])
-                eyes.append(guidance.place_m)
+                eyes.append(guidance.position_m)
             model.step(state, air, pod_m[k * substeps + step + 1], time_step_s)
         guidance.move()
-    return Motion(np.stack(nodes), np.stack(past), np.stack(eyes))
+    return SimulatedMotion(nodes_m=np.stack(nodes), past_drogue_m_s=np.stack(past), eye_m=np.stack(eyes))
 
 
-def _released(hose: HoseParameters, release_m: Array, sequences: int) -> HoseState:
-    """A hose that hangs at rest in an arc from the pod to a place, with all links of their length."""
+def _released_hose(hose: HoseParameters, release_m: Array, sequences: int) -> HoseState:
+    """A hose at rest in an arc from the pod to a point, its links at their lengths."""
     chord_m = float(np.linalg.norm(release_m))
     ratio = chord_m / hose.length_m
     if ratio >= 1 or chord_m == 0:
         raise ValueError(
-            f"release_m: a hose of {hose.length_m:g} m cannot hang between the pod and a place {chord_m:g} m away"
+            f"release_m: a hose of {hose.length_m:g} m cannot hang between the pod and a point {chord_m:g} m away"
         )
-    # A polygon of N equal chords of an arc, each turned by `turn` from the one before: sin(N turn/2) / (N sin(turn/2)).
+    # Chord over length of N equal links on an arc, each turned by `turn` from the one before:
+    # sin(N turn/2) / (N sin(turn/2)).
     turn = brentq(
         lambda angle: np.sin(LINKS * angle / 2) / (LINKS * np.sin(angle / 2)) - ratio, 1e-9, 2 * np.pi / LINKS
     )
@@ -138,10 +140,10 @@ def _released(hose: HoseParameters, release_m: Array, sequences: int) -> HoseSta
 
 
 class Trajectory:
-    """One simulated sequence as functions of time, which starts at 0 when the settling is over."""
+    """One simulated sequence as functions of time; time 0 is the end of settling."""
 
-    def __init__(self, motion: Motion, settling_s: float) -> None:
-        """Put splines through the samples of the first sequence of a simulation."""
+    def __init__(self, motion: SimulatedMotion, settling_s: float) -> None:
+        """Fit splines to the samples of the first sequence of a simulation."""
         times = GUST_PERIOD_S * np.arange(len(motion.nodes_m)) - settling_s
         nodes = motion.nodes_m[:, :, 0]
         mouth = mouth_directions(motion.past_drogue_m_s[..., 0], nodes[..., -1] - nodes[..., -2], GUST_PERIOD_S)
@@ -159,5 +161,5 @@ class Trajectory:
         return np.asarray(self._mouth(time_s), dtype=np.float64)
 
     def eye_m(self, time_s: float) -> Array:
-        """(3,) receiver's left eye, without its vibration. [m]"""
+        """(3,) position of the receiver's left eye, without vibration. [m]"""
         return np.asarray(self._eye(time_s), dtype=np.float64)

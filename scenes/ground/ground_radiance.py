@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import Environment, GroundKind
 from drogue_models.parameters import ReflectanceRgb
-from scenes.clouds.ray_march import enlarge
+from scenes.clouds.ray_march import upsample
 from scenes.ground.coast import Coast
 from scenes.ground.land_tiles import LandKind, land_tile
-from scenes.ground.sea import GroundLight, Sea, put_ships, sample_ships
+from scenes.ground.sea import GroundLight, Sea, draw_ships, sample_ships
 from scenes.ground_view import Field, GroundView, MipTile, ground_view, pixel_angle_rad, power_noise, smooth_noise
 from scenes.sky.light import Radiance
 
@@ -136,10 +136,10 @@ class Ground:
                 view = self._view(directions[chosen], step * angle_rad)
                 seen = self._block(view, regions[chosen], shapes[chosen])
                 height, width = total[block].shape[:2]
-                total[block] = seen if step == 1 else enlarge(seen, step, (height, width))
+                total[block] = seen if step == 1 else upsample(seen, step, (height, width))
         return total
 
-    def seen_from(self, environment: Environment) -> Ground:
+    def moved_to(self, environment: Environment) -> Ground:
         """The same ground from another place at the same altitude.
 
         Args:
@@ -177,7 +177,7 @@ class Ground:
             water = self._sea.radiance(
                 view, np.array(self._environment.ground_reflectance_rgb, dtype=np.float32), gusts
             )
-            put_ships(water, view, self._ships, self._light)
+            draw_ships(water, view, self._ships, self._light)
             return water
         offshore_m = None
         if self._coast is not None:

@@ -281,7 +281,7 @@ def sample_ships(rng: np.random.Generator, altitude_m: float) -> tuple[Ship, ...
     return tuple(ships)
 
 
-def put_ships(water: Radiance, view: GroundView, ships: tuple[Ship, ...], light: GroundLight) -> None:
+def draw_ships(water: Radiance, view: GroundView, ships: tuple[Ship, ...], light: GroundLight) -> None:
     """Draw ships and their wakes into the radiance of the sea, in place."""
     level = (light.level_lux / np.pi).astype(np.float32)
     for ship in ships:

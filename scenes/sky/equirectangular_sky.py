@@ -23,7 +23,7 @@ _CONTRAST, _SHARE = 12.0, 0.08
 
 
 @dataclass(frozen=True, eq=False)
-class MappedLight:
+class EnvironmentMapLight:
     """Light from all directions.
 
     Attributes:
@@ -52,12 +52,12 @@ class MappedLight:
         places = (column + 1.0).astype(np.float32), row.astype(np.float32)
         return np.asarray(cv2.remap(wide, *places, cv2.INTER_LINEAR), dtype=np.float32).reshape(directions.shape)
 
-    def shrunk(self, height_px: int) -> MappedLight:
+    def shrunk(self, height_px: int) -> EnvironmentMapLight:
         """The same with a smaller picture, averaged over its texels; itself when the picture is no larger."""
         if self.picture.shape[0] <= height_px:
             return self
         small = cv2.resize(self.picture, (2 * height_px, height_px), interpolation=cv2.INTER_AREA)
-        return MappedLight(small, self.rotation_rad, self.sun_direction, self.sun_lux)
+        return EnvironmentMapLight(small, self.rotation_rad, self.sun_direction, self.sun_lux)
 
 
 @lru_cache(maxsize=4)
@@ -78,7 +78,7 @@ def _read_cached(sha256: str, suffix: str, file: Path, environment_map: Environm
     return np.maximum(picture, 0.0)
 
 
-def load_map(environment_map: EnvironmentMap) -> MappedLight:
+def load_map(environment_map: EnvironmentMap) -> EnvironmentMapLight:
     """The light of a map.
 
     Raises:
@@ -88,7 +88,7 @@ def load_map(environment_map: EnvironmentMap) -> MappedLight:
 
 
 @lru_cache(maxsize=4)
-def _load_cached(environment_map: EnvironmentMap, folder: Path) -> MappedLight:
+def _load_cached(environment_map: EnvironmentMap, folder: Path) -> EnvironmentMapLight:
     file = folder / environment_map.path
     still = environment_map.model_copy(update={"rotation_deg": 0.0})
     picture = _read_cached(environment_map.sha256, file.suffix.lower(), file, still)
@@ -104,7 +104,7 @@ def _load_cached(environment_map: EnvironmentMap, folder: Path) -> MappedLight:
     without, direction, sun_lux = _take_out_sun(picture)
     turned = np.array([[np.cos(rotation_rad), -np.sin(rotation_rad)], [np.sin(rotation_rad), np.cos(rotation_rad)]])
     direction[:2] = turned @ direction[:2]
-    return MappedLight(without, rotation_rad, direction, sun_lux)
+    return EnvironmentMapLight(without, rotation_rad, direction, sun_lux)
 
 
 def _decode_hdr(data: bytes) -> Radiance:

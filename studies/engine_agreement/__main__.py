@@ -13,7 +13,7 @@ import cv2
 import typer
 
 from droguekit.batch.progress import PlainProgress
-from studies.engine_agreement.agreement import Bar, centroid_offset, frame_bars, navigation_bars, plate_bars
+from studies.engine_agreement.agreement import Requirement, centroid_offset, frame_bars, navigation_bars, plate_bars
 from studies.engine_agreement.agreement_report import (
     bar_lines,
     cost_line,
@@ -25,7 +25,7 @@ from studies.engine_agreement.agreement_report import (
     plate_line,
     write_json,
 )
-from studies.engine_agreement.comparison_run import Engines, Work
+from studies.engine_agreement.comparison_run import ComparisonRun, Engines
 from studies.engine_agreement.measures import agreement_of
 from studies.engine_agreement.navigation_agreement import (
     METHOD,
@@ -47,7 +47,7 @@ _EXAMPLES = """Examples:
   python -m studies.engine_agreement --part frames --family world-89/dusk --station 5 --count 1"""
 
 
-class Part(StrEnum):
+class ComparisonPart(StrEnum):
     """What is compared."""
 
     FRAMES = "frames"
@@ -60,7 +60,9 @@ def main(
     out: Annotated[
         Path, typer.Option("--out", help="Folder for numbers and pictures; what is found there stands.")
     ] = Path("out/engine-agreement"),
-    part: Annotated[list[Part] | None, typer.Option("--part", help="What to compare; repeatable, or all.")] = None,
+    part: Annotated[
+        list[ComparisonPart] | None, typer.Option("--part", help="What to compare; repeatable, or all.")
+    ] = None,
     engine: Annotated[tuple[str, str], typer.Option("--engines", help="Which two.")] = ("mitsuba", "blender"),
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")] = 20,
     count: Annotated[int | None, typer.Option("--count", min=1, help="Frames, or one of each family.")] = None,
@@ -79,12 +81,12 @@ def main(
     Exits with 1 when a bar is missed. A run that was stopped goes on where it was.
     """
     cv2.setNumThreads(1)
-    chosen = part or [*Part]
-    work = Work(out, Engines(engine), seed, typer.echo)
+    chosen = part or [*ComparisonPart]
+    work = ComparisonRun(out, Engines(engine), seed, typer.echo)
     tables: dict[str, Any] = {}
-    bars: list[Bar] = []
+    bars: list[Requirement] = []
     try:
-        if Part.FRAMES in chosen:
+        if ComparisonPart.FRAMES in chosen:
             families = family or [*FAMILIES, str(write_own_sky(out / "own-sky"))]
             frames = paired_frames(families, station or STATIONS_M, count or len(families), samples, seed)
             typer.echo(frame_head())
@@ -96,13 +98,13 @@ def main(
                 tables["centroid_offset"] = asdict(offset)
                 typer.echo(offset_line(offset))
             bars += frame_bars(agreements, [f.distance_m for f in frames])
-        if Part.PLATES in chosen:
+        if ComparisonPart.PLATES in chosen:
             plates = work.plates(plate_samples, plate_line)
             tables["plates"] = [vars(plate) for plate in plates]
             bars += plate_bars(plates)
-        if Part.COST in chosen:
+        if ComparisonPart.COST in chosen:
             tables["costs"] = [cost.row() for cost in work.costs(cost_line)]
-        if Part.NAVIGATION in chosen:
+        if ComparisonPart.NAVIGATION in chosen:
             bars += _navigation(out / "navigation", engine, seed, pairs, tables)
         write_json(out, tables, bars)
     except (ValueError, OSError) as error:
@@ -116,7 +118,9 @@ def _figures(row: dict[str, Any]) -> dict[str, Any]:
     return frame_figures(row, agreement_of(row["agreement"]))
 
 
-def _navigation(out: Path, engines: tuple[str, str], seed: int, pairs: int, tables: dict[str, Any]) -> Sequence[Bar]:
+def _navigation(
+    out: Path, engines: tuple[str, str], seed: int, pairs: int, tables: dict[str, Any]
+) -> Sequence[Requirement]:
     """Render and navigate at every distance; fills in the table."""
     stations = []
     for station_m, count in pairs_by_station(NAVIGATION_STATIONS_M, pairs).items():

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.engine import RenderEngine
-from studies.engine_agreement.measures import FrameAgreement, PlateLight, compare
+from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, compare
 from studies.engine_agreement.navigation_agreement import PairedErrors, mean_differences, size_ratios
-from studies.engine_agreement.paired_frames import PairedFrame, Rendered, render_both
+from studies.engine_agreement.paired_frames import PairedFrame, RenderedFrame, render_both
 
 # The bars of the agreement: see docs/explanation/blender.md.
 MOST_CENTROID_RMS_PX = 0.02
@@ -28,8 +28,8 @@ class ComparedFrame:
     """One frame by both engines: pictures and cost of either, and what differs."""
 
     paired: PairedFrame
-    one: Rendered
-    other: Rendered
+    one: RenderedFrame
+    other: RenderedFrame
     agreement: FrameAgreement
 
 
@@ -40,7 +40,7 @@ def compare_frame(paired: PairedFrame, one: RenderEngine, other: RenderEngine) -
 
 
 @dataclass(frozen=True)
-class Bar:
+class Requirement:
     """A figure, and the most or least that it may be."""
 
     name: str
@@ -54,7 +54,7 @@ class Bar:
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
-def frame_bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -> list[Bar]:
+def frame_bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -> list[Requirement]:
     """What the engines are held to, over all frames.
 
     Args:
@@ -64,19 +64,19 @@ def frame_bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -
     centroids = np.concatenate([frame.centroids_px for frame in frames])
     label, one, other = np.moveaxis(centroids, 1, 0)
     result = [
-        Bar("centroids between the engines, rms [px]", _rms(one - other), MOST_CENTROID_RMS_PX),
-        Bar("centroids, first engine and labels, rms [px]", _rms(one - label), MOST_CENTROID_RMS_PX),
-        Bar("centroids, second engine and labels, rms [px]", _rms(other - label), MOST_CENTROID_RMS_PX),
+        Requirement("centroids between the engines, rms [px]", _rms(one - other), MOST_CENTROID_RMS_PX),
+        Requirement("centroids, first engine and labels, rms [px]", _rms(one - label), MOST_CENTROID_RMS_PX),
+        Requirement("centroids, second engine and labels, rms [px]", _rms(other - label), MOST_CENTROID_RMS_PX),
     ]
     near = [frame.drogue_iou for frame, d in zip(frames, distances_m, strict=True) if d <= IOU_FROM_M]
     if near:
-        result.append(Bar("drogue masks up to 5 m, least overlap", min(near), LEAST_DROGUE_IOU, at_least=True))
+        result.append(Requirement("drogue masks up to 5 m, least overlap", min(near), LEAST_DROGUE_IOU, at_least=True))
     ribs = max(frame.rib_distance_px for frame in frames)
-    result.append(Bar("ribs, farthest boundary [px]", ribs, MOST_RIB_DISTANCE_PX))
+    result.append(Requirement("ribs, farthest boundary [px]", ribs, MOST_RIB_DISTANCE_PX))
     ratios = part_ratios(frames)
     for part in PARTS_WITH_A_BAR:
         if part in ratios:
-            result.append(Bar(f"{part}, difference of mean luminance", abs(ratios[part] - 1), MOST_PART_ERROR))
+            result.append(Requirement(f"{part}, difference of mean luminance", abs(ratios[part] - 1), MOST_PART_ERROR))
     return result
 
 
@@ -101,21 +101,21 @@ def centroid_offset(frames: Sequence[FrameAgreement]) -> CentroidOffset | None:
     )
 
 
-def plate_bars(plates: Sequence[PlateLight]) -> list[Bar]:
+def plate_bars(plates: Sequence[PlateIlluminance]) -> list[Requirement]:
     """What the engines are held to by light on white plates."""
     # numpy's maximum keeps what is not a number, so that a plate without light misses the bar.
     worst = float(np.max([abs(plate.ratio - 1) for plate in plates]))
-    return [Bar("white plates, largest difference", worst, MOST_PLATE_ERROR)]
+    return [Requirement("white plates, largest difference", worst, MOST_PLATE_ERROR)]
 
 
-def navigation_bars(stations: Sequence[PairedErrors]) -> list[Bar]:
+def navigation_bars(stations: Sequence[PairedErrors]) -> list[Requirement]:
     """Whether navigation errs alike: equal sizes and equal means lie within the intervals of what was measured."""
     sizes = [
-        Bar(f"{row.of} errors, equal sizes outside their interval by", row.outside, 0.0)
+        Requirement(f"{row.of} errors, equal sizes outside their interval by", row.outside, 0.0)
         for row in size_ratios(stations)
     ]
     means = [
-        Bar(f"{row.of} error, mean difference [own rms]", abs(row.mean), row.reach)
+        Requirement(f"{row.of} error, mean difference [own rms]", abs(row.mean), row.reach)
         for row in mean_differences(stations)
     ]
     return sizes + means

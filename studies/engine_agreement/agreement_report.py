@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.atomic import write_text_atomic
-from studies.engine_agreement.agreement import Bar, CentroidOffset, ComparedFrame, part_ratios
-from studies.engine_agreement.costs import CostAt
-from studies.engine_agreement.measures import FrameAgreement, PlateLight, luminance
+from studies.engine_agreement.agreement import CentroidOffset, ComparedFrame, Requirement, part_ratios
+from studies.engine_agreement.costs import CostComparison
+from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, luminance
 from studies.engine_agreement.navigation_agreement import PairedErrors, mean_differences, size_ratios, station_rows
 
 # A difference of a fortieth of the picture's white fills the scale from middle grey to black or white.
@@ -64,7 +64,7 @@ def frame_line(figures: dict[str, Any]) -> str:
     ).format(**figures) + " ".join(f"{name} {ratio:.3f}" for name, ratio in figures["part_ratios"].items())
 
 
-def bar_lines(bars: Sequence[Bar]) -> list[str]:
+def bar_lines(bars: Sequence[Requirement]) -> list[str]:
     """One line a bar."""
     return [
         f"{'reached' if bar.reached else 'MISSED ':<8} {bar.name}: {bar.value:.5f} "
@@ -82,7 +82,7 @@ def offset_line(offset: CentroidOffset) -> str:
     )
 
 
-def plate_line(plate: PlateLight) -> str:
+def plate_line(plate: PlateIlluminance) -> str:
     """One line for a plate."""
     return (
         f"plate pitch {plate.pitch_deg:+.0f} yaw {plate.yaw_deg:+.0f} deg: {plate.one_lux:.0f} lx and "
@@ -90,7 +90,7 @@ def plate_line(plate: PlateLight) -> str:
     )
 
 
-def cost_line(cost: CostAt) -> str:
+def cost_line(cost: CostComparison) -> str:
     """One line for the costs at a distance."""
     one, other = (
         f"{side.cpu_s:.2f} s at {side.samples} samples and noise {side.noise:.4f}" for side in (cost.one, cost.other)
@@ -113,7 +113,7 @@ def navigation_lines(stations: Sequence[PairedErrors]) -> list[str]:
     return [*lines, f"mean differences in own rms: {', '.join(means)}"]
 
 
-def write_json(out: Path, tables: dict[str, Any], bars: Sequence[Bar]) -> None:
+def write_json(out: Path, tables: dict[str, Any], bars: Sequence[Requirement]) -> None:
     """All figures as `agreement.json`.
 
     Raises:

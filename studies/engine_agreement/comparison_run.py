@@ -15,14 +15,14 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from render.engine import RenderEngine, load_engine
 from studies.engine_agreement.agreement import compare_frame
 from studies.engine_agreement.agreement_report import frame_row, write_picture
-from studies.engine_agreement.costs import COST_FAMILY, COST_STATIONS_M, CostAt, cost_of, measure_costs
-from studies.engine_agreement.measures import TILTS_DEG, PlateLight, compare_plate, plate_frame
+from studies.engine_agreement.costs import COST_FAMILY, COST_STATIONS_M, CostComparison, cost_of, measure_costs
+from studies.engine_agreement.measures import TILTS_DEG, PlateIlluminance, compare_plate, plate_frame
 from studies.engine_agreement.paired_frames import PairedFrame, frame_at, recipe_of_family
 
 Found = dict[str, Any]
 
 
-class Findings:
+class ResultStore:
     """A folder of found things; each names what it was made from, and counts for nothing else."""
 
     def __init__(self, folder: Path) -> None:
@@ -78,7 +78,7 @@ class Engines:
 
 
 @dataclass(frozen=True)
-class Work:
+class ComparisonRun:
     """Where it happens.
 
     Attributes:
@@ -112,7 +112,7 @@ class Work:
         write_picture(self.out / "frames" / f"{index:03d}.png", compared)
         return frame_row(compared)
 
-    def plates(self, samples: int, line: Callable[[PlateLight], str]) -> list[PlateLight]:
+    def plates(self, samples: int, line: Callable[[PlateIlluminance], str]) -> list[PlateIlluminance]:
         """Light on all plates.
 
         Raises:
@@ -123,14 +123,14 @@ class Work:
             frame, settings = plate_frame(samples, tilt)
             made_from = {"frame_sha256": _sha256(frame.model_dump_json(), settings.model_dump_json())}
             row = self._found(f"plate-{number}", made_from, partial(self._plate, tilt, samples))
-            plates.append(PlateLight(**row))
+            plates.append(PlateIlluminance(**row))
             self.say(line(plates[-1]))
         return plates
 
     def _plate(self, tilt_deg: tuple[float, float], samples: int) -> Found:
         return vars(compare_plate(tilt_deg, samples, *self.engines.both))
 
-    def costs(self, line: Callable[[CostAt], str]) -> list[CostAt]:
+    def costs(self, line: Callable[[CostComparison], str]) -> list[CostComparison]:
         """Cost and noise of a pair at all distances, from far to near.
 
         Raises:
@@ -149,7 +149,7 @@ class Work:
         return measure_costs(distance_m, self.seed, *self.engines.compiled).row()
 
     def _found(self, name: str, made_from: dict[str, Any], find: Callable[[], Found]) -> Found:
-        findings = Findings(self.out / "found")
+        findings = ResultStore(self.out / "found")
         whole = made_from | {"engines": self.engines.versions}
         kept = findings.get(name, whole)
         if kept is not None:

@@ -38,7 +38,7 @@ class EngineCost:
 
 
 @dataclass(frozen=True)
-class CostAt:
+class CostComparison:
     """Both engines at one distance: the first with the samples of recipes that do not say, the other as quiet as that.
 
     Attributes:
@@ -61,12 +61,12 @@ class CostAt:
         return asdict(self) | {"is_reached": self.is_reached}
 
 
-def cost_of(row: dict[str, Any]) -> CostAt:
-    """The figures as `CostAt.row` has put them."""
-    return CostAt(row["distance_m"], EngineCost(**row["one"]), EngineCost(**row["other"]))
+def cost_of(row: dict[str, Any]) -> CostComparison:
+    """The figures as `CostComparison.row` has put them."""
+    return CostComparison(row["distance_m"], EngineCost(**row["one"]), EngineCost(**row["other"]))
 
 
-def measure_costs(distance_m: float, seed: int, one: RenderEngine, other: RenderEngine) -> CostAt:
+def measure_costs(distance_m: float, seed: int, one: RenderEngine, other: RenderEngine) -> CostComparison:
     """Render one frame by both engines, each twice with samples of its own.
 
     The engines must have rendered something before: the first picture of a process pays for compiling.
@@ -81,7 +81,7 @@ def measure_costs(distance_m: float, seed: int, one: RenderEngine, other: Render
         second = _cost(distance_m, seed, other, samples)
         if second.noise <= first.noise:
             break
-    return CostAt(distance_m, first, second)
+    return CostComparison(distance_m, first, second)
 
 
 def _cost(distance_m: float, seed: int, engine: RenderEngine, samples: int) -> EngineCost:

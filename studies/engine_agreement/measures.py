@@ -18,10 +18,10 @@ from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, Eye
 from render.engine import EyeRadiance, RenderEngine, StereoRadiance
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.clear_sky import REC709_LUMINANCE
-from studies.engine_agreement.paired_frames import LAMP_CD_M2, Rendered
+from studies.engine_agreement.paired_frames import LAMP_CD_M2, RenderedFrame
 
 _FEWEST_PIXELS = 20
 # Beyond a disc's outline: blur of a moving drogue and the edge pixels.
@@ -62,7 +62,7 @@ def agreement_of(row: dict[str, Any]) -> FrameAgreement:
     )
 
 
-def compare(frame: FrameSpec, one: Rendered, other: Rendered) -> FrameAgreement:
+def compare(frame: FrameSpec, one: RenderedFrame, other: RenderedFrame) -> FrameAgreement:
     """Measure how far two engines agree on a frame."""
     assert frame.drogue is not None
     both = [(eye_of(one.plain, eye), eye_of(other.plain, eye)) for eye in EYES]
@@ -88,7 +88,7 @@ def luminance(radiance_cd_m2: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     return result
 
 
-def _centroids(frame: FrameSpec, one: Rendered, other: Rendered, eye: Eye) -> NDArray[np.float64]:
+def _centroids(frame: FrameSpec, one: RenderedFrame, other: RenderedFrame, eye: Eye) -> NDArray[np.float64]:
     """(M, 3, 2) of the markers that both engines show whole."""
     assert frame.drogue is not None and frame.left_from_drogue is not None
     layout = marker_layout(frame.drogue)
@@ -107,7 +107,7 @@ def _centroids(frame: FrameSpec, one: Rendered, other: Rendered, eye: Eye) -> ND
     return np.array(rows, dtype=np.float64).reshape(-1, 3, 2)
 
 
-def _is_whole(rendered: Rendered, eye: Eye, marker: int) -> bool:
+def _is_whole(rendered: RenderedFrame, eye: Eye, marker: int) -> bool:
     seen = eye_of(rendered.plain, eye)
     part = FIRST_MARKER_ID + marker
     amodal = seen.amodal_px.get(part, 0)
@@ -158,7 +158,7 @@ TILTS_DEG = ((0.0, 0.0), (35.0, 0.0), (-35.0, 0.0), (0.0, 40.0))
 
 
 @dataclass(frozen=True)
-class PlateLight:
+class PlateIlluminance:
     """Illuminance of one plate by either engine, and from the surroundings without anything around. [lux]"""
 
     pitch_deg: float
@@ -173,7 +173,9 @@ class PlateLight:
         return self.one_lux / self.other_lux
 
 
-def compare_plate(tilt_deg: tuple[float, float], samples: int, one: RenderEngine, other: RenderEngine) -> PlateLight:
+def compare_plate(
+    tilt_deg: tuple[float, float], samples: int, one: RenderEngine, other: RenderEngine
+) -> PlateIlluminance:
     """Light on the drogue's face, painted white: it shines with illuminance / pi.
 
     Args:
@@ -189,8 +191,8 @@ def compare_plate(tilt_deg: tuple[float, float], samples: int, one: RenderEngine
         got.append(np.pi * float(luminance(seen.radiance_cd_m2[inside]).mean()))
     assert frame.left_from_drogue is not None
     normal = -(frame.world_from_left @ frame.left_from_drogue).rotation[:, 2]
-    integral = luminance(surroundings(frame.environment).plate_illuminance_lux(normal))
-    return PlateLight(*tilt_deg, got[0], got[1], float(integral))
+    integral = luminance(environment_radiance(frame.environment).plate_illuminance_lux(normal))
+    return PlateIlluminance(*tilt_deg, got[0], got[1], float(integral))
 
 
 def plate_frame(samples: int, tilt_deg: tuple[float, float]) -> tuple[FrameSpec, RenderSettings]:

@@ -15,7 +15,7 @@ from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import FrameCounts, Recipe, RenderSettings, load_recipe, recipe_names
 from datasets_manifest.types.frame import FrameSpec
 from render.engine import RenderEngine, StereoRadiance
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 
 STATIONS_M = (2.0, 5.0, 10.0, 3.5, 20.0, 7.0, 40.0, 14.0)
@@ -48,7 +48,7 @@ class PairedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Rendered:
+class RenderedFrame:
     """One frame by one engine: as it is, and with the markers lit; CPU time of the first of both. [s]"""
 
     plain: StereoRadiance
@@ -123,11 +123,11 @@ def _settings(recipe: Recipe, distance_m: float, most_samples: int) -> RenderSet
     )
 
 
-def render_both(paired: PairedFrame, engine: RenderEngine) -> Rendered:
+def render_both(paired: PairedFrame, engine: RenderEngine) -> RenderedFrame:
     """The frame as it is and with lit markers, from the same samples: their difference is the lamps' light alone."""
     plain = engine.render(paired.frame, paired.settings)
     lit = engine.render(lamps_lit(paired.frame, LAMP_CD_M2), paired.settings)
-    return Rendered(plain, lit, sum(plain.stage_s.values()))
+    return RenderedFrame(plain, lit, sum(plain.stage_s.values()))
 
 
 def lamps_lit(frame: FrameSpec, luminance_cd_m2: float) -> FrameSpec:
@@ -179,7 +179,7 @@ def write_own_sky(folder: Path) -> Path:
 
 def _picture() -> NDArray[np.float32]:
     """(3, H, 2H) radiance: top row the zenith, the middle column looks east, right of it is south. [cd/m2]"""
-    around = surroundings(sample_frame(recipe_of_family(_DRAWN_FROM, _SEED), 0).environment)
+    around = environment_radiance(sample_frame(recipe_of_family(_DRAWN_FROM, _SEED), 0).environment)
     polar = (np.arange(_HEIGHT_PX) + 0.5) * np.pi / _HEIGHT_PX
     azimuth = np.pi - (np.arange(2 * _HEIGHT_PX) + 0.5) * np.pi / _HEIGHT_PX
     across, up = np.sin(polar)[:, None], np.broadcast_to(np.cos(polar)[:, None], (_HEIGHT_PX, 2 * _HEIGHT_PX))

@@ -19,16 +19,24 @@ from droguekit.batch.worker_pool import run_alone
 from render.camera.sensor import expose
 from render.compositing import inside_one_part
 from render.engine import load_engine
-from render.mitsuba_engine.trace_request import OF_DROGUE
+from render.mitsuba_engine.trace_request import DROGUE_PARTS
 from scenes.sky.clear_sky import REC709_LUMINANCE
 from studies.render_cost.cycles_messages import cpu_seconds
-from studies.render_cost.noise_search import Cost, NoiseAt, View, frame_at, recipe_at, relative_noise, reseeded
+from studies.render_cost.noise_search import (
+    MeasuredView,
+    NoiseEstimate,
+    RenderCost,
+    frame_at,
+    recipe_at,
+    relative_noise,
+    reseeded,
+)
 from studies.render_cost.plain_renderers import measure_plain_cycles, measure_plain_mitsuba
 
 _PICTURES_FOR_NOISE = 4
 
 
-def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseAt, Cost, View]:
+def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEstimate, RenderCost, MeasuredView]:
     """Cost and noise of our path with the settings that a recipe has by default.
 
     Args:
@@ -57,7 +65,7 @@ def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseAt
         seen: NDArray[np.float64] = engine.render(drawn, settings).left.radiance_cd_m2 @ REC709_LUMINANCE
         return seen
 
-    drogue = OF_DROGUE[radiance.left.part_id] > 0
+    drogue = DROGUE_PARTS[radiance.left.part_id] > 0
     inside = drogue & inside_one_part(radiance.left.part_id)
     seen = [luminance(reseeded(frame, by)) for by in range(_PICTURES_FOR_NOISE)]
     pairs = list(zip(seen[::2], seen[1::2], strict=True))
@@ -66,8 +74,8 @@ def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseAt
         for mask in (drogue, inside)
     )
     mean = float(np.mean(seen, axis=0)[drogue].mean())
-    found = NoiseAt(settings.samples_per_px, noise, noise_inside, mean)
-    return found, Cost(spent_s / repeat), View(frame, settings, drogue, inside)
+    found = NoiseEstimate(settings.samples_per_px, noise, noise_inside, mean)
+    return found, RenderCost(spent_s / repeat), MeasuredView(frame, settings, drogue, inside)
 
 
 OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
@@ -99,7 +107,7 @@ def compare_at(
     return {"schema": 1, "distance_m": distance_m, "seed": seed, "full_samples": full_samples, "renderers": rows}
 
 
-def _row(noise: NoiseAt, cost: Cost) -> dict[str, Any]:
+def _row(noise: NoiseEstimate, cost: RenderCost) -> dict[str, Any]:
     return asdict(noise) | asdict(cost)
 
 

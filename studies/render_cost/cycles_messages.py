@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from render.blender_engine.messages import CameraPath, FrameSetup, Window
+from render.blender_engine.messages import CameraPath, FrameSetup, ImageWindow
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class DenoisedPicture:
         file: where it is written, without `.exr`.
     """
 
-    window: Window
+    window: ImageWindow
     path: CameraPath
     samples: int
     bounces: int
@@ -30,7 +30,7 @@ class DenoisedPicture:
 
 
 @dataclass(frozen=True, eq=False)
-class CyclesOrder:
+class CyclesRequest:
     """A scene, and the pictures to take of it one after the other."""
 
     setup: FrameSetup

@@ -16,7 +16,7 @@ import bpy
 
 from render.blender_engine.blender_scene import BlenderScene, set_threads
 from render.blender_engine.messages import LIGHT
-from studies.render_cost.cycles_messages import CyclesOrder, DenoisedPicture, cpu_seconds
+from studies.render_cost.cycles_messages import CyclesRequest, DenoisedPicture, cpu_seconds
 
 _SENSOR_WIDTH_MM = 36.0
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5
@@ -27,7 +27,7 @@ def main() -> None:
     answers = os.fdopen(os.dup(1), "w")
     # Blender talks on standard output; what it says goes where errors go.
     os.dup2(2, 1)
-    order: CyclesOrder = pickle.load(sys.stdin.buffer)
+    order: CyclesRequest = pickle.load(sys.stdin.buffer)
     blender = BlenderScene()
     blender.set_frame(order.setup)
     scene = blender.scenes[LIGHT]

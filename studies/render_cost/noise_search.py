@@ -19,7 +19,7 @@ _MOST_ATTEMPTS = 5
 
 
 @dataclass(frozen=True)
-class NoiseAt:
+class NoiseEstimate:
     """What a renderer's pictures are like with so many samples.
 
     Attributes:
@@ -36,14 +36,14 @@ class NoiseAt:
     mean_cd_m2: float
     is_carried_on: bool = False
 
-    def with_samples(self, samples: int) -> NoiseAt:
+    def with_samples(self, samples: int) -> NoiseEstimate:
         """What so many samples would give: errors fall with their square root."""
         down = float(np.sqrt(samples / self.samples))
-        return NoiseAt(samples, self.noise / down, self.noise_inside / down, self.mean_cd_m2, True)
+        return NoiseEstimate(samples, self.noise / down, self.noise_inside / down, self.mean_cd_m2, True)
 
 
 @dataclass(frozen=True)
-class Cost:
+class RenderCost:
     """Time of a whole pair.
 
     Attributes:
@@ -67,21 +67,21 @@ def noise_of(
     samples: int,
     pictures: tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]],
     masks: tuple[NDArray[np.bool_], NDArray[np.bool_]],
-) -> NoiseAt:
+) -> NoiseEstimate:
     """Noise from two pictures with different seeds, on the drogue's pixels and inside its parts."""
     one, other = pictures
     drogue, inside = masks
     mean = float((one[drogue].mean(dtype=np.float64) + other[drogue].mean(dtype=np.float64)) / 2)
-    return NoiseAt(samples, relative_noise(one, other, drogue), relative_noise(one, other, inside), mean)
+    return NoiseEstimate(samples, relative_noise(one, other, drogue), relative_noise(one, other, inside), mean)
 
 
-def samples_for(measured: NoiseAt, noise: float) -> int:
+def samples_for(measured: NoiseEstimate, noise: float) -> int:
     """Samples with which the noise would be reached if it falls with their square root."""
     # Rounding of the square must not ask for one more.
     return max(1, int(np.ceil(measured.samples * (measured.noise / noise) ** 2 - 1e-6)))
 
 
-def reach_noise(measure: Callable[[int], NoiseAt], noise: float, pilot: int, most_samples: int) -> NoiseAt:
+def reach_noise(measure: Callable[[int], NoiseEstimate], noise: float, pilot: int, most_samples: int) -> NoiseEstimate:
     """Samples that give a noise, found by the square-root law and verified.
 
     Args:
@@ -93,7 +93,7 @@ def reach_noise(measure: Callable[[int], NoiseAt], noise: float, pilot: int, mos
     Returns:
         The attempt whose noise comes nearest, by ratio. Less noise than asked for with a single sample stands.
     """
-    tried: dict[int, NoiseAt] = {}
+    tried: dict[int, NoiseEstimate] = {}
     samples = pilot
     while len(tried) < _MOST_ATTEMPTS and samples not in tried:
         tried[samples] = measure(samples)
@@ -113,7 +113,7 @@ SCENES = 8
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class MeasuredView:
     """What every renderer draws.
 
     Attributes:

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from geometry.se3 import exp_twist
 from geometry.stereo import EYES, Eye
 from render.blender_engine.camera_path import EyePath
-from render.blender_engine.messages import FrameSetup, Window
+from render.blender_engine.messages import FrameSetup, ImageWindow
 from render.blender_engine.process import bpy_version, read_light
 from render.blender_engine.stage import Stage
 from render.engine import load_engine
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sky.clear_sky import REC709_LUMINANCE
-from studies.render_cost.cycles_messages import CyclesOrder, DenoisedPicture, cpu_seconds
-from studies.render_cost.noise_search import Cost, NoiseAt, View, noise_of, reach_noise
+from studies.render_cost.cycles_messages import CyclesRequest, DenoisedPicture, cpu_seconds
+from studies.render_cost.noise_search import MeasuredView, NoiseEstimate, RenderCost, noise_of, reach_noise
 
 STEP = 8
 """Samples of one launch: more are launched again, which bounds memory and is the same to independent samples."""
@@ -41,7 +41,7 @@ _MOST_PATHS_MITSUBA = 100_000_000
 _Crop = tuple[int, int, int, int]
 
 
-def measure_plain_mitsuba(view: View, noise: float) -> tuple[NoiseAt, Cost]:
+def measure_plain_mitsuba(view: MeasuredView, noise: float) -> tuple[NoiseEstimate, RenderCost]:
     """Samples and cost of a pair with a given noise; loading the scene and compiling kernels do not count.
 
     Noise is measured around the drogue, and the cost with one launch over every pixel of both eyes.
@@ -56,7 +56,7 @@ def measure_plain_mitsuba(view: View, noise: float) -> tuple[NoiseAt, Cost]:
 
     from render.mitsuba_engine.scene import SceneCache
 
-    scene = SceneCache().scene_of(view.frame, surroundings(view.frame.environment)).scene
+    scene = SceneCache().scene_of(view.frame, environment_radiance(view.frame.environment)).scene
     # Nothing is ended by lot, as everywhere in this comparison.
     depth = view.settings.max_depth
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": depth + 1})
@@ -68,7 +68,7 @@ def measure_plain_mitsuba(view: View, noise: float) -> tuple[NoiseAt, Cost]:
 
     around = mi.load_dict(_sensor(view, "left", view.crop))
 
-    def noise_at(samples: int) -> NoiseAt:
+    def noise_at(samples: int) -> NoiseEstimate:
         launches = -(-samples // STEP)
         one, other = (
             np.mean([launched(around, first * launches + each) for each in range(launches)], axis=0) for first in (0, 1)
@@ -82,10 +82,10 @@ def measure_plain_mitsuba(view: View, noise: float) -> tuple[NoiseAt, Cost]:
     began_s = cpu_seconds()
     for sensor in whole:
         launched(sensor, 1)
-    return found, Cost((cpu_seconds() - began_s) * -(-found.samples // STEP))
+    return found, RenderCost((cpu_seconds() - began_s) * -(-found.samples // STEP))
 
 
-def _sensor(view: View, eye: Eye, crop: _Crop | None = None) -> dict[str, Any]:
+def _sensor(view: MeasuredView, eye: Eye, crop: _Crop | None = None) -> dict[str, Any]:
     import mitsuba as mi
 
     camera = view.frame.rig.camera
@@ -121,7 +121,9 @@ _PILOT_SAMPLES = 4
 _MOST_PATHS_CYCLES = 20_000_000
 
 
-def measure_plain_cycles(view: View, noise: float, full_samples: int | None) -> tuple[NoiseAt, Cost]:
+def measure_plain_cycles(
+    view: MeasuredView, noise: float, full_samples: int | None
+) -> tuple[NoiseEstimate, RenderCost]:
     """Samples and cost of a denoised pair with a given noise; starting Blender and loading the scene do not count.
 
     Noise is measured around the drogue, and the cost over every pixel of both eyes.
@@ -136,10 +138,10 @@ def measure_plain_cycles(view: View, noise: float, full_samples: int | None) -> 
         OSError: its process failed; says what it said last.
     """
     bpy_version()
-    setup = Stage().set_frame(view.frame, surroundings(view.frame.environment))
+    setup = Stage().set_frame(view.frame, environment_radiance(view.frame.environment))
     around = view.crop
 
-    def noise_at(samples: int) -> NoiseAt:
+    def noise_at(samples: int) -> NoiseEstimate:
         orders = [_Wanted("left", around, samples, seed) for seed in (1, 2)]
         (_, one), (_, other) = _taken(view, setup, orders)
         return noise_of(samples, (one, other), view.masks)
@@ -151,7 +153,7 @@ def measure_plain_cycles(view: View, noise: float, full_samples: int | None) -> 
     # The first one loads the scene.
     orders = [_Wanted("left", around, 1, 1), *(_Wanted(eye, whole, samples, 1) for eye in EYES)]
     spent_s = [cpu_s for cpu_s, _ in _taken(view, setup, orders)]
-    return found, Cost(sum(spent_s[1:]), samples < found.samples)
+    return found, RenderCost(sum(spent_s[1:]), samples < found.samples)
 
 
 @dataclass(frozen=True)
@@ -162,24 +164,24 @@ class _Wanted:
     seed: int
 
 
-def _taken(view: View, setup: FrameSetup, orders: list[_Wanted]) -> list[tuple[float, NDArray[np.float32]]]:
+def _taken(view: MeasuredView, setup: FrameSetup, orders: list[_Wanted]) -> list[tuple[float, NDArray[np.float32]]]:
     """CPU time and luminance of each picture. [s, unit of the light]"""
     camera = view.frame.rig.camera
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         files = [Path(folder) / str(index) for index in range(len(orders))]
         pictures = []
         for order, file in zip(orders, files, strict=True):
-            window = Window(*order.crop, camera.fx_px, (camera.cx_px, camera.cy_px))
+            window = ImageWindow(*order.crop, camera.fx_px, (camera.cx_px, camera.cy_px))
             path = EyePath(view.frame, order.eye, np.zeros((0, 3), dtype=np.float32)).still
             bounces = view.settings.max_depth - 2
             pictures.append(DenoisedPicture(window, path, order.samples, bounces, order.seed, str(file)))
-        spent_s = _run(CyclesOrder(setup, tuple(pictures)), Path(folder))
+        spent_s = _run(CyclesRequest(setup, tuple(pictures)), Path(folder))
         unit = np.float32(setup.light.unit_cd_m2)
         seen = [read_light(file.with_suffix(".exr"))[..., :3] @ REC709_LUMINANCE * unit for file in files]
     return list(zip(spent_s, seen, strict=True))
 
 
-def _run(order: CyclesOrder, folder: Path) -> list[float]:
+def _run(order: CyclesRequest, folder: Path) -> list[float]:
     """CPU time of each picture. [s]"""
     ended = subprocess.run(
         # -P: a file that lies where the user works must not stand in for a module of Blender's.

@@ -15,7 +15,7 @@ from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from droguekit.benchmark.report.pose_report import write_report
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import RigidTransform
-from scenes.sampler import sample_reading_m
+from scenes.sampler import sample_rangefinder_m
 
 
 def read(record: PairRecord, reading_m: float) -> PairRecord:
@@ -60,7 +60,7 @@ def test_a_perfect_method_has_the_errors_of_the_shipped_rangefinder(
     """What the paper's bench would say of a method that does not err."""
     rangefinder = load_recipe("semi-physical-7").recipe.rangefinder
     records = [
-        read(record, sample_reading_m(rangefinder, 3, record.frame_index, record.left_from_drogue.translation_m[2]))
+        read(record, sample_rangefinder_m(rangefinder, 3, record.frame_index, record.left_from_drogue.translation_m[2]))
         for record in build.records([5.0], 100, rng)
     ]
     found = scored(records, [deeper(build, record, 0.0) for record in records]).methods["shifted"].overall.rangefinder

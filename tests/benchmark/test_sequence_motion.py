@@ -27,7 +27,7 @@ from droguekit.benchmark.sequences.sequence_truth import (
     true_state,
 )
 from geometry.se3 import RigidTransform
-from scenes.flight.sequence import moment_of_sequence
+from scenes.flight.sequence import sequence_kinematics
 
 PERIOD_S = 1 / 25
 MARGIN = 4
@@ -125,7 +125,7 @@ def test_the_motion_is_that_of_the_simulation_without_its_vibration() -> None:
 
 
 def moment_of(recipe: Recipe, place: int) -> TrueState:
-    one = moment_of_sequence(recipe, recipe.sequence, recipe.drogue, place)
+    one = sequence_kinematics(recipe, recipe.sequence, recipe.drogue, place)
     pose, drogue, camera = one.left_from_drogue, one.drogue_twist_per_s, one.left_twist_per_s
     velocity = pose.rotate(drogue[:3]) - camera[:3] - np.cross(camera[3:], pose.translation_m)
     return TrueState(place, 0, one.time_s, recipe.rig, recipe.drogue, pose, velocity, {})

@@ -25,7 +25,7 @@ from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.types.estimates import read_estimates
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from tests.support.damage_strategies import HOSTILE, byte_edits, fuzz, json_edits, quietly
 from tests.support.whole_dataset import RECIPE
@@ -76,7 +76,7 @@ def test_damaged_environment_maps(edit, other, suffix):
             OpenEXR.File({}, {name: picture[..., 0].copy() for name in "RGB"}).write(str(path))
         path.write_bytes(edit(other(path.read_bytes())))
         text = RECIPE.replace("[environment.clouds]", f'[environment]\nmap = "{path.name}"\n[environment.clouds]')
-        quietly(lambda: surroundings(sample_frame(parse_recipe(text, Path(place)), 0).environment))
+        quietly(lambda: environment_radiance(sample_frame(parse_recipe(text, Path(place)), 0).environment))
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from labelgen.validation.label_checks import check_against_passes
 from render.analytic_engine.pixel_coverage import pixel_coverage
 from render.camera.sensor import expose
 from render.engine import load_engine
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.clear_sky import REC709_LUMINANCE
 
@@ -175,7 +175,7 @@ def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic, make_recipe
     recipe = make_recipe(stations_m=(2.5,))
     frame = sample_frame(recipe, 0)
     seen = analytic.render(frame, recipe.render).left
-    around = surroundings(frame.environment)
+    around = environment_radiance(frame.environment)
     plate = around.plate_illuminance_lux(-(frame.world_from_left @ frame.left_from_drogue).rotation[:, 2])
     drogue, layout = frame.drogue, marker_layout(frame.drogue)
     features = [(int(Part.HUB), drogue.hub.reflectance_rgb, layout.hub_center_m)]

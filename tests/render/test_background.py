@@ -5,7 +5,7 @@ import numpy as np
 from datasets_manifest.types.environment import CloudLayer
 from geometry.se3 import RigidTransform
 from render.background import add_stars, background
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.light import luminance
 from scenes.sky.night import star_catalogue
@@ -22,7 +22,7 @@ def test_background_is_the_surroundings_by_pixel(make_recipe):
     """The coarse grid of the clear sky against the sky evaluated at every pixel."""
     frame = sample_frame(make_recipe(scale=0.5), 0)
     image = background(frame)
-    around = surroundings(frame.environment)
+    around = environment_radiance(frame.environment)
     expected = around.radiance(exact_rays(frame))
     # Linear interpolation over 8 px (0.4 degrees) of a sky that bends over tens of degrees, and float32.
     assert np.abs(image / expected - 1).max() < 0.01
@@ -51,7 +51,7 @@ def test_the_sun_is_drawn_where_it_stands(make_recipe):
     )
     image = background(frame.model_copy(update={"environment": environment})).max(axis=-1)
     disc = image > 1e7
-    sun = surroundings(environment).sky.sun_direction
+    sun = environment_radiance(environment).sky.sun_direction
     in_camera = frame.world_from_left.inverse().rotate(sun)
     expected = frame.rig.camera.project(in_camera)
     v, u = np.nonzero(disc)

@@ -8,7 +8,7 @@ import pytest
 from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import EYES
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 
 pytestmark = pytest.mark.mitsuba
@@ -19,7 +19,7 @@ def scene_of(engine):
     from render.mitsuba_engine.scene import SceneCache
 
     scenes = SceneCache()
-    return lambda frame: scenes.scene_of(frame, surroundings(frame.environment))
+    return lambda frame: scenes.scene_of(frame, environment_radiance(frame.environment))
 
 
 RECIPE = """
@@ -58,7 +58,7 @@ def test_nothing_is_seen_where_no_ray_is_sent(scene_of, rig, more, monkeypatch):
                 assert ids.any() and set(np.unique(all_ids)) == set(np.unique(ids))
                 # What a ray that grazes an edge meets may depend on the rays that travel with it.
                 other = np.flatnonzero(ids != all_ids)
-                sent = np.isin(other, passes._pixels_of(scene.things_m, s))
+                sent = np.isin(other, passes._pixels_of(scene.object_corners_m, s))
                 assert sent.all() and len(other) <= 3
                 assert np.count_nonzero(distance_m != all_m) <= 3
 

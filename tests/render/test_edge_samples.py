@@ -19,15 +19,15 @@ class Bits:
     def __init__(self, seed):
         self._seeds = frame_generator(seed, 0, "test")
 
-    def bits(self, kinds, pixels):
+    def random_bits(self, kinds, pixels):
         return self._seeds.integers(2**32, size=(kinds, pixels), dtype=np.uint32)
 
 
 @pytest.fixture
 def place(engine):
-    from render.mitsuba_engine.paths.sample_allocation import PlacedSamples
+    from render.mitsuba_engine.paths.sample_allocation import StratifiedSamples
 
-    return PlacedSamples
+    return StratifiedSamples
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_error_on_an_edge_goes_with_the_count_to_the_power_of_three_quarters(pla
     places = np.array(settled.place).T.reshape(2000, 1024, 2)
     truth = (np.einsum("pci,pi->pc", places - through[:, None], normal) > 0).mean(axis=1)
     rms = [np.sqrt(np.mean((covered - truth) ** 2)) for covered in errors]
-    # 16 times the samples: an eighth of the error, and the settled picture's own error in the second.
+    # 16 times the samples: an eighth of the error, and the settled compositor's own error in the second.
     assert rms[1] / rms[0] == pytest.approx(16**-0.75, rel=0.3)
     # No side is preferred.
     assert np.mean(errors[0] - truth) == pytest.approx(0.0, abs=4 * rms[0] / np.sqrt(2000))
@@ -123,23 +123,23 @@ def test_even_pixels_take_the_fewest_rays(counts_of):
 
 def test_rays_that_agree_do_not_prove_a_pixel_even(engine, make_recipe):
     """Nine rays miss what fills a twentieth of a pixel three times in five."""
-    from render.compositing import InPicture, TracedEye
+    from render.compositing import Compositor, TracedEye
     from render.mitsuba_engine.paths.sample_allocation import NoiseBudget
 
     frame = sample_frame(make_recipe(scale=0.1), 0)
     shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)
-    nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32)
     face = np.full(shape, int(Part.FACE), dtype=np.uint8)
-    seen = TracedEye(face, np.full(shape, 30.0, dtype=np.float32), np.zeros((*shape, 3)), {}, *nothing)
+    depth = np.full(shape, 30.0, dtype=np.float32)
+    seen = TracedEye.untraced(part_id=face, depth_m=depth, normal=np.zeros((*shape, 3)), amodal_px={})
     bright = np.full((*shape, 3), 10_000.0, dtype=np.float32)
-    picture = InPicture(frame, dict.fromkeys(EYES, seen), dict.fromkeys(EYES, bright))
+    compositor = Compositor(frame, dict.fromkeys(EYES, seen), dict.fromkeys(EYES, bright))
     # Every third pixel of some rows: none is another's neighbour.
     pixel = np.concatenate([np.arange(0, shape[1], 3) + row * shape[1] for row in (0, 5, 10, 15)])
     found = np.zeros((len(pixel), 9, 7), dtype=np.float32)
     found[..., :3], found[..., 3] = 200.0, 1.0
     found[::2, ::2, :4] = 0.0
     inside = pixel[:4], np.repeat(found[1:2, 0], 4, axis=0)
-    counts = NoiseBudget(picture, (pixel, found), inside, 0.1).edge_counts(512)
+    counts = NoiseBudget(compositor, (pixel, found), inside, 0.1).edge_counts(512)
     torn, agreeing = counts[::2], counts[1::2]
     assert len(np.unique(torn)) == len(np.unique(agreeing)) == 1
     # A hundredth of the mean variance, and to the power of 0.4: an eighth of the rays, which are powers of two.

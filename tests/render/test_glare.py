@@ -7,7 +7,7 @@ from datasets_manifest.types.environment import CloudLayer
 from render.camera.optics import glare_spread_per_sr, sun_glare
 from render.engine import EyeRadiance
 from scenes.clouds.cloud_layers import opacity_towards
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.light import luminance
 
@@ -50,7 +50,7 @@ def test_veil_falls_with_the_square_of_the_angle(make_recipe):
     camera = frame.rig.camera
     v, u = np.unravel_index(np.arange(0, veil.size, 997), veil.shape)
     rays = frame.world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1).astype(float)))
-    cosine = rays @ surroundings(frame.environment).beam_direction / np.linalg.norm(rays, axis=-1)
+    cosine = rays @ environment_radiance(frame.environment).beam_direction / np.linalg.norm(rays, axis=-1)
     angle = np.arccos(cosine)
     far = angle > 0.06
     slope = np.polyfit(np.log(angle[far]), np.log(veil[v, u][far]), 1)[0]
@@ -74,7 +74,7 @@ def test_clouds_that_a_flying_camera_passes_take_the_glare(make_recipe):
     frame = with_sun(make_recipe, 20.0, 0.0)
     heap = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_size_m=900.0, optical_depth=3.0,
                       texture_seed=1, thickness_m=100.0)  # fmt: skip
-    clear, beam = sun_glare(frame, eye(frame)), surroundings(frame.environment).beam_direction
+    clear, beam = sun_glare(frame, eye(frame)), environment_radiance(frame.environment).beam_direction
     shares = []
     for east_m in (0.0, 400.0, 800.0, 1200.0, 1600.0):
         update = {"clouds": (heap,), "camera_offset_m": (east_m, 0.0)}

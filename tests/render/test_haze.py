@@ -63,13 +63,13 @@ def test_contrast_falls_as_koschmieder_says_in_mitsuba(make_recipe, engine):
 
 def test_airlight_is_the_background_where_nothing_can_be_seen(make_recipe):
     """Endless air in front of things and the background behind them are one, in clear air and in mist."""
-    from scenes.environment_radiance import Surroundings
+    from scenes.environment_radiance import EnvironmentRadiance
 
     _, frame = black_frame(make_recipe, 10.0)
     azimuth = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(90, -1e-4)], axis=-1)[None].astype(np.float32)
     for environment in (frame.environment, frame.environment.model_copy(update={"mist": None, "visibility_m": 3e4})):
-        around = Surroundings(environment)
+        around = EnvironmentRadiance(environment)
         # 1e-4 rad down is endlessly far.
         np.testing.assert_allclose(around.radiance(rays), around.airlight(rays), rtol=0.02)
 
@@ -80,12 +80,14 @@ def test_a_pixel_is_as_hazy_alone_as_among_others():
     nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32)
     seen = TracedEye(depth_m > 0, depth_m, np.zeros((12, 9, 3)), {}, *nothing)
     per_m = rng.uniform(0.01, 0.05, depth_m.size).astype(np.float32)
-    all_of_them = seen.clear_share(np.arange(depth_m.size), per_m)
+    all_of_them = seen.air_transmittance(np.arange(depth_m.size), per_m)
     # By the definition: the nearest depth of the 25 pixels around, and clear air where none has one.
     padded = np.pad(depth_m, 2, constant_values=np.inf)
     nearest_m = np.lib.stride_tricks.sliding_window_view(padded, (5, 5)).min(axis=(2, 3)).ravel()
     expected = np.exp(-per_m * np.where(np.isfinite(nearest_m), nearest_m, 0.0))
     np.testing.assert_allclose(all_of_them[:, 0], expected, rtol=1e-6)
     for pixel in range(depth_m.size):
-        assert seen.clear_share(np.array([pixel]), per_m[[pixel]])[0, 0] == pytest.approx(expected[pixel], rel=1e-6)
-    assert seen.clear_share(np.zeros(0, dtype=np.int64), per_m[:0]).shape == (0, 1)
+        assert seen.air_transmittance(np.array([pixel]), per_m[[pixel]])[0, 0] == pytest.approx(
+            expected[pixel], rel=1e-6
+        )
+    assert seen.air_transmittance(np.zeros(0, dtype=np.int64), per_m[:0]).shape == (0, 1)

@@ -9,7 +9,7 @@ import pytest
 from drogue_models.parameters import DrogueParameters, HubParameters
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.light import luminance
 
@@ -32,7 +32,7 @@ def test_white_face_shines_as_its_irradiance_says(engine, make_recipe, sun_azimu
     frame = frame.model_copy(update={"drogue": drogue, "environment": environment})
     seen = engine.render(frame, recipe.render).left
     normal = -(frame.world_from_left @ frame.left_from_drogue).rotation[:, 2]
-    expected = luminance(surroundings(environment).plate_illuminance_lux(normal)) / np.pi
+    expected = luminance(environment_radiance(environment).plate_illuminance_lux(normal)) / np.pi
     inside = (seen.part_id == Part.FACE) & (seen.coverage > 0.999)
     got = luminance(seen.radiance_cd_m2[inside]).mean()
     # Monte Carlo over some 1000 pixels of 256 paths: below 0.3 %; the sky map's texels of 1.4 degrees: below 1 %.

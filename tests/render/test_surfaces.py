@@ -11,7 +11,7 @@ from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from render.engine import load_engine
-from render.surfaces import even_reflectance_rgb, reflectance_map
+from render.surfaces import clean_reflectance_rgb, reflectance_map
 from scenes.sampler import sample_frame
 
 NEW = SurfaceCondition()
@@ -87,7 +87,7 @@ def test_dirt_lies_where_its_map_has_it(engine, recipe, frame):
     points = frame.left_from_drogue.inverse().apply(rays * seen.depth_m[rows, columns][:, None].astype(float))
     place = (points[:, :2] - frame.drogue.marker_positions_m[1]) / (2 * frame.drogue.marker_radius_m) + 0.5
     texels = np.clip((place * 64).astype(int), 0, 63)
-    expected = reflectance_map(soiled, part)[texels[:, 1], texels[:, 0], 0] / even_reflectance_rgb(frame, part)[0]
+    expected = reflectance_map(soiled, part)[texels[:, 1], texels[:, 0], 0] / clean_reflectance_rgb(frame, part)[0]
     ratio = seen.radiance_cd_m2[rows, columns, 0] / plain.radiance_cd_m2[rows, columns, 0]
     # A pixel is some ten texels wide: edges of blotches blur, which leaves the correlation high.
     assert np.corrcoef(ratio, expected)[0, 1] > 0.85

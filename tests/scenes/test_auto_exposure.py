@@ -7,9 +7,9 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from drogue_models.parameters import WHITE_PAINT
-from scenes.auto_exposure import meter
+from scenes.auto_exposure import automatic_exposure
 from scenes.environment import environment_of_scene
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.light import luminance
 
@@ -83,7 +83,7 @@ def test_the_meter_alone_with_a_scene():
     made = recipe()
     environment = environment_of_scene(made.seed, 0, made.environment)
     frame = sample_frame(made, 0)
-    assert meter(made.exposure, environment, made.rig.camera, frame.world_from_left, made.sensor) == FREE
+    assert automatic_exposure(made.exposure, environment, made.rig.camera, frame.world_from_left, made.sensor) == FREE
 
 
 def test_a_meter_on_the_plate_minds_no_sky_behind_it():
@@ -93,12 +93,12 @@ def test_a_meter_on_the_plate_minds_no_sky_behind_it():
     longer = []
     for azimuth_deg in (0.0, 180.0):
         around = environment.model_copy(update={"sun_elevation_deg": 12.0, "sun_azimuth_deg": azimuth_deg})
-        got = meter(made.exposure, around, made.rig.camera, pose, made.sensor)
-        plate = surroundings(around).plate_illuminance_lux(-pose.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
+        got = automatic_exposure(made.exposure, around, made.rig.camera, pose, made.sensor)
+        plate = environment_radiance(around).plate_illuminance_lux(-pose.rotation[:, 2]) * np.array(WHITE_PAINT) / np.pi
         electrons = made.sensor.electrons_per_cd_m2(got) * float(luminance(plate))
         assert electrons == pytest.approx(0.5 * made.sensor.full_well_e, rel=1e-9)
         of_view = made.exposure.model_copy(update={"auto_meter": "view"})
-        longer.append(got.time_s / meter(of_view, around, made.rig.camera, pose, made.sensor).time_s)
+        longer.append(got.time_s / automatic_exposure(of_view, around, made.rig.camera, pose, made.sensor).time_s)
     # With the sun ahead the sky is brighter than the shaded plate; with the sun behind the plate is brighter.
     assert longer[0] > 2
     assert longer[1] == 1

@@ -7,7 +7,7 @@ import pytest
 
 from datasets_manifest.recipe.sequence_ranges import Follower, Receiver, SequenceRanges
 from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
-from scenes.flight.trajectory import Surroundings, simulate
+from scenes.flight.trajectory import SimulationInputs, simulate
 
 
 def test_bow_wave_of_a_half_body():
@@ -37,7 +37,7 @@ def simulate_beside(hose, radius_m, inwards_m, source_m):
     """(T, 3) way of a drogue beside a source that comes in from the left to its place about the hanging drogue."""
     from_drogue = np.zeros((len(inwards_m), 3, 1))
     from_drogue[:, 1, 0] = -inwards_m
-    around = Surroundings(
+    around = SimulationInputs(
         gusts_m_s=np.zeros_like(from_drogue),
         pod_m=lambda times: np.zeros((len(times), 3)),
         from_drogue_m=from_drogue,

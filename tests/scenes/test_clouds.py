@@ -6,9 +6,9 @@ import pytest
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.environment import CloudLayer, Environment, Mist
 from scenes.clouds.cloud_density import CloudDensity
-from scenes.clouds.cloud_layers import CloudLight, diffuse_transmission, opacity_towards, see_cloud
+from scenes.clouds.cloud_layers import CloudLight, diffuse_transmission, opacity_towards, render_cloud_layer
 from scenes.environment import environment_of_scene
-from scenes.environment_radiance import Surroundings
+from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.clear_sky import direction_from_angles
 from scenes.sky.light import luminance
 
@@ -85,8 +85,8 @@ def test_cover_is_the_share_of_the_plan(cover):
 def test_no_cloud_without_cover_and_no_sky_under_an_overcast():
     rays = upwards()
     for kind in ("cumulus", "stratus"):
-        clear = Surroundings(environment()).radiance(rays)
-        none = Surroundings(environment(clouds=(layer(kind=kind, cover_fraction=0.0),)))
+        clear = EnvironmentRadiance(environment()).radiance(rays)
+        none = EnvironmentRadiance(environment(clouds=(layer(kind=kind, cover_fraction=0.0),)))
         np.testing.assert_allclose(none.radiance(rays), clear, rtol=1e-3)
     thick = layer(kind="stratus", cover_fraction=1.0, optical_depth=60.0)
     assert opacity_towards(thick, direction_from_angles(40.0, 60.0)) > 0.99
@@ -96,11 +96,13 @@ def test_cumulus_is_darker_below_than_on_its_sunny_side():
     """Seen from above clouds send back most of the sunlight, seen from below they let a part of it through."""
     over, under = (
         luminance(
-            Surroundings(environment(clouds=(layer(height_above_camera_m=h, cover_fraction=0.9),))).radiance(rays)
+            EnvironmentRadiance(environment(clouds=(layer(height_above_camera_m=h, cover_fraction=0.9),))).radiance(
+                rays
+            )
         )
         for h, rays in ((-1000.0, upwards(sign=-1.0)), (1000.0, upwards()))
     )
-    clear = Surroundings(environment())
+    clear = EnvironmentRadiance(environment())
     facing_lux = float(luminance(clear.beam_illuminance_lux + clear.air.sky_level_lux))
     # A white, diffuse plane that faces the sun sends 1/pi of the light back; thick cloud 0.5 to 0.9 of that.
     assert 0.5 < np.percentile(over, 90) * np.pi / facing_lux < 0.9
@@ -110,7 +112,7 @@ def test_cumulus_is_darker_below_than_on_its_sunny_side():
 def test_light_under_an_overcast_is_what_two_streams_let_through():
     """Level illuminance below against that above: 1 / (1 + 0.11 depth) of it, and none of it from the sun itself."""
     stratus = layer(kind="stratus", cover_fraction=1.0, optical_depth=30.0, thickness_m=400.0)
-    open_sky, under = Surroundings(environment()), Surroundings(environment(clouds=(stratus,)))
+    open_sky, under = EnvironmentRadiance(environment()), EnvironmentRadiance(environment(clouds=(stratus,)))
     assert luminance(under.beam_illuminance_lux) < 1e-3 * luminance(open_sky.beam_illuminance_lux)
     up = np.array([0.0, 0.0, 1.0])
     share = float(luminance(under.plate_illuminance_lux(up)) / luminance(open_sky.plate_illuminance_lux(up)))
@@ -127,7 +129,7 @@ def test_edges_towards_the_sun_are_lined_with_silver():
     for azimuth_deg in (10.0, 190.0):
         sun = direction_from_angles(25.0, azimuth_deg)
         light = CloudLight(sun, np.full(3, 8e4), np.full(3, 1.5e4), np.full(3, 5e3))
-        seen = see_cloud(layer(cover_fraction=0.5), rays, light)
+        seen = render_cloud_layer(layer(cover_fraction=0.5), rays, light)
         brightness = luminance(seen.radiance)
         edge = (seen.opacity > 0.2) & (seen.opacity < 0.8)
         ratios.append(brightness[edge].mean() / brightness[seen.opacity > 0.99].mean())
@@ -137,7 +139,7 @@ def test_edges_towards_the_sun_are_lined_with_silver():
 
 def test_coarse_march_agrees_with_every_ray():
     """A large picture is seen on every second ray and marched on every fourth but for edges."""
-    around = Surroundings(environment(clouds=(layer(),)))
+    around = EnvironmentRadiance(environment(clouds=(layer(),)))
     rays = upwards(count=320, half_width=0.2)
     large = luminance(around.radiance(rays))
     parts = np.concatenate([luminance(around.radiance(rays[row : row + 80])) for row in range(0, 320, 80)])
@@ -148,11 +150,11 @@ def test_coarse_march_agrees_with_every_ray():
 
 def test_mist_hides_sun_and_sky_and_thins_out_in_the_limit():
     rays = upwards()
-    clear = Surroundings(environment())
-    thin = Surroundings(environment(mist=Mist(visibility_m=100_000, above_m=0.1, below_m=0.1)))
+    clear = EnvironmentRadiance(environment())
+    thin = EnvironmentRadiance(environment(mist=Mist(visibility_m=100_000, above_m=0.1, below_m=0.1)))
     # At most 8e-6 of the mist's light, which in red is some 20 times the bluest sky's.
     np.testing.assert_allclose(thin.radiance(rays), clear.radiance(rays), rtol=2e-4)
-    dense = Surroundings(environment(mist=Mist(visibility_m=50, above_m=300, below_m=300)))
+    dense = EnvironmentRadiance(environment(mist=Mist(visibility_m=50, above_m=300, below_m=300)))
     assert luminance(dense.beam_illuminance_lux) < 1e-6
     seen = luminance(dense.radiance(rays))
     assert seen.std() / seen.mean() < 1e-3
@@ -171,7 +173,7 @@ def test_finite_everywhere_at_any_hour(kind, height_m):
     rays[0, 1] = [0.0, 0.0, -1.0]
     rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
     for elevation in (60.0, 0.5, -4.0, -30.0):
-        around = Surroundings(
+        around = EnvironmentRadiance(
             environment(sun_elevation_deg=elevation, clouds=(layer(kind=kind, height_above_camera_m=height_m),))
         )
         seen = around.radiance(rays)

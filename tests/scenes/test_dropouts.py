@@ -12,7 +12,7 @@ from drogue_models.parts import Part
 from geometry.se3 import log_twist
 from geometry.stereo import EYES
 from labelgen.part_pixels import drogue_hull_m
-from scenes.flight.dropouts import LossEvent, flown_m, sample_loss
+from scenes.flight.dropouts import DropoutEvent, formation_displacement_m, sample_dropout
 from scenes.sampler import sample_frame
 from scenes.sky.light import direction_from_angles
 
@@ -48,7 +48,7 @@ def recipe(kind, seed=2, start_m=6.0, rig="", more=""):
 
 
 def event(drawn):
-    return sample_loss(frame_generator(drawn.seed, 0, "loss"), drawn.sequence.losses, 0)
+    return sample_dropout(frame_generator(drawn.seed, 0, "loss"), drawn.sequence.losses, 0)
 
 
 def lost(drawn):
@@ -116,13 +116,13 @@ def test_a_turned_receiver_sees_nothing_of_the_drogue_from_the_same_place(seed):
     drawn, plain = recipe("out-of-view", seed), recipe("none", seed)
     inside = lost(drawn)
     for k in range(0, FRAMES, 3):
-        turned, straight = sample_frame(drawn, k), sample_frame(plain, k)
-        places = [frame.left_from_drogue.inverse().translation_m for frame in (turned, straight)]
+        receiver_rotation, straight = sample_frame(drawn, k), sample_frame(plain, k)
+        places = [frame.left_from_drogue.inverse().translation_m for frame in (receiver_rotation, straight)]
         # Rounding.
         np.testing.assert_allclose(*places, atol=1e-9)
-        if turned.loss is None:
+        if receiver_rotation.loss is None:
             np.testing.assert_allclose(
-                turned.left_from_drogue.as_matrix(), straight.left_from_drogue.as_matrix(), atol=1e-12
+                receiver_rotation.left_from_drogue.as_matrix(), straight.left_from_drogue.as_matrix(), atol=1e-12
             )
     for k in inside:
         frame = sample_frame(drawn, k)
@@ -138,7 +138,7 @@ def test_the_turn_is_in_the_twists():
         .replace("time_s = 0.002", "time_s = 0.0005")
         .replace("= 40", "= 2000")
     )
-    happens = sample_loss(frame_generator(2, 0, "loss"), drawn.sequence.losses, 0)
+    happens = sample_dropout(frame_generator(2, 0, "loss"), drawn.sequence.losses, 0)
     middle = round(1000 * (happens.begin_s - happens.onset_s / 2))
     earlier, frame, later = (sample_frame(drawn, middle + step) for step in (-1, 0, 1))
     relative = log_twist(earlier.left_from_drogue.inverse() @ later.left_from_drogue) / 0.002
@@ -172,40 +172,43 @@ def test_the_sun_comes_beside_the_drogue_and_goes(seed):
     nearest = min(beside, key=lambda k: abs(k / 20 - happens.middle_s))
     # The pair nearest to the middle is half a period off, in which attitude and drogue move by tenths of a degree.
     assert beside[nearest] == pytest.approx(happens.sun_offset_rad, abs=np.radians(0.5))
-    away = [angle for k, angle in beside.items() if abs(happens.away(k / 20)) == 1]
+    phase = [angle for k, angle in beside.items() if abs(happens.phase(k / 20)) == 1]
     # Off by the whole sweep to one side and the other, but for the sun's place on one side of the drogue and the swing.
     half_drogue = np.arcsin(0.33 / 6.0)
-    assert min(away) > 0.95 * happens.sweep_rad - happens.sun_offset_rad - 2 * half_drogue - np.radians(2)
+    assert min(phase) > 0.95 * happens.sweep_rad - happens.sun_offset_rad - 2 * half_drogue - np.radians(2)
     headings = [happens.heading_rad(k / 20) for k in (0, FRAMES - 1)]
     assert headings[0] == pytest.approx(-headings[1]) and abs(headings[0]) == pytest.approx(happens.sweep_rad)
 
 
 def test_a_formation_that_turns_flies_where_it_heads():
-    happens = sample_loss(np.random.default_rng(1), DropoutRanges(kinds=("glare",)), 0)
+    happens = sample_dropout(np.random.default_rng(1), DropoutRanges(kinds=("glare",)), 0)
     time_s, step_s = 2.3, 1e-3
-    moved = (flown_m(happens, 120.0, time_s + step_s) - flown_m(happens, 120.0, time_s - step_s)) / (2 * step_s)
+    moved = (
+        formation_displacement_m(happens, 120.0, time_s + step_s)
+        - formation_displacement_m(happens, 120.0, time_s - step_s)
+    ) / (2 * step_s)
     heading = happens.heading_rad(time_s)
     # The middles of 121 pieces of two seconds: (0.02 s)^2 / 24 of the second derivative, 1e-4 of 120 m/s.
     np.testing.assert_allclose(moved, 120.0 * np.array([np.cos(heading), np.sin(heading)]), atol=0.05)
 
 
 def test_it_comes_lasts_and_goes_smoothly():
-    happens = LossEvent("occlusion", 2.0, 4.0, 0.5, 1, 1.0, 1.0, 0.5, 0.1, 0.2)
+    happens = DropoutEvent("occlusion", 2.0, 4.0, 0.5, 1, 1.0, 1.0, 0.5, 0.1, 0.2)
     times = np.linspace(0, 6, 6001)
-    away = np.array([happens.away(time) for time in times])
-    np.testing.assert_array_equal(away[(times >= 2) & (times <= 4)], 0)
-    assert (away[times <= 1.499] == 1).all() and (away[times >= 4.501] == -1).all()
-    assert (np.diff(away) <= 1e-12).all()
+    phase = np.array([happens.phase(time) for time in times])
+    np.testing.assert_array_equal(phase[(times >= 2) & (times <= 4)], 0)
+    assert (phase[times <= 1.499] == 1).all() and (phase[times >= 4.501] == -1).all()
+    assert (np.diff(phase) <= 1e-12).all()
     # Half a cosine over half a second.
-    assert np.abs(np.gradient(away, times)).max() == pytest.approx(np.pi, rel=1e-3)
-    assert [happens.acts(time) for time in (1.4, 1.6, 3.0, 4.4, 4.6)] == [False, True, True, True, False]
+    assert np.abs(np.gradient(phase, times)).max() == pytest.approx(np.pi, rel=1e-3)
+    assert [happens.is_active(time) for time in (1.4, 1.6, 3.0, 4.4, 4.6)] == [False, True, True, True, False]
 
 
 def test_kinds_come_in_turn_and_draws_do_not_depend_on_them():
     ranges = DropoutRanges(kinds=("occlusion", "none", "glare"))
-    drawn = [sample_loss(frame_generator(1, k, "loss"), ranges, k) for k in range(6)]
+    drawn = [sample_dropout(frame_generator(1, k, "loss"), ranges, k) for k in range(6)]
     assert [None if one is None else one.kind for one in drawn] == ["occlusion", None, "glare"] * 2
-    other = sample_loss(frame_generator(1, 0, "loss"), DropoutRanges(kinds=("glare",)), 0)
+    other = sample_dropout(frame_generator(1, 0, "loss"), DropoutRanges(kinds=("glare",)), 0)
     assert (other.tilt_rad, other.side) == (drawn[0].tilt_rad, drawn[0].side)
 
 
@@ -244,14 +247,14 @@ def test_losses_that_do_not_fit_are_refused(before, after, fault):
 
 def test_a_bar_as_thick_as_its_distance_is_refused():
     drawn = recipe("occlusion", more="obstacle_distance_m = 0.4", start_m=2.0)
-    with pytest.raises(ValueError, match=r"obstacle_distance_m: a bar that hides the drogue all along"):
+    with pytest.raises(ValueError, match=r"obstacle_distance_m: a bar that hides the drogue throughout"):
         sample_frame(drawn, 0)
 
 
 @pytest.mark.parametrize(("start_m", "obstacle_m"), [(4.0, 5.0), (4.0, 3.6)])
 def test_a_bar_that_does_not_stand_before_the_drogue_is_refused(start_m, obstacle_m):
     drawn = recipe("occlusion", more=f"obstacle_distance_m = {obstacle_m}", start_m=start_m)
-    with pytest.raises(ValueError, match=r"sequence.losses.obstacle_distance_m: .* does not stand before all of"):
+    with pytest.raises(ValueError, match=r"sequence.losses.obstacle_distance_m: .* is not in front of all of"):
         sample_frame(drawn, 0)
 
 

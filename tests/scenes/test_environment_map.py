@@ -12,7 +12,7 @@ import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.frame import FrameSpec
-from scenes.environment_radiance import surroundings
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.equirectangular_sky import load_map
 from scenes.sky.light import SUN_SOLID_ANGLE_SR, luminance
@@ -70,7 +70,7 @@ def texel_direction(row, column, rotation_deg=0.0):
 def test_levels_colours_and_sides_are_kept(tmp_path, name, tolerance):
     """Radiance files keep eight bits of mantissa: 0.4 % of the largest channel."""
     write(tmp_path / name, picture(sun=0))
-    around = surroundings(environment(tmp_path, name))
+    around = environment_radiance(environment(tmp_path, name))
     right = around.radiance(texel_direction(30, HEIGHT + 20)[None, None].astype(np.float32))[0, 0]
     left = around.radiance(texel_direction(30, HEIGHT - 20)[None, None].astype(np.float32))[0, 0]
     np.testing.assert_allclose(right, [2000, 1000, 1000], rtol=tolerance)
@@ -91,7 +91,7 @@ def test_the_sun_becomes_a_beam_of_the_same_light(tmp_path):
 
 def test_the_disc_is_drawn_where_the_sun_was(tmp_path):
     write(tmp_path / "sky.exr", picture())
-    around = surroundings(environment(tmp_path))
+    around = environment_radiance(environment(tmp_path))
     directions = around.beam_direction[None, None].astype(np.float32)
     seen = np.zeros((1, 1, 3), dtype=np.float32)
     around.add_discs(seen, directions)
@@ -105,7 +105,7 @@ def test_an_even_sky_has_no_sun(tmp_path):
 
 def test_illuminance_is_as_asked_for(tmp_path):
     write(tmp_path / "sky.exr", picture())
-    around = surroundings(environment(tmp_path, more="horizontal_illuminance_lux = 70000"))
+    around = environment_radiance(environment(tmp_path, more="horizontal_illuminance_lux = 70000"))
     # The light map has 128 rows, as this picture: only the split of the sun's texel among cosines is left.
     assert float(luminance(around.ground_illuminance_lux)) == pytest.approx(70_000, rel=0.01)
 
@@ -131,12 +131,12 @@ def test_a_frame_works_in_another_process(tmp_path):
     code = (
         "from pathlib import Path; import numpy as np\n"
         "from datasets_manifest.types.frame import FrameSpec\n"
-        "from scenes.environment_radiance import surroundings\n"
+        "from scenes.environment_radiance import environment_radiance\n"
         "frame = FrameSpec.model_validate_json(Path('frame.json').read_text())\n"
-        "print(surroundings(frame.environment).light_map.mean(dtype=np.float64))"
+        "print(environment_radiance(frame.environment).light_map.mean(dtype=np.float64))"
     )
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    here = surroundings(frame.environment).light_map.mean(dtype=np.float64)
+    here = environment_radiance(frame.environment).light_map.mean(dtype=np.float64)
     assert float(result.stdout) == pytest.approx(here, rel=1e-6)
     assert str(tmp_path) not in frame.model_dump_json()
     assert FrameSpec.model_validate_json(frame.model_dump_json()).environment.map.sha256 == frame.environment.map.sha256

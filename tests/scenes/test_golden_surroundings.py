@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.environment import CloudLayer, Environment
-from scenes.clouds.cloud_layers import CloudLight, opacity_towards, see_cloud
+from scenes.clouds.cloud_layers import CloudLight, opacity_towards, render_cloud_layer
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.sea import GroundLight
 
@@ -56,7 +56,7 @@ def cloud(kind):
         {"kind": kind, "height_above_camera_m": 1200.0, "feature_size_m": 900.0, "texture_seed": 4} | CLOUDS[kind]
     )
     light = CloudLight(TO_SUN, np.full(3, 6e4), np.full(3, 6e3), np.full(3, 2e3))
-    seen = see_cloud(layer, looking(1.0), light)
+    seen = render_cloud_layer(layer, looking(1.0), light)
     towards_sun = np.full((1, WIDTH_PX, 4), opacity_towards(layer, TO_SUN), dtype=np.float32)
     picture = np.concatenate([seen.radiance * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
     return np.concatenate([picture, towards_sun])

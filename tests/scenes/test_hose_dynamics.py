@@ -8,7 +8,7 @@ import pytest
 from datasets_manifest.recipe.sequence_ranges import HOSES, Follower
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.hose_dynamics import GRAVITY_M_S2, LINKS, TIME_STEP_S, HoseModel, HoseState
-from scenes.flight.trajectory import Surroundings, simulate
+from scenes.flight.trajectory import SimulationInputs, simulate
 
 FULL_SIZE = HOSES["full-size"]
 VACUUM = FULL_SIZE.model_copy(update={"air_density_kg_m3": 1e-12})
@@ -123,7 +123,9 @@ def gusty(severity, seconds, seed=3, body_radius_m=0.0):
         np.random.default_rng(seed), dryden(severity, FULL_SIZE.turbulence_altitude_m), 120.0, (samples, 1)
     )
     behind = np.tile(np.array([[2.5], [0.0], [-0.1]]), (samples, 1, 1))
-    return Surroundings(gusts, lambda time: np.zeros((*time.shape, 3)), behind, np.zeros(3), body_radius_m, Follower())
+    return SimulationInputs(
+        gusts, lambda time: np.zeros((*time.shape, 3)), behind, np.zeros(3), body_radius_m, Follower()
+    )
 
 
 @pytest.mark.parametrize("case", ["severe", "fall"])
@@ -150,7 +152,7 @@ def test_half_the_time_step_gives_the_same_trajectory():
 
 def test_sequences_side_by_side_are_those_alone():
     around = gusty("moderate", 4.0)
-    twice = Surroundings(
+    twice = SimulationInputs(
         np.repeat(around.gusts_m_s, 2, axis=2),
         around.pod_m,
         np.repeat(around.from_drogue_m, 2, axis=2),
@@ -195,7 +197,7 @@ def test_drogue_swings_as_far_as_it_should(severity, sd_m):
     gusts = sample_gusts(
         np.random.default_rng(1), dryden(severity, FULL_SIZE.turbulence_altitude_m), 120.0, (samples, sequences)
     )
-    around = Surroundings(
+    around = SimulationInputs(
         gusts,
         lambda time: np.zeros((*time.shape, 3)),
         np.zeros((samples, 3, sequences)),

@@ -8,8 +8,8 @@ import pytest
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.environment import CloudLayer, Environment
-from scenes.clouds.cloud_layers import CloudLight, see_cloud
-from scenes.environment_radiance import surroundings
+from scenes.clouds.cloud_layers import CloudLight, render_cloud_layer
+from scenes.environment_radiance import environment_radiance
 from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
 from scenes.sampler import sample_frame
@@ -75,7 +75,7 @@ def light():
 def test_ground_below_flows_by_focal_length_times_way_over_altitude(kind, flown_m):
     here = environment(kind)
     ground = Ground(here, light())
-    there = ground.seen_from(here.model_copy(update={"camera_offset_m": flown_m}))
+    there = ground.moved_to(here.model_copy(update={"camera_offset_m": flown_m}))
     before, after = (luminance(seen.radiance(looking(-1))) for seen in (ground, there))
     # East of us is on the right, and what we fly towards comes to the left. A tenth of a pixel is what phase
     # correlation finds of whole shifts under a window.
@@ -96,7 +96,7 @@ def test_ships_are_passed_as_the_sea_is():
     ship = ground._ships[0]
     above = environment("sea", ground_texture_seed=seed, camera_offset_m=(ship.x_m, ship.y_m))
     pictures = [
-        luminance(ground.seen_from(above.model_copy(update={"camera_offset_m": place})).radiance(looking(-1)))
+        luminance(ground.moved_to(above.model_copy(update={"camera_offset_m": place})).radiance(looking(-1)))
         for place in ((ship.x_m, ship.y_m), (ship.x_m + flown_m[0], ship.y_m))
     ]
     # A quarter of a pixel: the sky's reflection stays where it is.
@@ -109,13 +109,13 @@ def test_clouds_flow_by_their_own_distance():
     sun = CloudLight(np.array([0.6, 0.0, 0.8]), np.full(3, 6e4), np.full(3, 6e3), np.full(3, 2e3))
     expected_px = -FOCAL_PX * np.array(flown_m) / height_m
     cirrus = CloudLayer(kind="cirrus", height_above_camera_m=height_m, cover_fraction=0.7, **shared)
-    before, after = (see_cloud(cirrus, looking(1), sun, 1, place).opacity for place in ((0.0, 0.0), flown_m))
+    before, after = (render_cloud_layer(cirrus, looking(1), sun, 1, place).opacity for place in ((0.0, 0.0), flown_m))
     # Without depth: as for the ground, but the layer bends with the Earth, by nothing here.
     np.testing.assert_allclose(flow_px(before, after), expected_px, atol=0.15)
     cumulus = CloudLayer(
         kind="cumulus", height_above_camera_m=-height_m, cover_fraction=0.4, thickness_m=100.0, **shared
     )
-    before, after = (see_cloud(cumulus, looking(-1), sun, 1, place).opacity for place in ((0.0, 0.0), flown_m))
+    before, after = (render_cloud_layer(cumulus, looking(-1), sun, 1, place).opacity for place in ((0.0, 0.0), flown_m))
     # Between that of its tops and that of its base, 100 m farther, and a third of a pixel for edges that change.
     assert np.linalg.norm(flow_px(before, after) - expected_px) < 0.09 * np.linalg.norm(expected_px) + 0.33
 
@@ -127,7 +127,7 @@ def test_clouds_of_a_large_picture_flow_too():
                         optical_depth=3.0, texture_seed=4)  # fmt: skip
     here = environment(clouds=(cirrus,), sun_elevation_deg=20.0)
     there = here.model_copy(update={"camera_offset_m": flown_m})
-    before, after = (luminance(surroundings(seen).radiance(looking(1, side_px))) for seen in (here, there))
+    before, after = (luminance(environment_radiance(seen).radiance(looking(1, side_px))) for seen in (here, there))
     # A third of a pixel: the sky behind stays where it is.
     np.testing.assert_allclose(flow_px(before, after), -FOCAL_PX * np.array(flown_m) / height_m, atol=0.33)
 
@@ -138,14 +138,14 @@ CUMULUS = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_s
 
 def test_clouds_that_pass_before_the_sun_take_its_light():
     here = environment(clouds=(CUMULUS,), sun_elevation_deg=30.0)
-    to_sun = surroundings(here).beam_direction
+    to_sun = environment_radiance(here).beam_direction
     ray = to_sun[None, None].astype(np.float32)
     sun = CloudLight(to_sun, np.full(3, 6e4), np.full(3, 6e3), np.full(3, 2e3))
-    clear = surroundings(here.model_copy(update={"clouds": ()}))
+    clear = environment_radiance(here.model_copy(update={"clouds": ()}))
     clear_disc, open_shares = disc_towards(clear, ray), []
     for east_m in np.arange(0.0, 2500.0, 250.0):
-        around = surroundings(here.model_copy(update={"camera_offset_m": (float(east_m), 0.0)}))
-        open_shares.append(1.0 - float(see_cloud(CUMULUS, ray, sun, 1, (float(east_m), 0.0)).opacity[0, 0]))
+        around = environment_radiance(here.model_copy(update={"camera_offset_m": (float(east_m), 0.0)}))
+        open_shares.append(1.0 - float(render_cloud_layer(CUMULUS, ray, sun, 1, (float(east_m), 0.0)).opacity[0, 0]))
         # Float32 radiance.
         expected = clear_disc * open_shares[-1]
         np.testing.assert_allclose(disc_towards(around, ray), expected, rtol=1e-5, atol=1e-5 * clear_disc.max())
@@ -153,7 +153,7 @@ def test_clouds_that_pass_before_the_sun_take_its_light():
         np.testing.assert_allclose(around.beam_illuminance_lux, expected_lux, rtol=1e-9)  # the same float64 product
     assert min(open_shares) < 0.01 and max(open_shares) > 0.99
     # Nothing of the way stays behind.
-    np.testing.assert_allclose(disc_towards(surroundings(here), ray), clear_disc * open_shares[0], rtol=1e-5)
+    np.testing.assert_allclose(disc_towards(environment_radiance(here), ray), clear_disc * open_shares[0], rtol=1e-5)
 
 
 def disc_towards(around, ray):
@@ -167,13 +167,13 @@ def test_sky_and_light_stay_as_they_are():
                        texture_seed=1, thickness_m=300.0)  # fmt: skip
     here = environment(clouds=(cloud,))
     moved = here.model_copy(update={"camera_offset_m": (400.0, 20.0)})
-    there, around = surroundings(moved), surroundings(here)
-    assert around is surroundings(here)
+    there, around = environment_radiance(moved), environment_radiance(here)
+    assert around is environment_radiance(here)
     np.testing.assert_array_equal(there.light_map, around.light_map)
     np.testing.assert_array_equal(there.radiance(looking(1)), around.radiance(looking(1)))
     assert not np.array_equal(there.radiance(looking(-1)), around.radiance(looking(-1)))
     # Nothing of the way stays behind.
-    assert surroundings(here).environment.camera_offset_m == (0.0, 0.0)
+    assert environment_radiance(here).environment.camera_offset_m == (0.0, 0.0)
 
 
 def test_a_sequence_flies_with_its_airspeed_and_starts_again():

@@ -6,7 +6,7 @@ import numpy as np
 
 from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.recipe.rigs import Rangefinder
-from scenes.sampler import sample_frame, sample_reading_m
+from scenes.sampler import sample_frame, sample_rangefinder_m
 
 RECIPE = """
 name = "bench"
@@ -19,12 +19,12 @@ stations_m = [2.0, 3.0]
 
 
 def errors_m(rangefinder: Rangefinder, seed: int, count: int) -> np.ndarray:
-    return np.array([sample_reading_m(rangefinder, seed, index, 5.0) - 5.0 for index in range(count)])
+    return np.array([sample_rangefinder_m(rangefinder, seed, index, 5.0) - 5.0 for index in range(count)])
 
 
 def test_without_errors_it_reads_the_distance() -> None:
     perfect = Rangefinder(offset_m=0, noise_m=0, resolution_m=0)
-    assert sample_reading_m(perfect, 1, 0, 3.1234567) == 3.1234567
+    assert sample_rangefinder_m(perfect, 1, 0, 3.1234567) == 3.1234567
 
 
 def test_noise_has_the_stated_spread_and_the_offset_stays() -> None:
@@ -44,7 +44,7 @@ def test_offsets_of_datasets_spread_evenly_over_their_range() -> None:
 
 
 def test_readings_are_whole_steps_of_the_last_digit() -> None:
-    readings = [sample_reading_m(Rangefinder(resolution_m=0.001), 1, index, 4.0) for index in range(50)]
+    readings = [sample_rangefinder_m(Rangefinder(resolution_m=0.001), 1, index, 4.0) for index in range(50)]
     assert readings == [round(reading, 3) for reading in readings]
     assert len(set(readings)) > 3
 

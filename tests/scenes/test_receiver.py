@@ -6,24 +6,26 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.sequence_ranges import CLOSURE_ACCELERATION_M_S2, Follower, Receiver
-from scenes.flight.receiver import Guidance, run_m, wanted_places
+from scenes.flight.receiver import Guidance, closure_distance_m, desired_offsets_m
 
 
 def test_a_run_keeps_speed_and_acceleration():
     time_s = np.linspace(-1, 30, 31001)
-    way = run_m(time_s, 8.3, 0.6)
+    way = closure_distance_m(time_s, 8.3, 0.6)
     speed, acceleration = np.gradient(way, time_s), np.gradient(np.gradient(way, time_s), time_s)
     assert way[0] == 0 and way[-1] == pytest.approx(8.3)
     assert speed.max() == pytest.approx(0.6, abs=1e-6) and speed.min() > -1e-9
     assert np.abs(acceleration).max() < CLOSURE_ACCELERATION_M_S2 * 1.001
     # Too short to get up to speed: a triangle.
-    assert np.gradient(run_m(time_s, 0.1, 0.6), time_s).max() == pytest.approx(np.sqrt(0.1 * 0.5), rel=1e-2)
+    assert np.gradient(closure_distance_m(time_s, 0.1, 0.6), time_s).max() == pytest.approx(
+        np.sqrt(0.1 * 0.5), rel=1e-2
+    )
 
 
 def test_manoeuvres():
     receiver, time_s = Receiver(start_m=10, end_m=2, abort_m=3), np.linspace(0, 60, 601)
     docking, station, missed = (
-        wanted_places(receiver, manoeuvre, (0.5, -0.2), time_s)
+        desired_offsets_m(receiver, manoeuvre, (0.5, -0.2), time_s)
         for manoeuvre in ("docking", "station", "missed-approach")
     )
     np.testing.assert_allclose(docking[0], [0.5, -0.2, 10])
@@ -36,7 +38,7 @@ def test_manoeuvres():
 def follow(follower, drogue, period_s=0.02):
     guidance, places = Guidance(follower, period_s, np.zeros((3, 1))), []
     for place in drogue:
-        places.append(guidance.place_m[0, 0])
+        places.append(guidance.position_m[0, 0])
         guidance.steer(np.array([[place], [0.0], [0.0]]), np.zeros((3, 1)), np.zeros((3, 1)))
         guidance.move()
     return np.array(places)

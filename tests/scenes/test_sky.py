@@ -5,7 +5,7 @@ import pytest
 
 from datasets_manifest.types.environment import CloudLayer, Environment, Moon
 from scenes.clouds.cloud_density import sample_texture
-from scenes.environment_radiance import Surroundings
+from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.clear_sky import ClearSky, direction_from_angles
 from scenes.sky.light import REC709_FROM_XYZ, hemisphere, luminance
 from scenes.sky.night import moon_illuminance_lux, star_catalogue
@@ -96,7 +96,7 @@ def test_no_seam_at_the_horizon(cloud_height_m):
             texture_seed=1,
         )
         clouds = (layer,)
-    around = Surroundings(environment(clouds=clouds))
+    around = EnvironmentRadiance(environment(clouds=clouds))
     azimuth = np.linspace(0, 2 * np.pi, 200)
     rows = []
     for elevation in (-0.002, 0.002):
@@ -109,7 +109,7 @@ def test_no_seam_at_the_horizon(cloud_height_m):
 
 def test_ground_contrast_falls_as_koschmieder_says():
     """Contrast of ground against horizon goes with exp(-extinction x distance)."""
-    around = Surroundings(environment(sun_azimuth_deg=0.0))
+    around = EnvironmentRadiance(environment(sun_azimuth_deg=0.0))
     contrasts = []
     for depression in (0.5, 0.25):
         azimuth = np.linspace(0, 2 * np.pi, 720)
@@ -127,7 +127,7 @@ def test_ground_contrast_falls_as_koschmieder_says():
 
 
 def test_plate_illuminance_of_level_ground_agrees_with_the_sky_integral():
-    around = Surroundings(environment())
+    around = EnvironmentRadiance(environment())
     up = around.plate_illuminance_lux(np.array([0.0, 0.0, 1.0]))
     # Two quadratures of the same sky, 4 and 1.4 degrees wide.
     np.testing.assert_allclose(up, around.ground_illuminance_lux, rtol=0.01)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import Eye
-from render.camera.exposure_motion import window_of
+from render.camera.exposure_motion import image_window
 from render.compositing import TracedEye, amodal_counts
 from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.paths.rays import CameraRays, rows_of
 from render.mitsuba_engine.scene import DrogueScene, by_shape
-from render.mitsuba_engine.trace_request import ASIDE, OF_DROGUE, parts_in, slipped_through
+from render.mitsuba_engine.trace_request import DROGUE_PARTS, OFF_CENTER, leaked_rays, parts_in
 
 CENTER = (0.5, 0.5)
 
@@ -37,28 +37,28 @@ class CenterPasses:
     def part_ids(self, s: float) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """(H, W) part ids and distances [m] at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""
         ids, distance_m = np.zeros(self._shape, dtype=np.uint8), np.full(self._shape, np.inf, dtype=np.float32)
-        # Most rays meet nothing, and where the image has nothing need not be sent.
-        pixel = self._pixels_of(self._scene.things_m, s)
+        # Most rays miss; those through windows without objects need not be traced.
+        pixel = self._pixels_of(self._scene.object_corners_m, s)
         if len(pixel):
             rays = self._center_rays(jit_array(mi.UInt32, pixel), (s + 1) / 2)
             ids.reshape(-1)[pixel], distance_m.reshape(-1)[pixel] = self._hits(self._scene.scene, rays)
         return ids, distance_m
 
-    def _pixels_of(self, things_m: list[NDArray[np.float64]], s: float) -> NDArray[np.int64]:
-        """(P,) flat indices of pixels that may show one of some things, by points that have them between them."""
+    def _pixels_of(self, corners_of_objects_m: list[NDArray[np.float64]], s: float) -> NDArray[np.int64]:
+        """(P,) flat indices of pixels that may show one of some objects, by points whose convex hulls hold them."""
         held = np.zeros(self._shape, dtype=np.bool_)
         pose = self._rays.stage_from_eye(s)
-        for corners_m in things_m:
-            window = window_of(self._rig, [pose], corners_m)
+        for corners_m in corners_of_objects_m:
+            window = image_window(self._rig, [pose], corners_m)
             if window is not None:
                 (left, top), (right, bottom) = window
                 held[top:bottom, left:right] = True
         return np.flatnonzero(held)
 
     def sunlit(self, part_id: NDArray[np.uint8], s: float) -> NDArray[np.bool_]:
-        """(H, W) where the rays of `part_ids` at time s meet surfaces of the drogue that see the sun."""
+        """(H, W) where the rays of `part_ids` at time s hit surfaces of the drogue that the sun lights."""
         sunlit = np.zeros(self._shape, dtype=np.bool_)
-        pixel = np.flatnonzero(parts_in(part_id, OF_DROGUE))
+        pixel = np.flatnonzero(parts_in(part_id, DROGUE_PARTS))
         if len(pixel):
             to_sun, _ = self._scene.sun
             ray = self._center_rays(jit_array(mi.UInt32, pixel), (s + 1) / 2)
@@ -77,36 +77,30 @@ class CenterPasses:
         return np.array(ids).astype(np.uint8), np.array(hit.t)
 
     def traced_eye(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> TracedEye:
-        """The passes at mid-exposure, without radiance yet."""
+        """The passes at mid-exposure, from the part ids and distances there; both are corrected where rays leaked."""
         depth = np.full(self._shape, np.inf, dtype=np.float32)
         normal = np.zeros((*self._shape, 3), dtype=np.float32)
         covered = np.flatnonzero(part_id > 0)
         if len(covered):
             pose = self._rays.pose_at_middle
             points, normals = self._surface(covered, CENTER)
-            leaked = slipped_through(part_id.reshape(-1)[covered], normals, points - pose[:, 3])
-            for place in ASIDE:
+            leaked = leaked_rays(part_id.reshape(-1)[covered], normals, points - pose[:, 3])
+            for place in OFF_CENTER:
                 if not leaked.any():
                     break
-                again = np.flatnonzero(leaked)
-                aside = covered[again]
-                points[again], normals[again] = self._surface(aside, place)
+                retry = np.flatnonzero(leaked)
+                aside = covered[retry]
+                points[retry], normals[retry] = self._surface(aside, place)
                 ids, distances = self._hits(
                     self._scene.scene, self._center_rays(jit_array(mi.UInt32, aside), place=place)
                 )
                 part_id.reshape(-1)[aside], distance_m.reshape(-1)[aside] = ids, distances
-                leaked[again] = slipped_through(ids, normals[again], points[again] - pose[:, 3])
+                leaked[retry] = leaked_rays(ids, normals[retry], points[retry] - pose[:, 3])
             met = part_id.reshape(-1)[covered] > 0
             depth.reshape(-1)[covered[met]] = (points[met] - pose[:, 3]) @ pose[:, 2]
             normal.reshape(-1, 3)[covered[met]] = normals[met] @ pose[:, :3]
-        return TracedEye(
-            part_id,
-            depth,
-            normal,
-            self._amodal(part_id, distance_m),
-            np.zeros(0, dtype=np.int64),
-            np.zeros((0, 3), dtype=np.float32),
-            np.zeros(0, dtype=np.float32),
+        return TracedEye.untraced(
+            part_id=part_id, depth_m=depth, normal=normal, amodal_px=self._amodal(part_id, distance_m)
         )
 
     def _surface(
@@ -115,13 +109,13 @@ class CenterPasses:
         """(P, 3) points and normals in the drogue frame."""
         ray = self._center_rays(jit_array(mi.UInt32, pixel), place=place)
         hit = self._scene.scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
-        # Robust rays know how far they go to the last digit, but their place on a narrow triangle to a millimetre.
+        # Robust intersection gives exact distances, but points on narrow triangles only to a millimetre.
         point = ray(dr.select(hit.is_valid(), hit.t, 0.0))
         dr.eval(point, hit.n)
         return rows_of(point), rows_of(hit.n)
 
     def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
-        """Pixel centres that each marker and the hub would cover alone, on the image's grid."""
+        """Pixel centres that each marker and the hub would cover if nothing occluded it."""
         pixel = self._pixels_of([self._scene.features_m], 0.0)
         if not len(pixel):
             return {}

@@ -1,8 +1,9 @@
-"""The drogue, with the light of other surfaces smoothed over each surface and many rays to edges and shadows."""
+"""The drogue with denoising: indirect light smoothed over each surface, and many rays to edges and shadows."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -12,162 +13,241 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import RenderSettings
 from geometry.stereo import Eye
-from render.compositing import InPicture
+from render.compositing import Compositor
 from render.mitsuba_engine.jit_arrays import jit_array
-from render.mitsuba_engine.paths.rays import FrameRays, Sampled, and_some_again, means_by_pixel
-from render.mitsuba_engine.paths.sample_allocation import PILOT_COUNT, NoiseBudget, PlacedSamples, in_parts
-from render.mitsuba_engine.paths.sun_sky_integrator import trace_first
+from render.mitsuba_engine.paths.rays import FrameRays, SampledLight, means_by_pixel, with_duplicates
+from render.mitsuba_engine.paths.sample_allocation import (
+    PILOT_COUNT,
+    NoiseBudget,
+    StratifiedSamples,
+    chunks_by_count,
+)
+from render.mitsuba_engine.paths.sun_sky_integrator import trace_direct
 from render.mitsuba_engine.paths.surface_light import SMOOTHING_M, SurfaceLight
-from render.mitsuba_engine.render_noise import TWICE_EVERY
-from render.mitsuba_engine.trace_request import Plan
+from render.mitsuba_engine.render_noise import DUPLICATE_EVERY
+from render.mitsuba_engine.trace_request import SamplingPlan
 
 MOST_SMOOTHING_STEPS = 2.5
-"""Largest standard deviation of the smoothing, in steps from one known centre to the next."""
-# `samples_per_px` is the count where the smoothing is this wide; narrower ones take more.
+"""Largest standard deviation of the smoothing, in steps from one traced pixel centre to the next."""
+# `samples_per_px` paths are traced where the smoothing is this wide; narrower smoothing takes more.
 _SMOOTHING_AT_COUNT_PX = 2.4
-# Of the squared noise that is aimed at: what the smoothed light may err by when its paths are traced once more.
-_LIGHTS_SHARE = 0.5
-# So many times the paths, or it stays as it is; and no more than so many times.
-_WORTH_IT, _MOST_TIMES = 1.5, 16.0
-# Where it is less than this share of the light's squared error, more paths would not show.
-_COUNTS_FROM = 0.1
+# Share of the squared noise that is aimed at which the denoised light may have after it is traced again.
+_LIGHT_SHARE = 0.5
+# Light is traced again only with at least so many times the paths, and with at most so many times.
+_LEAST_TIMES, _MOST_TIMES = 1.5, 16.0
+# A group of centres with less than this share of the light's squared error takes no more paths: they would not show.
+_LEAST_ERROR_SHARE = 0.1
 
 
-class SmoothedPaths:
+@dataclass(frozen=True, eq=False)
+class _CenterLight:
+    """Indirect light at pixel centres.
+
+    Attributes:
+        light: traced and smoothed.
+        hidden: (P,) at which centres much of the sky is hidden.
+        paths: (2,) from each centre where the sky is hidden, and in the open, for each of two estimates.
+    """
+
+    light: SurfaceLight
+    hidden: NDArray[np.bool_]
+    paths: NDArray[np.float64]
+
+
+class DenoisedPaths:
     """Traces one frame, its drogue at one distance."""
 
     def __init__(self, rays: FrameRays, settings: RenderSettings, px_per_m: float, moves_px: float) -> None:
-        """With the scale of the image at the drogue [px/m], and how far things move during the exposure. [px]"""
+        """Prepare the tracing of a frame.
+
+        Args:
+            rays: of the frame.
+            settings: samples and depths.
+            px_per_m: scale of the image at the drogue. [px/m]
+            moves_px: largest motion of the image from mid-exposure to either end. [px]
+        """
         self._rays, self._settings, self._moves_px = rays, settings, moves_px
         self._sigma_px = min(SMOOTHING_M * px_per_m, MOST_SMOOTHING_STEPS)
 
-    def trace(self, plans: dict[Eye, Plan], centers: dict[str, NDArray[np.int64]], picture: InPicture) -> Sampled:
-        """Trace the planned pixels of the drogue, and some of them once more.
+    def trace(
+        self, plans: dict[Eye, SamplingPlan], centers: dict[str, NDArray[np.int64]], compositor: Compositor
+    ) -> SampledLight:
+        """Trace the planned pixels of the drogue, and some of them a second time.
 
         Args:
             plans: of both eyes.
-            centers: pixels from whose centres paths start: `open` and `hidden`, by whether most of the sky is seen
-                from what stands there.
-            picture: what the light will be seen in.
+            centers: pixels from whose centres paths start: `open` and `hidden`, by whether most of the sky is visible
+                from the surface there.
+            compositor: shows the light behind the air and over the background.
         """
-        rays, settings = self._rays, self._settings
-        inside, edges = (
-            np.concatenate([rays.of_both(plans, kind) for kind in kinds])
-            for kinds in (("open", "sheltered", "deep"), ("edges", "deep_edges"))
+        interior = self._planned(plans, ("open", "sheltered", "deep"))
+        edges = self._planned(plans, ("edges", "deep_edges"))
+        centered = self._trace_centers(centers)
+        interior_light, edge_counts = self._interior_light(centered.light, interior), np.zeros(0, dtype=np.int64)
+        if len(edges):
+            interior_light, budget = self._meet_budget(centered, compositor, edges, (interior, interior_light))
+            edge_counts = budget.edge_counts(self._settings.edge_samples_per_px)
+        edge_light = denoised_edge_light(
+            self._rays, centered.light, with_duplicates(edges), with_duplicates(edge_counts)
         )
+        return _without_duplicates([(interior, interior_light), (edges, edge_light)])
+
+    def _planned(self, plans: dict[Eye, SamplingPlan], kinds: tuple[str, ...]) -> NDArray[np.int64]:
+        return np.concatenate([self._rays.pixels_of_both_eyes(plans, kind) for kind in kinds])
+
+    def _trace_centers(self, centers: dict[str, NDArray[np.int64]]) -> _CenterLight:
+        """Indirect light at the pixel centres, smoothed where the sky is hidden."""
         pixel = np.concatenate([centers["hidden"], centers["open"]])
         hidden = np.arange(len(pixel)) < len(centers["hidden"])
-        light = SurfaceLight(rays, pixel, 1 + self._moves_px)
-        # In each of two estimates, where the sky is hidden and in the open.
-        paths = np.array([self._paths_of_centers(), settings.open_samples_per_px]) / 2
+        light = SurfaceLight(self._rays, pixel, 1 + self._moves_px)
+        paths = np.array([self._paths_where_hidden(), self._settings.open_samples_per_px]) / 2
         self._trace_light(light, hidden, paths)
         light.smooth(hidden, MOST_SMOOTHING_STEPS)
-        of_inside, counts = self._looked_up_inside(light, inside), np.zeros(0, dtype=np.int64)
-        if len(edges):
-            budget = self._budget(light, picture, edges, inside, of_inside)
-            if budget.of_light.sum() > _WORTH_IT * _LIGHTS_SHARE * budget.aim:
-                # What is in the open otherwise has something close by before it.
-                light.smooth(~hidden, MOST_SMOOTHING_STEPS)
-                of_inside = self._looked_up_inside(light, inside)
-                budget = self._budget(light, picture, edges, inside, of_inside)
-                if self._traced_more(light, hidden, paths, budget):
-                    of_inside = self._looked_up_inside(light, inside)
-            counts = budget.edge_counts(settings.edge_samples_per_px)
-        of_edges = looked_up_often(rays, light, and_some_again(edges), and_some_again(counts))
-        twice = [(inside, of_inside), (edges, of_edges)]
-        again = [found[len(pixel) :] for pixel, found in twice]
-        return Sampled(
-            np.concatenate([inside, edges]),
-            np.concatenate([found[: len(pixel), :4] for pixel, found in twice]),
-            np.concatenate([pixel[::TWICE_EVERY] for pixel, _ in twice]),
-            np.concatenate([found[:, :4] for found in again]),
-            np.concatenate([found[:, 4:] for found in again]),
-        )
+        return _CenterLight(light=light, hidden=hidden, paths=paths)
 
-    def _paths_of_centers(self) -> float:
-        """Paths from each centre where the sky is hidden."""
+    def _paths_where_hidden(self) -> float:
+        """Paths from each centre where much of the sky is hidden."""
         settings = self._settings
         most = max(settings.samples_per_px, settings.edge_samples_per_px)
-        # Not the square, which would keep the error: far away most pixels are edges, and their rays err more.
+        # Not the square, which would keep the error: far away most pixels are edges, whose rays err more.
         paths: float = settings.samples_per_px * (_SMOOTHING_AT_COUNT_PX / self._sigma_px) ** 1.5
         return min(paths, most)
 
     def _trace_light(self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64]) -> None:
-        """All of it, with some so many paths where the sky is `hidden` and in the open in each of two estimates."""
+        """Trace the light of all centres; `paths` as in `_CenterLight`."""
         of_hidden, of_open = (grid_count(count) for count in paths)
         light.trace([(hidden, of_hidden), (~hidden, of_open)], self._settings.max_depth)
 
-    def _traced_more(
-        self, light: SurfaceLight, hidden: NDArray[np.bool_], paths: NDArray[np.float64], budget: NoiseBudget
-    ) -> bool:
-        """Trace and smooth all light once more, with more paths where it errs, if it errs by too much; tell the budget.
+    def _meet_budget(
+        self,
+        centered: _CenterLight,
+        compositor: Compositor,
+        edges: NDArray[np.int64],
+        interior: tuple[NDArray[np.int64], NDArray[np.float32]],
+    ) -> tuple[NDArray[np.float32], NoiseBudget]:
+        """Smooth more, and then trace more paths, while the denoised light is too noisy for the noise aimed at.
+
+        Args:
+            centered: is changed.
+            compositor: shows the light behind the air and over the background.
+            edges: pixels with edges.
+            interior: pixels inside parts, and their light so far.
 
         Returns:
-            Whether it was.
+            The light of the interior pixels, and the noise budget with what is left of the light's error.
         """
-        times = min(budget.of_light.sum() / (_LIGHTS_SHARE * budget.aim), _MOST_TIMES)
-        if times <= _WORTH_IT:
+        light, hidden = centered.light, centered.hidden
+        pixel, interior_light = interior
+        budget = self._budget(light, compositor, edges, (pixel, interior_light))
+        if budget.light_error.sum() > _LEAST_TIMES * _LIGHT_SHARE * budget.aim:
+            # In this frame something close hides the sky also from parts that are usually in the open.
+            light.smooth(~hidden, MOST_SMOOTHING_STEPS)
+            interior_light = self._interior_light(light, pixel)
+            budget = self._budget(light, compositor, edges, (pixel, interior_light))
+            if self._trace_more(centered, budget):
+                interior_light = self._interior_light(light, pixel)
+        return interior_light, budget
+
+    def _trace_more(self, centered: _CenterLight, budget: NoiseBudget) -> bool:
+        """Trace and smooth all light again, with more paths where it is noisy, if it is too noisy; update the budget.
+
+        Returns:
+            Whether it was traced again.
+        """
+        paths = centered.paths
+        times = min(budget.light_error.sum() / (_LIGHT_SHARE * budget.aim), _MOST_TIMES)
+        if times <= _LEAST_TIMES:
             return False
-        more = paths * np.where(budget.of_light > _COUNTS_FROM * budget.of_light.sum(), times, 1.0)
-        self._trace_light(light, hidden, more)
-        light.smooth(np.ones(len(hidden), dtype=np.bool_), MOST_SMOOTHING_STEPS)
-        budget.of_light *= [grid_count(before) / grid_count(now) for before, now in zip(paths, more, strict=True)]
+        more = paths * np.where(budget.light_error > _LEAST_ERROR_SHARE * budget.light_error.sum(), times, 1.0)
+        self._trace_light(centered.light, centered.hidden, more)
+        centered.light.smooth(np.ones(len(centered.hidden), dtype=np.bool_), MOST_SMOOTHING_STEPS)
+        budget.light_error *= [grid_count(before) / grid_count(now) for before, now in zip(paths, more, strict=True)]
         return True
 
-    def _looked_up_inside(self, light: SurfaceLight, inside: NDArray[np.int64]) -> NDArray[np.float32]:
-        return looked_up(self._rays, light, and_some_again(inside), self._settings.open_samples_per_px, at_edges=False)
+    def _interior_light(self, light: SurfaceLight, interior: NDArray[np.int64]) -> NDArray[np.float32]:
+        count = self._settings.open_samples_per_px
+        return denoised_light(self._rays, light, with_duplicates(interior), count, at_edges=False)
 
     def _budget(
         self,
         light: SurfaceLight,
-        picture: InPicture,
+        compositor: Compositor,
         edges: NDArray[np.int64],
-        inside: NDArray[np.int64],
-        of_inside: NDArray[np.float32],
+        interior: tuple[NDArray[np.int64], NDArray[np.float32]],
     ) -> NoiseBudget:
-        """By rays beforehand through pixels on edges, and what is found inside."""
-        pilot = edges, pilot_rays(self._rays, light, edges)
-        some_inside = inside[::TWICE_EVERY], of_inside[len(inside) :]
-        return NoiseBudget(picture, pilot, some_inside, self._settings.noise_over_sensor)
+        """From pilot rays through pixels with edges, and the light of interior pixels."""
+        pixel, interior_light = interior
+        return NoiseBudget(
+            compositor=compositor,
+            edges=(edges, pilot_rays(self._rays, light, edges)),
+            interior=(pixel[::DUPLICATE_EVERY], interior_light[len(pixel) :]),
+            noise_over_sensor=self._settings.noise_over_sensor,
+        )
 
 
-def looked_up(
+def _without_duplicates(groups: list[tuple[NDArray[np.int64], NDArray[np.float32]]]) -> SampledLight:
+    """Pixels and their (P + A, 7) light, the A duplicates of each group told apart."""
+    duplicates = [found[len(pixel) :] for pixel, found in groups]
+    return SampledLight(
+        pixel=np.concatenate([pixel for pixel, _ in groups]),
+        light=np.concatenate([found[: len(pixel), :4] for pixel, found in groups]),
+        duplicate_pixel=np.concatenate([pixel[::DUPLICATE_EVERY] for pixel, _ in groups]),
+        duplicate_light=np.concatenate([found[:, :4] for found in duplicates]),
+        duplicate_error=np.concatenate([found[:, 4:] for found in duplicates]),
+    )
+
+
+def denoised_light(
     rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64], count: int, at_edges: bool
 ) -> NDArray[np.float32]:
-    """(P, 7) radiance, coverage and error of the smoothed light, of pixels of the lattice itself or `at_edges` any."""
-    return np.concatenate([_launch(rays, light, part, count, at_edges) for part in rays.parts(pixel, count)])
+    """Direct light of `count` rays through each pixel, with the denoised indirect light.
+
+    Args:
+        rays: of the frame.
+        light: indirect light at pixel centres.
+        pixel: (P,) flat indices.
+        count: rays per pixel.
+        at_edges: interpolate the indirect light between centres; otherwise each pixel must be one of the light's own.
+
+    Returns:
+        (P, 7) radiance, coverage and error of the denoised light.
+    """
+    chunks = rays.launch_chunks(pixel, count)
+    return np.concatenate([_denoised_means(rays, light, chunk, count, at_edges) for chunk in chunks])
 
 
-def looked_up_often(
+def denoised_edge_light(
     rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """The same at edges, of pixels that take so many rays each."""
+    """The same as `denoised_light` at edges, with (P,) counts of rays, one for each pixel."""
     found = [np.zeros((0, 7), dtype=np.float32)]
-    for part, part_counts in in_parts(pixel, counts):
-        samples = PlacedSamples(rays, part, part_counts)
-        found.append(_bounded(samples.means(_channels(rays, light, samples.pixel, samples.place, samples.moment))))
+    for chunk, chunk_counts in chunks_by_count(pixel, counts):
+        samples = StratifiedSamples(rays, chunk, chunk_counts)
+        found.append(_not_negative(samples.means(_channels(rays, light, samples.pixel, samples.place, samples.moment))))
     return np.concatenate(found)
 
 
 def pilot_rays(rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64]) -> NDArray[np.float32]:
-    """(P, PILOT_COUNT, 7) the same of single rays."""
-    found = [_channels(rays, light, *_places(rays, part, PILOT_COUNT)) for part in rays.parts(pixel, PILOT_COUNT)]
+    """(P, PILOT_COUNT, 7) radiance, coverage and error of single rays through each pixel."""
+    chunks = rays.launch_chunks(pixel, PILOT_COUNT)
+    found = [_channels(rays, light, *_random_places(rays, chunk, PILOT_COUNT)) for chunk in chunks]
     dr.eval(found)
     rows = np.concatenate([np.stack([np.array(channel) for channel in channels], axis=-1) for channels in found])
     single: NDArray[np.float32] = rows.reshape(len(pixel), PILOT_COUNT, 7)
     return single
 
 
-def _launch(
+def _denoised_means(
     rays: FrameRays, light: SurfaceLight, pixel: NDArray[np.int64], count: int, at_edges: bool
 ) -> NDArray[np.float32]:
     if not len(pixel):
         return np.zeros((0, 7), dtype=np.float32)
-    return _bounded(means_by_pixel(_channels(rays, light, *_places(rays, pixel, count), at_edges), count))
+    channels = _channels(rays, light, *_random_places(rays, pixel, count), at_edges)
+    return _not_negative(means_by_pixel(channels, count))
 
 
-def _places(rays: FrameRays, pixel: NDArray[np.int64], count: int) -> tuple[Any, Any, Any]:
-    """Pixel, place and moment of `count` neighbouring lanes for each pixel."""
+def _random_places(rays: FrameRays, pixel: NDArray[np.int64], count: int) -> tuple[Any, Any, Any]:
+    """Pixel, place in it and moment of `count` neighbouring lanes for each pixel."""
     lanes = len(pixel) * count
     sampler = rays.sampler(lanes, count)
     of_pixel = dr.gather(mi.UInt32, jit_array(mi.UInt32, pixel), dr.arange(mi.UInt32, lanes) // count)
@@ -177,24 +257,24 @@ def _places(rays: FrameRays, pixel: NDArray[np.int64], count: int) -> tuple[Any,
 def _channels(
     rays: FrameRays, light: SurfaceLight, of_pixel: Any, place: Any, moment: Any, at_edges: bool = True
 ) -> list[Any]:
-    """Radiance, coverage and error of the smoothed light of single rays: 7 arrays."""
+    """Radiance, coverage and error of the denoised light of single rays: 7 arrays."""
     ray = rays.through(of_pixel, place, moment)
-    radiance, hit, surface, known = trace_first(rays.scene, rays.lights, ray)
+    radiance, hit, surface, known = trace_direct(rays.scene, rays.lights, ray)
     reflectance = surface.bsdf(ray).eval_diffuse_reflectance(surface, hit)
-    other, error = light.towards(of_pixel, place, surface, known) if at_edges else light.at_center(of_pixel)
-    radiance += dr.select(hit, reflectance * other, 0.0)
+    indirect, error = light.towards(of_pixel, place, surface, known) if at_edges else light.at_center(of_pixel)
+    radiance += dr.select(hit, reflectance * indirect, 0.0)
     error = dr.select(hit, reflectance * error, 0.0)
     return [*radiance, dr.select(hit, mi.Float(1.0), 0.0), *error]
 
 
-def _bounded(means: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What is known of the sky's light can come out larger than what paths take away of it: light is not below 0."""
+def _not_negative(means: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Radiance of at least 0, in place: the residual can subtract more than the known light of the sky."""
     means[:, :3] = np.maximum(means[:, :3], 0.0)
     return means
 
 
 def grid_count(count: float) -> int:
-    """One of few counts, as each compiles kernels of its own: the nearest square from 4 on, a whole number below."""
+    """The nearest number of samples out of few, as each one compiles kernels of its own: squares from 4 on."""
     if count < 4:
         return max(int(count), 1)
     side = math.sqrt(count)

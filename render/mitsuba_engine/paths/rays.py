@@ -18,11 +18,11 @@ from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import pose_polynomial
 from render.mitsuba_engine.jit_arrays import jit_array
-from render.mitsuba_engine.paths.sun_sky_integrator import Lights, SkyIrradiance
-from render.mitsuba_engine.render_noise import TWICE_EVERY
+from render.mitsuba_engine.paths.sun_sky_integrator import SceneLights, SkyIrradiance
+from render.mitsuba_engine.render_noise import DUPLICATE_EVERY
 from render.mitsuba_engine.scene import DrogueScene, as_mitsuba_reads, by_shape
-from render.mitsuba_engine.trace_request import Plan
-from scenes.environment_radiance import Surroundings
+from render.mitsuba_engine.trace_request import SamplingPlan
+from scenes.environment_radiance import EnvironmentRadiance
 
 
 class CameraRays:
@@ -35,7 +35,7 @@ class CameraRays:
         self._pose = pose_polynomial(frame, eye)
         self.pose_at_middle = self._pose[0]
         self.moves = bool(np.abs(self._pose[1:]).max() > 0)
-        # Plain numbers would become part of the compiled kernel, and every frame would compile its own.
+        # Python numbers would become part of the compiled kernel, so that every frame would compile its own.
         self._opaque_pose = [
             [[dr.opaque(mi.Float, float(value)) for value in row] for row in coefficient] for coefficient in self._pose
         ]
@@ -67,7 +67,7 @@ class CameraRays:
         return mi.Ray3f(mi.Point3f(*[pose[i][3] for i in range(3)]), dr.normalize(direction))
 
     def _between_corners(self, slopes: Any, corner: Any, place: Any) -> Any:
-        """Slopes at places of pixels, by their four corners; `corner` is the index of the first of them."""
+        """Slopes at places of pixels, interpolated between their four corners; `corner` is the index of the first."""
         low, high = corner, corner + self.camera.width_px + 1
         first, second, third, fourth = (dr.gather(mi.Float, slopes, at) for at in (low, low + 1, high, high + 1))
         return dr.lerp(dr.lerp(first, second, place.x), dr.lerp(third, fourth, place.x), place.y)
@@ -80,9 +80,9 @@ class CameraRays:
 
 
 def _corner_slopes(lens: Lens) -> tuple[Any, Any]:
-    """Slopes x / z and y / z of the rays through the corners of a real eye's pixels, row by row.
+    """Slopes x / z and y / z of the rays through the pixel corners of an eye with a lens, row by row.
 
-    Across one pixel a lens bends them by less than 1e-7 from linear.
+    Within one pixel they deviate from linear interpolation by less than 1e-7.
     """
     camera = lens.camera
     u, v = np.meshgrid(np.arange(camera.width_px + 1) - 0.5, np.arange(camera.height_px + 1) - 0.5)
@@ -91,37 +91,46 @@ def _corner_slopes(lens: Lens) -> tuple[Any, Any]:
 
 
 MOST_LANES = 2_000_000
-"""Lanes of one launch: bounds memory (about 300 bytes a lane) without costing speed."""
+"""Most lanes of one kernel launch: bounds memory (about 300 bytes per lane) at no cost in speed."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
-    """What samples say of the pixels of both eyes; those of the right eye come after all of the left.
+class SampledLight:
+    """Sampled light of pixels of both eyes; flat indices of the right eye come after all of the left's.
 
     Attributes:
         pixel: (P,) flat indices.
         light: (P, 4) radiance [cd/m2] and coverage.
-        again: (A,) pixels of the drogue that were traced a second time.
-        light_again: (A, 4) what came of it.
-        error_again: (A, 3) known errors of their radiance that both share. [cd/m2]
+        duplicate_pixel: (A,) pixels of the drogue that were traced a second time.
+        duplicate_light: (A, 4) result of the second time.
+        duplicate_error: (A, 3) known errors of radiance that both have in common. [cd/m2]
     """
 
     pixel: NDArray[np.int64]
     light: NDArray[np.float32]
-    again: NDArray[np.int64]
-    light_again: NDArray[np.float32]
-    error_again: NDArray[np.float32]
+    duplicate_pixel: NDArray[np.int64]
+    duplicate_light: NDArray[np.float32]
+    duplicate_error: NDArray[np.float32]
 
-    def beside(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> Sampled:
-        """The same with other pixels that were traced once."""
+    def with_pixels(self, pixel: NDArray[np.int64], light: NDArray[np.float32]) -> SampledLight:
+        """The same and other pixels, which were traced once."""
         return replace(self, pixel=np.concatenate([self.pixel, pixel]), light=np.concatenate([self.light, light]))
 
 
 class FrameRays:
     """Cameras, lights and random numbers of one frame."""
 
-    def __init__(self, frame: FrameSpec, scene: DrogueScene, around: Surroundings, in_open: NDArray[np.uint8]) -> None:
-        """With a table by part id of what takes the open sky's light as known; see `Lights`."""
+    def __init__(
+        self, frame: FrameSpec, scene: DrogueScene, ambient: EnvironmentRadiance, open_to_sky: NDArray[np.uint8]
+    ) -> None:
+        """Set up the rays of a frame.
+
+        Args:
+            frame: cameras, exposure and seed.
+            scene: set up for the frame.
+            ambient: radiance of its environment.
+            open_to_sky: (256,) 1 for parts whose light from the whole sky is taken as known; see `SceneLights`.
+        """
         self.scene = scene.scene
         self.width_px = frame.rig.camera.width_px
         self.size = self.width_px * frame.rig.camera.height_px
@@ -130,24 +139,24 @@ class FrameRays:
         self._seeds = frame_generator(frame.seed, frame.frame_index, "mitsuba samples")
         to_sun, sun_lux = scene.sun
         world_from_stage = frame.world_from_left @ frame.left_from_stage_at(0.0)
-        self.lights = Lights(
-            to_sun,
-            sun_lux,
-            SkyIrradiance(as_mitsuba_reads(around.light_map), world_from_stage.rotation),
-            jit_array(mi.Float, by_shape(scene.scene, in_open)),
-            frame.drogue is not None and frame.drogue.marker_luminance_cd_m2 > 0,
+        self.lights = SceneLights(
+            to_sun=to_sun,
+            sun_lux=sun_lux,
+            sky=SkyIrradiance(as_mitsuba_reads(ambient.light_map), world_from_stage.rotation),
+            open_to_sky=jit_array(mi.Float, by_shape(scene.scene, open_to_sky)),
+            parts_emit=frame.drogue is not None and frame.drogue.marker_luminance_cd_m2 > 0,
         )
 
-    def of_both(self, plans: dict[Eye, Plan], kind: str) -> NDArray[np.int64]:
-        """Pixels of a kind of both eyes' plans."""
+    def pixels_of_both_eyes(self, plans: dict[Eye, SamplingPlan], kind: str) -> NDArray[np.int64]:
+        """Pixels of one group of both eyes' plans, such as `edges`."""
         return np.concatenate([getattr(plans[eye], kind) + index * self.size for index, eye in enumerate(EYES)])
 
-    def parts(self, pixel: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-        """The same pixels in as many pieces as launches of so many samples a pixel need."""
+    def launch_chunks(self, pixel: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+        """Pixels in chunks of at most `MOST_LANES` lanes, with `count` samples per pixel."""
         return np.split(pixel, range(max(MOST_LANES // count, 1), len(pixel), max(MOST_LANES // count, 1)))
 
     def sampler(self, lanes: int, count: int) -> Any:
-        """A sampler with a seed of its own, for `count` neighbouring lanes a pixel."""
+        """A sampler with a seed of its own, for `count` neighbouring lanes per pixel."""
         sampler = mi.load_dict({"type": "multijitter", "sample_count": count})
         # The multijitter sampler rounds its count to a product of two near-equal factors.
         if sampler.sample_count() != count:
@@ -156,7 +165,7 @@ class FrameRays:
         sampler.seed(int(self._seeds.integers(2**31)), lanes)
         return sampler
 
-    def bits(self, kinds: int, pixels: int) -> NDArray[np.uint32]:
+    def random_bits(self, kinds: int, pixels: int) -> NDArray[np.uint32]:
         """(kinds, pixels) random bits."""
         return self._seeds.integers(2**32, size=(kinds, pixels), dtype=np.uint32)
 
@@ -171,7 +180,7 @@ class FrameRays:
 
 def means_by_pixel(channels: list[Any], count: int) -> NDArray[np.float32]:
     """(P, len(channels)) means over `count` neighbouring lanes."""
-    # Without this every sum would trace the paths again.
+    # Without this evaluation every sum would trace the paths again.
     dr.eval(channels)
     sums = np.stack([np.array(dr.block_sum(channel, count)) for channel in channels], axis=-1)
     means: NDArray[np.float32] = sums / np.float32(count)
@@ -179,14 +188,14 @@ def means_by_pixel(channels: list[Any], count: int) -> NDArray[np.float32]:
 
 
 def rows_of(vector: Any) -> NDArray[np.float32]:
-    """(P, 3) numbers of an evaluated vector.
+    """(P, 3) array of an evaluated vector.
 
-    Converted as a whole, it would go through a kernel of its own for every P.
+    Converting the vector as a whole would compile a kernel for every P.
     """
     axes: NDArray[np.float32] = np.stack([np.array(axis) for axis in vector])
     return axes.T
 
 
-def and_some_again(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pixels, then every so many of them a second time."""
-    return np.concatenate([pixel, pixel[::TWICE_EVERY]])
+def with_duplicates(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pixels, followed by one in `DUPLICATE_EVERY` of them a second time."""
+    return np.concatenate([pixel, pixel[::DUPLICATE_EVERY]])

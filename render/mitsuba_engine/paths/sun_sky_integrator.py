@@ -24,20 +24,20 @@ from geometry.se3 import Array
 from render.mitsuba_engine.jit_arrays import jit_tensor
 from scenes.sky.light import Radiance
 
-# Light by direction of the plate is so smooth that linear interpolation between 3.75 degrees errs by 5e-4 at most.
+# Irradiance varies so smoothly with the normal that linear interpolation over 3.75 degrees errs by at most 5e-4.
 _ROWS = 48
-# Directions that the light is summed over: a cosine varies over a block of 4 x 4 texels of 1.4 degrees by 1e-3.
+# The integral sums over blocks of 4 x 4 texels of 1.4 degrees, over which a cosine varies by 1e-3.
 _BLOCK_PX = 4
 
 
 def irradiance_map(light: Radiance) -> Radiance:
-    """Mean radiance that a plate receives, weighted by the cosine, for plates of all directions.
+    """Irradiance over pi of plates of all directions.
 
     Args:
         light: (128, 256, 3) equirectangular map whose first and last rows are zenith and nadir, as Mitsuba reads it.
 
     Returns:
-        (48, 96, 3) map with texel centres half a texel inside: irradiance over pi. [cd/m2]
+        (48, 96, 3) map by direction of the normal, with texel centres half a texel inside. [cd/m2]
     """
     weights = _row_weights(light.shape[0])
     rows, columns = light.shape[0] // _BLOCK_PX, light.shape[1] // _BLOCK_PX
@@ -58,7 +58,7 @@ def _row_weights(height: int) -> Array:
 
 @lru_cache(maxsize=1)
 def _cosines(height: int) -> NDArray[np.float32]:
-    """(plates, blocks) what a block of texels counts for a plate; each plate's row sums to 1 under an even sky."""
+    """(plates, blocks) weight of each block of texels for each plate; the weights of a plate sum to 1."""
     weights = _row_weights(height)
     rows = height // _BLOCK_PX
     polar = np.arange(height) * np.pi / (height - 1)
@@ -80,17 +80,17 @@ def _directions(polar: Array, columns: int) -> Array:
 
 
 class SkyIrradiance:
-    """Irradiance over pi by the direction of a plate in the stage's axes."""
+    """Irradiance over pi by an unobstructed sky and ground, by the direction of the normal in the stage's axes."""
 
     def __init__(self, light: Radiance, world_from_stage: Array) -> None:
-        """From a light map (see `irradiance_map`) and the (3, 3) rotation into its axes."""
+        """Take a light map (see `irradiance_map`) and the (3, 3) rotation into its axes."""
         plates = irradiance_map(light)
         wrapped = np.concatenate([plates[:, -1:], plates, plates[:, :1]], axis=1)
         self._columns = plates.shape[1]
         # The type is chosen with the variant, which type checkers do not see.
         texture: Any = mi.Texture2f
         self._texture = texture(jit_tensor(wrapped), wrap_mode=dr.WrapMode.Clamp)
-        # Plain numbers would become part of the compiled kernel.
+        # Python numbers would become part of the compiled kernel.
         self._rotation = [[dr.opaque(mi.Float, float(value)) for value in row] for row in world_from_stage]
 
     def towards(self, normal: Any) -> Any:
@@ -103,54 +103,54 @@ class SkyIrradiance:
 
 
 @dataclass(frozen=True, eq=False)
-class Lights:
-    """What shines on the stage.
+class SceneLights:
+    """The lights of a scene.
 
     Attributes:
         to_sun: direction towards the sun, in the stage's axes.
-        sun_lux: illuminance of a plane that faces it.
-        sky: its light on plates in the open.
-        in_open: by the registry number of a shape, 1 where light from the open sky is taken as known, else 0.
-        lit: whether parts shine by themselves.
+        sun_lux: illuminance of a plane that faces the sun. [lux]
+        sky: irradiance by the unobstructed sky.
+        open_to_sky: by the registry number of a shape, 1 where light from the whole sky is taken as known, else 0.
+        parts_emit: whether markers are lamps.
     """
 
     to_sun: Any
     sun_lux: Any
     sky: SkyIrradiance
-    in_open: Any
-    lit: bool
+    open_to_sky: Any
+    parts_emit: bool
 
 
-def trace_first(scene: Any, lights: Lights, ray: Any) -> tuple[Any, Any, Any, Any]:
-    """What the surface that rays meet sends from lamps, sun and, for parts in the open, an unhidden sky.
+def trace_direct(scene: Any, lights: SceneLights, ray: Any) -> tuple[Any, Any, Any, Any]:
+    """Direct light of the first surface that rays hit: lamps, sun and, for parts open to the sky, an unobstructed sky.
 
     Returns:
-        Radiance (0 for rays that meet nothing), whether a ray meets something, the surface, and which share of the
-        unhidden sky's light is in the radiance.
+        Radiance (0 for rays that miss), whether a ray hits something, the surface, and the share of the unobstructed
+        sky's light that the radiance holds.
     """
     surface = scene.ray_intersect(ray, mi.RayFlags.All, True)
     hit = surface.is_valid()
-    radiance = _own_and_sunlight(scene, lights, surface, hit)
+    radiance = _emitted_and_sunlight(scene, lights, surface, hit)
     number: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
-    known = dr.gather(mi.Float, lights.in_open, number, hit)
+    known = dr.gather(mi.Float, lights.open_to_sky, number, hit)
     front = hit & (surface.wi.z > 0)
     reflectance = surface.bsdf(ray).eval_diffuse_reflectance(surface, front)
     radiance += dr.select(front, known * reflectance * lights.sky.towards(surface.sh_frame.n), 0.0)
     return radiance, hit, surface, known
 
 
-def trace_rest(scene: Any, lights: Lights, sampler: Any, first: tuple[Any, Any, Any], max_depth: int) -> Any:
-    """What `trace_first` leaves out: light by way of other surfaces, and the sky less what was taken as known.
+def trace_residual(scene: Any, lights: SceneLights, sampler: Any, first: tuple[Any, Any, Any], max_depth: int) -> Any:
+    """The light that `trace_direct` leaves out: by reflection from other surfaces, and the sky less its known light.
 
     Args:
-        scene: with its environment map.
-        lights: that shine on it.
+        scene: has an environment map.
+        lights: of the scene.
         sampler: seeded for the wavefront.
-        first: surface, whether it is one, and the share of the sky's light that is known, from `trace_first`.
-        max_depth: the longest path in segments.
+        first: surface, whether it was hit, and the known share of the sky's light, as from `trace_direct`.
+        max_depth: longest path in segments.
 
     Returns:
-        Radiance; may be negative, and is not on average.
+        Radiance; single samples may be negative.
     """
     surface, active, known = first
     context = mi.BSDFContext()
@@ -162,31 +162,31 @@ def trace_rest(scene: Any, lights: Lights, sampler: Any, first: tuple[Any, Any, 
         ray = surface.spawn_ray(surface.to_world(sample.wo))
         surface = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         hit = active & surface.is_valid()
-        total += weight * _sky_seen(scene, ray, active, hit, known)
-        total += weight * _own_and_sunlight(scene, lights, surface, hit)
+        total += weight * _unknown_sky(scene, ray, active, hit, known)
+        total += weight * _emitted_and_sunlight(scene, lights, surface, hit)
         active, known = hit, mi.Float(0.0)
     sample, share = surface.bsdf().sample(context, surface, sampler.next_1d(), sampler.next_2d(), active)
     weight *= share
     active &= dr.max(weight) > 0.0
     ray = surface.spawn_ray(surface.to_world(sample.wo))
     hit = active & scene.ray_test(ray, active)
-    total += weight * _sky_seen(scene, ray, active, hit, known)
+    total += weight * _unknown_sky(scene, ray, active, hit, known)
     return dr.select(dr.isfinite(total), total, 0.0)
 
 
-def _own_and_sunlight(scene: Any, lights: Lights, surface: Any, hit: Any) -> Any:
-    """Radiance of surfaces towards where they are seen from, by lamps and by sunlight alone."""
+def _emitted_and_sunlight(scene: Any, lights: SceneLights, surface: Any, hit: Any) -> Any:
+    """Radiance of surfaces towards the ray's origin, by lamps and by sunlight alone."""
     towards = surface.to_local(lights.to_sun)
     in_sun = hit & (towards.z > 0) & (surface.wi.z > 0)
     in_sun &= ~scene.ray_test(surface.spawn_ray(lights.to_sun), in_sun)
     radiance = lights.sun_lux * surface.bsdf().eval(mi.BSDFContext(), surface, towards, in_sun)
-    if lights.lit:
+    if lights.parts_emit:
         radiance += surface.emitter(scene).eval(surface, hit)
     return radiance
 
 
-def _sky_seen(scene: Any, ray: Any, active: Any, hit: Any, known: Any) -> Any:
-    """The sky at the end of rays that meet nothing, less the share of it that is known already."""
+def _unknown_sky(scene: Any, ray: Any, active: Any, hit: Any, known: Any) -> Any:
+    """The sky's radiance along rays that miss, less the share of it that is already counted as known."""
     end = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
     end.wi = -ray.d
     seen = dr.select(hit, -known, 1.0 - known)

@@ -9,8 +9,8 @@ import pytest
 
 from render.engine import load_engine
 from studies.engine_agreement.agreement import frame_bars, part_ratios, plate_bars
-from studies.engine_agreement.measures import PlateLight, compare
-from studies.engine_agreement.paired_frames import Rendered, paired_frames, render_both
+from studies.engine_agreement.measures import PlateIlluminance, compare
+from studies.engine_agreement.paired_frames import RenderedFrame, paired_frames, render_both
 
 
 @pytest.fixture(scope="module")
@@ -19,20 +19,20 @@ def paired():
 
 
 @pytest.fixture(scope="module")
-def rendered(paired) -> Rendered:
+def rendered(paired) -> RenderedFrame:
     return render_both(paired, load_engine("analytic"))
 
 
-def altered(rendered: Rendered, change) -> Rendered:
+def altered(rendered: RenderedFrame, change) -> RenderedFrame:
     """The same with every eye changed."""
     plain, lit = (
         replace(stereo, left=change(stereo.left), right=change(stereo.right))
         for stereo in (rendered.plain, rendered.lit)
     )
-    return Rendered(plain, lit, rendered.cpu_s)
+    return RenderedFrame(plain, lit, rendered.cpu_s)
 
 
-def missed(paired, one: Rendered, other: Rendered) -> set[str]:
+def missed(paired, one: RenderedFrame, other: RenderedFrame) -> set[str]:
     agreement = compare(paired.frame, one, other)
     return {bar.name.split(",")[0] for bar in frame_bars([agreement], [3.0]) if not bar.reached}
 
@@ -63,6 +63,6 @@ def test_masks_and_brightness_that_differ_are_found(paired, rendered):
 
 
 def test_a_plate_that_is_too_bright_is_found():
-    plate = PlateLight(0.0, 0.0, one_lux=101.0, other_lux=100.0, integral_lux=100.0)
+    plate = PlateIlluminance(0.0, 0.0, one_lux=101.0, other_lux=100.0, integral_lux=100.0)
     (found,) = plate_bars([plate])
     assert not found.reached and found.value == pytest.approx(0.01)

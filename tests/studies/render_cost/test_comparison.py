@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from studies.render_cost.comparison import CYCLES, MITSUBA, OWN, read_station, table_lines, write_station
-from studies.render_cost.noise_search import View, frame_at, recipe_at
+from studies.render_cost.noise_search import MeasuredView, frame_at, recipe_at
 
 
 def station() -> dict[str, Any]:
@@ -35,7 +35,7 @@ def test_lower_bounds_and_extrapolations_are_marked() -> None:
 def test_the_crop_holds_the_drogue() -> None:
     drogue = np.zeros((960, 1280), dtype=bool)
     drogue[400:450, 5:90] = True
-    view = View(frame_at(10.0, 1), recipe_at(10.0, 1).render, drogue, drogue)
+    view = MeasuredView(frame_at(10.0, 1), recipe_at(10.0, 1).render, drogue, drogue)
     left, top, width, height = view.crop
     assert left == 0 and top < 400 and top + height > 450 and width > 90
     assert all(np.count_nonzero(mask) == 50 * 85 for mask in view.masks)

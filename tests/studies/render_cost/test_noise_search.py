@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.render_cost.noise_search import NoiseAt, noise_of, reach_noise, relative_noise, samples_for
+from studies.render_cost.noise_search import NoiseEstimate, noise_of, reach_noise, relative_noise, samples_for
 
 
 def test_noise_of_two_pictures_is_that_of_one() -> None:
@@ -29,9 +29,9 @@ def test_only_pixels_of_the_masks_count() -> None:
 def renderer(power: float, tried: list[int]):  # type: ignore[no-untyped-def]
     """Noise that falls with a power of the samples, 0.4 at one."""
 
-    def measure(samples: int) -> NoiseAt:
+    def measure(samples: int) -> NoiseEstimate:
         tried.append(samples)
-        return NoiseAt(samples, 0.4 * samples**-power, 0.2 * samples**-power, 1.0)
+        return NoiseEstimate(samples, 0.4 * samples**-power, 0.2 * samples**-power, 1.0)
 
     return measure
 
@@ -56,4 +56,4 @@ def test_a_noise_below_the_one_asked_for_with_one_sample_stands() -> None:
 
 
 def test_samples_are_never_fewer_than_one() -> None:
-    assert samples_for(NoiseAt(4, 0.01, 0.01, 1.0), 1.0) == 1
+    assert samples_for(NoiseEstimate(4, 0.01, 0.01, 1.0), 1.0) == 1
