@@ -1,4 +1,4 @@
-"""How light spreads through the layers of one scene, and the light of the air itself."""
+"""Transfer of light through cloud layers and mist, and airlight."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from scenes.sky.light import Radiance, hemisphere, henyey_greenstein
 
 HORIZON_ELEVATION_RAD = 0.01
 _DROPLET_ASYMMETRY = 0.8
-# Height over which the haze thins out: how much of it stands before the sky at the horizon.
+# Scale height of the haze, which sets how much of it is in front of the sky at the horizon.
 _HAZE_SCALE_M = 1500.0
-# Air between a bright deck and dark ground shines with a little more than half of the light that falls into it.
+# Radiance of air between a bright cloud deck and dark ground, and of mist, over that of the incident light.
 _AIR_UNDER_DECK, _AIR_IN_MIST = 0.6, 0.75
 _LOWEST_BEAM_SINE = 0.05
 
 
 class LayeredAir:
-    """Light between the layers, from clear sky, cloud layers and mist of one environment."""
+    """Light between the cloud layers and mist of one environment, under its clear sky."""
 
     def __init__(self, environment: Environment, sky: ClearSky) -> None:
         self._environment = environment
         self._sky = sky
 
     def moved_to(self, environment: Environment) -> LayeredAir:
-        """The same air from another place: other clouds stand before sun and moon; what is a mean over them stays.
+        """The same air for a camera elsewhere: other clouds cover sun and moon; means over the layers stay.
 
         Args:
-            environment: the same, with another `camera_offset_m`.
+            environment: the same environment with another `camera_offset_m`.
         """
         moved = copy(self)
         moved._environment = environment
@@ -58,8 +58,8 @@ class LayeredAir:
 
     @cached_property
     def ground_illuminance_lux(self) -> NDArray[np.float64]:
-        """(3,) illuminance of level ground under all layers, on average over them. [lux]"""
-        result: NDArray[np.float64] = self._open_level_lux * _let_through(self._environment.clouds)
+        """(3,) mean illuminance of level ground under all layers. [lux]"""
+        result: NDArray[np.float64] = self._open_level_lux * _transmitted_share(self._environment.clouds)
         if self._environment.mist is not None:
             mist = self._environment.mist
             result /= 1.0 + BACK_SCATTER * mist.extinction_per_m * (mist.above_m + mist.below_m)
@@ -67,9 +67,9 @@ class LayeredAir:
 
     @cached_property
     def ground_beam_lux(self) -> NDArray[np.float64]:
-        """(3,) illuminance of a plane on the ground that faces the beam, on average over cloud and gaps. [lux]"""
+        """(3,) mean illuminance, over cloud and gaps, of a plane on the ground that faces the beam. [lux]"""
         beam, mist = self._sky.beam, self._environment.mist
-        share = _open_share(self._environment.clouds)
+        share = _direct_share(self._environment.clouds)
         if mist is not None:
             depth = mist.extinction_per_m * (mist.above_m + mist.below_m)
             share *= float(np.exp(-depth / max(float(beam.direction[2]), _LOWEST_BEAM_SINE)))
@@ -84,7 +84,7 @@ class LayeredAir:
 
     @cached_property
     def beam_share(self) -> float:
-        """Share of the beam that cloud and mist let through to the camera."""
+        """Share of the beam that cloud and mist transmit to the camera."""
         direction, offset_m = self._sky.beam.direction, self._environment.camera_offset_m
         share = 1.0
         for layer in self._environment.clouds:
@@ -100,30 +100,30 @@ class LayeredAir:
         return float(np.exp(-mist.extinction_per_m * mist.above_m / sine))
 
     def light_on(self, layer: CloudLayer) -> CloudLight:
-        """What shines on one cloud layer through those above it and from those below."""
+        """Light on a cloud layer through the layers above it and from those below."""
         environment, beam = self._environment, self._sky.beam
         height_m = layer.height_above_camera_m
         above = tuple(other for other in environment.clouds if other.height_above_camera_m > height_m)
         below = tuple(other for other in environment.clouds if other.height_above_camera_m < height_m)
-        open_share, through = _open_share(above), _let_through(above)
-        spread = np.maximum(through - open_share, 0.0) * self._open_level_lux
+        direct_share, through = _direct_share(above), _transmitted_share(above)
+        spread = np.maximum(through - direct_share, 0.0) * self._open_level_lux
         falling = through * self._open_level_lux
         ground = np.array(environment.ground_reflectance_rgb) * self.ground_illuminance_lux
         return CloudLight(
             direction=beam.direction,
-            beam_lux=open_share * beam.beam_illuminance_lux(max(environment.altitude_m + height_m, 0.0)),
-            sky_lux=open_share * self.sky_level_lux + spread,
-            ground_lux=ground + falling * (1.0 - _let_through(below)),
+            beam_lux=direct_share * beam.beam_illuminance_lux(max(environment.altitude_m + height_m, 0.0)),
+            sky_lux=direct_share * self.sky_level_lux + spread,
+            ground_lux=ground + falling * (1.0 - _transmitted_share(below)),
         )
 
     @cached_property
     def _under_deck(self) -> tuple[float, NDArray[np.float64]]:
-        """Share of the sky that clouds above the camera leave open, and the air's radiance under the rest."""
+        """Share of the sky that clouds above the camera leave open, and airlight under the rest. [cd/m2]"""
         above = tuple(layer for layer in self._environment.clouds if layer.is_above)
-        return _open_share(above), _AIR_UNDER_DECK / np.pi * _let_through(above) * self._open_level_lux
+        return _direct_share(above), _AIR_UNDER_DECK / np.pi * _transmitted_share(above) * self._open_level_lux
 
     def sky_and_air(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
-        """Clear sky behind the haze, and endless air, without mist.
+        """Clear sky behind the haze, and infinitely deep air, without mist.
 
         Args:
             directions: (..., 3) unit vectors in world axes.
@@ -137,30 +137,30 @@ class LayeredAir:
         flat[..., :2] /= horizontal[..., None]
         flat[..., 2] = np.sin(HORIZON_ELEVATION_RAD)
         horizon = self._sky.radiance(flat)
-        # Below this the path through the air hardly grows: held there, sky and air meet without a seam.
+        # Below this elevation the air path hardly grows: kept constant there, sky and air meet without a seam.
         sky = np.where((np.asarray(directions)[..., 2] < np.sin(HORIZON_ELEVATION_RAD))[..., None], horizon, sky)
-        open_share, under_deck = self._under_deck
-        if open_share == 1.0:
+        direct_share, under_deck = self._under_deck
+        if direct_share == 1.0:
             return sky, horizon
-        air = (open_share * horizon + (1.0 - open_share) * under_deck).astype(np.float32)
+        air = (direct_share * horizon + (1.0 - direct_share) * under_deck).astype(np.float32)
         up = np.maximum(np.asarray(directions)[..., 2], 1e-4)
         hidden = 1.0 - np.exp(-self._environment.extinction_per_m * _HAZE_SCALE_M / up)
         return sky + hidden[..., None].astype(np.float32) * (air - horizon), air
 
     def mist_light(self, directions: NDArray[np.floating[Any]]) -> Radiance:
-        """(..., 3) radiance of endless mist along (..., 3) unit directions. [cd/m2]"""
+        """(..., 3) radiance of infinitely deep mist along (..., 3) unit directions. [cd/m2]"""
         mist = self._environment.mist
         assert mist is not None
         above = tuple(layer for layer in self._environment.clouds if layer.is_above)
         depth = BACK_SCATTER * mist.extinction_per_m * mist.above_m
-        even = _AIR_IN_MIST / np.pi * _let_through(above) * self._open_level_lux / (1.0 + depth)
+        even = _AIR_IN_MIST / np.pi * _transmitted_share(above) * self._open_level_lux / (1.0 + depth)
         cosine = np.einsum("...i,i->...", directions, self._sky.beam.direction)
         peak = henyey_greenstein(cosine, _DROPLET_ASYMMETRY)[..., None] * self.beam_illuminance_lux
         result: Radiance = (even + peak).astype(np.float32)
         return result
 
     def mist_opacity(self, up: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """(...) share of what lies beyond the mist that it hides, by the vertical part of unit directions."""
+        """(...) opacity of the mist, by the vertical component of unit directions."""
         mist = self._environment.mist
         assert mist is not None
         reach_m = np.where(up > 0, np.float32(mist.above_m), np.float32(mist.below_m))
@@ -169,12 +169,12 @@ class LayeredAir:
         return opacity
 
 
-def _let_through(layers: tuple[CloudLayer, ...]) -> float:
-    """Share of all light that comes through the layers, straight or scattered."""
+def _transmitted_share(layers: tuple[CloudLayer, ...]) -> float:
+    """Share of light that the layers transmit, direct or scattered."""
     return float(np.prod([diffuse_transmission(layer) for layer in layers])) if layers else 1.0
 
 
-def _open_share(layers: tuple[CloudLayer, ...]) -> float:
-    """Share of the light that comes straight through the layers, on average over their plan."""
+def _direct_share(layers: tuple[CloudLayer, ...]) -> float:
+    """Mean share of light that the layers transmit directly."""
     shares = [1.0 - layer.cover_fraction * (1.0 - np.exp(-layer.optical_depth)) for layer in layers]
     return float(np.prod(shares)) if shares else 1.0

@@ -1,4 +1,4 @@
-"""Drawing a scene's drogue and its state, and what else stands in a frame."""
+"""Sampling a scene's drogue and its condition, and the other objects of a frame."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
 from scenes.environment import sample_uniform
 
-# Fewer cannot be told from anything else, and three fix a pose.
+# Three markers determine a pose; fewer could not be distinguished from other things.
 _FEWEST_MARKERS = 3
 _PROBE_LENGTH_M = 6.0
 _PROBE_GREY: ReflectanceRgb = (0.45, 0.45, 0.44)
@@ -25,7 +25,7 @@ _MOST_DISTRACTORS = 3
 
 
 def drogue_of_scene(recipe: Recipe, scene_id: int) -> DrogueParameters:
-    """The drogue that hangs in a scene, or would hang there."""
+    """The drogue of a scene, which frames without a drogue have in common."""
     variants = recipe.target.variants
     if not variants:
         return recipe.drogue
@@ -37,7 +37,7 @@ def drogue_of_scene(recipe: Recipe, scene_id: int) -> DrogueParameters:
 
 
 def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) -> DrogueCondition | None:
-    """The state of a scene's drogue, or None when it is as new."""
+    """The condition of a scene's drogue, or None when it is as new."""
     rng, ranges = frame_generator(recipe.seed, scene_id, "drogue condition"), recipe.target
     missing = rng.random(drogue.marker_count) < ranges.missing_marker_fraction
     spared = rng.permutation(drogue.marker_count)[:_FEWEST_MARKERS]
@@ -70,26 +70,26 @@ def sample_bystanders(
     """Probe, obstacle and distractors of one frame.
 
     Args:
-        rng: the frame's own.
-        recipe: with its `[target]`.
-        left_from_drogue: behind whose rim the distractors stay; None in a frame without a drogue.
+        rng: of the frame.
+        recipe: its section `[target]` has the ranges.
+        left_from_drogue: pose of the drogue, which distractors stay behind; None in a frame without a drogue.
     """
-    found = [_probe(recipe)] if recipe.target.probe else []
+    objects = [_probe(recipe)] if recipe.target.probe else []
     obstructed, distracted = rng.random(2) < (
         recipe.target.obstacle_frame_fraction,
         recipe.target.distractor_frame_fraction,
     )
     obstacle = _sample_obstacle(rng, recipe.rig)
     if obstructed:
-        found.append(obstacle)
+        objects.append(obstacle)
     count = int(rng.integers(1, _MOST_DISTRACTORS + 1))
     nearest_m = 2.5 if left_from_drogue is None else float(left_from_drogue.translation_m[2]) + 1.0
     distractors = [_sample_distractor(rng, recipe, nearest_m) for _ in range(count)]
-    return (*found, *(distractors if distracted else ()))
+    return (*objects, *(distractors if distracted else ()))
 
 
 def _probe(recipe: Recipe) -> Obstacle:
-    """The receiver's probe: its tip where the rig has it, its tube backwards along the body's axis."""
+    """The receiver's probe: its tip at the rig's position, its tube backwards along the body axis."""
     left_from_body = recipe.rig.body_from_left.inverse()
     tip_m = left_from_body.apply(recipe.rig.probe_tip_body_m)
     backwards = left_from_body.rotate(np.array([-1.0, 0.0, 0.0]))
@@ -102,7 +102,7 @@ def _probe(recipe: Recipe) -> Obstacle:
 
 
 def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Obstacle:
-    """A thin rod across the view half a metre or so before the cameras, like a pitot tube or a frame of the canopy."""
+    """A thin rod across the view 0.5 to 1.3 m from the cameras, like a pitot tube or a canopy frame."""
     depth_m, turn = rng.uniform(0.5, 1.3), rng.uniform(0.0, np.pi)
     place = _point_in_view(rng, rig, depth_m)
     along = np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)])
@@ -116,7 +116,7 @@ def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Obstacle:
 
 
 def _sample_distractor(rng: np.random.Generator, recipe: Recipe, nearest_m: float) -> Obstacle:
-    """Something round beyond a distance: a ball, a plate or a ring, about as large in the image as a drogue."""
+    """A round object beyond a distance: a ball, a plate or a ring, about as large in the image as a drogue."""
     depth_m = nearest_m + 40.0 * rng.random() ** 2
     size_m = float(rng.uniform(0.1, 0.45)) * max(1.0, depth_m / 12.0)
     forms = recipe.target.distractor_forms
@@ -134,7 +134,7 @@ def _sample_distractor(rng: np.random.Generator, recipe: Recipe, nearest_m: floa
 
 
 def _point_in_view(rng: np.random.Generator, rig: StereoRig, depth_m: float) -> Array:
-    """(3,) a point that the left eye sees, or nearly. [m]"""
+    """(3,) a point in view of the left eye, or just outside. [m]"""
     camera = rig.camera
     u, v = rng.uniform(-0.05, 1.05, 2) * (camera.width_px, camera.height_px)
     return np.array([(u - camera.cx_px) / camera.fx_px, (v - camera.cy_px) / camera.fy_px, 1.0]) * depth_m

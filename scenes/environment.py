@@ -1,4 +1,4 @@
-"""Drawing the environment of a scene."""
+"""Sampling the environment of a scene: sun, clouds, mist, moon and ground."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ from drogue_models.parameters import ReflectanceRgb
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE
 from scenes.sky.equirectangular_sky import load_map
 
-# How much brighter or darker, and how much redder or bluer, the ground of a scene is than its kind's mean.
+# Largest deviation of a scene's ground from the mean of its kind, in brightness and in colour.
 _GROUND_SPREAD, _GROUND_TINT = 0.25, 0.06
 
 
 def sample_uniform(rng: np.random.Generator, limits: Range) -> float:
-    """A uniform draw; one number is used up even when both ends are equal."""
+    """A uniform sample; it consumes one random number even when both limits are equal."""
     return float(rng.uniform(limits.low, limits.high))
 
 
 def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) -> Environment:
     """The environment of a scene: a function of seed and scene alone.
 
-    The streams are named apart, so that a scene keeps its sky when a layer, mist or a moon is added to the recipe.
+    Each part has a random stream of its own, so that a scene keeps its sky when the recipe gets another cloud layer,
+    mist or a moon.
     """
     rng = frame_generator(seed, scene_id, "environment")
     sky = {
@@ -43,13 +44,13 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
     ground = ranges.ground[int(rng.integers(len(ranges.ground)))]
     ground_texture_seed = int(rng.integers(2**31))
     ground_rng = frame_generator(seed, scene_id, "ground")
-    # The first layer is drawn from the scene's main stream, each other one from its own.
-    of_layer = [rng] + [
+    # The first layer uses the scene's main stream, each other layer a stream of its own.
+    layer_streams = [rng] + [
         frame_generator(seed, scene_id, f"cloud layer {index}") for index in range(1, len(ranges.clouds))
     ]
     layers = [
         sample_cloud(stream, frame_generator(seed, scene_id, f"cloud shape {index}"), clouds)
-        for index, (stream, clouds) in enumerate(zip(of_layer, ranges.clouds, strict=False))
+        for index, (stream, clouds) in enumerate(zip(layer_streams, ranges.clouds, strict=False))
     ]
     environment = Environment(
         **sky,
@@ -67,7 +68,7 @@ def environment_of_scene(seed: int, scene_id: int, ranges: EnvironmentRanges) ->
 
 
 def _mapped(environment: Environment, ranges: EnvironmentMapRanges, rng: np.random.Generator) -> Environment:
-    """The environment with a map for its sky and ground; the sun, if the map has one, is where it is in the map."""
+    """The environment with a map for sky and ground, and with the map's sun if it has one."""
     environment_map = EnvironmentMap(
         path=ranges.path,
         sha256=ranges.sha256,
@@ -92,7 +93,7 @@ def _sample_reflectance(rng: np.random.Generator, ground: GroundKind) -> Reflect
 
 
 def sample_cloud(rng: np.random.Generator, shape_rng: np.random.Generator, clouds: Clouds) -> CloudLayer | None:
-    """A cloud layer, or none; how thick it is and how it is drawn out comes from `shape_rng`."""
+    """A cloud layer, or None; thickness and heading come from `shape_rng`."""
     layer = CloudLayer(
         kind=clouds.kind,
         height_above_camera_m=sample_uniform(rng, clouds.height_above_camera_m),
@@ -107,7 +108,7 @@ def sample_cloud(rng: np.random.Generator, shape_rng: np.random.Generator, cloud
 
 
 def sample_mist(rng: np.random.Generator, ranges: MistRanges) -> Mist | None:
-    """Mist around the camera, or none."""
+    """Mist around the camera, or None."""
     mist = Mist(
         visibility_m=sample_uniform(rng, ranges.visibility_m),
         above_m=sample_uniform(rng, ranges.above_m),
@@ -117,7 +118,7 @@ def sample_mist(rng: np.random.Generator, ranges: MistRanges) -> Mist | None:
 
 
 def sample_moon(rng: np.random.Generator, ranges: MoonRanges) -> Moon | None:
-    """A moon, or none."""
+    """A moon, or None."""
     moon = Moon(
         elevation_deg=sample_uniform(rng, ranges.elevation_deg),
         azimuth_deg=sample_uniform(rng, ranges.azimuth_deg),

@@ -1,4 +1,4 @@
-"""Everything around the drogue as one function of direction: sky, sun, cloud, haze and ground.
+"""Radiance of the environment by direction: sky, sun, clouds, haze and ground.
 
 The same function is the background of the images and, as a map, the light on the drogue.
 """
@@ -25,15 +25,15 @@ from scenes.sky.equirectangular_sky import load_map
 from scenes.sky.light import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
 
 _LIGHT_MAP_HEIGHT_PX = 128
-# Clouds of a large picture are seen on every second pixel, 5 m at 5 km, which is less than their edges are wide.
+# Large images evaluate clouds at every second pixel: 5 m at 5 km, which is less than the width of their edges.
 _CLOUD_STEP_PX, _MANY_RAYS = 2, 60_000
 
 
 class EnvironmentRadiance:
-    """Radiance by direction for one environment.
+    """Radiance of one environment by direction.
 
     Attributes:
-        environment: what it is.
+        environment: its description.
         sky: clear sky with sun and moon.
         air: light between the layers.
     """
@@ -44,15 +44,14 @@ class EnvironmentRadiance:
         self.air = LayeredAir(environment, self.sky)
 
     def moved_to(self, environment: Environment) -> EnvironmentRadiance:
-        """The same surroundings from another place.
+        """The same environment for a camera elsewhere.
 
-        Ground and clouds move, and with them the share of the sun's beam that gets through; the light map stays that
-        of here.
+        Ground and clouds move, and with them the transmitted share of the sun's beam; the light map stays the same.
 
         Args:
-            environment: the same, with another `camera_offset_m`.
+            environment: the same environment with another `camera_offset_m`.
         """
-        # Made here, so that it does not matter who asked first.
+        # Computed here, so that the result does not depend on the order of calls.
         own = {"ground": self.ground.moved_to(environment), "light_map": self.light_map}
         moved = copy(self)
         moved.environment, moved.air = environment, self.air.moved_to(environment)
@@ -60,7 +59,7 @@ class EnvironmentRadiance:
         return moved
 
     def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
-        """The parts that vary slowly: clear sky, and endless air at the same azimuth.
+        """The slowly varying parts: clear sky, and infinitely deep air at the same azimuth.
 
         Args:
             directions: (..., 3) unit vectors in world axes.
@@ -73,11 +72,11 @@ class EnvironmentRadiance:
     def radiance(
         self, directions: NDArray[np.float32], sky: Radiance | None = None, horizon: Radiance | None = None
     ) -> Radiance:
-        """Radiance of everything but the sun's disc.
+        """Radiance of everything except the discs of sun and moon.
 
         Args:
             directions: (H, W, 3) unit vectors in world axes.
-            sky, horizon: (H, W, 3) results of `clear_radiance` for the same directions, if at hand.
+            sky, horizon: (H, W, 3) results of `clear_radiance` for the same directions, or None.
 
         Returns:
             (H, W, 3) luminance-scaled linear Rec. 709. [cd/m2]
@@ -110,12 +109,12 @@ class EnvironmentRadiance:
 
     @property
     def beam_direction(self) -> NDArray[np.float64]:
-        """(3,) unit vector in world axes towards what casts the shadows: the sun, or at night the moon."""
+        """(3,) unit vector in world axes towards the light that casts shadows: the sun, or at night the moon."""
         return self.sky.beam.direction
 
     @property
     def beam_illuminance_lux(self) -> NDArray[np.float64]:
-        """(3,) illuminance of a plane at the camera that faces it, through air, cloud and mist. [lux]"""
+        """(3,) illuminance of a plane at the camera that faces the beam, through air, cloud and mist. [lux]"""
         return self.air.beam_illuminance_lux
 
     @property
@@ -125,7 +124,7 @@ class EnvironmentRadiance:
         return self.environment.extinction_per_m + (mist.extinction_per_m if mist is not None else 0.0)
 
     def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
-        """Radiance of endless air and mist, which things fade into.
+        """Radiance of infinitely deep air and mist, into which distant objects fade.
 
         Args:
             directions: (..., 3) unit vectors in world axes.
@@ -147,15 +146,16 @@ class EnvironmentRadiance:
 
     @cached_property
     def ground(self) -> Ground:
-        """What lies below, in the light that comes down to it."""
+        """Land or sea, in the light that reaches it."""
         beam_lux, to_beam = self.air.ground_beam_lux, self.beam_direction
         sky_lux = np.maximum(self.ground_illuminance_lux - beam_lux * max(float(to_beam[2]), 0.0), 0.0)
-        return Ground(self.environment, GroundLight(sky_lux, to_beam, beam_lux, self.radiance))
+        light = GroundLight(sky_lux=sky_lux, beam_direction=to_beam, beam_lux=beam_lux, sky_radiance=self.radiance)
+        return Ground(self.environment, light)
 
     def _put_ground(
         self, total: Radiance, directions: NDArray[np.float32], horizon: Radiance, uncovered: NDArray[np.float32]
     ) -> None:
-        """Cover the lower half, in place, with ground that fades into the horizon; `uncovered` of it will be seen."""
+        """Cover the lower half, in place, with ground that fades into the horizon; `uncovered` is its visible share."""
         if directions.size == 0:
             return
         altitude_m = np.float32(self.environment.altitude_m)
@@ -167,12 +167,12 @@ class EnvironmentRadiance:
         seen += horizon
         below = directions[..., 2] < 0
         whole = below.all(axis=1)
-        # Rows at once, where they can be: choosing each number takes as long as all before.
+        # Whole rows at once where possible: a masked copy takes as long as everything before.
         total[whole] = seen[whole]
         np.copyto(total, seen, where=(below & ~whole[:, None])[..., None])
 
     def _cloud(self, layer: CloudLayer, directions: NDArray[np.float32], air: Radiance) -> Radiance:
-        """(H, W, 4) light of a cloud layer, itself behind haze, times its opacity, and its opacity."""
+        """(H, W, 4) light of a cloud layer behind haze times its opacity, and its opacity."""
         if directions.size == 0:
             return np.zeros((*directions.shape[:2], 4), dtype=np.float32)
         many = directions.shape[0] * directions.shape[1] >= _MANY_RAYS
@@ -181,7 +181,7 @@ class EnvironmentRadiance:
         seen = render_cloud_layer(layer, chosen, self.air.light_on(layer), every, self.environment.camera_offset_m)
         clear = np.exp(seen.distance_m * np.float32(-self.environment.extinction_per_m))[..., None]
         light = behind_air + clear * (seen.radiance - behind_air)
-        # Light times opacity is interpolated: light where there is no cloud means nothing.
+        # Light times opacity is interpolated, because light is undefined where there is no cloud.
         layered: Radiance = np.concatenate([light * seen.opacity[..., None], seen.opacity[..., None]], axis=-1)
         if not many:
             return layered
@@ -189,7 +189,7 @@ class EnvironmentRadiance:
 
     @cached_property
     def light_map(self) -> Radiance:
-        """(128, 256, 3) equirectangular map without the sun's disc; row 0 is the zenith, column 0 looks east. [cd/m2]
+        """(128, 256, 3) equirectangular map without the sun's disc; row 0 is the zenith, column 0 is east. [cd/m2]
 
         Columns go from east towards north; texel centres lie half a texel inside.
         """
@@ -225,32 +225,32 @@ class EnvironmentRadiance:
 
 
 def _rows_with(mask: NDArray[np.bool_]) -> slice:
-    """The rows from the first to the last that hold a true value."""
+    """The rows from the first to the last that hold True."""
     rows = np.flatnonzero(mask.any(axis=1))
     return slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
 
 
 class MappedEnvironmentRadiance(EnvironmentRadiance):
-    """Radiance by direction as a user's map has it: sky, ground and sun of an environment are not used."""
+    """Radiance by direction from a user's map; sky, ground and sun of the environment are not used."""
 
     def __init__(self, environment: Environment) -> None:
         assert environment.map is not None
         self.environment = environment
         self._light = load_map(environment.map)
-        self._coarse = self._light.shrunk(_LIGHT_MAP_HEIGHT_PX)
+        self._coarse = self._light.downsampled(_LIGHT_MAP_HEIGHT_PX)
 
     def moved_to(self, environment: Environment) -> EnvironmentRadiance:
         """The same: a map has no depth."""
         return self
 
     def clear_radiance(self, directions: NDArray[np.floating[Any]]) -> tuple[Radiance, Radiance]:
-        """Coarse radiance, and endless air at the same azimuth; see `EnvironmentRadiance.clear_radiance`."""
+        """Coarse radiance, and infinitely deep air at the same azimuth; see `EnvironmentRadiance.clear_radiance`."""
         return self._coarse.radiance(directions), self.airlight(directions)
 
     def radiance(
         self, directions: NDArray[np.float32], sky: Radiance | None = None, horizon: Radiance | None = None
     ) -> Radiance:
-        """Radiance of everything but the sun's disc; rays that lie far apart see the map averaged."""
+        """Radiance of everything except the sun's disc; rays that are far apart see the averaged map."""
         fine = pixel_angle_rad(directions) < np.pi / _LIGHT_MAP_HEIGHT_PX / 2
         return (self._light if fine else self._coarse).radiance(directions)
 
@@ -275,7 +275,7 @@ class MappedEnvironmentRadiance(EnvironmentRadiance):
         return self.plate_illuminance_lux(np.array([0.0, 0.0, 1.0]))
 
     def airlight(self, directions: NDArray[np.floating[Any]]) -> Radiance:
-        """Radiance of endless air: the map's own horizon at the same azimuth; see `EnvironmentRadiance.airlight`."""
+        """Radiance of infinitely deep air: the map's horizon at that azimuth; see `EnvironmentRadiance.airlight`."""
         level = np.array(directions, dtype=np.float32)
         length = np.maximum(np.hypot(level[..., 0], level[..., 1]), np.float32(1e-9))
         level[..., :2] /= length[..., None]
@@ -283,9 +283,9 @@ class MappedEnvironmentRadiance(EnvironmentRadiance):
         return self._coarse.radiance(level.reshape(1, -1, 3)).reshape(level.shape)
 
 
-# A recipe visits its scenes in turn; one takes half a megabyte.
+# A recipe visits its scenes in turn; each takes half a megabyte.
 @lru_cache(maxsize=128)
-def _cached(key: str, folder: Path | None) -> EnvironmentRadiance:
+def _of_scene(key: str, folder: Path | None) -> EnvironmentRadiance:
     environment = Environment.model_validate_json(key)
     if environment.map is None:
         return EnvironmentRadiance(environment)
@@ -293,19 +293,19 @@ def _cached(key: str, folder: Path | None) -> EnvironmentRadiance:
     return MappedEnvironmentRadiance(environment.model_copy(update={"map": placed}))
 
 
-# Engine, background and glare of one pair ask in turn.
+# Engine, background and glare of one pair use it in turn.
 @lru_cache(maxsize=2)
-def _passing(key: str, folder: Path | None) -> EnvironmentRadiance:
+def _moved_to_camera(key: str, folder: Path | None) -> EnvironmentRadiance:
     environment = Environment.model_validate_json(key)
     still = environment.model_copy(update={"camera_offset_m": (0.0, 0.0)})
-    return _cached(still.model_dump_json(), folder).moved_to(environment)
+    return _of_scene(still.model_dump_json(), folder).moved_to(environment)
 
 
 def environment_radiance(environment: Environment) -> EnvironmentRadiance:
-    """The surroundings of an environment; the same object for equal environments, as frames share scenes.
+    """The radiance of an environment; the same object for equal environments, because frames share scenes.
 
     Raises:
         ValueError: the environment's map cannot be read, or has changed.
     """
-    made = _cached if environment.camera_offset_m == (0.0, 0.0) else _passing
-    return made(environment.model_dump_json(), environment.map.folder if environment.map is not None else None)
+    build = _of_scene if environment.camera_offset_m == (0.0, 0.0) else _moved_to_camera
+    return build(environment.model_dump_json(), environment.map.folder if environment.map is not None else None)

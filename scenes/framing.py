@@ -13,12 +13,12 @@ from scenes.environment import sample_uniform
 
 _MOST_TRIES = 1000
 _OUTLINE_POINTS = 72
-# The rim polygon of 72 points lies within 0.1 % of the circle; a pixel of margin covers that and the lens blur.
+# The rim polygon of 72 points lies within 0.1 % of the circle; the margin covers that and the lens blur.
 _MARGIN_PX = 1.5
 
 
 def outline_points_m(drogue: DrogueParameters) -> Array:
-    """(M, 3) points of the drogue frame around everything that must be in view: rim, and back end. [m]"""
+    """(M, 3) points in the drogue frame around all that must be in view: rim and back end. [m]"""
     angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(_OUTLINE_POINTS)], axis=-1)
     back_m = drogue.hub_depth_m + drogue.coupling_length_m
@@ -32,7 +32,7 @@ def outline_points_m(drogue: DrogueParameters) -> Array:
 
 
 def origin_bounds_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[float, float, float, float] | None:
-    """Where the drogue's origin may lie at one depth.
+    """Limits of the drogue's origin at one depth.
 
     Args:
         rig: the stereo rig.
@@ -40,7 +40,7 @@ def origin_bounds_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[fl
         depth_m: Z of the origin. [m]
 
     Returns:
-        (x_low, x_high, y_low, y_high) so that both eyes see every point [m], or None where there is no room.
+        (x_low, x_high, y_low, y_high) within which both eyes see every point [m], or None if there are none.
     """
     c = rig.camera
     z = depth_m + points_m[:, 2]
@@ -56,18 +56,18 @@ def origin_bounds_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[fl
 
 
 def sample_pose(rng: np.random.Generator, recipe: Recipe, points_m: Array, depth_m: float) -> RigidTransform:
-    """Pose in the left camera at one depth: attitude from the recipe's ranges, place uniform in the common view.
+    """Pose in the left camera at one depth: attitude from the recipe's ranges, position uniform in the common view.
 
     An attitude that does not fit into both views at this depth is drawn again.
 
     Args:
-        rng: the frame's own.
-        recipe: for rig and ranges.
+        rng: of the frame.
+        recipe: gives rig and ranges.
         points_m: (M, 3) points around all that must be in view, in its own frame. [m]
         depth_m: Z of that frame's origin. [m]
 
     Raises:
-        ValueError: no attitude of the ranges fits.
+        ValueError: no attitude within the ranges fits.
     """
     for _ in range(_MOST_TRIES):
         pitch, yaw, roll = np.radians(
@@ -77,11 +77,11 @@ def sample_pose(rng: np.random.Generator, recipe: Recipe, points_m: Array, depth
             ]
         )
         rotation = rotation_from_angles(pitch, yaw, roll)
-        room = origin_bounds_m(recipe.rig, points_m @ rotation.T, depth_m)
+        bounds = origin_bounds_m(recipe.rig, points_m @ rotation.T, depth_m)
         place = rng.random(2)
-        if room is None:
+        if bounds is None:
             continue
-        x_low, x_high, y_low, y_high = room
+        x_low, x_high, y_low, y_high = bounds
         if recipe.pose.on_axis:
             middle = np.array([recipe.rig.baseline_m / 2, 0.0, depth_m])
             if not (x_low <= middle[0] <= x_high and y_low <= middle[1] <= y_high):
@@ -98,7 +98,7 @@ def sample_pose(rng: np.random.Generator, recipe: Recipe, points_m: Array, depth
 def sample_distance_m(rng: np.random.Generator, law: DistanceLaw, frame_index: int) -> float:
     """Distance of the rim centre along the optical axis. [m]
 
-    Stations are gone through frame by frame, so that any prefix of a dataset covers all of them.
+    Frames take the stations in turn, so that any prefix of a dataset covers all of them.
     """
     if law.stations_m is not None:
         return law.stations_m[frame_index % len(law.stations_m)]
@@ -108,5 +108,5 @@ def sample_distance_m(rng: np.random.Generator, law: DistanceLaw, frame_index: i
         return float(law.low_m + u * (law.high_m - law.low_m))
     if law.law == "log-uniform":
         return float(law.low_m * (law.high_m / law.low_m) ** u)
-    # The image's size goes with the inverse of the distance.
+    # Uniform in inverse distance, to which the size in the image is proportional.
     return float(1.0 / (1.0 / law.high_m + u * (1.0 / law.low_m - 1.0 / law.high_m)))

@@ -13,7 +13,7 @@ from datasets_manifest.random_streams import frame_generator
 Field = NDArray[np.float32]
 
 _SMALLEST_LEVEL_PX = 8
-# The finest levels hold square roots in eight bits: detail hides the steps, and the memory is a quarter.
+# The finest levels store square roots in eight bits: detail hides the steps, in a quarter of the memory.
 _BYTE_LEVELS = 2
 
 
@@ -21,23 +21,23 @@ def power_noise(seed: int, stream: str, size_px: int, slope: float, cycles: floa
     """(size, size) periodic Gaussian texture of unit variance, rough at all scales.
 
     Args:
-        seed, stream: of the random numbers.
+        seed, stream: keys of the random stream.
         size_px: width and height; a power of two.
-        slope: how fast the amplitude spectrum falls above its peak.
-        cycles: of the largest blobs in one repeat.
+        slope: exponent of the fall of the amplitude spectrum above its peak.
+        cycles: number of the largest blobs in one repeat.
     """
     frequency = _frequencies(size_px)
     return _noise_of_spectrum(seed, stream, np.where(frequency > 0, (frequency**2 + cycles**2) ** (-slope / 2), 0.0))
 
 
 def smooth_noise(seed: int, stream: str, size_px: int, cycles: float) -> Field:
-    """(size, size) periodic Gaussian texture of unit variance with one scale only; arguments as in `power_noise`."""
+    """(size, size) periodic Gaussian texture of unit variance with a single scale; arguments as in `power_noise`."""
     frequency = _frequencies(size_px) / cycles
     return _noise_of_spectrum(seed, stream, frequency * np.exp(-frequency * frequency))
 
 
 def _frequencies(size_px: int) -> NDArray[np.float64]:
-    """(size, size / 2 + 1) cycles in one repeat."""
+    """(size, size / 2 + 1) frequencies in cycles per repeat."""
     down, across = np.fft.fftfreq(size_px), np.fft.rfftfreq(size_px)
     result: NDArray[np.float64] = np.hypot(down[:, None], across[None, :]) * float(size_px)
     return result
@@ -52,12 +52,12 @@ def _noise_of_spectrum(seed: int, stream: str, amplitude: NDArray[np.float64]) -
 
 
 class MipTile:
-    """A periodic picture with copies of half, a quarter... its size.
+    """A periodic texture with mipmap levels of half, a quarter... its size.
 
     Args:
         texels: (N, N, C) values, C up to 4, N a power of two; not negative when `coded`.
-        texel_m: size of one. [m]
-        coded: keep the finest copies as square roots in eight bits; for reflectances up to 1.
+        texel_m: size of a texel. [m]
+        coded: store the finest levels as square roots in eight bits; for reflectances up to 1.
     """
 
     def __init__(self, texels: Field, texel_m: float, coded: bool = False) -> None:
@@ -73,11 +73,11 @@ class MipTile:
         self.mean: NDArray[np.float64] = texels.mean(axis=(0, 1), dtype=np.float64)
 
     def sample(self, x_m: Field, y_m: Field, footprint_m: Field) -> Field:
-        """Values averaged over about the footprint.
+        """Values averaged approximately over the footprint.
 
         Args:
-            x_m, y_m: (H, W) places. [m]
-            footprint_m: (H, W) width over which to average. [m]
+            x_m, y_m: (H, W) positions. [m]
+            footprint_m: (H, W) width to average over. [m]
 
         Returns:
             (H, W, C) values.
@@ -86,7 +86,7 @@ class MipTile:
         height = np.clip(np.log2(np.maximum(footprint_m, 1e-3) / np.float32(self._texel_m)), 0, top).astype(np.float32)
         first = int(height.min())
         last = min(top, int(np.ceil(height.max())))
-        # remap wraps only by its border mode and holds 16-bit coordinates: reduce to one repeat first.
+        # remap wraps only by its border mode and has 16-bit coordinates: reduce to one repeat first.
         size, per_m = np.float32(self._levels[0].shape[0]), np.float32(1.0 / self._texel_m)
         u, v = x_m * per_m, y_m * per_m
         u -= np.floor(u / size) * size
@@ -103,7 +103,7 @@ class MipTile:
         return total
 
     def _at_level(self, level: int, u: Field, v: Field) -> Field:
-        """(H, W, C) values of one copy at places in texels of the finest, within one repeat."""
+        """(H, W, C) values of one level at positions in texels of the finest level, within one repeat."""
         picture = self._levels[level]
         scale, half = np.float32(0.5**level), np.float32(0.5)
         seen = cv2.remap(picture, u * scale - half, v * scale - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
@@ -116,22 +116,22 @@ class MipTile:
         return np.asarray(seen, dtype=np.float32)
 
 
-FARTHEST_M = 4e5  # beyond this the haze has hidden everything
-# A piece seen at a grazing angle is drawn out; it is averaged over at most so many places along its length.
+FARTHEST_M = 4e5  # beyond this distance haze hides everything
+# A piece seen at a grazing angle is elongated; it is averaged over at most so many points along its length.
 _MOST_PLACES = 5
 _NARROWEST_RAD = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
 class GroundView:
-    """Pieces of ground seen along rays, all of shape (H, W).
+    """Pieces of ground that rays see, all of shape (H, W).
 
     Attributes:
-        x_m, y_m: their middles, east and north of the place about which the ground is laid out. [m]
+        x_m, y_m: their centres, east and north of the ground's origin. [m]
         away_x, away_y: unit vector along the ground, away from the camera.
         sine: of the angle between ray and ground.
         across_m, along_m: their width, and their length away from the camera. [m]
-        places: how many to average over along the length.
+        places: number of points to average over along the length.
     """
 
     x_m: Field
@@ -146,12 +146,12 @@ class GroundView:
     def average(
         self, tile: MipTile, turn: tuple[Field, Field] | None = None, shift: tuple[Field, Field] | None = None
     ) -> Field:
-        """What a picture of the ground shows in each piece.
+        """Mean of a ground texture over each piece.
 
         Args:
-            tile: the picture.
-            turn: (H, W) cosine and sine of how far it is turned, or None.
-            shift: (H, W) by which it is moved along its own axes, or None. [m]
+            tile: the texture.
+            turn: (H, W) cosine and sine of the texture's rotation, or None.
+            shift: (H, W) shift along the texture's own axes, or None. [m]
 
         Returns:
             (H, W, C) values.
@@ -186,13 +186,13 @@ def pixel_angle_rad(directions: NDArray[np.float32]) -> float:
 def ground_view(
     directions: NDArray[np.float32], altitude_m: float, angle_rad: float, offset_m: tuple[float, float] = (0.0, 0.0)
 ) -> GroundView:
-    """The ground along rays; those that miss it see its farthest rim.
+    """The ground along rays; rays that miss it see its farthest edge.
 
     Args:
         directions: (H, W, 3) unit vectors in world axes.
         altitude_m: of the camera. [m]
         angle_rad: between neighbouring rays. [rad]
-        offset_m: of the camera, east and north of the place about which the ground is laid out. [m]
+        offset_m: of the camera, east and north of the ground's origin. [m]
     """
     sine = np.maximum(-directions[..., 2], np.float32(altitude_m / FARTHEST_M))
     distance_m = np.float32(altitude_m) / sine

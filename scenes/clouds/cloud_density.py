@@ -13,13 +13,13 @@ from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import CloudLayer
 
 _SIZE_PX = 1024
-# Periods of the texture held by one repeat: the largest blobs are 1/8 of it, so repeats are not seen at once.
+# The largest blobs are 1/8 of one repeat, so that the repetition does not show.
 _LARGEST_PER_REPEAT = 8
-# Finer copies of the same texture stand in for its missing small scales: (scale, weight), scales without common factor.
+# Finer copies of the same texture add its missing small scales: (scale, weight); the scales have no common factor.
 _OCTAVE_GROUPS = ((1.0, 1.0), (6.13, 0.30), (37.7, 0.10))
 
 
-# A slope above this leaves nothing for the finest texels: half as many will do, and stay in the processor's cache.
+# A texture with a larger slope has no detail in the finest texels: half as many suffice, and fit the processor's cache.
 _SMOOTH_SLOPE = 2.5
 
 
@@ -42,7 +42,7 @@ def _half_tile(seed: int, slope: float) -> NDArray[np.float32]:
 
 
 def sample_tile(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """As `sample_texture` without the finer copies: smooth below a hundredth of the largest blobs, and faster."""
+    """Like `sample_texture`, without the finer copies: smooth below a hundredth of the largest blobs, and faster."""
     tile = _half_tile(seed, slope) if slope > _SMOOTH_SLOPE else _tile(seed, slope)
     texels, size = np.float32(len(tile) / _LARGEST_PER_REPEAT), np.float32(len(tile))
     u, v = x * texels, y * texels
@@ -56,8 +56,8 @@ def sample_texture(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[n
     """Texture values of zero mean and unit variance.
 
     Args:
-        seed: of the pattern.
-        slope: of its amplitude spectrum; larger is smoother.
+        seed: of the texture.
+        slope: of its amplitude spectrum; a larger slope is smoother.
         x, y: (H, W) coordinates in units of the largest blobs.
 
     Returns:
@@ -83,11 +83,11 @@ _Field = NDArray[np.float32]
 
 # Slopes of the amplitude spectra: bodies of cloud, the heaps on them, streaks of ice.
 _BODY_SLOPE, _HEAP_SLOPE, _KNOB_SLOPE, _STREAK_SLOPE = 3.0, 2.8, 2.0, 1.5
-# Heaps per body, along and across; the two patterns are sheared against each other so that height matters.
+# Heaps per body, along and across; two patterns are sheared against each other with height.
 _HEAPS_PER_BODY = 3.1
 _KNOBS_PER_BODY = 6.3
 _EARTH_M = 6.371e6
-# The patterns repeat along axes turned this far from the flight, or repeats would line up in the view ahead.
+# The patterns repeat along axes at this angle to the flight; otherwise repeats would line up in the view ahead.
 _TURN_COSINE, _TURN_SINE = np.float32(np.cos(0.37)), np.float32(np.sin(0.37))
 
 
@@ -96,12 +96,12 @@ class CloudDensity:
 
     Args:
         layer: its description.
-        offset_m: of the camera, east and north of the place about which the layer is laid out. [m]
+        offset_m: of the camera, east and north of the layer's origin. [m]
 
     Attributes:
         layer: its description.
         extinction_per_m: inside the cloud. [1/m]
-        steepness: how fast full density is reached with growing excess.
+        steepness: slope of density over excess, up to full density.
     """
 
     def __init__(self, layer: CloudLayer, offset_m: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -128,13 +128,13 @@ class CloudDensity:
         )
 
     def crossing(self, rise: _Field) -> tuple[_Field, _Field]:
-        """Where rays that rise towards the layer enter and leave it over the round Earth. [m]"""
+        """Distances at which rays that rise towards the layer enter and leave it, over the round Earth. [m]"""
         near_m = abs(self.layer.height_above_camera_m)
         steep = np.maximum(rise, 0.0)
         root = [
             np.sqrt(steep * steep + np.float32(2.0 * h / _EARTH_M)) for h in (near_m, near_m + self.layer.thickness_m)
         ]
-        # The roots of h = s rise + s^2 / 2 R, in the form that loses no digits at steep rays.
+        # The roots of h = s rise + s^2 / 2 R, in a form without cancellation for steep rays.
         entry, leave = (
             np.float32(2.0 * h) / (steep + r)
             for h, r in zip((near_m, near_m + self.layer.thickness_m), root, strict=True)
@@ -142,13 +142,13 @@ class CloudDensity:
         return entry, leave
 
     def _height_m(self, directions: NDArray[np.float32], distance_m: _Field) -> _Field:
-        """Height over the camera's level surface, which bends towards the layer. [m]"""
+        """Height above the level surface through the camera, which curves towards the layer. [m]"""
         bend = self._sign / np.float32(2.0 * _EARTH_M)
         height: _Field = directions[..., 2] * distance_m + bend * distance_m * distance_m
         return height
 
     def place(self, directions: NDArray[np.float32], distance_m: _Field) -> NDArray[np.float32]:
-        """(H, W, 3) place at a distance along each direction, the third coordinate over the level surface."""
+        """(H, W, 3) position at a distance along each direction; the third coordinate is above the level surface."""
         place = directions * distance_m[..., None]
         place[..., 0] += self._east_m
         place[..., 1] += self._north_m
@@ -173,8 +173,7 @@ class CloudDensity:
             relief = np.float32(0.5) + np.float32(0.2) * heaps
             sheet = np.minimum((1.15 - relief * 0.6) - height, height - relief * np.float32(0.35)) * np.float32(2.5)
             return np.minimum(sheet, body * np.float32(1.5))
-        # A dome over every body, knobbly outside, cut off along the level at which vapour condenses; no dome is higher
-        # than the layer.
+        # A dome over every body, with heaps on it, cut off at the condensation level; no dome is higher than the layer.
         square = height * height
         fall = np.float32(2.2) * square + np.float32(1.6) * square * square * square
         dome = body + np.float32(0.5) * heaps * (np.float32(0.3) + height) - fall
@@ -191,9 +190,9 @@ class CloudDensity:
         return heaps
 
     def knob_strength(self, place_m: NDArray[np.float32], width_m: _Field) -> _Field:
-        """(H, W) share of the knobs that is seen at (H, W, 3) places in pieces of a width. [m]
+        """(H, W) visible amplitude of the knobs at (H, W, 3) positions, for rays of a width. [m]
 
-        Knobs fade where they are too small to tell apart; the level at which vapour condenses is smooth.
+        Knobs fade where they are too small to resolve; the condensation level is smooth.
         """
         small = width_m * np.float32(3.0 * _KNOBS_PER_BODY / self.layer.feature_size_m)
         above_base = np.clip(np.float32(4.0) * self.height_fraction(place_m[..., 2]), 0.1, 1.0)
@@ -201,11 +200,11 @@ class CloudDensity:
         return strength
 
     def knobs(self, place_m: NDArray[np.float32]) -> _Field:
-        """(H, W) fine structure on the heaps at (H, W, 3) places: too fine to march through, for light and edges."""
+        """(H, W) knobs at (H, W, 3) positions: structure on the heaps too fine for ray marching, for light and edges."""
         per_m = np.float32(_KNOBS_PER_BODY / self.layer.feature_size_m)
         x, y, z = (place_m[..., axis] * per_m for axis in range(3))
         seed = self.layer.texture_seed + 1
-        # Each pattern runs on along one slanting axis; creases of their sum run along none.
+        # Each pattern is constant along one slanted axis; the sum of three has creases along none.
         total = sample_tile(seed, _KNOB_SLOPE, x + np.float32(0.5) * z, y - np.float32(0.6) * z)
         total += sample_tile(seed, _KNOB_SLOPE, y + np.float32(0.5) * x + np.float32(2.7), z - np.float32(0.4) * x)
         total += sample_tile(seed, _KNOB_SLOPE, z + np.float32(0.6) * y + np.float32(5.1), x - np.float32(0.5) * y)
@@ -213,7 +212,7 @@ class CloudDensity:
         return knobs
 
     def mottling(self, place_m: NDArray[np.float32]) -> _Field:
-        """(H, W) differences in thickness of a sheet, as the logarithm of its light."""
+        """(H, W) variation in thickness of a sheet, as the logarithm of its light."""
         per_m = np.float32(1.0 / self.layer.feature_size_m)
         x, y = place_m[..., 0] * per_m, place_m[..., 1] * per_m
         wide = sample_tile(self.layer.texture_seed, _BODY_SLOPE, x, y)

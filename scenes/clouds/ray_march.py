@@ -1,4 +1,4 @@
-"""Rays through the density of a cloud layer: how much cloud stands in each, and where its surface is."""
+"""Ray marching through a cloud layer: optical depth of each ray, and where the cloud's surface is."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from scenes.clouds.cloud_density import CloudDensity
 
 _Field = NDArray[np.float32]
 
-# Steps through a layer by kind: inside a picture of a cloud, and at its edges, where a ray may meet little of it.
+# Steps through a layer by kind: inside a cloud, and at its edges, where a ray may hit little of it.
 _STEPS = {"cumulus": 30, "stratus": 16}
 _EDGE_STEPS = {"cumulus": 36, "stratus": 20}
-# Such a ray begins this much before the nearest cloud around it, and ends this much behind the farthest.
+# A ray at an edge starts before the nearest cloud around it, and ends behind the farthest, by these factors.
 _BEFORE_CLOUD, _BEHIND_CLOUD = np.float32(0.92), np.float32(1.05)
 # Lengths of the steps towards the sun, in thicknesses of the layer.
 _SUN_STEPS = (0.05, 0.09, 0.16, 0.3)
-# A surface counts as seen while less than this stands before it; beyond the other depth nothing is seen.
+# A surface is visible behind less optical depth than this; behind the other depth nothing is visible.
 _SEEN_AT_DEPTH, _MOST_DEPTH = 0.5, np.float32(16.0)
-_SURFACE_TURNS = 2
+_SURFACE_ITERATIONS = 2
 # Light comes on average from this optical depth inside the surface.
 _LIGHT_DEPTH = 1.5
-# Between rays this much apart in distance, or in the share that they let through, lies an edge.
+# Neighbouring rays that differ by this factor in distance, or by this much in transmission, have an edge between them.
 _EDGE_DISTANCE, _EDGE_THROUGH = 1.08, 0.25
 _ROW = 256
-# So many rays at a time stay in the processor's cache.
+# Rays that are marched at a time, so that they fit the processor's cache.
 _RAYS_AT_ONCE = 12_000
 _NOWHERE_M = 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class MarchResult:
-    """What rays meet.
+    """Cloud along rays.
 
     Attributes:
         depth: (H, W) optical depth of all cloud in the ray.
-        distance_m: (H, W) of the surface at which most of it begins.
-        towards_sun: (H, W) optical depth from there towards the sun.
+        distance_m: (H, W) distance of its surface. [m]
+        towards_sun: (H, W) optical depth from the surface towards the sun.
     """
 
     depth: _Field
@@ -54,14 +54,14 @@ def march(density: CloudDensity, directions: NDArray[np.float32], sun: NDArray[n
         density: of the layer.
         directions: neighbours in the array must be neighbours in direction if `every` is not 1.
         sun: (3,) unit vector.
-        every: march every so many rays down and across, and of the others those between which an edge lies.
+        every: march one in so many rays down and across, and of the others those at edges.
     """
     kind = density.layer.kind
     if every == 1:
         return _march_all(density, directions, sun, _EDGE_STEPS[kind])
     coarse = _march_all(density, np.ascontiguousarray(directions[::every, ::every]), sun, _STEPS[kind])
     size = (directions.shape[0], directions.shape[1])
-    # Distance and light where there is no cloud mean nothing: both are interpolated with the cloud's weight.
+    # Distance and light are undefined where there is no cloud: both are interpolated with the cloud's weight.
     weight = 1.0 - np.exp(-coarse.depth) + np.float32(1e-3)
     stacked = np.stack([coarse.depth, weight, coarse.distance_m * weight, coarse.towards_sun * weight], axis=-1)
     fine = upsample(stacked, every, size)
@@ -69,18 +69,18 @@ def march(density: CloudDensity, directions: NDArray[np.float32], sun: NDArray[n
     edges, nearest_m, last_m = _edges(coarse)
     edge = np.flatnonzero(upsample(edges, every, size) > 0)
     if len(edge):
-        # Whole rows of rays, for the textures are sampled as pictures.
+        # Whole rows of rays, because textures are sampled as images.
         padded = np.resize(edge, (-(-len(edge) // _ROW), _ROW))
         block = padded // size[1] // every, padded % size[1] // every
         ends_m = _BEFORE_CLOUD * nearest_m[block], last_m[block] + np.float32(density.layer.thickness_m)
         near = _march_all(density, directions.reshape(-1, 3)[padded], sun, _EDGE_STEPS[kind], ends_m)
         for values, marched in ((depth, near.depth), (distance_m, near.distance_m), (towards_sun, near.towards_sun)):
             values.reshape(-1)[padded] = marched
-    return MarchResult(depth, distance_m, towards_sun)
+    return MarchResult(depth=depth, distance_m=distance_m, towards_sun=towards_sun)
 
 
 def upsample(image: NDArray[np.float32], every: int, size: tuple[int, int]) -> NDArray[np.float32]:
-    """An image of every `every`-th ray, interpolated to all (H, W) of them."""
+    """An image of every `every`-th ray, interpolated to all (H, W) rays."""
     to_coarse = np.array([[1.0 / every, 0.0, 0.0], [0.0, 1.0 / every, 0.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     large: NDArray[np.float32] = cv2.warpAffine(
@@ -90,12 +90,12 @@ def upsample(image: NDArray[np.float32], every: int, size: tuple[int, int]) -> N
 
 
 def _edges(coarse: MarchResult) -> tuple[_Field, _Field, _Field]:
-    """Where edges of cloud lie, and where cloud begins.
+    """Where edges of cloud are, and where cloud begins and ends.
 
     Returns:
         (H, W) 1 at rays next to an edge of the cloud or between two clouds, 0 elsewhere; (H, W) distance of the nearest
         cloud in the ray or its eight neighbours, 0 without any [m]; and (H, W) distance behind which there is none,
-        known where one of them meets none or little. [m]
+        known where one of them has little or none. [m]
     """
     block = np.ones((3, 3), dtype=np.uint8)
     through = np.exp(-coarse.depth)
@@ -132,15 +132,15 @@ def _march_all(
             towards_sun[rows] = _depth_towards_sun(density, place, sun)
         else:
             towards_sun[rows] = 0.0
-    return MarchResult(depth, distance_m, towards_sun)
+    return MarchResult(depth=depth, distance_m=distance_m, towards_sun=towards_sun)
 
 
 def _through(
     density: CloudDensity, directions: NDArray[np.float32], ends_m: tuple[_Field, _Field], steps: int
 ) -> tuple[_Field, _Field]:
-    """Optical depth between two distances, and where the surface is.
+    """Optical depth between two distances, and distance of the surface.
 
-    Between two samples the density is taken as linear, so that its edge falls between them and not on one of them.
+    Density is linear between samples, so that its edge is between them and not at one of them.
     """
     near_m, far_m = ends_m
     total = np.zeros(near_m.shape, dtype=np.float32)
@@ -159,9 +159,9 @@ def _through(
         if total.min() >= _MOST_DEPTH:
             break
     np.minimum(total, _MOST_DEPTH, out=total)
-    # The surface between the two samples, by false position; each turn keeps the end that still brackets it.
+    # The surface between the two samples, by regula falsi; each iteration keeps the end that still brackets it.
     low, high = np.zeros_like(entry_m), np.ones_like(entry_m)
-    for _ in range(_SURFACE_TURNS):
+    for _ in range(_SURFACE_ITERATIONS):
         part = low + (high - low) * outside / (outside - inside)
         value = density.excess(directions, entry_m + part * step_m)
         beyond = value > 0
@@ -171,7 +171,7 @@ def _through(
 
 
 def _mean_positive(first: _Field, last: _Field) -> _Field:
-    """Mean of the positive part of a value that goes linearly from `first` to `last`."""
+    """Mean of the positive part of a value that varies linearly from `first` to `last`."""
     change = last - first
     flat = np.abs(change) < 1e-4
     a, b = np.maximum(first, 0.0), np.maximum(last, 0.0)
@@ -180,7 +180,7 @@ def _mean_positive(first: _Field, last: _Field) -> _Field:
 
 
 def _depth_towards_sun(density: CloudDensity, place: NDArray[np.float32], sun: NDArray[np.float64]) -> _Field:
-    """(H, W) optical depth from (H, W, 3) places towards the sun."""
+    """(H, W) optical depth from (H, W, 3) positions towards the sun."""
     total = np.zeros(place.shape[:2], dtype=np.float32)
     reached = 0.0
     for step in _SUN_STEPS:

@@ -1,4 +1,4 @@
-"""Where land meets sea: shoreline, beach, shallows and surf."""
+"""The coast: shoreline, beach, shallows and surf."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BREAKER_SPACING_M = 38.0
 
 @lru_cache(maxsize=1)
 def _ragged() -> MipTile:
-    """Raggedness of the shoreline, and of breakers; each of unit variance."""
+    """Roughness of the shoreline and of breakers; each of unit variance."""
     made = [power_noise(_SEED, name, 512, 1.5, 12.0) for name in ("shore", "breakers")]
     return MipTile(np.stack(made, axis=-1), 6.0)
 
@@ -30,8 +30,8 @@ class Coast:
     """A shoreline across the view ahead.
 
     Args:
-        rng: draws where it runs.
-        altitude_m: of the camera, which sets how far ahead it should lie. [m]
+        rng: draws direction and position.
+        altitude_m: of the camera, which sets the distance ahead. [m]
     """
 
     def __init__(self, rng: np.random.Generator, altitude_m: float) -> None:
@@ -44,7 +44,7 @@ class Coast:
         self.reach_m = _SURF_M + 4 * _BEACH_M
 
     def offshore_m(self, view: GroundView, regions: Field, shapes: Field) -> Field:
-        """(H, W) distance from the shoreline, roughly; negative on land. [m]"""
+        """(H, W) approximate distance from the shoreline; negative on land. [m]"""
         straight = view.x_m * np.float32(self._normal[0]) + view.y_m * np.float32(self._normal[1])
         rough = _ragged().sample(
             view.x_m + self._shift_m[0], view.y_m + self._shift_m[1], np.sqrt(view.across_m * view.along_m)
@@ -61,13 +61,13 @@ class Coast:
         """(H, W, 3) reflectance of the land with sand along the water."""
         breadth_m = np.float32(_BEACH_M * self._breadth)
         sandy = _rise(offshore_m, -breadth_m, np.maximum(self._blur_m(view), np.float32(8.0)))[..., None]
-        # Sand that the last waves have wetted is darker.
+        # Wet sand is darker.
         wet = _rise(offshore_m, np.float32(-7.0), np.maximum(self._blur_m(view), np.float32(5.0)))[..., None]
         result: Field = albedo + sandy * (_SAND * (1.0 - np.float32(0.45) * wet) - albedo)
         return result
 
     def body_rgb(self, offshore_m: Field, deep_rgb: Field) -> Field:
-        """(H, W, 3) diffuse reflectance of the water: the bed shines through where it is shallow."""
+        """(H, W, 3) diffuse reflectance of the water: the bed shows through where it is shallow."""
         depth_m = np.float32(_BED_SLOPE) * np.maximum(offshore_m, 0.0)
         through = np.exp(-depth_m[..., None] * (2 * _ATTENUATION_PER_M))
         result: Field = deep_rgb + through * (np.float32(0.55) * _SAND - deep_rgb)
@@ -81,7 +81,7 @@ class Coast:
         blur_m = self._blur_m(view)
         swept = np.clip(1.0 - offshore_m / np.float32(_SURF_M), 0.0, 1.0) * (offshore_m > -2 * blur_m)
         phase = (offshore_m + 14.0 * rough) * np.float32(2 * np.pi / _BREAKER_SPACING_M)
-        # Lines of breakers merge into their mean where they cannot be told apart.
+        # Lines of breakers that cannot be resolved merge into their mean.
         sharp = np.exp(-((blur_m / np.float32(0.3 * _BREAKER_SPACING_M)) ** 2))
         lines = np.clip(np.cos(phase) * 1.6 - 0.5, 0.0, 1.0) * sharp + np.float32(0.3) * (1.0 - sharp)
         torn = np.clip(0.75 + 0.5 * rough, 0.0, 1.0)
@@ -91,13 +91,13 @@ class Coast:
         return result
 
     def _blur_m(self, view: GroundView) -> Field:
-        """(H, W) width of the pieces across the shoreline. [m]"""
+        """(H, W) width of the pieces of ground across the shoreline. [m]"""
         facing = np.abs(view.away_x * np.float32(self._normal[0]) + view.away_y * np.float32(self._normal[1]))
         result: Field = view.across_m + facing * view.along_m
         return result
 
 
 def _rise(value: Field, edge: np.float32, width: Field) -> Field:
-    """From 0 to 1 over a width around an edge."""
+    """Linear rise from 0 to 1 over a width around an edge."""
     result: Field = np.clip((value - edge) / width + np.float32(0.5), 0.0, 1.0)
     return result

@@ -19,10 +19,8 @@ from scenes.ground.sea import GroundLight, Sea, draw_ships, sample_ships
 from scenes.ground_view import Field, GroundView, MipTile, ground_view, pixel_angle_rad, power_noise, smooth_noise
 from scenes.sky.light import Radiance
 
-__all__ = ["MEAN_REFLECTANCE", "Ground", "GroundLight"]
-
 MEAN_REFLECTANCE: dict[GroundKind, ReflectanceRgb] = {
-    "sea": (0.006, 0.022, 0.030),  # of the water under the surface, which mirrors besides
+    "sea": (0.006, 0.022, 0.030),  # of the water body; the surface also mirrors the sky
     "forest": (0.036, 0.051, 0.021),
     "fields": (0.106, 0.110, 0.050),
     "dry": (0.207, 0.155, 0.107),
@@ -39,30 +37,30 @@ _LAND_OF: dict[GroundKind, LandKind] = {
     "town": "town",
 }
 _SEED = 3
-# Slowly varying fields are worked out on every so many pixels of a large picture.
+# Large images compute slowly varying fields at every so many pixels.
 _STEP_PX, _MANY_RAYS = 8, 60_000
-# Pieces in a block of rays are of about one size, so that one or two copies of a picture serve it.
+# Rays of a block see pieces of similar size, so that one or two mipmap levels serve it.
 _BLOCK_ROWS, _BLOCK_COLUMNS = 32, 320
 _SMOOTH_PX, _SMOOTH_TEXEL_M = 512, 60.0
 _WARP_M = 110.0
-# Contrast that is left of ground so far away that its detail need not be worked out.
+# Ground with less contrast than this behind the haze shows no detail.
 _HIDDEN = 0.004
-# With less contrast than this, every other pixel down and across will do.
+# Ground with less contrast than this is computed at every other pixel down and across.
 _HAZY, _HAZY_STEP_PX = 0.5, 2
 # Standard deviation of the terrain's slope.
 _RELIEF: dict[GroundKind, float] = {"forest": 0.10, "dry": 0.13, "fields": 0.025, "coast": 0.05}
-# Hedges and rows of trees so high, so far apart, hide what lies behind them from low rays; what one sees of them.
+# Height and spacing of hedges and rows of trees, which hide the ground behind them from low rays, and their colour.
 _HEDGE_M, _HEDGE_SPACING_M = 6.0, 220.0
 _HEDGE_SIDE = np.array([0.048, 0.062, 0.026], dtype=np.float32)
 _BRIGHTNESS, _TOWN_ABOVE, _GRAIN_BELOW_M, _GRAIN = 0.13, -0.45, 8.0, 0.22
-# Towns are lit when less daylight than this falls on them; the lamps' radiance is that of a lit street with the lamps.
+# Illuminance below which towns switch on their lamps, and the radiance of a lit street with its lamps.
 _LAMPS_ON_LUX = 40.0
 _LAMP_CD_M2 = np.array([36.0, 25.0, 14.0], dtype=np.float32)
 
 
 @lru_cache(maxsize=1)
 def _regions() -> MipTile:
-    """Three fields whose signs tell regions apart, and one of brightness."""
+    """Three fields whose signs separate regions, and one of brightness."""
     made = [smooth_noise(_SEED, f"region {index}", _SMOOTH_PX, 9.0) for index in range(3)]
     made.append(power_noise(_SEED, "brightness", _SMOOTH_PX, 1.6, 6.0))
     return MipTile(np.stack(made, axis=-1), _SMOOTH_TEXEL_M)
@@ -70,7 +68,7 @@ def _regions() -> MipTile:
 
 @lru_cache(maxsize=1)
 def _shapes() -> MipTile:
-    """By how much places are moved east and north, and the terrain's slopes; each of unit variance."""
+    """Displacements east and north, and slopes of the terrain; each of unit variance."""
     moved = [smooth_noise(_SEED, f"moved {axis}", _SMOOTH_PX, 17.0) for axis in "xy"]
     height = power_noise(_SEED, "terrain", _SMOOTH_PX, 2.1, 7.0)
     slopes = [np.roll(height, -1, axis) - np.roll(height, 1, axis) for axis in (1, 0)]
@@ -79,7 +77,7 @@ def _shapes() -> MipTile:
 
 @lru_cache(maxsize=1)
 def _grain() -> MipTile:
-    """What pictures of land are too coarse to show from low down."""
+    """Detail finer than the land textures, visible from low altitude."""
     return MipTile(power_noise(_SEED, "grain", 512, 1.0, 24.0)[..., None], 0.4)
 
 
@@ -87,8 +85,8 @@ class Ground:
     """Land or sea of one environment under its light.
 
     Args:
-        environment: kind, colour and seed of the ground, altitude and wind.
-        light: what shines on it.
+        environment: gives kind, colour and seed of the ground, altitude and wind.
+        light: on the ground.
     """
 
     def __init__(self, environment: Environment, light: GroundLight) -> None:
@@ -105,11 +103,11 @@ class Ground:
         self._ships = sample_ships(rng, environment.altitude_m) if self._kind == "sea" else ()
 
     def radiance(self, directions: NDArray[np.float32], uncovered: Field | None = None) -> Radiance:
-        """Radiance of the ground as if there were no air before it.
+        """Radiance of the ground without air in front of it.
 
         Args:
-            directions: (H, W, 3) unit vectors in world axes, those above the horizon see the ground's farthest rim.
-            uncovered: (H, W) share that clouds do not hide; what is hidden altogether is not worked out.
+            directions: (H, W, 3) unit vectors in world axes, those above the horizon see the ground's farthest edge.
+            uncovered: (H, W) share that clouds do not hide; completely hidden ground is not computed.
 
         Returns:
             (H, W, 3) radiance. [cd/m2]
@@ -131,7 +129,7 @@ class Ground:
                 if uncovered is not None and uncovered[block].max() < _HIDDEN:
                     total[block] = self._mean_radiance
                     continue
-                # One ray more than the block has, so that what lies between them can be interpolated.
+                # One more ray than the block has, for interpolation.
                 chosen = tuple(slice(part.start, part.stop + step - 1, step) for part in block)
                 view = self._view(directions[chosen], step * angle_rad)
                 seen = self._block(view, regions[chosen], shapes[chosen])
@@ -140,10 +138,10 @@ class Ground:
         return total
 
     def moved_to(self, environment: Environment) -> Ground:
-        """The same ground from another place at the same altitude.
+        """The same ground for a camera elsewhere at the same altitude.
 
         Args:
-            environment: this ground's, with another `camera_offset_m`.
+            environment: this ground's environment with another `camera_offset_m`.
         """
         moved = copy(self)
         moved._environment = environment
@@ -159,11 +157,11 @@ class Ground:
         return reflected.astype(np.float32)
 
     def _smooth_fields(self, directions: NDArray[np.float32], every: int, angle_rad: float) -> tuple[Field, Field]:
-        """(H, W, 4) regions; (H, W, 3) by how much places are moved, and the share of the beam that the slope takes."""
-        view = self._view(directions if every == 1 else _between(directions, every), every * angle_rad)
+        """(H, W, 4) regions; (H, W, 3) displacements, and the share of the beam that the terrain receives."""
+        view = self._view(directions if every == 1 else _square_centers(directions, every), every * angle_rad)
         x_m, y_m = view.x_m + self._shift_m[0], view.y_m + self._shift_m[1]
         fields = [tile.sample(x_m, y_m, np.sqrt(view.across_m * view.along_m)) for tile in (_regions(), _shapes())]
-        fields[1] = np.concatenate([fields[1][..., :2], self._facing(fields[1][..., 2:])[..., None]], axis=-1)
+        fields[1] = np.concatenate([fields[1][..., :2], self._beam_cosine(fields[1][..., 2:])[..., None]], axis=-1)
         if every == 1:
             return fields[0], fields[1]
         height, width = directions.shape[:2]
@@ -224,7 +222,7 @@ class Ground:
             brightness = brightness * np.maximum(1.0 + np.float32(_GRAIN) * grain, 0.2)
         albedo = seen[..., :3] * tint.astype(np.float32) * brightness[..., None]
         if kind == "fields":
-            # Seen from the side, a hedge takes its height over the sine of the ray out of the ground's length.
+            # A hedge hides ground over a length of its height over the sine of the ray's elevation.
             behind = np.exp(np.float32(-_HEDGE_M / _HEDGE_SPACING_M) / view.sine)[..., None]
             albedo = _HEDGE_SIDE + behind * (albedo - _HEDGE_SIDE)
         if self._coast is not None and offshore_m is not None:
@@ -234,8 +232,8 @@ class Ground:
             result += (self._lamps_on * seen[..., 3])[..., None] * _LAMP_CD_M2
         return result
 
-    def _facing(self, slopes: Field) -> Field:
-        """(H, W) cosine between the beam and the terrain of (H, W, 2) slopes, relative to their spread."""
+    def _beam_cosine(self, slopes: Field) -> Field:
+        """(H, W) cosine between the beam and the normal of terrain with (H, W, 2) slopes of unit variance."""
         relief = np.float32(_RELIEF.get(self._kind, 0.0))
         to_sun = self._light.beam_direction.astype(np.float32)
         east, north = relief * slopes[..., 0], relief * slopes[..., 1]
@@ -259,8 +257,8 @@ class Ground:
         return np.float32(np.clip(2.0 * (1.0 - daylight_lux / _LAMPS_ON_LUX), 0.0, 1.0))
 
 
-def _between(directions: NDArray[np.float32], every: int) -> NDArray[np.float32]:
-    """(H / every, W / every, 3) directions in the middles of squares of rays, rounded up; an even number to a side."""
+def _square_centers(directions: NDArray[np.float32], every: int) -> NDArray[np.float32]:
+    """(H / every, W / every, 3) directions at the centres of squares of rays, rounded up; `every` is even."""
     for axis in (0, 1):
         last = directions.shape[axis] - 1
         first = np.arange(every // 2 - 1, last + every // 2, every)

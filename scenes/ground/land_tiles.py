@@ -1,7 +1,7 @@
-"""Pictures of land from above: fields, forest, dry land and town, 8 km wide, painted once for all scenes.
+"""Textures of land from above: fields, forest, dry land and town, 8 km wide, painted once for all scenes.
 
-Reflectances are our choice within published ranges (linear Rec. 709). Scenes differ by which part of a picture lies
-where, how it is turned, and by its colour.
+Reflectances are our choice within published ranges (linear Rec. 709). Scenes differ by position, rotation and colour
+of the textures.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _ROOFS: tuple[Rgb, ...] = (
 
 @lru_cache(maxsize=4)
 def land_tile(kind: LandKind) -> MipTile:
-    """The picture of a kind of land: reflectance, and as the fourth channel how many lamps burn there at night."""
+    """The texture of a kind of land: reflectance, and as the fourth channel the density of lamps lit at night."""
     paint = {"fields": _paint_fields, "forest": _paint_forest, "dry": _paint_dry, "town": _paint_town}[kind]
     rng = frame_generator(_SEED, 0, f"paint {kind}")
     canvas = np.clip(paint(rng), 0.0, 1.0)
@@ -66,7 +66,7 @@ def _rgb(red: float, green: float, blue: float) -> NDArray[np.float32]:
 
 
 def _noise(stream: str, slope: float, cycles: float) -> Field:
-    """(2048, 2048) texture made of one of half its width, which repeats."""
+    """(2048, 2048) texture that repeats one of half its width."""
     return np.tile(power_noise(_SEED, stream, _SIZE_PX // 2, slope, cycles / 2), (2, 2))
 
 
@@ -75,7 +75,7 @@ def _smooth(stream: str, cycles: float) -> Field:
 
 
 def _bent(canvas: Field, stream: str, amplitude_px: float, cycles: float) -> Field:
-    """The picture with its straight lines bent."""
+    """The texture with its straight lines bent."""
     v, u = np.meshgrid(np.arange(_SIZE_PX, dtype=np.float32), np.arange(_SIZE_PX, dtype=np.float32), indexing="ij")
     u += np.float32(amplitude_px) * _smooth(f"{stream} u", cycles)
     v += np.float32(amplitude_px) * _smooth(f"{stream} v", cycles)
@@ -85,7 +85,7 @@ def _bent(canvas: Field, stream: str, amplitude_px: float, cycles: float) -> Fie
 
 
 def _parcels(rng: np.random.Generator, smallest_px: float, largest_px: float) -> list[tuple[Rectangle, int]]:
-    """Rectangles (left, top, right, bottom) that tile the picture, with how often each was divided."""
+    """Rectangles (left, top, right, bottom) that tile the texture, and how often each was divided."""
     done: list[tuple[Rectangle, int]] = []
     left = [((0, 0, _SIZE_PX, _SIZE_PX), 0)]
     while left:
@@ -184,7 +184,7 @@ def _paint_forest(rng: np.random.Generator) -> Field:
 
 
 def _blocks(rng: np.random.Generator, smallest_px: float, largest_px: float) -> Field:
-    """(2048, 2048) one random number in [0, 1) for each parcel."""
+    """(2048, 2048) a random number in [0, 1) for each parcel."""
     values = np.zeros((_SIZE_PX, _SIZE_PX), dtype=np.float32)
     for (x0, y0, x1, y1), _ in _parcels(rng, smallest_px, largest_px):
         values[y0:y1, x0:x1] = rng.random()
@@ -236,7 +236,7 @@ def _paint_town(rng: np.random.Generator) -> Field:
             _lots(canvas, rng, block, (4, 7), 2)
     canvas[_noise("street trees", 0.5, 500) > 1.75, :3] = _WOOD
     canvas[..., :3] *= (1.0 + 0.10 * _noise("wear", 0.8, 200))[..., None]
-    # Lamps stand apart: each lights its own spot of the street.
+    # Lamps are apart: each lights its own spot of the street.
     spots = np.clip(_noise("lamps", 0.2, 500) - 1.9, 0, 1)
     canvas[..., 3] *= 0.003 + spots
     return _bent(canvas, "town", 6.0, 6)

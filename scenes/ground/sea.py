@@ -23,7 +23,7 @@ _WATER_INDEX = 1.34
 _SEED = 5
 _TILE_PX, _TILE_TEXEL_M = 1024, 2.0
 _LONGEST_WAVE_M, _SHORTEST_WAVE_M = 75.0, 4.0
-# Slopes spread evenly over the octaves between gravity waves and ripples; these are the longest 4 of about 13.
+# Slope variance is even over the octaves from gravity waves to ripples; the longest 4 of about 13 are resolved.
 _RESOLVED_SHARE = 0.3
 _FOAM_REFLECTANCE = 0.35  # fresh and fading foam, Koepke 1984 (doi:10.1364/AO.23.001816)
 _FOAM_PATCHES = 0.01  # share of the tile under foam patches
@@ -33,12 +33,12 @@ _SKY_ROWS, _SKY_COLUMNS = 24, 72
 
 @dataclass(frozen=True, eq=False)
 class GroundLight:
-    """What shines on the ground.
+    """Light on the ground.
 
     Attributes:
-        sky_lux: (3,) illuminance of level ground by everything but the beam. [lux]
+        sky_lux: (3,) illuminance of level ground by everything except the beam. [lux]
         beam_direction: (3,) unit vector towards sun or moon.
-        beam_lux: (3,) illuminance of a plane that faces it. [lux]
+        beam_lux: (3,) illuminance of a plane that faces the beam. [lux]
         sky_radiance: radiance of the sky along (H, W, 3) directions above the horizon. [cd/m2]
     """
 
@@ -57,7 +57,7 @@ class GroundLight:
 def slope_variances(wind_speed_m_s: float) -> tuple[float, float]:
     """Mean squares of the slopes of a clean sea, along the wind and across it.
 
-    Source: Cox and Munk 1954 (doi:10.1364/JOSA.44.000838), from the wind at 12.5 m.
+    Source: Cox and Munk 1954 (doi:10.1364/JOSA.44.000838), for the wind at 12.5 m.
     """
     return 0.00316 * wind_speed_m_s + 1e-3, 0.003 + 0.00192 * wind_speed_m_s
 
@@ -77,7 +77,7 @@ def fresnel(cosine: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
 
 
 def hidden_share(sine: NDArray[np.floating[Any]], variance: float) -> NDArray[np.floating[Any]]:
-    """Smith's Lambda: what waves hide of each other, against what is seen of them.
+    """Smith's Lambda: hidden over visible area of waves.
 
     Source: Smith 1967 (doi:10.1109/TAP.1967.1138991), with Walter et al. 2007's rational approximation
     (doi:10.2312/EGWR/EGSR07/195-206).
@@ -115,9 +115,9 @@ class Sea:
     """Water under one sky and wind.
 
     Args:
-        light: what shines on it.
-        wind_speed_m_s: at 12.5 m above it. [m/s]
-        wind_rad: where the wind blows to, from east towards north. [rad]
+        light: on the sea.
+        wind_speed_m_s: at 12.5 m above the sea. [m/s]
+        wind_rad: direction to which the wind blows, from east towards north. [rad]
     """
 
     def __init__(self, light: GroundLight, wind_speed_m_s: float, wind_rad: float) -> None:
@@ -131,9 +131,9 @@ class Sea:
         """(H, W, 3) radiance of the water. [cd/m2]
 
         Args:
-            view: which pieces of it.
-            body_rgb: (H, W, 3) or (3,) diffuse reflectance of what lies under the surface.
-            gusts: (H, W) by which the variance of the slopes is larger than elsewhere.
+            view: pieces of the sea.
+            body_rgb: (H, W, 3) or (3,) diffuse reflectance of the water body.
+            gusts: (H, W) factor on the variance of the slopes.
         """
         cosine, sine = (np.full_like(view.x_m, value) for value in self._wind)
         waves = view.average(_wave_tile(), (cosine, sine))
@@ -150,17 +150,17 @@ class Sea:
         return result
 
     def _mirrored_sky(self, view: GroundView, towards: Field) -> Radiance:
-        """Sky in waves that are tilted by a resolved slope towards the camera; the finer ones are in the table."""
+        """Sky mirrored in waves that a resolved slope tilts towards the camera; the table holds the finer waves."""
         elevation = np.arcsin(np.clip(view.sine, 0.0, 1.0)) + towards
         row = _row_of_elevation(np.clip(elevation, 0.0, np.pi / 2)).astype(np.float32)
         azimuth = np.arctan2(view.away_y, view.away_x)
         column = np.mod(azimuth * np.float32(_TABLE_COLUMNS / (2 * np.pi)), np.float32(_TABLE_COLUMNS))
-        # One column is repeated at the end, for remap wraps rows as well as columns.
+        # One column is repeated at the end, because remap would wrap rows as well as columns.
         seen = cv2.remap(self._table, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(seen, dtype=np.float32).reshape(*view.x_m.shape, 3)
 
     def _glint(self, view: GroundView, slope_x: Field, slope_y: Field, gusts: Field) -> Radiance:
-        """Sun or moon in the waves: the share of the surface that is tilted just so.
+        """Glint of sun or moon: the share of the surface with the slope that mirrors it into the camera.
 
         Source: Cox and Munk 1954, as above; L = R E p / (4 sin(elevation of the camera) cos^4(tilt)).
         """
@@ -186,7 +186,7 @@ class Sea:
         return result
 
     def _sky_table(self) -> Radiance:
-        """(rows, columns + 1, 3) reflected sky by elevation of the camera over the water and azimuth of the ray."""
+        """(rows, columns + 1, 3) mirrored sky by elevation of the camera over the water and azimuth of the ray."""
         elevation = _elevation_of_row(np.arange(_TABLE_ROWS))
         azimuth = np.arange(_TABLE_COLUMNS + 1) * 2 * np.pi / _TABLE_COLUMNS
         e, a = np.meshgrid(elevation, azimuth, indexing="ij")
@@ -202,7 +202,7 @@ class Sea:
             facing = np.maximum(back @ normal, 0.0)
             weight = np.exp(-0.5 * (s * s + t * t)) * facing / normal[2]
             up = 2 * facing[..., None] * normal - back
-            total += (weight * fresnel(facing))[..., None] * _looked_up(sky, up)
+            total += (weight * fresnel(facing))[..., None] * _nearest_sky(sky, up)
             weights += weight
         result: Radiance = (total / np.maximum(weights, 1e-12)[..., None]).astype(np.float32)
         return result
@@ -215,8 +215,8 @@ class Sea:
         return self._light.sky_radiance(directions.astype(np.float32))
 
 
-def _looked_up(sky: Radiance, directions: NDArray[np.float64]) -> Radiance:
-    """The nearest texels of a sky map; what points below the horizon meets the next wave, which mirrors low sky."""
+def _nearest_sky(sky: Radiance, directions: NDArray[np.float64]) -> Radiance:
+    """The nearest texels of a sky map; directions below the horizon hit another wave, which mirrors low sky."""
     elevation = np.arcsin(np.clip(np.abs(directions[..., 2]), 0.0, 1.0))
     row = np.clip((elevation / (np.pi / 2) * _SKY_ROWS).astype(int), 0, _SKY_ROWS - 1)
     turns = np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi)
@@ -231,7 +231,7 @@ def _elevation_of_row(row: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
 
 
 def _row_of_elevation(elevation_rad: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Rows lie closer together where the camera looks along the water."""
+    """Row of an elevation; rows are closer together where the camera looks along the water."""
     result: NDArray[np.floating[Any]] = (_TABLE_ROWS - 1) * (elevation_rad / (np.pi / 2)) ** (2 / 3)
     return result
 
@@ -248,7 +248,7 @@ class Ship:
     """A ship from above: a hull with its bridge aft, and a wake.
 
     Attributes:
-        x_m, y_m: of its middle, east and north of the place about which the sea is laid out. [m]
+        x_m, y_m: of its middle, east and north of the ground's origin. [m]
         heading_rad: from east towards north.
         length_m, width_m: [m]
         hull_rgb: diffuse reflectance of hull and deck.
@@ -263,7 +263,7 @@ class Ship:
 
 
 def sample_ships(rng: np.random.Generator, altitude_m: float) -> tuple[Ship, ...]:
-    """Ships ahead of the camera, often none."""
+    """Up to four ships ahead of the camera."""
     ships = []
     for _ in range(int(rng.integers(0, _MOST_SHIPS + 1))):
         away_m = altitude_m * rng.uniform(3.5, 12.0)
@@ -305,14 +305,14 @@ def draw_ships(water: Radiance, view: GroundView, ships: tuple[Ship, ...], light
 
 
 def _widths(view: GroundView, cosine: np.float32, sine: np.float32) -> tuple[Field, Field]:
-    """(H, W) widths of the pieces along the ship and across it. [m]"""
+    """(H, W) widths of the pieces of sea along the ship and across it. [m]"""
     along = np.abs(cosine * view.away_x + sine * view.away_y)
     across = np.abs(cosine * view.away_y - sine * view.away_x)
     return along * view.along_m + across * view.across_m, across * view.along_m + along * view.across_m
 
 
 def _inside(place_m: Field, half_m: Field | float, blur_m: Field) -> Field:
-    """(H, W) share of each piece that lies within a distance of a line."""
+    """(H, W) share of each piece of sea within a distance of a line."""
     low = np.maximum(place_m - blur_m / 2, -half_m)
     high = np.minimum(place_m + blur_m / 2, half_m)
     result: Field = (np.clip(high - low, 0.0, None) / blur_m).astype(np.float32)

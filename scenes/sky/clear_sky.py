@@ -1,4 +1,4 @@
-"""The clear sky at any hour: sun, moon and night sky in absolute units, as a function of direction."""
+"""The clear sky at any hour: radiance of sun, moon and night sky by direction, in absolute units."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from datasets_manifest.types.environment import Environment
 from scenes.sky.daylight import DaylightSky
 from scenes.sky.light import (
-    REC709_LUMINANCE,
     SOLAR_ILLUMINANCE_LUX,
     SUN_RADIUS_RAD,
     SUN_SOLID_ANGLE_SR,
@@ -22,14 +21,12 @@ from scenes.sky.light import (
 from scenes.sky.night import lit_side_of_moon, moon_illuminance_lux, night_radiance
 from scenes.sky.twilight import TwilightSky, twilight_illuminance_lux
 
-__all__ = ["REC709_LUMINANCE", "ClearSky", "Luminary", "Radiance", "direction_from_angles"]
-
 # Below the first elevation the sky is the twilight model's, above the second the daylight model's. [deg]
 _TWILIGHT_BELOW_DEG, _DAYLIGHT_ABOVE_DEG = 2.0, 9.0
-# Preetham's sky is three times too bright under a low sun: between these elevations its level goes over to the measured
+# Preetham's sky is three times too bright under a low sun: between these elevations its level blends into the measured
 # one. [deg]
 _MEASURED_BELOW_DEG, _MODEL_ABOVE_DEG = 4.0, 22.0
-# Lower than this, the sun adds nothing that the night sky would not hide. [deg]
+# Below this elevation the sun's light is negligible beside the night sky. [deg]
 _NIGHT_BELOW_DEG = -18.5
 
 
@@ -45,7 +42,7 @@ class Luminary:
     Args:
         elevation_deg, azimuth_deg: direction to it. [deg]
         turbidity: as in `Environment`.
-        illuminance_lux: of a facing plane outside the atmosphere.
+        illuminance_lux: of a plane that faces it, outside the atmosphere. [lux]
         altitude_m: of the camera. [m]
     """
 
@@ -69,7 +66,7 @@ class Luminary:
             self._skies.append(((1.0 - day) * brighter, TwilightSky(turbidity, elevation_deg, azimuth_deg)))
 
     def beam_illuminance_lux(self, height_m: float = 0.0) -> NDArray[np.float64]:
-        """(3,) illuminance of a plane that faces it, by channel; from higher up it sets later. [lux]"""
+        """(3,) illuminance of a plane that faces it, by channel; at greater heights it sets later. [lux]"""
         dip_deg = float(np.degrees(np.sqrt(2.0 * max(height_m, 0.0) / 6.371e6)))
         through = beam_transmission(self._elevation_deg + dip_deg, self._turbidity)
         result: NDArray[np.float64] = SOLAR_ILLUMINANCE_LUX * self._share * through
@@ -84,11 +81,12 @@ class Luminary:
 
 
 class ClearSky:
-    """Sun, moon and night sky through clear air, seen from the ground and used at altitude unchanged.
+    """Sun, moon and night sky through clear air, as seen from the ground, and used unchanged at altitude.
 
     Attributes:
-        sun, moon: what shines; no moon, or a moon.
-        beam: the one of them that casts the shadows.
+        sun: always there.
+        moon: None without a moon.
+        beam: the brighter of the two, which casts the shadows.
     """
 
     def __init__(self, environment: Environment) -> None:
@@ -144,9 +142,9 @@ class ClearSky:
         """Add the discs of sun and moon, in place.
 
         Args:
-            radiance: (..., 3) seen along `directions`.
+            radiance: (..., 3) along `directions`. [cd/m2]
             directions: (..., 3) unit vectors in world axes.
-            through: share of the beam that cloud and mist let through.
+            through: share of the beam that cloud and mist transmit.
         """
         for luminary in (self.sun, self.moon):
             if luminary is None:
@@ -163,7 +161,7 @@ class ClearSky:
             radiance[disc] += lit[:, None] * share.astype(np.float32)
 
     def _lit_moon(self, directions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which (N, 3) directions into the moon's disc meet its lit side."""
+        """(N,) which (N, 3) directions within the moon's disc hit its lit side."""
         assert self.moon is not None and self._moon is not None
         to_moon = self.moon.direction
         away = to_moon * (to_moon @ self.sun.direction) - self.sun.direction

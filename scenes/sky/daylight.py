@@ -1,6 +1,6 @@
-"""The clear sky by day, after Preetham.
+"""The clear sky by day: the model of Preetham et al.
 
-Products over many directions are written with einsum: BLAS would round differently with another number of threads.
+Products over many directions use einsum, because BLAS rounds differently with another number of threads.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from scenes.sky.light import REC709_FROM_XYZ, REC709_LUMINANCE, Radiance, direct
 
 # Perez's function is singular at the horizon and undefined below it.
 _LOWEST_COSINE = 1e-3
-# Preetham's chromaticity turns pink towards the horizon, which no sky does; below some 7 degrees it hardly changes.
+# The model's chromaticity turns pink towards the horizon, unlike any sky: it is kept nearly constant below 7 degrees.
 _LOWEST_CHROMATIC_COSINE = 0.12
-# The least turbidity that the model was fitted to, and the height over which the haze thins out. [m]
+# Lowest turbidity that the model was fitted to, and scale height of the haze. [m]
 _LEAST_TURBIDITY, _HAZE_SCALE_M = 1.9, 1500.0
-# Beyond this x the sky is on the daylight locus; the model alone holds where x is less by the range.
+# Above this x the sky is on the daylight locus; below it by the range, the model alone counts.
 _GREEN_BEYOND_X, _GREEN_RANGE_X = 0.34, 0.08
-# White is here the sun outside the air, as for its beam: its chromaticity, about that of daylight of 5900 K, becomes
-# that of D65 by scaling the responses of the cones after Bradford (Lam 1985).
+# White is the sun outside the atmosphere, as for its beam: its chromaticity, about that of daylight of 5900 K, is
+# adapted to that of D65 by the Bradford transform (Lam 1985).
 _SUN_XYZ = np.array([0.3235 / 0.3395, 1.0, (1.0 - 0.3235 - 0.3395) / 0.3395])
 _D65_XYZ = np.array([0.95047, 1.0, 1.08883])
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -47,14 +47,14 @@ _ZENITH_Y = np.array(
 
 
 class DaylightSky:
-    """Preetham's daylight model under a full sun.
+    """Preetham's daylight model under the full sun.
 
-    The model is one of the sky seen from the ground. Its brightness is used at altitude unchanged; its colour is that
-    of the haze that is left above the camera, for haze is what turns a low sun's side orange.
+    The model is one of the sky seen from the ground. Its brightness is used unchanged at altitude. Its colour is that
+    of the haze above the camera, because haze turns the sky around a low sun orange.
 
     Args:
         turbidity: 1.9 to 10.
-        sun_elevation_deg, sun_azimuth_deg: direction to the sun; the model wants it above the horizon. [deg]
+        sun_elevation_deg, sun_azimuth_deg: direction to the sun, which must be above the horizon. [deg]
         altitude_m: of the camera. [m]
     """
 
@@ -102,12 +102,12 @@ class DaylightSky:
             self._relative(key, cosine, gamma, cos_gamma) * scale
             for key, cosine, scale in zip(("x", "y", "Y"), (softened, softened, cos_zenith), zenith, strict=True)
         )
-        # Around a low sun the model strays to green; measured skies keep to the daylight locus (CIE 15).
+        # Around a low sun the model is too green; measured skies keep to the daylight locus (CIE 15).
         locus = (2.870 - 3.0 * x) * x - 0.275
         y = locus + (y - locus) * np.clip((_GREEN_BEYOND_X - x) / _GREEN_RANGE_X, 0.0, 1.0)
         xyz = np.stack([x / y * luminance, luminance, (1.0 - x - y) / y * luminance], axis=-1)
         rgb = np.maximum(np.einsum("...j,ij->...i", xyz, _ADAPTED_FROM_XYZ), 0.0)
-        # Another white changes the colour and leaves the luminance.
+        # Adaptation changes the colour and must keep the luminance.
         rgb *= (luminance / np.einsum("...c,c->...", rgb, REC709_LUMINANCE))[..., None]
         result: Radiance = rgb.astype(np.float32)
         return result
@@ -115,7 +115,7 @@ class DaylightSky:
     def _relative(
         self, key: str, cos_zenith: NDArray[np.float64], gamma: NDArray[np.float64], cos_gamma: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Perez's function over its value at the zenith."""
+        """Perez's function, relative to its value at the zenith."""
         turbidity = self._turbidity if key == "Y" else self._chromatic_turbidity
         a, b, c, d, e = (slope * turbidity + offset for slope, offset in _PEREZ[key])
         value = (1 + a * np.exp(b / cos_zenith)) * (1 + c * np.exp(d * gamma) + e * cos_gamma**2)

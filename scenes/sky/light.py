@@ -1,4 +1,4 @@
-"""Names and numbers that everything which shines shares: colour, directions, the sun's beam through the air."""
+"""Photometry that all light sources share: colour, luminance, directions, and the sun's beam through the air."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHANNEL_WAVELENGTH_UM = np.array([0.610, 0.550, 0.465])  # centroids of the Rec.
 SOLAR_ILLUMINANCE_LUX = 127_500.0  # outside the atmosphere, IES Lighting Handbook, 9th ed., ch. 8
 SUN_RADIUS_RAD = np.radians(0.2666)
 SUN_SOLID_ANGLE_SR = 2 * np.pi * (1 - np.cos(SUN_RADIUS_RAD))
-# Sun and moon are lifted by about half a degree where they set (Bennett 1982, at 0 degrees).
+# Refraction lifts sun and moon by about half a degree at the horizon (Bennett 1982, at 0 degrees).
 _REFRACTION_AT_HORIZON_DEG = 0.57
 
 
@@ -36,10 +36,10 @@ def luminance(radiance: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
 
 
 def hemisphere(rows: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions that cover the upper half of the sphere.
+    """Directions that cover the upper hemisphere.
 
     Returns:
-        (rows, 4 rows, 3) unit vectors, and (rows, 4 rows) weights that turn radiance into illuminance of level ground.
+        (rows, 4 rows, 3) unit vectors, and (rows, 4 rows) weights that convert radiance to illuminance of level ground.
     """
     step = np.pi / 2 / rows
     elevation, azimuth = np.meshgrid((np.arange(rows) + 0.5) * step, np.arange(4 * rows) * step, indexing="ij")
@@ -59,9 +59,9 @@ def scattering_depth(turbidity: float) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def beam_transmission(elevation_deg: float, turbidity: float) -> NDArray[np.float64]:
-    """(3,) share of the sun's or moon's light that comes straight through the air, by channel; none once it has set.
+    """(3,) share of the sun's or moon's light that air transmits directly, by channel; 0 once it has set.
 
-    Source: depths as in `scattering_depth`; air mass of Kasten 1966 (doi:10.1007/BF02248840).
+    Source: optical depths as in `scattering_depth`; air mass of Kasten 1966 (doi:10.1007/BF02248840).
     """
     lifted_deg = elevation_deg + _REFRACTION_AT_HORIZON_DEG * np.exp(-max(elevation_deg, 0.0) / 1.5)
     radius_deg = float(np.degrees(SUN_RADIUS_RAD))
@@ -74,6 +74,6 @@ def beam_transmission(elevation_deg: float, turbidity: float) -> NDArray[np.floa
 
 
 def henyey_greenstein(cosine: NDArray[np.floating[Any]] | float, asymmetry: float) -> Any:
-    """Phase function of large particles, normalised over the sphere. [1/sr]"""
+    """Henyey-Greenstein phase function of large particles, normalised over the sphere. [1/sr]"""
     g2 = asymmetry * asymmetry
     return (1.0 - g2) / (4.0 * np.pi) / (1.0 + g2 - 2.0 * asymmetry * cosine) ** 1.5

@@ -1,4 +1,4 @@
-"""What is left when the sun has gone: the night sky's own light, the moon, and stars."""
+"""The night sky: airglow and starlight, the moon, and bright stars."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from datasets_manifest.types.environment import Moon
 from scenes.sky.light import Radiance
 
 # Dark sites: 21.9 mag/arcsec2 at the zenith, 1.9e-4 cd/m2 (Leinert et al. 1998, doi:10.1051/aas:1998105), with the
-# brighter stars, which no telescope counts into the background, 2.6e-4.
+# brighter stars, which the background of telescopes excludes, 2.6e-4.
 _ZENITH_CD_M2 = 2.6e-4
 _AIRGLOW_SHARE, _AIRGLOW_HEIGHT_M, _EARTH_M = 0.6, 9e4, 6.371e6
 EXTINCTION_MAG = 0.17
@@ -21,13 +21,13 @@ _NIGHT_RGB = np.array([1.02, 1.0, 0.95], dtype=np.float32)
 # A star of magnitude m gives 10^(-0.4 (m + 14.18)) lux (Allen's Astrophysical Quantities, 4th ed., sec. 2.6).
 _LUX_ZERO_MAGNITUDE = 14.18
 _FULL_MOON_MAGNITUDE = -12.73
-# Stars brighter than magnitude m over the whole sky go as 10^(0.5 m + 0.70) (the same, sec. 19.2, fitted to m 1 to 6).
+# Number of stars brighter than magnitude m in the whole sky: 10^(0.5 m + 0.70) (ibid., sec. 19.2, for m 1 to 6).
 _FAINTEST_MAGNITUDE = 6.0
 _STAR_SEED = 20
 
 
 def night_radiance(directions: NDArray[np.floating[Any]]) -> Radiance:
-    """Airglow and starlight without moon. [cd/m2]
+    """Airglow and starlight without a moon. [cd/m2]
 
     Args:
         directions: (..., 3) unit vectors in world axes; those below the horizon get the horizon's radiance.
@@ -55,8 +55,8 @@ def lit_side_of_moon(moon: Moon, across: NDArray[np.float32], away_from_sun: NDA
     """Which points of the moon's disc are lit.
 
     Args:
-        moon: its phase counts.
-        across, away_from_sun: coordinates on the disc in its radii, the second one pointing away from the sun.
+        moon: gives the phase.
+        across, away_from_sun: coordinates on the disc in radii; the second axis points away from the sun.
     """
     depth = np.sqrt(np.maximum(1.0 - across**2 - away_from_sun**2, 0.0))
     phase = np.radians(moon.phase_angle_deg)
@@ -66,14 +66,14 @@ def lit_side_of_moon(moon: Moon, across: NDArray[np.float32], away_from_sun: NDA
 
 @lru_cache(maxsize=1)
 def star_catalogue() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions (S, 3) and illuminance (S,) [lux] of drawn stars down to magnitude 6: as many as there are, elsewhere.
+    """Directions (S, 3) and illuminance (S,) [lux] of random stars to magnitude 6, in their true number.
 
-    Stars fainter than that are part of `night_radiance`.
+    Fainter stars are part of `night_radiance`.
     """
     rng = frame_generator(_STAR_SEED, 0, "stars")
     count = round(10 ** (0.5 * _FAINTEST_MAGNITUDE + 0.70))
     directions = rng.standard_normal((count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    # The inverse of the law of numbers at evenly drawn ranks.
+    # The inverse of the law of numbers at uniform ranks.
     magnitude = (np.log10(np.maximum(rng.random(count), 1e-4) * count) - 0.70) / 0.5
     return directions, 10.0 ** (-0.4 * (magnitude + _LUX_ZERO_MAGNITUDE))

@@ -1,8 +1,8 @@
 """The clear sky around sunset and through twilight.
 
-Light scattered once in a round, layered atmosphere gives the sky its shape and colour (the glow over the sun, the blue
-that ozone leaves at the zenith, the Earth's shadow); light scattered more often is spread evenly; the sum has the
-illuminance that is measured.
+Single scattering in a spherical, layered atmosphere gives the sky its shape and colour (the glow over the sun, the blue
+zenith by ozone, the Earth's shadow). Multiple scattering is spread evenly. The sum is scaled to the measured
+illuminance.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _OZONE_DEPTH = np.array([0.036, 0.028, 0.004])
 _OZONE_CENTER_M, _OZONE_HALF_WIDTH_M = 25_000.0, 15_000.0
 _AEROSOL_ASYMMETRY = 0.72
 _ELEVATIONS, _AZIMUTHS, _VIEW_STEPS, _SUN_STEPS = 26, 22, 28, 20
-# Share of the illuminance that was scattered more than once, and its colour: our choice between clear measurements of
-# the zenith's blue and brightness (tests state how near).
-_SHARE_SCATTERED_OFTEN = ((-18.0, 1.0), (-15.0, 0.65), (-9.0, 0.55), (-4.0, 0.35), (0.0, 0.25), (10.0, 0.2))
+# Share of multiple scattering in the illuminance, by elevation of the sun, and its colour: our compromise between
+# measurements of the zenith's colour and brightness (tests state how close it is).
+_MULTIPLE_SHARE = ((-18.0, 1.0), (-15.0, 0.65), (-9.0, 0.55), (-4.0, 0.35), (0.0, 0.25), (10.0, 0.2))
 _DARKEST = 1e-30
-_OFTEN_RGB = np.array([0.62, 0.98, 1.75])
+_MULTIPLE_RGB = np.array([0.62, 0.98, 1.75])
 
 
 def twilight_illuminance_lux(sun_elevation_deg: float) -> float:
@@ -48,7 +48,7 @@ def twilight_illuminance_lux(sun_elevation_deg: float) -> float:
 
 
 class TwilightSky:
-    """Sky of a sun near or below the horizon.
+    """The sky under a sun near or below the horizon.
 
     Args:
         turbidity: as in `Environment`.
@@ -58,17 +58,17 @@ class TwilightSky:
     def __init__(self, turbidity: float, sun_elevation_deg: float, sun_azimuth_deg: float) -> None:
         self._azimuth_rad = np.radians(sun_azimuth_deg)
         elevation, azimuth = _grid()
-        once = _scattered_once(turbidity, direction_from_angles(sun_elevation_deg, 0.0), elevation, azimuth)
-        once_lux = max(_level_illuminance(once, elevation, azimuth), _DARKEST)
-        elevations, shares = zip(*_SHARE_SCATTERED_OFTEN, strict=True)
-        often = float(np.interp(sun_elevation_deg, elevations, shares))
-        # Air that is lit evenly is brighter where there is more of it, until it hides itself.
+        single = _single_scattering(turbidity, direction_from_angles(sun_elevation_deg, 0.0), elevation, azimuth)
+        single_lux = max(_level_illuminance(single, elevation, azimuth), _DARKEST)
+        elevations, shares = zip(*_MULTIPLE_SHARE, strict=True)
+        multiple = float(np.interp(sun_elevation_deg, elevations, shares))
+        # Evenly lit air is brighter where it is deeper, until it is opaque.
         even = (1.0 + 0.8 * np.exp(-np.degrees(elevation) / 12.0))[..., None] * (
-            _OFTEN_RGB / (_OFTEN_RGB @ REC709_LUMINANCE)
+            _MULTIPLE_RGB / (_MULTIPLE_RGB @ REC709_LUMINANCE)
         )
         wanted_lux = twilight_illuminance_lux(sun_elevation_deg)
         table = wanted_lux * (
-            (1.0 - often) * once / once_lux + often * even / _level_illuminance(even, elevation, azimuth)
+            (1.0 - multiple) * single / single_lux + multiple * even / _level_illuminance(even, elevation, azimuth)
         )
         self._spline = [spline_filter(np.log(np.maximum(table[..., c], 1e-12)), mode="mirror") for c in range(3)]
 
@@ -110,7 +110,7 @@ def _level_illuminance(
 
 
 def _densities(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Molecules, aerosol and ozone over their vertical columns. [1/m]"""
+    """Densities of molecules, aerosol and ozone over their vertical columns. [1/m]"""
     molecules = np.exp(-height_m / _MOLECULE_SCALE_M) / _MOLECULE_SCALE_M
     aerosol = np.exp(-height_m / _AEROSOL_SCALE_M) / _AEROSOL_SCALE_M
     ozone = np.maximum(1.0 - np.abs(height_m - _OZONE_CENTER_M) / _OZONE_HALF_WIDTH_M, 0.0) / _OZONE_HALF_WIDTH_M
@@ -132,7 +132,7 @@ def _depth_to_sun(
     lowest = np.where(sine < 0, radius * np.sqrt(np.maximum(1 - sine**2, 0.0)), radius) - _EARTH_M
     nearest_m = np.where(sine < 0, -radius * sine, 0.0)
     column = np.zeros((3, *height_m.shape))
-    # Steps crowd around the lowest point of the ray, where nearly all of the air is.
+    # Steps are shorter around the lowest point of the ray, where nearly all of the air is.
     for low, high in ((np.zeros_like(nearest_m), nearest_m), (nearest_m, out_m)):
         edges = (np.arange(_SUN_STEPS // 2 + 1) / (_SUN_STEPS // 2)) ** 2
         edges = edges if high is out_m else 1.0 - edges[::-1]
@@ -142,15 +142,15 @@ def _depth_to_sun(
             length_m = (high - low) * (last - first)
             column += np.stack(_densities(np.maximum(height, 0.0))) * length_m
     depth: NDArray[np.float64] = np.einsum("k...,kc->...c", column, depths)
-    # The edge of the Earth's shadow is as soft as the lowest air is thick.
+    # The edge of the Earth's shadow is as soft as the lowest air is deep.
     depth += (200.0 * np.maximum(-lowest / 3000.0, 0.0))[..., None]
     return depth
 
 
-def _scattered_once(
+def _single_scattering(
     turbidity: float, sun: NDArray[np.float64], elevation: NDArray[np.float64], azimuth: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(E, A, 3) light scattered once towards the ground, per illuminance outside the atmosphere. [1/sr]"""
+    """(E, A, 3) light scattered once to the ground, per illuminance outside the atmosphere. [1/sr]"""
     molecules, aerosol = scattering_depth(turbidity)
     depths = np.stack([molecules, aerosol, _OZONE_DEPTH])
     sine, cosine = np.sin(elevation), np.cos(elevation)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.environment import GROUND_KINDS, Environment
-from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
+from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.land_tiles import land_tile
-from scenes.ground.sea import Sea, fresnel, slope_variances
+from scenes.ground.sea import GroundLight, Sea, fresnel, slope_variances
 from scenes.ground_view import FARTHEST_M, MipTile, ground_view, pixel_angle_rad, power_noise
 from scenes.sky.light import luminance
 

@@ -11,7 +11,8 @@ from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import CloudLight, render_cloud_layer
 from scenes.environment_radiance import environment_radiance
 from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
-from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground, GroundLight
+from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
+from scenes.ground.sea import GroundLight
 from scenes.sampler import sample_frame
 from scenes.sky.light import luminance
 
