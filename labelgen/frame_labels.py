@@ -26,7 +26,7 @@ from labelgen.disc_images import DiscInEye, hub_discs, marker_discs, window_arou
 from labelgen.part_pixels import drogue_box, drogue_mask, is_truncated, mask_box
 from render.camera.sensor import MONO_WEIGHTS
 from render.engine import EyeRadiance, StereoRadiance
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 # The surroundings that a feature stands out against reach from its edge to this multiple of its radius.
 _SURROUNDINGS_REACH = 1.8

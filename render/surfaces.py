@@ -10,7 +10,7 @@ from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.appearance import AS_NEW, SurfaceCondition
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID, SURROUNDING_PARTS, Part, part_reflectance_rgb
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 DIRT_MAP_PX = 64
 # Soot, hydraulic fluid and road dust: dark and nearly grey (our choice).

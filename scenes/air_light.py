@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import BACK_SCATTER, CloudLight, diffuse_transmission, opacity_towards
 from scenes.sky.clear_sky import ClearSky
-from scenes.sky.light import Radiance, hemisphere, henyey_greenstein
+from scenes.sky.photometry import Radiance, hemisphere, henyey_greenstein
 
 HORIZON_ELEVATION_RAD = 0.01
 _DROPLET_ASYMMETRY = 0.8

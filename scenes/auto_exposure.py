@@ -11,7 +11,7 @@ from drogue_models.parameters import WHITE_PAINT
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
-from scenes.sky.light import luminance
+from scenes.sky.photometry import luminance
 
 _METER_COLUMNS, _METER_ROWS = 16, 12
 _DARKEST_CD_M2 = 1e-9  # a millionth of a starlit sky; the limits of time and gain are reached long before

@@ -22,7 +22,7 @@ from scenes.ground.sea import GroundLight
 from scenes.ground_view import FARTHEST_M, pixel_angle_rad
 from scenes.sky.clear_sky import ClearSky
 from scenes.sky.equirectangular_sky import load_map
-from scenes.sky.light import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
+from scenes.sky.photometry import SUN_RADIUS_RAD, SUN_SOLID_ANGLE_SR, Radiance
 
 _LIGHT_MAP_HEIGHT_PX = 128
 # Large images evaluate clouds at every second pixel: 5 m at 5 km, which is less than the width of their edges.

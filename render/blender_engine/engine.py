@@ -38,7 +38,7 @@ from render.compositing import TracedEye, amodal_counts
 from render.engine import EyeRadiance, StereoRadiance
 from render.version import RENDER_VERSION
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 # Hose, tanker and other objects are convex enough for direct light from sky, sun and ground.
 _CONTEXT_DEPTH = 2

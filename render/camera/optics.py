@@ -15,7 +15,7 @@ from geometry.stereo import Eye
 from render.background import background
 from render.engine import EyeRadiance
 from scenes.environment_radiance import environment_radiance
-from scenes.sky.light import SUN_RADIUS_RAD
+from scenes.sky.photometry import SUN_RADIUS_RAD
 
 # Polished and coated glass scatters 1 / (a^2 + theta^2) ambient a source (the ABg law of optical
 # design with g = 2); the core is our choice for a lens of several elements.

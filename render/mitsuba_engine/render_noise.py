@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from render.camera.sensor import MONO_WEIGHTS
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 # One pixel in so many is rendered twice: a sixteenth more work, and some dozens of pairs on the smallest drogue.
 DUPLICATE_EVERY = 16

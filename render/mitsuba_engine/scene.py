@@ -37,7 +37,7 @@ from render.surfaces import (
     surface_condition,
 )
 from scenes.environment_radiance import EnvironmentRadiance
-from scenes.sky.light import Radiance
+from scenes.sky.photometry import Radiance
 
 
 def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any]) -> Any:

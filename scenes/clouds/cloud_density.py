@@ -200,7 +200,7 @@ class CloudDensity:
         return strength
 
     def knobs(self, place_m: NDArray[np.float32]) -> _Field:
-        """(H, W) knobs at (H, W, 3) positions: structure on the heaps too fine for ray marching, for light and edges."""
+        """(H, W) knobs at (H, W, 3) positions: structure on the heaps too fine for ray marching."""
         per_m = np.float32(_KNOBS_PER_BODY / self.layer.feature_size_m)
         x, y, z = (place_m[..., axis] * per_m for axis in range(3))
         seed = self.layer.texture_seed + 1

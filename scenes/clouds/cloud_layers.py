@@ -12,7 +12,7 @@ from datasets_manifest.types.environment import CloudLayer
 from scenes.clouds.cloud_density import CloudDensity
 from scenes.clouds.ray_march import march
 from scenes.ground_view import pixel_angle_rad
-from scenes.sky.light import Radiance, henyey_greenstein
+from scenes.sky.photometry import Radiance, henyey_greenstein
 
 _Field = NDArray[np.float32]
 

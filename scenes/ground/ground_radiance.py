@@ -17,7 +17,7 @@ from scenes.ground.coast import Coast
 from scenes.ground.land_tiles import LandKind, land_tile
 from scenes.ground.sea import GroundLight, Sea, draw_ships, sample_ships
 from scenes.ground_view import Field, GroundView, MipTile, ground_view, pixel_angle_rad, power_noise, smooth_noise
-from scenes.sky.light import Radiance
+from scenes.sky.photometry import Radiance
 
 MEAN_REFLECTANCE: dict[GroundKind, ReflectanceRgb] = {
     "sea": (0.006, 0.022, 0.030),  # of the water body; the surface also mirrors the sky

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import frame_generator
 from drogue_models.parameters import ReflectanceRgb
 from scenes.ground_view import Field, GroundView, MipTile, power_noise
-from scenes.sky.light import Radiance
+from scenes.sky.photometry import Radiance
 
 _WATER_INDEX = 1.34
 _SEED = 5

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import Environment
 from scenes.sky.daylight import DaylightSky
-from scenes.sky.light import (
+from scenes.sky.night import lit_side_of_moon, moon_illuminance_lux, night_radiance
+from scenes.sky.photometry import (
     SOLAR_ILLUMINANCE_LUX,
     SUN_RADIUS_RAD,
     SUN_SOLID_ANGLE_SR,
@@ -18,7 +19,6 @@ from scenes.sky.light import (
     beam_transmission,
     direction_from_angles,
 )
-from scenes.sky.night import lit_side_of_moon, moon_illuminance_lux, night_radiance
 from scenes.sky.twilight import TwilightSky, twilight_illuminance_lux
 
 # Below the first elevation the sky is the twilight model's, above the second the daylight model's. [deg]

@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.sky.light import REC709_FROM_XYZ, REC709_LUMINANCE, Radiance, direction_from_angles, hemisphere, luminance
+from scenes.sky.photometry import (
+    REC709_FROM_XYZ,
+    REC709_LUMINANCE,
+    Radiance,
+    direction_from_angles,
+    hemisphere,
+    luminance,
+)
 
 # Perez's function is singular at the horizon and undefined below it.
 _LOWEST_COSINE = 1e-3

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.storage.image_codecs import decode_exr
 from datasets_manifest.types.environment import EnvironmentMap, read_environment_map
-from scenes.sky.light import Radiance, luminance
+from scenes.sky.photometry import Radiance, luminance
 
 _SMALLEST_PX = 16
 # Reach of the sun's glow in a photograph, and of the ring around it that replaces it. [rad]

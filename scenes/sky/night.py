@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import Moon
-from scenes.sky.light import Radiance
+from scenes.sky.photometry import Radiance
 
 # Dark sites: 21.9 mag/arcsec2 at the zenith, 1.9e-4 cd/m2 (Leinert et al. 1998, doi:10.1051/aas:1998105), with the
 # brighter stars, which the background of telescopes excludes, 2.6e-4.

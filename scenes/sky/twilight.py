@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 from scipy.ndimage import map_coordinates, spline_filter
 
-from scenes.sky.light import REC709_LUMINANCE, Radiance, direction_from_angles, henyey_greenstein, scattering_depth
+from scenes.sky.photometry import REC709_LUMINANCE, Radiance, direction_from_angles, henyey_greenstein, scattering_depth
 
 _EARTH_M = 6.371e6
 _TOP_M = 9e4

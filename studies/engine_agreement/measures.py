@@ -20,7 +20,7 @@ from geometry.stereo import EYES, Eye
 from render.engine import EyeRadiance, RenderEngine, StereoRadiance
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 from studies.engine_agreement.paired_frames import LAMP_CD_M2, RenderedFrame
 
 _FEWEST_PIXELS = 20

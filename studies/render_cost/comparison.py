@@ -20,7 +20,7 @@ from render.camera.sensor import expose
 from render.compositing import inside_one_part
 from render.engine import load_engine
 from render.mitsuba_engine.trace_request import DROGUE_PARTS
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 from studies.render_cost.cycles_messages import cpu_seconds
 from studies.render_cost.noise_search import (
     MeasuredView,

@@ -26,7 +26,7 @@ from render.blender_engine.process import bpy_version, read_light
 from render.blender_engine.stage import Stage
 from render.engine import load_engine
 from scenes.environment_radiance import environment_radiance
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 from studies.render_cost.cycles_messages import CyclesRequest, DenoisedPicture, cpu_seconds
 from studies.render_cost.noise_search import MeasuredView, NoiseEstimate, RenderCost, noise_of, reach_noise
 

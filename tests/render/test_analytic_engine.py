@@ -29,7 +29,7 @@ from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 LAMP_CD_M2 = 1e6
 STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)

@@ -7,8 +7,8 @@ from geometry.se3 import RigidTransform
 from render.background import add_stars, background
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.light import luminance
 from scenes.sky.night import star_catalogue
+from scenes.sky.photometry import luminance
 
 
 def exact_rays(frame):

@@ -25,7 +25,7 @@ from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 pytestmark = [
     pytest.mark.blender,

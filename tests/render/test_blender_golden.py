@@ -10,7 +10,7 @@ import pytest
 from drogue_models.parts import Part
 from geometry.stereo import EYES
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 from tests.render.golden_frame import GOLDEN, golden_recipe
 
 pytestmark = [

@@ -9,7 +9,7 @@ from render.engine import EyeRadiance
 from scenes.clouds.cloud_layers import opacity_towards
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.light import luminance
+from scenes.sky.photometry import luminance
 
 
 def with_sun(make_recipe, elevation_deg, azimuth_deg):

@@ -14,7 +14,7 @@ import pytest
 from geometry.stereo import EYES
 from render.engine import load_engine
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 from tests.render.golden_frame import GOLDEN, golden_recipe
 
 pytestmark = pytest.mark.mitsuba

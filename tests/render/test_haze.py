@@ -12,7 +12,7 @@ from geometry.se3 import RigidTransform
 from render.compositing import TracedEye
 from render.engine import load_engine
 from scenes.sampler import sample_frame
-from scenes.sky.light import luminance
+from scenes.sky.photometry import luminance
 
 BLACK = (0.0, 0.0, 0.0)
 VISIBILITY_M = 60.0

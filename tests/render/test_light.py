@@ -11,7 +11,7 @@ from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.light import luminance
+from scenes.sky.photometry import luminance
 
 pytestmark = pytest.mark.mitsuba
 

@@ -8,7 +8,7 @@ import pytest
 from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from geometry.stereo import EYES
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 pytestmark = pytest.mark.mitsuba
 

@@ -11,7 +11,7 @@ from drogue_models.presets import load_drogue
 from render.camera.sensor import dn_per_electron, expose
 from render.engine import EyeRadiance, StereoRadiance, load_engine
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 SHAPE = (96, 128)
 # 36864 samples an image give the variance within 0.74 % (one sigma); eight images within 0.26 %.

@@ -12,7 +12,7 @@ from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.stereo import EYES
 from labelgen.disc_images import marker_discs
 from scenes.sampler import sample_frame
-from scenes.sky.light import REC709_LUMINANCE
+from scenes.sky.photometry import REC709_LUMINANCE
 
 pytestmark = pytest.mark.mitsuba
 

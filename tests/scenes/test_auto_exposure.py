@@ -11,7 +11,7 @@ from scenes.auto_exposure import automatic_exposure
 from scenes.environment import environment_of_scene
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.light import luminance
+from scenes.sky.photometry import luminance
 
 TABLE = """
 name = "meter-test"

@@ -9,7 +9,7 @@ from scenes.clouds.cloud_density import CloudDensity
 from scenes.clouds.cloud_layers import CloudLight, diffuse_transmission, opacity_towards, render_cloud_layer
 from scenes.environment import environment_of_scene
 from scenes.environment_radiance import EnvironmentRadiance
-from scenes.sky.light import direction_from_angles, luminance
+from scenes.sky.photometry import direction_from_angles, luminance
 
 RECIPE = """
 name = "weather-test"

@@ -14,7 +14,7 @@ from geometry.stereo import EYES
 from labelgen.part_pixels import drogue_hull_m
 from scenes.flight.dropouts import DropoutEvent, formation_displacement_m, sample_dropout
 from scenes.sampler import sample_frame
-from scenes.sky.light import direction_from_angles
+from scenes.sky.photometry import direction_from_angles
 
 FRAMES = 40
 BASE = """

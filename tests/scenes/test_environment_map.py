@@ -15,7 +15,7 @@ from datasets_manifest.types.frame import FrameSpec
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.equirectangular_sky import load_map
-from scenes.sky.light import SUN_SOLID_ANGLE_SR, luminance
+from scenes.sky.photometry import SUN_SOLID_ANGLE_SR, luminance
 
 HEIGHT = 128
 RECIPE = """

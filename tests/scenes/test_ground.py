@@ -10,7 +10,7 @@ from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.land_tiles import land_tile
 from scenes.ground.sea import GroundLight, Sea, fresnel, slope_variances
 from scenes.ground_view import FARTHEST_M, MipTile, ground_view, pixel_angle_rad, power_noise
-from scenes.sky.light import luminance
+from scenes.sky.photometry import luminance
 
 
 def environment(kind, **changes):

@@ -14,7 +14,7 @@ from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.sea import GroundLight
 from scenes.sampler import sample_frame
-from scenes.sky.light import luminance
+from scenes.sky.photometry import luminance
 
 FOCAL_PX, SIZE_PX = 400.0, 192
 RECIPE = """

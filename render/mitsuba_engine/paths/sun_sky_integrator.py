@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from geometry.se3 import Array
 from render.mitsuba_engine.jit_arrays import jit_tensor
-from scenes.sky.light import Radiance
+from scenes.sky.photometry import Radiance
 
 # Irradiance varies so smoothly with the normal that linear interpolation over 3.75 degrees errs by at most 5e-4.
 _ROWS = 48
