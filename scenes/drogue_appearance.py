@@ -64,10 +64,10 @@ def _sample_surface(rng: np.random.Generator, ranges: AppearanceRanges, missing:
     )
 
 
-def sample_bystanders(
+def sample_obstacles(
     rng: np.random.Generator, recipe: Recipe, left_from_drogue: RigidTransform | None
 ) -> tuple[Obstacle, ...]:
-    """Probe, obstacle and distractors of one frame.
+    """Probe, rod and distractors of one frame.
 
     Args:
         rng: of the frame.
@@ -79,9 +79,9 @@ def sample_bystanders(
         recipe.target.obstacle_frame_fraction,
         recipe.target.distractor_frame_fraction,
     )
-    obstacle = _sample_obstacle(rng, recipe.rig)
+    rod = _sample_rod(rng, recipe.rig)
     if obstructed:
-        objects.append(obstacle)
+        objects.append(rod)
     count = int(rng.integers(1, _MOST_DISTRACTORS + 1))
     nearest_m = 2.5 if left_from_drogue is None else float(left_from_drogue.translation_m[2]) + 1.0
     distractors = [_sample_distractor(rng, recipe, nearest_m) for _ in range(count)]
@@ -101,7 +101,7 @@ def _probe(recipe: Recipe) -> Obstacle:
     )
 
 
-def _sample_obstacle(rng: np.random.Generator, rig: StereoRig) -> Obstacle:
+def _sample_rod(rng: np.random.Generator, rig: StereoRig) -> Obstacle:
     """A thin rod across the view 0.5 to 1.3 m from the cameras, like a pitot tube or a canopy frame."""
     depth_m, turn = rng.uniform(0.5, 1.3), rng.uniform(0.0, np.pi)
     place = _point_in_view(rng, rig, depth_m)

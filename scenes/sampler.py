@@ -15,7 +15,7 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from scenes.auto_exposure import automatic_exposure
-from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_bystanders
+from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_obstacles
 from scenes.environment import environment_of_scene
 from scenes.flight.frame_kinematics import FrameKinematics, sample_suspension
 from scenes.flight.receiver import sample_attitude
@@ -119,7 +119,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         environment = _environment_of_sequence(environment, kinematics)
     # Other objects stay the same throughout a sequence.
     key = frame_index if kinematics.sequence_id is None else kinematics.sequence_id
-    bystanders = sample_bystanders(frame_generator(seed, key, "bystanders"), scene_recipe, pose)
+    obstacles = sample_obstacles(frame_generator(seed, key, "bystanders"), scene_recipe, pose)
     rig, sensor = scene_recipe.rig, scene_recipe.sensor
     return FrameSpec(
         seed=seed,
@@ -131,7 +131,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         drogue=None if pose is None else drogue,
         sought=drogue if pose is None and scene_recipe.target.variants else None,
         condition=None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue),
-        bystanders=bystanders if kinematics.obstacle is None else (*bystanders, kinematics.obstacle),
+        bystanders=obstacles if kinematics.obstacle is None else (*obstacles, kinematics.obstacle),
         board=_placed_board(scene_recipe, frame_index),
         left_from_drogue=pose,
         world_from_left=kinematics.world_from_left,

@@ -72,7 +72,7 @@ _Meshes = dict[str, tuple[int, trimesh.Trimesh]]
 
 
 def _moved_meshes(frame: FrameSpec) -> _Meshes:
-    """Hose, tanker and bystanders in the stage's axes, by name with their part ids. [m]"""
+    """Hose, tanker and other objects in the stage's axes, by name with their part ids. [m]"""
     stage_from_left = frame.left_from_stage_at(0.0).inverse()
     meshes: _Meshes = {}
     if frame.drogue is not None and frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None:
@@ -80,10 +80,10 @@ def _moved_meshes(frame: FrameSpec) -> _Meshes:
         meshes["hose"] = int(Part.HOSE), hose_mesh(nodes, frame.drogue.hose_radius_m)
         meshes["tanker"] = int(Part.TANKER), with_creases(tanker_mesh())
         meshes["tanker"][1].apply_transform((stage_from_left @ frame.left_from_tanker).as_matrix())
-    for index, bystander in enumerate(frame.bystanders):
-        mesh = with_creases(obstacle_mesh(bystander.shape))
-        mesh.apply_transform((stage_from_left @ bystander.left_from_object).as_matrix())
-        meshes[f"bystander_{index}"] = int(Part[bystander.kind.upper()]), mesh
+    for index, obstacle in enumerate(frame.bystanders):
+        mesh = with_creases(obstacle_mesh(obstacle.shape))
+        mesh.apply_transform((stage_from_left @ obstacle.left_from_object).as_matrix())
+        meshes[f"obstacle_{index}"] = int(Part[obstacle.kind.upper()]), mesh
     return meshes
 
 
@@ -138,9 +138,9 @@ def _appearance(frame: FrameSpec, part: int) -> SurfaceAppearance:
 
 def _moved_appearances(frame: FrameSpec, moved: _Meshes) -> dict[str, SurfaceAppearance]:
     appearances = {name: _appearance(frame, part) for name, (part, _) in moved.items() if name in ("hose", "tanker")}
-    for index, bystander in enumerate(frame.bystanders):
-        appearances[f"bystander_{index}"] = SurfaceAppearance(
-            reflectance=np.array(bystander.reflectance_rgb), emission_cd_m2=np.zeros(3)
+    for index, obstacle in enumerate(frame.bystanders):
+        appearances[f"obstacle_{index}"] = SurfaceAppearance(
+            reflectance=np.array(obstacle.reflectance_rgb), emission_cd_m2=np.zeros(3)
         )
     return appearances
 

@@ -36,7 +36,7 @@ def motion_blur_px(frame: FrameSpec) -> float:
             [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64
         )
     else:
-        places_m = np.array([bystander.left_from_object.translation_m for bystander in frame.bystanders])
+        places_m = np.array([obstacle.left_from_object.translation_m for obstacle in frame.bystanders])
     seen = [frame.rig.camera.project(frame.left_from_stage_at(s).apply(places_m)) for s in (-half_s, 0.0, half_s)]
     return float(max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[2] - seen[1]).max()))
 

@@ -107,27 +107,27 @@ def drogue_shapes(frame: FrameSpec, meshes: dict[int, trimesh.Trimesh]) -> dict[
     return shapes
 
 
-def bystander_shapes(frame: FrameSpec) -> dict[str, Any]:
-    """Mitsuba shapes of the bystanders, in their own frames until a frame moves them."""
+def obstacle_shapes(frame: FrameSpec) -> dict[str, Any]:
+    """Mitsuba shapes of the other objects, in their own frames until a frame moves them."""
     shapes: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        for index, bystander in enumerate(frame.bystanders):
-            part = int(Part[bystander.kind.upper()])
-            name = bystander_name(index, part)
-            look = _matt_material(np.array(bystander.reflectance_rgb))
-            shapes[name] = _shape(with_creases(obstacle_mesh(bystander.shape)), part, Path(folder), look)
+        for index, obstacle in enumerate(frame.bystanders):
+            part = int(Part[obstacle.kind.upper()])
+            name = obstacle_name(index, part)
+            look = _matt_material(np.array(obstacle.reflectance_rgb))
+            shapes[name] = _shape(with_creases(obstacle_mesh(obstacle.shape)), part, Path(folder), look)
             shapes[name].set_id(name)
     return shapes
 
 
-def bystander_name(index: int, part: int) -> str:
-    """Name of the shape of a frame's bystander."""
+def obstacle_name(index: int, part: int) -> str:
+    """Name of the shape of one of a frame's other objects."""
     return f"part_{part}_{index}"
 
 
 # Scenes that an engine caches; the least recently used one is dropped first.
 KEPT_SCENES = 8
-_BYSTANDER_PARTS = (Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
+_OBSTACLE_PARTS = (Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
 
 # Mitsuba's map has +y up; its first column looks along -z and the next ones turn towards +x. Our map starts in the east
 # (+x) and turns towards north (+y), the other way round: so the columns are reversed and the axes exchanged.
@@ -149,7 +149,7 @@ class DrogueScene:
         self.features_m = self._drogue_m = np.zeros((0, 3))
         self._has_context = frame.hose_nodes_left_m is not None and frame.left_from_tanker is not None
         self._tanker = with_creases(tanker_mesh())
-        shapes, features = bystander_shapes(frame), {}
+        shapes, features = obstacle_shapes(frame), {}
         if frame.drogue is not None:
             gone = missing_parts(frame)
             meshes = {part: mesh for part, mesh in drogue_meshes(frame.drogue).items() if part not in gone}
@@ -188,17 +188,17 @@ class DrogueScene:
             self._set_vertices(f"part_{int(Part.HOSE)}", np.asarray(hose.vertices), np.asarray(hose.vertex_normals))
             self.object_corners_m.append(np.asarray(hose.vertices))
             self._set_moved(f"part_{int(Part.TANKER)}", stage_from_left @ frame.left_from_tanker, self._tanker)
-        self._set_bystanders(frame, stage_from_left)
+        self._set_obstacles(frame, stage_from_left)
         self._set_materials(frame)
         self._set_lights(stage_from_left @ frame.world_from_left.inverse(), ambient)
         self._parameters.update()
 
-    def _set_bystanders(self, frame: FrameSpec, stage_from_left: RigidTransform) -> None:
-        for index, bystander in enumerate(frame.bystanders):
-            name = bystander_name(index, int(Part[bystander.kind.upper()]))
-            stage_from_object = stage_from_left @ bystander.left_from_object
-            self._set_moved(name, stage_from_object, with_creases(obstacle_mesh(bystander.shape)))
-            self._parameters[f"{name}.bsdf.reflectance.value"] = mi.Color3f(list(bystander.reflectance_rgb))
+    def _set_obstacles(self, frame: FrameSpec, stage_from_left: RigidTransform) -> None:
+        for index, obstacle in enumerate(frame.bystanders):
+            name = obstacle_name(index, int(Part[obstacle.kind.upper()]))
+            stage_from_object = stage_from_left @ obstacle.left_from_object
+            self._set_moved(name, stage_from_object, with_creases(obstacle_mesh(obstacle.shape)))
+            self._parameters[f"{name}.bsdf.reflectance.value"] = mi.Color3f(list(obstacle.reflectance_rgb))
 
     def _set_materials(self, frame: FrameSpec) -> None:
         """Set paints and lamps by the condition of this frame's drogue."""
@@ -207,7 +207,7 @@ class DrogueScene:
         self._aged = True
         for name in (shape.id() for shape in self.scene.shapes()):
             part = int(name.split("_")[1])
-            if part in _BYSTANDER_PARTS:
+            if part in _OBSTACLE_PARTS:
                 continue
             if f"{name}.bsdf.reflectance.data" in self._parameters:
                 self._parameters[f"{name}.bsdf.reflectance.data"] = jit_tensor(reflectance_map(frame, part))
@@ -312,9 +312,9 @@ def _scene_key(frame: FrameSpec) -> str:
     """Equal for frames that can share a scene: same drogue, and same topology and kinds of surface of all objects."""
     drogue = "" if frame.drogue is None else frame.drogue.model_dump_json()
     nodes = 0 if frame.hose_nodes_left_m is None else len(frame.hose_nodes_left_m)
-    bystanders = [(bystander.kind, bystander.shape.form) for bystander in frame.bystanders]
+    obstacles = [(obstacle.kind, obstacle.shape.form) for obstacle in frame.bystanders]
     paints = sorted(dirty_parts(frame)), sorted(missing_parts(frame))
-    return f"{drogue} {nodes} {frame.left_from_tanker is not None} {paints} {bystanders}"
+    return f"{drogue} {nodes} {frame.left_from_tanker is not None} {paints} {obstacles}"
 
 
 class SceneCache:

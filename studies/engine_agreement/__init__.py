@@ -1,1 +1,1 @@
-"""Whether two renderers agree: the same frames by both, before the sensor, and what differs."""
+"""Agreement of two render engines: the same frames by both, before the sensor, and their differences."""

@@ -1,4 +1,4 @@
-"""`python -m studies.engine_agreement`: do two engines agree?"""
+"""`python -m studies.engine_agreement`: compare two render engines."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ import cv2
 import typer
 
 from droguekit.batch.progress import PlainProgress
-from studies.engine_agreement.agreement import Requirement, centroid_offset, frame_bars, navigation_bars, plate_bars
+from studies.engine_agreement.agreement import (
+    Requirement,
+    centroid_offset,
+    frame_requirements,
+    navigation_requirements,
+    plate_requirements,
+)
 from studies.engine_agreement.agreement_report import (
-    bar_lines,
     cost_line,
     frame_figures,
     frame_head,
@@ -23,10 +28,11 @@ from studies.engine_agreement.agreement_report import (
     navigation_lines,
     offset_line,
     plate_line,
+    requirement_lines,
     write_json,
 )
 from studies.engine_agreement.comparison_run import ComparisonRun, Engines
-from studies.engine_agreement.measures import agreement_of
+from studies.engine_agreement.measures import agreement_from_row
 from studies.engine_agreement.navigation_agreement import (
     METHOD,
     RECIPE,
@@ -38,7 +44,7 @@ from studies.engine_agreement.navigation_agreement import (
 from studies.engine_agreement.navigation_agreement import (
     STATIONS_M as NAVIGATION_STATIONS_M,
 )
-from studies.engine_agreement.paired_frames import FAMILIES, STATIONS_M, paired_frames, write_own_sky
+from studies.engine_agreement.paired_frames import FAMILIES, STATIONS_M, paired_frames, write_sky_recipe
 
 _EXAMPLES = """Examples:
 
@@ -48,7 +54,7 @@ _EXAMPLES = """Examples:
 
 
 class ComparisonPart(StrEnum):
-    """What is compared."""
+    """A part of the comparison."""
 
     FRAMES = "frames"
     PLATES = "plates"
@@ -58,64 +64,64 @@ class ComparisonPart(StrEnum):
 
 def main(
     out: Annotated[
-        Path, typer.Option("--out", help="Folder for numbers and pictures; what is found there stands.")
+        Path, typer.Option("--out", help="Folder for numbers and pictures; results that are there are kept.")
     ] = Path("out/engine-agreement"),
     part: Annotated[
-        list[ComparisonPart] | None, typer.Option("--part", help="What to compare; repeatable, or all.")
+        list[ComparisonPart] | None, typer.Option("--part", help="Part of the comparison; repeatable; default all.")
     ] = None,
-    engine: Annotated[tuple[str, str], typer.Option("--engines", help="Which two.")] = ("mitsuba", "blender"),
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")] = 20,
-    count: Annotated[int | None, typer.Option("--count", min=1, help="Frames, or one of each family.")] = None,
+    engine: Annotated[tuple[str, str], typer.Option("--engines", help="The two engines.")] = ("mitsuba", "blender"),
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all frames.")] = 20,
+    count: Annotated[
+        int | None, typer.Option("--count", min=1, help="Number of frames; default one of each family.")
+    ] = None,
     family: Annotated[
         list[str] | None, typer.Option("--family", help="A recipe, or recipe/family; repeatable.")
     ] = None,
-    station: Annotated[
-        list[float] | None, typer.Option("--station", help="A frame's distance in metres; repeatable.")
-    ] = None,
-    samples: Annotated[int, typer.Option("--samples", min=4, help="Most samples through a pixel of a frame.")] = 64,
-    plate_samples: Annotated[int, typer.Option("--plate-samples", min=1, help="Through a plate's pixel.")] = 256,
-    pairs: Annotated[int, typer.Option("--pairs", min=14, help="Pairs to navigate on.")] = 100,
+    station: Annotated[list[float] | None, typer.Option("--station", help="Distance in metres; repeatable.")] = None,
+    samples: Annotated[int, typer.Option("--samples", min=4, help="Most samples per pixel of a frame.")] = 64,
+    plate_samples: Annotated[int, typer.Option("--plate-samples", min=1, help="Samples per pixel of a plate.")] = 256,
+    pairs: Annotated[int, typer.Option("--pairs", min=14, help="Number of pairs for navigation.")] = 100,
 ) -> None:
-    """Render the same frames by two engines, and report what differs.
+    """Render the same frames by two engines, and report their differences.
 
-    Exits with 1 when a bar is missed. A run that was stopped goes on where it was.
+    Exits with 1 when a requirement is missed. A run that was stopped resumes where it was.
     """
     cv2.setNumThreads(1)
     chosen = part or [*ComparisonPart]
-    work = ComparisonRun(out, Engines(engine), seed, typer.echo)
+    run = ComparisonRun(out, Engines(engine), seed, typer.echo)
     tables: dict[str, Any] = {}
-    bars: list[Requirement] = []
+    requirements: list[Requirement] = []
     try:
         if ComparisonPart.FRAMES in chosen:
-            families = family or [*FAMILIES, str(write_own_sky(out / "own-sky"))]
+            families = family or [*FAMILIES, str(write_sky_recipe(out / "own-sky"))]
             frames = paired_frames(families, station or STATIONS_M, count or len(families), samples, seed)
             typer.echo(frame_head())
-            rows = work.frames(frames, lambda row: frame_line(_figures(row)))
+            rows = run.frames(frames, lambda row: frame_line(_figures(row)))
             tables["frames"] = [_figures(row) for row in rows]
-            agreements = [agreement_of(row["agreement"]) for row in rows]
+            agreements = [agreement_from_row(row["agreement"]) for row in rows]
             offset = centroid_offset(agreements)
             if offset is not None:
                 tables["centroid_offset"] = asdict(offset)
                 typer.echo(offset_line(offset))
-            bars += frame_bars(agreements, [f.distance_m for f in frames])
+            requirements += frame_requirements(agreements, [f.distance_m for f in frames])
         if ComparisonPart.PLATES in chosen:
-            plates = work.plates(plate_samples, plate_line)
+            plates = run.plates(plate_samples, plate_line)
             tables["plates"] = [vars(plate) for plate in plates]
-            bars += plate_bars(plates)
+            requirements += plate_requirements(plates)
         if ComparisonPart.COST in chosen:
-            tables["costs"] = [cost.row() for cost in work.costs(cost_line)]
+            tables["costs"] = [cost.row() for cost in run.costs(cost_line)]
         if ComparisonPart.NAVIGATION in chosen:
-            bars += _navigation(out / "navigation", engine, seed, pairs, tables)
-        write_json(out, tables, bars)
+            requirements += _navigation(out / "navigation", engine, seed, pairs, tables)
+        write_json(out, tables, requirements)
     except (ValueError, OSError) as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error
-    typer.echo("\n".join([*bar_lines(bars), f"numbers and pictures are in {out}"]))
-    raise typer.Exit(0 if all(bar.reached for bar in bars) else 1)
+    typer.echo("\n".join([*requirement_lines(requirements), f"numbers and pictures are in {out}"]))
+    raise typer.Exit(0 if all(requirement.reached for requirement in requirements) else 1)
 
 
 def _figures(row: dict[str, Any]) -> dict[str, Any]:
-    return frame_figures(row, agreement_of(row["agreement"]))
+    return frame_figures(row, agreement_from_row(row["agreement"]))
 
 
 def _navigation(
@@ -128,7 +134,7 @@ def _navigation(
         stations.append(paired_errors(paired))
     typer.echo("\n".join(navigation_lines(stations)))
     tables["navigation"] = {"method": METHOD, "recipe": RECIPE} | navigation_table(stations)
-    return navigation_bars(stations)
+    return navigation_requirements(stations)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Both engines over all paired frames, and what that adds up to."""
+"""Requirements on the agreement of two engines, over all paired frames."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from render.engine import RenderEngine
-from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, compare
+from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, compare_renderings
 from studies.engine_agreement.navigation_agreement import PairedErrors, mean_differences, size_ratios
-from studies.engine_agreement.paired_frames import PairedFrame, RenderedFrame, render_both
+from studies.engine_agreement.paired_frames import PairedFrame, RenderedFrame, render_plain_and_lit
 
 # The bars of the agreement: see docs/explanation/blender.md.
 MOST_CENTROID_RMS_PX = 0.02
@@ -20,12 +20,12 @@ IOU_FROM_M = 5.0
 MOST_RIB_DISTANCE_PX = 1.0
 MOST_PLATE_ERROR = 0.005
 MOST_PART_ERROR = 0.02
-PARTS_WITH_A_BAR = ("markers", "rim", "canopy", "hose")
+REQUIRED_PARTS = ("markers", "rim", "canopy", "hose")
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedFrame:
-    """One frame by both engines: pictures and cost of either, and what differs."""
+    """One frame by both engines: renderings, costs and differences."""
 
     paired: PairedFrame
     one: RenderedFrame
@@ -35,13 +35,14 @@ class ComparedFrame:
 
 def compare_frame(paired: PairedFrame, one: RenderEngine, other: RenderEngine) -> ComparedFrame:
     """Render a frame by both engines and compare."""
-    first, second = render_both(paired, one), render_both(paired, other)
-    return ComparedFrame(paired, first, second, compare(paired.frame, first, second))
+    first, second = render_plain_and_lit(paired, one), render_plain_and_lit(paired, other)
+    agreement = compare_renderings(paired.frame, first, second)
+    return ComparedFrame(paired=paired, one=first, other=second, agreement=agreement)
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """A figure, and the most or least that it may be."""
+    """A figure and its limit: the most, or the least, that it may be."""
 
     name: str
     value: float
@@ -50,16 +51,16 @@ class Requirement:
 
     @property
     def reached(self) -> bool:
-        """Whether the figure keeps to its limit."""
+        """Whether the figure is within its limit."""
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
 
-def frame_bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -> list[Requirement]:
-    """What the engines are held to, over all frames.
+def frame_requirements(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -> list[Requirement]:
+    """Requirements on all frames together.
 
     Args:
-        frames: agreement of each.
-        distances_m: of each frame's drogue. [m]
+        frames: agreement of each frame.
+        distances_m: distance of each frame's drogue. [m]
     """
     centroids = np.concatenate([frame.centroids_px for frame in frames])
     label, one, other = np.moveaxis(centroids, 1, 0)
@@ -74,7 +75,7 @@ def frame_bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -
     ribs = max(frame.rib_distance_px for frame in frames)
     result.append(Requirement("ribs, farthest boundary [px]", ribs, MOST_RIB_DISTANCE_PX))
     ratios = part_ratios(frames)
-    for part in PARTS_WITH_A_BAR:
+    for part in REQUIRED_PARTS:
         if part in ratios:
             result.append(Requirement(f"{part}, difference of mean luminance", abs(ratios[part] - 1), MOST_PART_ERROR))
     return result
@@ -82,7 +83,7 @@ def frame_bars(frames: Sequence[FrameAgreement], distances_m: Sequence[float]) -
 
 @dataclass(frozen=True)
 class CentroidOffset:
-    """Whether one engine's markers lie to a side of the other's: second less first, mean and standard error. [px]"""
+    """Systematic offset of the second engine's markers from the first's: mean and standard error. [px]"""
 
     n: int
     mean_px: tuple[float, float]
@@ -90,26 +91,28 @@ class CentroidOffset:
 
 
 def centroid_offset(frames: Sequence[FrameAgreement]) -> CentroidOffset | None:
-    """Over all markers of all frames; None with fewer than two."""
+    """The offset over all markers of all frames; None with fewer than two markers."""
     centroids = np.concatenate([frame.centroids_px for frame in frames])
     apart = centroids[:, 2] - centroids[:, 1]
     if len(apart) < 2:
         return None
     errors = apart.std(axis=0, ddof=1) / np.sqrt(len(apart))
     return CentroidOffset(
-        len(apart), (float(apart[:, 0].mean()), float(apart[:, 1].mean())), (float(errors[0]), float(errors[1]))
+        n=len(apart),
+        mean_px=(float(apart[:, 0].mean()), float(apart[:, 1].mean())),
+        error_px=(float(errors[0]), float(errors[1])),
     )
 
 
-def plate_bars(plates: Sequence[PlateIlluminance]) -> list[Requirement]:
-    """What the engines are held to by light on white plates."""
-    # numpy's maximum keeps what is not a number, so that a plate without light misses the bar.
+def plate_requirements(plates: Sequence[PlateIlluminance]) -> list[Requirement]:
+    """Requirements on the illuminance of white plates."""
+    # NumPy's maximum keeps NaN, so that a plate without light misses the requirement.
     worst = float(np.max([abs(plate.ratio - 1) for plate in plates]))
     return [Requirement("white plates, largest difference", worst, MOST_PLATE_ERROR)]
 
 
-def navigation_bars(stations: Sequence[PairedErrors]) -> list[Requirement]:
-    """Whether navigation errs alike: equal sizes and equal means lie within the intervals of what was measured."""
+def navigation_requirements(stations: Sequence[PairedErrors]) -> list[Requirement]:
+    """Requirements on navigation: equal error sizes and equal mean errors lie within the measured intervals."""
     sizes = [
         Requirement(f"{row.of} errors, equal sizes outside their interval by", row.outside, 0.0)
         for row in size_ratios(stations)
@@ -122,7 +125,7 @@ def navigation_bars(stations: Sequence[PairedErrors]) -> list[Requirement]:
 
 
 def part_ratios(frames: Sequence[FrameAgreement]) -> dict[str, float]:
-    """Mean luminance of each part by the second engine over that by the first, frames weighted by their pixels."""
+    """Mean luminance of each part by the second engine over that by the first, weighted by the frames' pixels."""
     names = sorted({name for frame in frames for name in frame.part_sums})
     ratios = {}
     for name in names:
@@ -134,5 +137,5 @@ def part_ratios(frames: Sequence[FrameAgreement]) -> dict[str, float]:
 
 
 def _rms(values: NDArray[np.float64]) -> float:
-    """Root mean square; of nothing it is infinite, as nothing was shown."""
+    """Root mean square; infinite without values, because nothing was measured."""
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("inf")

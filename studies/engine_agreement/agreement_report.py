@@ -1,4 +1,4 @@
-"""The agreement on paper: tables of text, the numbers as JSON, and pictures of what differs."""
+"""Report of the agreement: text lines, numbers as JSON, and difference images."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from studies.engine_agreement.costs import CostComparison
 from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, luminance
 from studies.engine_agreement.navigation_agreement import PairedErrors, mean_differences, size_ratios, station_rows
 
-# A difference of a fortieth of the picture's white fills the scale from middle grey to black or white.
+# A difference of a fortieth of the image's white reaches from middle grey to black or white.
 _DIFFERENCE_SCALE = 40.0
 _MARGIN_PX = 12
 
 
 def frame_row(compared: ComparedFrame) -> dict[str, Any]:
-    """What is kept of one frame."""
+    """The stored result of one frame."""
     return {
         "family": compared.paired.family,
         "distance_m": compared.paired.distance_m,
@@ -36,7 +36,7 @@ def frame_row(compared: ComparedFrame) -> dict[str, Any]:
 
 
 def frame_figures(row: dict[str, Any], agreement: FrameAgreement) -> dict[str, Any]:
-    """The figures of one frame without its single markers."""
+    """The figures of one frame, without those of single markers."""
     label, one, other = np.moveaxis(agreement.centroids_px, 1, 0)
     return {name: value for name, value in row.items() if name != "agreement"} | {
         "markers": len(label),
@@ -51,7 +51,7 @@ def frame_figures(row: dict[str, Any], agreement: FrameAgreement) -> dict[str, A
 
 
 def frame_head() -> str:
-    """What stands over the lines of frames."""
+    """The header over the lines of frames."""
     head = f"{'family':<26}{'m':>6}{'spp':>5}{'markers':>8}{'between':>9}{'1st-label':>10}{'2nd-label':>10}"
     return head + f"{'IoU':>9}{'ribs':>6}{'cpu 1st':>9}{'cpu 2nd':>9}  parts 2nd/1st"
 
@@ -64,8 +64,8 @@ def frame_line(figures: dict[str, Any]) -> str:
     ).format(**figures) + " ".join(f"{name} {ratio:.3f}" for name, ratio in figures["part_ratios"].items())
 
 
-def bar_lines(bars: Sequence[Requirement]) -> list[str]:
-    """One line a bar."""
+def requirement_lines(bars: Sequence[Requirement]) -> list[str]:
+    """One line per requirement."""
     return [
         f"{'reached' if bar.reached else 'MISSED ':<8} {bar.name}: {bar.value:.5f} "
         f"({'at least' if bar.at_least else 'at most'} {bar.limit:.4g})"
@@ -74,7 +74,7 @@ def bar_lines(bars: Sequence[Requirement]) -> list[str]:
 
 
 def offset_line(offset: CentroidOffset) -> str:
-    """One line for the mean of what the centroids differ by."""
+    """One line for the mean offset of the centroids."""
     (u, v), (error_u, error_v) = offset.mean_px, offset.error_px
     return (
         f"centroids, second engine less first: u {u:+.5f} +- {error_u:.5f} px, v {v:+.5f} +- {error_v:.5f} px, "
@@ -99,7 +99,7 @@ def cost_line(cost: CostComparison) -> str:
 
 
 def navigation_lines(stations: Sequence[PairedErrors]) -> list[str]:
-    """One line a distance, then what all of them say."""
+    """One line per distance, then the figures over all of them."""
     lines = []
     for row in station_rows(stations):
         sizes = " ".join(
@@ -119,7 +119,7 @@ def write_json(out: Path, tables: dict[str, Any], bars: Sequence[Requirement]) -
     Raises:
         OSError: it cannot be written.
     """
-    # JSON has no number for what was not measured.
+    # JSON has no infinity.
     rows = [{**vars(bar), "value": bar.value if math.isfinite(bar.value) else None} for bar in bars]
     reached = [{**row, "reached": bar.reached} for row, bar in zip(rows, bars, strict=True)]
     content = {"schema": 2, "bars": reached, **tables}

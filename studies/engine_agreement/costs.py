@@ -1,4 +1,4 @@
-"""What a pair costs by either engine at the same noise."""
+"""Cost of a stereo pair by each engine at equal noise."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES
 from render.engine import RenderEngine, StereoRadiance
-from studies.engine_agreement.measures import eye_of, luminance
+from studies.engine_agreement.measures import eye_radiance, luminance
 from studies.engine_agreement.paired_frames import frame_at, recipe_of_family
 
 COST_STATIONS_M = (40.0, 20.0, 10.0, 5.0, 2.0)
 COST_FAMILY = "demo"
-# Even squares, tried in turn: on edges noise falls faster than any law by which it could be carried on.
+# Even squares, tried in turn: on edges noise falls faster than any law by which it could be extrapolated.
 _SAMPLES = (16, 64, 144, 256, 400, 576)
 
 
 @dataclass(frozen=True)
 class EngineCost:
-    """One pair by one engine.
+    """Cost of one pair by one engine.
 
     Attributes:
-        samples: through each pixel of the drogue.
-        cpu_s: without sensor, labels and disk. [s]
+        samples: per pixel of the drogue.
+        cpu_s: CPU time without sensor, labels and disk. [s]
         noise: root mean square error of luminance by sampling over its mean, on the pixels whose centres see the
             drogue, edges included.
     """
@@ -39,12 +39,12 @@ class EngineCost:
 
 @dataclass(frozen=True)
 class CostComparison:
-    """Both engines at one distance: the first with the samples of recipes that do not say, the other as quiet as that.
+    """Both engines at one distance: the first with default samples, the second at the same noise or less.
 
     Attributes:
         distance_m: of the drogue. [m]
         one: first engine.
-        other: second engine with the fewest samples of those tried that are no noisier, or with the most.
+        other: second engine with the fewest samples tried that give no more noise, or with the most samples.
     """
 
     distance_m: float
@@ -53,7 +53,7 @@ class CostComparison:
 
     @property
     def is_reached(self) -> bool:
-        """Whether the second engine came down to the noise of the first."""
+        """Whether the second engine reached the noise of the first."""
         return self.other.noise <= self.one.noise
 
     def row(self) -> dict[str, Any]:
@@ -61,15 +61,15 @@ class CostComparison:
         return asdict(self) | {"is_reached": self.is_reached}
 
 
-def cost_of(row: dict[str, Any]) -> CostComparison:
-    """The figures as `CostComparison.row` has put them."""
-    return CostComparison(row["distance_m"], EngineCost(**row["one"]), EngineCost(**row["other"]))
+def cost_from_row(row: dict[str, Any]) -> CostComparison:
+    """The comparison from its `CostComparison.row`."""
+    return CostComparison(distance_m=row["distance_m"], one=EngineCost(**row["one"]), other=EngineCost(**row["other"]))
 
 
 def measure_costs(distance_m: float, seed: int, one: RenderEngine, other: RenderEngine) -> CostComparison:
-    """Render one frame by both engines, each twice with samples of its own.
+    """Render one frame by both engines, each twice with independent samples.
 
-    The engines must have rendered something before: the first picture of a process pays for compiling.
+    Both engines must have rendered before, because the first picture of a process includes compilation.
 
     Args:
         distance_m: of the drogue. [m]
@@ -81,7 +81,7 @@ def measure_costs(distance_m: float, seed: int, one: RenderEngine, other: Render
         second = _cost(distance_m, seed, other, samples)
         if second.noise <= first.noise:
             break
-    return CostComparison(distance_m, first, second)
+    return CostComparison(distance_m=distance_m, one=first, other=second)
 
 
 def _cost(distance_m: float, seed: int, engine: RenderEngine, samples: int) -> EngineCost:
@@ -92,14 +92,17 @@ def _cost(distance_m: float, seed: int, engine: RenderEngine, samples: int) -> E
     parts = drogue_part_ids(frame.drogue.marker_count)
     first, second = (_on_parts(picture, pictures[0], parts) for picture in pictures)
     return EngineCost(
-        samples,
-        float(np.mean([sum(picture.stage_s.values()) for picture in pictures])),
-        float(np.sqrt(np.mean(np.square(first - second)) / 2) / np.mean((first + second) / 2)),
+        samples=samples,
+        cpu_s=float(np.mean([sum(picture.stage_s.values()) for picture in pictures])),
+        noise=float(np.sqrt(np.mean(np.square(first - second)) / 2) / np.mean((first + second) / 2)),
     )
 
 
 def _on_parts(picture: StereoRadiance, where: StereoRadiance, parts: list[int]) -> NDArray[np.float64]:
-    """Luminance of both eyes where `where` sees the parts."""
+    """Luminance of both eyes at the pixels where `where` shows the parts."""
     return np.concatenate(
-        [luminance(eye_of(picture, eye).radiance_cd_m2[np.isin(eye_of(where, eye).part_id, parts)]) for eye in EYES]
+        [
+            luminance(eye_radiance(picture, eye).radiance_cd_m2[np.isin(eye_radiance(where, eye).part_id, parts)])
+            for eye in EYES
+        ]
     )

@@ -24,22 +24,22 @@ from scenes.sky.photometry import REC709_LUMINANCE
 from studies.engine_agreement.paired_frames import LAMP_CD_M2, RenderedFrame
 
 _FEWEST_PIXELS = 20
-# Beyond a disc's outline: blur of a moving drogue and the edge pixels.
+# Margin around a disc's outline, for motion blur and edge pixels.
 _REACH_PX = 2.5
-# Of the light that a whole disc would give; less is a lamp that is hidden, out, or behind thick mist.
+# Least share of the light of a whole disc; with less, the lamp is hidden, out, or behind thick mist.
 _LEAST_LIGHT = 0.02
 MARKERS = "markers"
 
 
 @dataclass(frozen=True)
 class FrameAgreement:
-    """One frame by two engines.
+    """Agreement of two engines on one frame.
 
     Attributes:
-        centroids_px: (M, 3, 2) per marker and eye: the label, and the centroid of its lamp's light by either engine.
+        centroids_px: (M, 3, 2) by marker and eye: the label, and the centroid of the lamp's light by each engine.
         drogue_iou: intersection over union of the drogue's masks, both eyes together.
-        rib_distance_px: farthest that a rib's pixel lies from the other engine's ribs, 0 without ribs. [px]
-        part_sums: by part name: pixels, and the sums of luminance over them by either engine. [cd/m2]
+        rib_distance_px: largest distance of a rib's pixel from the other engine's ribs, 0 without ribs. [px]
+        part_sums: by part name: number of pixels, and the sums of luminance over them by each engine. [cd/m2]
     """
 
     centroids_px: NDArray[np.float64]
@@ -52,33 +52,33 @@ class FrameAgreement:
         return vars(self) | {"centroids_px": self.centroids_px.tolist()}
 
 
-def agreement_of(row: dict[str, Any]) -> FrameAgreement:
-    """The figures as `FrameAgreement.row` has put them."""
+def agreement_from_row(row: dict[str, Any]) -> FrameAgreement:
+    """The agreement from its `FrameAgreement.row`."""
     return FrameAgreement(
-        np.array(row["centroids_px"], dtype=np.float64).reshape(-1, 3, 2),
-        row["drogue_iou"],
-        row["rib_distance_px"],
-        {name: tuple(sums) for name, sums in row["part_sums"].items()},
+        centroids_px=np.array(row["centroids_px"], dtype=np.float64).reshape(-1, 3, 2),
+        drogue_iou=row["drogue_iou"],
+        rib_distance_px=row["rib_distance_px"],
+        part_sums={name: tuple(sums) for name, sums in row["part_sums"].items()},
     )
 
 
-def compare(frame: FrameSpec, one: RenderedFrame, other: RenderedFrame) -> FrameAgreement:
+def compare_renderings(frame: FrameSpec, one: RenderedFrame, other: RenderedFrame) -> FrameAgreement:
     """Measure how far two engines agree on a frame."""
     assert frame.drogue is not None
-    both = [(eye_of(one.plain, eye), eye_of(other.plain, eye)) for eye in EYES]
+    both = [(eye_radiance(one.plain, eye), eye_radiance(other.plain, eye)) for eye in EYES]
     ids = np.stack([[a.part_id, b.part_id] for a, b in both], axis=1)
     drogue = np.isin(ids, drogue_part_ids(frame.drogue.marker_count))
     union = np.count_nonzero(drogue[0] | drogue[1])
     return FrameAgreement(
-        np.concatenate([_centroids(frame, one, other, eye) for eye in EYES]),
-        np.count_nonzero(drogue[0] & drogue[1]) / union if union else 1.0,
-        max(_farthest_px(a.part_id == Part.RIBS, b.part_id == Part.RIBS) for a, b in both),
-        _part_sums(both),
+        centroids_px=np.concatenate([_centroids(frame, one, other, eye) for eye in EYES]),
+        drogue_iou=np.count_nonzero(drogue[0] & drogue[1]) / union if union else 1.0,
+        rib_distance_px=max(_farthest_px(a.part_id == Part.RIBS, b.part_id == Part.RIBS) for a, b in both),
+        part_sums=_part_sums(both),
     )
 
 
-def eye_of(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
-    """What one eye sees."""
+def eye_radiance(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
+    """Radiance of one eye."""
     return radiance.left if eye == "left" else radiance.right
 
 
@@ -89,12 +89,15 @@ def luminance(radiance_cd_m2: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
 
 
 def _centroids(frame: FrameSpec, one: RenderedFrame, other: RenderedFrame, eye: Eye) -> NDArray[np.float64]:
-    """(M, 3, 2) of the markers that both engines show whole."""
+    """(M, 3, 2) as in `FrameAgreement`, of the markers that both engines show completely."""
     assert frame.drogue is not None and frame.left_from_drogue is not None
     layout = marker_layout(frame.drogue)
     pose = frame.left_from_drogue
     labels = project_disc_centers(frame.rig, pose, layout.centers_m, np.full(layout.count, layout.radius_m), eye)
-    images = [luminance(eye_of(r.lit, eye).radiance_cd_m2 - eye_of(r.plain, eye).radiance_cd_m2) for r in (one, other)]
+    images = [
+        luminance(eye_radiance(r.lit, eye).radiance_cd_m2 - eye_radiance(r.plain, eye).radiance_cd_m2)
+        for r in (one, other)
+    ]
     rows = []
     for index, (center_m, label) in enumerate(zip(layout.centers_m, labels, strict=True)):
         area = disc_area_px2(frame.rig, pose, center_m, layout.radius_m, eye)
@@ -108,7 +111,7 @@ def _centroids(frame: FrameSpec, one: RenderedFrame, other: RenderedFrame, eye: 
 
 
 def _is_whole(rendered: RenderedFrame, eye: Eye, marker: int) -> bool:
-    seen = eye_of(rendered.plain, eye)
+    seen = eye_radiance(rendered.plain, eye)
     part = FIRST_MARKER_ID + marker
     amodal = seen.amodal_px.get(part, 0)
     return amodal > 0 and amodal == np.count_nonzero(seen.part_id == part)
@@ -138,7 +141,7 @@ def _farthest_px(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
 
 
 def _part_sums(both: list[tuple[EyeRadiance, EyeRadiance]]) -> dict[str, tuple[int, float, float]]:
-    """Sums over the pixels that both engines give to a part; all markers together."""
+    """Sums over the pixels in which both engines see the same part; all markers together."""
     sums: dict[str, tuple[int, float, float]] = {}
     for a, b in both:
         values = luminance(a.radiance_cd_m2), luminance(b.radiance_cd_m2)
@@ -153,13 +156,13 @@ def _part_sums(both: list[tuple[EyeRadiance, EyeRadiance]]) -> dict[str, tuple[i
 
 
 WHITE = (1.0, 1.0, 1.0)
-# Facing the camera, and turned up, down and aside.
+# Facing the camera, and tilted up, down and sideways.
 TILTS_DEG = ((0.0, 0.0), (35.0, 0.0), (-35.0, 0.0), (0.0, 40.0))
 
 
 @dataclass(frozen=True)
 class PlateIlluminance:
-    """Illuminance of one plate by either engine, and from the surroundings without anything around. [lux]"""
+    """Illuminance of one plate by each engine, and by integration over the unobstructed environment. [lux]"""
 
     pitch_deg: float
     yaw_deg: float
@@ -169,14 +172,14 @@ class PlateIlluminance:
 
     @property
     def ratio(self) -> float:
-        """One engine's light over the other's."""
+        """First engine's illuminance over the second's."""
         return self.one_lux / self.other_lux
 
 
 def compare_plate(
     tilt_deg: tuple[float, float], samples: int, one: RenderEngine, other: RenderEngine
 ) -> PlateIlluminance:
-    """Light on the drogue's face, painted white: it shines with illuminance / pi.
+    """Illuminance of the drogue's face, painted white: its radiance is illuminance / pi.
 
     Args:
         tilt_deg: pitch and yaw of the plate. [deg]
@@ -192,7 +195,13 @@ def compare_plate(
     assert frame.left_from_drogue is not None
     normal = -(frame.world_from_left @ frame.left_from_drogue).rotation[:, 2]
     integral = luminance(environment_radiance(frame.environment).plate_illuminance_lux(normal))
-    return PlateIlluminance(*tilt_deg, got[0], got[1], float(integral))
+    return PlateIlluminance(
+        pitch_deg=tilt_deg[0],
+        yaw_deg=tilt_deg[1],
+        one_lux=got[0],
+        other_lux=got[1],
+        integral_lux=float(integral),
+    )
 
 
 def plate_frame(samples: int, tilt_deg: tuple[float, float]) -> tuple[FrameSpec, RenderSettings]:
@@ -216,7 +225,7 @@ def _tilted(recipe: Recipe, pitch_deg: float, yaw_deg: float) -> FrameSpec:
     drogue = DrogueParameters.model_validate(
         frame.drogue.model_dump() | {"face_reflectance_rgb": WHITE, "marker_reflectance_rgb": WHITE}
     )
-    # The sun behind the cameras, so that nothing throws a shadow on the plate; air that takes nothing.
+    # The sun is behind the cameras, so that nothing shades the plate; the air is clear.
     environment = frame.environment.model_copy(
         update={"sun_azimuth_deg": 190.0, "sun_elevation_deg": 35.0, "visibility_m": 400_000.0}
     )

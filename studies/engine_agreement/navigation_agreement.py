@@ -24,12 +24,12 @@ from nav.runner import navigate
 
 @dataclass(frozen=True, eq=False)
 class PairedErrors:
-    """Errors in the pairs of one distance for which both engines' images gave a pose.
+    """Pose errors at one distance, for pairs in which both engines' images gave a pose.
 
     Attributes:
         distance_m: of the drogue. [m]
-        pairs: rendered.
-        one, other: (n, 5) errors of X, Y, Z [m], pitch and yaw [deg] by either engine.
+        pairs: number of rendered pairs.
+        one, other: (n, 5) errors of X, Y, Z [m], pitch and yaw [deg] by each engine.
     """
 
     distance_m: float
@@ -43,10 +43,10 @@ class SizeRatio:
     """Root mean square error by the second engine over that by the first, in the same pairs.
 
     Attributes:
-        of: what errors.
-        n: pairs.
-        ratio: of the root mean squares, each distance weighing the same.
-        interval: of 95 %, from resampled pairs; None with fewer than two.
+        of: kind of error.
+        n: number of pairs.
+        ratio: of the root mean squares, with equal weight of each distance.
+        interval: 95 % interval from resampled pairs; None with fewer than two.
     """
 
     of: str
@@ -56,19 +56,19 @@ class SizeRatio:
 
     @property
     def outside(self) -> float:
-        """How far 1 lies outside the interval."""
+        """Distance of 1 from the interval; 0 inside."""
         low, high = self.interval or (self.ratio, self.ratio)
         return max(low - 1.0, 1.0 - high, 0.0)
 
 
 @dataclass(frozen=True)
 class MeanDifference:
-    """Mean of the differences of the engines' errors in one component.
+    """Mean difference of the engines' errors in one component.
 
     Attributes:
         of: the component.
         mean: second engine less the first, in units of their root mean square error at each distance.
-        reach: half the interval of 95 % for all five components together.
+        reach: half the width of the 95 % interval for all five components together.
     """
 
     of: str
@@ -80,7 +80,7 @@ def size_ratios(stations: Sequence[PairedErrors]) -> list[SizeRatio]:
     """Sizes of position and attitude errors by the second engine over those by the first.
 
     Args:
-        stations: of different distances, whose errors are taken in units of their own root mean square.
+        stations: of different distances; errors count in units of each distance's root mean square.
     """
     one, other = (_squares(stations, which) for which in ("one", "other"))
     blocks = list(range(len(one)))
@@ -101,17 +101,17 @@ def size_ratios(stations: Sequence[PairedErrors]) -> list[SizeRatio]:
 
 
 def mean_differences(stations: Sequence[PairedErrors]) -> list[MeanDifference]:
-    """Whether one engine's images pull the poses to a side, by component."""
+    """Systematic differences of the poses by the two engines' images, by component."""
     scaled = np.concatenate([(s.other - s.one) / _root_mean_square(s) for s in stations])
     count, components = scaled.shape
-    # Bonferroni: all components together stay inside with 95 %.
+    # Bonferroni: all components together are inside with 95 %.
     reach = t.ppf(1 - (1 - CONFIDENCE) / 2 / components, count - 1) * scaled.std(axis=0, ddof=1) / np.sqrt(count)
     means = scaled.mean(axis=0)
     return [MeanDifference(name, float(means[i]), float(reach[i])) for i, name in enumerate(COMPONENTS)]
 
 
 def station_rows(stations: Sequence[PairedErrors]) -> list[dict[str, Any]]:
-    """Root mean square errors of either engine at each distance."""
+    """Root mean square errors of each engine at each distance."""
     return [
         {
             "distance_m": s.distance_m,
@@ -160,13 +160,13 @@ def _rms(errors: Array) -> Array:
 METHOD = "joint"
 RECIPE = "pose-tier-b"
 STATIONS_M = (40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
-# So many that the renderers' noise, of which each has its own, is small beside the sensor's, which is the same in both.
+# Samples with which the noise of each renderer is small beside that of the sensor, which is the same for both.
 _SAMPLES_AT_5_M, _MOST_SAMPLES = 64, 576
 
 
 @dataclass(frozen=True)
 class PairedDatasets:
-    """The same poses at one distance as two datasets.
+    """Two datasets of the same poses at one distance.
 
     Attributes:
         distance_m: of the drogue. [m]
@@ -179,10 +179,10 @@ class PairedDatasets:
 
 
 def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> RecipeSource:
-    """What is rendered at one distance.
+    """The recipe of the pairs at one distance.
 
-    Every pixel of the drogue gets as many samples by either engine: where one of them spent more on the markers' edges,
-    its poses would err less for that alone.
+    Both engines take the same number of samples for every pixel of the drogue: an engine with more samples at the
+    markers' edges would have smaller pose errors for that reason alone.
     """
     source = load_recipe(RECIPE, seed)
     side = 2 * round(np.sqrt(_SAMPLES_AT_5_M) * distance_m / 5.0 / 2)
@@ -202,7 +202,7 @@ def station_recipe(engine: str, distance_m: float, pairs: int, seed: int) -> Rec
 
 
 def pairs_by_station(stations_m: Sequence[float], pairs: int) -> dict[float, int]:
-    """As many pairs at each distance, the first ones of them taking the rest."""
+    """Equal numbers of pairs at each distance; the first distances take the remainder."""
     each, rest = divmod(pairs, len(stations_m))
     return {station_m: each + (place < rest) for place, station_m in enumerate(stations_m) if each + (place < rest)}
 
@@ -210,10 +210,10 @@ def pairs_by_station(stations_m: Sequence[float], pairs: int) -> dict[float, int
 def render_paired(
     out: Path, engines: tuple[str, str], station_m: float, pairs: int, seed: int, report: ProgressReport
 ) -> PairedDatasets:
-    """Render the poses of one distance by both engines; pairs that are there already are kept.
+    """Render the poses of one distance by both engines; existing pairs are kept.
 
     Raises:
-        ValueError: a folder of something else, an engine that cannot be used, or frames that could not be made.
+        ValueError: a folder holds something else, an engine cannot be used, or frames could not be rendered.
         OSError: the folder cannot be written.
     """
     folders = []
@@ -231,10 +231,10 @@ def render_paired(
 
 
 def paired_errors(paired: PairedDatasets) -> PairedErrors:
-    """Navigate on both datasets, without their truth, and compare with it.
+    """Navigate on both datasets without their truth, and compare with it.
 
     Raises:
-        ValueError: the datasets are not of the same frames, or cannot be read.
+        ValueError: the datasets do not hold the same frames, or cannot be read.
         OSError: the estimates cannot be written beside the datasets.
     """
     datasets = Dataset(paired.one), Dataset(paired.other)
@@ -251,7 +251,7 @@ def paired_errors(paired: PairedDatasets) -> PairedErrors:
 
 
 def _errors(dataset: Dataset, folder: Path) -> dict[int, Array]:
-    """(5,) errors by frame, of the frames that gave a pose."""
+    """(5,) errors by frame, for frames with a pose."""
     estimates = list(navigate(BlindDataset(folder), (METHOD,)))
     write_estimates(folder.parent / f"{folder.name}.jsonl", estimates)
     errors = {}

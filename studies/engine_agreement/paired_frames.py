@@ -19,7 +19,7 @@ from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 
 STATIONS_M = (2.0, 5.0, 10.0, 3.5, 20.0, 7.0, 40.0, 14.0)
-# Day and dusk with paint alone, then the 13 families of `world-89`, two of them with lit markers.
+# Day and dusk with unlit markers, then the 13 families of `world-89`, two of them with lit markers.
 FAMILIES = (
     *("demo", "pose-tier-b", "pose-tier-b-dusk", "pose-tier-a", "pose-tier-a-dusk", "daylight-10m"),
     *("world-89/clear", "world-89/cumulus-above", "world-89/cumulus-below", "world-89/overcast", "world-89/above-deck"),
@@ -35,10 +35,10 @@ class PairedFrame:
     """One frame to be rendered by both engines.
 
     Attributes:
-        family: what it is drawn from, see `recipe_of_family`.
+        family: its recipe, see `recipe_of_family`.
         distance_m: of the drogue. [m]
         frame: with a drogue.
-        settings: as many samples as its size in the image can afford.
+        settings: with more samples the smaller the drogue is in the image.
     """
 
     family: str
@@ -49,7 +49,7 @@ class PairedFrame:
 
 @dataclass(frozen=True, eq=False)
 class RenderedFrame:
-    """One frame by one engine: as it is, and with the markers lit; CPU time of the first of both. [s]"""
+    """One frame by one engine: unchanged and with lit markers; CPU time of the unchanged one. [s]"""
 
     plain: StereoRadiance
     lit: StereoRadiance
@@ -57,11 +57,11 @@ class RenderedFrame:
 
 
 def recipe_of_family(name: str, seed: int) -> Recipe:
-    """The recipe that draws one kind of frames.
+    """The recipe of one kind of frames.
 
     Args:
         name: of a recipe, or a recipe file; `recipe/family` for one family of a recipe that has them.
-        seed: of everything drawn.
+        seed: of the frames.
 
     Raises:
         ValueError: no such recipe or family.
@@ -80,14 +80,14 @@ def recipe_of_family(name: str, seed: int) -> Recipe:
 def paired_frames(
     families: Sequence[str], stations_m: Sequence[float], count: int, most_samples: int, seed: int
 ) -> list[PairedFrame]:
-    """Frames that go through families and distances in turn.
+    """Frames that take families and distances in turn.
 
     Args:
         families: see `recipe_of_family`.
-        stations_m: distances of the drogue; where a rig cannot see all of it, the nearest at which it can. [m]
+        stations_m: distances of the drogue; if a rig cannot see all of it, the nearest distance at which it can. [m]
         count: number of frames.
-        most_samples: through a pixel of the drogue.
-        seed: of everything drawn.
+        most_samples: per pixel of the drogue.
+        seed: of the frames.
 
     Raises:
         ValueError: no such recipe or family, or one with real lenses or without drogues.
@@ -105,33 +105,33 @@ def paired_frames(
 
 
 def frame_at(recipe: Recipe, distance_m: float, count: int, index: int) -> FrameSpec:
-    """One of `count` frames, each of a scene of its own, with the drogue at a distance [m]."""
+    """One of `count` frames, each in a scene of its own, with the drogue at a distance [m]."""
     changes = {
         "frames": FrameCounts(count=count, scenes=count),
         "distance": DistanceLaw(law="stations", stations_m=(distance_m,)),
     }
-    # A dump would lose the folder of an environment's map.
+    # Not by `model_dump`, which would lose the folder of an environment map.
     return sample_frame(recipe.model_copy(update=changes), index)
 
 
 def _settings(recipe: Recipe, distance_m: float, most_samples: int) -> RenderSettings:
-    """All samples from 10 m on, fewer where the drogue has more pixels; hose and tanker a quarter of that."""
-    # Even squares, which samplers can spread evenly over a pixel.
+    """All samples from 10 m on, fewer where the drogue has more pixels; a quarter for hose and tanker."""
+    # Even squares, which samplers can stratify over a pixel.
     side = 2 * max(1, round(np.sqrt(most_samples) * min(distance_m / 10.0, 1.0) / 2))
     return recipe.render.model_copy(
         update={"samples_per_px": side**2, "surround_samples_per_px": max(4, (side // 2) ** 2)}
     )
 
 
-def render_both(paired: PairedFrame, engine: RenderEngine) -> RenderedFrame:
-    """The frame as it is and with lit markers, from the same samples: their difference is the lamps' light alone."""
+def render_plain_and_lit(paired: PairedFrame, engine: RenderEngine) -> RenderedFrame:
+    """The frame unchanged and with lit markers, by the same samples: their difference is the lamps' light alone."""
     plain = engine.render(paired.frame, paired.settings)
-    lit = engine.render(lamps_lit(paired.frame, LAMP_CD_M2), paired.settings)
-    return RenderedFrame(plain, lit, sum(plain.stage_s.values()))
+    lit = engine.render(with_lit_lamps(paired.frame, LAMP_CD_M2), paired.settings)
+    return RenderedFrame(plain=plain, lit=lit, cpu_s=sum(plain.stage_s.values()))
 
 
-def lamps_lit(frame: FrameSpec, luminance_cd_m2: float) -> FrameSpec:
-    """The frame with its markers shining by themselves."""
+def with_lit_lamps(frame: FrameSpec, luminance_cd_m2: float) -> FrameSpec:
+    """The frame with markers that emit light."""
     assert frame.drogue is not None
     drogue = frame.drogue.model_copy(update={"marker_luminance_cd_m2": luminance_cd_m2})
     return frame.model_copy(update={"drogue": drogue})
@@ -157,8 +157,8 @@ rotation_deg = [-180, 180]
 """
 
 
-def write_own_sky(folder: Path) -> Path:
-    """Write picture and recipe, if they are not there.
+def write_sky_recipe(folder: Path) -> Path:
+    """Write a recipe whose sky is an image with the sun as one very bright spot, unless it is there.
 
     Returns:
         The recipe's file.
@@ -172,21 +172,21 @@ def write_own_sky(folder: Path) -> Path:
         channels = {name: np.ascontiguousarray(values) for name, values in zip("RGB", _picture(), strict=True)}
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         OpenEXR.File(header, channels).write(str(picture))
-        # Comes last and says that the picture is whole.
+        # Written last: its presence shows that the image is complete.
         write_text_atomic(recipe, _RECIPE)
     return recipe
 
 
 def _picture() -> NDArray[np.float32]:
     """(3, H, 2H) radiance: top row the zenith, the middle column looks east, right of it is south. [cd/m2]"""
-    around = environment_radiance(sample_frame(recipe_of_family(_DRAWN_FROM, _SEED), 0).environment)
+    ambient = environment_radiance(sample_frame(recipe_of_family(_DRAWN_FROM, _SEED), 0).environment)
     polar = (np.arange(_HEIGHT_PX) + 0.5) * np.pi / _HEIGHT_PX
     azimuth = np.pi - (np.arange(2 * _HEIGHT_PX) + 0.5) * np.pi / _HEIGHT_PX
     across, up = np.sin(polar)[:, None], np.broadcast_to(np.cos(polar)[:, None], (_HEIGHT_PX, 2 * _HEIGHT_PX))
     directions = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), up], axis=-1)
-    picture = around.radiance(directions.astype(np.float32)).astype(np.float32)
-    row, column = np.unravel_index(int(np.argmax(directions @ around.beam_direction)), up.shape)
+    picture = ambient.radiance(directions.astype(np.float32)).astype(np.float32)
+    row, column = np.unravel_index(int(np.argmax(directions @ ambient.beam_direction)), up.shape)
     solid_angle_sr = (np.pi / _HEIGHT_PX) ** 2 * np.sin(polar[row])
-    picture[row, column] += (around.beam_illuminance_lux / solid_angle_sr).astype(np.float32)
+    picture[row, column] += (ambient.beam_illuminance_lux / solid_angle_sr).astype(np.float32)
     result: NDArray[np.float32] = np.moveaxis(picture, -1, 0)
     return result

@@ -1,1 +1,1 @@
-"""What a stereo pair costs here and by plain scripts around Cycles and Mitsuba, at the same noise on the drogue."""
+"""Cost of a stereo pair by our renderer and by plain Cycles and Mitsuba scripts, at equal noise on the drogue."""

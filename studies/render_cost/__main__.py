@@ -1,4 +1,4 @@
-"""`python -m studies.render_cost`: what a pair costs here and by plain scripts around Cycles and Mitsuba."""
+"""`python -m studies.render_cost`: cost of a stereo pair by our renderer and by plain Cycles and Mitsuba scripts."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ _EXAMPLES = """Examples:
 
 
 def main(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the numbers; distances found there stand.")] = Path(
-        "out/peer-comparison"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for the numbers; distances that are there are kept.")
+    ] = Path("out/peer-comparison"),
     station: Annotated[list[float] | None, typer.Option("--station", help="A distance in metres; repeatable.")] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the frames.")] = 1,
-    repeat: Annotated[int, typer.Option("--repeat", min=1, max=SCENES - 1, help="Pairs for our own cost.")] = 3,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the frames.")] = 1,
+    repeat: Annotated[
+        int, typer.Option("--repeat", min=1, max=SCENES - 1, help="Number of pairs for our own cost.")
+    ] = 3,
     full_samples: Annotated[
         int | None,
         typer.Option(
@@ -31,7 +33,7 @@ def main(
         ),
     ] = None,
 ) -> None:
-    """Measure CPU seconds of a stereo pair by our path, plain Cycles with OIDN and plain Mitsuba at the same noise."""
+    """Measure CPU seconds of a stereo pair by our renderer, plain Cycles with OIDN and plain Mitsuba at equal noise."""
     stations = []
     try:
         for distance_m in station or STATIONS_M:

@@ -29,7 +29,7 @@ from studies.render_cost.noise_search import (
     frame_at,
     recipe_at,
     relative_noise,
-    reseeded,
+    with_seed_offset,
 )
 from studies.render_cost.plain_renderers import measure_plain_cycles, measure_plain_mitsuba
 
@@ -37,7 +37,7 @@ _PICTURES_FOR_NOISE = 4
 
 
 def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEstimate, RenderCost, MeasuredView]:
-    """Cost and noise of our path with the settings that a recipe has by default.
+    """Noise and cost of our renderer with default settings.
 
     Args:
         distance_m: of the drogue. [m]
@@ -45,15 +45,15 @@ def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEs
         repeat: pairs over which the cost is averaged; fewer than `SCENES`.
 
     Returns:
-        Noise, cost, and the view for the others.
+        Noise, cost, and the view for the other renderers.
     """
     cv2.setNumThreads(1)
     engine = load_engine("mitsuba")
     settings = recipe_at(distance_m, seed).render
-    # Loading the engine and compiling its kernels does not count.
+    # Loading the engine and compiling kernels do not count.
     engine.render(frame_at(distance_m, seed, index=repeat), settings)
     spent_s = 0.0
-    # Each in a scene of its own, so that no sky is at hand already; the last one is the view that all draw.
+    # Each in a scene of its own, so that no sky is cached; the last one is the view that all renderers draw.
     for index in reversed(range(repeat)):
         began_s = cpu_seconds()
         frame = frame_at(distance_m, seed, index)
@@ -67,15 +67,16 @@ def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEs
 
     drogue = DROGUE_PARTS[radiance.left.part_id] > 0
     inside = drogue & inside_one_part(radiance.left.part_id)
-    seen = [luminance(reseeded(frame, by)) for by in range(_PICTURES_FOR_NOISE)]
+    seen = [luminance(with_seed_offset(frame, by)) for by in range(_PICTURES_FOR_NOISE)]
     pairs = list(zip(seen[::2], seen[1::2], strict=True))
     noise, noise_inside = (
         float(np.sqrt(np.mean([relative_noise(one, other, mask) ** 2 for one, other in pairs])))
         for mask in (drogue, inside)
     )
     mean = float(np.mean(seen, axis=0)[drogue].mean())
-    found = NoiseEstimate(settings.samples_per_px, noise, noise_inside, mean)
-    return found, RenderCost(spent_s / repeat), MeasuredView(frame, settings, drogue, inside)
+    found = NoiseEstimate(samples=settings.samples_per_px, noise=noise, noise_inside=noise_inside, mean_cd_m2=mean)
+    view = MeasuredView(frame=frame, settings=settings, drogue=drogue, inside=inside)
+    return found, RenderCost(spent_s / repeat), view
 
 
 OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
@@ -89,9 +90,9 @@ def compare_at(
     Args:
         distance_m: of the drogue. [m]
         seed: of the frames.
-        repeat: pairs over which our own cost is averaged.
-        full_samples: most samples of Cycles over every pixel, or None for as many as are needed.
-        say: takes a line about what goes on.
+        repeat: number of pairs over which our own cost is averaged.
+        full_samples: most samples of Cycles over every pixel, or None without a limit.
+        say: called with a line about progress.
 
     Raises:
         ValueError: Mitsuba or Blender is missing.
@@ -112,17 +113,17 @@ def _row(noise: NoiseEstimate, cost: RenderCost) -> dict[str, Any]:
 
 
 def station_file(out: Path, distance_m: float) -> Path:
-    """Where what was found at a distance is kept."""
+    """File of the results at a distance."""
     return out / f"{distance_m:g}m.json"
 
 
 def write_station(out: Path, found: dict[str, Any]) -> None:
-    """Keep what was found at a distance; a file is there whole or not at all."""
+    """Store the results at a distance; the file is written completely or not at all."""
     write_text_atomic(station_file(out, found["distance_m"]), json.dumps(found, indent=1) + "\n")
 
 
 def read_station(out: Path, distance_m: float, seed: int, full_samples: int | None) -> dict[str, Any] | None:
-    """What was found before at a distance with this seed and this limit, None if nothing was."""
+    """Stored results at a distance with this seed and limit, or None."""
     file = station_file(out, distance_m)
     if not file.exists():
         return None
@@ -131,7 +132,7 @@ def read_station(out: Path, distance_m: float, seed: int, full_samples: int | No
 
 
 def table_lines(stations: list[dict[str, Any]]) -> list[str]:
-    """One line a distance: cost of each, and how much more the others take."""
+    """One table row per distance: the cost of each renderer, and the ratios to our own."""
     lines = [
         "| distance | noise | own path | plain Mitsuba | plain Cycles, OIDN | Mitsuba / own | Cycles / own |",
         "|---|---|---|---|---|---|---|",

@@ -10,15 +10,15 @@ from render.blender_engine.messages import CameraPath, FrameSetup, ImageWindow
 
 @dataclass(frozen=True, eq=False)
 class DenoisedPicture:
-    """One eye, denoised.
+    """One denoised picture of one eye.
 
     Attributes:
-        window: what of the image, as a camera of its own.
+        window: part of the image, as a camera of its own.
         path: the camera at one moment.
-        samples: paths through each pixel.
-        bounces: how often light may be thrown on after the first surface.
+        samples: paths per pixel.
+        bounces: how many surfaces after the first may reflect light.
         seed: of the samples.
-        file: where it is written, without `.exr`.
+        file: path of the result, without `.exr`.
     """
 
     window: ImageWindow
@@ -31,7 +31,7 @@ class DenoisedPicture:
 
 @dataclass(frozen=True, eq=False)
 class CyclesRequest:
-    """A scene, and the pictures to take of it one after the other."""
+    """A scene, and the pictures to render of it one after the other."""
 
     setup: FrameSetup
     pictures: tuple[DenoisedPicture, ...]

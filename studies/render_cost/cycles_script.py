@@ -1,7 +1,7 @@
-"""A pair as a plain script around Blender makes it: Cycles' own camera and world, every pixel alike, then denoised.
+"""A stereo pair as a plain Blender script renders it: Cycles' own camera and world, equal samples per pixel, denoised.
 
-Runs as Blender's own process, which takes an order from its standard input and prints what each picture took; no other
-module imports it.
+Runs as Blender's own process, which reads a request from its standard input and prints the CPU time of each picture. No
+other module imports it.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ _NEAREST_M, _FARTHEST_M = 0.01, 1e5
 
 
 def main() -> None:
-    """Carry out one order."""
+    """Carry out one request."""
     answers = os.fdopen(os.dup(1), "w")
-    # Blender talks on standard output; what it says goes where errors go.
+    # Blender prints on standard output, which is redirected to standard error.
     os.dup2(2, 1)
-    order: CyclesRequest = pickle.load(sys.stdin.buffer)
+    request: CyclesRequest = pickle.load(sys.stdin.buffer)
     blender = BlenderScene()
-    blender.set_frame(order.setup)
+    blender.set_frame(request.setup)
     scene = blender.scenes[LIGHT]
-    # Blender's own way to find sky and sun.
+    # Blender's default sampling of sky and sun.
     scene.world.cycles.sampling_method = "AUTOMATIC"
     spent_s = []
-    for picture in order.pictures:
+    for picture in request.pictures:
         began_s = cpu_seconds()
-        _take(scene, blender.camera, picture)
+        _render(scene, blender.camera, picture)
         spent_s.append(cpu_seconds() - began_s)
     json.dump(spent_s, answers)
     answers.flush()
 
 
-def _take(scene: Any, camera: Any, picture: DenoisedPicture) -> None:
+def _render(scene: Any, camera: Any, picture: DenoisedPicture) -> None:
     window, lens = picture.window, camera.data
     lens.sensor_fit, lens.sensor_width = "HORIZONTAL", _SENSOR_WIDTH_MM
     lens.lens = _SENSOR_WIDTH_MM * window.focal_px / window.width_px

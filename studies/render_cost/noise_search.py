@@ -13,21 +13,21 @@ from datasets_manifest.recipe.recipe import Recipe, RenderSettings, load_recipe
 from datasets_manifest.types.frame import FrameSpec
 from scenes.sampler import sample_frame
 
-# Noise that is measured on a few hundred pixels is itself known to some percent.
+# Noise measured on a few hundred pixels is itself known to a few percent.
 _CLOSE_ENOUGH = 0.1
 _MOST_ATTEMPTS = 5
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """What a renderer's pictures are like with so many samples.
+    """Noise of a renderer's pictures with a number of samples.
 
     Attributes:
-        samples: paths through each pixel.
+        samples: paths per pixel.
         noise: root mean square error of luminance over its mean, on the drogue's pixels.
-        noise_inside: the same on those that see one part alone, edges left out.
+        noise_inside: the same without pixels at edges between parts.
         mean_cd_m2: mean luminance of the drogue's pixels. [cd/m2]
-        is_carried_on: by the law of independent samples from fewer, as these would have taken too long.
+        is_carried_on: extrapolated from fewer samples by the law of independent samples.
     """
 
     samples: int
@@ -37,18 +37,24 @@ class NoiseEstimate:
     is_carried_on: bool = False
 
     def with_samples(self, samples: int) -> NoiseEstimate:
-        """What so many samples would give: errors fall with their square root."""
+        """Extrapolation to so many samples: errors fall with their square root."""
         down = float(np.sqrt(samples / self.samples))
-        return NoiseEstimate(samples, self.noise / down, self.noise_inside / down, self.mean_cd_m2, True)
+        return NoiseEstimate(
+            samples=samples,
+            noise=self.noise / down,
+            noise_inside=self.noise_inside / down,
+            mean_cd_m2=self.mean_cd_m2,
+            is_carried_on=True,
+        )
 
 
 @dataclass(frozen=True)
 class RenderCost:
-    """Time of a whole pair.
+    """CPU time of a whole pair.
 
     Attributes:
         cpu_s: user and system time. [s]
-        is_least: it was taken with fewer samples, and would have been more.
+        is_least: a lower bound, measured with fewer samples than needed.
     """
 
     cpu_s: float
@@ -72,12 +78,17 @@ def noise_of(
     one, other = pictures
     drogue, inside = masks
     mean = float((one[drogue].mean(dtype=np.float64) + other[drogue].mean(dtype=np.float64)) / 2)
-    return NoiseEstimate(samples, relative_noise(one, other, drogue), relative_noise(one, other, inside), mean)
+    return NoiseEstimate(
+        samples=samples,
+        noise=relative_noise(one, other, drogue),
+        noise_inside=relative_noise(one, other, inside),
+        mean_cd_m2=mean,
+    )
 
 
 def samples_for(measured: NoiseEstimate, noise: float) -> int:
-    """Samples with which the noise would be reached if it falls with their square root."""
-    # Rounding of the square must not ask for one more.
+    """Samples that reach a noise if it falls with their square root."""
+    # Rounding of the square must not add a sample.
     return max(1, int(np.ceil(measured.samples * (measured.noise / noise) ** 2 - 1e-6)))
 
 
@@ -85,13 +96,13 @@ def reach_noise(measure: Callable[[int], NoiseEstimate], noise: float, pilot: in
     """Samples that give a noise, found by the square-root law and verified.
 
     Args:
-        measure: renders with so many samples; may take a few more.
+        measure: renders with at least so many samples.
         noise: to be reached.
         pilot: samples of the first attempt.
-        most_samples: of an attempt; beyond these the law is taken at its word.
+        most_samples: of an attempt; beyond these the law extrapolates.
 
     Returns:
-        The attempt whose noise comes nearest, by ratio. Less noise than asked for with a single sample stands.
+        The attempt whose noise is nearest, by ratio; a single sample may give less noise than asked for.
     """
     tried: dict[int, NoiseEstimate] = {}
     samples = pilot
@@ -105,22 +116,22 @@ def reach_noise(measure: Callable[[int], NoiseEstimate], noise: float, pilot: in
 
 
 STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
-# What a denoiser may look at beyond the drogue.
+# Margin around the drogue for the denoiser.
 _MARGIN_PX = 32
 _RECIPE = "daylight-10m"
-# Enough for scenes that differ, so that nothing kept from one frame serves the next.
+# Enough different scenes that nothing cached from one frame serves the next.
 SCENES = 8
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredView:
-    """What every renderer draws.
+    """The view that every renderer draws.
 
     Attributes:
-        frame: a drogue in its surroundings.
-        settings: those that a recipe has by default.
+        frame: has a drogue, at rest on a clear day.
+        settings: default settings.
         drogue: (H, W) pixels of the left eye whose centres see the drogue.
-        inside: those of them around which all pixels see the same part.
+        inside: those of them whose neighbours all see the same part.
     """
 
     frame: FrameSpec
@@ -155,8 +166,8 @@ def recipe_at(distance_m: float, seed: int) -> Recipe:
     return Recipe.model_validate({**recipe.model_dump(), **changes})
 
 
-def reseeded(frame: FrameSpec, by: int) -> FrameSpec:
-    """The same frame with other samples and other noise of the sensor."""
+def with_seed_offset(frame: FrameSpec, by: int) -> FrameSpec:
+    """The same frame with other samples and other sensor noise."""
     return frame.model_copy(update={"seed": frame.seed + by})
 
 

@@ -31,7 +31,7 @@ from studies.render_cost.cycles_messages import CyclesRequest, DenoisedPicture, 
 from studies.render_cost.noise_search import MeasuredView, NoiseEstimate, RenderCost, noise_of, reach_noise
 
 STEP = 8
-"""Samples of one launch: more are launched again, which bounds memory and is the same to independent samples."""
+"""Samples of one launch; further launches take the rest, which bounds memory."""
 
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -42,22 +42,22 @@ _Crop = tuple[int, int, int, int]
 
 
 def measure_plain_mitsuba(view: MeasuredView, noise: float) -> tuple[NoiseEstimate, RenderCost]:
-    """Samples and cost of a pair with a given noise; loading the scene and compiling kernels do not count.
+    """Samples and cost of a Mitsuba pair at a given noise; loading the scene and compiling kernels do not count.
 
     Noise is measured around the drogue, and the cost with one launch over every pixel of both eyes.
 
     Args:
-        view: what to draw.
+        view: to render.
         noise: to be reached.
     """
-    # Chooses the variant and the number of threads, as for our own path.
+    # Sets the variant and the number of threads, as for our own renderer.
     load_engine("mitsuba")
     import mitsuba as mi
 
     from render.mitsuba_engine.scene import SceneCache
 
     scene = SceneCache().scene_of(view.frame, environment_radiance(view.frame.environment)).scene
-    # Nothing is ended by lot, as everywhere in this comparison.
+    # No Russian roulette, as for all renderers of this comparison.
     depth = view.settings.max_depth
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": depth + 1})
 
@@ -124,26 +124,26 @@ _MOST_PATHS_CYCLES = 20_000_000
 def measure_plain_cycles(
     view: MeasuredView, noise: float, full_samples: int | None
 ) -> tuple[NoiseEstimate, RenderCost]:
-    """Samples and cost of a denoised pair with a given noise; starting Blender and loading the scene do not count.
+    """Samples and cost of a denoised Cycles pair at a given noise; starting Blender and loading the scene do not count.
 
     Noise is measured around the drogue, and the cost over every pixel of both eyes.
 
     Args:
-        view: what to draw.
+        view: to render.
         noise: to be reached.
         full_samples: most samples over every pixel; with fewer than needed the cost is a lower bound.
 
     Raises:
         ValueError: Blender is not installed.
-        OSError: its process failed; says what it said last.
+        OSError: its process failed; the message has its last line.
     """
     bpy_version()
     setup = Stage().set_frame(view.frame, environment_radiance(view.frame.environment))
     around = view.crop
 
     def noise_at(samples: int) -> NoiseEstimate:
-        orders = [_Wanted("left", around, samples, seed) for seed in (1, 2)]
-        (_, one), (_, other) = _taken(view, setup, orders)
+        requests = [_Request("left", around, samples, seed) for seed in (1, 2)]
+        (_, one), (_, other) = _render_pictures(view, setup, requests)
         return noise_of(samples, (one, other), view.masks)
 
     found = reach_noise(noise_at, noise, _PILOT_SAMPLES, max(_PILOT_SAMPLES, _MOST_PATHS_CYCLES // view.masks[0].size))
@@ -151,42 +151,61 @@ def measure_plain_cycles(
     whole = (0, 0, camera.width_px, camera.height_px)
     samples = min(found.samples, full_samples or found.samples)
     # The first one loads the scene.
-    orders = [_Wanted("left", around, 1, 1), *(_Wanted(eye, whole, samples, 1) for eye in EYES)]
-    spent_s = [cpu_s for cpu_s, _ in _taken(view, setup, orders)]
+    requests = [_Request("left", around, 1, 1), *(_Request(eye, whole, samples, 1) for eye in EYES)]
+    spent_s = [cpu_s for cpu_s, _ in _render_pictures(view, setup, requests)]
     return found, RenderCost(sum(spent_s[1:]), samples < found.samples)
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class _Request:
     eye: Eye
     crop: tuple[int, int, int, int]
     samples: int
     seed: int
 
 
-def _taken(view: MeasuredView, setup: FrameSetup, orders: list[_Wanted]) -> list[tuple[float, NDArray[np.float32]]]:
+def _render_pictures(
+    view: MeasuredView, setup: FrameSetup, requests: list[_Request]
+) -> list[tuple[float, NDArray[np.float32]]]:
     """CPU time and luminance of each picture. [s, unit of the light]"""
     camera = view.frame.rig.camera
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        files = [Path(folder) / str(index) for index in range(len(orders))]
+        files = [Path(folder) / str(index) for index in range(len(requests))]
         pictures = []
-        for order, file in zip(orders, files, strict=True):
-            window = ImageWindow(*order.crop, camera.fx_px, (camera.cx_px, camera.cy_px))
-            path = EyePath(view.frame, order.eye, np.zeros((0, 3), dtype=np.float32)).still
+        for request, file in zip(requests, files, strict=True):
+            left, top, width, height = request.crop
+            window = ImageWindow(
+                left_px=left,
+                top_px=top,
+                width_px=width,
+                height_px=height,
+                focal_px=camera.fx_px,
+                center_px=(camera.cx_px, camera.cy_px),
+            )
+            path = EyePath(view.frame, request.eye, np.zeros((0, 3), dtype=np.float32)).still
             bounces = view.settings.max_depth - 2
-            pictures.append(DenoisedPicture(window, path, order.samples, bounces, order.seed, str(file)))
+            pictures.append(
+                DenoisedPicture(
+                    window=window,
+                    path=path,
+                    samples=request.samples,
+                    bounces=bounces,
+                    seed=request.seed,
+                    file=str(file),
+                )
+            )
         spent_s = _run(CyclesRequest(setup, tuple(pictures)), Path(folder))
         unit = np.float32(setup.light.unit_cd_m2)
         seen = [read_light(file.with_suffix(".exr"))[..., :3] @ REC709_LUMINANCE * unit for file in files]
     return list(zip(spent_s, seen, strict=True))
 
 
-def _run(order: CyclesRequest, folder: Path) -> list[float]:
+def _run(request: CyclesRequest, folder: Path) -> list[float]:
     """CPU time of each picture. [s]"""
     ended = subprocess.run(
         # -P: a file that lies where the user works must not stand in for a module of Blender's.
         [sys.executable, "-P", "-m", "studies.render_cost.cycles_script"],
-        input=pickle.dumps(order),
+        input=pickle.dumps(request),
         capture_output=True,
         env={**os.environ, "BLENDER_USER_RESOURCES": str(folder)},
         check=False,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from render.engine import load_engine
-from studies.engine_agreement.agreement import frame_bars, part_ratios, plate_bars
-from studies.engine_agreement.measures import PlateIlluminance, compare
-from studies.engine_agreement.paired_frames import RenderedFrame, paired_frames, render_both
+from studies.engine_agreement.agreement import frame_requirements, part_ratios, plate_requirements
+from studies.engine_agreement.measures import PlateIlluminance, compare_renderings
+from studies.engine_agreement.paired_frames import RenderedFrame, paired_frames, render_plain_and_lit
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def paired():
 
 @pytest.fixture(scope="module")
 def rendered(paired) -> RenderedFrame:
-    return render_both(paired, load_engine("analytic"))
+    return render_plain_and_lit(paired, load_engine("analytic"))
 
 
 def altered(rendered: RenderedFrame, change) -> RenderedFrame:
@@ -33,12 +33,12 @@ def altered(rendered: RenderedFrame, change) -> RenderedFrame:
 
 
 def missed(paired, one: RenderedFrame, other: RenderedFrame) -> set[str]:
-    agreement = compare(paired.frame, one, other)
-    return {bar.name.split(",")[0] for bar in frame_bars([agreement], [3.0]) if not bar.reached}
+    agreement = compare_renderings(paired.frame, one, other)
+    return {bar.name.split(",")[0] for bar in frame_requirements([agreement], [3.0]) if not bar.reached}
 
 
 def test_an_engine_agrees_with_itself(paired, rendered):
-    agreement = compare(paired.frame, rendered, rendered)
+    agreement = compare_renderings(paired.frame, rendered, rendered)
     assert agreement.centroids_px.shape == (16, 3, 2)
     assert np.array_equal(agreement.centroids_px[:, 1], agreement.centroids_px[:, 2])
     assert agreement.drogue_iou == 1.0 and agreement.rib_distance_px == 0.0
@@ -64,5 +64,5 @@ def test_masks_and_brightness_that_differ_are_found(paired, rendered):
 
 def test_a_plate_that_is_too_bright_is_found():
     plate = PlateIlluminance(0.0, 0.0, one_lux=101.0, other_lux=100.0, integral_lux=100.0)
-    (found,) = plate_bars([plate])
+    (found,) = plate_requirements([plate])
     assert not found.reached and found.value == pytest.approx(0.01)

@@ -10,7 +10,7 @@ import pytest
 
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
-from studies.engine_agreement.agreement import navigation_bars
+from studies.engine_agreement.agreement import navigation_requirements
 from studies.engine_agreement.navigation_agreement import (
     PairedDatasets,
     PairedErrors,
@@ -42,7 +42,7 @@ def drawn(seed, other_size=1.0, shift=0.0):
 
 
 def missed(stations):
-    return {bar.name.split(",")[0] for bar in navigation_bars(stations) if not bar.reached}
+    return {bar.name.split(",")[0] for bar in navigation_requirements(stations) if not bar.reached}
 
 
 def test_errors_of_one_law_pass_as_often_as_the_intervals_say():

@@ -14,8 +14,8 @@ from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from studies.engine_agreement.__main__ import main
 from studies.engine_agreement.comparison_run import ResultStore
-from studies.engine_agreement.costs import CostComparison, EngineCost, cost_of, measure_costs
-from studies.engine_agreement.paired_frames import FAMILIES, paired_frames, recipe_of_family, write_own_sky
+from studies.engine_agreement.costs import CostComparison, EngineCost, cost_from_row, measure_costs
+from studies.engine_agreement.paired_frames import FAMILIES, paired_frames, recipe_of_family, write_sky_recipe
 
 
 def run(*arguments):
@@ -67,14 +67,14 @@ def test_every_family_is_of_its_kind():
 
 def test_the_picture_of_a_sky_gives_its_sun_back(tmp_path):
     drawn = environment_radiance(sample_frame(recipe_of_family("world-89/sea", 1), 0).environment)
-    recipe = write_own_sky(tmp_path)
+    recipe = write_sky_recipe(tmp_path)
     (frame,) = paired_frames([str(recipe)], [10.0], 1, 4, seed=3)
     mapped = environment_radiance(frame.frame.environment)
     # One texel is 0.7 degrees; what is cut out with the sun is replaced by the sky around it.
     assert mapped.beam_direction[2] == pytest.approx(drawn.beam_direction[2], abs=0.013)
     np.testing.assert_allclose(mapped.beam_illuminance_lux, drawn.beam_illuminance_lux, rtol=0.02)
     written = (tmp_path / "sky.exr").stat().st_mtime_ns
-    assert write_own_sky(tmp_path) == recipe and (tmp_path / "sky.exr").stat().st_mtime_ns == written
+    assert write_sky_recipe(tmp_path) == recipe and (tmp_path / "sky.exr").stat().st_mtime_ns == written
 
 
 def test_findings_count_for_what_they_were_made_from_alone(tmp_path):
@@ -90,7 +90,7 @@ def test_findings_count_for_what_they_were_made_from_alone(tmp_path):
 
 def test_an_engine_without_noise_is_never_matched_by_one_that_has_some():
     cost = CostComparison(10.0, EngineCost(16, 1.0, 0.0), EngineCost(256, 3.0, 0.10))
-    assert not cost.is_reached and cost_of(cost.row()) == cost
+    assert not cost.is_reached and cost_from_row(cost.row()) == cost
     # No sampling, no noise: the fewest samples do.
     analytic = load_engine("analytic")
     same = measure_costs(40.0, 1, analytic, analytic)
