@@ -18,7 +18,7 @@ from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
 
-DOC = Path(__file__).resolve().parents[2] / "docs/how-to/calibrate.md"
+DOC = Path(__file__).resolve().parents[3] / "docs/how-to/calibrate.md"
 RECIPE = """
 name = "board"
 seed = 2
