@@ -111,14 +111,14 @@ def load_engine(name: str) -> RenderEngine:
     if name not in _OURS:
         return _loaded(_others()[name])
     if name == "analytic":
-        from render.analytic_engine.engine import AnalyticEngine
+        from render.analytic_engine.analytic_engine import AnalyticEngine
 
         return AnalyticEngine()
     if name == "blender":
-        from render.blender_engine.engine import BlenderEngine
+        from render.blender_engine.blender_engine import BlenderEngine
 
         return BlenderEngine()
-    from render.mitsuba_engine.engine import MitsubaEngine
+    from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
 
     return MitsubaEngine()
 

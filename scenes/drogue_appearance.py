@@ -12,7 +12,7 @@ from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters, ReflectanceRgb
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
-from scenes.environment import sample_uniform
+from scenes.environment_sampling import sample_uniform
 
 # Three markers determine a pose; fewer could not be distinguished from other things.
 _FEWEST_MARKERS = 3

@@ -9,7 +9,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
-from scenes.environment import sample_uniform
+from scenes.environment_sampling import sample_uniform
 
 _MOST_TRIES = 1000
 _OUTLINE_POINTS = 72

@@ -16,7 +16,7 @@ from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 from scenes.auto_exposure import automatic_exposure
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_obstacles
-from scenes.environment import environment_of_scene
+from scenes.environment_sampling import environment_of_scene
 from scenes.flight.frame_kinematics import FrameKinematics, sample_suspension
 from scenes.flight.receiver import sample_attitude
 from scenes.flight.sequence import sequence_kinematics

@@ -15,7 +15,7 @@ from drogue_models.parameters import ReflectanceRgb
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from scenes.drogue_appearance import rotation_with_z
-from scenes.environment import sample_uniform
+from scenes.environment_sampling import sample_uniform
 
 # The bar is wider by this share, for the canopy behind the rim and for motion between the samples.
 _SPARE_FRACTION = 0.15

@@ -15,7 +15,7 @@ from datasets_manifest.recipe.sequence_ranges import (
     run_time_s,
 )
 from geometry.se3 import Array
-from scenes.environment import sample_uniform
+from scenes.environment_sampling import sample_uniform
 
 # Camera axes (right, down, forward) of a receiver that flies east, in world axes (east, north, up).
 _WORLD_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

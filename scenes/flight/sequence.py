@@ -17,7 +17,7 @@ from drogue_models.parameters import DrogueParameters
 from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform, exp_twist, log_twist
-from scenes.environment import sample_uniform
+from scenes.environment_sampling import sample_uniform
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.dropouts import (
     OccludingBar,

@@ -203,7 +203,7 @@ def _render_pictures(
 def _run(request: CyclesRequest, folder: Path) -> list[float]:
     """CPU time of each picture. [s]"""
     ended = subprocess.run(
-        # -P: a file that lies where the user works must not stand in for a module of Blender's.
+        # -P: a file in the working folder must not replace one of Blender's modules.
         [sys.executable, "-P", "-m", "studies.render_cost.cycles_script"],
         input=pickle.dumps(request),
         capture_output=True,

@@ -37,7 +37,7 @@ TRESPASSES = [
     ("light", "droguekit/benchmark/trespass.py", "import trimesh"),
     ("renderers", "labelgen/trespass.py", "import mitsuba"),
     ("renderers", "droguekit/cli/trespass.py", "import drjit"),
-    ("blender", "render/blender_engine/engine.py", "import render.blender_engine.blender_scene"),
+    ("blender", "render/blender_engine/blender_engine.py", "import render.blender_engine.blender_scene"),
     ("blender", "droguekit/batch/trespass.py", "import bpy"),
     ("dimensions", "drogue_models/parameters.py", "import trimesh"),
     ("torch", "nav/pose/trespass.py", "import torch"),

@@ -16,7 +16,7 @@ from labelgen.frame_labels import label_frame
 from labelgen.part_pixels import parts_mask
 from labelgen.segmentation_masks import OCCLUDERS, amodal_masks, named_parts, part_triangles, union_of_masks
 from labelgen.silhouettes import silhouette
-from render.analytic_engine.engine import AnalyticEngine
+from render.analytic_engine.analytic_engine import AnalyticEngine
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame

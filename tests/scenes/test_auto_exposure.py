@@ -8,8 +8,8 @@ import pytest
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from drogue_models.parameters import WHITE_PAINT
 from scenes.auto_exposure import automatic_exposure
-from scenes.environment import environment_of_scene
 from scenes.environment_radiance import environment_radiance
+from scenes.environment_sampling import environment_of_scene
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
 

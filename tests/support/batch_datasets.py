@@ -42,7 +42,7 @@ test = 0.5
 TROUBLED_ENGINE = """
 import ctypes, json, os, resource
 from pathlib import Path
-from render.analytic_engine.engine import AnalyticEngine
+from render.analytic_engine.analytic_engine import AnalyticEngine
 
 class TroubledEngine(AnalyticEngine):
     def render(self, frame, settings):

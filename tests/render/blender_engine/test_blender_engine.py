@@ -41,7 +41,7 @@ PASSES = ("radiance_cd_m2", "coverage", "part_id", "depth_m", "normal")
 @pytest.fixture(scope="module")
 def blender():
     # Not at the top: the test is collected where Blender is missing, too.
-    from render.blender_engine.engine import BlenderEngine
+    from render.blender_engine.blender_engine import BlenderEngine
 
     engine = BlenderEngine()
     yield engine
@@ -185,7 +185,7 @@ def test_noise_is_what_two_renderings_by_other_samples_differ_by(blender, make_r
 
 @pytest.mark.slow
 def test_same_frame_same_bits_whatever_came_before(blender, make_recipe):
-    from render.blender_engine.engine import BlenderEngine
+    from render.blender_engine.blender_engine import BlenderEngine
 
     recipe = make_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4, speed_m_s=2.0)
     first = blender.render(sample_frame(recipe, 0), recipe.render)

@@ -25,7 +25,7 @@ RENDER_LINES = 'engine = "blender"', "samples_per_px = 16", "surround_samples_pe
 
 
 def test_renders_scatter_around_the_other_path_tracer_s_mean():
-    from render.blender_engine.engine import BlenderEngine
+    from render.blender_engine.blender_engine import BlenderEngine
 
     with np.load(GOLDEN) as stored:
         mean, variance, parts = stored["mean"].astype(float), stored["variance"].astype(float), stored["parts"]

@@ -54,7 +54,7 @@ samples_per_px = 16
 
 @pytest.fixture(scope="module")
 def made():
-    from render.blender_engine.engine import BlenderEngine
+    from render.blender_engine.blender_engine import BlenderEngine
 
     recipe = parse_recipe(RECIPE)
     frame = sample_frame(recipe, 0)

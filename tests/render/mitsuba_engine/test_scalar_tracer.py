@@ -17,7 +17,7 @@ pytestmark = pytest.mark.mitsuba
 
 SCRIPT = """
 import pickle, sys
-from render.mitsuba_engine.engine import MitsubaEngine
+from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
 from datasets_manifest.recipe.recipe import parse_recipe
 from scenes.sampler import sample_frame
 recipe = parse_recipe(open(sys.argv[1]).read())

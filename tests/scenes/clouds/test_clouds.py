@@ -7,8 +7,8 @@ from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.environment import CloudLayer, Environment, Mist
 from scenes.clouds.cloud_density import CloudDensity
 from scenes.clouds.cloud_layers import CloudLight, diffuse_transmission, opacity_towards, render_cloud_layer
-from scenes.environment import environment_of_scene
 from scenes.environment_radiance import EnvironmentRadiance
+from scenes.environment_sampling import environment_of_scene
 from scenes.sky.photometry import direction_from_angles, luminance
 
 RECIPE = """
