@@ -17,27 +17,6 @@ DIRT_MAP_PX = 64
 DIRT_RGB = (0.055, 0.050, 0.045)
 _BLOTCH_PX = 5.0
 _EDGE_PX = 1.2
-
-
-def dirt_map(seed: int, dirt_fraction: float) -> NDArray[np.float32]:
-    """Where dirt covers the square around a disc.
-
-    Args:
-        seed: of the pattern.
-        dirt_fraction: share of the square that is covered.
-
-    Returns:
-        (64, 64) share of each texel under dirt, 0 to 1; row 0 is the low y end of the square.
-    """
-    noise = frame_generator(seed, 0, "dirt").standard_normal((DIRT_MAP_PX, DIRT_MAP_PX))
-    smooth = gaussian_filter(noise, _BLOTCH_PX, mode="wrap")
-    covered = (smooth >= np.quantile(smooth, 1.0 - dirt_fraction)).astype(np.float64)
-    if dirt_fraction <= 0:
-        covered[:] = 0.0
-    softened: NDArray[np.float32] = gaussian_filter(covered, _EDGE_PX, mode="wrap").astype(np.float32)
-    return softened
-
-
 SMOOTH_PARTS = (Part.RIM, Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
 """Parts with interpolated normals, whose meshes need creases at sharp edges; other parts have flat faces."""
 
@@ -108,3 +87,22 @@ def _features(frame: FrameSpec) -> list[int]:
     if frame.drogue is None or frame.condition is None:
         return []
     return [int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)]
+
+
+def dirt_map(seed: int, dirt_fraction: float) -> NDArray[np.float32]:
+    """Where dirt covers the square around a disc.
+
+    Args:
+        seed: of the pattern.
+        dirt_fraction: share of the square that is covered.
+
+    Returns:
+        (64, 64) share of each texel under dirt, 0 to 1; row 0 is the low y end of the square.
+    """
+    noise = frame_generator(seed, 0, "dirt").standard_normal((DIRT_MAP_PX, DIRT_MAP_PX))
+    smooth = gaussian_filter(noise, _BLOTCH_PX, mode="wrap")
+    covered = (smooth >= np.quantile(smooth, 1.0 - dirt_fraction)).astype(np.float64)
+    if dirt_fraction <= 0:
+        covered[:] = 0.0
+    softened: NDArray[np.float32] = gaussian_filter(covered, _EDGE_PX, mode="wrap").astype(np.float32)
+    return softened

@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from datasets_manifest.random_streams import frame_generator
 
 Field = NDArray[np.float32]
-
 _SMALLEST_LEVEL_PX = 8
 # The finest levels store square roots in eight bits: detail hides the steps, in a quarter of the memory.
 _BYTE_LEVELS = 2
+FARTHEST_M = 4e5  # beyond this distance haze hides everything
+# A piece seen at a grazing angle is elongated; it is averaged over at most so many points along its length.
+_MOST_PLACES = 5
+_NARROWEST_RAD = 1e-5
 
 
 def power_noise(seed: int, stream: str, size_px: int, slope: float, cycles: float) -> Field:
@@ -114,12 +117,6 @@ class MipTile:
             root *= root
             return root
         return np.asarray(seen, dtype=np.float32)
-
-
-FARTHEST_M = 4e5  # beyond this distance haze hides everything
-# A piece seen at a grazing angle is elongated; it is averaged over at most so many points along its length.
-_MOST_PLACES = 5
-_NARROWEST_RAD = 1e-5
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,10 @@ from geometry.stereo import Eye, StereoRig
 from render.surfaces import lamp_radiance_rgb, mean_reflectance_rgb
 from scenes.environment_radiance import EnvironmentRadiance
 
+# Largest distance between the circle and a polygon of equal area: the error of a pixel's coverage is no larger.
+_OUTLINE_ERROR_PX = 1e-4
+_FEWEST_SIDES = 64
+
 
 @dataclass(frozen=True)
 class FlatRing:
@@ -117,11 +121,6 @@ class FlatSurfaceLight:
         clear = np.exp(-self._extinction_per_depth * depth_m)
         radiance: Array = sent * clear + self._air * (1.0 - clear)
         return radiance
-
-
-# Largest distance between the circle and a polygon of equal area: the error of a pixel's coverage is no larger.
-_OUTLINE_ERROR_PX = 1e-4
-_FEWEST_SIDES = 64
 
 
 @dataclass(frozen=True, eq=False)

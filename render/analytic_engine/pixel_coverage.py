@@ -15,6 +15,7 @@ from geometry.se3 import Array
 
 # Sums of signed areas leave pixels that are wholly inside or outside within some 1e-12 of 1 or 0.
 _ROUNDING = 1e-9
+_NO_AREA = shapely.Polygon()
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +111,6 @@ def _split_at_integers(start: Array, end: Array, axis: int) -> tuple[Array, Arra
     stops = np.where((index == pieces[edge] - 1)[:, None], end[edge], start[edge] + share * (end - start)[edge])
     starts = np.where((index == 0)[:, None], start[edge], np.roll(stops, 1, axis=0))
     return starts, stops
-
-
-_NO_AREA = shapely.Polygon()
 
 
 def paint(

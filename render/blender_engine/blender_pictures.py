@@ -44,47 +44,6 @@ shader real_eye(output point position = 0.0, output vector direction = 0.0, outp
     direction = normalize(vector(right, -down, forward));
 }}
 """
-
-
-def set_distorted_eye(camera: Any, window: ImageWindow, eye: DistortedEye, folder: Path) -> None:
-    """Make a Blender camera render a window of the image of an eye with a lens."""
-    camera.type, camera.custom_mode = "CUSTOM", "INTERNAL"
-    bytecode = _compiled(_shader_source(window, eye), folder)
-    digest = hashlib.md5(bytecode.encode(), usedforsecurity=False).hexdigest()
-    if camera.custom_bytecode_hash != digest:
-        camera.custom_bytecode, camera.custom_bytecode_hash = bytecode, digest
-
-
-def _shader_source(window: ImageWindow, eye: DistortedEye) -> str:
-    numbers = {
-        "left": window.left_px,
-        "top": window.top_px,
-        "width": window.width_px,
-        "height": window.height_px,
-        **dict(zip(("fx", "fy"), eye.focal_px, strict=True)),
-        **dict(zip(("cx", "cy"), window.center_px, strict=True)),
-        **dict(zip(("k1", "k2", "p1", "p2", "k3"), eye.distortion, strict=True)),
-        **{f"r{index}": value for index, value in enumerate(eye.ideal_from_real)},
-    }
-    return _SHADER.format(**{name: f"({float(value)!r})" for name, value in numbers.items()})
-
-
-@lru_cache(maxsize=64)
-def _compiled(source: str, folder: Path) -> str:
-    """Bytecode of the lens shader.
-
-    Raises:
-        RuntimeError: this Blender cannot compile it.
-    """
-    # Part of `bpy`; importable once `bpy` is loaded.
-    cycles: Any = importlib.import_module("_cycles")
-    text, result = folder / "real_eye.osl", folder / "real_eye.oso"
-    text.write_text(source, encoding="ascii")
-    if not cycles.osl_compile(str(text), str(result)):
-        raise RuntimeError("this Blender was built without Open Shading Language, which real lenses need")
-    return result.read_text(encoding="ascii")
-
-
 # Only the ratio of focal length to sensor width counts. Blender limits the sensor width, not the focal length.
 _SENSOR_WIDTH_MM = 36.0
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5
@@ -173,3 +132,42 @@ def _set_sampling(scene: Any, request: PictureRequest) -> None:
         cycles.pixel_filter_type = "BOX"
     else:
         cycles.pixel_filter_type, cycles.filter_width = "GAUSSIAN", _NARROWEST_FILTER_PX
+
+
+def set_distorted_eye(camera: Any, window: ImageWindow, eye: DistortedEye, folder: Path) -> None:
+    """Make a Blender camera render a window of the image of an eye with a lens."""
+    camera.type, camera.custom_mode = "CUSTOM", "INTERNAL"
+    bytecode = _compiled(_shader_source(window, eye), folder)
+    digest = hashlib.md5(bytecode.encode(), usedforsecurity=False).hexdigest()
+    if camera.custom_bytecode_hash != digest:
+        camera.custom_bytecode, camera.custom_bytecode_hash = bytecode, digest
+
+
+def _shader_source(window: ImageWindow, eye: DistortedEye) -> str:
+    numbers = {
+        "left": window.left_px,
+        "top": window.top_px,
+        "width": window.width_px,
+        "height": window.height_px,
+        **dict(zip(("fx", "fy"), eye.focal_px, strict=True)),
+        **dict(zip(("cx", "cy"), window.center_px, strict=True)),
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), eye.distortion, strict=True)),
+        **{f"r{index}": value for index, value in enumerate(eye.ideal_from_real)},
+    }
+    return _SHADER.format(**{name: f"({float(value)!r})" for name, value in numbers.items()})
+
+
+@lru_cache(maxsize=64)
+def _compiled(source: str, folder: Path) -> str:
+    """Bytecode of the lens shader.
+
+    Raises:
+        RuntimeError: this Blender cannot compile it.
+    """
+    # Part of `bpy`; importable once `bpy` is loaded.
+    cycles: Any = importlib.import_module("_cycles")
+    text, result = folder / "real_eye.osl", folder / "real_eye.oso"
+    text.write_text(source, encoding="ascii")
+    if not cycles.osl_compile(str(text), str(result)):
+        raise RuntimeError("this Blender was built without Open Shading Language, which real lenses need")
+    return result.read_text(encoding="ascii")

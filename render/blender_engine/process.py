@@ -22,6 +22,8 @@ from render.blender_engine.messages import NORMAL_PASS, FrameSetup, ImageWindow,
 
 _MEMORY_FOLDER = Path("/dev/shm")
 _GRACE_S = 5.0
+# Blender gives rays that miss a depth of 1e10.
+_NOTHING_M = 1e9
 
 
 class BlenderEndedError(RuntimeError):
@@ -130,10 +132,6 @@ def _end(process: subprocess.Popen[bytes], folder: Path) -> None:
         process.kill()
         process.wait()
     shutil.rmtree(folder, ignore_errors=True)
-
-
-# Blender gives rays that miss a depth of 1e10.
-_NOTHING_M = 1e9
 
 
 @dataclass(frozen=True, eq=False)

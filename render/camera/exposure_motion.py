@@ -11,6 +11,11 @@ from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import Eye, StereoRig
 
+NEAREST_M = 0.05
+"""If a corner is nearer than this, its projection is useless and the window is the whole image. [m]"""
+# Margin beyond the corners, for rounding and for the pixel that holds them.
+_MARGIN_PX = 2
+
 
 def pose_polynomial(frame: FrameSpec, eye: Eye) -> NDArray[np.float64]:
     """Pose of an eye in the stage's axes (`FrameSpec.left_from_stage_at`) over the exposure.
@@ -39,12 +44,6 @@ def motion_blur_px(frame: FrameSpec) -> float:
         places_m = np.array([obstacle.left_from_object.translation_m for obstacle in frame.bystanders])
     seen = [frame.rig.camera.project(frame.left_from_stage_at(s).apply(places_m)) for s in (-half_s, 0.0, half_s)]
     return float(max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[2] - seen[1]).max()))
-
-
-NEAREST_M = 0.05
-"""If a corner is nearer than this, its projection is useless and the window is the whole image. [m]"""
-# Margin beyond the corners, for rounding and for the pixel that holds them.
-_MARGIN_PX = 2
 
 
 def image_window(

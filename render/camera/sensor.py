@@ -28,8 +28,107 @@ from render.engine import StereoRadiance
 # A Poisson variate of this mean has skewness 0.14 and its quantiles are within 0.2 electrons of a normal one's.
 _POISSON_BELOW_E = 50.0
 _QUANTILE_BITS = 16
-
 _Loop = TypeVar("_Loop", bound=Callable[..., Any])
+# Response of bare silicon behind a daylight scene to the three bands of Rec. 709 (our assumption).
+MONO_WEIGHTS = np.array([[0.36, 0.37, 0.27]], dtype=np.float32)
+# Sites of the RGGB mosaic: channel, first row, first column.
+_MOSAIC_SITES = ((0, 0, 0), (1, 0, 1), (1, 1, 0), (2, 1, 1))
+
+
+def dn_per_electron(sensor: Sensor, gain: float) -> float:
+    """Digital numbers per electron; at gain 1 a full well gives the highest number. [DN/e-]"""
+    return float(gain * (2**sensor.adc_bits - 1 - sensor.black_level_dn) / sensor.full_well_e)
+
+
+def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
+    """The stereo pair of images that the sensors deliver.
+
+    Args:
+        frame: gives sensor, exposure and the keys of the random streams.
+        radiance: of both eyes.
+    """
+    sensor = frame.sensor
+    images: dict[Eye, Pixels] = {}
+    mosaics: dict[Eye, Pixels | None] = {}
+    readout = SensorReadout(
+        electrons_per_cd_m2=sensor.electrons_per_cd_m2(frame.exposure),
+        read_noise_e=sensor.read_noise_e,
+        full_well_e=sensor.full_well_e,
+        dn_per_e=dn_per_electron(sensor, frame.exposure.gain),
+        black_level_dn=sensor.black_level_dn,
+        adc_bits=sensor.adc_bits,
+    )
+    for index, eye in enumerate(EYES):
+        seen = light_on_sensor(frame, radiance.left if eye == "left" else radiance.right, eye)
+        light = _sample_sites(seen, sensor)
+        gains = _pixel_gains(frame.seed, index, light.shape, sensor.prnu_fraction)
+        rng = bulk_frame_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
+        numbers = readout.digital_numbers(light, gains, rng)
+        mosaics[eye] = _store(numbers, sensor, "linear") if sensor.color == "bayer" else None
+        if sensor.color == "bayer":
+            numbers = cv2.cvtColor(numbers, cv2.COLOR_BayerRGGB2RGB)
+        images[eye] = _store(numbers, sensor, sensor.encoding)
+    black_level = _store(np.array([[sensor.black_level_dn]], dtype=np.uint16), sensor, sensor.encoding)
+    return StereoImages(
+        left=images["left"],
+        right=images["right"],
+        time_s=frame.time_s,
+        exposure_s=frame.exposure.time_s,
+        bits=sensor.output_bits,
+        encoding=sensor.encoding,
+        black_level_dn=float(black_level[0, 0]),
+        left_mosaic=mosaics["left"],
+        right_mosaic=mosaics["right"],
+    )
+
+
+def _sample_sites(seen: NDArray[np.float32], sensor: Sensor) -> NDArray[np.float32]:
+    """Light on each site of the sensor: (H, W, 3), or (H, W) for a mosaic or a monochrome sensor."""
+    if sensor.color == "rgb":
+        return seen
+    if sensor.color == "mono":
+        mono: NDArray[np.float32] = cv2.transform(seen, MONO_WEIGHTS)
+        return mono
+    mosaic = np.empty(seen.shape[:2], dtype=np.float32)
+    for channel, row, column in _MOSAIC_SITES:
+        mosaic[row::2, column::2] = seen[row::2, column::2, channel]
+    return mosaic
+
+
+@lru_cache(maxsize=2)
+def _pixel_gains(seed: int, eye_index: int, shape: tuple[int, ...], spread: float) -> NDArray[np.float32]:
+    """Fixed gain of every site of one sensor, mean 1."""
+    rng = bulk_frame_generator(seed, eye_index, "pixel gains")
+    gains = rng.standard_normal(shape, dtype=np.float32)
+    gains *= np.float32(spread)
+    gains += np.float32(1.0)
+    return gains
+
+
+def _store(numbers: NDArray[np.uint16], sensor: Sensor, encoding: str) -> Pixels:
+    """Digital numbers as stored: linear or on the sRGB curve, in `output_bits`."""
+    if encoding == "linear":
+        if sensor.output_bits == sensor.adc_bits:
+            return numbers
+        # Scales, rounds half to even and clips in one pass; a lookup table takes three times as long.
+        scaled: Pixels = cv2.convertScaleAbs(numbers, alpha=2**sensor.output_bits / 2**sensor.adc_bits)
+        return scaled
+    table = _gamma_table(sensor.adc_bits, sensor.output_bits, sensor.black_level_dn)
+    stored: Pixels = table[numbers]
+    return stored
+
+
+@lru_cache(maxsize=8)
+def _gamma_table(adc_bits: int, output_bits: int, black_level_dn: int) -> Pixels:
+    """Stored number for every digital number, on the sRGB curve.
+
+    Source of the curve: IEC 61966-2-1 (sRGB), on the signal above the black level.
+    """
+    numbers = np.arange(2**adc_bits, dtype=np.float64)
+    signal = np.clip((numbers - black_level_dn) / (2**adc_bits - 1 - black_level_dn), 0.0, 1.0)
+    curve = np.where(signal <= 0.0031308, 12.92 * signal, 1.055 * signal ** (1 / 2.4) - 0.055)
+    table: Pixels = np.rint(curve * (2**output_bits - 1)).astype(np.uint8 if output_bits == 8 else np.uint16)
+    return table
 
 
 @dataclass(frozen=True)
@@ -133,105 +232,3 @@ def _convert_all(
         number = min(signal_e * dn_per_e, full_dn) + offset_dn
         numbers[site] = np.uint16(min(max(number, dark), top_dn))
     return least_e
-
-
-# Response of bare silicon behind a daylight scene to the three bands of Rec. 709 (our assumption).
-MONO_WEIGHTS = np.array([[0.36, 0.37, 0.27]], dtype=np.float32)
-# Sites of the RGGB mosaic: channel, first row, first column.
-_MOSAIC_SITES = ((0, 0, 0), (1, 0, 1), (1, 1, 0), (2, 1, 1))
-
-
-def dn_per_electron(sensor: Sensor, gain: float) -> float:
-    """Digital numbers per electron; at gain 1 a full well gives the highest number. [DN/e-]"""
-    return float(gain * (2**sensor.adc_bits - 1 - sensor.black_level_dn) / sensor.full_well_e)
-
-
-def expose(frame: FrameSpec, radiance: StereoRadiance) -> StereoImages:
-    """The stereo pair of images that the sensors deliver.
-
-    Args:
-        frame: gives sensor, exposure and the keys of the random streams.
-        radiance: of both eyes.
-    """
-    sensor = frame.sensor
-    images: dict[Eye, Pixels] = {}
-    mosaics: dict[Eye, Pixels | None] = {}
-    readout = SensorReadout(
-        electrons_per_cd_m2=sensor.electrons_per_cd_m2(frame.exposure),
-        read_noise_e=sensor.read_noise_e,
-        full_well_e=sensor.full_well_e,
-        dn_per_e=dn_per_electron(sensor, frame.exposure.gain),
-        black_level_dn=sensor.black_level_dn,
-        adc_bits=sensor.adc_bits,
-    )
-    for index, eye in enumerate(EYES):
-        seen = light_on_sensor(frame, radiance.left if eye == "left" else radiance.right, eye)
-        light = _sample_sites(seen, sensor)
-        gains = _pixel_gains(frame.seed, index, light.shape, sensor.prnu_fraction)
-        rng = bulk_frame_generator(frame.seed, frame.frame_index, f"sensor noise {eye}")
-        numbers = readout.digital_numbers(light, gains, rng)
-        mosaics[eye] = _store(numbers, sensor, "linear") if sensor.color == "bayer" else None
-        if sensor.color == "bayer":
-            numbers = cv2.cvtColor(numbers, cv2.COLOR_BayerRGGB2RGB)
-        images[eye] = _store(numbers, sensor, sensor.encoding)
-    black_level = _store(np.array([[sensor.black_level_dn]], dtype=np.uint16), sensor, sensor.encoding)
-    return StereoImages(
-        left=images["left"],
-        right=images["right"],
-        time_s=frame.time_s,
-        exposure_s=frame.exposure.time_s,
-        bits=sensor.output_bits,
-        encoding=sensor.encoding,
-        black_level_dn=float(black_level[0, 0]),
-        left_mosaic=mosaics["left"],
-        right_mosaic=mosaics["right"],
-    )
-
-
-def _sample_sites(seen: NDArray[np.float32], sensor: Sensor) -> NDArray[np.float32]:
-    """Light on each site of the sensor: (H, W, 3), or (H, W) for a mosaic or a monochrome sensor."""
-    if sensor.color == "rgb":
-        return seen
-    if sensor.color == "mono":
-        mono: NDArray[np.float32] = cv2.transform(seen, MONO_WEIGHTS)
-        return mono
-    mosaic = np.empty(seen.shape[:2], dtype=np.float32)
-    for channel, row, column in _MOSAIC_SITES:
-        mosaic[row::2, column::2] = seen[row::2, column::2, channel]
-    return mosaic
-
-
-@lru_cache(maxsize=2)
-def _pixel_gains(seed: int, eye_index: int, shape: tuple[int, ...], spread: float) -> NDArray[np.float32]:
-    """Fixed gain of every site of one sensor, mean 1."""
-    rng = bulk_frame_generator(seed, eye_index, "pixel gains")
-    gains = rng.standard_normal(shape, dtype=np.float32)
-    gains *= np.float32(spread)
-    gains += np.float32(1.0)
-    return gains
-
-
-def _store(numbers: NDArray[np.uint16], sensor: Sensor, encoding: str) -> Pixels:
-    """Digital numbers as stored: linear or on the sRGB curve, in `output_bits`."""
-    if encoding == "linear":
-        if sensor.output_bits == sensor.adc_bits:
-            return numbers
-        # Scales, rounds half to even and clips in one pass; a lookup table takes three times as long.
-        scaled: Pixels = cv2.convertScaleAbs(numbers, alpha=2**sensor.output_bits / 2**sensor.adc_bits)
-        return scaled
-    table = _gamma_table(sensor.adc_bits, sensor.output_bits, sensor.black_level_dn)
-    stored: Pixels = table[numbers]
-    return stored
-
-
-@lru_cache(maxsize=8)
-def _gamma_table(adc_bits: int, output_bits: int, black_level_dn: int) -> Pixels:
-    """Stored number for every digital number, on the sRGB curve.
-
-    Source of the curve: IEC 61966-2-1 (sRGB), on the signal above the black level.
-    """
-    numbers = np.arange(2**adc_bits, dtype=np.float64)
-    signal = np.clip((numbers - black_level_dn) / (2**adc_bits - 1 - black_level_dn), 0.0, 1.0)
-    curve = np.where(signal <= 0.0031308, 12.92 * signal, 1.055 * signal ** (1 / 2.4) - 0.055)
-    table: Pixels = np.rint(curve * (2**output_bits - 1)).astype(np.uint8 if output_bits == 8 else np.uint16)
-    return table

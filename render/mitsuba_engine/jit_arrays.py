@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 # The widest vector register; kernels read at most one register past the end.
 _REGISTER_BYTES = 64
+# Eight cached scenes hold up to 40 shapes each, and the features of their drogues again.
+_RESERVED_NUMBERS = 1024
 
 
 def jit_array(kind: Any, values: ArrayLike) -> Any:
@@ -42,10 +44,6 @@ def _aligned_copy(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     copied: NDArray[Any] = memory[first : first + used].view(dtype)
     copied[:] = values
     return copied
-
-
-# Eight cached scenes hold up to 40 shapes each, and the features of their drogues again.
-_RESERVED_NUMBERS = 1024
 
 
 def reserve_registry() -> Any:

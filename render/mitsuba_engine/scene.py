@@ -39,96 +39,9 @@ from render.surfaces import (
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import Radiance
 
-
-def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any]) -> Any:
-    """A Mitsuba shape from a mesh; `look` holds its material, and its emitter if it is a lamp."""
-    path = folder / f"{part}.ply"
-    mesh.export(path)
-    shape = {"type": "ply", "filename": str(path), "face_normals": part not in SMOOTH_PARTS, **look}
-    return mi.load_dict(shape)
-
-
-def _matt_material(reflectance_rgb: NDArray[np.float64]) -> dict[str, Any]:
-    return {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance_rgb.tolist()}}}
-
-
-def _with_sheen(look: dict[str, Any], satin: SatinPaint | None) -> dict[str, Any]:
-    """The same look, its material mixed with specular microfacets if the part has satin paint."""
-    if satin is None:
-        return look
-    facets = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": satin.roughness}
-    mixed = {"type": "blendbsdf", "weight": satin.sheen_fraction, "paint": look["bsdf"], "facets": facets}
-    return look | {"bsdf": mixed}
-
-
-def _mapped_material() -> dict[str, Any]:
-    """A matt material with a reflectance map, which every frame replaces."""
-    bitmap = mi.Bitmap(np.zeros((DIRT_MAP_PX, DIRT_MAP_PX, 3), dtype=np.float32))
-    texture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
-    return {"bsdf": {"type": "diffuse", "reflectance": texture}}
-
-
-def _lamp(frame: FrameSpec, part: int) -> dict[str, Any]:
-    assert frame.drogue is not None
-    if part < FIRST_MARKER_ID or frame.drogue.marker_luminance_cd_m2 == 0:
-        return {}
-    radiance = lamp_radiance_rgb(frame, part).tolist()
-    return {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}}
-
-
-def _with_texture_coordinates(mesh: trimesh.Trimesh, center_m: tuple[float, float], radius_m: float) -> trimesh.Trimesh:
-    """The mesh with texture coordinates that map the square around a disc to the unit square."""
-    places = (np.asarray(mesh.vertices)[:, :2] - np.asarray(center_m)) / (2 * radius_m) + 0.5
-    mesh.vertex_attributes["s"] = places[:, 0].astype(np.float32)
-    mesh.vertex_attributes["t"] = places[:, 1].astype(np.float32)
-    return mesh
-
-
-def front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The front of a flat feature; its side walls are sunk in the part around it."""
-    return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
-
-
-def drogue_shapes(frame: FrameSpec, meshes: dict[int, trimesh.Trimesh]) -> dict[str, Any]:
-    """Mitsuba shapes of the drogue's parts by name; dirty parts have reflectance maps."""
-    assert frame.drogue is not None
-    shapes: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        for part, mesh in meshes.items():
-            look = _with_sheen(_matt_material(clean_reflectance_rgb(frame, part)), part_satin(frame.drogue, part))
-            if not surface_condition(frame, part).is_clean:
-                is_hub = part == Part.HUB
-                assert not is_hub or frame.drogue.hub is not None
-                center_m = (0.0, 0.0) if is_hub else frame.drogue.marker_positions_m[part - FIRST_MARKER_ID]
-                radius_m = frame.drogue.hub.outer_radius_m if is_hub else frame.drogue.marker_radius_m  # type: ignore[union-attr]
-                mesh, look = _with_texture_coordinates(mesh, center_m, radius_m), _mapped_material()
-            shapes[f"part_{part}"] = _shape(mesh, part, Path(folder), look | _lamp(frame, part))
-            shapes[f"part_{part}"].set_id(f"part_{part}")
-    return shapes
-
-
-def obstacle_shapes(frame: FrameSpec) -> dict[str, Any]:
-    """Mitsuba shapes of the other objects, in their own frames until a frame moves them."""
-    shapes: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        for index, obstacle in enumerate(frame.bystanders):
-            part = int(Part[obstacle.kind.upper()])
-            name = obstacle_name(index, part)
-            look = _matt_material(np.array(obstacle.reflectance_rgb))
-            shapes[name] = _shape(with_creases(obstacle_mesh(obstacle.shape)), part, Path(folder), look)
-            shapes[name].set_id(name)
-    return shapes
-
-
-def obstacle_name(index: int, part: int) -> str:
-    """Name of the shape of one of a frame's other objects."""
-    return f"part_{part}_{index}"
-
-
 # Scenes that an engine caches; the least recently used one is dropped first.
 KEPT_SCENES = 8
 _OBSTACLE_PARTS = (Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
-
 # Mitsuba's map has +y up; its first column looks along -z and the next ones turn towards +x. Our map starts in the east
 # (+x) and turns towards north (+y), the other way round: so the columns are reversed and the axes exchanged.
 _MAP_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
@@ -332,3 +245,88 @@ class SceneCache:
             self._scenes.popitem(last=False)
         scene.set_frame(frame, ambient)
         return scene
+
+
+def _shape(mesh: trimesh.Trimesh, part: int, folder: Path, look: dict[str, Any]) -> Any:
+    """A Mitsuba shape from a mesh; `look` holds its material, and its emitter if it is a lamp."""
+    path = folder / f"{part}.ply"
+    mesh.export(path)
+    shape = {"type": "ply", "filename": str(path), "face_normals": part not in SMOOTH_PARTS, **look}
+    return mi.load_dict(shape)
+
+
+def _matt_material(reflectance_rgb: NDArray[np.float64]) -> dict[str, Any]:
+    return {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance_rgb.tolist()}}}
+
+
+def _with_sheen(look: dict[str, Any], satin: SatinPaint | None) -> dict[str, Any]:
+    """The same look, its material mixed with specular microfacets if the part has satin paint."""
+    if satin is None:
+        return look
+    facets = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": satin.roughness}
+    mixed = {"type": "blendbsdf", "weight": satin.sheen_fraction, "paint": look["bsdf"], "facets": facets}
+    return look | {"bsdf": mixed}
+
+
+def _mapped_material() -> dict[str, Any]:
+    """A matt material with a reflectance map, which every frame replaces."""
+    bitmap = mi.Bitmap(np.zeros((DIRT_MAP_PX, DIRT_MAP_PX, 3), dtype=np.float32))
+    texture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
+    return {"bsdf": {"type": "diffuse", "reflectance": texture}}
+
+
+def _lamp(frame: FrameSpec, part: int) -> dict[str, Any]:
+    assert frame.drogue is not None
+    if part < FIRST_MARKER_ID or frame.drogue.marker_luminance_cd_m2 == 0:
+        return {}
+    radiance = lamp_radiance_rgb(frame, part).tolist()
+    return {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}}
+
+
+def _with_texture_coordinates(mesh: trimesh.Trimesh, center_m: tuple[float, float], radius_m: float) -> trimesh.Trimesh:
+    """The mesh with texture coordinates that map the square around a disc to the unit square."""
+    places = (np.asarray(mesh.vertices)[:, :2] - np.asarray(center_m)) / (2 * radius_m) + 0.5
+    mesh.vertex_attributes["s"] = places[:, 0].astype(np.float32)
+    mesh.vertex_attributes["t"] = places[:, 1].astype(np.float32)
+    return mesh
+
+
+def front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The front of a flat feature; its side walls are sunk in the part around it."""
+    return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
+
+
+def drogue_shapes(frame: FrameSpec, meshes: dict[int, trimesh.Trimesh]) -> dict[str, Any]:
+    """Mitsuba shapes of the drogue's parts by name; dirty parts have reflectance maps."""
+    assert frame.drogue is not None
+    shapes: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        for part, mesh in meshes.items():
+            look = _with_sheen(_matt_material(clean_reflectance_rgb(frame, part)), part_satin(frame.drogue, part))
+            if not surface_condition(frame, part).is_clean:
+                is_hub = part == Part.HUB
+                assert not is_hub or frame.drogue.hub is not None
+                center_m = (0.0, 0.0) if is_hub else frame.drogue.marker_positions_m[part - FIRST_MARKER_ID]
+                radius_m = frame.drogue.hub.outer_radius_m if is_hub else frame.drogue.marker_radius_m  # type: ignore[union-attr]
+                mesh, look = _with_texture_coordinates(mesh, center_m, radius_m), _mapped_material()
+            shapes[f"part_{part}"] = _shape(mesh, part, Path(folder), look | _lamp(frame, part))
+            shapes[f"part_{part}"].set_id(f"part_{part}")
+    return shapes
+
+
+def obstacle_shapes(frame: FrameSpec) -> dict[str, Any]:
+    """Mitsuba shapes of the other objects, in their own frames until a frame moves them."""
+    shapes: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        for index, obstacle in enumerate(frame.bystanders):
+            part = int(Part[obstacle.kind.upper()])
+            name = obstacle_name(index, part)
+            look = _matt_material(np.array(obstacle.reflectance_rgb))
+            shapes[name] = _shape(with_creases(obstacle_mesh(obstacle.shape)), part, Path(folder), look)
+            shapes[name].set_id(name)
+    return shapes
+
+
+def obstacle_name(index: int, part: int) -> str:
+    """Name of the shape of one of a frame's other objects."""
+    return f"part_{part}_{index}"

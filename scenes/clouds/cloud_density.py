@@ -17,70 +17,9 @@ _SIZE_PX = 1024
 _LARGEST_PER_REPEAT = 8
 # Finer copies of the same texture add its missing small scales: (scale, weight); the scales have no common factor.
 _OCTAVE_GROUPS = ((1.0, 1.0), (6.13, 0.30), (37.7, 0.10))
-
-
 # A texture with a larger slope has no detail in the finest texels: half as many suffice, and fit the processor's cache.
 _SMOOTH_SLOPE = 2.5
-
-
-@lru_cache(maxsize=24)
-def _tile(seed: int, slope: float) -> NDArray[np.float32]:
-    """(1024, 1024) periodic Gaussian texture of unit variance whose spectrum falls with `slope` above its peak."""
-    rng = frame_generator(seed, 0, "texture")
-    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(_SIZE_PX), np.fft.rfftfreq(_SIZE_PX), indexing="ij")) * _SIZE_PX
-    amplitude = np.where(frequency > 0, (frequency**2 + _LARGEST_PER_REPEAT**2) ** (-slope / 2), 0.0)
-    noise = np.fft.rfft2(rng.standard_normal((_SIZE_PX, _SIZE_PX)))
-    tile = np.fft.irfft2(noise * amplitude, s=(_SIZE_PX, _SIZE_PX))
-    result: NDArray[np.float32] = (tile / tile.std()).astype(np.float32)
-    return result
-
-
-@lru_cache(maxsize=24)
-def _half_tile(seed: int, slope: float) -> NDArray[np.float32]:
-    """(512, 512) every second texel of a smooth tile."""
-    return np.ascontiguousarray(_tile(seed, slope)[::2, ::2])
-
-
-def sample_tile(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Like `sample_texture`, without the finer copies: smooth below a hundredth of the largest blobs, and faster."""
-    tile = _half_tile(seed, slope) if slope > _SMOOTH_SLOPE else _tile(seed, slope)
-    texels, size = np.float32(len(tile) / _LARGEST_PER_REPEAT), np.float32(len(tile))
-    u, v = x * texels, y * texels
-    u -= np.floor(u / size) * size
-    v -= np.floor(v / size) * size
-    result: NDArray[np.float32] = cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-    return result
-
-
-def sample_texture(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Texture values of zero mean and unit variance.
-
-    Args:
-        seed: of the texture.
-        slope: of its amplitude spectrum; a larger slope is smoother.
-        x, y: (H, W) coordinates in units of the largest blobs.
-
-    Returns:
-        (H, W) values.
-    """
-    if x.size == 0:
-        return np.zeros(x.shape, dtype=np.float32)
-    tile = _tile(seed, slope)
-    total = np.zeros(x.shape, dtype=np.float32)
-    norm = 0.0
-    for scale, weight in _OCTAVE_GROUPS:
-        texels = np.float32(scale * _SIZE_PX / _LARGEST_PER_REPEAT)
-        # remap wraps only by its border mode and holds 16-bit coordinates: reduce to one repeat first.
-        u, v = x * texels, y * texels
-        u -= np.floor(u / np.float32(_SIZE_PX)) * np.float32(_SIZE_PX)
-        v -= np.floor(v / np.float32(_SIZE_PX)) * np.float32(_SIZE_PX)
-        total += np.float32(weight) * cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-        norm += weight**2
-    return total / np.float32(np.sqrt(norm))
-
-
 _Field = NDArray[np.float32]
-
 # Slopes of the amplitude spectra: bodies of cloud, the heaps on them, streaks of ice.
 _BODY_SLOPE, _HEAP_SLOPE, _KNOB_SLOPE, _STREAK_SLOPE = 3.0, 2.8, 2.0, 1.5
 # Heaps per body, along and across; two patterns are sheared against each other with height.
@@ -242,3 +181,59 @@ class CloudDensity:
         amount = np.clip(patches * np.float32(0.6) + np.float32(0.3), 0.0, 1.0)
         depth: _Field = np.float32(layer.optical_depth) * amount * np.clip(0.45 + 0.55 * streaks, 0.0, 1.6)
         return depth
+
+
+@lru_cache(maxsize=24)
+def _tile(seed: int, slope: float) -> NDArray[np.float32]:
+    """(1024, 1024) periodic Gaussian texture of unit variance whose spectrum falls with `slope` above its peak."""
+    rng = frame_generator(seed, 0, "texture")
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(_SIZE_PX), np.fft.rfftfreq(_SIZE_PX), indexing="ij")) * _SIZE_PX
+    amplitude = np.where(frequency > 0, (frequency**2 + _LARGEST_PER_REPEAT**2) ** (-slope / 2), 0.0)
+    noise = np.fft.rfft2(rng.standard_normal((_SIZE_PX, _SIZE_PX)))
+    tile = np.fft.irfft2(noise * amplitude, s=(_SIZE_PX, _SIZE_PX))
+    result: NDArray[np.float32] = (tile / tile.std()).astype(np.float32)
+    return result
+
+
+@lru_cache(maxsize=24)
+def _half_tile(seed: int, slope: float) -> NDArray[np.float32]:
+    """(512, 512) every second texel of a smooth tile."""
+    return np.ascontiguousarray(_tile(seed, slope)[::2, ::2])
+
+
+def sample_tile(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Like `sample_texture`, without the finer copies: smooth below a hundredth of the largest blobs, and faster."""
+    tile = _half_tile(seed, slope) if slope > _SMOOTH_SLOPE else _tile(seed, slope)
+    texels, size = np.float32(len(tile) / _LARGEST_PER_REPEAT), np.float32(len(tile))
+    u, v = x * texels, y * texels
+    u -= np.floor(u / size) * size
+    v -= np.floor(v / size) * size
+    result: NDArray[np.float32] = cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return result
+
+
+def sample_texture(seed: int, slope: float, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Texture values of zero mean and unit variance.
+
+    Args:
+        seed: of the texture.
+        slope: of its amplitude spectrum; a larger slope is smoother.
+        x, y: (H, W) coordinates in units of the largest blobs.
+
+    Returns:
+        (H, W) values.
+    """
+    if x.size == 0:
+        return np.zeros(x.shape, dtype=np.float32)
+    tile = _tile(seed, slope)
+    total = np.zeros(x.shape, dtype=np.float32)
+    norm = 0.0
+    for scale, weight in _OCTAVE_GROUPS:
+        texels = np.float32(scale * _SIZE_PX / _LARGEST_PER_REPEAT)
+        # remap wraps only by its border mode and holds 16-bit coordinates: reduce to one repeat first.
+        u, v = x * texels, y * texels
+        u -= np.floor(u / np.float32(_SIZE_PX)) * np.float32(_SIZE_PX)
+        v -= np.floor(v / np.float32(_SIZE_PX)) * np.float32(_SIZE_PX)
+        total += np.float32(weight) * cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        norm += weight**2
+    return total / np.float32(np.sqrt(norm))

@@ -11,6 +11,17 @@ from datasets_manifest.types.frame import DropoutKind
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, RigidTransform
 
+HOSE_NODES = 17
+# Position of the drogue behind and below the pod: equilibrium of a 15 m hose at 120 m/s in a lumped-mass model.
+_TRAIL_AFT_M, _TRAIL_BELOW_M = 14.2, 4.9
+_LATERAL_SPREAD_M = 0.6
+# The hose leaves the pod nearly level and steepens towards the drogue.
+_SLOPE_AT_POD = 0.2
+# Length of hose inside the coupling's tail, so that no gap shows.
+HOSE_OVERLAP_M = 0.02
+# World axes of a tanker that flies east: aft, right wing, up.
+WORLD_FROM_TANKER = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+
 
 @dataclass(frozen=True, eq=False)
 class FrameKinematics:
@@ -41,18 +52,6 @@ class FrameKinematics:
     loss: DropoutKind | None = None
     obstacle: Obstacle | None = None
     sun_deg: tuple[float, float] | None = None
-
-
-HOSE_NODES = 17
-# Position of the drogue behind and below the pod: equilibrium of a 15 m hose at 120 m/s in a lumped-mass model.
-_TRAIL_AFT_M, _TRAIL_BELOW_M = 14.2, 4.9
-_LATERAL_SPREAD_M = 0.6
-# The hose leaves the pod nearly level and steepens towards the drogue.
-_SLOPE_AT_POD = 0.2
-# Length of hose inside the coupling's tail, so that no gap shows.
-HOSE_OVERLAP_M = 0.02
-# World axes of a tanker that flies east: aft, right wing, up.
-WORLD_FROM_TANKER = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def sample_suspension(

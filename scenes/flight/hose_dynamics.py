@@ -26,6 +26,13 @@ from geometry.se3 import Array, angles_from_axis, rotation_from_angles
 LINKS = 16
 TIME_STEP_S = 0.002
 GRAVITY_M_S2 = 9.80665  # standard gravity
+# Weight of the relative wind in the drogue's direction; the rest is the last link's. Our reconstruction.
+_WIND_SHARE = 0.7
+_LAG_S = 0.15
+# In slower air than this the drogue's weight counts more than the wind. [m/s]
+_WEAK_WIND_M_S = 1.0
+# Axes of a level camera that looks ahead (right, down, forward) from the tanker's axes (aft, right, up).
+LEVEL_CAMERA_FROM_TANKER = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass
@@ -208,15 +215,6 @@ class HoseModel:
 def _below_the_wind(angle: float) -> Array:
     """Unit vector from a link's upper to its lower end, turned down from the wind's direction by an angle [rad]."""
     return np.array([np.cos(angle), 0.0, -np.sin(angle)])
-
-
-# Weight of the relative wind in the drogue's direction; the rest is the last link's. Our reconstruction.
-_WIND_SHARE = 0.7
-_LAG_S = 0.15
-# In slower air than this the drogue's weight counts more than the wind. [m/s]
-_WEAK_WIND_M_S = 1.0
-# Axes of a level camera that looks ahead (right, down, forward) from the tanker's axes (aft, right, up).
-LEVEL_CAMERA_FROM_TANKER = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 
 
 def mouth_directions(past_m_s: Array, last_link: Array, period_s: float) -> Array:

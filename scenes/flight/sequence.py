@@ -33,45 +33,6 @@ from scenes.flight.trajectory import SETTLING_S, SimulationInputs, Trajectory, s
 from scenes.framing import outline_points_m
 
 _SINES = 8
-
-
-@dataclass(frozen=True)
-class Oscillation:
-    """Irregular motion as a sum of sines along several axes: known at any time, with its rate, without a time grid.
-
-    Attributes:
-        amplitudes: (A,) of each sine, the same for all of an axis.
-        rates_rad_s: (A, N) angular frequencies. [rad/s]
-        phases_rad: (A, N). [rad]
-    """
-
-    amplitudes: Array
-    rates_rad_s: Array
-    phases_rad: Array
-
-    def at(self, time_s: ArrayLike) -> Array:
-        """(..., A) values at (...) times."""
-        time = np.asarray(time_s, dtype=np.float64)[..., None, None]
-        value: Array = self.amplitudes * np.sin(self.rates_rad_s * time + self.phases_rad).sum(axis=-1)
-        return value
-
-
-def sample_oscillation(rng: np.random.Generator, sd: ArrayLike, low_hz: float, high_hz: float) -> Oscillation:
-    """Draw an oscillation.
-
-    Args:
-        rng: draws phases, and one frequency in each of equal parts of the band.
-        sd: (A,) standard deviation of each axis.
-        low_hz, high_hz: the band. [Hz]
-    """
-    deviations = np.asarray(sd, dtype=np.float64)
-    shape = (len(deviations), _SINES)
-    steps = (np.arange(_SINES) + rng.random(shape)) / _SINES
-    rates = 2 * np.pi * (low_hz + (high_hz - low_hz) * steps)
-    phases = rng.uniform(0.0, 2 * np.pi, shape)
-    return Oscillation(amplitudes=deviations * np.sqrt(2.0 / _SINES), rates_rad_s=rates, phases_rad=phases)
-
-
 # Pause between the last pair of a sequence and the first of the next, so that no tracker takes them for neighbours.
 _PAUSE_S = 10.0
 # Frequency bands of the motion of tanker and receiver; our choice. [Hz]
@@ -299,3 +260,40 @@ def _twist(pose_at: Callable[[float], RigidTransform], time_s: float) -> Array:
     step = pose_at(time_s - _HALF_DIFFERENCE_S).inverse() @ pose_at(time_s + _HALF_DIFFERENCE_S)
     rate: Array = log_twist(step) / (2 * _HALF_DIFFERENCE_S)
     return rate
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """Irregular motion as a sum of sines along several axes: known at any time, with its rate, without a time grid.
+
+    Attributes:
+        amplitudes: (A,) of each sine, the same for all of an axis.
+        rates_rad_s: (A, N) angular frequencies. [rad/s]
+        phases_rad: (A, N). [rad]
+    """
+
+    amplitudes: Array
+    rates_rad_s: Array
+    phases_rad: Array
+
+    def at(self, time_s: ArrayLike) -> Array:
+        """(..., A) values at (...) times."""
+        time = np.asarray(time_s, dtype=np.float64)[..., None, None]
+        value: Array = self.amplitudes * np.sin(self.rates_rad_s * time + self.phases_rad).sum(axis=-1)
+        return value
+
+
+def sample_oscillation(rng: np.random.Generator, sd: ArrayLike, low_hz: float, high_hz: float) -> Oscillation:
+    """Draw an oscillation.
+
+    Args:
+        rng: draws phases, and one frequency in each of equal parts of the band.
+        sd: (A,) standard deviation of each axis.
+        low_hz, high_hz: the band. [Hz]
+    """
+    deviations = np.asarray(sd, dtype=np.float64)
+    shape = (len(deviations), _SINES)
+    steps = (np.arange(_SINES) + rng.random(shape)) / _SINES
+    rates = 2 * np.pi * (low_hz + (high_hz - low_hz) * steps)
+    phases = rng.uniform(0.0, 2 * np.pi, shape)
+    return Oscillation(amplitudes=deviations * np.sqrt(2.0 / _SINES), rates_rad_s=rates, phases_rad=phases)

@@ -29,6 +29,11 @@ _FOAM_REFLECTANCE = 0.35  # fresh and fading foam, Koepke 1984 (doi:10.1364/AO.2
 _FOAM_PATCHES = 0.01  # share of the tile under foam patches
 _TABLE_ROWS, _TABLE_COLUMNS = 20, 36
 _SKY_ROWS, _SKY_COLUMNS = 24, 72
+_HULLS: tuple[ReflectanceRgb, ...] = ((0.38, 0.05, 0.04), (0.22, 0.05, 0.035), (0.05, 0.07, 0.12), (0.10, 0.10, 0.10))
+_HOUSE: ReflectanceRgb = (0.55, 0.55, 0.53)
+_WAKE_REFLECTANCE = 0.22
+_WAKE_LENGTHS = 7.0
+_MOST_SHIPS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,13 +239,6 @@ def _row_of_elevation(elevation_rad: NDArray[np.floating[Any]]) -> NDArray[np.fl
     """Row of an elevation; rows are closer together where the camera looks along the water."""
     result: NDArray[np.floating[Any]] = (_TABLE_ROWS - 1) * (elevation_rad / (np.pi / 2)) ** (2 / 3)
     return result
-
-
-_HULLS: tuple[ReflectanceRgb, ...] = ((0.38, 0.05, 0.04), (0.22, 0.05, 0.035), (0.05, 0.07, 0.12), (0.10, 0.10, 0.10))
-_HOUSE: ReflectanceRgb = (0.55, 0.55, 0.53)
-_WAKE_REFLECTANCE = 0.22
-_WAKE_LENGTHS = 7.0
-_MOST_SHIPS = 4
 
 
 @dataclass(frozen=True)

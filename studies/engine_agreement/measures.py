@@ -29,6 +29,9 @@ _REACH_PX = 2.5
 # Least share of the light of a whole disc; with less, the lamp is hidden, out, or behind thick mist.
 _LEAST_LIGHT = 0.02
 MARKERS = "markers"
+WHITE = (1.0, 1.0, 1.0)
+# Facing the camera, and tilted up, down and sideways.
+TILTS_DEG = ((0.0, 0.0), (35.0, 0.0), (-35.0, 0.0), (0.0, 40.0))
 
 
 @dataclass(frozen=True)
@@ -153,11 +156,6 @@ def _part_sums(both: list[tuple[EyeRadiance, EyeRadiance]]) -> dict[str, tuple[i
             count, one, other = sums.get(name, (0, 0.0, 0.0))
             sums[name] = count + int(same.sum()), one + values[0][same].sum(), other + values[1][same].sum()
     return {name: row for name, row in sums.items() if row[0] >= _FEWEST_PIXELS}
-
-
-WHITE = (1.0, 1.0, 1.0)
-# Facing the camera, and tilted up, down and sideways.
-TILTS_DEG = ((0.0, 0.0), (35.0, 0.0), (-35.0, 0.0), (0.0, 40.0))
 
 
 @dataclass(frozen=True)

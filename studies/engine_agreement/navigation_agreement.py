@@ -21,6 +21,12 @@ from droguekit.benchmark.poses.pose_errors import COMPONENTS, pose_error
 from geometry.se3 import Array
 from nav.runner import navigate
 
+METHOD = "joint"
+RECIPE = "pose-tier-b"
+STATIONS_M = (40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
+# Samples with which the noise of each renderer is small beside that of the sensor, which is the same for both.
+_SAMPLES_AT_5_M, _MOST_SAMPLES = 64, 576
+
 
 @dataclass(frozen=True, eq=False)
 class PairedErrors:
@@ -155,13 +161,6 @@ def _root_mean_square(station: PairedErrors) -> Array:
 def _rms(errors: Array) -> Array:
     result: Array = np.sqrt(np.mean(np.square(errors), axis=0))
     return result
-
-
-METHOD = "joint"
-RECIPE = "pose-tier-b"
-STATIONS_M = (40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
-# Samples with which the noise of each renderer is small beside that of the sensor, which is the same for both.
-_SAMPLES_AT_5_M, _MOST_SAMPLES = 64, 576
 
 
 @dataclass(frozen=True)

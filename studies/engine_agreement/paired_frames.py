@@ -28,6 +28,24 @@ FAMILIES = (
 )
 # Far brighter than any sky.
 LAMP_CD_M2 = 1e6
+_DRAWN_FROM, _SEED = "world-89/sea", 1
+_HEIGHT_PX = 256
+_RECIPE = """name = "own-sky"
+seed = 1
+rig = "rgb-ideal"
+
+[frames]
+count = 1
+
+[distance]
+law = "stations"
+stations_m = [10.0]
+
+[environment.map]
+file = "sky.exr"
+cd_m2_per_unit = 1.0
+rotation_deg = [-180, 180]
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,26 +153,6 @@ def with_lit_lamps(frame: FrameSpec, luminance_cd_m2: float) -> FrameSpec:
     assert frame.drogue is not None
     drogue = frame.drogue.model_copy(update={"marker_luminance_cd_m2": luminance_cd_m2})
     return frame.model_copy(update={"drogue": drogue})
-
-
-_DRAWN_FROM, _SEED = "world-89/sea", 1
-_HEIGHT_PX = 256
-_RECIPE = """name = "own-sky"
-seed = 1
-rig = "rgb-ideal"
-
-[frames]
-count = 1
-
-[distance]
-law = "stations"
-stations_m = [10.0]
-
-[environment.map]
-file = "sky.exr"
-cd_m2_per_unit = 1.0
-rotation_deg = [-180, 180]
-"""
 
 
 def write_sky_recipe(folder: Path) -> Path:

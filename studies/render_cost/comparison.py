@@ -34,6 +34,7 @@ from studies.render_cost.noise_search import (
 from studies.render_cost.plain_renderers import measure_plain_cycles, measure_plain_mitsuba
 
 _PICTURES_FOR_NOISE = 4
+OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
 
 
 def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEstimate, RenderCost, MeasuredView]:
@@ -77,9 +78,6 @@ def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEs
     found = NoiseEstimate(samples=settings.samples_per_px, noise=noise, noise_inside=noise_inside, mean_cd_m2=mean)
     view = MeasuredView(frame=frame, settings=settings, drogue=drogue, inside=inside)
     return found, RenderCost(spent_s / repeat), view
-
-
-OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
 
 
 def compare_at(

@@ -16,6 +16,12 @@ from scenes.sampler import sample_frame
 # Noise measured on a few hundred pixels is itself known to a few percent.
 _CLOSE_ENOUGH = 0.1
 _MOST_ATTEMPTS = 5
+STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
+# Margin around the drogue for the denoiser.
+_MARGIN_PX = 32
+_RECIPE = "daylight-10m"
+# Enough different scenes that nothing cached from one frame serves the next.
+SCENES = 8
 
 
 @dataclass(frozen=True)
@@ -113,14 +119,6 @@ def reach_noise(measure: Callable[[int], NoiseEstimate], noise: float, pilot: in
             return best
         samples = min(samples_for(best, noise), most_samples)
     return best.with_samples(samples_for(best, noise)) if best.noise > noise else best
-
-
-STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
-# Margin around the drogue for the denoiser.
-_MARGIN_PX = 32
-_RECIPE = "daylight-10m"
-# Enough different scenes that nothing cached from one frame serves the next.
-SCENES = 8
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,13 +32,12 @@ from studies.render_cost.noise_search import MeasuredView, NoiseEstimate, Render
 
 STEP = 8
 """Samples of one launch; further launches take the rest, which bounds memory."""
-
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-
-
 _MOST_PATHS_MITSUBA = 100_000_000
 _Crop = tuple[int, int, int, int]
+_PILOT_SAMPLES = 4
+_MOST_PATHS_CYCLES = 20_000_000
 
 
 def measure_plain_mitsuba(view: MeasuredView, noise: float) -> tuple[NoiseEstimate, RenderCost]:
@@ -115,10 +114,6 @@ def _sensor(view: MeasuredView, eye: Eye, crop: _Crop | None = None) -> dict[str
             "rfilter": {"type": "box"},
         },
     }
-
-
-_PILOT_SAMPLES = 4
-_MOST_PATHS_CYCLES = 20_000_000
 
 
 def measure_plain_cycles(

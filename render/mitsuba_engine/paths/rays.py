@@ -24,6 +24,9 @@ from render.mitsuba_engine.scene import DrogueScene, as_mitsuba_reads, by_shape
 from render.mitsuba_engine.trace_request import SamplingPlan
 from scenes.environment_radiance import EnvironmentRadiance
 
+MOST_LANES = 2_000_000
+"""Most lanes of one kernel launch: bounds memory (about 300 bytes per lane) at no cost in speed."""
+
 
 class CameraRays:
     """Rays of one eye in the stage's axes, through its lens if it has one."""
@@ -88,10 +91,6 @@ def _corner_slopes(lens: Lens) -> tuple[Any, Any]:
     u, v = np.meshgrid(np.arange(camera.width_px + 1) - 0.5, np.arange(camera.height_px + 1) - 0.5)
     rays = lens.rays(np.stack([u, v], axis=-1)).astype(np.float32)
     return jit_array(mi.Float, rays[..., 0].ravel()), jit_array(mi.Float, rays[..., 1].ravel())
-
-
-MOST_LANES = 2_000_000
-"""Most lanes of one kernel launch: bounds memory (about 300 bytes per lane) at no cost in speed."""
 
 
 @dataclass(frozen=True, eq=False)

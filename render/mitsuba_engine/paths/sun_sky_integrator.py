@@ -30,78 +30,6 @@ _ROWS = 48
 _BLOCK_PX = 4
 
 
-def irradiance_map(light: Radiance) -> Radiance:
-    """Irradiance over pi of plates of all directions.
-
-    Args:
-        light: (128, 256, 3) equirectangular map whose first and last rows are zenith and nadir, as Mitsuba reads it.
-
-    Returns:
-        (48, 96, 3) map by direction of the normal, with texel centres half a texel inside. [cd/m2]
-    """
-    weights = _row_weights(light.shape[0])
-    rows, columns = light.shape[0] // _BLOCK_PX, light.shape[1] // _BLOCK_PX
-    blocks = (light * weights[:, None, None]).reshape(rows, _BLOCK_PX, columns, _BLOCK_PX, 3).sum(axis=(1, 3))
-    result: Radiance = _cosines(light.shape[0]) @ blocks.reshape(-1, 3).astype(np.float32)
-    plates: Radiance = result.reshape(_ROWS, 2 * _ROWS, 3)
-    return plates
-
-
-def _row_weights(height: int) -> Array:
-    """(height,) solid angle of the texels of each row, up to a factor."""
-    polar = np.arange(height) * np.pi / (height - 1)
-    weights: Array = np.sin(polar)
-    # The last rows are caps of half a texel.
-    weights[[0, -1]] = np.pi / (height - 1) / 8
-    return weights
-
-
-@lru_cache(maxsize=1)
-def _cosines(height: int) -> NDArray[np.float32]:
-    """(plates, blocks) weight of each block of texels for each plate; the weights of a plate sum to 1."""
-    weights = _row_weights(height)
-    rows = height // _BLOCK_PX
-    polar = np.arange(height) * np.pi / (height - 1)
-    share = weights.reshape(rows, _BLOCK_PX)
-    middle = (share * polar.reshape(rows, _BLOCK_PX)).sum(axis=1) / share.sum(axis=1)
-    blocks = _directions(middle, 2 * height // _BLOCK_PX)
-    plates = _directions((np.arange(_ROWS) + 0.5) * np.pi / _ROWS, 2 * _ROWS)
-    cosines = np.maximum(plates @ blocks.T, 0.0)
-    totals = cosines @ np.repeat(share.sum(axis=1) * _BLOCK_PX, 2 * height // _BLOCK_PX)
-    result: NDArray[np.float32] = (cosines / totals[:, None]).astype(np.float32)
-    return result
-
-
-def _directions(polar: Array, columns: int) -> Array:
-    """(rows * columns, 3) unit vectors of an equirectangular grid."""
-    p, a = np.meshgrid(polar, (np.arange(columns) + 0.5) * 2 * np.pi / columns, indexing="ij")
-    directions: Array = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
-    return directions.reshape(-1, 3)
-
-
-class SkyIrradiance:
-    """Irradiance over pi by an unobstructed sky and ground, by the direction of the normal in the stage's axes."""
-
-    def __init__(self, light: Radiance, world_from_stage: Array) -> None:
-        """Take a light map (see `irradiance_map`) and the (3, 3) rotation into its axes."""
-        plates = irradiance_map(light)
-        wrapped = np.concatenate([plates[:, -1:], plates, plates[:, :1]], axis=1)
-        self._columns = plates.shape[1]
-        # The type is chosen with the variant, which type checkers do not see.
-        texture: Any = mi.Texture2f
-        self._texture = texture(jit_tensor(wrapped), wrap_mode=dr.WrapMode.Clamp)
-        # Python numbers would become part of the compiled kernel.
-        self._rotation = [[dr.opaque(mi.Float, float(value)) for value in row] for row in world_from_stage]
-
-    def towards(self, normal: Any) -> Any:
-        """Irradiance over pi of plates with these unit normals. [cd/m2]"""
-        x, y, z = (row[0] * normal.x + row[1] * normal.y + row[2] * normal.z for row in self._rotation)
-        turn = dr.atan2(y, x) / (2 * dr.pi)
-        u = ((turn - dr.floor(turn)) * self._columns + 1) / (self._columns + 2)
-        red, green, blue = self._texture.eval(mi.Point2f(u, dr.safe_acos(z) / dr.pi))
-        return mi.Color3f(red, green, blue)
-
-
 @dataclass(frozen=True, eq=False)
 class SceneLights:
     """The lights of a scene.
@@ -191,3 +119,75 @@ def _unknown_sky(scene: Any, ray: Any, active: Any, hit: Any, known: Any) -> Any
     end.wi = -ray.d
     seen = dr.select(hit, -known, 1.0 - known)
     return seen * scene.environment().eval(end, active & (seen != 0.0))
+
+
+def irradiance_map(light: Radiance) -> Radiance:
+    """Irradiance over pi of plates of all directions.
+
+    Args:
+        light: (128, 256, 3) equirectangular map whose first and last rows are zenith and nadir, as Mitsuba reads it.
+
+    Returns:
+        (48, 96, 3) map by direction of the normal, with texel centres half a texel inside. [cd/m2]
+    """
+    weights = _row_weights(light.shape[0])
+    rows, columns = light.shape[0] // _BLOCK_PX, light.shape[1] // _BLOCK_PX
+    blocks = (light * weights[:, None, None]).reshape(rows, _BLOCK_PX, columns, _BLOCK_PX, 3).sum(axis=(1, 3))
+    result: Radiance = _cosines(light.shape[0]) @ blocks.reshape(-1, 3).astype(np.float32)
+    plates: Radiance = result.reshape(_ROWS, 2 * _ROWS, 3)
+    return plates
+
+
+def _row_weights(height: int) -> Array:
+    """(height,) solid angle of the texels of each row, up to a factor."""
+    polar = np.arange(height) * np.pi / (height - 1)
+    weights: Array = np.sin(polar)
+    # The last rows are caps of half a texel.
+    weights[[0, -1]] = np.pi / (height - 1) / 8
+    return weights
+
+
+@lru_cache(maxsize=1)
+def _cosines(height: int) -> NDArray[np.float32]:
+    """(plates, blocks) weight of each block of texels for each plate; the weights of a plate sum to 1."""
+    weights = _row_weights(height)
+    rows = height // _BLOCK_PX
+    polar = np.arange(height) * np.pi / (height - 1)
+    share = weights.reshape(rows, _BLOCK_PX)
+    middle = (share * polar.reshape(rows, _BLOCK_PX)).sum(axis=1) / share.sum(axis=1)
+    blocks = _directions(middle, 2 * height // _BLOCK_PX)
+    plates = _directions((np.arange(_ROWS) + 0.5) * np.pi / _ROWS, 2 * _ROWS)
+    cosines = np.maximum(plates @ blocks.T, 0.0)
+    totals = cosines @ np.repeat(share.sum(axis=1) * _BLOCK_PX, 2 * height // _BLOCK_PX)
+    result: NDArray[np.float32] = (cosines / totals[:, None]).astype(np.float32)
+    return result
+
+
+def _directions(polar: Array, columns: int) -> Array:
+    """(rows * columns, 3) unit vectors of an equirectangular grid."""
+    p, a = np.meshgrid(polar, (np.arange(columns) + 0.5) * 2 * np.pi / columns, indexing="ij")
+    directions: Array = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=-1)
+    return directions.reshape(-1, 3)
+
+
+class SkyIrradiance:
+    """Irradiance over pi by an unobstructed sky and ground, by the direction of the normal in the stage's axes."""
+
+    def __init__(self, light: Radiance, world_from_stage: Array) -> None:
+        """Take a light map (see `irradiance_map`) and the (3, 3) rotation into its axes."""
+        plates = irradiance_map(light)
+        wrapped = np.concatenate([plates[:, -1:], plates, plates[:, :1]], axis=1)
+        self._columns = plates.shape[1]
+        # The type is chosen with the variant, which type checkers do not see.
+        texture: Any = mi.Texture2f
+        self._texture = texture(jit_tensor(wrapped), wrap_mode=dr.WrapMode.Clamp)
+        # Python numbers would become part of the compiled kernel.
+        self._rotation = [[dr.opaque(mi.Float, float(value)) for value in row] for row in world_from_stage]
+
+    def towards(self, normal: Any) -> Any:
+        """Irradiance over pi of plates with these unit normals. [cd/m2]"""
+        x, y, z = (row[0] * normal.x + row[1] * normal.y + row[2] * normal.z for row in self._rotation)
+        turn = dr.atan2(y, x) / (2 * dr.pi)
+        u = ((turn - dr.floor(turn)) * self._columns + 1) / (self._columns + 2)
+        red, green, blue = self._texture.eval(mi.Point2f(u, dr.safe_acos(z) / dr.pi))
+        return mi.Color3f(red, green, blue)
