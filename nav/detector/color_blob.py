@@ -17,14 +17,14 @@ from nav.matching.marker_channel import OTHERS_WEIGHTS, marker_channel, marker_c
 from nav.matching.ring_matching import RingMatch, match_ring
 
 # A marker of 5 px diameter covers about 20 pixels; after blurring, half of them stay above half its contrast.
-_LEAST_AREA_PX2 = 7.0
+_MIN_AREA_PX2 = 7.0
 # The peak is the level that at least this many pixels reach: the pixels of the smallest ring of markers.
 _PEAK_PIXELS = 30
 # Thresholds, as fractions of that peak: markers in shade reach a tenth of the level of a sunlit red object.
 _LEVELS = tuple(0.8 * 0.75**step for step in range(11))
 # Below this level there is only quantisation noise.
-_LEAST_LEVEL_DN = 2.0
-_MOST_BLOBS = 150
+_MIN_LEVEL_DN = 2.0
+_MAX_BLOBS = 150
 
 
 class ColorBlobDetector:
@@ -66,7 +66,7 @@ class ColorBlobDetector:
         smooth = cv2.blur(channel, (3, 3))
         for level in _levels(smooth):
             mask: NDArray[np.uint8] = (smooth > level).view(np.uint8)
-            match = match_ring(disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS), self._layout)
+            match = match_ring(disc_like_blobs(mask, _MIN_AREA_PX2, _MAX_BLOBS), self._layout)
             if match is not None and (best is None or match.count > best.count):
                 best = match
             if best is not None and best.count == self._layout.count:
@@ -80,7 +80,7 @@ def _levels(channel: Pixels) -> list[float]:
     histogram = cv2.calcHist([channel], [0], None, [top], [0, top]).ravel()
     at_least = np.cumsum(histogram[::-1])[::-1]
     peak = float(np.flatnonzero(at_least >= min(_PEAK_PIXELS, channel.size))[-1])
-    return [share * peak for share in _LEVELS if share * peak >= _LEAST_LEVEL_DN]
+    return [share * peak for share in _LEVELS if share * peak >= _MIN_LEVEL_DN]
 
 
 def _circle_box(affine: Array, radius_m: float) -> tuple[float, float, float, float]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.images import Pixels, StereoImages
 from geometry.se3 import Array
 from geometry.stereo import Eye
-from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
+from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
 
 PADDING_DN = 114
 """Grey of the padding: between the brightness of sky and ground, so that its edge has little contrast."""
@@ -57,9 +57,9 @@ def letterbox(image_size_px: tuple[int, int], input_size_px: tuple[int, int]) ->
     if min(input_size_px) < SIZE_STEP_PX or any(side % SIZE_STEP_PX for side in input_size_px):
         width, height = input_size_px
         raise ValueError(f"input_size_px: must be multiples of {SIZE_STEP_PX}, got {width}x{height}")
-    if max(input_size_px) > MOST_SIDE_PX:
+    if max(input_size_px) > MAX_SIDE_PX:
         width, height = input_size_px
-        raise ValueError(f"input_size_px: must be at most {MOST_SIDE_PX} a side, got {width}x{height}")
+        raise ValueError(f"input_size_px: must be at most {MAX_SIDE_PX} a side, got {width}x{height}")
     fit = min(inside / side for inside, side in zip(input_size_px, image_size_px, strict=True))
     width, height = (max(1, round(side * fit)) for side in image_size_px)
     offset = (input_size_px[0] - width) // 2, (input_size_px[1] - height) // 2

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
+from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
 
 METADATA_KEY = "droguekit_detector"
 """Key of the ONNX metadata under which the JSON of `ModelMetadata` is stored."""
@@ -45,13 +45,13 @@ class ModelMetadata:
         sides = self.input_size_px
         if len(sides) != 2 or any(type(side) is not int or side < 1 or side % SIZE_STEP_PX for side in sides):
             raise ValueError(f"input_size_px: must be two multiples of {SIZE_STEP_PX}, got {sides!r}")
-        if max(sides) > MOST_SIDE_PX:
-            raise ValueError(f"input_size_px: must be at most {MOST_SIDE_PX} a side, got {sides!r}")
+        if max(sides) > MAX_SIDE_PX:
+            raise ValueError(f"input_size_px: must be at most {MAX_SIDE_PX} a side, got {sides!r}")
         # In Python a bool is an int.
         if type(self.score_threshold) not in (int, float) or not 0 <= self.score_threshold <= 1:
             raise ValueError(f"score_threshold: must be 0 to 1, got {self.score_threshold!r}")
-        if type(self.large_from_px) not in (int, float) or not 0 <= self.large_from_px <= MOST_SIDE_PX:
-            raise ValueError(f"large_from_px: must be 0 to {MOST_SIDE_PX}, got {self.large_from_px!r}")
+        if type(self.large_from_px) not in (int, float) or not 0 <= self.large_from_px <= MAX_SIDE_PX:
+            raise ValueError(f"large_from_px: must be 0 to {MAX_SIDE_PX}, got {self.large_from_px!r}")
         if len(self.classes) != 1 or not all(isinstance(name, str) for name in self.classes):
             raise ValueError(f"classes: must be one name, got {self.classes!r}")
         for name, kind in (("licence", str), ("manifest_sha256", str), ("network", Mapping), ("training", Mapping)):

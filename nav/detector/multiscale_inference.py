@@ -22,7 +22,7 @@ ScoredBoxes = tuple[Array, Array]
 # Near the limit the boxes of both passes count, so that no drogue is lost between them.
 _SHARED_FACTOR = 1.25
 # A box of which more than this lies in a large drogue's box is a part of that drogue, such as a marker.
-_MOST_INSIDE = 0.5
+_MAX_INSIDE = 0.5
 
 
 def half_size_px(input_size_px: tuple[int, int]) -> tuple[int, int]:
@@ -36,7 +36,7 @@ def detect_multiscale(
     run: Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[Any]]],
     large_from_px: float,
     least_score: float,
-    most: int,
+    max_boxes: int,
 ) -> list[ScoredBoxes]:
     """Detect drogues in images of one size, with a second pass at half the size where it is asked for.
 
@@ -45,15 +45,15 @@ def detect_multiscale(
         run: the network, from images of one size to output maps; see `nav.detector.output_maps`.
         large_from_px: see `merge_scales`; 0 for a single pass.
         least_score: boxes with a lower score are left out.
-        most: largest number of boxes of an image.
+        max_boxes: largest number of boxes of an image.
     """
     full = decode_maps(run(images), least_score)
     if large_from_px == 0:
-        return [(boxes[:most], scores[:most]) for boxes, scores in full]
+        return [(boxes[:max_boxes], scores[:max_boxes]) for boxes, scores in full]
     height, width = images[0].shape[:2]
     halves, placements = zip(*(letterbox_image(each, half_size_px((width, height))) for each in images), strict=True)
     half = map(to_full_size, decode_maps(run(halves), least_score), placements)
-    return [merge_scales(*both, large_from_px, most) for both in zip(full, half, strict=True)]
+    return [merge_scales(*both, large_from_px, max_boxes) for both in zip(full, half, strict=True)]
 
 
 def to_full_size(found: ScoredBoxes, placement: Letterbox) -> ScoredBoxes:
@@ -63,13 +63,13 @@ def to_full_size(found: ScoredBoxes, placement: Letterbox) -> ScoredBoxes:
     return placement.to_image(boxes) + np.array([0.5, 0.5, 0.0, 0.0]), scores
 
 
-def merge_scales(full: ScoredBoxes, half: ScoredBoxes, large_from_px: float, most: int) -> ScoredBoxes:
+def merge_scales(full: ScoredBoxes, half: ScoredBoxes, large_from_px: float, max_boxes: int) -> ScoredBoxes:
     """Merge the boxes of both passes: large ones from the half-size pass, others from the full-size pass, after NMS.
 
     Args:
         full, half: boxes of the two passes, both in coordinates of the full size.
         large_from_px: a box whose longer side is at least this is large.
-        most: largest number of boxes.
+        max_boxes: largest number of boxes.
     """
     small = full[0][:, 2:].max(axis=1, initial=0) < large_from_px * _SHARED_FACTOR
     large = half[0][:, 2:].max(axis=1, initial=0) >= large_from_px / _SHARED_FACTOR
@@ -80,7 +80,7 @@ def merge_scales(full: ScoredBoxes, half: ScoredBoxes, large_from_px: float, mos
     boxes, scores, is_large = boxes[order], scores[order], is_large[order]
     whole = ~_is_part(boxes, is_large)
     boxes, scores = boxes[whole], scores[whole]
-    kept = non_maximum_suppression(boxes, most)
+    kept = non_maximum_suppression(boxes, max_boxes)
     return boxes[kept], scores[kept]
 
 
@@ -88,6 +88,6 @@ def _is_part(boxes: Array, is_large: Array) -> Array:
     """(n,) whether each box, best first, lies mostly within a large box with a better score."""
     low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
     sides = np.maximum(np.minimum(high[:, None], high) - np.maximum(low[:, None], low), 0)
-    inside = sides.prod(axis=2) > _MOST_INSIDE * boxes[:, 2:].prod(axis=1)[:, None]
+    inside = sides.prod(axis=2) > _MAX_INSIDE * boxes[:, 2:].prod(axis=1)[:, None]
     is_part: Array = np.tril(inside & is_large, k=-1).any(axis=1)
     return is_part

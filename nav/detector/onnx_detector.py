@@ -17,7 +17,7 @@ from nav.detector.detector import Detection, StereoDetection
 from nav.detector.input_image import input_image, letterbox, network_input
 from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.multiscale_inference import ScoredBoxes, detect_multiscale, half_size_px
-from nav.detector.output_maps import MAP_CHANNELS, MOST_SIDE_PX, SIZE_STEP_PX, STRIDES
+from nav.detector.output_maps import MAP_CHANNELS, MAX_SIDE_PX, SIZE_STEP_PX, STRIDES
 
 _ORT_ERRORS = (
     ort_errors.EPFail, ort_errors.Fail, ort_errors.InvalidArgument, ort_errors.InvalidGraph, ort_errors.InvalidProtobuf,
@@ -74,18 +74,18 @@ class OnnxDetector:
 
     def detect(self, images: StereoImages) -> StereoDetection:
         """The best box in each image, if it reaches the score threshold of the file."""
-        found = self._candidates(images, self.metadata.score_threshold, most=1)
+        found = self._candidates(images, self.metadata.score_threshold, max_boxes=1)
         return StereoDetection(*(next(iter(found[eye]), None) for eye in EYES))
 
     def candidates(self, images: StereoImages, least_score: float) -> dict[Eye, tuple[Detection, ...]]:
         """The boxes of each image after non-maximum suppression, the best first."""
-        return self._candidates(images, least_score, most=20)
+        return self._candidates(images, least_score, max_boxes=20)
 
-    def _candidates(self, images: StereoImages, least_score: float, most: int) -> dict[Eye, tuple[Detection, ...]]:
+    def _candidates(self, images: StereoImages, least_score: float, max_boxes: int) -> dict[Eye, tuple[Detection, ...]]:
         inputs, placements = zip(*(input_image(images, eye, self.input_size_px) for eye in EYES), strict=True)
         candidates: dict[Eye, tuple[Detection, ...]] = {}
         for eye, placement, (boxes, scores) in zip(
-            EYES, placements, self._detect(inputs, least_score, most), strict=True
+            EYES, placements, self._detect(inputs, least_score, max_boxes), strict=True
         ):
             candidates[eye] = tuple(
                 Detection((x, y, width, height), score)
@@ -95,10 +95,10 @@ class OnnxDetector:
             )
         return candidates
 
-    def _detect(self, inputs: Sequence[NDArray[np.uint8]], least_score: float, most: int) -> list[ScoredBoxes]:
+    def _detect(self, inputs: Sequence[NDArray[np.uint8]], least_score: float, max_boxes: int) -> list[ScoredBoxes]:
         """For each image the boxes in corner coordinates of the input, and their scores."""
         return detect_multiscale(
-            inputs, lambda batch: self._run(network_input(batch)), self.metadata.large_from_px, least_score, most
+            inputs, lambda batch: self._run(network_input(batch)), self.metadata.large_from_px, least_score, max_boxes
         )
 
     def _run(self, batch: NDArray[np.float32]) -> list[NDArray[Any]]:
@@ -151,8 +151,8 @@ def _checked_input(file: Path, session: onnxruntime.InferenceSession) -> tuple[s
         return inputs[0].name, None
     if width % SIZE_STEP_PX or height % SIZE_STEP_PX:
         raise ValueError(f"{file}: width and height must be multiples of {SIZE_STEP_PX}, got {width}x{height}")
-    if max(width, height) > MOST_SIDE_PX:
-        raise ValueError(f"{file}: width and height must be at most {MOST_SIDE_PX}, got {width}x{height}")
+    if max(width, height) > MAX_SIDE_PX:
+        raise ValueError(f"{file}: width and height must be at most {MAX_SIDE_PX}, got {width}x{height}")
     return inputs[0].name, (width, height)
 
 

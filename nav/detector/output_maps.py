@@ -26,7 +26,7 @@ MAP_CHANNELS = 5
 SIZE_STEP_PX = STRIDES[-1]
 """Width and height of an input image are multiples of this. [px]"""
 
-MOST_SIDE_PX = 4096
+MAX_SIDE_PX = 4096
 """Largest width and height of an input image: a wrong size is refused before memory is allocated for it. [px]"""
 
 LOG_DISTANCE_RANGE = (-6.0, 6.0)
@@ -40,23 +40,23 @@ _MAX_CELLS = 1000
 
 
 def decode_maps(
-    maps: Sequence[NDArray[np.floating[Any]]], least_score: float, most: int = 20
+    maps: Sequence[NDArray[np.floating[Any]]], least_score: float, max_boxes: int = 20
 ) -> list[tuple[Array, Array]]:
     """Decode the boxes and scores of every image, the best first, with non-maximum suppression.
 
     Args:
         maps: three times (B, 5, H, W); see the docstring of this module.
         least_score: boxes with a lower score are left out.
-        most: largest number of boxes of an image.
+        max_boxes: largest number of boxes of an image.
 
     Returns:
         For each image (n, 4) boxes x, y, width, height in corner coordinates of the network's input [px], and (n,)
         scores.
     """
-    return [_decode_one([each[index] for each in maps], least_score, most) for index in range(maps[0].shape[0])]
+    return [_decode_one([each[index] for each in maps], least_score, max_boxes) for index in range(maps[0].shape[0])]
 
 
-def _decode_one(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, most: int) -> tuple[Array, Array]:
+def _decode_one(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, max_boxes: int) -> tuple[Array, Array]:
     scores, boxes = [], []
     for stride, each in zip(STRIDES, maps, strict=True):
         score = _sigmoid(each[0].astype(np.float64))
@@ -70,11 +70,11 @@ def _decode_one(maps: Sequence[NDArray[np.floating[Any]]], least_score: float, m
     finite = np.isfinite(all_boxes).all(axis=1)
     all_scores, all_boxes = all_scores[finite], all_boxes[finite]
     order = np.argsort(-all_scores, kind="stable")[:_MAX_CELLS]
-    kept = non_maximum_suppression(all_boxes[order], most)
+    kept = non_maximum_suppression(all_boxes[order], max_boxes)
     return all_boxes[order][kept], all_scores[order][kept]
 
 
-def non_maximum_suppression(boxes: Array, most: int) -> list[int]:
+def non_maximum_suppression(boxes: Array, max_boxes: int) -> list[int]:
     """Indices of the boxes, sorted best first, whose IoU with every better box that is kept is small."""
     area = boxes[:, 2] * boxes[:, 3]
     is_open = np.ones(len(boxes), dtype=bool)
@@ -83,7 +83,7 @@ def non_maximum_suppression(boxes: Array, most: int) -> list[int]:
         if not is_open[index]:
             continue
         kept.append(index)
-        if len(kept) == most:
+        if len(kept) == max_boxes:
             break
         shared = intersection_area(boxes[index], boxes)
         is_open &= shared <= _MAX_IOU * (area[index] + area - shared)

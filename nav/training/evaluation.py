@@ -33,10 +33,10 @@ from nav.training.training_state import ComputeDevice
 
 MAX_BOXES = 10
 """Number of predictions of an image that are scored, the best first."""
-_LEAST_SCORE = 0.01  # average precision needs all predictions, down to scores that hardly change it
+_MIN_SCORE = 0.01  # average precision needs all predictions, down to scores that hardly change it
 _STATISTICS_IMAGES = 192  # their mean is uncertain by about a fourteenth of the standard deviation between images
 _STATISTICS_BATCH = 16
-_LEAST_IOU = 0.5
+_MIN_IOU = 0.5
 
 
 def to_tensor(images: NDArray[np.uint8], compute: ComputeDevice) -> Tensor:
@@ -137,7 +137,7 @@ def predict(
         return [each.float().cpu().numpy() for each in maps]
 
     for group in prefetch_map(read, groups, threads=1, ahead=2):
-        found += detect_multiscale([image for image, _ in group], run, large_from_px, _LEAST_SCORE, MAX_BOXES)
+        found += detect_multiscale([image for image, _ in group], run, large_from_px, _MIN_SCORE, MAX_BOXES)
         truth += [boxes for _, boxes in group]
     return Predictions(truth, found)
 
@@ -219,7 +219,7 @@ def best_threshold(truth: Sequence[Boxes], found: Sequence[tuple[Boxes, Boxes]],
         The middle between the highest and the lowest of those thresholds.
     """
     best = [
-        (float(scores[0]), len(own) > 0, len(own) > 0 and intersection_over_union(own[0], boxes[0]) >= _LEAST_IOU)
+        (float(scores[0]), len(own) > 0, len(own) > 0 and intersection_over_union(own[0], boxes[0]) >= _MIN_IOU)
         for own, (boxes, scores) in zip(truth, found, strict=True)
         if len(scores)
     ]

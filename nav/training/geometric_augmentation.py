@@ -20,7 +20,7 @@ from nav.detector.input_image import PADDING_DN, letterbox, letterbox_image
 Boxes = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-LEAST_VISIBLE_FRACTION = 0.3
+MIN_VISIBLE_FRACTION = 0.3
 """A drogue of which a view shows less is painted over, for nobody would call what is left a drogue."""
 # Longer side over the canvas's height: 13 px of 480, 9 px of 320. At 40 m the paper's camera sees 17.5 and 11 px.
 _SMALLEST_BOX_FRACTION = 0.027
@@ -183,7 +183,7 @@ def paint_view(canvas: Image, image: Image, boxes: Boxes, view: ImageView) -> Bo
     """
     warp_view(canvas, image, view)
     visible, fractions = clip_boxes(transform_boxes(boxes, view), view.window)
-    kept = fractions >= LEAST_VISIBLE_FRACTION
+    kept = fractions >= MIN_VISIBLE_FRACTION
     for x, y, width, height in visible[~kept & (fractions > 0)]:
         canvas[int(y) : int(np.ceil(y + height)), int(x) : int(np.ceil(x + width))] = PADDING_DN
     return visible[kept]

@@ -20,7 +20,7 @@ _CAST_FRACTION, _CAST = 0.2, (0.6, 1.5)
 _GREY_FRACTION = 0.08  # for mono cameras, and so that the network does not rely on colour alone
 _SATURATION = (0.5, 1.4)
 _LOW_LIGHT_FRACTION, _LOW_LIGHT = 0.12, (0.15, 0.5)
-_LEAST_MEAN_DN = 20.0  # no image is made darker, or invisible drogues would keep their boxes
+_MIN_MEAN_DN = 20.0  # no image is made darker, or invisible drogues would keep their boxes
 _BLUR_FRACTION, _BLUR_SIGMA_PX = 0.15, (0.4, 1.6)
 _MOTION_FRACTION, _MOTION_PX = 0.08, (3, 9)
 _NOISE_FRACTION, _NOISE_DN = 0.35, (0.5, 6.0)
@@ -32,7 +32,7 @@ _DISTRACTED_FRACTION = 0.3  # of the canvases
 _MAX_DISTRACTORS = 3
 _DISTRACTOR_SIZE = (0.02, 0.6)  # over the canvas's height
 _RING_TUBE_FRACTION = (0.08, 0.3)  # radius of a ring's tube over the radius of the ring
-_LEAST_TUBE_PX = 0.5
+_MIN_TUBE_PX = 0.5
 _RING_AMBIENT_FRACTION = (0.2, 0.9)  # brightness of the side that faces away from the lamp, over that which faces it
 # Red and orange (paint, lamps), white, dark: the colours of drogues, markers, pods and probes.
 _COLORS = ((200, 30, 30), (225, 95, 35), (150, 20, 30), (235, 235, 235), (35, 35, 38), (120, 122, 125))
@@ -84,7 +84,7 @@ def _tone_curves(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 def _darken(rng: np.random.Generator, image: Image) -> Image:
     """Scale the image down to low light."""
-    gain = max(_log_uniform(rng, _LOW_LIGHT).item(), min(1.0, _LEAST_MEAN_DN / max(float(image.mean()), 1.0)))
+    gain = max(_log_uniform(rng, _LOW_LIGHT).item(), min(1.0, _MIN_MEAN_DN / max(float(image.mean()), 1.0)))
     return np.asarray(cv2.LUT(image, np.rint(gain * np.arange(256)).astype(np.uint8)), dtype=np.uint8)
 
 
@@ -193,7 +193,7 @@ def paint_distractors(rng: np.random.Generator, image: Image, boxes: Boxes) -> N
             cv2.ellipse(image, at, halves, turn_deg, 0, 360, color, -1, cv2.LINE_AA)
         elif kind == 1:
             ring = axes / (1 + tube)
-            tube_px = max(tube * float(ring.max()), _LEAST_TUBE_PX)
+            tube_px = max(tube * float(ring.max()), _MIN_TUBE_PX)
             paint_ring(image, center, ring, turn_deg, tube_px, color, ambient, toward_lamp)
         else:
             corners = cv2.boxPoints((center.tolist(), (2 * axes[0], axes[1] / 2), turn_deg))

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
-from nav.detector.output_maps import MOST_SIDE_PX, SIZE_STEP_PX
+from nav.detector.output_maps import MAX_SIDE_PX, SIZE_STEP_PX
 
 SizePx = tuple[int, int]
 """(height, width) of the network's input. [px]"""
@@ -74,7 +74,7 @@ class TrainingSettings(FrozenModel):
     threads: int = Field(default=0, ge=0, le=1024)
     loader_threads: int = Field(default=1, ge=1, le=64)
     checkpoint_minutes: float = Field(default=5.0, gt=0)
-    large_from_px: float = Field(default=160.0, ge=0, le=MOST_SIDE_PX)
+    large_from_px: float = Field(default=160.0, ge=0, le=MAX_SIDE_PX)
     start_sha256: str = Field(default="", pattern="^([0-9a-f]{64})?$", exclude_if=lambda digest: not digest)
     licence: str = Field(default="", max_length=100)
 
@@ -85,8 +85,8 @@ class TrainingSettings(FrozenModel):
                 raise ValueError(
                     f"{name}: must be multiples of {SIZE_STEP_PX} px, such as 480x640, got {size_text(size)}"
                 )
-            if size is not None and max(size) > MOST_SIDE_PX:
-                raise ValueError(f"{name}: must be at most {MOST_SIDE_PX} px a side, got {size_text(size)}")
+            if size is not None and max(size) > MAX_SIDE_PX:
+                raise ValueError(f"{name}: must be at most {MAX_SIDE_PX} px a side, got {size_text(size)}")
         if self.views == "both" and self.batch_images % 2:
             raise ValueError(f"batch_images: must be even for both views at once, got {self.batch_images}")
         return self

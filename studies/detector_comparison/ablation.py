@@ -39,7 +39,7 @@ class SingleViewDetector(OnnxDetector):
         candidates: dict[Eye, tuple[Detection, ...]] = {}
         for eye in EYES:
             image, placement = input_image(images, eye, self.input_size_px)
-            ((boxes, scores),) = self._detect([image], least_score, most=20)
+            ((boxes, scores),) = self._detect([image], least_score, max_boxes=20)
             candidates[eye] = tuple(
                 Detection((x, y, width, height), score)
                 for (x, y, width, height), score in zip(

@@ -14,7 +14,7 @@ from nav.detector.detector import Detector
 _WARM_UP_ROUNDS = 3
 _PERCENTILES = (50.0, 90.0, 99.0)
 # Boxes besides the best one cost little, and the threshold is the same for all detectors.
-_LEAST_SCORE = 0.25
+_MIN_SCORE = 0.25
 
 
 class PairLatency(NamedTuple):
@@ -60,7 +60,7 @@ def measure_latency(
         images = pairs[number % len(pairs)]
         for name in _shuffled(names, number + _WARM_UP_ROUNDS):
             wall_s, cpu_s = time.perf_counter(), time.process_time()
-            detectors[name].candidates(images, _LEAST_SCORE)
+            detectors[name].candidates(images, _MIN_SCORE)
             wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
             if number >= 0:
                 spent[name].append((1e3 * wall_s, 1e3 * cpu_s))

@@ -19,7 +19,7 @@ Attention = Literal["eca", "se"]
 
 _STEM_CHANNELS = 16
 # MobileNetV3 squeezes to a quarter of the channels, rounded to a multiple of 8 that is at most a tenth below it.
-_REDUCTION, _CHANNEL_STEP, _LEAST_FRACTION = 4, 8, 0.9
+_REDUCTION, _CHANNEL_STEP, _MIN_FRACTION = 4, 8, 0.9
 # A running mean over about 10 batches: in a short training weights change fast, and old means do not fit them.
 _NORM_MOMENTUM, _NORM_EPSILON = 0.1, 1e-3
 
@@ -89,7 +89,7 @@ def squeezed_channels(channels: int) -> int:
     """Width of the bottleneck of squeeze and excitation."""
     quarter = channels // _REDUCTION
     nearest = max((quarter + _CHANNEL_STEP // 2) // _CHANNEL_STEP, 1) * _CHANNEL_STEP
-    return nearest if nearest >= _LEAST_FRACTION * quarter else nearest + _CHANNEL_STEP
+    return nearest if nearest >= _MIN_FRACTION * quarter else nearest + _CHANNEL_STEP
 
 
 class SqueezeExcitation(nn.Module):

@@ -19,7 +19,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from nav.detector.network.head import anchor_points, decode_boxes, flatten_maps
 
-_LEAST_AREA_PX2 = 1e-6  # keeps quotients finite where a box is empty
+_MIN_AREA_PX2 = 1e-6  # keeps quotients finite where a box is empty
 # The alignment of a cell with a box is score^a IoU^b; this many of the best aligned cells are assigned to the box.
 _SCORE_POWER, _IOU_POWER = 0.5, 6.0
 _CELLS_PER_BOX = 10
@@ -35,7 +35,7 @@ def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
     """IoU of boxes that broadcast against each other: (..., 4) and (..., 4) -> (...)."""
     sides = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp(min=0)
     shared = sides[..., 0] * sides[..., 1]
-    return shared / (_area(a) + _area(b) - shared).clamp(min=_LEAST_AREA_PX2)
+    return shared / (_area(a) + _area(b) - shared).clamp(min=_MIN_AREA_PX2)
 
 
 def complete_iou(a: Tensor, b: Tensor) -> Tensor:
@@ -54,10 +54,10 @@ def complete_iou(a: Tensor, b: Tensor) -> Tensor:
     iou = intersection_over_union(a, b)
     hull = torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])
     center_offset = (a[:, :2] + a[:, 2:] - b[:, :2] - b[:, 2:]) / 2
-    distance = center_offset.square().sum(dim=1) / hull.square().sum(dim=1).clamp(min=_LEAST_AREA_PX2)
+    distance = center_offset.square().sum(dim=1) / hull.square().sum(dim=1).clamp(min=_MIN_AREA_PX2)
     aspect = (4 / pi**2) * (_diagonal_angle(a) - _diagonal_angle(b)).square()
     with torch.no_grad():
-        weight = aspect / (1 - iou + aspect).clamp(min=_LEAST_AREA_PX2)
+        weight = aspect / (1 - iou + aspect).clamp(min=_MIN_AREA_PX2)
     return iou - distance - weight * aspect
 
 
@@ -67,7 +67,7 @@ def _area(boxes: Tensor) -> Tensor:
 
 
 def _diagonal_angle(boxes: Tensor) -> Tensor:
-    sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=_LEAST_AREA_PX2)
+    sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=_MIN_AREA_PX2)
     return torch.atan2(sides[:, 0], sides[:, 1])
 
 
@@ -173,11 +173,11 @@ def detection_loss(maps: Sequence[Tensor], boxes_xywh_px: Sequence[Tensor]) -> D
 
 def _pad_boxes(boxes_xywh_px: Sequence[Tensor], device: torch.device) -> tuple[Tensor, Tensor]:
     """(B, M, 4) left, top, right, bottom, and (B, M) which rows are boxes and not padding; M at least 1."""
-    most = max(1, *(len(boxes) for boxes in boxes_xywh_px))
+    max_boxes = max(1, *(len(boxes) for boxes in boxes_xywh_px))
     rows = [boxes.to(device, torch.float32) for boxes in boxes_xywh_px]
-    xywh = pad_sequence([*rows, torch.zeros((most, 4), device=device)], batch_first=True)[:-1]
+    xywh = pad_sequence([*rows, torch.zeros((max_boxes, 4), device=device)], batch_first=True)[:-1]
     counts = torch.tensor([len(boxes) for boxes in boxes_xywh_px], device=device)
-    is_box = torch.arange(most, device=device) < counts[:, None]
+    is_box = torch.arange(max_boxes, device=device) < counts[:, None]
     return torch.cat((xywh[..., :2], xywh[..., :2] + xywh[..., 2:]), dim=-1), is_box
 
 

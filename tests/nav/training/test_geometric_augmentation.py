@@ -10,7 +10,7 @@ from nav.detector.input_image import PADDING_DN, input_image, network_input
 from nav.training.corpus import CachedPair, Corpus, ImageCache
 from nav.training.evaluation import to_tensor, whole_image
 from nav.training.geometric_augmentation import (
-    LEAST_VISIBLE_FRACTION,
+    MIN_VISIBLE_FRACTION,
     CanvasWindow,
     ImageView,
     ViewRanges,
@@ -110,7 +110,7 @@ def test_a_drogue_of_which_too_little_is_visible_is_painted_over() -> None:
 
 def test_a_drogue_at_the_edge_keeps_its_visible_part() -> None:
     window = CanvasWindow(0, 0, 120, 120)
-    share = LEAST_VISIBLE_FRACTION + 0.1
+    share = MIN_VISIBLE_FRACTION + 0.1
     cut = ImageView(np.eye(2), np.array([120 - 60 - share * 50, 0.0]), window)
     kept = paint_view(np.zeros((120, 120, 3), np.uint8), ellipse_image(), BOX, cut)
     np.testing.assert_allclose(kept, [[100.0, 40.0, 20.0, 36.0]], atol=1e-9)  # sums of a few numbers

@@ -9,7 +9,7 @@ from nav.detector.network.detection_loss import assign_anchors, complete_iou, in
 from nav.detector.network.head import anchor_points, decode_boxes
 
 CELLS = anchor_points([torch.zeros(1, 5, 128 // stride, 160 // stride) for stride in (8, 16, 32)])
-MOST_CELLS = 10
+MAX_CELLS = 10
 
 
 def corners(xywh: list[tuple[float, float, float, float]]) -> torch.Tensor:
@@ -67,7 +67,7 @@ def test_cells_are_assigned_to_boxes_that_contain_them(seed):
     iou = intersection_over_union(filled[0][:, None], boxes[0][None])
     for index in range(3):
         cells = torch.nonzero(assigned.foreground[0] & (assigned.box_index[0] == index))[:, 0]
-        assert 1 <= len(cells) <= MOST_CELLS
+        assert 1 <= len(cells) <= MAX_CELLS
         places, box = CELLS.centers_px[cells], truth[index]
         assert bool(((places > box[:2]) & (places < box[2:])).all())
         # The target score of the best aligned cell is the best IoU, and no other is higher.

@@ -24,7 +24,7 @@ from nav.detector.network.network import DetectorNetwork, NetworkConfig, complex
 from nav.detector.output_maps import STRIDES
 
 CONFIGS = [NetworkConfig(*each) for each in product(("l", "s"), ("eca", "se"), ("asff", "concat"))]
-MOST_WEIGHTS_BYTES = 12e6
+MAX_WEIGHTS_BYTES = 12e6
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: "-".join(config.to_dict().values()))
@@ -109,7 +109,7 @@ def test_eca_replaces_every_squeeze_and_excitation(variant):
 
 @pytest.mark.parametrize("variant", ["l", "s"])
 def test_weights_fit_into_the_package(variant):
-    assert 4 * complexity(DetectorNetwork(NetworkConfig(variant)), (64, 64)).parameters < MOST_WEIGHTS_BYTES
+    assert 4 * complexity(DetectorNetwork(NetworkConfig(variant)), (64, 64)).parameters < MAX_WEIGHTS_BYTES
 
 
 def test_fusion_weights_of_each_location_sum_to_one():
