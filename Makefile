@@ -1,5 +1,5 @@
-# Every target does its own set-up (scripts/setup) and is quick the second time. Paths are relative: no target minds
-# where the folder lies.
+# Every target does its own set-up (scripts/setup), which is quick the second time. Paths are relative, so the folder may
+# lie anywhere.
 .DEFAULT_GOAL := help
 .PHONY: help setup demo docs test test-slow torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
@@ -23,9 +23,9 @@ docs: ## build the documentation into out/docs (installs mkdocs-material)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "docs: open $(CURDIR)/out/docs/index.html"
 
-# Three for two cores: tests of commands and pages wait for other processes much of their time.
-# A process that crashes ends the tests, with the name of the test that it ran: replaced, it may leave them waiting for
-# ever (pytest-xdist 3.8).
+# Three processes for two cores: tests of commands and pages spend much of their time waiting for other processes.
+# A process that crashes ends the run and names its test: if it were replaced, the others might wait for ever
+# (pytest-xdist 3.8).
 test: setup lint ## linters, types and the fast tests
 	@echo "test: pytest, the fast tests"
 	@$(BIN)/python -m pytest -m "not slow" --numprocesses 3 --dist loadfile --max-worker-restart 0
@@ -34,7 +34,7 @@ test-slow: setup ## the tests that render for longer
 	@echo "test-slow: pytest, the slow tests"
 	@$(BIN)/python -m pytest -m "slow and not torture"
 
-torture: setup ## kill a run 50 times on its way through 200 pairs, and compare with an undisturbed one (minutes)
+torture: setup ## kill a run of 200 pairs 50 times, and compare the result with an undisturbed run (minutes)
 	@$(BIN)/python -m pytest tests/batch -m torture --capture=no
 
 fuzz: setup ## 10,000 damaged and hostile files through every reader, validate and every export (minutes)
@@ -48,56 +48,56 @@ lint: setup ## formatting, style, types, walls between the packages, links of th
 	@$(BIN)/mypy
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (an hour; installs Blender; goes on where it stopped)
+bench-engines: ## the same frames by Mitsuba and by Blender: do they agree? (an hour; installs Blender; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.engine_agreement --out out/engine-agreement
 
-bench-peers: ## CPU seconds per pair of our path, plain Cycles and plain Mitsuba at equal noise (hours; installs Blender; goes on where it stopped)
+bench-peers: ## CPU seconds per pair of droguekit, plain Cycles and plain Mitsuba at equal noise (hours; installs Blender; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.render_cost --out out/peer-comparison
 
-bench-scaling: ## two workers against one on 200 pairs, and what a frame costs besides its work (minutes; on a machine that does nothing else; goes on where it stopped)
+bench-scaling: ## two workers against one on 200 pairs, and the overhead per frame (minutes, on an idle machine; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.scaling --out out/scaling
 
 CORPUS ?= out/detector/datasets/detector-small
-bench-detectors: ## detectors OURS=FILE.onnx beside YOLOv8n and YOLOv8s, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; goes on where it stopped)
+bench-detectors: ## detectors OURS=FILE.onnx beside YOLOv8n and YOLOv8s, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.detector_comparison --out out/detector-peers --corpus $(CORPUS) $(foreach file,$(OURS),--ours $(file))
 
-bench: ## CPU seconds per stereo pair by distance and stage, and pairs a second of all workers
+bench: ## CPU seconds per stereo pair by distance and stage, and pairs per second of all workers
 	@scripts/setup mitsuba
 	@$(BIN)/droguekit bench
 
-bars-nav-a: ## accuracy bars, tier A: analytic images, day and dusk, 400 pairs a distance (hours; goes on where it stopped)
+bars-nav-a: ## acceptance, tier A: analytic images, day and dusk, 400 pairs per distance (hours; resumes)
 	@scripts/setup mitsuba
 	@$(BIN)/python -m studies.acceptance a --out out/bars/a
 
-bars-nav-b: ## accuracy bars, tier B: path-traced images, day and dusk, 64 pairs a distance (hours; goes on where it stopped)
+bars-nav-b: ## acceptance, tier B: path-traced images, day and dusk, 64 pairs per distance (hours; resumes)
 	@scripts/setup mitsuba
 	@$(BIN)/python -m studies.acceptance b --out out/bars/b
 
-bars-nav-b-blender: ## accuracy bars, tier B by the engine Blender (hours; installs Blender; goes on where it stopped)
+bars-nav-b-blender: ## acceptance, tier B by the engine Blender (hours; installs Blender; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.acceptance b --out out/bars/b-blender --engine blender
 
-bars-nav-c: ## accuracy bars, tier C: noise, flips, covariances and tolerances at the level of centroids (minutes)
+bars-nav-c: ## acceptance, tier C: noise, mirrored tilts, covariances and tolerances with drawn centroids (minutes)
 	@scripts/setup mitsuba
 	@$(BIN)/python -m studies.acceptance c --out out/bars/c
 
-bars-nav-d: ## accuracy bars, tier D: markers measured wrongly, at the level of centroids (minutes)
+bars-nav-d: ## acceptance, tier D: wrong markers, with drawn centroids (minutes)
 	@scripts/setup mitsuba
 	@$(BIN)/python -m studies.acceptance d --out out/bars/d
 
-bars-nav-e: ## accuracy bars, tier E: sequences behind a swinging drogue, with tracker and filter (hours; goes on where it stopped)
+bars-nav-e: ## acceptance, tier E: sequences behind a swinging drogue, with tracker and filter (hours; resumes)
 	@scripts/setup mitsuba
 	@$(BIN)/python -m studies.acceptance e --out out/bars/e
 
-bars-nav-docking: ## accuracy bars of whole docking runs, by both engines and beside by two other sensors (days; goes on where it stopped)
+bars-nav-docking: ## acceptance of whole docking runs, by both engines, and with two more sensors (days; resumes)
 	@scripts/setup all
 	@$(BIN)/python -m studies.acceptance docking --out out/bars/docking --engine mitsuba --engine blender --rig rgb-ideal --rig paper-colour --rig mono
 
-publish: ## make the published manifests of the small recipes anew (minutes); after a change of pixels or recipes
+publish: ## make the published manifests of the small recipes again, after a change of pixels or recipes (minutes)
 	@scripts/setup mitsuba
 	@rm -rf out/publish
 	@$(BIN)/python -m studies.publish --work out/publish --out datasets_manifest/published

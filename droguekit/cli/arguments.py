@@ -65,7 +65,7 @@ WorkersOption = Annotated[
 DetectorOption = Annotated[
     str | None,
     typer.Option(
-        "--detector", metavar="NAME|FILE.onnx", help="A detector's name, or a network; docs/reference/detection.md."
+        "--detector", metavar="NAME|FILE.onnx", help="A detector's name, or a network; docs/reference/detectors.md."
     ),
 ]
 EngineOption = Annotated[str | None, typer.Option("--engine", metavar="NAME", help="Replaces the recipe's engine.")]

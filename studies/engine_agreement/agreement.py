@@ -13,7 +13,7 @@ from studies.engine_agreement.measures import FrameAgreement, PlateIlluminance, 
 from studies.engine_agreement.navigation_agreement import PairedErrors, mean_differences, size_ratios
 from studies.engine_agreement.paired_frames import PairedFrame, RenderedFrame, render_plain_and_lit
 
-# The bars of the agreement: see docs/explanation/blender.md.
+# The criteria of the agreement, which README.md lists.
 MOST_CENTROID_RMS_PX = 0.02
 LEAST_DROGUE_IOU = 0.995
 IOU_FROM_M = 5.0

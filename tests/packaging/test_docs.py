@@ -27,6 +27,8 @@ from nav.runner import method_names
 REPOSITORY = Path(__file__).resolve().parents[2]
 PAGES = sorted([*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("studies/*/*.md")])
 
+CODE = ("geometry", "drogue_models", "datasets_manifest", "scenes", "render", "labelgen", "nav", "droguekit", "studies")
+
 
 def text(name: str) -> str:
     return (REPOSITORY / name).read_text(encoding="utf-8")
@@ -71,8 +73,7 @@ def test_targets_of_make_exist() -> None:
 
 
 def test_files_named_in_the_docs_exist() -> None:
-    packages = "geometry|drogue_models|datasets_manifest|scenes|render|labelgen|nav|droguekit|studies|tests|docs"
-    pattern = rf"`((?:{packages})/[\w/.]+)`"
+    pattern = rf"`((?:{'|'.join(CODE)}|tests|docs)/[\w/.]+)`"
     named = {name for page in PAGES for name in re.findall(pattern, page.read_text(encoding="utf-8"))}
     assert named and [name for name in sorted(named) if "NAME" not in name and not (REPOSITORY / name).exists()] == []
 
@@ -105,10 +106,20 @@ def test_the_example_of_a_method_finds_a_pose() -> None:
     np.testing.assert_allclose(answer.left_from_drogue.translation_m, [0.06, 0.0, 5.0], atol=1e-9)
 
 
-def test_every_test_named_for_the_paper_exists() -> None:
-    named = set(re.findall(r"`(test_\w+)`", text("docs/explanation/paper.md")))
-    there = set(re.findall(r"^def (test_\w+)", "".join(p.read_text() for p in REPOSITORY.glob("tests/**/*.py")), re.M))
-    assert named and named <= there
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_every_test_named_in_the_docs_exists(page: Path) -> None:
+    named = set(re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8")))
+    tests = "".join(path.read_text(encoding="utf-8") for path in REPOSITORY.glob("tests/**/*.py"))
+    assert named <= set(re.findall(r"^def (test_\w+)", tests, re.MULTILINE))
+    assert named or page.name != "paper.md"
+
+
+def test_pages_named_in_the_code_exist() -> None:
+    code = [path for package in CODE for path in (REPOSITORY / package).rglob("*.py")]
+    named = {
+        name for path in code for name in re.findall(r"(?<!-)\bdocs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    assert named and [name for name in sorted(named) if not (REPOSITORY / name).exists()] == []
 
 
 def test_the_table_of_methods_names_their_centroids() -> None:
