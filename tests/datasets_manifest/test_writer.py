@@ -197,7 +197,6 @@ def test_an_unwritable_folder_is_one_clear_line(tmp_path):
 KILLED = """
 import os, signal
 from pathlib import Path
-from datasets_manifest.storage.storage import writer
 
 def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)
