@@ -1,4 +1,4 @@
-"""A disc as one eye sees it: the ellipse of its image, and where pixel centres meet its plane."""
+"""The image of a disc in one eye: its ellipse, and the points of its plane that pixel centres see."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
 
-# Their lowest and highest fall short of the curve's by 8e-5 of the radius.
+# The extent of so many points is smaller than the curve's by 8e-5 of the radius.
 _OUTLINE_POINTS = 256
 
 
@@ -91,7 +91,7 @@ class DiscInEye:
 
 
 def marker_discs(layout: MarkerLayout, rig: StereoRig, pose: RigidTransform, eye: Eye) -> list[DiscInEye]:
-    """The markers in their order, as one eye sees them; `pose` is `left_from_drogue`."""
+    """The markers in the drogue's order, in the frame of one eye; `pose` is `left_from_drogue`."""
     centers = pose.apply(layout.centers_m) - rig.eye_offset_m(eye)
     axis = pose.rotation[:, 2]
     return [
@@ -103,7 +103,7 @@ def marker_discs(layout: MarkerLayout, rig: StereoRig, pose: RigidTransform, eye
 def hub_discs(
     layout: MarkerLayout, rig: StereoRig, pose: RigidTransform, eye: Eye
 ) -> tuple[DiscInEye, DiscInEye] | None:
-    """The discs of the hub's outer and inner edge, as one eye sees them, or None without a hub."""
+    """The discs of the hub's outer and inner edge in the frame of one eye, or None without a hub."""
     if layout.hub_center_m is None:
         return None
     center = pose.apply(layout.hub_center_m) - rig.eye_offset_m(eye)
@@ -119,7 +119,7 @@ class PixelWindow:
     """A rectangle of pixels.
 
     Attributes:
-        rows, columns: where it lies in the image.
+        rows, columns: its position in the image.
         pixels_px: (h, w, 2) coordinates of its pixel centres.
     """
 
@@ -129,11 +129,11 @@ class PixelWindow:
 
 
 def window_around(disc: DiscInEye, factor: float) -> PixelWindow | None:
-    """The pixels of the image near a disc, or None where its surroundings lie outside.
+    """The pixels of the image around a disc, or None where none of them is on the image.
 
     Args:
         disc: the disc.
-        factor: how many times the extent of its image to cover.
+        factor: size of the window over the extent of the disc's image.
     """
     u_low, v_low, u_high, v_high = disc.extent_px()
     columns = _within((u_low + u_high) / 2, factor * (u_high - u_low) / 2, disc.camera.width_px)

@@ -1,4 +1,4 @@
-"""All labels of one stereo pair."""
+"""All labels of one stereo pair: pose, markers, hub, boxes and conditions."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from render.camera.sensor import MONO_WEIGHTS
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sky.photometry import REC709_LUMINANCE
 
-# The surroundings that a feature stands out against reach from its edge to this multiple of its radius.
+# A feature's background reaches from its edge to this multiple of its radius.
 _SURROUNDINGS_REACH = 1.8
 
 
 def marker_views(
     frame: FrameSpec, layout: MarkerLayout, pose: RigidTransform, eye: Eye, seen: EyeRadiance
 ) -> tuple[FeatureView, ...]:
-    """Labels of all markers in their order.
+    """Labels of all markers in the drogue's order.
 
     Args:
         frame: for rig, sensor and exposure.
@@ -89,8 +89,8 @@ def _feature_view(frame: FrameSpec, disc: DiscInEye, seen: EyeRadiance, proj: Ar
 def signal_to_noise(frame: FrameSpec, disc: DiscInEye, seen: EyeRadiance) -> float:
     """Contrast of a feature against the dark parts around it, over shot and read noise at their mean level.
 
-    Of the sensor's channels the best one counts. Numbers are those of a perfect lens, before noise and rounding; 0 for
-    a feature without visible pixels.
+    Of the sensor's channels the one with the highest ratio. Computed for a perfect lens, before noise and rounding; 0
+    for a feature without visible pixels.
     """
     window = window_around(disc, _SURROUNDINGS_REACH)
     if window is None:
@@ -133,12 +133,12 @@ def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages
     """The truth of one pair.
 
     Args:
-        frame: what was rendered.
-        radiance: with the passes that visibility is read from.
-        images: what the sensor made of it.
+        frame: its specification.
+        radiance: with the passes that determine visibility.
+        images: of the sensor.
 
     Returns:
-        The record, without its files' hashes.
+        The record, without the hashes of its files.
 
     Raises:
         ValueError: images or passes do not belong to the frame.
@@ -248,7 +248,7 @@ def _board_corners_px(frame: FrameSpec, eye: Eye) -> tuple[PixelPoint, ...]:
 
 
 def _background_luminance_cd_m2(radiance: StereoRadiance) -> float:
-    """Mean luminance of the pixels of both eyes that see no part; of all pixels where every one sees some part."""
+    """Mean luminance of the sky pixels of both eyes; of all pixels where none sees the sky."""
     eyes = (radiance.left, radiance.right)
     masks = [(eye.part_id == Part.SKY).view(np.uint8) for eye in eyes]
     counts = np.array([np.count_nonzero(mask) for mask in masks], dtype=np.float64)

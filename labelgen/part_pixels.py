@@ -23,7 +23,7 @@ _FEATURES = (int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + MAX_MARKER
 
 
 def parts_mask(part_id: NDArray[np.uint8], parts: tuple[int, ...] | list[int]) -> NDArray[np.bool_]:
-    """(H, W) whether a pixel centre sees one of some parts."""
+    """(H, W) whether a pixel centre sees one of the given parts."""
     table = np.zeros(256, dtype=np.uint8)
     table[list(parts)] = 1
     mask: NDArray[np.bool_] = cv2.LUT(part_id, table).view(np.bool_)
@@ -31,7 +31,7 @@ def parts_mask(part_id: NDArray[np.uint8], parts: tuple[int, ...] | list[int]) -
 
 
 class FeaturePixels:
-    """Where one eye sees markers and hub; they are found in one pass over the image."""
+    """Pixels of markers and hub in one eye's image, found in one pass over it."""
 
     def __init__(self, part_id: NDArray[np.uint8]) -> None:
         found = cv2.findNonZero(parts_mask(part_id, _FEATURES).view(np.uint8))
@@ -42,11 +42,11 @@ class FeaturePixels:
         self._ends = np.searchsorted(parts[order], np.arange(257))
 
     def count(self, part: int) -> int:
-        """How many pixel centres see a feature."""
+        """Number of pixel centres that see a feature."""
         return int(self._ends[part + 1] - self._ends[part])
 
     def indices(self, part: int) -> tuple[Indices, Indices]:
-        """Rows and columns of the pixel centres that see a feature, in the order of the image."""
+        """Rows and columns of the pixel centres that see a feature, row by row."""
         places = self._places[self._ends[part] : self._ends[part + 1]]
         return places[:, 1], places[:, 0]
 
@@ -55,7 +55,7 @@ class FeaturePixels:
 def drogue_hull_m(drogue: DrogueParameters) -> Array:
     """(V, 3) corners of the convex hull of rim, face, canopy, ribs, coupling, hub and markers, drogue frame. [m]
 
-    A perspective image's extent is reached at corners of the hull, so nothing else has to be projected.
+    The extent of a perspective image is reached at corners of the hull, so only these have to be projected.
     """
     meshes = drogue_meshes(drogue)
     wanted = [np.asarray(meshes[part].vertices) for part in drogue_part_ids(drogue.marker_count) if part in meshes]
@@ -82,12 +82,12 @@ def drogue_box(drogue: DrogueParameters, rig: StereoRig, left_from_drogue: Rigid
 
 
 def drogue_mask(part_id: NDArray[np.uint8], marker_count: int) -> NDArray[np.bool_]:
-    """(H, W) whether a pixel centre sees a part that belongs to the drogue's box."""
+    """(H, W) whether a pixel centre sees a part of the drogue, as its box covers it."""
     return parts_mask(part_id, drogue_part_ids(marker_count))
 
 
 def mask_box(mask: NDArray[np.bool_]) -> PixelBox | None:
-    """Box around the pixels of a mask, their whole areas included, or None for an empty one. [px]"""
+    """Box around the areas of a mask's pixels, or None for an empty mask. [px]"""
     columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
     if columns.size == 0:
         return None
@@ -96,6 +96,6 @@ def mask_box(mask: NDArray[np.bool_]) -> PixelBox | None:
 
 
 def is_truncated(box: PixelBox, camera: PinholeCamera) -> bool:
-    """Whether a box is not wholly on the image."""
+    """Whether a box reaches beyond the image."""
     u, v, width, height = box
     return bool(u < -0.5 or v < -0.5 or u + width > camera.width_px - 0.5 or v + height > camera.height_px - 0.5)

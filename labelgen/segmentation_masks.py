@@ -1,4 +1,4 @@
-"""Part masks of one eye: what is seen of a part, and all of it as if nothing stood before it."""
+"""Amodal part masks of one eye: every part as if nothing occluded it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from render.surfaces import missing_parts
 def part_triangles(frame: FrameSpec, eye: Eye) -> dict[int, Array]:
     """(T, 3, 3) corners of the triangles of every part at mid-exposure, in the frame of an eye. [m]
 
-    Of markers and hub only the front faces: their other sides are sunk in the part around them.
+    Markers and hub contribute only their front faces, as their other sides are inside the part around them.
 
     Raises:
         ValueError: a user's body mesh that is missing or was changed.
@@ -37,9 +37,9 @@ def part_triangles(frame: FrameSpec, eye: Eye) -> dict[int, Array]:
             meshes.append((int(Part.HOSE), hose_mesh(frame.hose_nodes_left_m, frame.drogue.hose_radius_m), here))
         if frame.left_from_tanker is not None:
             meshes.append((int(Part.TANKER), tanker_mesh(), frame.left_from_tanker))
-    for bystander in frame.bystanders:
-        part = int(Part[bystander.kind.upper()])
-        meshes.append((part, obstacle_mesh(bystander.shape), bystander.left_from_object))
+    for obstacle in frame.bystanders:
+        part = int(Part[obstacle.kind.upper()])
+        meshes.append((part, obstacle_mesh(obstacle.shape), obstacle.left_from_object))
     offset_m = frame.rig.eye_offset_m(eye)
     found: dict[int, list[Array]] = {}
     for part, mesh, left_from_mesh in meshes:
@@ -57,14 +57,14 @@ def _front(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 Mask = NDArray[np.bool_]
 
-# What stands before a drogue without belonging to it.
+# Parts that may occlude a drogue.
 OCCLUDERS = (int(Part.PROBE), int(Part.OBSTACLE))
 
 
 def named_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
-    """Names of the masks of a pair, and the part ids that belong to each.
+    """Part ids by name of the mask, for all masks of a pair.
 
-    `drogue` is all that belongs to its box, `occluder` the receiver's probe and obstacles; the others are single parts.
+    `drogue` is everything inside its box, `occluder` the receiver's probe and obstacles; all others are single parts.
     """
     drogue = record.frame.drogue
     parts: dict[str, tuple[int, ...]] = {}
@@ -83,15 +83,15 @@ def named_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
 
 
 def amodal_masks(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> dict[int, Mask]:
-    """(H, W) by part id, the pixel centres that would see the part if it stood alone.
+    """(H, W) by part id, the pixel centres that would see the part if nothing occluded it.
 
-    Every part is projected alone, as the engine draws it: as a mesh, or as flat rings by the analytic engine. What
-    is seen of a part belongs to all of it, though a ray that passes on an edge may be decided otherwise.
+    Every part is projected by itself, as the engine draws it: as a mesh, or as flat rings by the analytic engine. The
+    visible pixels are always included, even where rounding at an edge would decide otherwise.
 
     Args:
         record: of the pair.
         eye: which eye.
-        part_id: (H, W) what the eye sees.
+        part_id: (H, W) visible part ids.
 
     Raises:
         ValueError: a user's body mesh that is missing or was changed.
@@ -105,7 +105,7 @@ def amodal_masks(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> di
 
 
 def union_of_masks(masks: dict[int, Mask], parts: tuple[int, ...], shape: tuple[int, ...]) -> Mask:
-    """(H, W) of `shape`, the union of the masks of some parts; parts without a mask count as empty."""
+    """(H, W) of `shape`, the union of the masks of the given parts; a part without a mask is empty."""
     union = np.zeros(shape, dtype=np.bool_)
     for part in parts:
         if part in masks:

@@ -1,4 +1,4 @@
-"""Which pixel centres of an eye see a mesh that stands alone, through whatever lens the eye has."""
+"""Silhouettes: the pixel centres of an eye that see a mesh, through an ideal or a real lens."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from geometry.distortion import border_px
 from geometry.se3 import Array
 from geometry.stereo import Eye, StereoRig
 
-# Nothing stands nearer to an eye. [m]
+# No part is closer to an eye. [m]
 _NEAR_M = 0.01
-# The image with a rim around it: beyond, a lens's polynomial may fold back into the image.
+# Field of view with a margin; beyond it a lens's polynomial may fold back into the image.
 _FIELD_MARGIN = 1.05
-# A strong lens bends an edge of this length by 3e-3 px (curvature 1e-4 / px), which decides no pixel in a hundred.
+# A strong lens bends an edge of this length by 3e-3 px (curvature 1e-4 / px), which changes no pixel in a hundred.
 _STRAIGHT_PX = 16.0
 _MOST_PIECES = 128
 
@@ -42,7 +42,7 @@ def silhouette(triangles_m: Array, rig: StereoRig, eye: Eye) -> NDArray[np.bool_
 
 
 def _field_planes(rig: StereoRig, eye: Eye) -> Array:
-    """(5, 4) planes around what the eye sees: a point p is inside where `plane[:3] @ p >= plane[3]`."""
+    """(5, 4) planes around the field of view: a point p is inside where `plane[:3] @ p >= plane[3]`."""
     lens = rig.lens(eye)
     rays = rig.rays(border_px(rig.camera if lens is None else lens.camera), eye)
     low, high = rays[:, :2].min(axis=0) * _FIELD_MARGIN, rays[:, :2].max(axis=0) * _FIELD_MARGIN
@@ -58,7 +58,7 @@ def _field_planes(rig: StereoRig, eye: Eye) -> Array:
 
 
 def _clipped(triangles_m: Array, planes: Array) -> Array:
-    """(T', 3, 3) what of (T, 3, 3) triangles is inside all planes, again as triangles."""
+    """(T', 3, 3) triangles of the parts of (T, 3, 3) triangles inside all planes."""
     kept = triangles_m
     for plane in planes:
         height = kept @ plane[:3] - plane[3]
@@ -70,7 +70,7 @@ def _clipped(triangles_m: Array, planes: Array) -> Array:
 
 
 def _cut(corners_m: Array, height_m: Array) -> Array:
-    """(1 or 2, 3, 3) the part of a triangle whose corners' heights are not negative (Sutherland and Hodgman)."""
+    """(1 or 2, 3, 3) the part of a triangle at heights that are not negative (Sutherland and Hodgman)."""
     outline = []
     for index in range(3):
         following = (index + 1) % 3
@@ -91,7 +91,7 @@ def _divided(triangles_m: Array, pieces: int) -> Array:
 
 
 def _span_ends(outlines_px: Array, width_px: int, height_px: int) -> NDArray[np.int64]:
-    """(H (W + 1),) how many outlines more than left of it each pixel centre lies in.
+    """(H (W + 1),) difference in the number of outlines around a pixel centre and its left neighbour.
 
     Args:
         outlines_px: (P, M, 2) corners of convex outlines.

@@ -51,10 +51,10 @@ def dataset_drogues(recipe: Recipe) -> list[DrogueParameters]:
 
 
 def object_id(recipe: Recipe, record: PairRecord) -> int:
-    """The id of a pair's drogue.
+    """The object id of a pair's drogue.
 
     Raises:
-        ValueError: the pair has none, or one that is not the recipe's.
+        ValueError: the pair has none, or one that is not in the recipe.
     """
     drogues = dataset_drogues(recipe)
     if record.frame.drogue not in drogues:
@@ -83,9 +83,9 @@ def write_models(recipe: Recipe, folder: Path) -> None:
 
 
 def model_info(drogue: DrogueParameters, vertices_mm: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
-    """Diameter, extent and symmetries of a model; its (V, 3) vertices are given. [mm]
+    """Diameter, extent and symmetries of a model, from its (V, 3) vertices. [mm]
 
-    The symmetries are those of the markers, 4x4 row by row: turns about the axis, the whole turn left out.
+    The symmetries are those of the markers: turns about the axis as 4x4 matrices, row by row, without the identity.
     """
     low, size = vertices_mm.min(axis=0), np.ptp(vertices_mm, axis=0)
     hull = vertices_mm[ConvexHull(vertices_mm).vertices]
@@ -105,7 +105,7 @@ def _turn(angle: float) -> list[float]:
 
 SPLIT_FOLDERS: dict[SplitName, str] = {"train": "train_pbr", "val": "val", "test": "test"}
 TARGETS_FILE = "test_targets_bop19.json"
-# The challenge asks for objects of which this share is seen.
+# The challenge's targets are objects with at least this visible share.
 _TARGET_FROM_FRACTION = 0.1
 # Millimetres per depth number: the finest that holds the farthest thing in the image.
 _DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
@@ -173,7 +173,7 @@ def write_bop(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
 
 class _Scenes:
-    """The images and tables of all scenes; every pair is appended to its scene's tables as it comes."""
+    """The images and tables of all scenes, to which pairs are appended one by one."""
 
     def __init__(self, source: Dataset, folder: Path, log: ExportLog) -> None:
         self._source, self._folder, self._log = source, folder, log
@@ -183,7 +183,7 @@ class _Scenes:
         """Write one pair.
 
         Returns:
-            The share of the drogue that the eye which sees more of it sees.
+            The visible share of the drogue, in the eye that sees more of it.
         """
         scene = self._folder / SPLIT_FOLDERS[split] / f"{record.scene_id:06d}"
         seen = [self._add_eye(record, eye, scene) for eye in EYES]
@@ -216,14 +216,14 @@ class _Scenes:
         return visible_share
 
     def _masks(self, record: PairRecord, eye: Eye) -> tuple[Mask, Mask]:
-        """All of the drogue, and what is seen of it."""
+        """Amodal and visible mask of the drogue."""
         assert record.frame.drogue is not None
         part_id = self._source.part_ids(record.frame_index, eye)
         parts = tuple(drogue_part_ids(record.frame.drogue.marker_count))
         return union_of_masks(amodal_masks(record, eye, part_id), parts, part_id.shape), parts_mask(part_id, parts)
 
     def _add_depth(self, record: PairRecord, eye: Eye, scene: Path) -> float:
-        """Write the depth where the dataset has it; returns millimetres per number."""
+        """Write the depth, where the dataset has it, and return millimetres per depth number."""
         if not self._source.manifest.recipe.outputs.exr:
             self._log.lost("depth images left out, for the dataset has no EXR files")
             return 1.0
@@ -244,7 +244,7 @@ class _Scenes:
 
 
 def depth_numbers(depth_m: NDArray[np.float32]) -> tuple[NDArray[np.uint16], float]:
-    """(H, W) depth as BOP stores it, and millimetres per number; 0 for the sky and what no number reaches."""
+    """(H, W) depth as BOP stores it, 0 for the sky and beyond the range, and millimetres per depth number."""
     known = np.isfinite(depth_m)
     depth_mm = np.where(known, depth_m, 0.0).astype(np.float64) * MM_PER_M
     farthest = float(depth_mm.max(initial=0.0))
@@ -294,7 +294,7 @@ def _ground_truth(record: PairRecord, eye: Eye, obj_id: int) -> dict[str, Any]:
 
 
 def _count_all(record: PairRecord, eye: Eye, whole: Mask) -> int:
-    """Pixels of the whole silhouette beyond the image too, on a canvas of three times its size, as BOP counts them."""
+    """Pixels of the whole silhouette, also beyond the image, on a canvas of three times its size as in BOP."""
     view = record.views.left if eye == "left" else record.views.right
     if not view.truncated or record.frame.drogue is None:
         return int(np.count_nonzero(whole))

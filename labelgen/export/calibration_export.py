@@ -1,4 +1,4 @@
-"""The rig's calibration in the files of one program at a time."""
+"""Exports of the rig's calibration, for OpenCV, Kalibr or ROS."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def write_kalibr(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
 
 def write_camera_info(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """ROS's `camera_info`, a file an eye; arguments and errors as in `labelgen.export.formats`."""
+    """ROS's `camera_info`, one file for each eye; arguments and errors as in `labelgen.export.formats`."""
     rig = read_manifest(dataset).recipe.rig
     return _write(out, {camera_info_file(eye): camera_info(rig, eye) for eye in EYES})
 

@@ -45,7 +45,7 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class MaskPixels:
-    """Pixels of an image in COCO's order, column by column.
+    """The pixels of one mask, column by column as in COCO.
 
     Attributes:
         columns, rows: (N,) of each pixel. [px]
@@ -86,7 +86,7 @@ class MaskPixels:
 
 
 class DroguePixels:
-    """Where one eye sees the drogue and its features; only the drogue's visible box is looked at."""
+    """Masks of the drogue and its features in one eye's image, computed within the drogue's visible box."""
 
     def __init__(self, part_id: NDArray[np.uint8], box: PixelBox, marker_count: int) -> None:
         """Crop the part ids.
@@ -106,7 +106,7 @@ class DroguePixels:
         self._features = FeaturePixels(self._turned)
 
     def drogue(self) -> MaskPixels:
-        """All that belongs to the drogue's box."""
+        """The whole drogue."""
         return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count)))
 
     def feature(self, part: int) -> MaskPixels:
@@ -129,7 +129,7 @@ KEYPOINT_SIGMA = 0.0214
 
 
 def coco_image_id(frame_index: int, eye: Eye) -> int:
-    """Id of an image, the same in every file and after any merge; it is the drogue's annotation's id too."""
+    """Id of an image, and of its drogue's annotation; the same in every file and after any merge."""
     return 2 * frame_index + EYES.index(eye) + 1
 
 
@@ -217,7 +217,7 @@ def coco_annotation(
     image_id = coco_image_id(record.frame_index, eye)
     mask = {} if part_id is None else {"segmentation": _drogue_mask(record, eye, part_id)}
     return {
-        # One drogue an image: the image's id is as unique and as stable.
+        # With one drogue in an image, the image's id identifies it too.
         "id": image_id,
         "image_id": image_id,
         "category_id": DROGUE,
@@ -316,18 +316,18 @@ def _corner_box(box: PixelBox) -> list[float]:
 
 
 def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Keypoint results in that one of the equal orders which fits the truth best; `COCOeval` then scores them as usual.
+    """Keypoint results in the symmetric order that fits the truth best, to be scored by `COCOeval`.
 
-    An even ring of eight looks the same after each of eight turns, so a detector may begin with any marker. Its result
-    counts as the best of the turns, the minimum of the squared distances over them; orders that are not a turn of the
-    drogue, such as the mirrored one, stay wrong.
+    An evenly spaced ring of eight looks the same after each of eight turns, so a detector may begin with any marker.
+    The order with the smallest sum of squared distances is taken; orders that are not a turn of the drogue, such as the
+    mirrored one, remain errors.
 
     Args:
         truth: a file of `write_coco` or a dataset's `annotations`.
-        results: as for `COCO.loadRes`, with `keypoints` in any of the equal orders, that in the image among them.
+        results: as for `COCO.loadRes`, with `keypoints` in any of the symmetric orders, such as that in the image.
 
     Returns:
-        Copies of the results. Those on images without a drogue are as they were.
+        Copies of the results; those on images without a drogue are unchanged.
 
     Raises:
         ValueError: a result with another number of keypoints than the truth has.
@@ -373,20 +373,20 @@ def write_coco(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: the dataset's folder.
         out: folder to write into; files of these names are replaced.
-        log: is told what is left out.
+        log: counts what the format cannot hold.
 
     Returns:
         The files, `all.json` first.
 
     Raises:
         ValueError: the dataset cannot be read; names the file.
-        OSError: a file cannot be written. It is then left as it was before.
+        OSError: a file cannot be written; an existing one stays as it was.
     """
     return [out / name for name in _write(dataset, out, log, with_features=True)]
 
 
 def read_part_ids(source: Dataset, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
-    """(H, W) the part ids of a view, or None where its record knows of none.
+    """(H, W) part ids of a view, or None where its record lists none.
 
     Raises:
         ValueError: they are on record but cannot be read; names the file.
@@ -421,7 +421,7 @@ def _write(dataset: Location, out: Location, log: ExportLog, with_features: bool
 
 
 def _tell(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[str, Any]]) -> None:
-    """Count what the annotations of a view lack."""
+    """Log what the annotations of a view lack."""
     log_cut_labels(log, record, eye)
     if not annotations:
         return
@@ -435,7 +435,7 @@ def _tell(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[s
 
 
 class _CocoFile:
-    """One file that grows entry by entry: images go straight to it, annotations wait in a spool on disk."""
+    """A COCO file, written entry by entry: images directly, annotations by way of a temporary file."""
 
     def __init__(self, stack: ExitStack, target: Storage, name: str, header: str) -> None:
         self._stream: IO[str] = stack.enter_context(target.write_text(name))

@@ -1,4 +1,4 @@
-"""What every export shares: progress, the log of what a format cannot hold, consistency of records, order in time."""
+"""Shared by all exports: progress, the log of what a format cannot hold, consistency of records, order in time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LARGEST_ID = 2**63 - 1
 
 
 def record_fault(record: PairRecord) -> str | None:
-    """What in a record contradicts the rest of it, or None; `droguekit validate` looks closer, and at the pixels."""
+    """The first contradiction within a record, or None; `droguekit validate` checks more, also against pixels."""
     if max(record.scene_id, record.sequence_id or 0) > _LARGEST_ID:
         return f"scene_id, sequence_id: must be at most {_LARGEST_ID}"
     angles = (record.pitch_deg, record.yaw_deg, record.roll_deg, record.roll_modulo_deg)
@@ -65,30 +65,30 @@ def _is_pixels(box: PixelBox, camera: PinholeCamera) -> bool:
 
 
 class Progress(Protocol):
-    """What counts the pairs for the user."""
+    """A progress display."""
 
     def begin(self, what: str, total: int) -> None:
-        """`total` pieces of work of the kind `what` are about to start."""
+        """Begin a task of `total` steps with the unit `what`."""
         ...
 
     def advance(self) -> None:
-        """One piece is finished."""
+        """Finish one step."""
         ...
 
     def end(self) -> None:
-        """The work that `begin` announced is over."""
+        """End the task."""
         ...
 
 
 class ExportLog:
-    """Counts pairs for the user and, by reason, everything that was dropped, cut or changed."""
+    """Reports progress and counts, by reason, everything that an export drops, cuts or changes."""
 
     def __init__(self, progress: Progress | None = None) -> None:
         self._progress = progress
         self._losses: Counter[str] = Counter()
 
     def records(self, source: Dataset) -> Iterator[PairRecord]:
-        """The truth of all pairs in the order of their indices, one at a time.
+        """The records of all pairs in the order of their indices, one at a time.
 
         Raises:
             ValueError: a record that cannot be read or contradicts itself; names the file.
@@ -105,18 +105,18 @@ class ExportLog:
                 self._progress.advance()
 
     def end(self) -> None:
-        """The export is over, or has failed."""
+        """End the progress display, after success or failure."""
         if self._progress is not None:
             self._progress.end()
 
     def lost(self, what: str, count: int = 1) -> None:
-        """`count` more of `what` (plural, with the reason) are not in the export as they are in the dataset."""
+        """Count `count` more of `what` (plural, with the reason), which the export lacks or changes."""
         if count:
             self._losses[what] += count
 
     @property
     def losses(self) -> dict[str, int]:
-        """How many of what, by name."""
+        """Counts by reason, sorted by name."""
         return dict(sorted(self._losses.items()))
 
 
@@ -124,12 +124,12 @@ _LATEST_S = 2.0**31
 
 
 def sequence_name(sequence_id: int | None) -> str:
-    """Name of a sequence's file or folder; single pairs, which belong to none, share one."""
+    """Name of a sequence's file or folder; all single pairs share one."""
     return "single_pairs" if sequence_id is None else f"sequence_{sequence_id:04d}"
 
 
 class SequenceOrder:
-    """Checks, pair by pair, that times ascend and that no sequence comes back after another one began.
+    """Checks, pair by pair, that times ascend and that sequences do not interleave.
 
     Attributes:
         is_first: whether the last pair began a sequence.

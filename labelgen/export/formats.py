@@ -1,7 +1,7 @@
-"""The formats that a dataset can be written in; a format's module is imported when it is asked for.
+"""The export formats; a format's module is imported when it is used.
 
-A writer takes the dataset's place, the folder to write into and a log. It goes through `log.records(...)`, holds one
-pair at a time, tells the log what its format cannot hold, and makes files appear whole or not at all: single files by
+A writer takes the dataset's location, the folder to write into and a log. It iterates over `log.records(...)`, holds
+one pair at a time, logs what its format cannot hold, and makes files appear whole or not at all: single files by
 `open_text_atomic`, folders by `new_folder`, both of `datasets_manifest.atomic`. The same dataset gives the same bytes.
 """
 
@@ -24,8 +24,8 @@ class ExportFormat:
 
     Attributes:
         description: one line for the command's help.
-        writer: `module:function` of its `Writer`, which returns the files or folders to tell the user of.
-        extra: the extra of pyproject.toml that has what it needs, or None.
+        writer: `module:function` of its `Writer`, which returns the main files or folders that it wrote.
+        extra: the extra of pyproject.toml with its dependencies, or None.
     """
 
     description: str
@@ -77,15 +77,15 @@ def write_export(name: str, dataset: Location, out: Path, log: ExportLog) -> lis
         name: of the format.
         dataset: the dataset's folder.
         out: folder to write into.
-        log: is told how far the work is and what the format cannot hold.
+        log: receives the progress and what the format cannot hold.
 
     Returns:
-        The files or folders to tell the user of.
+        The main files or folders that were written.
 
     Raises:
         ValueError: no such format, a package that it needs is missing, a dataset that cannot be read or has no
             pairs, or a place that cannot be written into.
-        OSError: the disk is full or cannot be written; nothing half-written is left.
+        OSError: the disk is full or cannot be written; nothing incomplete is left.
     """
     if name not in FORMATS:
         raise ValueError(f"--format: no format named {name!r}; there are {', '.join(FORMATS)}")

@@ -1,4 +1,4 @@
-"""Files of a dataset's frames on their way into an export."""
+"""Exports image files of a dataset's frames: as hard links, copies or converted to 8 bits."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from labelgen.export.export_log import ExportLog
 
 
 def export_file(source: Dataset, frame_index: int, name: str, target: Path) -> None:
-    """A file of a pair once more: without taking room where the disk can do so.
+    """Write a file of a pair to `target`, as a hard link where the disk supports it.
 
     Raises:
-        ValueError: it is missing or leads elsewhere; names the file.
+        ValueError: it is missing or leads out of the frame's folder; names the file.
         OSError: it cannot be written.
     """
     path = source.frames.path(frame_index, name)
@@ -32,7 +32,7 @@ def export_file(source: Dataset, frame_index: int, name: str, target: Path) -> N
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """The file once more under another name: without taking room where the disk can do so, else as a copy.
+    """Link `target` to `source`, or copy it where the disk does not support hard links.
 
     Raises:
         OSError: it cannot be written.
@@ -48,14 +48,14 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 
 def export_image(source: Dataset, frame_index: int, eye: Eye, target: Path, log: ExportLog) -> None:
-    """One eye's image for programs that take 8 bits a sample.
+    """Write one eye's image for programs that take 8 bits a sample.
 
     Args:
         source: the dataset.
         frame_index: which pair.
         eye: which image.
         target: the PNG to make: a link or a copy, or the upper 8 of 12 bits.
-        log: is told of bits that are left out.
+        log: counts the images that lose bits.
 
     Raises:
         ValueError: the image is missing or damaged; names the file.

@@ -1,4 +1,4 @@
-"""Markers as keypoints: places, flags, and the orders that an even ring cannot tell apart."""
+"""Markers as keypoints: positions, visibility flags, and the equivalent orders of an evenly spaced ring."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye
 from labelgen.export.export_log import ExportLog
 
-# A marker counts as visible from half of its pixels on.
+# A marker counts as visible if at least this share of its pixels is.
 _VISIBLE_FROM_FRACTION = 0.5
 CORNER_FROM_CENTER_PX = 0.5
-"""What formats that count from the image's corner add to the records' pixel-centre coordinates."""
+"""Offset of formats whose origin is the image's corner from the records' pixel-centre coordinates. [px]"""
 MIN_KEYPOINTS = 8
-"""Drogues with fewer markers get as many keypoints, the rest absent, so that all datasets fit one network."""
+"""Drogues with fewer markers get absent keypoints up to this number, so that one network fits all datasets."""
 
 
 class Keypoint(NamedTuple):
-    """A marker's centre, counted from the image's corner [px]; flag 0 outside the image (x = y = 0), 1 hidden, 2 seen.
+    """A marker's centre from the image's corner [px]; flag 0 outside the image (x = y = 0), 1 hidden, 2 visible.
 
-    Hidden is a marker of which less than half can be seen.
+    A marker of which less than half is visible counts as hidden.
     """
 
     x: float
@@ -38,7 +38,7 @@ ABSENT = Keypoint(0.0, 0.0, 0)
 
 
 def keypoint_count(manifest: Manifest) -> int:
-    """Keypoints of every drogue in a dataset's exports: markers of the drogue with most of them, at least 8."""
+    """Number of keypoints of every drogue in a dataset's exports: the largest number of markers, at least 8."""
     recipe = manifest.recipe
     counts = [recipe.drogue.marker_count, *(variant.drogue.marker_count for variant in recipe.variants)]
     return max(MIN_KEYPOINTS, *counts)
@@ -50,7 +50,7 @@ def view_of(record: PairRecord, eye: Eye) -> ViewRecord:
 
 
 def view_keypoints(view: ViewRecord, camera: PinholeCamera, count: int) -> list[Keypoint]:
-    """The markers of a view in the drogue's order, filled up with absent ones to `count`."""
+    """The markers of a view in the drogue's order, padded with absent ones to `count`."""
     points = []
     for marker in view.markers:
         u, v = marker.center_proj_px
@@ -63,9 +63,9 @@ def view_keypoints(view: ViewRecord, camera: PinholeCamera, count: int) -> list[
 
 
 def clockwise_order(view: ViewRecord) -> list[int]:
-    """Indices of the markers as they stand in the image: the one nearest the top first, then clockwise.
+    """Indices of the markers by their positions in the image: the one nearest the top first, then clockwise.
 
-    Even rings look the same after a turn by one marker; this order does not depend on which is which.
+    An evenly spaced ring looks the same after a turn by one marker; this order does not depend on the marker's index.
     """
     centers = np.array([marker.center_proj_px for marker in view.markers])
     right, down = (centers - centers.mean(axis=0)).T
@@ -76,10 +76,10 @@ def clockwise_order(view: ViewRecord) -> list[int]:
 
 @lru_cache(maxsize=64)
 def symmetric_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
-    """The orders of the markers that a turn of the drogue onto itself makes, beginning with the drogue's own.
+    """The permutations of the markers by turns that map the drogue onto itself, beginning with the identity.
 
     Returns:
-        One for each of the `symmetry_order` turns: entry i is the place, by marker, to which marker i comes.
+        One for each of the `symmetry_order` turns: entry i is the index of the marker to whose position marker i moves.
     """
     layout = marker_layout(drogue)
     places = layout.centers_m[:, :2]
@@ -93,7 +93,7 @@ def symmetric_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
 
 
 def log_cut_labels(log: ExportLog, record: PairRecord, eye: Eye) -> None:
-    """Tell the log what formats with visible boxes do not hold of a view's drogue."""
+    """Log a drogue without visible pixels, or whose box is cut at the image's border."""
     view = view_of(record, eye)
     if record.left_from_drogue is not None and view.box_visible_xywh_px is None:
         log.lost("views with a drogue of which no pixel is seen: without a label")
@@ -102,6 +102,6 @@ def log_cut_labels(log: ExportLog, record: PairRecord, eye: Eye) -> None:
 
 
 def log_absent_keypoints(log: ExportLog, points: list[Keypoint], marker_count: int) -> None:
-    """Tell the log how many of the markers, which come first among the keypoints, have no place."""
+    """Log how many of the markers, the first of the keypoints, are outside the image."""
     absent = sum(point.flag == 0 for point in points[:marker_count])
     log.lost("keypoints outside the image: without a place", absent)

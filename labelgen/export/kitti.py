@@ -28,7 +28,7 @@ from labelgen.export.keypoints import log_cut_labels, view_of
 from labelgen.part_pixels import drogue_hull_m
 
 _NUMBER_OF_EYE: dict[Eye, int] = {"left": 2, "right": 3}
-# KITTI's own levels have no numbers; of the markers' area that should be seen, these shares divide ours.
+# KITTI defines its occlusion levels in words; our limits are these visible shares of the markers' area.
 _UNOCCLUDED_FRACTION, _PARTLY_FRACTION = 0.99, 0.5
 
 
@@ -38,7 +38,7 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: the dataset's folder.
         out: new folder.
-        log: is told what is left out.
+        log: counts what the format cannot hold.
 
     Returns:
         The folder.
@@ -77,7 +77,7 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
 
 def kitti_calibration(rig: StereoRig) -> list[str]:
-    """The lines of a `calib` file; the rig has no laser scanner, and its left eye stands for it."""
+    """Lines of a `calib` file; the rig has no laser scanner, so the left eye takes its place."""
     matrices = opencv_stereo_matrices(rig)
     still = np.hstack([np.eye(3), np.zeros((3, 1))])
     lines: dict[str, Array] = {

@@ -1,4 +1,4 @@
-"""Part masks as PNG images, a folder a pair: what is seen of every part, and all of it as if it stood alone."""
+"""Exports part masks as PNG images, a folder for each pair: every part's visible and amodal mask."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from labelgen.segmentation_masks import Mask, amodal_masks, named_parts, union_o
 def write_masks(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write `000123/left_rim_visible.png` and `left_rim_amodal.png`, 255 on the part and 0 elsewhere.
 
-    A part that the image has nothing of has no file. Arguments and errors as in `labelgen.export.formats`.
+    Empty masks have no file. Arguments and errors as in `labelgen.export.formats`.
     """
     source = Dataset(dataset)
     with new_folder(out) as folder:

@@ -1,7 +1,7 @@
 """One Parquet table with a row a view: pose, conditions, boxes and features.
 
 Names, units and meaning are those of the records; boxes and points are in pixel-centre coordinates. Columns of markers
-are lists in the drogue's order. What a view has not, such as the pose of an empty frame, is null.
+are lists in the drogue's order. Missing values, such as the pose of an empty frame, are null.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def write_parquet(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: the dataset's folder.
         out: folder to write into; a file of this name is replaced.
-        log: is told how far the work is.
+        log: receives the progress.
 
     Returns:
         The file.

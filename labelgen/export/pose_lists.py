@@ -39,7 +39,7 @@ def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: the dataset's folder.
         out: new folder.
-        log: is told of images without a drogue, which the format cannot list.
+        log: counts images without a drogue, which the format cannot list.
 
     Returns:
         The folders of the eyes.
@@ -138,7 +138,7 @@ def write_tum(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: folder.
         out: folder to make.
-        log: is told the progress, and which pairs have no pose.
+        log: receives the progress, and counts pairs without a pose.
 
     Returns:
         The files.

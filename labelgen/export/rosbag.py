@@ -50,7 +50,7 @@ def header(stamp_ns: int, frame: str) -> Any:
 
 
 def image_message(images: StereoImages, eye: Eye, stamp_ns: int) -> Any:
-    """What an eye saw, as it left the sensor: a Bayer sensor's mosaic as the mosaic."""
+    """The image of an eye; of a Bayer sensor the raw mosaic."""
     left_pixels, left_mosaic = images.left, images.left_mosaic
     pixels, mosaic = (left_pixels, left_mosaic) if eye == "left" else (images.right, images.right_mosaic)
     kind = "bayer_rggb" if mosaic is not None else "rgb" if pixels.ndim == 3 else "mono"
@@ -105,7 +105,7 @@ def transforms_message(transforms: dict[tuple[str, str], RigidTransform], stamp_
 
 
 def fixed_transforms(rig: StereoRig) -> dict[tuple[str, str], RigidTransform]:
-    """Where the eyes sit on the receiver."""
+    """Poses of the eyes on the receiver."""
     right = RigidTransform(np.eye(3), rig.eye_offset_m("right"))
     return {(BASE_FRAME, LEFT_FRAME): FLU_FROM_FRD @ rig.body_from_left, (LEFT_FRAME, RIGHT_FRAME): right}
 
@@ -113,7 +113,7 @@ def fixed_transforms(rig: StereoRig) -> dict[tuple[str, str], RigidTransform]:
 def moving_transforms(
     rig: StereoRig, world_from_left: RigidTransform, left_from_drogue: RigidTransform | None
 ) -> dict[tuple[str, str], RigidTransform]:
-    """Where the receiver is in the world, and the drogue, if any, before the left eye."""
+    """Pose of the receiver in the world and, if there is a drogue, of the drogue in the left eye."""
     map_from_base = world_from_left @ (FLU_FROM_FRD @ rig.body_from_left).inverse()
     moving = {(MAP_FRAME, BASE_FRAME): map_from_base}
     if left_from_drogue is not None:
@@ -153,14 +153,14 @@ def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: folder.
         out: folder to make; it holds a folder a bag.
-        log: is told the progress, and which pairs have no pose.
+        log: receives the progress, and counts pairs without a pose.
 
     Returns:
         The bags' folders.
 
     Raises:
         ValueError: a pair that cannot be read, or times that do not ascend.
-        OSError: it cannot be written; nothing half-written is left.
+        OSError: it cannot be written; nothing incomplete is left.
     """
     source = Dataset(dataset)
     order = SequenceOrder()
@@ -208,7 +208,7 @@ class _Bag:
 
 @contextmanager
 def _open_bag(path: Path, rig: StereoRig, start_ns: int) -> Iterator[_Bag]:
-    """A new bag with what stands still in it."""
+    """A new bag with the fixed transforms."""
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         bag = _Bag(writer)
         bag.write("/tf_static", transforms_message(fixed_transforms(rig), start_ns), start_ns)
@@ -216,7 +216,7 @@ def _open_bag(path: Path, rig: StereoRig, start_ns: int) -> Iterator[_Bag]:
 
 
 def _qos(is_kept: bool) -> Qos:
-    """Reliable delivery; what is kept reaches those too who listen later."""
+    """Reliable delivery; with `is_kept` later subscribers receive the last message too."""
     return Qos(
         history=QosHistory.KEEP_LAST,
         depth=1 if is_kept else 10,

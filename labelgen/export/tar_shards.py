@@ -27,7 +27,7 @@ def write_webdataset(dataset: Location, out: Path, log: ExportLog, shard_bytes: 
     Args:
         dataset: the dataset's folder.
         out: new folder.
-        log: is told how far the work is.
+        log: receives the progress.
         shard_bytes: the largest size of a shard. [B]
 
     Returns:
@@ -82,7 +82,7 @@ class _Shards:
             # Two empty blocks end an archive, which is filled up to a whole record.
             self._size = tarfile.RECORDSIZE
         for name in sorted(files):
-            # Nobody's, at no time: the header is a function of the sample alone.
+            # Without owner and time stamp: the header depends on the sample alone.
             header = tarfile.TarInfo(name)
             header.size, header.mode = len(files[name]), 0o644
             self._archive.addfile(header, io.BytesIO(files[name]))

@@ -42,7 +42,7 @@ def write_yolo(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: the dataset's folder.
         out: new folder.
-        log: is told what is left out.
+        log: counts what the format cannot hold.
 
     Returns:
         `data.yaml`, which names the rest.
@@ -57,8 +57,8 @@ def write_yolo(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 def write_yolo_image_order(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """Write boxes and keypoints, beginning with the keypoint nearest the top and then clockwise.
 
-    On an even ring a network cannot know which marker is the first; this order it can learn. Arguments, result and
-    errors as those of `write_yolo`.
+    On an evenly spaced ring a network cannot identify the first marker, but it can learn this order. Arguments, result
+    and errors as those of `write_yolo`.
     """
     return _write_pose(dataset, out, log, in_image_order=True)
 
@@ -134,7 +134,7 @@ def _write(source: Dataset, out: Path, log: ExportLog, rows: Rows, lines: tuple[
 
 
 def _split_lines(splits: set[str], log: ExportLog) -> list[str]:
-    """The folders of the splits; ultralytics wants the first two, with or without pairs of their own."""
+    """The folders of the splits; ultralytics needs the first two, even if the dataset has no pairs for them."""
     lines = []
     for split in ("train", "val", "test"):
         if split in splits:
@@ -152,14 +152,14 @@ def _drogues(manifest: Manifest) -> list[DrogueParameters]:
 
 
 def _one_flip_fits(manifest: Manifest, in_image_order: bool) -> bool:
-    """Whether mirroring an image exchanges the same keypoints on all drogues of a dataset."""
+    """Whether one `flip_idx` is right for all drogues of a dataset."""
     layouts = [marker_layout(drogue) for drogue in _drogues(manifest)]
     even = all(layout.symmetry_order == layout.count for layout in layouts)
     return len({layout.count for layout in layouts}) == 1 and (even or in_image_order)
 
 
 def _shares(box: list[float], record: PairRecord) -> list[float]:
-    """Middle and size of a box that counts from the image's corner, as shares of the image."""
+    """Centre and size of a box with the image's corner as origin, as shares of the image."""
     camera = record.frame.rig.camera
     x, y, width, height = box
     return [

@@ -1,4 +1,4 @@
-"""ROS 2 bags that lie in a dataset's folder, read with the mcap library, against the dataset."""
+"""Checks ROS 2 bags in a dataset's folder against the dataset, with the independent mcap library."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def bag_files(dataset: Location) -> list[str]:
 
 
 def bag_faults(dataset: Dataset, names: list[str]) -> list[str]:
-    """What is wrong with the bags: images in pairs, as many as the dataset has, and its calibration.
+    """Faults of the bags: unpaired images, missing pairs, another calibration than the dataset's.
 
     Args:
-        dataset: that they were made of.
-        names: all of them.
+        dataset: from which they were exported.
+        names: of all bag files.
     """
     storage = open_storage(dataset.path)
     paths = {name: storage.where(name) for name in names}
@@ -44,7 +44,7 @@ def bag_faults(dataset: Dataset, names: list[str]) -> list[str]:
         try:
             with storage.local_copy(name) as file:
                 stamps, infos = _contents(file)
-        # Whatever a damaged bag makes the library raise.
+        # Any error that the library raises on a damaged bag.
         except Exception as error:
             faults.append(f"{path}: is damaged: {' '.join(str(error).split()) or type(error).__name__}")
             continue

@@ -1,4 +1,4 @@
-"""A dataset's COCO files, read with pycocotools as anybody would, against its records."""
+"""Checks a dataset's COCO files, read with pycocotools, against its records."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class CocoFiles:
     """`all.json` and the file of every split that has pairs, in memory."""
 
     def __init__(self, dataset: Location, manifest: Manifest) -> None:
-        """Read what can be read; what cannot is a fault."""
+        """Read all files; those that cannot be read become faults."""
         self._faults: list[str] = []
         self._storage = open_storage(dataset)
         self._path = self._storage.where(f"{ANNOTATIONS_FOLDER}/all.json")
@@ -44,11 +44,11 @@ class CocoFiles:
                 self._check_part(split, part)
 
     def faults(self) -> list[str]:
-        """What is wrong with the files as a whole."""
+        """Faults of the files as a whole."""
         return self._faults
 
     def annotation_faults(self, record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> list[str]:
-        """What is wrong with the annotation of one image of `all.json`."""
+        """Faults of the annotation of one image in `all.json`."""
         image_id = coco_image_id(record.frame_index, eye)
         if self._all is None or image_id not in self._all.imgs:
             return []
@@ -91,7 +91,7 @@ class CocoFiles:
         return coco
 
     def _check_part(self, split: str, part: COCO) -> None:
-        """A split's file must say the same as `all.json`."""
+        """Check that a split's file agrees with `all.json`."""
         assert self._all is not None
         whole: dict[int, Any] = self._all.imgs
         same = all(whole.get(key) == image for key, image in part.imgs.items())

@@ -1,4 +1,4 @@
-"""A dataset's folder checked from the outside: files, hashes, labels against pixels, annotations against records."""
+"""Checks of a whole dataset: files, hashes, calibration, labels against pixels, annotations against records."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _TOLERANCE = 1e-14
 
 
 def calibration_faults(dataset: Location, rig: StereoRig) -> list[str]:
-    """What is wrong with the files that are there; OpenCV's must be."""
+    """Faults of the calibration files; all but OpenCV's may be missing."""
     storage, faults = open_storage(dataset), []
     for name, text in calibration_files(rig).items():
         path = storage.where(f"{CALIBRATION_FOLDER}/{name}")
@@ -66,7 +66,7 @@ def calibration_faults(dataset: Location, rig: StereoRig) -> list[str]:
         if found != text.encode():
             faults.append(f"{path}: is not that of the manifest's rig")
         elif name == OPENCV_STEREO_FILE:
-            # Only what is known not to be damaged is given to OpenCV's parser.
+            # Only a file that is known to be undamaged reaches OpenCV's parser.
             faults += _opencv_faults(path, text, rig)
     return faults
 
@@ -120,12 +120,12 @@ def _faults(storage: Storage, number: int, pairs_per_tar: int) -> list[str]:
 
 
 class Check(FrozenModel):
-    """One kind of check.
+    """The result of one kind of check.
 
     Attributes:
-        name: what was checked.
-        count: how often.
-        faults: what was wrong, a line each.
+        name: of the check.
+        count: how often it was made.
+        faults: a line each.
     """
 
     name: str
@@ -134,10 +134,10 @@ class Check(FrozenModel):
 
 
 class ValidationReport(FrozenModel):
-    """What a validation found.
+    """The result of a validation.
 
     Attributes:
-        pairs: in the manifest.
+        pairs: number of pairs in the manifest.
         checks: in the order in which they were made.
     """
 
@@ -151,7 +151,7 @@ class ValidationReport(FrozenModel):
 
     @property
     def passed(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there are no faults."""
         return not self.faults
 
     def table(self) -> str:
@@ -168,12 +168,12 @@ class _Tally:
         self._faults: defaultdict[str, list[str]] = defaultdict(list)
 
     def add(self, name: str, faults: Sequence[str]) -> None:
-        """One more thing was checked."""
+        """Add the faults of one check."""
         self._counts[name] += 1
         self._faults[name] += faults
 
     def report(self, pairs: int) -> ValidationReport:
-        """The result so far."""
+        """The report so far."""
         checks = (
             Check(name=name, count=count, faults=tuple(self._faults[name])) for name, count in self._counts.items()
         )
@@ -181,17 +181,17 @@ class _Tally:
 
 
 def validate_dataset(path: Location) -> ValidationReport:
-    """Check everything that can be checked about a dataset without making it again.
+    """Make all checks of a dataset that need no rendering.
 
     Args:
-        path: where the dataset lies.
+        path: location of the dataset.
 
     Returns:
-        What was checked and what is wrong; damaged files are faults, not exceptions.
+        All checks with their faults; damaged files are faults, not exceptions.
 
     Raises:
         ValueError: there is no such folder, or a URL that cannot be used.
-        OSError: a place that cannot be reached.
+        OSError: a location that cannot be reached.
     """
     storage = open_storage(path)
     if not storage.root_exists():
@@ -253,7 +253,7 @@ def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _T
         tally.add("part ids", [])
         tally.add("labels against part ids", [f"{path}: {fault}" for fault in _label_faults(record, eye, part_id)])
         tally.add("annotations", coco.annotation_faults(record, eye, part_id))
-        # What was changed does not reach the decoder; it is a fault already.
+        # Files that were changed are a fault already, and must not reach the decoder.
         found = passes_faults(dataset, record, eye, part_id) if not changed else None
         if found is not None:
             tally.add("depth and normals", [f"{folder}: {fault}" for fault in found])
@@ -265,7 +265,7 @@ def _count_faults(manifest: Manifest) -> list[str]:
 
 
 def _drop_faults(manifest: Manifest) -> list[str]:
-    """Every frame of the recipe is there, or dropped with its reason, or was not asked for; none twice."""
+    """Frames that are listed twice, both made and dropped, or not in the recipe."""
     indices = [entry.frame_index for entry in manifest.frames]
     dropped = [drop.frame_index for drop in manifest.drops]
     count = manifest.recipe.frames.count
@@ -330,7 +330,7 @@ def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> l
 
 
 def _read_part_ids(frames: FrameStore, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
-    """The part ids by OpenCV's own reader; None where they cannot be had."""
+    """The part ids as OpenCV reads them, or None where they are missing or wrong."""
     camera = record.frame.rig.camera
     try:
         data = frames.read(record.frame_index, parts_file(eye))

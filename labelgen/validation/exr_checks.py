@@ -1,4 +1,4 @@
-"""A pair's EXR files, read with OpenEXR's own reader, against part ids and labels."""
+"""Checks a pair's EXR files against part ids and labels."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Plane = NDArray[np.float32]
 
 
 def passes_faults(dataset: Dataset, record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> list[str] | None:
-    """What is wrong with the passes of one eye; None where the pair has none.
+    """Faults of the passes of one eye, or None where the pair has none.
 
     Args:
         dataset: that holds the pair.
-        record: of the pair, whose hashes were checked: a file that was changed must not come here.
+        record: of the pair; its hashes must have been checked, as changed files must not reach the decoder.
         eye: which eye.
         part_id: (H, W) part ids of the PNG file.
     """
@@ -55,7 +55,7 @@ def passes_faults(dataset: Dataset, record: PairRecord, eye: Eye, part_id: NDArr
 
 
 def _surface_faults(planes: dict[str, Plane], part_id: NDArray[np.uint8]) -> list[str]:
-    """Depth and normals where something stands, and where nothing does."""
+    """Faults of depth and normals, of surfaces and of the sky."""
     faults = []
     depth, sky = planes["depth.Z"], part_id == Part.SKY
     if not np.isposinf(depth[sky]).all() or not (np.isfinite(depth[~sky]) & (depth[~sky] > 0)).all():
@@ -67,7 +67,7 @@ def _surface_faults(planes: dict[str, Plane], part_id: NDArray[np.uint8]) -> lis
 
 
 def _feature_faults(record: PairRecord, eye: Eye, depth_m: Plane, part_id: NDArray[np.uint8]) -> list[str]:
-    """Markers and hub against the planes that the pose gives them."""
+    """Faults of markers and hub against the planes that follow from the pose."""
     pose, drogue = record.left_from_drogue, record.frame.drogue
     if pose is None or drogue is None:
         return []

@@ -1,6 +1,6 @@
 """Labels against the passes they were made with, and against OpenCV's projection.
 
-`check_against_passes` runs on every frame before it is written; the others are what `droguekit validate` uses too.
+`check_against_passes` runs on every frame before it is written; `droguekit validate` uses the other checks.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from render.engine import EyeRadiance, StereoRadiance
 # lever of a / sqrt 2, over an area of pi a b: sqrt(2 a / (12 pi b^2)).
 LATTICE_RMS = float(np.sqrt(2.0 / (12.0 * np.pi)))
 
-# The largest of 1e5 simulated discs was 2.9 rms; the error has an end, unlike a normal one.
+# The largest of 1e5 simulated discs was 2.9 rms; unlike a normal error, this one is bounded.
 _LATTICE_LIMIT_RMS = 4.0
 
 # Meshes draw circles as polygons of 128 sides and the same area, whose corners stand out by (pi / 128)^2 / 6 = 1e-4.
@@ -166,13 +166,13 @@ def _check_visibility(feature: FeatureView, visible: int, amodal: int) -> list[s
 def check_feature_pixels(
     disc: DiscInEye, hole_m: float, depth_m: NDArray[np.float32], pixels: FeaturePixels
 ) -> list[str]:
-    """Every pixel of a feature around a hole: whether it lies on it, and its depth against the feature's plane.
+    """Faults of the pixels of a feature: pixels beyond its edge, and depths off its plane.
 
     Args:
         disc: the feature's.
         hole_m: radius of its hole. [m]
         depth_m: (H, W) planar depth. [m]
-        pixels: where the eye sees which feature.
+        pixels: of all features in the eye's image.
     """
     rows, columns = pixels.indices(disc.part)
     places_px = np.stack([columns, rows], axis=-1).astype(np.float64)
@@ -181,7 +181,7 @@ def check_feature_pixels(
     beyond = int(np.count_nonzero(distance_m > disc.radius_m * (1 + _OUTLINE_TOLERANCE)))
     if beyond:
         faults.append(f"{beyond} pixels of part {disc.part} lie beyond its edge")
-    # On the outline a ray may slip between two parts that touch; through the hole it sees the inner wall.
+    # On the outline a ray may pass between two touching parts; through the hole it sees the inner wall.
     on_face = (distance_m > hole_m * (1 + _OUTLINE_TOLERANCE)) & (distance_m < disc.radius_m * (1 - _OUTLINE_TOLERANCE))
     if not on_face.any():
         return faults
@@ -192,7 +192,7 @@ def check_feature_pixels(
     reach_m = float(np.linalg.norm(disc.center_m)) + disc.radius_m
     limit_m = _DEPTH_ROUNDINGS * float(np.finfo(np.float32).eps) * reach_m / slant
     worst = int(np.argmax(error_m / limit_m))
-    # A depth that is no number is a fault too.
+    # NaN is a fault too.
     if not error_m[worst] <= limit_m[worst]:
         faults.append(
             f"depth at pixel {columns[worst]}, {rows[worst]} is {error_m[worst]:.2e} m off the plane of part "
@@ -210,14 +210,14 @@ def _contains(outer: PixelBox, inner: PixelBox, margin_px: float) -> bool:
     )
 
 
-# Two ways to project in float64 agree far better; a pixel convention that is wrong does not.
+# Two projections in float64 agree far better; a wrong pixel convention exceeds it.
 _PROJECTION_TOLERANCE_PX = 1e-6
-# The eyes' rows come out of the same numbers.
+# The rows of both eyes are computed from the same numbers.
 _EPIPOLAR_TOLERANCE_PX = 1e-9
 
 
 def projection_faults(record: PairRecord) -> list[str]:
-    """What is wrong with the centres of markers and hub, and with the corners of a calibration board."""
+    """Faults of the centres of markers and hub, and of the corners of a calibration board."""
     if record.frame.board is not None:
         board = record.frame.board
         corners_m = board.shape.corners_m()
