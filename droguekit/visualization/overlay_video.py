@@ -24,7 +24,7 @@ from droguekit.benchmark.report.label_drawing import (
     resized,
 )
 from droguekit.visualization.drogue_outlines import drogue_rings, ring_images
-from droguekit.visualization.video_file import evenly, period_s, write_movie
+from droguekit.visualization.video_file import evenly, period_s, write_video
 from geometry.se3 import Array, RigidTransform
 
 TRUE_RGB: Rgb = (80, 255, 100)
@@ -99,7 +99,7 @@ def write_overlay_video(
         return draw_overlay(record, dataset.images(index), drogue, method, answers.get(index))
 
     length_s = period_s(records)
-    write_movie(path, map(draw, records), length_s)
+    write_video(path, map(draw, records), length_s)
     return len(records), len(records) * length_s
 
 
