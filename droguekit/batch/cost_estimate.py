@@ -19,7 +19,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import Drop
 from droguekit.batch.failure_policy import ERRORS_OF_THE_PLACE, drop_of
 from droguekit.batch.frame_task import FrameReport, FrameTask
-from droguekit.batch.recipe_plan import DrawnFrames, Plan
+from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan
 from droguekit.batch.worker_pool import Limits, run_alone
 from geometry.se3 import Array
 from scenes.sampler import scene_of_frame
@@ -168,7 +168,7 @@ _SCENE_STAGE = "sample"
 
 
 @dataclass(frozen=True)
-class Cost:
+class CostEstimate:
     """What a whole run is expected to take, in seconds of a processor unless it says otherwise.
 
     Attributes:
@@ -211,7 +211,7 @@ class Cost:
         return max(1, min(workers, self.count), math.ceil(self.count / Limits().tasks_per_process))
 
 
-def probe_cost(recipe: Recipe, plan: Plan) -> Cost:
+def probe_cost(recipe: Recipe, plan: RecipePlan) -> CostEstimate:
     """Render a few frames, spread over distances and families, and reckon from them.
 
     Raises:
@@ -221,7 +221,7 @@ def probe_cost(recipe: Recipe, plan: Plan) -> Cost:
     return reckon(recipe, plan, probe(recipe, choose_frames(plan.drawn, recipe.frames.count)))
 
 
-def reckon(recipe: Recipe, plan: Plan, probed: Probe) -> Cost:
+def reckon(recipe: Recipe, plan: RecipePlan, probed: Probe) -> CostEstimate:
     """What measured frames say of all pairs of a recipe."""
     reports = list(probed.counted.values())
     every = [*probed.warm_up.values(), *reports, probed.repeated]
@@ -230,7 +230,7 @@ def reckon(recipe: Recipe, plan: Plan, probed: Probe) -> Cost:
     # What that stage takes of every pair is what it takes of one whose environment is at hand.
     at_hand_s = _scene_stage_s(probed.repeated)
     frames_s, error_s = law.total([cpu_s(report) - _scene_stage_s(report) + at_hand_s for report in reports], count)
-    return Cost(
+    return CostEstimate(
         probed=probed.counted,
         drops=probed.drops,
         start_s=probed.start_cpu_s,

@@ -166,10 +166,19 @@ def progress_report() -> ProgressReport:
 
 
 def duration(seconds: float) -> str:
-    """A length of time for people."""
+    """A length of time as text."""
     whole = round(seconds)
     if whole < 60:
         return f"{max(seconds, 0):.1f} s" if seconds < 9.95 else f"{whole} s"
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def human_size(size_bytes: float) -> str:
+    """A size in bytes as text."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if size_bytes < 1000:
+            return f"{size_bytes:.0f} {unit}" if unit == "B" else f"{size_bytes:.3g} {unit}"
+        size_bytes /= 1000
+    return f"{size_bytes:.3g} TB"

@@ -62,7 +62,7 @@ class DrawnFrames:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RecipePlan:
     """What a recipe will make.
 
     Attributes:
@@ -89,7 +89,7 @@ class Plan:
         return drops / (drops + len(self.drawn.indices))
 
 
-def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> Plan:
+def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> RecipePlan:
     """Count the pairs of a recipe, and draw its frames or, of a larger one, so many of them evenly spread.
 
     Raises:
@@ -110,7 +110,7 @@ def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> Plan:
             {int(index) for index in np.linspace(0, recipe.frames.count - 1, min(recipe.frames.count, most_sampled))}
         )
     )
-    return Plan(dict(by_split), dict(by_scene), by_family, draw_frames(recipe, sampled))
+    return RecipePlan(dict(by_split), dict(by_scene), by_family, draw_frames(recipe, sampled))
 
 
 def frame_timeout_s(recipe: Recipe) -> float:

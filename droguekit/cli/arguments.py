@@ -105,12 +105,3 @@ def parse_shard(text: str | None, frames: range) -> range:
     if not shard:
         raise ValueError(f"--shard: {text} has none of the {len(frames)} frames; take fewer shards")
     return shard
-
-
-def human_size(size_bytes: float) -> str:
-    """A size for people."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if size_bytes < 1000:
-            return f"{size_bytes:.0f} {unit}" if unit == "B" else f"{size_bytes:.3g} {unit}"
-        size_bytes /= 1000
-    return f"{size_bytes:.3g} TB"

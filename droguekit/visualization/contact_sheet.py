@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 
+from datasets_manifest.atomic import write_bytes_atomic
 from datasets_manifest.storage.blind import BlindDataset, BlindPair
+from datasets_manifest.storage.layout import BLIND_FILE
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
@@ -19,6 +23,67 @@ _TEXT_RGB = (255, 255, 255)
 _PAPER = 24
 _GAP_PX = 4
 _CAPTION_PX = 22
+
+
+def write_contact_sheet(
+    dataset: Location, out: Path, count: int, columns: int, tile_width_px: int, by_family: bool
+) -> tuple[int, int]:
+    """Draw pairs of a dataset, spread evenly, and write the sheet as PNG or JPEG.
+
+    Args:
+        dataset: with its truth or without.
+        out: ends in .png or .jpg.
+        count: pairs at most.
+        columns: tiles in a row, or families side by side.
+        tile_width_px: width of a tile.
+        by_family: a row for each family of conditions, without labels.
+
+    Returns:
+        How many pairs it shows, and how many there are.
+
+    Raises:
+        ValueError: a number out of its range, another ending, no pairs, or one that cannot be read.
+        OSError: it cannot be written.
+    """
+    _check_sheet(out, count, columns, tile_width_px)
+    sheet, shown, pairs = _draw_sheet(dataset, count, columns, tile_width_px, by_family)
+    _, data = cv2.imencode(out.suffix.lower(), cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))
+    write_bytes_atomic(out, data.tobytes())
+    return shown, pairs
+
+
+def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:
+    for name, value, low, high in (
+        ("count", count, 1, 400),
+        ("columns", columns, 1, 40),
+        ("tile-width", tile_width, 64, 4096),
+    ):
+        if not low <= value <= high:
+            raise ValueError(f"--{name}: must be from {low} to {high}, got {value}")
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise ValueError(f"--out: must end in .png or .jpg, got {out}")
+
+
+def _draw_sheet(
+    dataset: Location, count: int, columns: int, tile_width: int, by_family: bool
+) -> tuple[Picture, int, int]:
+    """The sheet, how many pairs it shows, and how many there are."""
+    is_blind = open_storage(dataset).exists(BLIND_FILE)
+    if is_blind and by_family:
+        raise ValueError(f"--by-family: {dataset} has no truth, and so no families")
+    source = BlindDataset(dataset) if is_blind else Dataset(dataset)
+    pairs = len(source.frame_indices)
+    if not pairs:
+        raise ValueError(f"{dataset}: holds no pairs yet")
+    if by_family and isinstance(source, Dataset):
+        sheet, shown = draw_family_sheet(source, count, columns, tile_width)
+        return sheet, shown, pairs
+    places = np.linspace(0, pairs - 1, min(count, pairs)).round()
+    frames = [source.frame_indices[int(place)] for place in places]
+    columns = min(columns, len(frames))
+    if isinstance(source, BlindDataset):
+        return draw_blind_sheet(source, frames, columns, tile_width), len(frames), pairs
+    return draw_contact_sheet(source, frames, columns, tile_width), len(frames), pairs
 
 
 def draw_contact_sheet(dataset: Dataset, frames: Sequence[int], columns: int, tile_width_px: int) -> Picture:

@@ -24,7 +24,7 @@ from droguekit.benchmark.report.label_drawing import (
     resized,
 )
 from droguekit.visualization.drogue_outlines import drogue_rings, ring_images
-from droguekit.visualization.video_file import evenly, period_s, write_video
+from droguekit.visualization.video_file import check_video, evenly, period_s, write_video
 from geometry.se3 import Array, RigidTransform
 
 TRUE_RGB: Rgb = (80, 255, 100)
@@ -82,6 +82,7 @@ def write_overlay_video(
         ValueError: no such pairs, or one that cannot be read.
         OSError: it cannot be written.
     """
+    check_video("--overlay", path, count)
     fitting = [
         index
         for index in dataset.frame_indices

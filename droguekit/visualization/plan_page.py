@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.recipe.recipe import Recipe
-from droguekit.batch.recipe_plan import Plan, check_places, check_sizes, distance_share
+from droguekit.batch.recipe_plan import RecipePlan, check_places, check_sizes, distance_share
 from geometry.se3 import Array
 
 _PANEL_IN = (6.2, 4.4)
@@ -43,7 +43,7 @@ class PlanFigure:
     png: bytes
 
 
-def plan_figures(recipe: Recipe, planned: Plan) -> Iterator[PlanFigure]:
+def plan_figures(recipe: Recipe, planned: RecipePlan) -> Iterator[PlanFigure]:
     """The pictures of a plan; those of boxes only where there are drogues."""
     if planned.by_family:
         yield _figure(
@@ -84,7 +84,7 @@ def _law_note(recipe: Recipe) -> str:
     return " Line: what the recipe intends." if _draws_distance(recipe) else ""
 
 
-def _place_note(recipe: Recipe, planned: Plan) -> str:
+def _place_note(recipe: Recipe, planned: RecipePlan) -> str:
     places = check_places(planned.drawn, recipe.rig.camera)
     if places is None:
         return ""
@@ -95,14 +95,14 @@ def _place_note(recipe: Recipe, planned: Plan) -> str:
     )
 
 
-def _chance(recipe: Recipe, planned: Plan) -> str:
+def _chance(recipe: Recipe, planned: RecipePlan) -> str:
     sizes = check_sizes(planned.drawn, recipe)
     if sizes is None or not sizes[0].degrees:
         return ""
     return f" Line: what the recipe intends; chi-square against it: p = {sizes[0].p_value:.2g}."
 
 
-def _families(axes: Axes, planned: Plan) -> None:
+def _families(axes: Axes, planned: RecipePlan) -> None:
     names = list(planned.by_family)
     pairs = [pairs for _, pairs in planned.by_family.values()]
     bars = axes.barh(names, pairs, color=_BAR)
@@ -113,7 +113,7 @@ def _families(axes: Axes, planned: Plan) -> None:
     axes.set_xlabel("Stereo pairs")
 
 
-def _distances(axes: Axes, recipe: Recipe, planned: Plan) -> None:
+def _distances(axes: Axes, recipe: Recipe, planned: RecipePlan) -> None:
     distances = planned.drawn.distances_m[np.isfinite(planned.drawn.distances_m)]
     law = recipe.distance
     axes.set_xlabel("Distance [m]")
@@ -129,7 +129,7 @@ def _distances(axes: Axes, recipe: Recipe, planned: Plan) -> None:
     _logarithmic(axes)
 
 
-def _sizes(axes: Axes, recipe: Recipe, planned: Plan) -> None:
+def _sizes(axes: Axes, recipe: Recipe, planned: RecipePlan) -> None:
     sides = planned.drawn.sides_px[np.isfinite(planned.drawn.sides_px)]
     axes.set_xlabel("Side of the box [px]")
     sizes = check_sizes(planned.drawn, recipe)
@@ -143,7 +143,7 @@ def _sizes(axes: Axes, recipe: Recipe, planned: Plan) -> None:
     _logarithmic(axes)
 
 
-def _places(axes: Axes, recipe: Recipe, planned: Plan) -> None:
+def _places(axes: Axes, recipe: Recipe, planned: RecipePlan) -> None:
     camera = recipe.rig.camera
     centers = planned.drawn.centers_px[np.isfinite(planned.drawn.centers_px).all(axis=1)]
     edges = [np.linspace(-0.5, n - 0.5, max(4, n // _CELL_PX) + 1) for n in (camera.width_px, camera.height_px)]
@@ -220,7 +220,7 @@ pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.82rem
 """
 
 
-def write_plan_page(recipe: Recipe, planned: Plan, lines: Sequence[str], out: Path) -> None:
+def write_plan_page(recipe: Recipe, planned: RecipePlan, lines: Sequence[str], out: Path) -> None:
     """Write the page; it is replaced as a whole, or not at all.
 
     Args:

@@ -20,7 +20,7 @@ from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
 from drogue_models.tanker import tanker_mesh
 from droguekit.benchmark.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
-from droguekit.visualization.video_file import evenly, period_s, write_video
+from droguekit.visualization.video_file import check_video, evenly, period_s, write_video
 from geometry.se3 import Array, RigidTransform
 
 _INCHES, _DPI = (12.8, 5.4), 100
@@ -49,6 +49,7 @@ def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int |
         ValueError: no such pairs, or one that cannot be read.
         OSError: it cannot be written.
     """
+    check_video("--animate", path, count)
     records = [dataset.record(index) for index in _chosen(dataset, count, sequence_id)]
     length_s = period_s(records)
     side_view = SideView(records)

@@ -13,7 +13,8 @@ from datasets_manifest.atomic import part_path
 from datasets_manifest.types.records import PairRecord
 from droguekit.benchmark.report.label_drawing import Picture, resized
 
-SUFFIXES = (".gif", ".mp4")
+_SUFFIXES = (".gif", ".mp4")
+_MOST_PICTURES = 2000
 # Pairs that have nothing to do with each other are shown as single pictures.
 _SLIDE_S = 0.5
 _FASTEST_S, _SLOWEST_S = 0.02, 2.0
@@ -45,6 +46,18 @@ def write_video(path: Path, pictures: Iterable[Picture], picture_s: float) -> No
         raise OSError(error.errno, f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def check_video(option: str, path: Path, count: int) -> None:
+    """See that a video can be made before its pictures are drawn.
+
+    Raises:
+        ValueError: too many pictures or none, or a file of another kind; names the command's option.
+    """
+    if not 1 <= count <= _MOST_PICTURES:
+        raise ValueError(f"--count: must be from 1 to {_MOST_PICTURES} in a video, got {count}")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValueError(f"{option}: must end in {' or '.join(_SUFFIXES)}, got {path}")
 
 
 def evenly(indices: Sequence[int], count: int) -> list[int]:

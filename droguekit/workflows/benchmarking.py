@@ -1,14 +1,93 @@
-"""Estimates against the truth of a dataset, or against its images alone where it has none."""
+"""Score pose estimates and detections against a dataset's truth, or against its images alone where it has none."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from datasets_manifest.storage.layout import BLIND_FILE
+from datasets_manifest.storage.storage import Location, open_storage
+
 if TYPE_CHECKING:
-    from datasets_manifest.storage.storage import Location
-    from droguekit.benchmark.blind_check import BlindCheck
+    from droguekit.batch.progress import ProgressReport
     from droguekit.benchmark.pose_benchmark import BenchmarkResult
+    from droguekit.benchmark.blind_check import BlindCheck
+    from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import DetectorRunner
+    from droguekit.benchmark.results.detection_result import DetectionResult
+    from nav.detector.onnx_cost import NetworkCost
+
+
+@dataclass(frozen=True)
+class DetectionOptions:
+    """Which boxes to score, and how.
+
+    Attributes:
+        files: of COCO results, each known by its name without ending.
+        detectors: names or files of networks, to be run first.
+        split: to score on, see `score_detections`.
+        threshold: operating threshold, see `score_detections`.
+    """
+
+    files: Sequence[Path]
+    detectors: Sequence[str]
+    split: str | None = None
+    threshold: float | None = None
+
+
+def benchmark_lines(
+    dataset: Location,
+    estimates: Path | None,
+    options: DetectionOptions,
+    outputs: tuple[Path | None, Path | None],
+    report: ProgressReport,
+) -> Iterator[str]:
+    """Compare estimates, or a detector's boxes, with the truth, and give the result as lines.
+
+    Args:
+        dataset: with its truth, or an imported one without.
+        estimates: file of poses; None for detections.
+        options: which detections.
+        outputs: files for the numbers as JSON and for the report as HTML, or None.
+        report: hears how detectors proceed.
+
+    Raises:
+        ValueError: estimates and detections together, or inputs that cannot be read.
+        OSError: a result cannot be written.
+    """
+    json_out, html_out = outputs
+    wants_detections = bool(options.files or options.detectors)
+    if (estimates is not None) == wants_detections:
+        raise ValueError("--estimates: give either estimates, or detections (--detections, --detector)")
+    if estimates is None:
+        from droguekit.benchmark.detection.detection_tables import detector_lines
+
+        return detector_lines(benchmark_detections(dataset, options, json_out, html_out, report))
+    if options.split is not None or options.threshold is not None:
+        raise ValueError("--split, --threshold: are for detections, not for estimates")
+    if open_storage(dataset).exists(BLIND_FILE):
+        return _blind_lines(check_blind_dataset(dataset, estimates, json_out, html_out))
+    return _error_lines(benchmark_dataset(dataset, estimates, json_out, html_out))
+
+
+def _error_lines(result: BenchmarkResult) -> Iterator[str]:
+    yield f"{'method':<16} {'fixes':>7} {'mean':>9} {'rmse':>9} {'p95':>9}   position error [mm]"
+    for name, scores in result.methods.items():
+        row = scores.overall
+        errors = (row.position_mean_m, row.position_rmse_m, row.position_p95_m)
+        shown = " ".join(f"{'-':>9}" if error is None else f"{1e3 * error:9.1f}" for error in errors)
+        yield f"{name:<16} {100 * row.fix_fraction:6.1f}% {shown}"
+
+
+def _blind_lines(check: BlindCheck) -> Iterator[str]:
+    from droguekit.benchmark.blind_check import COLUMNS, row_cells
+
+    yield f"{check.dataset.name} has no true poses: estimates are compared with their own measurements and with boxes"
+    yield " ".join([f"{'method':<16}", *(f"{column:>16}" for column in COLUMNS)])
+    for name in check.methods:
+        yield " ".join([f"{name:<16}", *(f"{cell:>16}" for cell in row_cells(check, name))])
 
 
 def benchmark_dataset(
@@ -42,7 +121,8 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.benchmark.blind_check import check_blind, write_blind_report
+    from droguekit.benchmark.blind_check import check_blind
+    from droguekit.benchmark.blind_check import write_blind_report
     from droguekit.numerical_threads import one_thread
 
     with one_thread():
@@ -52,3 +132,92 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         if html_out is not None:
             write_blind_report(dataset, estimates, check, html_out)
     return check
+
+
+def benchmark_detections(
+    dataset: Location, options: DetectionOptions, json_out: Path | None, html_out: Path | None, report: ProgressReport
+) -> DetectionResult:
+    """Compare boxes with the truth, and write the numbers and the report where a place is given for them.
+
+    Raises:
+        ValueError: a dataset, file or detector that cannot be read, or two of one name.
+        OSError: a result cannot be written.
+    """
+    from datasets_manifest.atomic import write_text_atomic
+    from droguekit.benchmark.detection.detection_scores import score_detections
+    from droguekit.benchmark.detection.detection_report import write_detection_report
+    from droguekit.benchmark.detection.detection_scores import split_to_score
+    from droguekit.benchmark.detection.detection_truth import read_detection_truth
+
+    if options.threshold is not None and not 0 <= options.threshold <= 1:
+        raise ValueError(f"--threshold: must be from 0 to 1, got {options.threshold:g}")
+    truth = read_detection_truth(dataset)
+    # Whatever is wrong is said before a detector looks at the first image.
+    split = split_to_score(truth.images, options.split)
+    scored = score_detections(truth, _runs(dataset, options, report), split, options.threshold)
+    if json_out is not None:
+        write_text_atomic(json_out, scored.result.to_json())
+    if html_out is not None:
+        write_detection_report(dataset, scored, html_out)
+    return scored.result
+
+
+def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorOutput]:
+    """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
+    from datasets_manifest.storage.blind import read_blind_index
+    from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import DetectorRunner
+    from droguekit.benchmark.results.detection_result import image_id_of, read_detections
+    from geometry.stereo import EYES
+    from nav.detector.detector_registry import detector_factory
+
+    # Also of images that are not scored, for a detector answers for all.
+    image_ids = frozenset(image_id_of(frame, eye) for frame in read_blind_index(dataset).frames for eye in EYES)
+    runs = [(file.stem, DetectorOutput(read_detections(file, image_ids))) for file in options.files]
+    passes = [(name, DetectorRunner(dataset, detector_factory(name))) for name in options.detectors]
+    names = [name for name, _ in runs] + [detecting.name for _, detecting in passes]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"--detections, --detector: two are named {name!r}; rename a file")
+    runs += [(detecting.name, _detector_run(name, detecting, report)) for name, detecting in passes]
+    return dict(runs)
+
+
+def _detector_run(name_or_file: str, detecting: DetectorRunner, report: ProgressReport) -> DetectorOutput:
+    """What a detector finds in all images."""
+    from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import LEAST_SCORE
+
+    report.say(f"{detecting.name}: looking for the drogue, without the truth")
+    report.begin("pairs", detecting.pairs)
+    try:
+        boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
+    finally:
+        report.end()
+    cost = _network_cost(name_or_file, detecting.pass_sizes_px)
+    return DetectorOutput(
+        boxes,
+        detecting.times(),
+        detecting.score_threshold,
+        parameters=None if cost is None else cost.parameters,
+        gflops_per_image=None if cost is None else cost.gflops_per_image,
+    )
+
+
+def _network_cost(name_or_file: str, sizes_px: tuple[tuple[int, int], ...]) -> NetworkCost | None:
+    """Of all passes through a network in a file; None where they cannot be counted, or what counts is missing."""
+    from importlib.util import find_spec
+
+    from nav.detector.detector_registry import network_file
+
+    file = network_file(name_or_file)
+    if file is None or not sizes_px or find_spec("onnx") is None:
+        return None
+    from nav.detector.onnx_cost import NetworkCost, network_cost
+
+    try:
+        costs = [network_cost(file, size_px) for size_px in sizes_px]
+    except ValueError:
+        # The network runs, and its boxes are not lost for operations that nobody can count.
+        return None
+    return NetworkCost(costs[0].parameters, sum(cost.gflops_per_image for cost in costs))

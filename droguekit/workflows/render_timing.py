@@ -1,67 +1,109 @@
-"""How fast pairs are rendered: the recipes by which it is measured."""
+"""How fast stereo pairs are rendered, by distance, quality and stage."""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
+from collections.abc import Iterator
+from importlib.resources import files
 from typing import TYPE_CHECKING
 
 from droguekit.workflows.rendering import open_recipe
 
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe
+    from droguekit.batch.frame_task import FrameReport
+    from droguekit.batch.frame_timing import MeasuredFrame
 
-_BENCH_STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
-
-
-_BENCH_SCENES = 8
-
-
-_BENCH_SAMPLES: dict[str, dict[str, float]] = {
-    "corpus": {"samples_per_px": 16, "open_samples_per_px": 4, "edge_samples_per_px": 324},
-    "benchmark": {
-        "samples_per_px": 64,
-        "open_samples_per_px": 8,
-        "edge_samples_per_px": 400,
-        "noise_over_sensor": 0.3,
-    },
-}
+QUALITIES = ("corpus", "benchmark")
 
 
-BENCH_QUALITIES = tuple(_BENCH_SAMPLES)
+def render_timing_lines(repeat: int, pairs: int, workers: int | None, engine: str | None) -> Iterator[str]:
+    """Measure, and give the lines of three tables as they are measured: by distance, by quality, and by the clock.
+
+    Args:
+        repeat: pairs at each distance.
+        pairs: over the uniform law, for each quality.
+        workers: processes of the measurement by the clock; as many as the machine can carry when None.
+        engine: replaces the recipes'.
+
+    Raises:
+        ValueError: a wrong number, or an engine that cannot be used.
+        OSError: a process died, or a temporary folder cannot be written.
+    """
+    from droguekit.batch.execution import default_workers
+    from droguekit.batch.frame_timing import frames_per_second, measure_closely, measure_frames, warm_up
+
+    workers = default_workers() if workers is None else workers
+    if workers < 1:
+        raise ValueError(f"--workers: must be at least 1, got {workers}")
+    recipe = open_stations_recipe(repeat, engine)
+    # The farthest first: the pair that is not counted is the cheapest.
+    yield from _stations_table(recipe, measure_frames(recipe, tuple(reversed(range(recipe.frames.count)))))
+    yield f"\n{'2 to 40 m':>9} {'CPU s/pair':>11} {'noise/sensor':>13} {'memory [MB]':>12} {'growth':>8}"
+    for quality in QUALITIES:
+        uniform = open_uniform_recipe(pairs, quality, engine)
+        yield _mean_row(quality, measure_closely(uniform, tuple(range(pairs))))
+    yield f"\n{'2 to 40 m':>9} {'pairs/s by the clock':>20} {'workers':>8}"
+    for quality in QUALITIES:
+        uniform = open_uniform_recipe(pairs + warm_up(workers), quality, engine)
+        yield f"{quality:>9} {frames_per_second(uniform, workers):20.2f} {workers:8d}"
 
 
-def open_bench_recipe(repeat: int, engine: str | None) -> Recipe:
-    """The recipe by which speed is measured: `repeat` full-size pairs at each of five distances.
+def open_stations_recipe(repeat: int, engine: str | None) -> Recipe:
+    """The recipe `bench-stations` with `repeat` pairs at each distance.
 
     Raises:
         ValueError: fewer than one pair, or no such engine.
     """
     if repeat < 1:
         raise ValueError(f"--repeat: must be at least 1, got {repeat}")
-    distance: dict[str, object] = {"law": "stations", "stations_m": _BENCH_STATIONS_M}
-    return _bench_recipe({"count": repeat * len(_BENCH_STATIONS_M)}, distance, "corpus", engine)
+    recipe = _packaged_recipe("bench-stations", engine)
+    return _with_frames(recipe, repeat * len(recipe.distance.stations_m or ()), recipe.frames.scenes)
 
 
-def open_uniform_bench_recipe(pairs: int, quality: str, engine: str | None) -> Recipe:
-    """The recipe by which a corpus's mean speed and noise are measured: distances uniform from 2 to 40 m, some scenes.
+def open_uniform_recipe(pairs: int, quality: str, engine: str | None) -> Recipe:
+    """The recipe `bench-corpus` or `bench-benchmark` with `pairs` pairs in several scenes.
 
     Raises:
         ValueError: fewer than one pair, or no such engine.
     """
     if pairs < 1:
         raise ValueError(f"--pairs: must be at least 1, got {pairs}")
-    distance: dict[str, object] = {"law": "uniform", "low_m": _BENCH_STATIONS_M[0], "high_m": _BENCH_STATIONS_M[-1]}
-    # One sky has up to two and a half times the noise of another.
-    frames = {"count": pairs, "scenes": min(pairs, _BENCH_SCENES)}
-    return _bench_recipe(frames, distance, quality, engine)
+    recipe = _packaged_recipe(f"bench-{quality}", engine)
+    return _with_frames(recipe, pairs, min(pairs, recipe.frames.scenes))
 
 
-def _bench_recipe(frames: dict[str, int], distance: dict[str, object], quality: str, engine: str | None) -> Recipe:
-    from datasets_manifest.recipe.recipe import Recipe
+def _packaged_recipe(name: str, engine: str | None) -> Recipe:
+    return open_recipe(str(files("droguekit.workflows") / "recipes" / f"{name}.toml"), None, engine).recipe
 
-    demo = open_recipe("demo", None, engine).recipe
-    changes = {
-        "frames": frames,
-        "distance": distance,
-        "render": {**demo.render.model_dump(), **_BENCH_SAMPLES[quality]},
-    }
-    return Recipe.model_validate({**demo.model_dump(), **changes})
+
+def _with_frames(recipe: Recipe, count: int, scenes: int) -> Recipe:
+    frames = recipe.frames.model_copy(update={"count": count, "scenes": scenes})
+    return type(recipe).model_validate(dict(recipe) | {"frames": frames})
+
+
+def _stations_table(recipe: Recipe, reports: tuple[FrameReport, ...]) -> Iterator[str]:
+    """CPU time of a pair at each distance, and the share of each stage."""
+    stages = list(dict.fromkeys(stage for report in reports for stage in report.stage_s))
+    yield f"{'distance':>9} {'CPU s/pair':>11}  share of each stage [%]"
+    yield f"{'':>21}  {' '.join(f'{stage:>9}' for stage in stages)}"
+    for station_m in recipe.distance.stations_m or ():
+        total, count = Counter[str](), 0
+        for report in reports:
+            if report.distance_m is not None and abs(report.distance_m - station_m) < 1e-6 * station_m:
+                total.update(report.stage_s)
+                count += 1
+        cpu_s = sum(total.values())
+        shares = " ".join(f"{100 * total[stage] / cpu_s:9.1f}" for stage in stages)
+        yield f"{station_m:7g} m {cpu_s / count:11.2f}  {shares}"
+
+
+def _mean_row(quality: str, frames: tuple[MeasuredFrame, ...]) -> str:
+    """Mean CPU time of a pair, renderer's noise over the sensor's, and the process's memory and its growth."""
+    cpu_s = sum(sum(frame.report.stage_s.values()) for frame in frames) / len(frames)
+    noise = [frame.noise_over_sensor for frame in frames if frame.noise_over_sensor is not None]
+    over_sensor = f"{math.sqrt(sum(value**2 for value in noise) / len(noise)):.2f}" if noise else "-"
+    early, late = frames[(len(frames) - 1) // 5].memory_bytes, frames[-1].memory_bytes
+    memory = f"{late / 1e6:12.0f} {late / early - 1:8.1%}" if early and late else f"{'-':>12} {'-':>8}"
+    return f"{quality:>9} {cpu_s:11.2f} {over_sensor:>13} {memory}"

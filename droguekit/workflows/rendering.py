@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from droguekit.batch.progress import duration, human_size
+
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import RecipeSource
     from datasets_manifest.storage.storage import Location
@@ -74,6 +76,22 @@ def render_frames(
     if notice is not None:
         report.say(notice)
     return render_dataset(source, out, frames, options, report)
+
+
+def run_lines(out: Location, summary: RunSummary) -> Iterator[str]:
+    """What a run made and what it cost, for people."""
+    totals = summary.totals
+    cpu_s, retries = sum(totals.stage_s.values()), f", {totals.retries} attempts repeated" if totals.retries else ""
+    yield (
+        f"{out}: made {len(totals.made)} pairs ({duration(cpu_s)} of CPU time, {human_size(totals.size_bytes)}"
+        f"{retries}), kept {summary.kept}"
+    )
+    if totals.made:
+        stages = ", ".join(f"{stage} {duration(seconds)}" for stage, seconds in totals.stage_s.most_common())
+        yield f"CPU time by stage: {stages}"
+    if totals.peak_gib:
+        yield f"workers held up to {totals.peak_gib:.1f} GiB together"
+    yield f"{summary.pairs} of {summary.planned} pairs are there; dataset sha256 {summary.dataset_sha256}"
 
 
 @contextmanager

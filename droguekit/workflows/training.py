@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +28,7 @@ class TrainingOptions:
     Attributes:
         sources: folders or URLs of datasets, and recipes.
         settings_file: TOML of training settings, or None.
-        changes: to both the file and the defaults.
+        changes: to both the file and the defaults; None changes nothing.
         size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
         cache: folder for images at the network's size, or None for the training's own.
         start_from: shipped detector or file of weights to start from, or None for random ones.
@@ -72,6 +73,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     from droguekit.batch.stop_request import StopRequest
     from nav.training.training_settings import build_settings, parse_size
 
+    changes = {name: value for name, value in options.changes.items() if value is not None}
     sizes = {"size_px": options.size, "final_size_px": options.final_size}
     parsed = {name: parse_size(text) for name, text in sizes.items() if text is not None}
     missing = [name for name in _NEEDED if find_spec(name) is None]
@@ -83,7 +85,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
 
     start = None if options.start_from is None else read_starting_weights(options.start_from)
     network = None if start is None or start.network is None else start.network.to_dict()
-    settings = build_settings(options.settings_file, {**options.changes, **parsed}, network)
+    settings = build_settings(options.settings_file, {**changes, **parsed}, network)
     found = [_find(source) for source in options.sources]
     from nav.training.training_run import check_training, train
 
@@ -96,3 +98,15 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     ]
     with StopRequest(report.say) as stop:
         return train(datasets, out, settings, report, options.cache, lambda: stop.is_requested, start)
+
+
+def training_lines(result: TrainingResult) -> Iterator[str]:
+    """What a training reached, and where its network is."""
+    for split, reached in (("val", result.validation), ("test", result.test)):
+        if reached is not None:
+            ap50, ap75, ap, recall50 = (
+                f"{100 * value:.2f} %" for value in (reached.ap50, reached.ap75, reached.ap, reached.recall50)
+            )
+            yield f"{split}: AP50 {ap50}, AP75 {ap75}, AP {ap}, recall at an overlap of 0.5 {recall50}"
+    threshold = f"{result.score_threshold:.3f}"
+    yield f"{result.file}: the weights after {result.best_step} steps, score threshold {threshold}"

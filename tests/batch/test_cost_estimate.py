@@ -13,7 +13,7 @@ import pytest
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from datasets_manifest.storage.manifest import Drop
 from droguekit.batch.cost_estimate import (
-    Cost,
+    CostEstimate,
     Probe,
     choose_frames,
     fit_over_distance,
@@ -23,7 +23,7 @@ from droguekit.batch.cost_estimate import (
 )
 from droguekit.batch.failure_policy import drop_of
 from droguekit.batch.frame_task import FrameReport
-from droguekit.batch.recipe_plan import Plan, plan_recipe
+from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
 from droguekit.batch.worker_pool import Limits
 from droguekit.cli.dataset.plan import _cost
 
@@ -107,7 +107,7 @@ def test_only_empty_frames_are_probed_where_there_are_no_others() -> None:
     assert len(choose_frames(drawn, 200).counted) == 1
 
 
-def synthetic(recipe: Recipe, plan: Plan, rest_s: Callable[[int], float], first_s: float = 0.0) -> Probe:
+def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], first_s: float = 0.0) -> Probe:
     """A probe whose frames take `rest_s`, 0.2 s of their own to be drawn, and `first_s` where a scene is new."""
     drawn, met = plan.drawn, set[int]()
 
@@ -212,8 +212,8 @@ def test_time_that_failed_frames_took_is_no_start() -> None:
     assert make_in_turn(made_unless_odd, (1,), [], False)[1] == 0
 
 
-def cost(count: int, scenes: int, sequences: int = 0) -> Cost:
-    return Cost(
+def cost(count: int, scenes: int, sequences: int = 0) -> CostEstimate:
+    return CostEstimate(
         probed={},
         drops=(),
         start_s=10.0,

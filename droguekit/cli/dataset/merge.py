@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from datasets_manifest.storage.storage import as_location
-from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import Place, TarOption, human_size, places
+from droguekit.batch.progress import human_size, progress_report
+from droguekit.cli.arguments import Place, TarOption, places
 from droguekit.cli.main import FAULT
 
 EXAMPLES = ("droguekit merge data/demo data/demo-0 data/demo-1",)

@@ -8,7 +8,7 @@ import typer
 
 from datasets_manifest.storage.storage import as_location
 from droguekit.batch.execution import ExecutionOptions
-from droguekit.batch.progress import duration, progress_report
+from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import (
     EngineOption,
     Place,
@@ -16,12 +16,11 @@ from droguekit.cli.arguments import (
     SeedOption,
     TarOption,
     WorkersOption,
-    human_size,
     parse_frames,
     parse_shard,
 )
 from droguekit.cli.main import FAULT
-from droguekit.workflows.rendering import open_recipe, render_frames
+from droguekit.workflows.rendering import open_recipe, render_frames, run_lines
 
 EXAMPLES = (
     "droguekit render demo --out data/demo",
@@ -74,18 +73,8 @@ def render(
     wanted = parse_shard(shard, parse_frames(frames, source.recipe.frames.count))
     options = ExecutionOptions(workers, timeout, scheduler, tar)
     summary = render_frames(source, out, wanted, options, progress_report())
-    totals = summary.totals
-    cpu_s, retries = sum(totals.stage_s.values()), f", {totals.retries} attempts repeated" if totals.retries else ""
-    typer.echo(
-        f"{out}: made {len(totals.made)} pairs ({duration(cpu_s)} of CPU time, {human_size(totals.size_bytes)}"
-        f"{retries}), kept {summary.kept}"
-    )
-    if totals.made:
-        stages = ", ".join(f"{stage} {duration(seconds)}" for stage, seconds in totals.stage_s.most_common())
-        typer.echo(f"CPU time by stage: {stages}")
-    if totals.peak_gib:
-        typer.echo(f"workers held up to {totals.peak_gib:.1f} GiB together")
-    typer.echo(f"{summary.pairs} of {summary.planned} pairs are there; dataset sha256 {summary.dataset_sha256}")
+    for line in run_lines(out, summary):
+        typer.echo(line)
     for drop in summary.drops:
         typer.echo(f"frame {drop.frame_index} is missing: {drop.reason}", err=True)
     if summary.drops:

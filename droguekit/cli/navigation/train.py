@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import WorkersOption, output_option
-from droguekit.workflows.training import TrainingOptions, train_detector
+from droguekit.workflows.training import TrainingOptions, train_detector, training_lines
 
 EXAMPLES = (
     "droguekit train detector-small --out out/detector   (renders the recipe first)",
@@ -76,7 +76,7 @@ def train(
 
     The same command again goes on where the last one stopped. Ctrl-C saves and stops; twice stops at once.
     """
-    given = {
+    changes = {
         "variant": variant,
         "attention": attention,
         "fusion": fusion,
@@ -87,14 +87,6 @@ def train(
         "device": device,
         "threads": threads,
     }
-    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     options = TrainingOptions(tuple(sources), settings, changes, size, final_size, cache, start_from, workers)
-    result = train_detector(options, out, progress_report())
-    for split, reached in (("val", result.validation), ("test", result.test)):
-        if reached is not None:
-            ap50, ap75, ap, recall50 = (
-                f"{100 * value:.2f} %" for value in (reached.ap50, reached.ap75, reached.ap, reached.recall50)
-            )
-            typer.echo(f"{split}: AP50 {ap50}, AP75 {ap75}, AP {ap}, recall at an overlap of 0.5 {recall50}")
-    threshold = f"{result.score_threshold:.3f}"
-    typer.echo(f"{result.file}: the weights after {result.best_step} steps, score threshold {threshold}")
+    for line in training_lines(train_detector(options, out, progress_report())):
+        typer.echo(line)

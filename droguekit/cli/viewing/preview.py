@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from droguekit.cli.arguments import DatasetArgument, output_option
-
-if TYPE_CHECKING:
-    from datasets_manifest.storage.reader import Dataset
-    from datasets_manifest.storage.storage import Location
-    from droguekit.benchmark.report.label_drawing import Picture
 
 EXAMPLES = (
     "droguekit preview data/demo --out sheet.png",
@@ -42,10 +37,7 @@ def preview(
         Path | None, output_option("--animate", "FILE", "A .gif or .mp4 file: the flight from the side, in time.")
     ] = None,
     overlay: Annotated[
-        Path | None,
-        output_option(
-            "--overlay", "FILE", "An .mp4 or .gif file: left images with boxes, outlines, estimates, errors."
-        ),
+        Path | None, output_option("--overlay", "FILE", "An .mp4 or .gif file: left images with truth and estimates.")
     ] = None,
     estimates: Annotated[
         Path | None, typer.Option("--estimates", metavar="FILE.jsonl", help="Poses to draw in an overlay.")
@@ -59,108 +51,36 @@ def preview(
 ) -> None:
     """Draw a contact sheet of left images with the drogue's box, the features' centres and the distance.
 
-    A dataset without truth, such as an imported one, is drawn without them. Instead of a sheet: --animate makes a film
-    of the flight from the side, --overlay one of the left images with truth and estimates; both need a dataset with
-    its truth.
+    A dataset without truth, such as an imported one, is drawn without labels. Instead of a sheet, --animate makes a
+    video of the flight from the side, and --overlay one of the left images with truth and estimates; both need truth.
+    MP4 needs the extra `video`.
     """
-    from datasets_manifest.storage.reader import Dataset
-
     if sum(file is not None for file in (out, animate, overlay)) != 1:
-        raise ValueError("--out, --animate, --overlay: give one of them, a file for a sheet or for a film")
+        raise ValueError("--out, --animate, --overlay: give one of them, a file for a sheet or for a video")
     if out is None and (by_family or columns != _COLUMNS or tile_width != _TILE_WIDTH_PX):
-        raise ValueError("--by-family, --columns, --tile-width: go with --out; leave them out of a film")
+        raise ValueError("--by-family, --columns, --tile-width: go with --out; leave them out of a video")
     if sequence is not None and out is not None:
         raise ValueError("--sequence: goes with --animate or --overlay; leave it out for a sheet")
     if overlay is None and (estimates is not None or method is not None):
         raise ValueError("--estimates, --method: go with --overlay")
     if method is not None and estimates is None:
         raise ValueError("--method: goes with --estimates, a file that holds it")
-    if animate is not None:
-        _animate(Dataset(dataset), animate, 150 if count is None else count, sequence)
-    if overlay is not None:
-        _overlay(Dataset(dataset), overlay, 150 if count is None else count, sequence, (estimates, method))
     if out is not None:
-        _check_sheet(out, 20 if count is None else count, columns, tile_width)
-        sheet, shown, pairs = _draw_sheet(dataset, 20 if count is None else count, columns, tile_width, by_family)
-        _write_picture(out, sheet)
+        from droguekit.visualization.contact_sheet import write_contact_sheet
+
+        shown, pairs = write_contact_sheet(dataset, out, 20 if count is None else count, columns, tile_width, by_family)
         typer.echo(f"wrote {out}: {shown} of {pairs} pairs")
-
-
-def _animate(source: Dataset, path: Path, count: int, sequence: int | None) -> None:
-    from droguekit.visualization.side_view import write_animation
-
-    _check_film("--animate", path, count)
-    shown, length_s = write_animation(source, path, count, sequence)
-    typer.echo(f"wrote {path}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")
-
-
-def _overlay(
-    source: Dataset, path: Path, count: int, sequence: int | None, chosen: tuple[Path | None, str | None]
-) -> None:
-    from droguekit.visualization.overlay_video import read_method, write_overlay_video
-
-    _check_film("--overlay", path, count)
-    estimates, method = chosen
-    answers = ("", {}) if estimates is None else read_method(estimates, source, method)
-    shown, length_s = write_overlay_video(source, path, count, sequence, answers)
-    typer.echo(f"wrote {path}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")
-
-
-def _check_film(option: str, path: Path, count: int) -> None:
-    from droguekit.visualization.video_file import SUFFIXES
-
-    if not 1 <= count <= 2000:
-        raise ValueError(f"--count: must be from 1 to 2000 in a film, got {count}")
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{option}: must end in {' or '.join(SUFFIXES)}, got {path}")
-
-
-def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:
-    for name, value, low, high in (
-        ("count", count, 1, 400),
-        ("columns", columns, 1, 40),
-        ("tile-width", tile_width, 64, 4096),
-    ):
-        if not low <= value <= high:
-            raise ValueError(f"--{name}: must be from {low} to {high}, got {value}")
-    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise ValueError(f"--out: must end in .png or .jpg, got {out}")
-
-
-def _draw_sheet(
-    dataset: Location, count: int, columns: int, tile_width: int, by_family: bool
-) -> tuple[Picture, int, int]:
-    """The sheet, how many pairs it shows, and how many there are."""
-    import numpy as np
-
-    from datasets_manifest.storage.blind import BlindDataset
-    from datasets_manifest.storage.layout import BLIND_FILE
+        return
     from datasets_manifest.storage.reader import Dataset
-    from datasets_manifest.storage.storage import open_storage
-    from droguekit.visualization.contact_sheet import draw_blind_sheet, draw_contact_sheet, draw_family_sheet
 
-    is_blind = open_storage(dataset).exists(BLIND_FILE)
-    if is_blind and by_family:
-        raise ValueError(f"--by-family: {dataset} has no truth, and so no families")
-    source = BlindDataset(dataset) if is_blind else Dataset(dataset)
-    pairs = len(source.frame_indices)
-    if not pairs:
-        raise ValueError(f"{dataset}: holds no pairs yet")
-    if by_family and isinstance(source, Dataset):
-        sheet, shown = draw_family_sheet(source, count, columns, tile_width)
-        return sheet, shown, pairs
-    places = np.linspace(0, pairs - 1, min(count, pairs)).round()
-    frames = [source.frame_indices[int(place)] for place in places]
-    columns = min(columns, len(frames))
-    if isinstance(source, BlindDataset):
-        return draw_blind_sheet(source, frames, columns, tile_width), len(frames), pairs
-    return draw_contact_sheet(source, frames, columns, tile_width), len(frames), pairs
+    source, most = Dataset(dataset), 150 if count is None else count
+    if animate is not None:
+        from droguekit.visualization.side_view import write_animation
 
+        shown, length_s = write_animation(source, animate, most, sequence)
+    elif overlay is not None:
+        from droguekit.visualization.overlay_video import read_method, write_overlay_video
 
-def _write_picture(path: Path, picture: Picture) -> None:
-    import cv2
-
-    from datasets_manifest.atomic import write_bytes_atomic
-
-    _, data = cv2.imencode(path.suffix.lower(), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    write_bytes_atomic(path, data.tobytes())
+        chosen = ("", {}) if estimates is None else read_method(estimates, source, method)
+        shown, length_s = write_overlay_video(source, overlay, most, sequence, chosen)
+    typer.echo(f"wrote {animate or overlay}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")

@@ -1,0 +1,170 @@
+"""What is installed here, which engines work, and what is missing."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import sys
+from collections.abc import Generator, Iterator
+
+_PACKAGES = (
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "OpenEXR",
+    "pydantic",
+    "pycocotools",
+    "trimesh",
+    "matplotlib",
+    "typer",
+    "mitsuba",
+    "drjit",
+    "bpy",
+    "rerun-sdk",
+)
+# What Blender's Python package loads from the system, and Debian's packages of them.
+_BLENDER_LIBRARIES = {
+    "libX11.so.6": "libx11-6",
+    "libXrender.so.1": "libxrender1",
+    "libXfixes.so.3": "libxfixes3",
+    "libXi.so.6": "libxi6",
+    "libxkbcommon.so.0": "libxkbcommon0",
+    "libSM.so.6": "libsm6",
+    "libGL.so.1": "libgl1",
+}
+
+
+def installation_lines() -> Generator[str, None, bool]:
+    """Look at machine, packages, optional programs and engines.
+
+    Returns:
+        Whether the path tracer works; labels, navigation and benchmark work without any.
+    """
+    yield from _machine_lines()
+    yield from _package_lines()
+    yield from _viewer_lines()
+    yield from _video_lines()
+    yield from _browser_lines()
+    return (yield from engine_lines())
+
+
+def _machine_lines() -> Iterator[str]:
+    from datasets_manifest.storage.provenance import cpu_features
+    from droguekit.batch.execution import available_cores, available_memory_gib, default_workers
+
+    yield f"python     {platform.python_version()}, {sys.executable}"
+    yield f"system     {platform.platform()}"
+    yield f"processor  {available_cores()} of {os.cpu_count()} cores; {' '.join(cpu_features())}"
+    yield f"memory     {available_memory_gib():.1f} GiB free: {default_workers()} workers by default"
+
+
+def _package_lines() -> Iterator[str]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    for package in ("droguekit", *_PACKAGES):
+        try:
+            found = version(package)
+        except PackageNotFoundError:
+            found = "missing"
+        yield f"package    {package} {found}"
+
+
+def _viewer_lines() -> Iterator[str]:
+    """Load the rerun viewer's library, which only `view` needs."""
+    try:
+        import rerun
+    except ImportError as error:
+        yield f"viewer     rerun is optional: {error}; pip install 'droguekit[viz]'"
+        return
+    yield f"viewer     rerun {rerun.__version__}, for droguekit view"
+
+
+def _video_lines() -> Iterator[str]:
+    """Load the package that writes MP4, which only videos of `preview` need."""
+    try:
+        import av
+    except ImportError as error:
+        yield f"video      PyAV is optional: {error}; pip install 'droguekit[video]'"
+        return
+    yield f"video      PyAV {av.__version__}, for MP4 files of droguekit preview"
+
+
+def _browser_lines() -> Iterator[str]:
+    """Look for a browser, which only the PDF of `report` needs."""
+    from droguekit.visualization.print_pdf import NO_BROWSER, find_browser
+
+    found = find_browser()
+    if found is None:
+        yield f"browser    Chromium is optional: {NO_BROWSER}"
+        return
+    yield f"browser    {found}, for droguekit report --pdf"
+
+
+def engine_lines() -> Generator[str, None, bool]:
+    """Try each engine.
+
+    Returns:
+        Whether Mitsuba works; the analytic engine needs nothing.
+    """
+    from render.mitsuba_engine.variant import probe_variant
+
+    yield "engine     analytic works: flat discs without path tracing, for estimators"
+    yield from _blender_lines()
+    missing = _missing_libraries()
+    for name, remedy in missing:
+        yield f"library    {name} is missing; {remedy}"
+    try:
+        variant = probe_variant()
+    except ValueError as error:
+        yield f"engine     mitsuba does not work: {error}"
+        return False
+    if _LIBATOMIC in missing:
+        yield "engine     mitsuba does not work without libatomic.so.1"
+        return False
+    yield f"engine     mitsuba works as {variant.variant}: {variant.reason}"
+    return True
+
+
+def _blender_lines() -> Iterator[str]:
+    """Start Blender, which only its own engine needs."""
+    from render.blender_engine.process import BlenderProcess, bpy_version
+
+    try:
+        found = bpy_version()
+    except ValueError as error:
+        yield f"engine     blender is optional: {error}"
+        return
+    missing = [package for library, package in _BLENDER_LIBRARIES.items() if not _loads(library)]
+    if missing:
+        yield f"engine     blender does not work: apt-get install {' '.join(missing)}"
+        return
+    try:
+        BlenderProcess().close()
+    except ValueError as error:
+        yield f"engine     blender does not work: {error}"
+        return
+    yield f"engine     blender works: bpy {found}, Cycles on the CPU, in a process of its own"
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+_LIBATOMIC = ("libatomic.so.1", "apt-get install libatomic1")
+
+
+def _missing_libraries() -> list[tuple[str, str]]:
+    """System libraries that Mitsuba asks for and that are not here, each with what to do."""
+    from render.mitsuba_engine.variant import llvm_libraries
+
+    missing = []
+    if not _loads(_LIBATOMIC[0]):
+        missing.append(_LIBATOMIC)
+    if not any(library.exists() for library in llvm_libraries()):
+        missing.append(("LLVM >= 15", "apt-get install libllvm15 (or newer), or name one in DRJIT_LIBLLVM_PATH"))
+    return missing
