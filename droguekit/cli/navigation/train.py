@@ -40,8 +40,7 @@ def train(
         bool | None, typer.Option("--mosaic/--no-mosaic", help="Put four images together; on by default.")
     ] = None,
     views: Annotated[
-        Literal["one", "both"] | None,
-        typer.Option("--views", help="Both eyes of a pair in one batch (the default), or single eyes."),
+        Literal["one", "both"] | None, typer.Option("--views", help="Eyes of a pair in one batch; both by default.")
     ] = None,
     image_passes: Annotated[
         int | None, typer.Option("--image-passes", help="Images that go through the network in all; 40,000.")
@@ -56,8 +55,7 @@ def train(
     device: Annotated[Literal["cpu", "cuda"] | None, typer.Option("--device", help="Where to compute; cpu.")] = None,
     threads: Annotated[int | None, typer.Option("--threads", help="That compute; as many as cores.")] = None,
     settings: Annotated[
-        Path | None,
-        typer.Option("--settings", metavar="FILE", help="TOML with any of the settings; options here go before it."),
+        Path | None, typer.Option("--settings", metavar="FILE", help="TOML of settings, which options here override.")
     ] = None,
     cache: Annotated[
         Path | None, typer.Option("--cache", metavar="DIR", help="For images at the network's size; OUT/cache.")
