@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from droguekit.batch.progress import ProgressReport
-    from droguekit.benchmark.results.detection_result import DetectedBox
-    from droguekit.benchmark.results.detection_result import PairTimes
+    from droguekit.benchmark.results.detection_result import DetectedBox, PairTimes
 
 
 @dataclass(frozen=True)
