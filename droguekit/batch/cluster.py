@@ -21,7 +21,7 @@ from datasets_manifest.storage.storage import absolute, open_storage
 from droguekit.batch.execution import resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
 from droguekit.batch.stop_request import StopRequest
-from droguekit.batch.worker_pool import MAX_ATTEMPTS, Attempt, run_alone
+from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, run_in_own_process
 from render.engine import load_engine
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class LostWorkersError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Build:
+class WorkerBuild:
     """What pixels and labels depend on besides the recipe."""
 
     software: tuple[tuple[str, str], ...]
@@ -54,13 +54,13 @@ class Build:
 
 
 @cache
-def build_here() -> Build:
+def current_build() -> WorkerBuild:
     """The build of this process."""
-    return Build(tuple(sorted(software_versions().items())), frozenset(cpu_features()))
+    return WorkerBuild(tuple(sorted(software_versions().items())), frozenset(cpu_features()))
 
 
 @dataclass(frozen=True)
-class Made:
+class ClusterResult:
     """A frame that a Dask worker has made.
 
     Attributes:
@@ -85,10 +85,10 @@ class ClusterTask:
     """
 
     task: FrameTask
-    build: Build
+    build: WorkerBuild
     timeout_s: float
 
-    def __call__(self, frame_index: int) -> Made:
+    def __call__(self, frame_index: int) -> ClusterResult:
         """Make and write frame `frame_index`.
 
         Raises:
@@ -99,7 +99,7 @@ class ClusterTask:
 
         worker = get_worker()
         where = f"Dask worker {worker.address}"
-        _same_build(self.build, build_here(), where)
+        _check_build(self.build, current_build(), where)
         if worker.state.nthreads != 1:
             raise OtherBuildError(
                 f"{where}: must have one thread, has {worker.state.nthreads}; start with --nthreads 1"
@@ -112,10 +112,10 @@ class ClusterTask:
             report = self.task(frame_index)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
-        return Made(self.task.pack(frame_index, report), worker.address, resident_gib())
+        return ClusterResult(self.task.pack(frame_index, report), worker.address, resident_gib())
 
 
-def make_on_worker(pickled_task: bytes, frame_index: int) -> Made:
+def make_on_worker(pickled_task: bytes, frame_index: int) -> ClusterResult:
     """Frame `frame_index` by a pickled `ClusterTask`; for thousands of frames it is packed and unpacked once."""
     return _unpickled(pickled_task)(frame_index)
 
@@ -129,7 +129,7 @@ def _unpickled(pickled_task: bytes) -> ClusterTask:
 
 def run_on_cluster(
     task: FrameTask, indices: Sequence[int], address: str, timeout_s: float, stop: StopRequest
-) -> Generator[Attempt[FrameReport], None, None]:
+) -> Generator[TaskAttempt[FrameReport], None, None]:
     """Let the workers of a scheduler make frames, and report each as it ends.
 
     Workers may come and go meanwhile. A few frames for each worker are with the scheduler at any time.
@@ -145,16 +145,18 @@ def run_on_cluster(
         ValueError: `distributed` is missing.
         OSError: no scheduler answers there, or it has ended.
     """
-    version = task.engine_version or run_alone(partial(_engine_version, task.recipe.render.engine))
+    version = task.engine_version or run_in_own_process(partial(_engine_version, task.recipe.render.engine))
     shared = replace(task, dataset=absolute(task.dataset), engine_version=version)
     client = _connect(address)
     try:
-        yield from _Window(client, ClusterTask(shared, build_here(), timeout_s), deque(indices)).attempts(stop)
+        yield from _SubmissionWindow(client, ClusterTask(shared, current_build(), timeout_s), deque(indices)).attempts(
+            stop
+        )
     finally:
         client.close()
 
 
-class _Window:
+class _SubmissionWindow:
     """The frames that wait, and the few that are with the scheduler."""
 
     def __init__(self, client: Client, task: ClusterTask, waiting: deque[int]) -> None:
@@ -169,7 +171,7 @@ class _Window:
         self._asked_s = -math.inf
         self._resident_gib: dict[str, float] = {}
 
-    def attempts(self, stop: StopRequest) -> Generator[Attempt[FrameReport], None, None]:
+    def attempts(self, stop: StopRequest) -> Generator[TaskAttempt[FrameReport], None, None]:
         """Report each frame as it ends; frames that the caller does not wait for any more are cancelled."""
         stop.wake = lambda: self._ended.put(None)
         self._allow_failures(ALLOWED_FAILURES)
@@ -218,7 +220,7 @@ class _Window:
     def _allow_failures(self, count: int) -> None:
         self._client.run_on_scheduler(_allow_failures, count=count)
 
-    def _attempt(self, index: int, future: Future) -> Attempt[FrameReport]:
+    def _attempt(self, index: int, future: Future) -> TaskAttempt[FrameReport]:
         """How a frame ended.
 
         Raises:
@@ -230,7 +232,7 @@ class _Window:
         error: Exception | None = None
         final = True
         try:
-            made: Made = future.result()
+            made: ClusterResult = future.result()
             value, self._resident_gib[made.worker] = made.report, made.resident_gib
         except CancelledError as ended:
             raise OSError("the Dask scheduler has ended; start it and the same command again to go on") from ended
@@ -240,7 +242,7 @@ class _Window:
                 self._suspects.append(index)
         except Exception as raised:
             error = raised
-        return Attempt(index, 1 + self._alone, value, error, final, sum(self._resident_gib.values()))
+        return TaskAttempt(index, 1 + self._alone, value, error, final, sum(self._resident_gib.values()))
 
 
 def _connect(address: str) -> Client:
@@ -267,7 +269,7 @@ def _allow_failures(count: int, dask_scheduler: Any) -> None:
     dask_scheduler.allowed_failures = count
 
 
-def _same_build(wanted: Build, here: Build, where: str) -> None:
+def _check_build(wanted: WorkerBuild, here: WorkerBuild, where: str) -> None:
     """See that frames made here are those that the client would make.
 
     Raises:

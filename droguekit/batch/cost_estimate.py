@@ -17,10 +17,10 @@ from scipy.optimize import nnls
 
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import Drop
-from droguekit.batch.failure_policy import ERRORS_OF_THE_PLACE, drop_of
+from droguekit.batch.failure_policy import FATAL_ERRORS, make_drop
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan
-from droguekit.batch.worker_pool import Limits, run_alone
+from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process
 from geometry.se3 import Array
 from scenes.sampler import scene_of_frame
 
@@ -43,7 +43,7 @@ class ProbeFrames:
 
 
 @dataclass(frozen=True)
-class Probe:
+class ProbeResult:
     """What frames cost.
 
     Attributes:
@@ -61,7 +61,7 @@ class Probe:
     drops: tuple[Drop, ...]
 
 
-def choose_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
+def choose_probe_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
     """One frame from each of several strata of distance, one without a drogue if there are any, and as many before.
 
     Nearest and farthest are counted. Within a stratum the family, and then the scene, that has had the fewest comes
@@ -78,13 +78,13 @@ def choose_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
     )
     ends: list[NDArray[np.intp]] = [order[[-1]], *strata[1:-1], order[[0]]] if len(strata) > 1 else [order]
     empty = np.flatnonzero(np.isnan(drawn.distances_m))[:1]
-    counted = _rarest(drawn, [*ends, empty])
+    counted = _pick_rarest(drawn, [*ends, empty])
     rest = [stratum[~np.isin(stratum, counted)] for stratum in strata]
-    warm_up = _rarest(drawn, rest) or counted[:1]
+    warm_up = _pick_rarest(drawn, rest) or counted[:1]
     return ProbeFrames(*(tuple(drawn.indices[place] for place in places) for places in (warm_up, counted)))
 
 
-def _rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]:
+def _pick_rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]:
     """A place in `drawn` from each stratum that has any."""
     families, scenes, chosen = Counter[int](), Counter[int](), list[int]()
     for stratum in strata:
@@ -98,7 +98,7 @@ def _rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]
     return chosen
 
 
-def probe(recipe: Recipe, order: ProbeFrames) -> Probe:
+def probe(recipe: Recipe, order: ProbeFrames) -> ProbeResult:
     """Make frames in a temporary folder, in a process of their own with one thread, and throw them away.
 
     A frame that `render` would drop is one here.
@@ -107,10 +107,10 @@ def probe(recipe: Recipe, order: ProbeFrames) -> Probe:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the process died, or the temporary folder cannot be written.
     """
-    return run_alone(partial(_probe, recipe, order))
+    return run_in_own_process(partial(_probe, recipe, order))
 
 
-def _probe(recipe: Recipe, order: ProbeFrames) -> Probe:
+def _probe(recipe: Recipe, order: ProbeFrames) -> ProbeResult:
     drops = list[Drop]()
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         task = FrameTask(recipe, Path(folder))
@@ -121,7 +121,7 @@ def _probe(recipe: Recipe, order: ProbeFrames) -> Probe:
         repeated = task(next(reversed(counted)))
     reports = [*warm_up.values(), *counted.values(), repeated]
     in_frames_s = sum(cpu_s(report) for report in reports) + failed_s + more_failed_s
-    return Probe(warm_up, counted, repeated, max(0.0, time.process_time() - in_frames_s), tuple(drops))
+    return ProbeResult(warm_up, counted, repeated, max(0.0, time.process_time() - in_frames_s), tuple(drops))
 
 
 def make_in_turn(
@@ -147,10 +147,10 @@ def make_in_turn(
         began_s = time.process_time()
         try:
             made[frame_index] = task(frame_index)
-        except ERRORS_OF_THE_PLACE:
+        except FATAL_ERRORS:
             raise
         except Exception as error:
-            drops.append(drop_of(frame_index, error))
+            drops.append(make_drop(frame_index, error))
             if is_loaded or made:
                 failed_s += time.process_time() - began_s
     return made, failed_s
@@ -208,7 +208,7 @@ class CostEstimate:
         return (self._processes(workers) * self.start_s + self.work_s(workers)) / max(1, min(workers, self.count))
 
     def _processes(self, workers: int) -> int:
-        return max(1, min(workers, self.count), math.ceil(self.count / Limits().tasks_per_process))
+        return max(1, min(workers, self.count), math.ceil(self.count / WorkerLimits().tasks_per_process))
 
 
 def probe_cost(recipe: Recipe, plan: RecipePlan) -> CostEstimate:
@@ -218,15 +218,15 @@ def probe_cost(recipe: Recipe, plan: RecipePlan) -> CostEstimate:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the temporary folder cannot be written.
     """
-    return reckon(recipe, plan, probe(recipe, choose_frames(plan.drawn, recipe.frames.count)))
+    return estimate_cost(recipe, plan, probe(recipe, choose_probe_frames(plan.drawn, recipe.frames.count)))
 
 
-def reckon(recipe: Recipe, plan: RecipePlan, probed: Probe) -> CostEstimate:
+def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> CostEstimate:
     """What measured frames say of all pairs of a recipe."""
     reports = list(probed.counted.values())
     every = [*probed.warm_up.values(), *reports, probed.repeated]
     count = recipe.frames.count * (1 - plan.dropped_fraction)
-    law = _Law(plan.drawn, probed.counted)
+    law = _DistanceFit(plan.drawn, probed.counted)
     # What that stage takes of every pair is what it takes of one whose environment is at hand.
     at_hand_s = _scene_stage_s(probed.repeated)
     frames_s, error_s = law.total([cpu_s(report) - _scene_stage_s(report) + at_hand_s for report in reports], count)
@@ -245,7 +245,7 @@ def reckon(recipe: Recipe, plan: RecipePlan, probed: Probe) -> CostEstimate:
     )
 
 
-class _Law:
+class _DistanceFit:
     """How measured values go with the distance, each family of frames counting by its share of the recipe."""
 
     def __init__(self, drawn: DrawnFrames, reports: dict[int, FrameReport]) -> None:
@@ -274,7 +274,7 @@ class _Law:
         return total, count * share * math.sqrt(float(np.square(left[shows]).sum()) / (n - _TERMS) / n)
 
 
-def _scene_s(recipe: Recipe, probed: Probe) -> float:
+def _scene_s(recipe: Recipe, probed: ProbeResult) -> float:
     """What the first frame of a scene, or of a sequence, takes more than its later ones. [s]"""
     first_s: dict[int, float] = {}
     for frame_index, report in (probed.warm_up | probed.counted).items():

@@ -7,15 +7,15 @@ from droguekit.batch.frame_task import OtherBuildError
 from render.engine import EngineUnavailableError
 
 # Errors that other frames would meet too; so does whatever the first frames of a run all fail by.
-ERRORS_OF_THE_PLACE = (OSError, EngineUnavailableError, OtherBuildError)
+FATAL_ERRORS = (OSError, EngineUnavailableError, OtherBuildError)
 FIRST_FRAMES = 3
 
 
-def reason_of(error: BaseException) -> str:
+def error_reason(error: BaseException) -> str:
     """What an error says, in one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def drop_of(frame_index: int, error: BaseException) -> Drop:
+def make_drop(frame_index: int, error: BaseException) -> Drop:
     """The drop of a frame that an error keeps from being made."""
-    return Drop(frame_index=frame_index, reason=reason_of(error))
+    return Drop(frame_index=frame_index, reason=error_reason(error))

@@ -14,7 +14,7 @@ from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.reader import read_record_table
 from droguekit.batch.frame_task import FrameReport, FrameTask
-from droguekit.batch.worker_pool import run_alone, run_tasks
+from droguekit.batch.worker_pool import run_in_own_process, run_tasks
 
 # A worker's first frames compile kernels.
 _WARM_UP_FRAMES = 4
@@ -35,12 +35,7 @@ class MeasuredFrame:
     memory_bytes: int | None
 
 
-def measure_frames(recipe: Recipe, frames: tuple[int, ...]) -> tuple[FrameReport, ...]:
-    """What frames cost; see `measure_closely`."""
-    return tuple(measured.report for measured in measure_closely(recipe, frames))
-
-
-def measure_closely(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
+def measure_frames(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
     """Make frames in a temporary folder, in a process of their own with one thread.
 
     The first frame is made once more before, so that loading the engine and compiling its kernels does not count.
@@ -53,14 +48,14 @@ def measure_closely(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFr
         ValueError: the engine cannot be used, or a frame cannot be made.
         OSError: the process died, or the temporary folder cannot be written.
     """
-    return run_alone(partial(_measure, recipe, frames))
+    return run_in_own_process(partial(_measure, recipe, frames))
 
 
 def _measure(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         task = FrameTask(recipe, Path(folder))
         task(frames[0])
-        return tuple(_measured(task, frame_index) for frame_index in frames)
+        return tuple(_measure_frame(task, frame_index) for frame_index in frames)
 
 
 def frames_per_second(recipe: Recipe, workers: int) -> float:
@@ -76,7 +71,7 @@ def frames_per_second(recipe: Recipe, workers: int) -> float:
         ValueError: too few frames, the engine cannot be used, or a frame cannot be made.
         OSError: a process died again and again, or the temporary folder cannot be written.
     """
-    uncounted = warm_up(workers)
+    uncounted = warm_up_frames(workers)
     if recipe.frames.count <= uncounted:
         raise ValueError(f"frames: {recipe.frames.count} are too few for {workers} workers; {uncounted} do not count")
     ended_s = []
@@ -90,12 +85,12 @@ def frames_per_second(recipe: Recipe, workers: int) -> float:
     return (len(ended_s) - uncounted) / (ended_s[-1] - ended_s[uncounted - 1])
 
 
-def warm_up(workers: int) -> int:
+def warm_up_frames(workers: int) -> int:
     """Frames of `frames_per_second` that do not count."""
     return _WARM_UP_FRAMES * workers
 
 
-def _measured(task: FrameTask, frame_index: int) -> MeasuredFrame:
+def _measure_frame(task: FrameTask, frame_index: int) -> MeasuredFrame:
     report = task(frame_index)
     conditions = read_record_table(FrameStore(task.dataset), frame_index)["conditions"]
     return MeasuredFrame(report, conditions["monte_carlo_over_sensor_noise"], _memory_bytes())

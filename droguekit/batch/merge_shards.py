@@ -12,8 +12,8 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.storage.writer import write_frame
 from droguekit.batch.progress import ProgressReport
-from droguekit.batch.render_dataset import Events, RunSummary, Totals, describe_dataset, still_missing
-from droguekit.batch.resume import differing_keys, open_dataset, sort_frames
+from droguekit.batch.render_dataset import EventLog, RunSummary, RunTotals, describe_dataset, still_missing
+from droguekit.batch.resume import check_frames, differing_keys, open_dataset
 from render.version import RENDER_VERSION
 
 _SHOWN = 20
@@ -41,21 +41,21 @@ def merge_shards(
     manifests = {shard: read_manifest(shard) for shard in shards}
     first, manifest = next(iter(manifests.items()))
     for shard, other in manifests.items():
-        _belongs(first, manifest, shard, other)
-    sources = _sources(manifests)
+        _check_compatible(first, manifest, shard, other)
+    sources = _locate_frames(manifests)
     drops = [drop for other in manifests.values() for drop in other.drops if drop.frame_index not in sources]
-    _complete(manifest.recipe.frames.count, {*sources, *(drop.frame_index for drop in drops)})
+    _check_complete(manifest.recipe.frames.count, {*sources, *(drop.frame_index for drop in drops)})
     datasets = {shard: Dataset(shard) for shard in shards}
     source = RecipeSource(manifest.recipe, open_storage(first).read(RECIPE_FILE).decode())
     with open_dataset(out, source, pairs_per_tar) as stream:
-        events = Events(stream)
-        whole = sort_frames(out, read_manifest(out)).whole
+        events = EventLog(stream)
+        whole = check_frames(out, read_manifest(out)).whole
         events.write("merge", shards=[str(shard) for shard in shards], kept=len(whole))
-        totals, packing = Totals(), read_packing(out, range(manifest.recipe.frames.count))
+        totals, packing = RunTotals(), read_packing(out, range(manifest.recipe.frames.count))
         report.begin("pairs", len(sources) - len(whole))
         try:
             for frame_index in sorted(set(sources) - whole):
-                totals.size_bytes += _copy(datasets[sources[frame_index]], frame_index, out)
+                totals.size_bytes += _copy_frame(datasets[sources[frame_index]], frame_index, out)
                 totals.made.append(frame_index)
                 if packing is not None:
                     pack_if_complete(out, frame_index, packing)
@@ -69,7 +69,7 @@ def merge_shards(
     return RunSummary(totals, len(whole), missing, result.counts.pairs, planned, result.dataset_sha256)
 
 
-def _belongs(first: Location, manifest: Manifest, shard: Location, other: Manifest) -> None:
+def _check_compatible(first: Location, manifest: Manifest, shard: Location, other: Manifest) -> None:
     """See that two shards are parts of one dataset.
 
     Raises:
@@ -78,7 +78,7 @@ def _belongs(first: Location, manifest: Manifest, shard: Location, other: Manife
     differing = differing_keys(manifest.recipe.model_dump(mode="json"), other.recipe.model_dump(mode="json"))
     if differing:
         raise ValueError(f"{shard}: is of another recipe than {first}, which differs in {', '.join(differing[:8])}")
-    for what, there, here in _builds(manifest, other):
+    for what, there, here in _build_pairs(manifest, other):
         if there != here:
             raise ValueError(
                 f"{shard}: was made with {what} {here}, but {first} with {there}; their pixels or last digits differ: "
@@ -88,7 +88,7 @@ def _belongs(first: Location, manifest: Manifest, shard: Location, other: Manife
         raise ValueError(f"{shard}: is of render version {other.render_version}, this is {RENDER_VERSION}; use that")
 
 
-def _builds(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str, str]]:
+def _build_pairs(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str, str]]:
     """What two shards were made with, by the kind of thing."""
     yield "render version", manifest.render_version, other.render_version
     if manifest.engines and other.engines:
@@ -103,7 +103,7 @@ def _builds(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str, str
     )
 
 
-def _sources(manifests: dict[Location, Manifest]) -> dict[int, Location]:
+def _locate_frames(manifests: dict[Location, Manifest]) -> dict[int, Location]:
     """Where each frame lies.
 
     Raises:
@@ -118,7 +118,7 @@ def _sources(manifests: dict[Location, Manifest]) -> dict[int, Location]:
     return {frame_index: shard for frame_index, (shard, _) in found.items()}
 
 
-def _complete(count: int, there: set[int]) -> None:
+def _check_complete(count: int, there: set[int]) -> None:
     missing = [frame_index for frame_index in range(count) if frame_index not in there]
     if missing:
         shown = ", ".join(map(str, missing[:_SHOWN])) + (
@@ -130,7 +130,7 @@ def _complete(count: int, there: set[int]) -> None:
         )
 
 
-def _copy(source: Dataset, frame_index: int, out: Location) -> int:
+def _copy_frame(source: Dataset, frame_index: int, out: Location) -> int:
     """Copy a frame, hashing it on the way.
 
     Returns:

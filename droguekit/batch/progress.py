@@ -45,12 +45,12 @@ class PlainProgress:
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._what, self._note = "", ""
-        self._pace = Pace(0)
+        self._pace = ProgressRate(0)
         self._told_s = 0.0
 
     def begin(self, what: str, total: int) -> None:
         """Start counting."""
-        self._what, self._note, self._pace = what, "", Pace(total)
+        self._what, self._note, self._pace = what, "", ProgressRate(total)
         self._told_s = time.monotonic()
 
     def advance(self) -> None:
@@ -75,7 +75,7 @@ class PlainProgress:
         """Nothing to clear."""
 
 
-class _NotedBar(Progress):
+class _BarWithNote(Progress):
     """A bar with a line below it."""
 
     note = ""
@@ -92,13 +92,13 @@ class TerminalProgress:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._progress: _NotedBar | None = None
+        self._progress: _BarWithNote | None = None
         self._task = TaskID(0)
-        self._pace = Pace(0)
+        self._pace = ProgressRate(0)
 
     def begin(self, what: str, total: int) -> None:
         """Draw the empty bar."""
-        self._progress = _NotedBar(
+        self._progress = _BarWithNote(
             TextColumn("{task.description}"),
             BarColumn(bar_width=None),  # what the others leave of the line
             MofNCompleteColumn(),
@@ -108,7 +108,7 @@ class TerminalProgress:
             expand=True,
         )
         self._task = self._progress.add_task(what, total=total, pace="")
-        self._pace = Pace(total)
+        self._pace = ProgressRate(total)
         self._progress.start()
 
     def advance(self) -> None:
@@ -134,7 +134,7 @@ class TerminalProgress:
             self._progress = None
 
 
-class Pace:
+class ProgressRate:
     """How fast equal pieces of work go, by the clock that nobody sets."""
 
     def __init__(self, total: int) -> None:

@@ -17,7 +17,7 @@ from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import Drop
 from drogue_models.parameters import DrogueParameters
-from droguekit.batch.failure_policy import FIRST_FRAMES, drop_of
+from droguekit.batch.failure_policy import FIRST_FRAMES, make_drop
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, StereoRig
@@ -148,7 +148,7 @@ def draw_frames(recipe: Recipe, indices: tuple[int, ...]) -> DrawnFrames:
                 known[scene_id] = places.get(own.family, 0), drogue_of_scene(own, scene_id), is_placed
             row = _row(recipe, frame_index, *known[scene_id][1:])
         except ValueError as error:
-            drops.append(drop_of(frame_index, error))
+            drops.append(make_drop(frame_index, error))
             if not drawn and len(drops) >= min(FIRST_FRAMES, len(indices)):
                 raise
             continue

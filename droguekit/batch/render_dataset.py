@@ -21,20 +21,20 @@ from datasets_manifest.storage.packing import read_packing
 from datasets_manifest.storage.storage import Location, join
 from droguekit.batch.cluster import LostWorkersError, run_on_cluster
 from droguekit.batch.execution import GIB_PER_WORKER, ExecutionOptions, available_memory_gib
-from droguekit.batch.failure_policy import ERRORS_OF_THE_PLACE, FIRST_FRAMES, reason_of
+from droguekit.batch.failure_policy import FATAL_ERRORS, FIRST_FRAMES, error_reason
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.recipe_plan import frame_timeout_s
-from droguekit.batch.resume import finish_frames, open_dataset, sort_frames
+from droguekit.batch.resume import check_frames, finish_frames, open_dataset
 from droguekit.batch.stop_request import StopRequest
-from droguekit.batch.worker_pool import MAX_ATTEMPTS, Attempt, Limits, is_accident, run_tasks
+from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerLimits, is_accident, run_tasks
 from labelgen.export.coco import write_annotations
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
 
 @dataclass
-class Totals:
+class RunTotals:
     """What the new frames of a run cost together.
 
     Attributes:
@@ -63,7 +63,7 @@ class Totals:
         return {"made": len(self.made), **numbers, "stage_s": dict(self.stage_s)}
 
 
-class Events:
+class EventLog:
     """What happened when and where, a JSON object a line; not part of what a dataset is."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -77,8 +77,8 @@ class Events:
 
 
 def make_frames(
-    task: FrameTask, todo: Sequence[int], options: ExecutionOptions, report: ProgressReport, events: Events
-) -> tuple[Totals, list[Drop]]:
+    task: FrameTask, todo: Sequence[int], options: ExecutionOptions, report: ProgressReport, events: EventLog
+) -> tuple[RunTotals, list[Drop]]:
     """Make frames; those that cannot be made are dropped with their reason, and the others go on.
 
     Args:
@@ -93,14 +93,14 @@ def make_frames(
         OSError: the same, such as a full disk.
         KeyboardInterrupt: it was told to stop, and the frames in hand are finished.
     """
-    totals, drops = Totals(), list[Drop]()
+    totals, drops = RunTotals(), list[Drop]()
     if not todo:
         return totals, drops
     report.begin("pairs", len(todo))
     try:
         with StopRequest(report.say) as stop, closing(_attempts(task, todo, options, stop)) as attempts:
             for attempt in attempts:
-                _take(attempt, totals, drops, len(todo), report, events)
+                _record_attempt(attempt, totals, drops, len(todo), report, events)
     finally:
         report.end()
     if stop.is_requested:
@@ -110,13 +110,13 @@ def make_frames(
     return totals, drops
 
 
-def _take(
-    attempt: Attempt[FrameReport],
-    totals: Totals,
+def _record_attempt(
+    attempt: TaskAttempt[FrameReport],
+    totals: RunTotals,
     drops: list[Drop],
     planned: int,
     report: ProgressReport,
-    events: Events,
+    events: EventLog,
 ) -> None:
     """Count an attempt, and tell of it."""
     totals.peak_gib = max(totals.peak_gib, attempt.workers_gib)
@@ -125,18 +125,18 @@ def _take(
         cost = {**asdict(attempt.value), "workers_gib": round(attempt.workers_gib, 3)}
         events.write("frame", frame=attempt.index, attempt=attempt.number, **cost)
     else:
-        reason = _reason(attempt, len(totals.made), len(drops), planned)
+        reason = _failure_reason(attempt, len(totals.made), len(drops), planned)
         events.write("drop" if attempt.final else "retry", frame=attempt.index, reason=reason)
         report.say(f"frame {attempt.index}: {reason}{'' if attempt.final else '; it is tried again'}")
         totals.retries += not attempt.final
         if attempt.final:
             drops.append(Drop(frame_index=attempt.index, reason=reason))
-    report.note(_state(totals.retries, len(drops), attempt.workers_gib))
+    report.note(_progress_note(totals.retries, len(drops), attempt.workers_gib))
     if attempt.final:
         report.advance()
 
 
-def _state(retries: int, drops: int, workers_gib: float) -> str:
+def _progress_note(retries: int, drops: int, workers_gib: float) -> str:
     """What stands beside the count: failures and memory, as far as there are any."""
     parts = (
         f"{retries} repeated" if retries else "",
@@ -148,17 +148,17 @@ def _state(retries: int, drops: int, workers_gib: float) -> str:
 
 def _attempts(
     task: FrameTask, todo: Sequence[int], options: ExecutionOptions, stop: StopRequest
-) -> Generator[Attempt[FrameReport], None, None]:
+) -> Generator[TaskAttempt[FrameReport], None, None]:
     timeout_s = frame_timeout_s(task.recipe) if options.timeout_s is None else options.timeout_s
     if options.scheduler is not None:
         return run_on_cluster(task, todo, options.scheduler, timeout_s, stop)
     workers = min(options.worker_count(), len(todo))
     share_gib = available_memory_gib() / max(workers, 1)
-    limits = Limits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib))
+    limits = WorkerLimits(timeout_s, process_gib=max(GIB_PER_WORKER, share_gib))
     return run_tasks(task, todo, workers, limits, stop, task.pack)
 
 
-def _reason(attempt: Attempt[FrameReport], made: int, dropped: int, planned: int) -> str:
+def _failure_reason(attempt: TaskAttempt[FrameReport], made: int, dropped: int, planned: int) -> str:
     """Why an attempt failed.
 
     Raises:
@@ -171,9 +171,9 @@ def _reason(attempt: Attempt[FrameReport], made: int, dropped: int, planned: int
         return f"{error}, attempt {attempt.number} of {MAX_ATTEMPTS}"
     if not isinstance(error, LostWorkersError):
         is_common = made == 0 and dropped + 1 >= min(FIRST_FRAMES, planned)
-        if is_common or isinstance(error, ERRORS_OF_THE_PLACE):
+        if is_common or isinstance(error, FATAL_ERRORS):
             raise error
-    return reason_of(error)
+    return error_reason(error)
 
 
 # For so many, a step that takes milliseconds a pair is long enough to be announced.
@@ -192,7 +192,7 @@ class RunSummary:
         dataset_sha256: of the dataset as it stands now.
     """
 
-    totals: Totals
+    totals: RunTotals
     kept: int
     drops: tuple[Drop, ...]
     pairs: int
@@ -229,17 +229,17 @@ def render_dataset(
         raise ValueError(f"frames: must be different indices from 0 to {recipe.frames.count - 1}")
     options = (ExecutionOptions(options) if isinstance(options, int) else options).with_workers()
     with open_dataset(out, source, options.pairs_per_tar) as stream:
-        events = Events(stream)
+        events = EventLog(stream)
         manifest = read_manifest(out)
         present = len(list_frames(out))
         if present >= _MANY_PAIRS:
             report.say(f"looking whether {present} pairs are as they were written")
-        there = sort_frames(out, manifest)
+        there = check_frames(out, manifest)
         kept = sum(index in there.whole for index in frames)
         if kept:
             report.say(f"{kept} of {len(frames)} pairs are there already and whole")
         if there.damaged:
-            report.say(f"{len(there.damaged)} pairs are damaged and made again: {_few(there.damaged)}")
+            report.say(f"{len(there.damaged)} pairs are damaged and made again: {_shortened(there.damaged)}")
         events.write("start", frames=len(frames), kept=kept, damaged=there.damaged, **asdict(options))
         packing = read_packing(out, frames if isinstance(frames, range) else range(recipe.frames.count))
         task = FrameTask(recipe, out, there.engine_version, packing)
@@ -285,6 +285,6 @@ def still_missing(drops: Iterable[Drop], out: Location) -> tuple[Drop, ...]:
     return tuple(latest.values())
 
 
-def _few(indices: Sequence[int]) -> str:
+def _shortened(indices: Sequence[int]) -> str:
     shown = ", ".join(map(str, indices[:20]))
     return shown if len(indices) <= 20 else f"{shown} and {len(indices) - 20} more"

@@ -18,7 +18,7 @@ from datasets_manifest.storage.provenance import cpu_features, differing_builds,
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from droguekit.batch.frame_task import FrameTask
-from droguekit.batch.worker_pool import run_alone
+from droguekit.batch.worker_pool import run_in_own_process
 
 # Numbers that do not come from noisy paths agree this well on any machine: numpy's exp, log, tan, arctan2 and matmul
 # differ in their last bits between instruction sets.
@@ -42,12 +42,12 @@ class Reproduction:
         verdict: `identical`, bit for bit; `equivalent`, made with other versions or on another processor, with equal
             draws and numbers that agree; or `different`.
         differences: where the records differ beyond what is promised.
-        elsewhere: versions and processor features that are not those of the dataset.
+        build_differences: versions and processor features that are not those of the dataset.
     """
 
     verdict: Literal["identical", "equivalent", "different"]
     differences: tuple[str, ...]
-    elsewhere: tuple[str, ...]
+    build_differences: tuple[str, ...]
 
 
 def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
@@ -64,14 +64,16 @@ def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
     if faults:
         return Reproduction("different", tuple(faults), ())
     old = json.loads(source.frames.read(frame_index, RECORD_FILE))
-    new, record_sha256 = run_alone(partial(_make_again, source.manifest.recipe, frame_index))
+    new, record_sha256 = run_in_own_process(partial(_make_again, source.manifest.recipe, frame_index))
     expected = next(entry.record_sha256 for entry in source.manifest.frames if entry.frame_index == frame_index)
     # The record holds the hashes of all other files.
     if record_sha256 == expected:
         return Reproduction("identical", (), ())
-    elsewhere = _elsewhere(source, old, new)
-    differences = _differences(old, new, pixels_too=not elsewhere)
-    return Reproduction("equivalent" if elsewhere and not differences else "different", differences, elsewhere)
+    build_differences = _build_differences(source, old, new)
+    differences = _differences(old, new, pixels_too=not build_differences)
+    return Reproduction(
+        "equivalent" if build_differences and not differences else "different", differences, build_differences
+    )
 
 
 def _make_again(recipe: Recipe, frame_index: int) -> tuple[dict[str, Any], str]:
@@ -82,7 +84,7 @@ def _make_again(recipe: Recipe, frame_index: int) -> tuple[dict[str, Any], str]:
     return json.loads(data), hashlib.sha256(data).hexdigest()
 
 
-def _elsewhere(source: Dataset, old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
+def _build_differences(source: Dataset, old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
     """How this machine differs from the one that the manifest describes, as far as pixels depend on it."""
     manifest = source.manifest
     found = differing_builds(manifest.software, manifest.cpu_features, software_versions(), cpu_features())
@@ -110,9 +112,9 @@ def _differences(old: Any, new: Any, pixels_too: bool, where: str = "") -> tuple
         same = math.isclose(old, new, rel_tol=_RELATIVE_TOLERANCE, abs_tol=_RELATIVE_TOLERANCE)
     else:
         same = old == new
-    return () if same else (f"{where}: {_short(old)} there, {_short(new)} here",)
+    return () if same else (f"{where}: {_shortened(old)} there, {_shortened(new)} here",)
 
 
-def _short(value: Any) -> str:
+def _shortened(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 40 else text[:37] + "..."

@@ -23,7 +23,7 @@ from datasets_manifest.types.records import PairRecord
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
-_OURS = {
+_OWN_NAMES = {
     layout.RECIPE_FILE,
     layout.MANIFEST_FILE,
     layout.EVENTS_FILE,
@@ -62,7 +62,7 @@ def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None 
     folder = open_storage(out).path("")
     with _open_place(out) if folder is None else _open_folder(folder) as events:
         remove_leftovers(out)
-        _start(out, source)
+        _check_or_create(out, source)
         configure_packing(out, pairs_per_tar)
         repair_shards(out)
         yield events
@@ -115,7 +115,7 @@ def _open_place(out: Location) -> Iterator[TextIO]:
 
 def _refuse_foreign(out: Location) -> None:
     names = open_storage(out).names("")
-    foreign = [name for name in names if name not in _OURS and not name.startswith(".")]
+    foreign = [name for name in names if name not in _OWN_NAMES and not name.startswith(".")]
     if foreign and layout.MANIFEST_FILE not in names:
         raise ValueError(f"{out}: holds other things ({foreign[0]}); give a new or empty folder for the dataset")
 
@@ -125,7 +125,7 @@ def _lock(events: TextIO, out: Path) -> None:
         raise ValueError(f"{out}: another run is writing into it; wait for its end, or give another folder")
 
 
-def _start(out: Location, source: RecipeSource) -> None:
+def _check_or_create(out: Location, source: RecipeSource) -> None:
     """See that the place belongs to the recipe; a new one gets its manifest before its first frame."""
     storage, recipe = open_storage(out), source.recipe
     if storage.exists(layout.MANIFEST_FILE):
@@ -165,7 +165,7 @@ def differing_keys(first: Any, second: Any, where: str = "") -> list[str]:
 
 
 @dataclass(frozen=True)
-class Found:
+class ExistingFrames:
     """The frames that a folder holds.
 
     Attributes:
@@ -179,7 +179,7 @@ class Found:
     engine_version: str | None
 
 
-def sort_frames(dataset: Location, manifest: Manifest) -> Found:
+def check_frames(dataset: Location, manifest: Manifest) -> ExistingFrames:
     """Tell the frames that are there as they were written from the damaged ones.
 
     Raises:
@@ -202,7 +202,7 @@ def sort_frames(dataset: Location, manifest: Manifest) -> Found:
     if len(versions) > 1:
         shown = ", ".join(f"frame {index} by {version}" for version, index in versions.items())
         raise ValueError(f"{dataset}: its frames were made by different engines: {shown}; delete those of one")
-    return Found(frozenset(whole), tuple(damaged), next(iter(versions), None))
+    return ExistingFrames(frozenset(whole), tuple(damaged), next(iter(versions), None))
 
 
 def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) -> PairRecord | None:

@@ -31,7 +31,7 @@ class WorkerDiedError(OSError):
 
     def __init__(self, exit_code: int | None) -> None:
         """With the exit code as `multiprocessing` gives it: negative for a signal."""
-        super().__init__(f"its worker process died ({_ending(exit_code)})")
+        super().__init__(f"its worker process died ({_exit_text(exit_code)})")
         self.exit_code = exit_code
 
 
@@ -118,7 +118,7 @@ def _serve(
     # A group of its own: Ctrl-C at the terminal reaches the parent alone, and a kill reaches what an engine started.
     os.setpgid(0, 0)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a cluster that ends a job tells every process; the parent decides
-    _end_with(parent)
+    _die_with_parent(parent)
     connection.send(READY)
     while True:
         try:
@@ -132,18 +132,18 @@ def _serve(
                 connection.send(UNTIMED)
                 value = then(index, value)
         except Exception as raised:
-            value, error = None, _portable(raised)
+            value, error = None, _picklable(raised)
         connection.send((value, error, resident_gib()))
 
 
-def _end_with(parent: int) -> None:
+def _die_with_parent(parent: int) -> None:
     """Let the kernel kill this process when its parent ends, however it ends and whatever this process does."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)  # it had ended before
 
 
-def _portable(error: Exception) -> Exception:
+def _picklable(error: Exception) -> Exception:
     """The error, or one that says the same where it cannot cross to another process; with its traceback as a note."""
     note = "".join(traceback.format_exception(error))
     try:
@@ -156,7 +156,7 @@ def _portable(error: Exception) -> Exception:
     return carried
 
 
-def _ending(exit_code: int | None) -> str:
+def _exit_text(exit_code: int | None) -> str:
     if exit_code is None or exit_code >= 0:
         return f"exit code {exit_code}"
     try:
@@ -171,7 +171,7 @@ MAX_ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
-class Limits:
+class WorkerLimits:
     """What a worker may take.
 
     Attributes:
@@ -197,7 +197,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Attempt(Generic[T]):
+class TaskAttempt(Generic[T]):
     """How one attempt at one task ended.
 
     Attributes:
@@ -226,10 +226,10 @@ def run_tasks(
     function: Callable[[int], T],
     indices: Iterable[int],
     workers: int,
-    limits: Limits | None = None,
+    limits: WorkerLimits | None = None,
     stop: StopRequest | None = None,
     then: Callable[[int, T], T] | None = None,
-) -> Generator[Attempt[T], None, None]:
+) -> Generator[TaskAttempt[T], None, None]:
     """Run `function(index)` for every index in worker processes, and report each attempt as it ends.
 
     An attempt whose process dies or that takes too long is repeated, up to `MAX_ATTEMPTS`; one that raises is not.
@@ -251,7 +251,7 @@ def run_tasks(
             if stop is None or not stop.is_requested:
                 yield _attempt_here(function, then, index)
         return
-    crew = _Crew[T](partial(Worker, function, then), deque(indices), workers, limits or Limits())
+    crew = _WorkerPool[T](partial(Worker, function, then), deque(indices), workers, limits or WorkerLimits())
     try:
         while crew.fill(stop is not None and stop.is_requested):
             yield from crew.attempts(stop)
@@ -259,18 +259,18 @@ def run_tasks(
         crew.kill()
 
 
-def _attempt_here(function: Callable[[int], T], then: Callable[[int, T], T] | None, index: int) -> Attempt[T]:
+def _attempt_here(function: Callable[[int], T], then: Callable[[int, T], T] | None, index: int) -> TaskAttempt[T]:
     try:
         value = function(index)
-        return Attempt(index, 1, value if then is None else then(index, value), None, final=True)
+        return TaskAttempt(index, 1, value if then is None else then(index, value), None, final=True)
     except Exception as error:
-        return Attempt(index, 1, None, error, final=True)
+        return TaskAttempt(index, 1, None, error, final=True)
 
 
-class _Crew(Generic[T]):
+class _WorkerPool(Generic[T]):
     """The workers of one run, the tasks that wait, and how often each task has failed."""
 
-    def __init__(self, start: Callable[[], Worker], waiting: deque[int], size: int, limits: Limits) -> None:
+    def __init__(self, start: Callable[[], Worker], waiting: deque[int], size: int, limits: WorkerLimits) -> None:
         self._start, self._waiting, self._size, self._limits = start, waiting, size, limits
         self._workers: list[Worker] = []
         self._failures: Counter[int] = Counter()
@@ -292,7 +292,7 @@ class _Crew(Generic[T]):
             self._workers.append(self._start())
         return bool(self._waiting) or any(worker.index is not None for worker in self._workers)
 
-    def attempts(self, stop: StopRequest | None) -> Iterator[Attempt[T]]:
+    def attempts(self, stop: StopRequest | None) -> Iterator[TaskAttempt[T]]:
         """Wait until something happens, and report the attempts that have ended with it."""
         busy = [worker for worker in self._workers if worker.index is not None]
         awaited: list[Any] = [worker.connection for worker in self._workers]
@@ -311,7 +311,7 @@ class _Crew(Generic[T]):
             if self._limits.timeout_s is not None and worker.seconds_left(self._limits.timeout_s) <= 0:
                 yield self._fail(worker, TaskTimeoutError(self._limits.timeout_s))
 
-    def _hear(self, worker: Worker) -> Iterator[Attempt[T]]:
+    def _hear(self, worker: Worker) -> Iterator[TaskAttempt[T]]:
         try:
             message = worker.receive()
         except WorkerDiedError as error:
@@ -340,9 +340,9 @@ class _Crew(Generic[T]):
         ):
             self._workers.remove(worker)
             worker.dismiss()
-        yield Attempt(index, self._failures[index] + 1, value, raised, True, workers_gib)
+        yield TaskAttempt(index, self._failures[index] + 1, value, raised, True, workers_gib)
 
-    def _fail(self, worker: Worker, error: BaseException) -> Attempt[T]:
+    def _fail(self, worker: Worker, error: BaseException) -> TaskAttempt[T]:
         """End a worker by whose accident a task has failed; the task waits for its next attempt if it has one."""
         index = cast(int, worker.index)
         self._workers.remove(worker)
@@ -351,7 +351,7 @@ class _Crew(Generic[T]):
         final = self._failures[index] >= MAX_ATTEMPTS
         if not final:
             self._waiting.append(index)
-        return Attempt(index, self._failures[index], None, error, final, self._resident_gib())
+        return TaskAttempt(index, self._failures[index], None, error, final, self._resident_gib())
 
     def _resident_gib(self) -> float:
         return sum(worker.resident_gib for worker in self._workers)
@@ -374,7 +374,7 @@ class _Crew(Generic[T]):
         self._workers.clear()
 
 
-def run_alone(function: Callable[[], T]) -> T:
+def run_in_own_process(function: Callable[[], T]) -> T:
     """Run one function in a worker process of its own and return what it returns.
 
     Raises:

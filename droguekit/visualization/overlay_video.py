@@ -43,7 +43,7 @@ _FARTHEST_WIDTHS = 8.0
 _SHIFT = 4
 
 
-def read_method(path: Path, dataset: Dataset, method: str | None) -> tuple[str, Mapping[int, Estimate]]:
+def read_estimates_of_method(path: Path, dataset: Dataset, method: str | None) -> tuple[str, Mapping[int, Estimate]]:
     """One method's estimates by frame.
 
     Args:
@@ -104,7 +104,7 @@ def write_overlay_video(
     return len(records), len(records) * length_s
 
 
-class _Lines(NamedTuple):
+class _Overlay(NamedTuple):
     """What is drawn over the left image. [px]"""
 
     box: PixelBox | None
@@ -135,15 +135,15 @@ def draw_overlay(
     whole = whole[:height]
     _draw(whole, lines, scale, (-0.5, -0.5))
     close = np.full((height, height, 3), _PAPER, dtype=np.uint8)
-    around = _around(record, lines)
+    around = _region_of_interest(record, lines)
     if around is not None:
         close, larger, corner = _close_up(picture, around, height)
         _draw(close, lines, larger, corner)
-    bar = _bar(record, method, estimate, whole.shape[1] + height)
+    bar = _caption_bar(record, method, estimate, whole.shape[1] + height)
     return np.concatenate([bar, np.concatenate([whole, close], axis=1)])
 
 
-def _lines(record: PairRecord, drogue: DrogueParameters, estimate: Estimate | None) -> _Lines:
+def _lines(record: PairRecord, drogue: DrogueParameters, estimate: Estimate | None) -> _Overlay:
     rig, rings = record.frame.rig, drogue_rings(drogue)
     # An estimate may be anywhere: far beyond the picture OpenCV's fixed point overflows.
     most_px = _FARTHEST_WIDTHS * rig.camera.width_px
@@ -153,7 +153,7 @@ def _lines(record: PairRecord, drogue: DrogueParameters, estimate: Estimate | No
         return [image for image in images if np.abs(image).max() < most_px]
 
     found = [f.center_px for f in estimate.features if f.eye == "left"] if estimate is not None else []
-    return _Lines(
+    return _Overlay(
         record.views.left.box_visible_xywh_px,
         outlines(record.left_from_drogue),
         outlines(estimate.left_from_drogue if isinstance(estimate, PoseEstimate) else None),
@@ -161,7 +161,7 @@ def _lines(record: PairRecord, drogue: DrogueParameters, estimate: Estimate | No
     )
 
 
-def _draw(tile: Picture, lines: _Lines, scale: float, corner: PixelPoint) -> None:
+def _draw(tile: Picture, lines: _Overlay, scale: float, corner: PixelPoint) -> None:
     """Draw them into a copy of the left image, or a part of it that begins at `corner`."""
     if lines.box is not None:
         draw_box(tile, lines.box, scale, corner)
@@ -171,7 +171,7 @@ def _draw(tile: Picture, lines: _Lines, scale: float, corner: PixelPoint) -> Non
     draw_crosses(tile, lines.centers, scale, corner, CENTROID_RGB)
 
 
-def _around(record: PairRecord, lines: _Lines) -> PixelBox | None:
+def _region_of_interest(record: PairRecord, lines: _Overlay) -> PixelBox | None:
     """What the close-up shows: the drogue, or where an estimate puts it; None where there is neither."""
     box = lines.box or record.views.left.box_full_xywh_px
     if box is None and lines.estimated:
@@ -196,7 +196,7 @@ def _close_up(picture: Picture, box: PixelBox, side: int) -> tuple[Picture, floa
     return np.asarray(part, dtype=np.uint8), scale, corner
 
 
-def _bar(record: PairRecord, method: str, estimate: Estimate | None, width: int) -> Picture:
+def _caption_bar(record: PairRecord, method: str, estimate: Estimate | None, width: int) -> Picture:
     bar = np.full((_BAR_PX, width, 3), _PAPER, dtype=np.uint8)
     distance_m = record.conditions.distance_m
     where = "no drogue" if distance_m is None else f"drogue at {distance_m:.2f} m"
@@ -205,12 +205,12 @@ def _bar(record: PairRecord, method: str, estimate: Estimate | None, width: int)
     _write(bar, f"frame {record.frame_index}{when}: {where}", (14, 26), _TEXT_RGB)
     _write(bar, "true", (14, 52), TRUE_RGB)
     if method:
-        _write(bar, f"{method}: {_verdict(record, estimate)}", (72, 52), ESTIMATE_RGB)
+        _write(bar, f"{method}: {_error_text(record, estimate)}", (72, 52), ESTIMATE_RGB)
         _write(bar, "+ measured centres, left eye", (width - 290, 26), _SOFT_RGB)
     return bar
 
 
-def _verdict(record: PairRecord, estimate: Estimate | None) -> str:
+def _error_text(record: PairRecord, estimate: Estimate | None) -> str:
     if estimate is None:
         return "says nothing of this pair"
     if isinstance(estimate, NoFix):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class DetectionCounts:
+class DetectionSummary:
     """What `detect_dataset` did."""
 
     detector: str
@@ -31,7 +31,7 @@ def detect_dataset(
     least_score: float,
     report: ProgressReport,
     tracker: str | None = None,
-) -> DetectionCounts:
+) -> DetectionSummary:
     """Find the drogue in every image without the truth, and write COCO results; the default detector when None.
 
     With a tracker, pairs are taken to follow each other in time, and the detector looks only where the drogue is lost,
@@ -65,4 +65,4 @@ def detect_dataset(
         boxes = write_detections(out, counted())
     finally:
         report.end()
-    return DetectionCounts(detecting.name, boxes, len(images), detecting.pairs, detecting.times())
+    return DetectionSummary(detecting.name, boxes, len(images), detecting.pairs, detecting.times())

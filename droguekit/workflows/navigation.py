@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from datasets_manifest.types.estimates import Estimate
     from droguekit.batch.progress import ProgressReport
-    from nav.sequence_navigator import PairEstimates, SequenceSettings, SkippedPair
+    from nav.sequence_navigator import SkippedPair, PairEstimates, SequenceSettings
 
 
 _SCHEMA = 1
 
 
 @dataclass(frozen=True)
-class Percentiles:
+class LatencyPercentiles:
     """Of one time over all pairs that were worked on. [ms]"""
 
     p50_ms: float
@@ -49,8 +49,8 @@ class LatencyReport:
     rate_hz: float
     pairs: int
     late: int
-    latency: Percentiles | None
-    stages: dict[str, Percentiles]
+    latency: LatencyPercentiles | None
+    stages: dict[str, LatencyPercentiles]
 
     def to_json(self) -> str:
         """The content of a file."""
@@ -102,11 +102,11 @@ class LatencyTally:
         )
 
 
-def _percentiles(times_s: list[float], count: int) -> Percentiles:
+def _percentiles(times_s: list[float], count: int) -> LatencyPercentiles:
     """Of times, and of zeros up to a count."""
     padded_ms = 1e3 * np.array(times_s + [0.0] * (count - len(times_s)))
     middle, high, highest, most = np.percentile(padded_ms, [50, 95, 99, 100]).tolist()
-    return Percentiles(middle, high, highest, most)
+    return LatencyPercentiles(middle, high, highest, most)
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class NavigationOptions:
 
 
 @dataclass(frozen=True)
-class Fixes:
+class FixCount:
     """How many poses a method found in how many pairs."""
 
     method: str
@@ -160,7 +160,7 @@ class Fixes:
 
 
 @dataclass(frozen=True)
-class Navigated:
+class NavigationSummary:
     """What navigation did.
 
     Attributes:
@@ -168,7 +168,7 @@ class Navigated:
         latency: where pairs came at a rate.
     """
 
-    fixes: list[Fixes]
+    fixes: list[FixCount]
     latency: LatencyReport | None
 
 
@@ -178,7 +178,7 @@ def navigate_dataset(
     out: Path,
     report: ProgressReport,
     options: NavigationOptions | None = None,
-) -> Navigated:
+) -> NavigationSummary:
     """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
 
     Raises:
@@ -200,11 +200,11 @@ def navigate_dataset(
     fixes: Counter[str] = Counter()
 
     def counted(answers: Iterable[PairEstimates | SkippedPair]) -> Iterator[Estimate]:
-        for estimate in add_smoothed(_told(answers, tally, report), settings):
+        for estimate in add_smoothed(_with_progress(answers, tally, report), settings):
             fixes[estimate.method] += estimate.status == "fix"
             yield estimate
 
-    opened = _answers(blind, settings, options)
+    opened = _estimate_pairs(blind, settings, options)
     # Whatever stops the writing ends the threads that answers come from.
     with one_thread(), closing(opened) as answers:
         for file in filter(None, (out, options.latency_out)):
@@ -217,7 +217,9 @@ def navigate_dataset(
     latency = None if tally is None else tally.report()
     if latency is not None and options.latency_out is not None:
         write_text_atomic(options.latency_out, latency.to_json())
-    return Navigated([Fixes(name, fixes[name], len(blind.frame_indices)) for name in settings.names], latency)
+    return NavigationSummary(
+        [FixCount(name, fixes[name], len(blind.frame_indices)) for name in settings.names], latency
+    )
 
 
 def _check_places(out: Path, latency_out: Path | None) -> None:
@@ -252,21 +254,21 @@ def _settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSet
     )
 
 
-def _answers(
+def _estimate_pairs(
     blind: BlindDataset, settings: SequenceSettings, options: NavigationOptions
 ) -> Generator[PairEstimates | SkippedPair]:
     """Answers to all pairs, as fast as can be or as they come."""
     from nav.detector.detector_registry import DEFAULT_DETECTOR
     from nav.realtime.pipeline import MonotonicClock, replay
-    from nav.runner import open_navigator, process_dataset
+    from nav.runner import answers_of, open_navigator
 
     navigator = open_navigator(settings, DEFAULT_DETECTOR if options.detector is None else options.detector)
     if options.rate_hz is None:
-        return process_dataset(blind, navigator)
+        return answers_of(blind, navigator)
     return replay(blind, navigator, options.rate_hz, MonotonicClock())
 
 
-def _told(
+def _with_progress(
     answers: Iterable[PairEstimates | SkippedPair], tally: LatencyTally | None, report: ProgressReport
 ) -> Iterator[PairEstimates | SkippedPair]:
     """The same, while progress and latencies are told; what happens until the next one is asked for is their output."""

@@ -32,21 +32,22 @@ def render_timing_lines(repeat: int, pairs: int, workers: int | None, engine: st
         OSError: a process died, or a temporary folder cannot be written.
     """
     from droguekit.batch.execution import default_workers
-    from droguekit.batch.frame_timing import frames_per_second, measure_closely, measure_frames, warm_up
+    from droguekit.batch.frame_timing import frames_per_second, measure_frames, warm_up_frames
 
     workers = default_workers() if workers is None else workers
     if workers < 1:
         raise ValueError(f"--workers: must be at least 1, got {workers}")
     recipe = open_stations_recipe(repeat, engine)
     # The farthest first: the pair that is not counted is the cheapest.
-    yield from _stations_table(recipe, measure_frames(recipe, tuple(reversed(range(recipe.frames.count)))))
+    measured = measure_frames(recipe, tuple(reversed(range(recipe.frames.count))))
+    yield from _stations_table(recipe, tuple(frame.report for frame in measured))
     yield f"\n{'2 to 40 m':>9} {'CPU s/pair':>11} {'noise/sensor':>13} {'memory [MB]':>12} {'growth':>8}"
     for quality in QUALITIES:
         uniform = open_uniform_recipe(pairs, quality, engine)
-        yield _mean_row(quality, measure_closely(uniform, tuple(range(pairs))))
+        yield _mean_row(quality, measure_frames(uniform, tuple(range(pairs))))
     yield f"\n{'2 to 40 m':>9} {'pairs/s by the clock':>20} {'workers':>8}"
     for quality in QUALITIES:
-        uniform = open_uniform_recipe(pairs + warm_up(workers), quality, engine)
+        uniform = open_uniform_recipe(pairs + warm_up_frames(workers), quality, engine)
         yield f"{quality:>9} {frames_per_second(uniform, workers):20.2f} {workers:8d}"
 
 

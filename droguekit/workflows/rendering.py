@@ -60,7 +60,7 @@ def render_frames(
         ValueError: a folder of another recipe, or an engine that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
     """
-    with interrupts_wait():
+    with delay_interrupts():
         from droguekit.batch.render_dataset import render_dataset
         from render.engine import engine_notice
 
@@ -95,7 +95,7 @@ def run_lines(out: Location, summary: RunSummary) -> Iterator[str]:
 
 
 @contextmanager
-def interrupts_wait() -> Iterator[None]:
+def delay_interrupts() -> Iterator[None]:
     """Let Ctrl-C wait until the block is done.
 
     Mesh libraries try optional imports and catch whatever comes of them, the exception of a Ctrl-C too: it were lost.

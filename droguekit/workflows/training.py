@@ -45,14 +45,14 @@ class TrainingOptions:
     workers: int | None
 
 
-def _find(source: str) -> Location | RecipeSource:
+def _find_source(source: str) -> Location | RecipeSource:
     location = as_location(source)
     if isinstance(location, str) or location.is_dir():
         return location
     return open_recipe(source, None, None)
 
 
-def _render(source: RecipeSource, out: Path, workers: int | None, report: ProgressReport) -> Path:
+def _render_source(source: RecipeSource, out: Path, workers: int | None, report: ProgressReport) -> Path:
     """Make the pairs that are not there yet; the dataset's folder."""
     recipe, place = source.recipe, out / "datasets" / source.recipe.name
     report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {place}")
@@ -86,7 +86,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     start = None if options.start_from is None else read_starting_weights(options.start_from)
     network = None if start is None or start.network is None else start.network.to_dict()
     settings = build_settings(options.settings_file, {**changes, **parsed}, network)
-    found = [_find(source) for source in options.sources]
+    found = [_find_source(source) for source in options.sources]
     from nav.training.training_run import check_training, train
 
     # Rendering takes hours: what would stop the training afterwards is looked for first.
@@ -94,7 +94,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
         raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
     check_training(out, settings, start)
     datasets = [
-        _render(each, out, options.workers, report) if isinstance(each, RecipeSource) else each for each in found
+        _render_source(each, out, options.workers, report) if isinstance(each, RecipeSource) else each for each in found
     ]
     with StopRequest(report.say) as stop:
         return train(datasets, out, settings, report, options.cache, lambda: stop.is_requested, start)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.types.frame import FrameSpec
-from droguekit.batch.worker_pool import run_alone
+from droguekit.batch.worker_pool import run_in_own_process
 from render.camera.sensor import expose
 from render.compositing import inside_one_part
 from render.engine import load_engine
@@ -97,10 +97,10 @@ def compare_at(
         OSError: a process ended.
     """
     say(f"{distance_m:g} m: {OWN}")
-    own, own_cost, view = run_alone(partial(measure_own_path, distance_m, seed, repeat))
+    own, own_cost, view = run_in_own_process(partial(measure_own_path, distance_m, seed, repeat))
     rows = {OWN: _row(own, own_cost)}
     say(f"{distance_m:g} m: {MITSUBA}, to reach a noise of {own.noise:.1%}")
-    rows[MITSUBA] = _row(*run_alone(partial(measure_plain_mitsuba, view, own.noise)))
+    rows[MITSUBA] = _row(*run_in_own_process(partial(measure_plain_mitsuba, view, own.noise)))
     say(f"{distance_m:g} m: {CYCLES}, to reach a noise of {own.noise:.1%}")
     rows[CYCLES] = _row(*measure_plain_cycles(view, own.noise, full_samples))
     return {"schema": 1, "distance_m": distance_m, "seed": seed, "full_samples": full_samples, "renderers": rows}

@@ -23,7 +23,7 @@ from datasets_manifest.storage.layout import EVENTS_FILE
 from droguekit.batch.execution import ExecutionOptions, resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.progress import ProgressReport
-from droguekit.batch.render_dataset import Events, make_frames
+from droguekit.batch.render_dataset import EventLog, make_frames
 
 EMPTY_RECIPE = """
 name = "empty"
@@ -150,7 +150,7 @@ def _run(folder: Path, frames: int, options: ExecutionOptions, report: ProgressR
     samples = MemorySamples(report, max(1, frames // _SAMPLES))
     began_s, began_cpu_s = time.monotonic(), time.process_time()
     with (folder / EVENTS_FILE).open("a", encoding="utf-8") as stream:
-        make_frames(task, range(frames), options, samples, Events(stream))
+        make_frames(task, range(frames), options, samples, EventLog(stream))
     cpu_ms = {"client": 1000 * (time.process_time() - began_cpu_s) / frames}
     wall_ms = 1000 * (time.monotonic() - began_s) / frames
     return {"cpu_ms": cpu_ms, "wall_ms": wall_ms, "client_mib": samples.client_mib}

@@ -16,7 +16,7 @@ import pytest
 from datasets_manifest.recipe.recipe import RecipeSource
 from datasets_manifest.storage import layout
 from droguekit.batch import cluster
-from droguekit.batch.cluster import Build, ClusterTask, build_here
+from droguekit.batch.cluster import ClusterTask, WorkerBuild, current_build
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.frame_task import FrameTask, OtherBuildError
 from droguekit.batch.render_dataset import RunSummary
@@ -232,10 +232,10 @@ def test_workers_of_another_build_are_refused(
     from datasets_manifest.recipe.recipe import parse_recipe
 
     worker(start, scheduler)
-    here = build_here()
+    here = current_build()
     builds = {
-        "has numpy .*, the client 0.9": Build((*here.software, ("numpy", "0.9")), here.cpu_features),
-        "processor differs from the client's in AVX4096": Build(here.software, here.cpu_features | {"AVX4096"}),
+        "has numpy .*, the client 0.9": WorkerBuild((*here.software, ("numpy", "0.9")), here.cpu_features),
+        "processor differs from the client's in AVX4096": WorkerBuild(here.software, here.cpu_features | {"AVX4096"}),
     }
     (tmp_path / layout.EVENTS_FILE).touch()
     with distributed.Client(scheduler, set_as_default=False) as client:

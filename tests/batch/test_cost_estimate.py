@@ -14,17 +14,17 @@ from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from datasets_manifest.storage.manifest import Drop
 from droguekit.batch.cost_estimate import (
     CostEstimate,
-    Probe,
-    choose_frames,
+    ProbeResult,
+    choose_probe_frames,
+    estimate_cost,
     fit_over_distance,
     make_in_turn,
     probe_cost,
-    reckon,
 )
-from droguekit.batch.failure_policy import drop_of
+from droguekit.batch.failure_policy import make_drop
 from droguekit.batch.frame_task import FrameReport
 from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
-from droguekit.batch.worker_pool import Limits
+from droguekit.batch.worker_pool import WorkerLimits
 from droguekit.cli.dataset.plan import _cost
 
 RECIPE = """
@@ -70,7 +70,7 @@ def test_weighted_values_pull_the_fit() -> None:
 def test_probed_frames_are_spread_over_distances_families_and_scenes() -> None:
     recipe = parse_recipe(RECIPE)
     drawn = plan_recipe(recipe).drawn
-    order = choose_frames(drawn, 200)
+    order = choose_probe_frames(drawn, 200)
     chosen = order.counted
     assert len(chosen) == len(set(chosen)) == 13
     distances = drawn.distances_m[list(chosen)]
@@ -86,7 +86,7 @@ def test_probed_frames_are_spread_over_distances_families_and_scenes() -> None:
 
 def test_as_many_other_frames_of_all_distances_and_families_come_first() -> None:
     drawn = plan_recipe(parse_recipe(RECIPE)).drawn
-    order = choose_frames(drawn, 200)
+    order = choose_probe_frames(drawn, 200)
     assert len(set(order.warm_up)) == 12
     assert not set(order.warm_up) & set(order.counted)
     assert np.bincount(drawn.families[list(order.warm_up)]).min() >= 5
@@ -97,17 +97,17 @@ def test_as_many_other_frames_of_all_distances_and_families_come_first() -> None
 
 def test_few_frames_are_probed_where_there_are_few() -> None:
     drawn = plan_recipe(parse_recipe(RECIPE.replace("count = 200", "count = 2").replace("= 0.2", "= 0.0"))).drawn
-    order = choose_frames(drawn, 2)
+    order = choose_probe_frames(drawn, 2)
     assert sorted(order.counted) == [0, 1]
     assert len(order.warm_up) == 1
 
 
 def test_only_empty_frames_are_probed_where_there_are_no_others() -> None:
     drawn = plan_recipe(parse_recipe(RECIPE.replace("empty_fraction = 0.2", "empty_fraction = 1.0"))).drawn
-    assert len(choose_frames(drawn, 200).counted) == 1
+    assert len(choose_probe_frames(drawn, 200).counted) == 1
 
 
-def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], first_s: float = 0.0) -> Probe:
+def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], first_s: float = 0.0) -> ProbeResult:
     """A probe whose frames take `rest_s`, 0.2 s of their own to be drawn, and `first_s` where a scene is new."""
     drawn, met = plan.drawn, set[int]()
 
@@ -119,16 +119,16 @@ def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], 
         stage_s = {"sample": sample_s, "paths": rest_s(index)}
         return FrameReport("here", sum(stage_s.values()), stage_s, None if np.isnan(distance_m) else distance_m, 1000)
 
-    order = choose_frames(drawn, recipe.frames.count)
+    order = choose_probe_frames(drawn, recipe.frames.count)
     warm_up = {index: report(index) for index in order.warm_up}
     counted = {index: report(index) for index in order.counted}
-    return Probe(warm_up, counted, report(order.counted[-1]), 3.0, ())
+    return ProbeResult(warm_up, counted, report(order.counted[-1]), 3.0, ())
 
 
 def test_drawing_a_frame_counts_for_every_pair_and_a_new_scene_once() -> None:
     recipe = parse_recipe(RECIPE)
     plan = plan_recipe(recipe)
-    found = reckon(recipe, plan, synthetic(recipe, plan, lambda _: 1.0, first_s=0.7))
+    found = estimate_cost(recipe, plan, synthetic(recipe, plan, lambda _: 1.0, first_s=0.7))
     assert found.frames_s == pytest.approx(200 * (1.0 + 0.2), rel=1e-9)  # float64 least squares
     assert found.scene_s == pytest.approx(0.7, rel=1e-9)
     # One process in which each of ten scenes is met.
@@ -144,7 +144,7 @@ def test_families_without_a_measured_frame_count_as_the_others(seed: int) -> Non
         f'[distance]\nlaw = "uniform"\nlow_m = 2\nhigh_m = 20\n{families}'
     )
     plan = plan_recipe(recipe)
-    found = reckon(recipe, plan, synthetic(recipe, plan, lambda _: 1.0))
+    found = estimate_cost(recipe, plan, synthetic(recipe, plan, lambda _: 1.0))
     assert len(found.probed) == 3
     assert found.frames_s == pytest.approx(12 * 1.2, rel=1e-9)
     assert found.size_bytes == pytest.approx(12 * 1000, rel=1e-9)
@@ -161,7 +161,7 @@ def test_the_standard_error_is_how_much_the_total_scatters() -> None:
         # Terms far above the noise, so that none is held at zero.
         return 5.0 if np.isnan(distance_m) else 20 + 20 / distance_m + 20 / distance_m**2 + rng.normal(0, 0.1)
 
-    costs = [reckon(recipe, plan, synthetic(recipe, plan, noisy_s)) for _ in range(400)]
+    costs = [estimate_cost(recipe, plan, synthetic(recipe, plan, noisy_s)) for _ in range(400)]
     errors = [found.error_s for found in costs if found.error_s is not None]
     assert len(errors) == 400
     told_s = np.sqrt(np.square(errors).mean())
@@ -175,7 +175,7 @@ def test_the_standard_error_is_how_much_the_total_scatters() -> None:
 def test_as_many_frames_as_terms_say_nothing_of_scatter() -> None:
     recipe = parse_recipe(RECIPE.replace("count = 200", "count = 9"))
     plan = plan_recipe(recipe)
-    found = reckon(recipe, plan, synthetic(recipe, plan, float))
+    found = estimate_cost(recipe, plan, synthetic(recipe, plan, float))
     assert len([index for index, report in found.probed.items() if report.distance_m is not None]) == 3
     assert found.error_s is None
 
@@ -189,8 +189,8 @@ def test_a_scatter_is_told_only_where_it_is_known(error_s: float | None) -> None
 
 
 def test_an_error_without_words_is_told_by_its_kind() -> None:
-    assert drop_of(3, ValueError()) == Drop(frame_index=3, reason="ValueError")
-    assert drop_of(3, ValueError("two\n lines")) == Drop(frame_index=3, reason="two lines")
+    assert make_drop(3, ValueError()) == Drop(frame_index=3, reason="ValueError")
+    assert make_drop(3, ValueError("two\n lines")) == Drop(frame_index=3, reason="two lines")
 
 
 def test_time_that_failed_frames_took_is_no_start() -> None:
@@ -230,7 +230,7 @@ def cost(count: int, scenes: int, sequences: int = 0) -> CostEstimate:
 
 def test_time_counts_starts_and_scenes_of_every_process() -> None:
     # Five processes, each of which meets 60 scenes.
-    count = 5 * Limits().tasks_per_process
+    count = 5 * WorkerLimits().tasks_per_process
     assert cost(count, 60).work_s(2) == 5 * 60 * 0.5 + 1000
     assert cost(count, 60).run_s(2) == (5 * 10 + 5 * 60 * 0.5 + 1000) / 2
     # With twenty workers a hundred pairs are five for each, so that no more than a hundred scenes are met.
@@ -238,7 +238,7 @@ def test_time_counts_starts_and_scenes_of_every_process() -> None:
 
 
 def test_every_worker_flies_every_sequence_once_and_a_new_process_the_one_it_comes_to() -> None:
-    count = 5 * Limits().tasks_per_process
+    count = 5 * WorkerLimits().tasks_per_process
     assert cost(count, 1, sequences=4).work_s(2) == (4 * 2 + 5 - 2) * 0.5 + 1000
     assert cost(24, 1, sequences=1).work_s(1) == 0.5 + 1000
 
@@ -264,7 +264,7 @@ def test_a_frame_that_the_engine_refuses_is_a_drop_of_the_probe(
 ) -> None:
     recipe = parse_recipe(quick_recipe)
     plan = plan_recipe(recipe)
-    order = choose_frames(plan.drawn, 8)
+    order = choose_probe_frames(plan.drawn, 8)
     troubled(refuse=[order.warm_up[0], order.counted[1]])
     found = probe_cost(recipe, plan)
     assert [drop.frame_index for drop in found.drops] == [order.warm_up[0], order.counted[1]]

@@ -19,7 +19,7 @@ from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
 from droguekit.batch.frame_task import FrameTask
 from droguekit.batch.render_dataset import RunSummary
-from droguekit.batch.worker_pool import run_alone
+from droguekit.batch.worker_pool import run_in_own_process
 
 Make = Callable[..., RunSummary]
 Hashes = Callable[[Path], dict[str, str]]
@@ -145,7 +145,7 @@ def test_another_recipe_is_refused_with_the_keys_that_differ(
 def test_frames_of_another_engine_build_are_not_mixed_in(tiny_recipe: str, tiny_dataset: Path, tmp_path: Path) -> None:
     task = FrameTask(parse_recipe(tiny_recipe), tmp_path, engine_version="mitsuba 0.1")
     with pytest.raises(ValueError, match=r"made by mitsuba 0\.1, but here runs mitsuba .*, whose pixels differ"):
-        run_alone(partial(task, 0))
+        run_in_own_process(partial(task, 0))
     assert list(tmp_path.iterdir()) == []
 
 

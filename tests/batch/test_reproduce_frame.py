@@ -40,7 +40,7 @@ def with_changed_record(tiny_dataset: Path, tmp_path: Path) -> Callable[[Change]
 
 def test_a_frame_made_again_is_identical(tiny_dataset: Path) -> None:
     result = reproduce_frame(tiny_dataset, 1)
-    assert (result.verdict, result.differences, result.elsewhere) == ("identical", (), ())
+    assert (result.verdict, result.differences, result.build_differences) == ("identical", (), ())
 
 
 def test_a_changed_image_is_a_difference(tiny_dataset: Path, tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_elsewhere_numbers_may_differ_in_their_last_bits(with_changed_record: Ca
 
     result = reproduce_frame(with_changed_record(change), 1)
     assert (result.verdict, result.differences) == ("equivalent", ())
-    assert any("mitsuba 0.1 there" in line for line in result.elsewhere)
+    assert any("mitsuba 0.1 there" in line for line in result.build_differences)
 
 
 def test_elsewhere_labels_must_still_agree(with_changed_record: Callable[[Change], Path]) -> None:

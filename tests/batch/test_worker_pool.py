@@ -17,11 +17,11 @@ from droguekit.batch.worker_pool import (
     MAX_ATTEMPTS,
     READY,
     UNTIMED,
-    Limits,
     TaskTimeoutError,
     Worker,
     WorkerDiedError,
-    run_alone,
+    WorkerLimits,
+    run_in_own_process,
     run_tasks,
 )
 
@@ -149,7 +149,7 @@ def test_the_time_of_a_task_ends_before_what_follows_on_it(tasks: ModuleType, mo
         worker.kill()
     # As if the time were over as soon as the task is.
     monkeypatch.setattr(Worker, "seconds_left", lambda worker, timeout_s: timeout_s if worker.is_timed else -1.0)
-    attempts = [*run_tasks(tasks.square, range(4), 2, Limits(timeout_s=600.0), then=partial(tasks.add, 10))]
+    attempts = [*run_tasks(tasks.square, range(4), 2, WorkerLimits(timeout_s=600.0), then=partial(tasks.add, 10))]
     assert sorted(attempt.value or 0 for attempt in attempts) == [10, 11, 14, 19]
 
 
@@ -158,14 +158,14 @@ def test_workers_get_one_thread_each_and_this_process_keeps_its_own(
 ) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    assert run_alone(tasks.threads) == ["1", "1", "1"]
+    assert run_in_own_process(tasks.threads) == ["1", "1", "1"]
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
 
 
 def test_a_function_that_runs_alone_raises_here_what_it_raised_there(tasks: ModuleType) -> None:
     with pytest.raises(ValueError, match="index: 3 is refused"):
-        run_alone(partial(tasks.refuse, 3, 3))
+        run_in_own_process(partial(tasks.refuse, 3, 3))
 
 
 def test_workers_end_with_the_process_that_started_them(tasks: ModuleType, tmp_path: Path) -> None:
@@ -192,13 +192,15 @@ def test_workers_end_with_the_process_that_started_them(tasks: ModuleType, tmp_p
 
 
 def test_a_task_that_hangs_is_stopped_and_given_up(tasks: ModuleType) -> None:
-    attempts = [*run_tasks(tasks.hang, [4], 1, Limits(timeout_s=0.5))]
+    attempts = [*run_tasks(tasks.hang, [4], 1, WorkerLimits(timeout_s=0.5))]
     assert [(attempt.number, attempt.final) for attempt in attempts] == [(1, False), (2, False), (3, True)]
     assert all(isinstance(attempt.error, TaskTimeoutError) for attempt in attempts)
 
 
 def test_a_process_is_replaced_after_its_number_of_tasks(tasks: ModuleType) -> None:
-    processes = [attempt.value for attempt in run_tasks(tasks.process_of, range(5), 1, Limits(tasks_per_process=2))]
+    processes = [
+        attempt.value for attempt in run_tasks(tasks.process_of, range(5), 1, WorkerLimits(tasks_per_process=2))
+    ]
     assert len(set(processes)) == 3
     assert processes[0] == processes[1]
     assert processes[2] == processes[3]
@@ -207,13 +209,13 @@ def test_a_process_is_replaced_after_its_number_of_tasks(tasks: ModuleType) -> N
 def test_a_process_is_replaced_when_it_holds_too_much_memory(tasks: ModuleType) -> None:
     # No Python process is as small as the first limit, and none here as large as the second.
     for limit_gib, processes in ((1e-6, 4), (100.0, 1)):
-        made = [attempt.value for attempt in run_tasks(tasks.grow, range(4), 1, Limits(process_gib=limit_gib))]
+        made = [attempt.value for attempt in run_tasks(tasks.grow, range(4), 1, WorkerLimits(process_gib=limit_gib))]
         assert len(set(made)) == processes
 
 
 def test_an_error_that_cannot_cross_processes_says_the_same(tasks: ModuleType) -> None:
     with pytest.raises(ValueError, match="OddError: 1 and 2") as caught:
-        run_alone(partial(tasks.raise_odd_error, 0))
+        run_in_own_process(partial(tasks.raise_odd_error, 0))
     assert "raise OddError(1, 2)" in "".join(caught.value.__notes__)
 
 
@@ -231,7 +233,7 @@ def test_workers_that_cannot_start_end_the_run(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("wrong", [{"timeout_s": 0}, {"tasks_per_process": 0}, {"process_gib": -1.0}])
 def test_limits_must_be_positive(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}: must be above 0"):
-        Limits(**wrong)  # type: ignore[arg-type]
+        WorkerLimits(**wrong)  # type: ignore[arg-type]
 
 
 def test_a_containers_share_counts(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import pytest
 
-from droguekit.workflows.rendering import interrupts_wait
+from droguekit.workflows.rendering import delay_interrupts
 
 
 @pytest.fixture(autouse=True)
@@ -20,7 +20,7 @@ def default_handler() -> Iterator[None]:
 def test_an_interrupt_that_somebody_would_swallow_comes_after_the_block():
     swallowed = reached = False
     with pytest.raises(KeyboardInterrupt):
-        with interrupts_wait(), suppress(BaseException):
+        with delay_interrupts(), suppress(BaseException):
             signal.raise_signal(signal.SIGINT)
             swallowed = True
         reached = True
@@ -31,7 +31,7 @@ def test_an_interrupt_that_somebody_would_swallow_comes_after_the_block():
 def test_the_handler_of_before_hears_it_once_after_the_block():
     heard: list[int] = []
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
-    with interrupts_wait():
+    with delay_interrupts():
         signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         assert heard == []
@@ -39,6 +39,6 @@ def test_the_handler_of_before_hears_it_once_after_the_block():
 
 
 def test_without_an_interrupt_nothing_happens():
-    with interrupts_wait():
+    with delay_interrupts():
         pass
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -24,7 +24,7 @@ def reproduce(
     from droguekit.batch.reproduce_frame import reproduce_frame
 
     result = reproduce_frame(dataset, frame)
-    for difference in result.elsewhere:
+    for difference in result.build_differences:
         typer.echo(f"not the same machine: {difference}")
     for difference in result.differences:
         typer.echo(difference)

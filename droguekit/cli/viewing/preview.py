@@ -79,8 +79,8 @@ def preview(
 
         shown, length_s = write_animation(source, animate, most, sequence)
     elif overlay is not None:
-        from droguekit.visualization.overlay_video import read_method, write_overlay_video
+        from droguekit.visualization.overlay_video import read_estimates_of_method, write_overlay_video
 
-        chosen = ("", {}) if estimates is None else read_method(estimates, source, method)
+        chosen = ("", {}) if estimates is None else read_estimates_of_method(estimates, source, method)
         shown, length_s = write_overlay_video(source, overlay, most, sequence, chosen)
     typer.echo(f"wrote {animate or overlay}: {shown} of {len(source.frame_indices)} pairs, {length_s:.1f} s")

@@ -26,13 +26,13 @@ from droguekit.batch.worker_pool import is_accident, run_tasks
 from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from droguekit.visualization.browse.pairs import (
     LIGHTS,
-    DatasetFacts,
-    FrameEntry,
-    PairSource,
-    open_source,
+    BrowsedPairs,
+    PageEntry,
+    PageFacts,
+    open_browsed_pairs,
     picture_files,
     rings_name,
-    with_answers,
+    with_estimates,
     write_pictures,
 )
 from droguekit.visualization.drogue_outlines import Ring
@@ -45,7 +45,7 @@ _SCRIPTS = ("projection.js", "overlay.js", "catalogue.js", "single.js", "page.js
 
 
 @dataclass(frozen=True)
-class Skipped:
+class SkippedPair:
     """A pair that is not on the page, and why."""
 
     frame_index: int
@@ -53,7 +53,7 @@ class Skipped:
 
 
 @contextmanager
-def opened_page(out: Path) -> Iterator[None]:
+def lock_page_folder(out: Path) -> Iterator[None]:
     """Make the page's folders, or go on with those of an earlier run, and keep other runs out of them.
 
     Raises:
@@ -107,8 +107,8 @@ def write_labels(out: Path, frame_index: int, labels: dict[str, Any]) -> str:
 
 
 def write_page(
-    out: Path, facts: DatasetFacts, rows: Sequence[dict[str, Any]], drogues: Iterable[tuple[Ring, ...]],
-    methods: Sequence[str], skipped: Sequence[Skipped],
+    out: Path, facts: PageFacts, rows: Sequence[dict[str, Any]], drogues: Iterable[tuple[Ring, ...]],
+    methods: Sequence[str], skipped: Sequence[SkippedPair],
 ) -> None:  # fmt: skip
     """Write the catalogue and the page itself, and remove what earlier runs left of other pairs.
 
@@ -136,10 +136,10 @@ def write_page(
     }
     write_text_atomic(out / DATA_FOLDER / "catalogue.js", f"droguekit.catalogue = {_json(catalogue)};\n")
     _write_site(out, facts, skipped)
-    _remove_others(out, rows)
+    _remove_stale_files(out, rows)
 
 
-def _write_site(out: Path, facts: DatasetFacts, skipped: Sequence[Skipped]) -> None:
+def _write_site(out: Path, facts: PageFacts, skipped: Sequence[SkippedPair]) -> None:
     folder = files(__package__) / SITE_FOLDER
     for name in ("browse.css", *_SCRIPTS):
         write_text_atomic(out / SITE_FOLDER / name, (folder / name).read_text(encoding="utf-8"))
@@ -154,7 +154,7 @@ def _write_site(out: Path, facts: DatasetFacts, skipped: Sequence[Skipped]) -> N
     write_text_atomic(out / "index.html", page)
 
 
-def _remove_others(out: Path, rows: Sequence[dict[str, Any]]) -> None:
+def _remove_stale_files(out: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Remove pictures and labels of pairs that are not in the catalogue any more, or have other pixels now."""
     kept = {str(row["picture"]) for row in rows}
     for path in (out / PICTURES_FOLDER).iterdir():
@@ -201,7 +201,7 @@ class BrowseSummary:
 
     shown: int
     kept: int
-    skipped: tuple[Skipped, ...]
+    skipped: tuple[SkippedPair, ...]
 
 
 def write_browse(
@@ -220,23 +220,23 @@ def write_browse(
         ValueError: dataset or estimates cannot be used, or the folder holds other things or is written by another run.
         OSError: the page cannot be written.
     """
-    source = open_source(absolute(dataset))
+    source = open_browsed_pairs(absolute(dataset))
     indices = source.frame_indices()
     if not indices:
         raise ValueError(f"{dataset}: holds no pairs yet")
-    answers = {} if estimates is None else estimates_by_method(_lean(estimates), indices, str(estimates))
-    with opened_page(out):
+    answers = {} if estimates is None else estimates_by_method(_without_unused_parts(estimates), indices, str(estimates))
+    with lock_page_folder(out):
         return _write(source, out, answers, workers, report)
 
 
 def _write(
-    source: PairSource, out: Path, answers: Mapping[str, Mapping[int, Estimate]], workers: int, report: ProgressReport
+    source: BrowsedPairs, out: Path, answers: Mapping[str, Mapping[int, Estimate]], workers: int, report: ProgressReport
 ) -> BrowseSummary:
     indices = source.frame_indices()
-    make = _FrameWork(source, out.resolve())
+    make = _PictureTask(source, out.resolve())
     rows: dict[int, dict[str, Any]] = {}
     drogues: set[tuple[Ring, ...]] = set()
-    skipped: dict[int, Skipped] = {}
+    skipped: dict[int, SkippedPair] = {}
     kept = 0
     report.begin("pairs", len(indices))
     try:
@@ -245,12 +245,12 @@ def _write(
                 index = attempt.index
                 if attempt.value is not None:
                     entry, was_there = attempt.value
-                    entry = with_answers(entry, [frames.get(index) for frames in answers.values()])
+                    entry = with_estimates(entry, [frames.get(index) for frames in answers.values()])
                     rows[index] = entry.row | {"labels": write_labels(out, index, entry.labels)}
                     kept += was_there
                     drogues.add(entry.rings)
                 elif attempt.final:
-                    skipped[index] = Skipped(index, _reason(attempt.error))
+                    skipped[index] = SkippedPair(index, _reason(attempt.error))
                     report.note(f"{len(skipped)} skipped")
                 if attempt.final:
                     report.advance()
@@ -261,13 +261,13 @@ def _write(
     return BrowseSummary(len(rows), kept, left_out)
 
 
-class _FrameWork:
+class _PictureTask:
     """What a worker does with one pair."""
 
-    def __init__(self, source: PairSource, out: Path) -> None:
+    def __init__(self, source: BrowsedPairs, out: Path) -> None:
         self._source, self._out = source, out
 
-    def __call__(self, frame_index: int) -> tuple[FrameEntry, bool]:
+    def __call__(self, frame_index: int) -> tuple[PageEntry, bool]:
         """Write a pair's pictures, unless they are there.
 
         Returns:
@@ -281,7 +281,7 @@ class _FrameWork:
         return entry, was_there
 
 
-def _lean(path: Path) -> Iterator[Estimate]:
+def _without_unused_parts(path: Path) -> Iterator[Estimate]:
     """Estimates without what the page does not show: a file of them may be large."""
     for estimate in read_estimates(path):
         dropped: dict[str, Any] = {"stage_s": {}, "regions": ()}

@@ -15,7 +15,7 @@ from datasets_manifest.atomic import write_bytes_atomic
 from datasets_manifest.storage.blind import BlindDataset, read_blind_index
 from datasets_manifest.storage.frame_store import FrameStore
 from datasets_manifest.storage.layout import BLIND_FILE, image_file
-from datasets_manifest.storage.manifest import FrameEntry as ManifestEntry
+from datasets_manifest.storage.manifest import FrameEntry
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.environment import Environment
@@ -113,7 +113,7 @@ _PX_DIGITS, _POSE_DIGITS = 3, 9
 
 
 @dataclass(frozen=True)
-class FrameEntry:
+class PageEntry:
     """What the page says of one pair.
 
     Attributes:
@@ -129,7 +129,7 @@ class FrameEntry:
     left_from_drogue: RigidTransform | None
 
 
-def frame_entry(record: PairRecord, drogue: DrogueParameters, split: str, record_sha256: str) -> FrameEntry:
+def page_entry(record: PairRecord, drogue: DrogueParameters, split: str, record_sha256: str) -> PageEntry:
     """What the page says of a pair, but for estimates.
 
     Args:
@@ -158,10 +158,10 @@ def frame_entry(record: PairRecord, drogue: DrogueParameters, split: str, record
         "right": _view(record.views.right),
         "conditions": conditions_table(record, split),
     }
-    return FrameEntry(row, labels, rings, record.left_from_drogue)
+    return PageEntry(row, labels, rings, record.left_from_drogue)
 
 
-def blind_entry(frame_index: int, time_s: float, rings: tuple[Ring, ...], pixels_sha256: str) -> FrameEntry:
+def page_entry_without_truth(frame_index: int, time_s: float, rings: tuple[Ring, ...], pixels_sha256: str) -> PageEntry:
     """What the page says of a pair without truth.
 
     Args:
@@ -175,10 +175,10 @@ def blind_entry(frame_index: int, time_s: float, rings: tuple[Ring, ...], pixels
     row: dict[str, Any] = dict.fromkeys(("distance_m", "family", "split", "sequence", "light", "box_px"))
     row |= {"frame": frame_index, "text": "", "picture": picture_stem(frame_index, pixels_sha256)}
     labels = {"pose": None, "drogue": rings_name(rings), "left": view, "right": view}
-    return FrameEntry(row, labels | {"conditions": [("Time", f"{time_s:.3f} s")]}, rings, None)
+    return PageEntry(row, labels | {"conditions": [("Time", f"{time_s:.3f} s")]}, rings, None)
 
 
-def with_answers(entry: FrameEntry, estimates: Sequence[Estimate | None]) -> FrameEntry:
+def with_estimates(entry: PageEntry, estimates: Sequence[Estimate | None]) -> PageEntry:
     """The same with what estimators said of the pair: one estimate a method, None where it said nothing."""
     truth = entry.left_from_drogue
     answers = [None if estimate is None else _answer(estimate, truth) for estimate in estimates]
@@ -271,7 +271,7 @@ def _box(box: PixelBox | None) -> list[float] | None:
     return None if box is None else [round(side, _PX_DIGITS) for side in box]
 
 
-class DatasetFacts(NamedTuple):
+class PageFacts(NamedTuple):
     """What stands at the top of the page, and the cameras.
 
     Attributes:
@@ -285,10 +285,10 @@ class DatasetFacts(NamedTuple):
     is_blind: bool
 
 
-class PairSource(Protocol):
+class BrowsedPairs(Protocol):
     """Pairs by their index; may be pickled for another process."""
 
-    def facts(self) -> DatasetFacts:
+    def facts(self) -> PageFacts:
         """What is to be said of the whole."""
         ...
 
@@ -296,7 +296,7 @@ class PairSource(Protocol):
         """Of the pairs, ascending."""
         ...
 
-    def entry(self, frame_index: int) -> FrameEntry:
+    def entry(self, frame_index: int) -> PageEntry:
         """What the page says of a pair; `ValueError` where it cannot be read."""
         ...
 
@@ -305,18 +305,20 @@ class PairSource(Protocol):
         ...
 
 
-def open_source(dataset: Location) -> PairSource:
+def open_browsed_pairs(dataset: Location) -> BrowsedPairs:
     """The pairs of a dataset.
 
     Raises:
         ValueError: no dataset there, or one that cannot be trusted.
     """
-    source: PairSource = BlindPairs(dataset) if open_storage(dataset).exists(BLIND_FILE) else TruePairs(dataset)
+    source: BrowsedPairs = (
+        PairsWithoutTruth(dataset) if open_storage(dataset).exists(BLIND_FILE) else PairsWithTruth(dataset)
+    )
     source.frame_indices()
     return source
 
 
-class _Opened:
+class _ReopenedDataset:
     """Opens the dataset when it is asked for, in each process anew."""
 
     def __init__(self, dataset: Location) -> None:
@@ -326,7 +328,7 @@ class _Opened:
         return {"_place": self._place}
 
 
-class TruePairs(_Opened):
+class PairsWithTruth(_ReopenedDataset):
     """Pairs with their truth."""
 
     @cached_property
@@ -334,26 +336,26 @@ class TruePairs(_Opened):
         return Dataset(self._place)
 
     @cached_property
-    def _known(self) -> dict[int, ManifestEntry]:
+    def _known(self) -> dict[int, FrameEntry]:
         return {entry.frame_index: entry for entry in self._dataset.manifest.frames}
 
-    def facts(self) -> DatasetFacts:
+    def facts(self) -> PageFacts:
         """From the manifest."""
         manifest = self._dataset.manifest
         counts = f"{manifest.counts.pairs} stereo pairs, {manifest.counts.empty} of them without a drogue."
         origin = f"Content hash {manifest.dataset_sha256}; data under {manifest.data_licence}."
         facts = tuple(filter(None, (manifest.recipe.description, counts, origin)))
-        return DatasetFacts(manifest.name, facts, manifest.recipe.rig, False)
+        return PageFacts(manifest.name, facts, manifest.recipe.rig, False)
 
     def frame_indices(self) -> tuple[int, ...]:
         """Of the manifest."""
         return self._dataset.frame_indices
 
-    def entry(self, frame_index: int) -> FrameEntry:
+    def entry(self, frame_index: int) -> PageEntry:
         """From its record."""
         known, record = self._known[frame_index], self._dataset.record(frame_index)
         drogue = self._dataset.sought_drogue(record)
-        return frame_entry(record, drogue, known.split, known.record_sha256)
+        return page_entry(record, drogue, known.split, known.record_sha256)
 
     def images(self, frame_index: int) -> StereoImages:
         """Decoded, if they are those on record: its hash stands for them in the names of the pictures."""
@@ -365,7 +367,7 @@ class TruePairs(_Opened):
         return self._dataset.images(frame_index)
 
 
-class BlindPairs(_Opened):
+class PairsWithoutTruth(_ReopenedDataset):
     """Pairs without truth."""
 
     @cached_property
@@ -376,22 +378,22 @@ class BlindPairs(_Opened):
     def _frames(self) -> FrameStore:
         return FrameStore(self._place)
 
-    def facts(self) -> DatasetFacts:
+    def facts(self) -> PageFacts:
         """From the index."""
         index = read_blind_index(self._place)
-        return DatasetFacts(index.name, (f"{len(index.frames)} stereo pairs without truth.",), index.rig, True)
+        return PageFacts(index.name, (f"{len(index.frames)} stereo pairs without truth.",), index.rig, True)
 
     def frame_indices(self) -> tuple[int, ...]:
         """Of the index."""
         return self._dataset.frame_indices
 
-    def entry(self, frame_index: int) -> FrameEntry:
+    def entry(self, frame_index: int) -> PageEntry:
         """Of the pair's time and drogue; its images' own hash stands for them."""
         pixels = hashlib.sha256()
         for eye in EYES:
             pixels.update(self._frames.read(frame_index, image_file(eye)))
         pair = self._dataset.pair(frame_index)
-        return blind_entry(frame_index, pair.images.time_s, drogue_rings(pair.drogue), pixels.hexdigest())
+        return page_entry_without_truth(frame_index, pair.images.time_s, drogue_rings(pair.drogue), pixels.hexdigest())
 
     def images(self, frame_index: int) -> StereoImages:
         """Decoded."""

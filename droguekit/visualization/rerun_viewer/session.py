@@ -23,7 +23,7 @@ from droguekit.visualization.rerun_viewer.recording import APPLICATION, PairReco
 # Only this machine may tell the viewer anything.
 _HOST = "127.0.0.1"
 # How long a slow machine takes to open the viewer, and how long one may take to find that it gets no window. [s]
-_PATIENCE_S, _SETTLING_S = 30.0, 2.0
+_OPEN_TIMEOUT_S, _WINDOW_TIMEOUT_S = 30.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -58,16 +58,16 @@ def view_pairs(
     recording = rr.new_recording(APPLICATION)
     if save is None:
         _open_viewer(recording)
-        return _tell(recording, source, frames, answers, report)
+        return _log_pairs(recording, source, frames, answers, report)
     part = part_path(save)
     try:
         save.parent.mkdir(parents=True, exist_ok=True)
         # The library tells of no failed write but this one.
         part.touch(exist_ok=False)
         rr.save(part, default_blueprint=blueprint(), recording=recording)
-        summary = _tell(recording, source, frames, answers, report)
+        summary = _log_pairs(recording, source, frames, answers, report)
         rr.disconnect(recording=recording)
-        _check(part, len(summary.shown))
+        _check_recording(part, len(summary.shown))
         if summary.shown:
             part.replace(save)
     except OSError as error:
@@ -87,17 +87,19 @@ def _open_viewer(recording: rr.RecordingStream) -> None:
     # The one that came with the library, whatever the search path says; it stays when this process ends.
     command = [sys.executable, "-m", "rerun_cli", "--bind", _HOST, "--port", str(port)]
     viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
-    until_s = time.monotonic() + _PATIENCE_S
+    until_s = time.monotonic() + _OPEN_TIMEOUT_S
     while viewer.poll() is None and not _answers(port) and time.monotonic() < until_s:
         time.sleep(0.2)
     # It listens before it has a window, and ends when it gets none.
     with suppress(subprocess.TimeoutExpired):
-        viewer.wait(_SETTLING_S)
+        viewer.wait(_WINDOW_TIMEOUT_S)
     if viewer.returncode is not None or not _answers(port):
         with suppress(ProcessLookupError):
             os.killpg(viewer.pid, signal.SIGKILL)
         raise OSError(None, "the viewer does not open; write a recording with --save FILE.rrd")
-    rr.connect_tcp(f"{_HOST}:{port}", flush_timeout_sec=_PATIENCE_S, default_blueprint=blueprint(), recording=recording)
+    rr.connect_tcp(
+        f"{_HOST}:{port}", flush_timeout_sec=_OPEN_TIMEOUT_S, default_blueprint=blueprint(), recording=recording
+    )
 
 
 def _free_port() -> int:
@@ -115,7 +117,7 @@ def _answers(port: int) -> bool:
         return False
 
 
-def _tell(
+def _log_pairs(
     recording: rr.RecordingStream,
     source: ShownPairs,
     frames: Sequence[int],
@@ -141,7 +143,7 @@ def _tell(
     return ViewSummary(tuple(shown), tuple(faults))
 
 
-def _check(path: Path, pairs: int) -> None:
+def _check_recording(path: Path, pairs: int) -> None:
     """Read the file again.
 
     Raises:
