@@ -1,1 +1,1 @@
-"""Many frames: planning them, making them in worker processes, going on after a stop, making one again."""
+"""Plan many frames, render them in worker processes, resume after a stop, and reproduce single frames."""

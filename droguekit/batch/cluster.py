@@ -1,4 +1,4 @@
-"""Frames made by the workers of a Dask scheduler, which spreads them, restarts what dies and survives lost nodes."""
+"""Render frames on the workers of a Dask scheduler, which distributes them and survives lost workers and nodes."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from render.engine import load_engine
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# Nodes that are taken away are no fault of the frames on them, and Dask blames every frame that a lost worker held.
+# Dask counts a failure for every frame that a lost worker held, though a node may be lost through no fault of theirs.
 ALLOWED_FAILURES = 9
-# Enough that no worker waits for the client, and few enough that the scheduler stays small whatever the recipe's size.
+# Enough that no worker waits for the client, and few enough that the scheduler's memory is independent of the recipe.
 _FRAMES_PER_WORKER = 2
 _CONNECT_S = 30
-# The crew is asked for this often at most: the answer comes from the scheduler, and takes longer than a frame's report.
-_CREW_EVERY_S = 1.0
+# Least time between two questions for the number of workers: the scheduler's answer is slower than a frame's report.
+_WORKERS_EVERY_S = 1.0
 
 
 class LostWorkersError(RuntimeError):
-    """Dask gave a frame up because too many workers were lost that held it."""
+    """Dask gave up a frame because too many workers that held it were lost."""
 
     def __init__(self, was_alone: bool) -> None:
-        """With whether nothing else was with the workers at the time."""
+        """With whether the workers had no other frame at the time."""
         lost, beside = (MAX_ATTEMPTS, "it alone") if was_alone else (ALLOWED_FAILURES + 1, "it and perhaps others")
         super().__init__(f"{lost} Dask workers died or ran out of time with {beside}")
 
 
 @dataclass(frozen=True)
 class WorkerBuild:
-    """What pixels and labels depend on besides the recipe."""
+    """Software versions and processor features, on which pixels and labels depend besides the recipe."""
 
     software: tuple[tuple[str, str], ...]
     cpu_features: frozenset[str]
@@ -55,18 +55,18 @@ class WorkerBuild:
 
 @cache
 def current_build() -> WorkerBuild:
-    """The build of this process."""
+    """Versions and processor features of this process."""
     return WorkerBuild(tuple(sorted(software_versions().items())), frozenset(cpu_features()))
 
 
 @dataclass(frozen=True)
 class ClusterResult:
-    """A frame that a Dask worker has made.
+    """A frame made by a Dask worker.
 
     Attributes:
-        report: what it cost.
+        report: time and size of the frame.
         worker: address of the worker.
-        resident_gib: memory that the worker held afterwards. [GiB]
+        resident_gib: memory of the worker afterwards. [GiB]
     """
 
     report: FrameReport
@@ -76,12 +76,12 @@ class ClusterResult:
 
 @dataclass(frozen=True)
 class ClusterTask:
-    """A frame on a Dask worker, which must be of the same build as the client and see the same storage.
+    """Makes a frame on a Dask worker, which must run the client's versions and see the same storage.
 
     Attributes:
         task: makes the frame.
         build: of the client.
-        timeout_s: after which the worker's process ends; Dask starts another and gives it the frame again. [s]
+        timeout_s: after which the worker's process ends; Dask starts another, which gets the frame again. [s]
     """
 
     task: FrameTask
@@ -92,8 +92,8 @@ class ClusterTask:
         """Make and write frame `frame_index`.
 
         Raises:
-            OtherBuildError: other packages or another processor than the client's.
-            OSError: the dataset's folder is not there.
+            OtherBuildError: packages or processor differ from the client's.
+            OSError: the dataset's folder does not exist.
         """
         from distributed import get_worker
 
@@ -106,7 +106,7 @@ class ClusterTask:
             )
         if not open_storage(self.task.dataset).exists(EVENTS_FILE):
             raise FileNotFoundError(f"{where}: does not see {self.task.dataset}; give a folder on shared storage")
-        # The kernel's default for this signal ends the process, whatever hangs in it, by a clock that nobody sets.
+        # This signal ends the process by default, even where native code hangs.
         signal.setitimer(signal.ITIMER_REAL, self.timeout_s)
         try:
             report = self.task(frame_index)
@@ -116,7 +116,7 @@ class ClusterTask:
 
 
 def make_on_worker(pickled_task: bytes, frame_index: int) -> ClusterResult:
-    """Frame `frame_index` by a pickled `ClusterTask`; for thousands of frames it is packed and unpacked once."""
+    """Make frame `frame_index` by a pickled `ClusterTask`, which is pickled and unpickled once for all frames."""
     return _unpickled(pickled_task)(frame_index)
 
 
@@ -130,16 +130,16 @@ def _unpickled(pickled_task: bytes) -> ClusterTask:
 def run_on_cluster(
     task: FrameTask, indices: Sequence[int], address: str, timeout_s: float, stop: StopRequest
 ) -> Generator[TaskAttempt[FrameReport], None, None]:
-    """Let the workers of a scheduler make frames, and report each as it ends.
+    """Make frames on the workers of a scheduler, and report each as it ends.
 
-    Workers may come and go meanwhile. A few frames for each worker are with the scheduler at any time.
+    Workers may join and leave meanwhile. The scheduler holds a few frames for each worker at any time.
 
     Args:
         task: makes a frame; its folder must be on storage that all workers share.
-        indices: of the frames, without repetition.
+        indices: of the frames, each once.
         address: of the scheduler.
         timeout_s: for one frame. [s]
-        stop: once it is requested, no more frames begin, and the iterator ends with those that are running.
+        stop: once it is requested, no more frames start, and the iterator ends after the running ones.
 
     Raises:
         ValueError: `distributed` is missing.
@@ -157,22 +157,22 @@ def run_on_cluster(
 
 
 class _SubmissionWindow:
-    """The frames that wait, and the few that are with the scheduler."""
+    """The frames that wait, and the few that the scheduler holds."""
 
     def __init__(self, client: Client, task: ClusterTask, waiting: deque[int]) -> None:
         self._client, self._task, self._waiting = client, pickle.dumps(task), waiting
         self._running: dict[int, Future] = {}
-        # Frames that Dask gave up: one of them ended workers, and the others may only have stood behind it.
+        # Frames that Dask gave up: one of them killed workers, the others may only have waited on the same workers.
         self._suspects: deque[int] = deque()
         self._alone = False
-        # Futures end in a thread of Dask's, and a request to stop comes in a signal handler: both only put.
+        # Futures end in a thread of Dask, and stop requests come from a signal handler: both only put into the queue.
         self._ended: SimpleQueue[int | None] = SimpleQueue()
         self._threads: dict[str, int] = {}
         self._asked_s = -math.inf
         self._resident_gib: dict[str, float] = {}
 
     def attempts(self, stop: StopRequest) -> Generator[TaskAttempt[FrameReport], None, None]:
-        """Report each frame as it ends; frames that the caller does not wait for any more are cancelled."""
+        """Report each frame as it ends; frames are cancelled when the caller stops iterating."""
         stop.wake = lambda: self._ended.put(None)
         self._allow_failures(ALLOWED_FAILURES)
         try:
@@ -188,10 +188,10 @@ class _SubmissionWindow:
             self._client.cancel([*self._running.values()])
 
     def _fill(self, stopping: bool) -> bool:
-        """Hand out frames up to the window's size.
+        """Submit frames up to the window's size.
 
         Returns:
-            Whether there is anything to wait for.
+            Whether any frame is running.
         """
         size = self._size()
         while self._waiting and not stopping and len(self._running) < size:
@@ -212,7 +212,7 @@ class _SubmissionWindow:
         self._ended.put(index)
 
     def _size(self) -> int:
-        if time.monotonic() - self._asked_s > _CREW_EVERY_S:
+        if time.monotonic() - self._asked_s > _WORKERS_EVERY_S:
             self._asked_s, self._threads = time.monotonic(), self._client.nthreads()
             self._resident_gib = {name: gib for name, gib in self._resident_gib.items() if name in self._threads}
         return _FRAMES_PER_WORKER * max(1, sum(self._threads.values()))
@@ -221,7 +221,7 @@ class _SubmissionWindow:
         self._client.run_on_scheduler(_allow_failures, count=count)
 
     def _attempt(self, index: int, future: Future) -> TaskAttempt[FrameReport]:
-        """How a frame ended.
+        """The outcome of a frame.
 
         Raises:
             OSError: the scheduler has ended.
@@ -235,7 +235,9 @@ class _SubmissionWindow:
             made: ClusterResult = future.result()
             value, self._resident_gib[made.worker] = made.report, made.resident_gib
         except CancelledError as ended:
-            raise OSError("the Dask scheduler has ended; start it and the same command again to go on") from ended
+            raise OSError(
+                "the Dask scheduler has ended; start it again, then run the same command to continue"
+            ) from ended
         except KilledWorker:
             error, final = LostWorkersError(self._alone), self._alone
             if not final:
@@ -252,7 +254,7 @@ def _connect(address: str) -> Client:
     except ImportError as error:
         raise ValueError("--scheduler: Dask is missing: pip install 'droguekit[cluster]'") from error
     for name in ("distributed", "distributed.client"):  # Dask gives the second a level of its own
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters of it is reported by frame
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # failures are reported by frame
     try:
         # Every message to the scheduler names the task, and by default a client remembers the last thousand.
         with dask.config.set({"distributed.admin.low-level-log-length": 10}):
@@ -270,10 +272,10 @@ def _allow_failures(count: int, dask_scheduler: Any) -> None:
 
 
 def _check_build(wanted: WorkerBuild, here: WorkerBuild, where: str) -> None:
-    """See that frames made here are those that the client would make.
+    """Check that this worker makes the same frames as the client would.
 
     Raises:
-        OtherBuildError: they are not; names what differs.
+        OtherBuildError: it does not; names what differs.
     """
     for name in sorted({name for name, _ in (*wanted.software, *here.software)}):
         there, mine = dict(wanted.software).get(name, "missing"), dict(here.software).get(name, "missing")
@@ -282,6 +284,6 @@ def _check_build(wanted: WorkerBuild, here: WorkerBuild, where: str) -> None:
     odd = sorted(wanted.cpu_features ^ here.cpu_features)
     if odd:
         raise OtherBuildError(
-            f"{where}: its processor differs from the client's in {', '.join(odd)}, and so would last digits; run the "
-            "client on a node of the same kind"
+            f"{where}: its processor differs from the client's in {', '.join(odd)}, so the last digits would differ; "
+            "run the client on a node of the same kind"
         )

@@ -24,18 +24,18 @@ from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process
 from geometry.se3 import Array
 from scenes.sampler import scene_of_frame
 
-# Three cannot tell the law from the differences between scenes; more than a dozen hardly better the mean.
+# Fewer than three cannot separate distance from scene; more than a dozen hardly improve the mean.
 _FEWEST_PROBES, _MOST_PROBES = 3, 12
 
 
 @dataclass(frozen=True)
 class ProbeFrames:
-    """Frames to make, in this order.
+    """The frames that a probe makes.
 
     Attributes:
-        warm_up: made first and not counted: engines compile kernels for what they have not met, keep them on disk, and
-            so the first dozen frames cost half as much again as the hundreds that follow.
-        counted: the frames to reckon from.
+        warm_up: made first and not counted: engines compile kernels for new content and keep them on disk, so the first
+            dozen frames cost half as much again as later ones.
+        counted: the frames from which the cost is estimated.
     """
 
     warm_up: tuple[int, ...]
@@ -44,13 +44,13 @@ class ProbeFrames:
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """What frames cost.
+    """What the probed frames cost.
 
     Attributes:
         warm_up: frames made before the others.
-        counted: frames to reckon from.
-        repeated: the last frame that was made, once more.
-        start_cpu_s: processor time of the process that went into none of the frames. [s]
+        counted: frames from which the cost is estimated.
+        repeated: the last frame, made a second time.
+        start_cpu_s: processor time of the process outside the frames. [s]
         drops: frames that cannot be made, and why.
     """
 
@@ -62,14 +62,14 @@ class ProbeResult:
 
 
 def choose_probe_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
-    """One frame from each of several strata of distance, one without a drogue if there are any, and as many before.
+    """One frame from each of several strata of distance, one without a drogue if there are any, and as many to warm up.
 
-    Nearest and farthest are counted. Within a stratum the family, and then the scene, that has had the fewest comes
-    first.
+    The nearest and the farthest frame are among the counted ones. Within a stratum, families and then scenes that were
+    chosen least often come first.
 
     Args:
         drawn: of the recipe.
-        count: of all its pairs.
+        count: number of all pairs of the recipe.
     """
     shows = np.flatnonzero(np.isfinite(drawn.distances_m))
     order = shows[np.argsort(drawn.distances_m[shows], kind="stable")]
@@ -85,7 +85,7 @@ def choose_probe_frames(drawn: DrawnFrames, count: int) -> ProbeFrames:
 
 
 def _pick_rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list[int]:
-    """A place in `drawn` from each stratum that has any."""
+    """An index into `drawn` from each stratum that is not empty."""
     families, scenes, chosen = Counter[int](), Counter[int](), list[int]()
     for stratum in strata:
         if len(stratum):
@@ -98,26 +98,26 @@ def _pick_rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list
     return chosen
 
 
-def probe(recipe: Recipe, order: ProbeFrames) -> ProbeResult:
-    """Make frames in a temporary folder, in a process of their own with one thread, and throw them away.
+def probe(recipe: Recipe, frames: ProbeFrames) -> ProbeResult:
+    """Make frames in a temporary folder, in a process of their own with one thread, and delete them.
 
-    A frame that `render` would drop is one here.
+    Frames that `render` would drop are reported as drops.
 
     Raises:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the process died, or the temporary folder cannot be written.
     """
-    return run_in_own_process(partial(_probe, recipe, order))
+    return run_in_own_process(partial(_probe, recipe, frames))
 
 
-def _probe(recipe: Recipe, order: ProbeFrames) -> ProbeResult:
+def _probe(recipe: Recipe, frames: ProbeFrames) -> ProbeResult:
     drops = list[Drop]()
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         task = FrameTask(recipe, Path(folder))
-        warm_up, failed_s = make_in_turn(task, order.warm_up, drops, False)
-        counted, more_failed_s = make_in_turn(task, order.counted, drops, bool(warm_up))
+        warm_up, failed_s = make_in_turn(task, frames.warm_up, drops, False)
+        counted, more_failed_s = make_in_turn(task, frames.counted, drops, bool(warm_up))
         if not counted:
-            raise ValueError(f"frames: none of {len(order.counted)} can be made, the last because: {drops[-1].reason}")
+            raise ValueError(f"frames: none of {len(frames.counted)} can be made, the last because: {drops[-1].reason}")
         repeated = task(next(reversed(counted)))
     reports = [*warm_up.values(), *counted.values(), repeated]
     in_frames_s = sum(cpu_s(report) for report in reports) + failed_s + more_failed_s
@@ -130,13 +130,13 @@ def make_in_turn(
     """Make frames one after the other.
 
     Args:
-        task: makes one.
-        frames: which.
-        drops: those that cannot be made are added to it.
-        is_loaded: the engine is; before, its loading is part of the first frame's time.
+        task: makes a frame.
+        frames: indices.
+        drops: gets the frames that cannot be made.
+        is_loaded: whether the engine is loaded; if not, loading it is part of the first frame's time.
 
     Returns:
-        Those that can be made, and processor time that went into the others, the engine being loaded. [s]
+        Reports of the frames, and processor time spent on failed frames after the engine was loaded. [s]
 
     Raises:
         ValueError: the engine cannot be used.
@@ -161,25 +161,25 @@ def cpu_s(report: FrameReport) -> float:
     return sum(report.stage_s.values())
 
 
-# Of the law: constant, inverse and inverse square of the distance.
+# Constant, inverse and inverse square of the distance.
 _TERMS = 3
-# In which the environment of a scene is made; every process does it once for each of its scenes.
+# The stage that makes a scene's environment; every process does it once for each of its scenes.
 _SCENE_STAGE = "sample"
 
 
 @dataclass(frozen=True)
 class CostEstimate:
-    """What a whole run is expected to take, in seconds of a processor unless it says otherwise.
+    """The expected cost of a whole run; times are processor time unless stated otherwise.
 
     Attributes:
         probed: the measured frames by index.
         drops: frames that were to be measured and cannot be made, and why.
         start_s: until a worker process is ready for its first frame. [s]
-        scene_s: for a process to make the environment of a scene, or to fly a sequence. [s]
-        frames_s: for all pairs, their environments at hand. [s]
-        error_s: standard error of `frames_s`, or None where too few were measured to tell. [s]
-        wall_over_cpu: how long a second of a processor took: 1 on an idle machine, more where others work too, or where
-            the engine waits for another device.
+        scene_s: for a process to make the environment of a scene, or to simulate the flight of a sequence. [s]
+        frames_s: for all pairs, without making their environments. [s]
+        error_s: standard error of `frames_s`, or None where too few frames were measured. [s]
+        wall_over_cpu: wall time per processor time: 1 on an idle machine, more on a busy one or where the engine waits
+            for another device.
         size_bytes: of all pairs on disk, without the records.
         count, scenes, sequences: of the recipe; 0 sequences where pairs are single.
     """
@@ -197,9 +197,9 @@ class CostEstimate:
     sequences: int
 
     def work_s(self, workers: int) -> float:
-        """Processor time of all frames of a run, without the starts of its processes. [s]"""
+        """Processor time of all frames of a run, without starting its processes. [s]"""
         processes, workers = self._processes(workers), max(1, min(workers, self.count))
-        # Pairs go through the scenes in turn, and so does every process; sequences come one after the other.
+        # Single pairs cycle through the scenes, so every process meets all; sequences follow one another.
         visits = processes * self.scenes if self.sequences == 0 else self.sequences * workers + processes - workers
         return min(self.count, visits) * self.scene_s + self.frames_s
 
@@ -212,7 +212,7 @@ class CostEstimate:
 
 
 def probe_cost(recipe: Recipe, plan: RecipePlan) -> CostEstimate:
-    """Render a few frames, spread over distances and families, and reckon from them.
+    """Render a few frames, spread over distances and families, and estimate the cost of all from them.
 
     Raises:
         ValueError: the engine cannot be used, or none of the frames can be made.
@@ -222,14 +222,14 @@ def probe_cost(recipe: Recipe, plan: RecipePlan) -> CostEstimate:
 
 
 def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> CostEstimate:
-    """What measured frames say of all pairs of a recipe."""
+    """Extrapolate from measured frames to all pairs of a recipe."""
     reports = list(probed.counted.values())
     every = [*probed.warm_up.values(), *reports, probed.repeated]
     count = recipe.frames.count * (1 - plan.dropped_fraction)
-    law = _DistanceFit(plan.drawn, probed.counted)
-    # What that stage takes of every pair is what it takes of one whose environment is at hand.
-    at_hand_s = _scene_stage_s(probed.repeated)
-    frames_s, error_s = law.total([cpu_s(report) - _scene_stage_s(report) + at_hand_s for report in reports], count)
+    fit = _DistanceFit(plan.drawn, probed.counted)
+    # Every pair takes in this stage what one takes whose environment exists already.
+    reused_s = _scene_stage_s(probed.repeated)
+    frames_s, error_s = fit.total([cpu_s(report) - _scene_stage_s(report) + reused_s for report in reports], count)
     return CostEstimate(
         probed=probed.counted,
         drops=probed.drops,
@@ -238,7 +238,7 @@ def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> Cost
         frames_s=frames_s,
         error_s=error_s,
         wall_over_cpu=max(1.0, sum(report.wall_s for report in every) / sum(cpu_s(report) for report in every)),
-        size_bytes=law.total([report.size_bytes for report in reports], count)[0],
+        size_bytes=fit.total([report.size_bytes for report in reports], count)[0],
         count=recipe.frames.count,
         scenes=recipe.frames.scenes,
         sequences=0 if recipe.sequence is None else -(-recipe.frames.count // recipe.sequence.frames_per_sequence),
@@ -246,22 +246,22 @@ def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> Cost
 
 
 class _DistanceFit:
-    """How measured values go with the distance, each family of frames counting by its share of the recipe."""
+    """A fit of measured values over distance, in which each family counts by its share of the recipe."""
 
     def __init__(self, drawn: DrawnFrames, reports: dict[int, FrameReport]) -> None:
         rows = [drawn.indices.index(frame_index) for frame_index in reports]
         self._measured_m, self._drawn_m = drawn.distances_m[rows], drawn.distances_m
         shows, families = np.isfinite(self._measured_m), drawn.families[rows]
-        # A family of which none was measured counts as the others do on average.
+        # A family without a measured frame is represented by the average of the others.
         shares = np.bincount(drawn.families[np.isfinite(self._drawn_m)], minlength=int(drawn.families.max()) + 1)
         probes = np.bincount(families[shows], minlength=len(shares))
-        # Those without a drogue have a law of their own, a constant.
+        # Frames without a drogue have a constant of their own.
         self._weights = np.where(shows, (shares / np.maximum(probes, 1))[families], 1.0)
 
     def total(self, values: ArrayLike, count: float) -> tuple[float, float | None]:
-        """Sum over all pairs, and its standard error by how the measured values scatter about the law.
+        """Sum over all pairs, and its standard error from the residuals of the fit.
 
-        The error is None where the law has as many terms as there are values with a drogue: none scatters then.
+        The error is None where the fit has as many terms as there are values with a drogue: it has no residuals then.
         """
         measured = np.asarray(values, dtype=np.float64)
         fitted = fit_over_distance(self._measured_m, measured, self._drawn_m, self._weights)
@@ -275,13 +275,13 @@ class _DistanceFit:
 
 
 def _scene_s(recipe: Recipe, probed: ProbeResult) -> float:
-    """What the first frame of a scene, or of a sequence, takes more than its later ones. [s]"""
+    """Extra time of the first frame of a scene or of a sequence over its later ones. [s]"""
     first_s: dict[int, float] = {}
     for frame_index, report in (probed.warm_up | probed.counted).items():
         length = None if recipe.sequence is None else recipe.sequence.frames_per_sequence
         unit = scene_of_frame(recipe, frame_index) if length is None else frame_index // length
         first_s.setdefault(unit, _scene_stage_s(report))
-    # Tables that serve all scenes are made in the first frame of all.
+    # The very first frame also makes tables that all scenes share.
     later_s = list(first_s.values())[1:] or list(first_s.values())
     return max(0.0, float(np.mean(later_s)) - _scene_stage_s(probed.repeated))
 
@@ -291,19 +291,19 @@ def _scene_stage_s(report: FrameReport) -> float:
 
 
 def fit_over_distance(distance_m: ArrayLike, values: ArrayLike, at_m: ArrayLike, weights: ArrayLike = 1.0) -> Array:
-    """The law `a + b / distance + c / distance^2` that fits given values best, at other distances.
+    """Fit `a + b / distance + c / distance^2` to values with non-negative terms, and evaluate it at other distances.
 
-    The drogue's area in the image goes with the inverse square of its distance, and its outline with the inverse.
-    Frames without a drogue have a value of their own. No term is negative.
+    The drogue's area in the image is proportional to the inverse square of its distance, its outline to the inverse.
+    Frames without a drogue have a value of their own.
 
     Args:
-        distance_m: (N,) of the given values, NaN without a drogue. [m]
-        values: (N,) given.
-        at_m: (M,) where the law is wanted, NaN without a drogue. [m]
-        weights: (N,) how much each value counts.
+        distance_m: (N,) distances of the values, NaN without a drogue. [m]
+        values: (N,) to fit.
+        at_m: (M,) distances at which the fit is evaluated, NaN without a drogue. [m]
+        weights: (N,) of the values.
 
     Returns:
-        (M,) values of the law.
+        (M,) fitted values.
     """
     root = np.sqrt(np.broadcast_to(weights, np.shape(values)))
     terms, _ = nnls(_terms(distance_m) * root[:, None], np.asarray(values, dtype=np.float64) * root)

@@ -17,7 +17,7 @@ else:
 
 
 def output_option(name: str, metavar: str, help: str) -> Any:
-    """An option of type `Path` that names what is written, on this machine: a URL would become the name of a folder."""
+    """An option of type `Path` for an output file or folder on this machine; a URL is refused."""
     return typer.Option(name, metavar=metavar, parser=str, callback=_local_path, help=help)
 
 
@@ -51,7 +51,7 @@ TarOption = Annotated[
     typer.Option(
         "--tar",
         metavar="N",
-        help="Keep pairs in tar files of N instead of a folder each, for corpora of millions; once chosen, it stays.",
+        help="Keep pairs in tar files of N pairs instead of a folder each; cannot be changed later.",
     ),
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Replaces the recipe's seed.")]
@@ -59,7 +59,7 @@ WorkersOption = Annotated[
     int | None,
     typer.Option(
         "--workers",
-        help="Worker processes; by default as many as cores and memory allow. 0 works in this process, for debugging.",
+        help="Worker processes; by default as many as cores and memory allow. 0 runs in this process, for debugging.",
     ),
 ]
 DetectorOption = Annotated[
@@ -72,10 +72,10 @@ EngineOption = Annotated[str | None, typer.Option("--engine", metavar="NAME", he
 
 
 def parse_frames(text: str | None, count: int) -> range:
-    """The frames of `A:B`: from A up to but without B; either may be left out, and all are meant by None.
+    """The frames of `A:B`, from A up to but not including B; either may be omitted, and None means all.
 
     Raises:
-        ValueError: not of that form, or outside the recipe.
+        ValueError: another form, or frames outside the recipe.
     """
     if text is None:
         return range(count)
@@ -84,17 +84,17 @@ def parse_frames(text: str | None, count: int) -> range:
         raise ValueError(f"--frames: must be A:B with whole numbers, such as 0:100, got {text!r}")
     first, last = int(low or 0), int(high or count)
     if not first < last <= count:
-        raise ValueError(f"--frames: must name frames of the recipe's {count}, at least one, got {text!r}")
+        raise ValueError(f"--frames: must name at least one of the recipe's {count} frames, got {text!r}")
     return range(first, last)
 
 
 def parse_shard(text: str | None, frames: range) -> range:
-    """Every n-th of the frames, from the i-th on, by `i/n`; all of them by None.
+    """Every n-th frame, starting with the i-th, for `i/n`; None means all.
 
-    Neighbours go to different shards, so that all take about as long.
+    Consecutive frames go to different shards, so that all shards take about as long.
 
     Raises:
-        ValueError: not of that form, or a shard without frames.
+        ValueError: another form, or a shard without frames.
     """
     if text is None:
         return frames

@@ -24,9 +24,9 @@ def demo(
     out: Annotated[Path, output_option("--out", "DIR", "Where everything goes.")] = Path("out/demo"),
     workers: WorkersOption = None,
 ) -> None:
-    """Render a small dataset of a drogue from 40 m down to 1.7 m, navigate on it blind, and write a report.
+    """Render a small dataset of a drogue from 40 m down to 1.7 m, estimate poses without the truth, and write a report.
 
-    Writes dataset/, estimates.jsonl, benchmark.json and report.html. Run again, it keeps the pairs that are there.
+    Writes dataset/, estimates.jsonl, benchmark.json and report.html. Run again, it keeps pairs that exist.
     """
     files, summary = run_demo(recipe, out, workers, progress_report())
     typer.echo(f"{summary.pairs} pairs in {files.dataset}, dataset sha256 {summary.dataset_sha256}")

@@ -32,11 +32,11 @@ COMMANDS = {
     "plan": Command(
         "droguekit.cli.dataset.plan", "Show what a recipe will make, how long it takes and how large it gets."
     ),
-    "render": Command("droguekit.cli.dataset.render", "Make a dataset from a recipe; goes on where it stopped."),
-    "merge": Command("droguekit.cli.dataset.merge", "Join shards of a dataset that were made apart."),
+    "render": Command("droguekit.cli.dataset.render", "Make a dataset from a recipe; continues where it stopped."),
+    "merge": Command("droguekit.cli.dataset.merge", "Join shards of a dataset into one."),
     "import": Command("droguekit.cli.dataset.import_", "Make a dataset from real stereo images, without truth."),
     "validate": Command("droguekit.cli.dataset.validate", "Check a dataset: files, hashes, labels against part ids."),
-    "reproduce": Command("droguekit.cli.dataset.reproduce", "Make one frame of a dataset again and compare."),
+    "reproduce": Command("droguekit.cli.dataset.reproduce", "Render one frame of a dataset again and compare."),
     "export": Command("droguekit.cli.dataset.export", "Write a dataset's labels in another format."),
     "preview": Command("droguekit.cli.viewing.preview", "Draw a contact sheet of a dataset with its labels."),
     "browse": Command("droguekit.cli.viewing.browse", "Write a page to look through a dataset in a browser."),
@@ -128,7 +128,7 @@ def droguekit(
         bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Root of all commands; its help text is `HELP`."""
+    """The command without a subcommand."""
 
 
 def explain(error: BaseException) -> str:
@@ -159,7 +159,7 @@ def run(arguments: list[str], command: typer.Typer = app, name: str = "droguekit
     except SystemExit as exit_:
         code = exit_.code if isinstance(exit_.code, int) else DONE if exit_.code is None else WRONG_INPUT
         if code == INTERRUPTED:
-            print(f"{name}: interrupted; the same command goes on with what is finished", file=sys.stderr)
+            print(f"{name}: interrupted; run the same command to continue", file=sys.stderr)
         return code
     except Exception as error:
         if debug:

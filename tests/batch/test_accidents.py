@@ -184,7 +184,7 @@ def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
     assert process.returncode == INTERRUPTED
     assert told[-2:] == [
         "stopped after 3 of 8 pairs, all of which are whole",
-        "droguekit: interrupted; the same command goes on with what is finished",
+        "droguekit: interrupted; run the same command to continue",
     ]
     out = tmp_path / "out"
     assert layout.frame_indices(out) == [0, 1, 2]

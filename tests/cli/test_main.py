@@ -82,5 +82,5 @@ def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()
     assert process.returncode == INTERRUPTED
-    assert told.splitlines()[-1] == "droguekit: interrupted; the same command goes on with what is finished"
+    assert told.splitlines()[-1] == "droguekit: interrupted; run the same command to continue"
     assert "Traceback" not in told

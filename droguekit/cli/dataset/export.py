@@ -26,7 +26,7 @@ def export(
 ) -> None:
     """Write a dataset's labels in another format, with the images where the format has them.
 
-    What the format cannot hold as it is in the dataset is counted and printed.
+    The command counts and prints what the format cannot represent.
     """
     log = ExportLog(progress_report())
     for path in write_export(format_, dataset, out, log):

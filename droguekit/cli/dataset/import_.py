@@ -23,7 +23,11 @@ def import_(
     out: Annotated[Path, output_option("--out", "DIR", "The new dataset's folder.")],
     calibration: Annotated[
         Path | None,
-        typer.Option("--calibration", metavar="FILE", help="OpenCV's M1, D1, M2, D2, R, T; a bag's own if left out."),
+        typer.Option(
+            "--calibration",
+            metavar="FILE",
+            help="OpenCV stereo calibration (M1, D1, M2, D2, R, T); by default the bag's.",
+        ),
     ] = None,
     calibration_unit: Annotated[str, typer.Option(metavar="m|cm|mm", help="Unit of the calibration's T.")] = "m",
     drogue: Annotated[str, typer.Option("--drogue", metavar="NAME|FILE", help="Preset or .toml file.")] = "red-8",
@@ -31,23 +35,25 @@ def import_(
         Path | None, typer.Option("--boxes", metavar="FILE", help="COCO boxes of the drogue, by image name.")
     ] = None,
     topics: Annotated[
-        str | None, typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics of a bag, where several are.")
+        str | None, typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics, where a bag has several.")
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", help="Pairs a second in a folder; 25 if left out.", show_default=False),
+        typer.Option("--rate", metavar="HZ", help="Pairs per second in a folder; 25 by default.", show_default=False),
     ] = None,
     encoding: Annotated[
         str | None,
-        typer.Option(metavar="linear|gamma", help="Of the numbers; by default gamma for 8 bit, linear for deeper."),
+        typer.Option(metavar="linear|gamma", help="Encoding of pixel values; by default gamma for 8 bit, else linear."),
     ] = None,
-    black_level: Annotated[float, typer.Option(metavar="DN", help="Number that no light gives.")] = 0.0,
-    bits: Annotated[int | None, typer.Option(help="Bits that 16-bit images use; by default as the first pair.")] = None,
+    black_level: Annotated[float, typer.Option(metavar="DN", help="Pixel value without light.")] = 0.0,
+    bits: Annotated[
+        int | None, typer.Option(help="Bits used in 16-bit images; by default as in the first pair.")
+    ] = None,
 ) -> None:
     """Make a dataset without truth from real stereo images, for `navigate`, `preview` and `benchmark`.
 
-    Pixels stay as they are: the rig's eyes get the calibration's distortion and rotation, and navigation rectifies what
-    it measures.
+    Pixels stay as they are: the rig stores the calibration's distortion and rotation, and navigation rectifies the
+    points that it measures.
     """
     options = ImportOptions(calibration, calibration_unit, drogue, boxes, topics, rate, encoding, black_level, bits)
     count = import_images(source, out, options, progress_report())

@@ -29,9 +29,9 @@ def merge(
     ],
     tar: TarOption = None,
 ) -> None:
-    """Join shards of one recipe to the dataset that one run would have made.
+    """Join shards of one recipe into the dataset that a single run would have made.
 
-    Refuses shards of different recipes, versions or processors, and shards that lack frames or hold damaged ones.
+    Refuses shards of different recipes, versions or processors, and shards with missing or damaged frames.
     """
     from droguekit.batch.merge_shards import merge_shards
 

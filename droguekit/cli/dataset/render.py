@@ -27,7 +27,7 @@ EXAMPLES = (
     "droguekit render my-recipe.toml --out data/mine --seed 7 --workers 4",
     "droguekit render demo --out data/demo --frames 0:10   (a part now, the rest later)",
     "droguekit render my-recipe.toml --out s3://bucket/mine --tar 1000   (an object store, tar files of 1000 pairs)",
-    "droguekit render demo --out data/demo-0 --shard 0/4   (a fourth here, the others elsewhere; see `merge`)",
+    "droguekit render demo --out data/demo-0 --shard 0/4   (a quarter here, the rest on other machines; see `merge`)",
 )
 
 
@@ -45,29 +45,35 @@ def render(
     ],
     seed: SeedOption = None,
     frames: Annotated[
-        str | None, typer.Option("--frames", metavar="A:B", help="Only frames A up to but without B.")
+        str | None, typer.Option("--frames", metavar="A:B", help="Only frames from A up to B - 1.")
     ] = None,
     shard: Annotated[
         str | None,
-        typer.Option("--shard", metavar="I/N", help="Only every N-th of the frames, from the I-th on, I from 0."),
+        typer.Option("--shard", metavar="I/N", help="Only every N-th frame, starting with the I-th (counted from 0)."),
     ] = None,
     tar: TarOption = None,
     workers: WorkersOption = None,
     timeout: Annotated[
         float | None,
-        typer.Option("--timeout", metavar="S", help="Seconds for one frame; by default what `droguekit plan` tells."),
+        typer.Option(
+            "--timeout", metavar="S", help="Seconds allowed for one frame; by default what `droguekit plan` shows."
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, such as tcp://HOST:8786, to work on."),
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Render on the workers of this Dask scheduler, such as tcp://HOST:8786.",
+        ),
     ] = None,
     engine: EngineOption = None,
 ) -> None:
     """Make a dataset from a recipe.
 
-    The same command again goes on where the last one stopped: pairs that are whole stay, damaged ones are made again,
-    and the result is the same as that of one undisturbed run. Ctrl-C finishes the pairs in hand and stops; twice stops
-    at once.
+    Run again, the same command continues where it stopped: it keeps complete pairs and renders damaged ones again, and
+    the result is the same as that of an uninterrupted run. Ctrl-C finishes the pairs being rendered and stops; a second
+    Ctrl-C stops at once.
     """
     source = open_recipe(recipe, seed, engine)
     wanted = parse_shard(shard, parse_frames(frames, source.recipe.frames.count))

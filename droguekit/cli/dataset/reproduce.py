@@ -16,10 +16,10 @@ def reproduce(
     dataset: DatasetArgument,
     frame: Annotated[int, typer.Option("--frame", metavar="N", help="Index of the frame.")],
 ) -> None:
-    """Make one frame of a dataset again, from its manifest alone, and compare record and images.
+    """Render one frame of a dataset again, from its manifest alone, and compare record and images.
 
-    On the same processor with the same packages both must be the same bit for bit. Elsewhere the draws must be equal
-    and the labels agree within 1e-9; the command says which of the two it proved, and exits with 1 when neither holds.
+    On the same processor with the same packages, both must be identical bit for bit. Elsewhere the random draws must be
+    equal and the labels agree within 1e-9. The command says which of the two holds, and exits with 1 when neither does.
     """
     from droguekit.batch.reproduce_frame import reproduce_frame
 

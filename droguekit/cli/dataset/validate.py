@@ -14,22 +14,22 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "droguekit validate data/demo",
-    "droguekit validate data/demo --published   (is it the demo that was published?)",
+    "droguekit validate data/demo --published   (compare with the published demo)",
 )
 
 
 def validate(
     dataset: DatasetArgument,
     published: Annotated[
-        bool, typer.Option("--published", help="Compare also with the published manifest of the dataset's recipe.")
+        bool, typer.Option("--published", help="Also compare with the published manifest of the dataset's recipe.")
     ] = False,
 ) -> None:
-    """Check a dataset: every file there and unchanged, labels in agreement with part ids, annotations with records.
+    """Check that all files are there and unchanged, that labels agree with part ids, and annotations with records.
 
-    With --published also whether it is the dataset that was published: bit for bit, or, made with other packages or on
-    another processor, with the same labels.
+    With --published, also check whether it is the published dataset: bit for bit, or with the same labels where it was
+    made with other packages or on another processor.
 
-    Exits with 1 and a line for each fault when something is wrong.
+    Exits with 1 and prints a line for each fault it finds.
     """
     from labelgen.validation.dataset_checks import validate_dataset
 

@@ -23,30 +23,32 @@ def benchmark(
     dataset: DatasetArgument,
     estimates: Annotated[
         Path | None,
-        typer.Option("--estimates", metavar="FILE.jsonl", help="Of `navigate`, or anybody's in that format."),
+        typer.Option("--estimates", metavar="FILE.jsonl", help="Written by `navigate`, or any in that format."),
     ] = None,
     detections: Annotated[
         list[Path] | None,
-        typer.Option("--detections", metavar="FILE.json", help="Of `detect`, or anybody's COCO results. Repeatable."),
+        typer.Option("--detections", metavar="FILE.json", help="Written by `detect`, or any COCO results. Repeatable."),
     ] = None,
     detector: Annotated[
         list[str] | None,
-        typer.Option("--detector", metavar="NAME|FILE.onnx", help="Runs a detector and scores it. Repeatable."),
+        typer.Option("--detector", metavar="NAME|FILE.onnx", help="Run a detector and score it. Repeatable."),
     ] = None,
     split: Annotated[
         str | None,
-        typer.Option("--split", metavar="NAME", help="Detectors: train, val, test or all; by default test if there."),
+        typer.Option(
+            "--split", metavar="NAME", help="For detections: train, val, test or all; by default test, if there is one."
+        ),
     ] = None,
     threshold: Annotated[
         float | None,
-        typer.Option("--threshold", help="Detectors: score from which a box counts in recall and false alarms."),
+        typer.Option("--threshold", help="For detections: lowest score that counts in recall and false alarms."),
     ] = None,
-    json_: Annotated[Path | None, output_option("--json", "FILE", "Gets the numbers.")] = None,
-    html: Annotated[Path | None, output_option("--html", "FILE", "Gets the report, one page.")] = None,
+    json_: Annotated[Path | None, output_option("--json", "FILE", "Write the numbers.")] = None,
+    html: Annotated[Path | None, output_option("--html", "FILE", "Write the report as one page.")] = None,
 ) -> None:
     """Compare pose estimates, or a detector's boxes, with the truth of a dataset.
 
-    An imported dataset has none: there, estimates are compared with their own measurements, and both with boxes if any.
+    An imported dataset has no truth: its estimates are compared with their own measurements, and with boxes if any.
     """
     options = DetectionOptions(detections or (), detector or (), split, threshold)
     for line in benchmark_lines(dataset, estimates, options, (json_, html), progress_report()):

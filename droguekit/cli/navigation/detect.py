@@ -21,23 +21,23 @@ EXAMPLES = (
 
 def detect(
     dataset: DatasetArgument,
-    out: Annotated[Path, output_option("--out", "FILE.json", "Gets the boxes, as COCO results.")],
+    out: Annotated[Path, output_option("--out", "FILE.json", "Write the boxes as COCO results.")],
     detector: DetectorOption = None,
-    least_score: Annotated[float, typer.Option("--least-score", help="Boxes that score less are left out.")] = 0.001,
+    least_score: Annotated[float, typer.Option("--least-score", help="Omit boxes with a lower score.")] = 0.001,
     tracker: Annotated[
         str | None,
         typer.Option(
             "--tracker",
             metavar="NAME",
-            help="Follow the drogue from pair to pair with bernoulli, flow, mil or pose-predict; the detector looks "
-            "where it is lost, and at every 25th pair. docs/explanation/tracking.md.",
+            help="Follow the drogue from pair to pair with bernoulli, flow, mil or pose-predict; the detector runs "
+            "when the drogue is lost, and on every 25th pair. docs/explanation/tracking.md.",
         ),
     ] = None,
 ) -> None:
-    """Find the drogue in every image of a dataset, from images, rig and drogue alone.
+    """Find the drogue in every image of a dataset, from images, rig and drogue dimensions alone.
 
-    Image ids are those of the dataset's annotations/all.json, also where there is no such file: twice the pair's index,
-    and 1 for the left or 2 for the right image.
+    Image ids are those of the dataset's annotations/all.json, even where there is no such file: twice the pair's index,
+    plus 1 for the left or 2 for the right image.
     """
     counts = detect_dataset(dataset, detector, out, least_score, progress_report(), tracker)
     typer.echo(

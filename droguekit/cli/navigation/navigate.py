@@ -23,16 +23,16 @@ EXAMPLES = (
 
 def navigate(
     dataset: DatasetArgument,
-    out: Annotated[Path, output_option("--out", "FILE.jsonl", "Gets one estimate a line.")],
+    out: Annotated[Path, output_option("--out", "FILE.jsonl", "Write one estimate a line.")],
     method: Annotated[
-        list[str] | None, typer.Option("--method", metavar="NAME", help="May be repeated; all methods unless given.")
+        list[str] | None, typer.Option("--method", metavar="NAME", help="Repeatable; all methods by default.")
     ] = None,
     centroids: Annotated[
         str,
         typer.Option(
             "--centroids",
             metavar="own|binary|edge",
-            help="Measured points: each method's own (the paper's chain, or edge fits), or one kind for all.",
+            help="How to measure centres: each method's own way (as the paper, or edge fits), or one for all.",
         ),
     ] = "own",
     detector: DetectorOption = None,
@@ -41,32 +41,32 @@ def navigate(
         typer.Option(
             "--tracker",
             metavar="NAME",
-            help="Follow the drogue; the detector only begins, checks, and looks again after a loss.",
+            help="Follow the drogue; the detector only starts, checks, and searches again after a loss.",
         ),
     ] = None,
     redetect_every: Annotated[
         int | None,
-        typer.Option(metavar="N", help="The detector checks the tracker at every N-th pair; 25 if left out."),
+        typer.Option(metavar="N", help="The detector checks the tracker on every N-th pair; 25 by default."),
     ] = None,
     filtered: Annotated[
-        bool, typer.Option("--filter", help="Also filtered estimates, of METHOD+filter, with docking.")
+        bool, typer.Option("--filter", help="Add filtered estimates as METHOD+filter, with docking quantities.")
     ] = False,
     smoothed: Annotated[
-        bool, typer.Option("--smooth", help="Also estimates smoothed over each sequence, of METHOD+smoother.")
+        bool, typer.Option("--smooth", help="Add estimates smoothed over each sequence as METHOD+smoother.")
     ] = False,
     capture_radius: Annotated[
         float | None,
-        typer.Option(metavar="M", help="A miss within it is a capture; by default what the drogue's opening allows."),
+        typer.Option(metavar="M", help="Largest miss that is a capture; by default from the drogue's opening."),
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option(metavar="HZ", help="Real time: pairs come at this rate, and those that come too late are told."),
+        typer.Option(metavar="HZ", help="Real time: pairs arrive at this rate; late ones are skipped and counted."),
     ] = None,
     latency: Annotated[
-        Path | None, output_option("--latency", "FILE.json", "Gets the latencies of --rate by stage.")
+        Path | None, output_option("--latency", "FILE.json", "Write the latencies of --rate by stage.")
     ] = None,
 ) -> None:
-    """Estimate the drogue's pose in every pair of a dataset, from images, rig and drogue alone."""
+    """Estimate the drogue's pose in every pair of a dataset, from images, rig and drogue dimensions alone."""
     options = NavigationOptions(
         centroids=centroids,
         detector=detector,

@@ -25,54 +25,54 @@ def train(
         list[str],
         typer.Argument(
             metavar="SOURCE",
-            help="Datasets' folders or URLs, and recipes, shipped or .toml, which are rendered into OUT/datasets.",
+            help="Datasets (folders or URLs) and recipes (shipped or .toml; rendered into OUT/datasets).",
         ),
     ],
     out: Annotated[Path, output_option("--out", "DIR", "The training's folder; made if missing.")],
     variant: Annotated[Literal["l", "s"] | None, typer.Option("--variant", help="Large or small network.")] = None,
-    attention: Annotated[
-        Literal["eca", "se"] | None, typer.Option("--attention", help="Attention to channels.")
-    ] = None,
+    attention: Annotated[Literal["eca", "se"] | None, typer.Option("--attention", help="Channel attention.")] = None,
     fusion: Annotated[
         Literal["asff", "concat"] | None, typer.Option("--fusion", help="Fusion of the three scales.")
     ] = None,
     mosaic: Annotated[
-        bool | None, typer.Option("--mosaic/--no-mosaic", help="Put four images together; on by default.")
+        bool | None, typer.Option("--mosaic/--no-mosaic", help="Mosaic of four images; on by default.")
     ] = None,
     views: Annotated[
         Literal["one", "both"] | None, typer.Option("--views", help="Eyes of a pair in one batch; both by default.")
     ] = None,
     image_passes: Annotated[
-        int | None, typer.Option("--image-passes", help="Images that go through the network in all; 40,000.")
+        int | None, typer.Option("--image-passes", help="Images in total; 40,000 by default.")
     ] = None,
     size: Annotated[
-        str | None, typer.Option("--size", metavar="HxW", help="The network's input, multiples of 32; 480x640.")
+        str | None, typer.Option("--size", metavar="HxW", help="Input size, multiples of 32; 480x640 by default.")
     ] = None,
     final_size: Annotated[
-        str | None, typer.Option("--final-size", metavar="HxW", help="The same in the last half of the training.")
+        str | None, typer.Option("--final-size", metavar="HxW", help="Input size in the last half; --size by default.")
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Of weights and augmentation; 0.")] = None,
-    device: Annotated[Literal["cpu", "cuda"] | None, typer.Option("--device", help="Where to compute; cpu.")] = None,
-    threads: Annotated[int | None, typer.Option("--threads", help="That compute; as many as cores.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of weights and augmentation; 0 by default.")] = None,
+    device: Annotated[
+        Literal["cpu", "cuda"] | None, typer.Option("--device", help="Device to train on; cpu by default.")
+    ] = None,
+    threads: Annotated[int | None, typer.Option("--threads", help="Threads; as many as cores by default.")] = None,
     settings: Annotated[
         Path | None, typer.Option("--settings", metavar="FILE", help="TOML of settings, which options here override.")
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option("--cache", metavar="DIR", help="For images at the network's size; OUT/cache.")
+        Path | None, typer.Option("--cache", metavar="DIR", help="For resized images; OUT/cache by default.")
     ] = None,
     start_from: Annotated[
         str | None,
         typer.Option(
             "--start-from",
             metavar="NAME|FILE",
-            help="Weights to begin with: mobile-s, mobile-l, an .onnx of droguekit, or best.pt of a training.",
+            help="Initial weights: mobile-s, mobile-l, an .onnx of droguekit, or best.pt of a training.",
         ),
     ] = None,
     workers: WorkersOption = None,
 ) -> None:
     """Train a detector on datasets, evaluate it on their test splits, and export it as ONNX.
 
-    The same command again goes on where the last one stopped. Ctrl-C saves and stops; twice stops at once.
+    Run again, the same command continues where it stopped. Ctrl-C saves and stops; a second Ctrl-C stops at once.
     """
     changes = {
         "variant": variant,

@@ -25,10 +25,10 @@ def browse(
     ] = None,
     workers: WorkersOption = None,
 ) -> None:
-    """Write a page to look through a dataset: filters, both eyes of a pair large, labels and estimates drawn over them.
+    """Write a page to look through a dataset, with filters, and with labels and estimates drawn over both images.
 
-    It needs no server and no network. Run again it keeps the pictures that are still right. Exit code 1 says that some
-    pairs could not be read; they are named, and the page has the others.
+    The page needs no server and no network. Run again, the command keeps the pictures that are still valid. It exits
+    with 1 when some pairs could not be read; it names them, and the page shows the others.
     """
     from droguekit.batch.execution import default_workers
     from droguekit.batch.progress import progress_report

@@ -30,9 +30,9 @@ def view(
         Path | None, output_option("--save", "FILE.rrd", "Write a recording instead of opening the viewer.")
     ] = None,
 ) -> None:
-    """Show a dataset in the rerun viewer: both eyes, boxes and markers, the drogue in 3-D, errors over time.
+    """Show a dataset in the rerun viewer: both images with boxes and markers, the drogue in 3-D, errors over time.
 
-    Needs the extra `viz`. Exit code 1 says that some pairs could not be read; they are named, and the others are shown.
+    Needs the extra `viz`. Exits with 1 when some pairs could not be read; they are named, and the others are shown.
     """
     if save is not None and save.suffix != _SUFFIX:
         raise ValueError(f"--save: must end in {_SUFFIX}, got {save}")
