@@ -53,7 +53,7 @@ def plan_lines(
     lines.append(f"a frame that is at work for {duration(frame_timeout_s(recipe))} counts as hung and is tried again")
     yield from lines
     if probe:
-        costs = list(_cost(probe_cost(recipe, plan), default_workers() if workers is None else workers))
+        costs = list(cost_lines(probe_cost(recipe, plan), default_workers() if workers is None else workers))
         yield from costs
         lines += costs
     if html is not None:
@@ -143,7 +143,7 @@ def _verdict(check: LawCheck) -> str:
     )
 
 
-def _cost(cost: CostEstimate, workers: int) -> Iterator[str]:
+def cost_lines(cost: CostEstimate, workers: int) -> Iterator[str]:
     from droguekit.batch.cost_estimate import cpu_s
 
     yield "measured, with one worker, once it was warm:"

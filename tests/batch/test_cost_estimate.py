@@ -25,7 +25,7 @@ from droguekit.batch.failure_policy import make_drop
 from droguekit.batch.frame_task import FrameReport
 from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
 from droguekit.batch.worker_pool import WorkerLimits
-from droguekit.cli.dataset.plan import _cost
+from droguekit.workflows.planning import cost_lines
 
 RECIPE = """
 name = "spread"
@@ -182,7 +182,7 @@ def test_as_many_frames_as_terms_say_nothing_of_scatter() -> None:
 
 @pytest.mark.parametrize("error_s", [None, 50.0])
 def test_a_scatter_is_told_only_where_it_is_known(error_s: float | None) -> None:
-    lines = list(_cost(replace(cost(24, 1), error_s=error_s), 1))
+    lines = list(cost_lines(replace(cost(24, 1), error_s=error_s), 1))
     # One process and one scene: 1000.5 s.
     told = "" if error_s is None else ", give or take 5 % by how the measured ones scatter"
     assert f"all pairs: 16 min 40 s of processor time{told}" in lines
