@@ -13,8 +13,8 @@ from datasets_manifest.storage.storage import Location, open_storage
 if TYPE_CHECKING:
     from droguekit.batch.progress import ProgressReport
     from droguekit.benchmark.blind_check import BlindCheck
-    from droguekit.benchmark.detection.detector_runner import DetectorRunner
     from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import DetectorRunner
     from droguekit.benchmark.pose_benchmark import BenchmarkResult
     from droguekit.benchmark.results.detection_result import DetectionResult
     from nav.detector.onnx_cost import NetworkCost
@@ -163,8 +163,8 @@ def benchmark_detections(
 def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorOutput]:
     """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
-    from droguekit.benchmark.detection.detector_runner import DetectorRunner
     from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import DetectorRunner
     from droguekit.benchmark.results.detection_result import image_id_of, read_detections
     from geometry.stereo import EYES
     from nav.detector.detector_registry import detector_factory
@@ -183,8 +183,8 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
 
 def _detector_run(name_or_file: str, detecting: DetectorRunner, report: ProgressReport) -> DetectorOutput:
     """What a detector finds in all images."""
-    from droguekit.benchmark.detection.detector_runner import LEAST_SCORE
     from droguekit.benchmark.detection.detection_scores import DetectorOutput
+    from droguekit.benchmark.detection.detector_runner import LEAST_SCORE
 
     report.say(f"{detecting.name}: looking for the drogue, without the truth")
     report.begin("pairs", detecting.pairs)

@@ -144,6 +144,7 @@ def _verdict(check: LawCheck) -> str:
 
 
 def cost_lines(cost: CostEstimate, workers: int) -> Iterator[str]:
+    """The estimated time and size of a run by so many workers, and the measurements behind it."""
     from droguekit.batch.cost_estimate import cpu_s
 
     yield "measured, with one worker, once it was warm:"

@@ -224,7 +224,9 @@ def write_browse(
     indices = source.frame_indices()
     if not indices:
         raise ValueError(f"{dataset}: holds no pairs yet")
-    answers = {} if estimates is None else estimates_by_method(_without_unused_parts(estimates), indices, str(estimates))
+    answers = (
+        {} if estimates is None else estimates_by_method(_without_unused_parts(estimates), indices, str(estimates))
+    )
     with lock_page_folder(out):
         return _write(source, out, answers, workers, report)
 
