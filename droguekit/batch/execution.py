@@ -1,4 +1,4 @@
-"""Who makes frames: worker processes of this machine, as many as it can carry, or a Dask scheduler."""
+"""Who renders frames: worker processes, as many as this machine can run, or a Dask scheduler."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-# A worker with the engine loaded and a 1280 x 960 pair in work stays below this.
+# A worker that has the engine loaded and renders a 1280 x 960 pair stays below this.
 GIB_PER_WORKER = 1.5
 _GROUP = Path("/sys/fs/cgroup")
 
 
 @dataclass(frozen=True)
 class ExecutionOptions:
-    """Who makes frames, and how long each may take.
+    """Who renders frames, and how long each may take.
 
     Attributes:
-        workers: processes of this machine; 0 works in this process, for debugging; None is as many as the machine
-            can carry.
+        workers: processes of this machine; 0 runs in this process, for debugging; None means as many as cores and
+            memory allow.
         timeout_s: for one frame; None computes it from the recipe. [s]
         scheduler: address of a Dask scheduler whose workers make the frames instead, or None.
         pairs_per_tar: how many frames come into a tar file; None keeps what the dataset has, folders at first.
@@ -53,7 +53,7 @@ def available_cores(group: Path = _GROUP) -> int:
 
 
 def available_memory_gib(group: Path = _GROUP) -> float:
-    """Memory that is free for new processes, by the kernel's and the container's account. [GiB]
+    """Memory that is free for new processes, as the kernel and the container's limit tell. [GiB]
 
     Args:
         group: folder of the control group.
@@ -63,7 +63,7 @@ def available_memory_gib(group: Path = _GROUP) -> float:
         limit = (group / "memory.max").read_text(encoding="ascii").strip()
         if limit != "max":
             used = int((group / "memory.current").read_text(encoding="ascii"))
-            # Files in the cache count as used, and go when memory is asked for.
+            # Cached files count as used, but are evicted when memory is needed.
             free.append(int(limit) - used + _number_after("inactive_file", group / "memory.stat"))
     except (OSError, ValueError):
         pass  # no container limit is in force
@@ -71,7 +71,7 @@ def available_memory_gib(group: Path = _GROUP) -> float:
 
 
 def default_workers() -> int:
-    """As many workers as there are cores, and as the memory holds."""
+    """As many workers as cores and memory allow."""
     return max(1, min(available_cores(), int(available_memory_gib() / GIB_PER_WORKER)))
 
 

@@ -1,4 +1,4 @@
-"""Which errors cost one frame, and which speak of the recipe or the place."""
+"""Which errors drop a single frame, and which end the run because other frames would fail too."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from datasets_manifest.storage.manifest import Drop
 from droguekit.batch.frame_task import OtherBuildError
 from render.engine import EngineUnavailableError
 
-# Errors that other frames would meet too; so does whatever the first frames of a run all fail by.
+# Errors of machine or storage, which other frames would meet too.
 FATAL_ERRORS = (OSError, EngineUnavailableError, OtherBuildError)
+# If so many first frames of a run all fail, whatever the error, the recipe is at fault.
 FIRST_FRAMES = 3
 
 
 def error_reason(error: BaseException) -> str:
-    """What an error says, in one line."""
+    """The message of an error on one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def make_drop(frame_index: int, error: BaseException) -> Drop:
-    """The drop of a frame that an error keeps from being made."""
+    """Record that a frame is dropped because of an error."""
     return Drop(frame_index=frame_index, reason=error_reason(error))

@@ -28,22 +28,22 @@ from scenes.sampler import sample_frame
 
 
 class FrameFaultError(ValueError):
-    """Labels and rendered passes of a frame contradict each other; the frame is not written."""
+    """Labels and rendered passes of a frame disagree; the frame is not written."""
 
 
 class OtherBuildError(ValueError):
-    """What runs here is not what made, or makes, the other frames of the dataset."""
+    """Software or processor differ from those that make the other frames of the dataset."""
 
 
 @dataclass(frozen=True)
 class FrameTask:
-    """Makes frames of one recipe and writes them into one dataset; calling it with an index makes that frame.
+    """Makes frames of a recipe and writes them into a dataset; calling it with an index makes that frame.
 
     Attributes:
         recipe: what to make.
-        dataset: where it lies.
-        engine_version: what the frames that are already there were made with, or None when there are none.
-        packing: which frames come into a tar file together, or None where each keeps its folder.
+        dataset: its place.
+        engine_version: of the existing frames, or None when there are none.
+        packing: which frames share a tar file, or None where each keeps its folder.
     """
 
     recipe: Recipe
@@ -63,14 +63,14 @@ class FrameTask:
         engine = _engine(self.recipe.render.engine)
         if self.engine_version not in (None, engine.version):
             raise OtherBuildError(
-                f"{self.dataset}: its frames were made by {self.engine_version}, but here runs {engine.version}, whose "
-                "pixels differ; go on where they were made, or render into a new folder"
+                f"{self.dataset}: its frames were made by {self.engine_version}, but this is {engine.version}, whose "
+                "pixels differ; continue where they were made, or render into a new folder"
             )
         began_s = time.monotonic()
         try:
             record, files, stage_s = make_frame(self.recipe, frame_index, engine)
         except OSError as error:
-            # Engines and encoders pass things through temporary files.
+            # Engines and encoders use temporary files.
             where = error.filename or tempfile.gettempdir()
             raise OSError(error.errno, f"frame {frame_index}: cannot be made: {where}: {error.strerror}") from error
         with _timed(stage_s, "write"):
@@ -80,14 +80,16 @@ class FrameTask:
         return FrameReport(socket.gethostname(), time.monotonic() - began_s, stage_s, distance_m, size_bytes)
 
     def pack(self, frame_index: int, report: FrameReport) -> FrameReport:
-        """Pack the tar file that a frame has made complete, if it has; apart, for it may take longer than a frame may.
+        """Pack the tar file that a frame completes, if it does.
+
+        This is a separate step because it may take longer than the time limit of a frame.
 
         Args:
-            frame_index: of the frame, which is made.
-            report: of it.
+            frame_index: of the frame, which exists.
+            report: of the frame.
 
         Returns:
-            The report with what this cost.
+            The report with the time of packing added.
 
         Raises:
             OSError: the tar file could not be written; the frames stay as they are.
@@ -102,10 +104,10 @@ class FrameTask:
 
 @dataclass(frozen=True)
 class FrameReport:
-    """What making a frame cost.
+    """Time and size of one frame.
 
     Attributes:
-        host: where it was made.
+        host: name of the machine.
         wall_s: from start to end, with the engine loaded. [s]
         stage_s: CPU seconds by stage. [s]
         distance_m: of the drogue, None in an empty frame. [m]

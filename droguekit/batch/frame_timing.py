@@ -1,4 +1,4 @@
-"""What frames of a recipe cost, made by warm worker processes and thrown away."""
+"""Time and memory of frames, made by warmed-up worker processes and deleted."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from datasets_manifest.storage.reader import read_record_table
 from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.worker_pool import run_in_own_process, run_tasks
 
-# A worker's first frames compile kernels.
+# The first frames of a worker compile kernels.
 _WARM_UP_FRAMES = 4
 
 
 @dataclass(frozen=True)
 class MeasuredFrame:
-    """One frame as it was made.
+    """Measurements of one frame.
 
     Attributes:
-        report: what it cost.
-        noise_over_sensor: noise of the renderer over that of the sensor on the drogue, None if it was not measured.
-        memory_bytes: that the process held afterwards, None where the system does not tell.
+        report: its time and size.
+        noise_over_sensor: the renderer's noise over the sensor's on the drogue, None if it was not measured.
+        memory_bytes: resident memory of the process afterwards, None where the system does not report it.
     """
 
     report: FrameReport
@@ -38,7 +38,7 @@ class MeasuredFrame:
 def measure_frames(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
     """Make frames in a temporary folder, in a process of their own with one thread.
 
-    The first frame is made once more before, so that loading the engine and compiling its kernels does not count.
+    The first frame is made once before, so that loading the engine and compiling its kernels do not count.
 
     Args:
         recipe: what to make.
@@ -59,9 +59,9 @@ def _measure(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ..
 
 
 def frames_per_second(recipe: Recipe, workers: int) -> float:
-    """How many frames come to be in a second of the clock when all of a recipe are made, in a temporary folder.
+    """Frames per second of wall time when all frames of a recipe are made, in a temporary folder.
 
-    What starting costs does not count, and what it costs that fewer and fewer workers have work at the end does.
+    Starting the workers does not count; that they run out of work one by one at the end does.
 
     Args:
         recipe: what to make; its first frames, `warm_up(workers)` of them, do not count.
@@ -86,7 +86,7 @@ def frames_per_second(recipe: Recipe, workers: int) -> float:
 
 
 def warm_up_frames(workers: int) -> int:
-    """Frames of `frames_per_second` that do not count."""
+    """Number of frames that `frames_per_second` does not count."""
     return _WARM_UP_FRAMES * workers
 
 

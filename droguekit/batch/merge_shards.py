@@ -1,4 +1,4 @@
-"""Parts of a dataset that were made apart, joined to one."""
+"""Join parts of a dataset that were made separately."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _SHOWN = 20
 def merge_shards(
     out: Location, shards: Sequence[Location], report: ProgressReport, pairs_per_tar: int | None = None
 ) -> RunSummary:
-    """Join shards of one recipe to a dataset, the same that one run would have made.
+    """Join shards of one recipe into the dataset that a single run would have made.
 
-    Frames that are in `out` already and whole stay, so a merge that was stopped goes on by the same call.
+    Complete frames that are in `out` already stay, so the same call continues a merge that was stopped.
 
     Args:
-        out: where the dataset is to lie; a folder is made if missing.
-        shards: places of datasets that hold a part of the frames each; a frame may be in several.
-        report: hears how it goes.
-        pairs_per_tar: how many frames come into a tar file; None leaves that as it is, folders at first.
+        out: place of the dataset; a folder is made if missing.
+        shards: datasets that hold a part of the frames each; a frame may be in several.
+        report: is told of the progress.
+        pairs_per_tar: frames in a tar file; None keeps what the dataset has, folders at first.
 
     Raises:
-        ValueError: the shards do not belong together, lack frames, or hold a damaged one; nothing is joined then.
+        ValueError: the shards do not belong together, lack frames, or hold damaged ones; nothing is joined then.
         OSError: the folder cannot be written; finished frames stay.
     """
     if not shards:
@@ -70,14 +70,14 @@ def merge_shards(
 
 
 def _check_compatible(first: Location, manifest: Manifest, shard: Location, other: Manifest) -> None:
-    """See that two shards are parts of one dataset.
+    """Check that two shards are parts of one dataset.
 
     Raises:
         ValueError: they are not; names what differs.
     """
     differing = differing_keys(manifest.recipe.model_dump(mode="json"), other.recipe.model_dump(mode="json"))
     if differing:
-        raise ValueError(f"{shard}: is of another recipe than {first}, which differs in {', '.join(differing[:8])}")
+        raise ValueError(f"{shard}: is of another recipe than {first}: they differ in {', '.join(differing[:8])}")
     for what, there, here in _build_pairs(manifest, other):
         if there != here:
             raise ValueError(
@@ -89,7 +89,7 @@ def _check_compatible(first: Location, manifest: Manifest, shard: Location, othe
 
 
 def _build_pairs(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str, str]]:
-    """What two shards were made with, by the kind of thing."""
+    """What two shards were made with: kind, value of the one, value of the other."""
     yield "render version", manifest.render_version, other.render_version
     if manifest.engines and other.engines:
         yield "engine", " and ".join(sorted(manifest.engines)), " and ".join(sorted(other.engines))
@@ -104,7 +104,7 @@ def _build_pairs(manifest: Manifest, other: Manifest) -> Iterator[tuple[str, str
 
 
 def _locate_frames(manifests: dict[Location, Manifest]) -> dict[int, Location]:
-    """Where each frame lies.
+    """The shard that holds each frame.
 
     Raises:
         ValueError: two shards hold different frames of one index.
@@ -114,7 +114,9 @@ def _locate_frames(manifests: dict[Location, Manifest]) -> dict[int, Location]:
         for entry in manifest.frames:
             known, sha256 = found.setdefault(entry.frame_index, (shard, entry.record_sha256))
             if sha256 != entry.record_sha256:
-                raise ValueError(f"{shard}: its frame {entry.frame_index} is not the one of {known}; make both again")
+                raise ValueError(
+                    f"{shard}: its frame {entry.frame_index} differs from that of {known}; make both again"
+                )
     return {frame_index: shard for frame_index, (shard, _) in found.items()}
 
 
@@ -125,7 +127,7 @@ def _check_complete(count: int, there: set[int]) -> None:
             f" and {len(missing) - _SHOWN} more" if len(missing) > _SHOWN else ""
         )
         raise ValueError(
-            f"shards: {len(missing)} of {count} frames are in none of them: {shown}; start the commands of their "
+            f"shards: {len(missing)} of {count} frames are in none of them: {shown}; run the commands of their "
             "shards again, then merge"
         )
 
@@ -142,6 +144,6 @@ def _copy_frame(source: Dataset, frame_index: int, out: Location) -> int:
     try:
         record, files = source.whole_frame(frame_index)
     except ValueError as error:
-        raise ValueError(f"{error}; start the command of that shard again, which mends it, then merge") from error
+        raise ValueError(f"{error}; run the command of that shard again, which repairs it, then merge") from error
     write_frame(out, record, files)
     return sum(len(content) for content in files.values())

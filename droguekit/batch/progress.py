@@ -1,4 +1,4 @@
-"""How far long work is: a bar with rate and time left on a terminal, plain lines otherwise."""
+"""Progress of long work: a bar with rate and time left on a terminal, plain lines otherwise."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
-# A log gets a line at most this often, and always one at the end.
+# Shortest time between two lines of a log, which always gets one at the end.
 _LINE_EVERY_S = 10.0
 
 
 class ProgressReport(Protocol):
-    """What long work tells while it runs."""
+    """Where long work reports its progress."""
 
     def begin(self, what: str, total: int) -> None:
-        """`total` pieces of work of the kind `what` are about to start."""
+        """Start counting `total` pieces of work, called `what`."""
         ...
 
     def advance(self) -> None:
-        """One piece is finished."""
+        """Count one finished piece."""
         ...
 
     def note(self, text: str) -> None:
-        """What stands beside the count from the next piece on, such as failures so far; empty for nothing."""
+        """Show a text beside the count from the next piece on, such as failures so far; empty for none."""
         ...
 
     def say(self, text: str) -> None:
-        """A line for the user."""
+        """Print a line for the user."""
         ...
 
     def end(self) -> None:
-        """The work that `begin` announced is over."""
+        """Stop counting."""
         ...
 
 
 class PlainProgress:
-    """Lines on a stream that nobody watches live."""
+    """Progress as lines, for logs."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -54,7 +54,7 @@ class PlainProgress:
         self._told_s = time.monotonic()
 
     def advance(self) -> None:
-        """Count one, and tell it when the last line is old or this was the last piece."""
+        """Count one, and print a line if the last one is old or this was the last piece."""
         self._pace.advance()
         now_s = time.monotonic()
         if self._pace.done < self._pace.total and now_s - self._told_s < _LINE_EVERY_S:
@@ -76,7 +76,7 @@ class PlainProgress:
 
 
 class _BarWithNote(Progress):
-    """A bar with a line below it."""
+    """A progress bar with a line of text below."""
 
     note = ""
 
@@ -88,7 +88,7 @@ class _BarWithNote(Progress):
 
 
 class TerminalProgress:
-    """A bar on a terminal, with the note on a line of its own: narrow terminals have no room for both."""
+    """Progress as a bar on a terminal, with the note on a line of its own for narrow terminals."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -100,7 +100,7 @@ class TerminalProgress:
         """Draw the empty bar."""
         self._progress = _BarWithNote(
             TextColumn("{task.description}"),
-            BarColumn(bar_width=None),  # what the others leave of the line
+            BarColumn(bar_width=None),  # takes the rest of the line
             MofNCompleteColumn(),
             TextColumn("{task.fields[pace]}", markup=False),
             console=self._console,
@@ -135,7 +135,7 @@ class TerminalProgress:
 
 
 class ProgressRate:
-    """How fast equal pieces of work go, by the clock that nobody sets."""
+    """Rate of equal pieces of work, by the monotonic clock."""
 
     def __init__(self, total: int) -> None:
         self.total, self.done = total, 0
@@ -150,7 +150,7 @@ class ProgressRate:
         return f"{60 * self._per_second():.1f} a minute"
 
     def time_left(self) -> str:
-        """Of the pieces that are not finished, at the rate so far; empty when there are none."""
+        """Time left at the rate so far; empty when everything is finished."""
         left = self.total - self.done
         return f"{duration(left / self._per_second())} left" if left else ""
 
@@ -159,7 +159,7 @@ class ProgressRate:
 
 
 def progress_report() -> ProgressReport:
-    """The report that suits where standard error goes."""
+    """A bar if standard error is a terminal, else lines."""
     if sys.stderr.isatty():
         return TerminalProgress(Console(stderr=True))
     return PlainProgress(sys.stderr)

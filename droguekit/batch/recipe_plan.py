@@ -25,11 +25,11 @@ from labelgen.part_pixels import drogue_box
 from scenes.drogue_appearance import drogue_of_scene
 from scenes.sampler import family_of_scene, recipe_of_scene, sample_left_from_drogue, scene_of_frame, split_of_scenes
 
-# A worker may have to load its engine and compile kernels within its first frame.
+# A worker may load its engine and compile kernels within its first frame.
 _START_S = 300.0
-# Our choice, far above what an engine takes for one sample of one pixel.
+# Our choice, far above what any engine takes for one sample of one pixel.
 _S_PER_SAMPLE = 20e-6
-# Shares to within 1 %, and every frame of the corpora that ship; ten seconds.
+# Gives shares to within 1 % and every frame of the shipped corpora, in ten seconds.
 _MOST_SAMPLED = 10_000
 # Distance, middle and side of the box, room of its middle.
 _COLUMNS = 8
@@ -37,18 +37,18 @@ _COLUMNS = 8
 
 @dataclass(frozen=True, eq=False)
 class DrawnFrames:
-    """Frames of a recipe as they were drawn; NaN where a frame has no drogue.
+    """Random draws of a recipe's frames; NaN where a frame has no drogue.
 
     Attributes:
         indices: (N,) of the frames, ascending, without those that cannot be made.
-        scenes: (N,) which scene each belongs to.
-        families: (N,) place of its family in the recipe, 0 without families.
+        scenes: (N,) scene of each.
+        families: (N,) index of its family in the recipe, 0 without families.
         distances_m: (N,) of the rim centre along the optical axis. [m]
         centers_px: (N, 2) middle of the drogue's full box in the left image. [px]
         sides_px: (N,) side of the square with that box's area. [px]
         rooms_px: (N, 4) lowest and highest u, lowest and highest v, between which the middle of the box may lie so that
             both views hold all of the drogue; NaN also where the place is not drawn. [px]
-        drops: frames that were asked for and cannot be made, and why.
+        drops: requested frames that cannot be made, and why.
     """
 
     indices: tuple[int, ...]
@@ -66,7 +66,7 @@ class RecipePlan:
     """What a recipe will make.
 
     Attributes:
-        by_split: pairs in each split, with those that turn out to be impossible to make.
+        by_split: pairs in each split, including those that cannot be made.
         by_scene: pairs in each scene, likewise.
         by_family: scenes and pairs of each family, in the recipe's order; empty without families.
         drawn: the frames that were drawn.
@@ -84,13 +84,13 @@ class RecipePlan:
 
     @property
     def dropped_fraction(self) -> float:
-        """Share of the frames that were to be drawn that cannot be made."""
+        """Share of the drawn frames that cannot be made."""
         drops = len(self.drawn.drops)
         return drops / (drops + len(self.drawn.indices))
 
 
 def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> RecipePlan:
-    """Count the pairs of a recipe, and draw its frames or, of a larger one, so many of them evenly spread.
+    """Count the pairs of a recipe and draw its frames; of a large recipe, `most_sampled` frames, spread evenly.
 
     Raises:
         ValueError: none of the first ones can be made.
@@ -114,7 +114,7 @@ def plan_recipe(recipe: Recipe, most_sampled: int = _MOST_SAMPLED) -> RecipePlan
 
 
 def frame_timeout_s(recipe: Recipe) -> float:
-    """How long a frame may take before it counts as hung: far more than any engine needs here. [s]"""
+    """Time after which a frame counts as hung, far longer than any engine needs. [s]"""
     camera = recipe.rig.camera
     samples = 2 * camera.width_px * camera.height_px * recipe.render.samples_per_px
     return _START_S + float(round(_S_PER_SAMPLE * samples))
@@ -186,7 +186,7 @@ def _box(drogue: DrogueParameters, rig: StereoRig, pose: RigidTransform) -> tupl
     boxes = np.array([drogue_box(drogue, rig, pose, eye) for eye in EYES])
     low, size = boxes[:, :2], boxes[:, 2:]
     center = low[0] + size[0] / 2
-    # A box moves in both images alike, as far as neither leaves its image; lenses may move it further out.
+    # A box shifts equally in both images until one leaves its image; lens distortion may move it further out.
     edge = rig.largest_shift_px() - 0.5
     limit = np.array([rig.camera.width_px, rig.camera.height_px]) - 1 - edge
     lowest, highest = center - (low.min(axis=0) - edge), center + (limit - (low + size).max(axis=0))

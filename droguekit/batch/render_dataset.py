@@ -1,4 +1,4 @@
-"""A dataset from a recipe: what is there stays, the rest is made by worker processes, and the whole is described."""
+"""Render a dataset from a recipe: keep what exists, make the rest in worker processes, and describe the whole."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from scenes.sampler import split_of_scenes
 
 @dataclass
 class RunTotals:
-    """What the new frames of a run cost together.
+    """Time and size of the new frames of a run.
 
     Attributes:
-        made: their indices in the order in which they were finished.
-        retries: attempts that came to nothing by an accident and were repeated.
+        made: their indices in the order in which they finished.
+        retries: attempts that failed by an accident and were repeated.
         stage_s: CPU seconds by stage. [s]
         size_bytes: of their files without the records.
-        peak_gib: the most memory that the workers were seen to hold together between their frames. [GiB]
+        peak_gib: largest memory of all workers together, measured between frames. [GiB]
     """
 
     made: list[int] = field(default_factory=list)
@@ -52,19 +52,19 @@ class RunTotals:
     peak_gib: float = 0.0
 
     def add(self, index: int, report: FrameReport) -> None:
-        """One more frame is finished."""
+        """Add a finished frame."""
         self.made.append(index)
         self.stage_s.update(report.stage_s)
         self.size_bytes += report.size_bytes
 
     def as_event(self) -> dict[str, Any]:
-        """The numbers alone, for the last event of a run."""
+        """The numbers for the last event of a run."""
         numbers = {"retries": self.retries, "size_bytes": self.size_bytes, "workers_peak_gib": round(self.peak_gib, 3)}
         return {"made": len(self.made), **numbers, "stage_s": dict(self.stage_s)}
 
 
 class EventLog:
-    """What happened when and where, a JSON object a line; not part of what a dataset is."""
+    """The log of a run, one JSON object a line; not part of the dataset's hash."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -79,19 +79,19 @@ class EventLog:
 def make_frames(
     task: FrameTask, todo: Sequence[int], options: ExecutionOptions, report: ProgressReport, events: EventLog
 ) -> tuple[RunTotals, list[Drop]]:
-    """Make frames; those that cannot be made are dropped with their reason, and the others go on.
+    """Make frames; those that cannot be made are dropped with a reason.
 
     Args:
         task: makes a frame.
-        todo: indices of the frames, without repetition, in the order in which they begin.
+        todo: indices of the frames, each once, in the order in which they start.
         options: who makes them.
-        report: hears how it goes.
-        events: are told of every attempt.
+        report: is told of the progress.
+        events: gets every attempt.
 
     Raises:
-        ValueError: what went wrong would go wrong for other frames too.
-        OSError: the same, such as a full disk.
-        KeyboardInterrupt: it was told to stop, and the frames in hand are finished.
+        ValueError: an error that other frames would meet too.
+        OSError: likewise, such as a full disk.
+        KeyboardInterrupt: the user asked to stop, and the running frames are finished.
     """
     totals, drops = RunTotals(), list[Drop]()
     if not todo:
@@ -105,7 +105,7 @@ def make_frames(
         report.end()
     if stop.is_requested:
         events.write("stop", left=len(todo) - len(totals.made), **totals.as_event())
-        report.say(f"stopped after {len(totals.made)} of {len(todo)} pairs, all of which are whole")
+        report.say(f"stopped after {len(totals.made)} of {len(todo)} pairs, all of them complete")
         raise KeyboardInterrupt
     return totals, drops
 
@@ -118,7 +118,7 @@ def _record_attempt(
     report: ProgressReport,
     events: EventLog,
 ) -> None:
-    """Count an attempt, and tell of it."""
+    """Count, log and report an attempt."""
     totals.peak_gib = max(totals.peak_gib, attempt.workers_gib)
     if attempt.value is not None:
         totals.add(attempt.index, attempt.value)
@@ -137,7 +137,7 @@ def _record_attempt(
 
 
 def _progress_note(retries: int, drops: int, workers_gib: float) -> str:
-    """What stands beside the count: failures and memory, as far as there are any."""
+    """Failures and memory, as far as there are any."""
     parts = (
         f"{retries} repeated" if retries else "",
         f"{drops} left out" if drops else "",
@@ -162,7 +162,7 @@ def _failure_reason(attempt: TaskAttempt[FrameReport], made: int, dropped: int, 
     """Why an attempt failed.
 
     Raises:
-        BaseException: what went wrong, where it goes wrong for other frames too.
+        BaseException: the error itself, if other frames would meet it too.
     """
     error = attempt.error
     if error is None:
@@ -176,7 +176,7 @@ def _failure_reason(attempt: TaskAttempt[FrameReport], made: int, dropped: int, 
     return error_reason(error)
 
 
-# For so many, a step that takes milliseconds a pair is long enough to be announced.
+# With so many pairs, a step of milliseconds a pair takes long enough to be announced.
 _MANY_PAIRS = 1000
 
 
@@ -186,10 +186,11 @@ class RunSummary:
 
     Attributes:
         totals: of the frames that it made.
-        kept: frames that were there already.
-        drops: frames that were given up, and why.
-        pairs: in the dataset now; `planned` by the recipe.
-        dataset_sha256: of the dataset as it stands now.
+        kept: frames that existed before.
+        drops: frames that cannot be made, and why.
+        pairs: in the dataset now.
+        planned: pairs of the recipe.
+        dataset_sha256: of the dataset now.
     """
 
     totals: RunTotals
@@ -207,22 +208,22 @@ def render_dataset(
     options: int | ExecutionOptions,
     report: ProgressReport,
 ) -> RunSummary:
-    """Make the frames of a recipe that are not there yet, then describe the whole dataset.
+    """Make the missing frames of a recipe, then describe the whole dataset.
 
     The result does not depend on the order of `frames`, on who makes them, or on how often a run was stopped and
-    started again. A dataset of part of the frames is a valid one, which a later run completes.
+    started again. A dataset with only a part of the frames is valid; a later run completes it.
 
     Args:
         source: the recipe; its text is kept in the dataset.
-        out: where the dataset lies: a folder, or a URL that all who make frames can reach.
+        out: place of the dataset: a folder, or a URL that all workers can reach.
         frames: indices of the frames to make, in that order.
-        options: who makes them; a number is that many worker processes of this machine.
-        report: hears how it goes.
+        options: who makes them; a number means that many worker processes of this machine.
+        report: is told of the progress.
 
     Raises:
         ValueError: wrong frames, a folder of another recipe, or an engine that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
-        KeyboardInterrupt: it was told to stop; finished frames stay, and what describes the dataset is as before.
+        KeyboardInterrupt: the user asked to stop; finished frames stay, and manifest and annotations are as before.
     """
     recipe = source.recipe
     if len(set(frames)) != len(frames) or any(not 0 <= index < recipe.frames.count for index in frames):
@@ -233,13 +234,13 @@ def render_dataset(
         manifest = read_manifest(out)
         present = len(list_frames(out))
         if present >= _MANY_PAIRS:
-            report.say(f"looking whether {present} pairs are as they were written")
+            report.say(f"checking {present} existing pairs")
         there = check_frames(out, manifest)
         kept = sum(index in there.whole for index in frames)
         if kept:
-            report.say(f"{kept} of {len(frames)} pairs are there already and whole")
+            report.say(f"{kept} of {len(frames)} pairs exist already")
         if there.damaged:
-            report.say(f"{len(there.damaged)} pairs are damaged and made again: {_shortened(there.damaged)}")
+            report.say(f"{len(there.damaged)} pairs are damaged and will be made again: {_shortened(there.damaged)}")
         events.write("start", frames=len(frames), kept=kept, damaged=there.damaged, **asdict(options))
         packing = read_packing(out, frames if isinstance(frames, range) else range(recipe.frames.count))
         task = FrameTask(recipe, out, there.engine_version, packing)
@@ -255,13 +256,13 @@ def render_dataset(
 
 
 def describe_dataset(recipe: Recipe, out: Location, drops: Sequence[Drop], made_by: Manifest | None = None) -> Manifest:
-    """Write all that a dataset holds besides its frames: manifest, annotations, calibration, card, Croissant.
+    """Write everything besides the frames: manifest, annotations, calibration, card, Croissant.
 
     Args:
-        recipe: that it was made from.
-        out: where it lies; nobody may be making frames there any more.
-        drops: frames that were given up.
-        made_by: names the versions and processor features by which the frames were made; those of here if None.
+        recipe: of the dataset.
+        out: its place; no frames may be in the making there.
+        drops: frames that cannot be made.
+        made_by: manifest with the versions and processor features that made the frames; None means this process.
 
     Raises:
         OSError: they cannot be written.
@@ -279,7 +280,7 @@ def describe_dataset(recipe: Recipe, out: Location, drops: Sequence[Drop], made_
 
 
 def still_missing(drops: Iterable[Drop], out: Location) -> tuple[Drop, ...]:
-    """The last reason for each dropped frame that has not been made since."""
+    """The latest drop of each frame that has not been made since."""
     there = set(list_frames(out))
     latest = {drop.frame_index: drop for drop in drops if drop.frame_index not in there}
     return tuple(latest.values())

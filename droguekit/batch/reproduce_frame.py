@@ -1,4 +1,4 @@
-"""One frame of a dataset made again, and what its sameness proves."""
+"""Render a frame of a dataset again, and compare it with the stored one."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from datasets_manifest.storage.storage import Location
 from droguekit.batch.frame_task import FrameTask
 from droguekit.batch.worker_pool import run_in_own_process
 
-# Numbers that do not come from noisy paths agree this well on any machine: numpy's exp, log, tan, arctan2 and matmul
-# differ in their last bits between instruction sets.
+# Numbers that do not depend on rendered noise agree this well on any machine: numpy's exp, log, tan, arctan2 and
+# matmul differ in their last bits between instruction sets.
 _RELATIVE_TOLERANCE = 1e-9
-# What follows from the pixels, which are the same only for the same engine, packages and processor features.
+# Keys that depend on pixels, which are equal only for the same engine, packages and processor features.
 _FROM_PIXELS = {
     "file_sha256",
     "monte_carlo_noise_fraction",
@@ -36,13 +36,13 @@ _FROM_HERE = {"engine", "engine_version"}
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What making a frame again showed.
+    """The outcome of making a frame again.
 
     Attributes:
-        verdict: `identical`, bit for bit; `equivalent`, made with other versions or on another processor, with equal
-            draws and numbers that agree; or `different`.
-        differences: where the records differ beyond what is promised.
-        build_differences: versions and processor features that are not those of the dataset.
+        verdict: `identical` bit for bit; `equivalent` if versions or processor differ, but draws are equal and numbers
+            agree; or `different`.
+        differences: keys at which the records differ by more than they may.
+        build_differences: versions and processor features that differ from the dataset's.
     """
 
     verdict: Literal["identical", "equivalent", "different"]
@@ -77,7 +77,7 @@ def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
 
 
 def _make_again(recipe: Recipe, frame_index: int) -> tuple[dict[str, Any], str]:
-    """The record that a fresh folder gets, and the hash of its file."""
+    """Make the frame in a new folder: its record, and the hash of the record's file."""
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         FrameTask(recipe, Path(folder))(frame_index)
         data = (frame_folder(Path(folder), frame_index) / RECORD_FILE).read_bytes()
@@ -85,7 +85,7 @@ def _make_again(recipe: Recipe, frame_index: int) -> tuple[dict[str, Any], str]:
 
 
 def _build_differences(source: Dataset, old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, ...]:
-    """How this machine differs from the one that the manifest describes, as far as pixels depend on it."""
+    """Versions and processor features on which pixels depend and that differ from the manifest's."""
     manifest = source.manifest
     found = differing_builds(manifest.software, manifest.cpu_features, software_versions(), cpu_features())
     if old["engine_version"] != new["engine_version"]:

@@ -1,4 +1,4 @@
-"""What of a dataset is already there: whether it belongs to the recipe, and which frames can stay."""
+"""Open an existing dataset to continue it: check that it belongs to the recipe, and which frames can stay."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ _OWN_NAMES = {
 
 @contextmanager
 def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None = None) -> Iterator[TextIO]:
-    """A dataset, new or to be completed, that nobody else writes into meanwhile.
+    """Open a new dataset, or one to be completed, and keep other runs out of it.
 
-    Frames that a manifest does not vouch for are removed, and so is what killed runs left half-written. A folder that
-    was new is removed again when the block ends with an error before it has a frame.
+    Frames of a folder without a manifest are removed, and so are half-written files of killed runs. A new folder is
+    removed again when the block ends with an error before it has a frame.
 
-    Nothing keeps two runs out of one place on an object store, and they damage each other's frames: give each its own
-    place and merge.
+    An object store has no lock: two runs in one place would damage each other's frames. Give each its own place and
+    merge.
 
     Args:
-        out: where it lies.
-        source: the recipe that it is made from.
-        pairs_per_tar: how many frames come into a tar file; None leaves that as it is.
+        out: its place.
+        source: its recipe.
+        pairs_per_tar: frames in a tar file; None keeps what the dataset has.
 
     Yields:
         The stream to which events are appended.
 
     Raises:
-        ValueError: the place holds something else, another recipe, or another run at work.
+        ValueError: the place holds other things or a dataset of another recipe, or another run is writing into it.
         OSError: it cannot be made or written.
     """
     check_pairs_per_tar(pairs_per_tar)
@@ -69,10 +69,10 @@ def open_dataset(out: Location, source: RecipeSource, pairs_per_tar: int | None 
 
 
 def finish_frames(out: Location) -> None:
-    """What is left to do for the frames once nobody makes any more: pack them, and remove what lost workers began.
+    """Finish after the last frame: pack frames, and remove incomplete files of lost workers.
 
     Raises:
-        ValueError: a list of a tar file is missing or damaged.
+        ValueError: the index of a tar file is missing or damaged.
         OSError: a place that cannot be read or written.
     """
     remove_leftovers(out)
@@ -98,11 +98,11 @@ def _open_folder(out: Path) -> Iterator[TextIO]:
 
 @contextmanager
 def _open_place(out: Location) -> Iterator[TextIO]:
-    """The same where files cannot be appended to: new events wait in a temporary file until the block ends."""
+    """The same on an object store, where files cannot be appended to: events go to a temporary file until the end."""
     _refuse_foreign(out)
     storage = open_storage(out)
     before = storage.read(layout.EVENTS_FILE) if storage.exists(layout.EVENTS_FILE) else b""
-    storage.write(layout.EVENTS_FILE, before)  # by which workers elsewhere see that it is the same place
+    storage.write(layout.EVENTS_FILE, before)  # lets remote workers check that they see the same place
     with storage.spool("") as events:
         try:
             yield events
@@ -117,7 +117,7 @@ def _refuse_foreign(out: Location) -> None:
     names = open_storage(out).names("")
     foreign = [name for name in names if name not in _OWN_NAMES and not name.startswith(".")]
     if foreign and layout.MANIFEST_FILE not in names:
-        raise ValueError(f"{out}: holds other things ({foreign[0]}); give a new or empty folder for the dataset")
+        raise ValueError(f"{out}: holds other files ({foreign[0]}); give a new or empty folder for the dataset")
 
 
 def _lock(events: TextIO, out: Path) -> None:
@@ -126,14 +126,14 @@ def _lock(events: TextIO, out: Path) -> None:
 
 
 def _check_or_create(out: Location, source: RecipeSource) -> None:
-    """See that the place belongs to the recipe; a new one gets its manifest before its first frame."""
+    """Check that the place belongs to the recipe; a new one gets its manifest before its first frame."""
     storage, recipe = open_storage(out), source.recipe
     if storage.exists(layout.MANIFEST_FILE):
         manifest = read_manifest(out)
         differing = differing_keys(manifest.recipe.model_dump(mode="json"), recipe.model_dump(mode="json"))
         if differing:
             shown = ", ".join(differing[:8]) + (f" and {len(differing) - 8} more" if len(differing) > 8 else "")
-            raise ValueError(f"{out}: was made from another recipe, which differs in {shown}; give another folder")
+            raise ValueError(f"{out}: was made from another recipe: they differ in {shown}; give another folder")
         if manifest.render_version != RENDER_VERSION:
             raise ValueError(
                 f"{out}: was made by render version {manifest.render_version}, but this is {RENDER_VERSION}, whose "
@@ -166,12 +166,12 @@ def differing_keys(first: Any, second: Any, where: str = "") -> list[str]:
 
 @dataclass(frozen=True)
 class ExistingFrames:
-    """The frames that a folder holds.
+    """The frames in a folder.
 
     Attributes:
-        whole: indices of those that are as they were written.
+        whole: indices of the undamaged frames.
         damaged: indices of the others, ascending.
-        engine_version: that made the whole ones; None when there are none.
+        engine_version: that made the undamaged frames; None when there are none.
     """
 
     whole: frozenset[int]
@@ -180,11 +180,11 @@ class ExistingFrames:
 
 
 def check_frames(dataset: Location, manifest: Manifest) -> ExistingFrames:
-    """Tell the frames that are there as they were written from the damaged ones.
+    """Check every frame of a dataset against its hashes.
 
     Raises:
-        ValueError: whole frames were made by different engine versions, or a list of a tar file is damaged.
-        OSError: the connection to an object store fails, which says nothing of the frames.
+        ValueError: frames were made by different engine versions, or the index of a tar file is damaged.
+        OSError: the connection to an object store fails, which is no damage of the frames.
     """
     vouched = {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
     whole: list[int] = []
@@ -206,7 +206,7 @@ def check_frames(dataset: Location, manifest: Manifest) -> ExistingFrames:
 
 
 def _read_whole(store: FrameStore, frame_index: int, record_sha256: str | None) -> PairRecord | None:
-    """The record of a frame, or None where it or a file of the frame is not what was written.
+    """The record of a frame, or None where the record or a file of the frame is damaged.
 
     Raises:
         OSError: the connection to an object store fails.

@@ -1,4 +1,4 @@
-"""Ctrl-C once to finish what is in hand, twice to stop at once."""
+"""The first Ctrl-C finishes running tasks, the second stops at once."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequest:
-    """While it is entered, the first Ctrl-C or SIGTERM is a request, and the second raises `KeyboardInterrupt`.
+    """While entered, the first Ctrl-C or SIGTERM is a request, and the second raises `KeyboardInterrupt`.
 
-    It can be waited for like a connection: it becomes readable with the request.
+    It can be waited for like a connection: it becomes readable when the request comes.
 
     Attributes:
-        is_requested: whether the first has come.
-        wake: called then, in the signal handler, for those who wait in another way.
+        is_requested: whether the first signal has come.
+        wake: called then, in the signal handler, for code that does not wait for the descriptor.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
-        """With the function that tells the user that the request was heard."""
+        """Take the function that prints a line for the user."""
         self.is_requested = False
         self.wake: Callable[[], object] | None = None
         self._say = say
@@ -32,14 +32,14 @@ class StopRequest:
         self._reader = self._writer = -1
 
     def __enter__(self) -> Self:
-        """Take over the signals; outside the main thread Python gives them to nobody, and nothing changes."""
+        """Install the signal handlers; outside the main thread, where Python allows none, nothing changes."""
         self._reader, self._writer = os.pipe()
         if threading.current_thread() is threading.main_thread():
             self._before = {number: signal.signal(number, self._hear) for number in _SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give the signals back."""
+        """Restore the signal handlers."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         os.close(self._reader)
@@ -50,9 +50,9 @@ class StopRequest:
         return self._reader
 
     def acknowledge(self, in_hand: int) -> None:
-        """Tell the user what happens now."""
+        """Tell the user what happens next."""
         self._say(
-            f"stopping: frames in hand ({in_hand}) are finished first; once more stops at once and loses only those"
+            f"stopping after the running frames ({in_hand}); press Ctrl-C again to stop at once and lose only those"
         )
 
     def _hear(self, number: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""Many tasks in worker processes: an accident costs one attempt of one task, and the others go on."""
+"""Run many tasks in worker processes, so that a crash costs one attempt of one task and the others continue."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ class WorkerDiedError(OSError):
     """The process of a task ended before the task did."""
 
     def __init__(self, exit_code: int | None) -> None:
-        """With the exit code as `multiprocessing` gives it: negative for a signal."""
+        """Take the exit code of `multiprocessing`, which is negative for a signal."""
         super().__init__(f"its worker process died ({_exit_text(exit_code)})")
         self.exit_code = exit_code
 
 
 class TaskTimeoutError(OSError):
-    """A task was still at work after its time."""
+    """A task ran longer than its time limit."""
 
     def __init__(self, timeout_s: float) -> None:
-        """With the time it had. [s]"""
+        """Take the time limit. [s]"""
         super().__init__(f"it was still at work after {timeout_s:g} s and was stopped")
 
 
 class Worker:
-    """A process that works on at most one task; nothing of it is shared with another one."""
+    """A process that works on at most one task and shares nothing with other workers."""
 
     def __init__(self, function: Callable[[int], Any], then: Callable[[int, Any], Any] | None = None) -> None:
-        """Start it; it says `READY` once it can take tasks.
+        """Start the process, which sends `READY` once it can take tasks.
 
         Args:
-            function: of each index.
-            then: makes of an index and its value what is sent back; it says `UNTIMED` before.
+            function: is called with each index.
+            then: turns an index and its value into what is sent back, without time limit; `UNTIMED` is sent before.
 
         Raises:
             OSError: it cannot be started.
@@ -70,22 +70,22 @@ class Worker:
         self.is_timed = False
         self._began_s = 0.0
 
-    def give(self, index: int) -> None:
-        """Let it begin a task; that it is dead already shows when its answer is received."""
+    def assign(self, index: int) -> None:
+        """Start a task; a worker that is already dead shows when its answer is received."""
         self.index, self.is_timed = index, True
         self._began_s = time.monotonic()
         with suppress(OSError):
             self.connection.send(index)
 
     def seconds_left(self, timeout_s: float) -> float:
-        """How long its task may go on; the clock is one that nobody sets. [s]"""
+        """Time left for its task, by the monotonic clock. [s]"""
         return self._began_s + timeout_s - time.monotonic()
 
     def receive(self) -> Any:
-        """What it sent.
+        """Receive what it sent.
 
         Raises:
-            WorkerDiedError: it has ended without an answer.
+            WorkerDiedError: it ended without an answer.
         """
         try:
             return self.connection.recv()
@@ -94,16 +94,16 @@ class Worker:
             raise WorkerDiedError(self._process.exitcode) from error
 
     def kill(self) -> None:
-        """End it at once, with all processes that it has started."""
+        """Kill it with all processes that it started."""
         try:
             os.killpg(self._process.pid or 0, signal.SIGKILL)
         except ProcessLookupError:
-            self._process.kill()  # it has no group of its own yet, or has ended
+            self._process.kill()  # it has no process group yet, or has ended
         self._process.join()
         self.connection.close()
 
-    def dismiss(self) -> None:
-        """Let it end by itself; it holds no task."""
+    def shut_down(self) -> None:
+        """Let it end; it has no task."""
         self.connection.close()
         self._process.join()
 
@@ -114,10 +114,10 @@ def _serve(
     then: Callable[[int, Any], Any] | None,
     parent: int,
 ) -> None:
-    """The life of a worker: answers each index with (value, error, resident memory in GiB)."""
-    # A group of its own: Ctrl-C at the terminal reaches the parent alone, and a kill reaches what an engine started.
+    """The main loop of a worker: answers each index with (value, error, resident memory in GiB)."""
+    # In a process group of its own, Ctrl-C reaches only the parent, and a kill also reaches what an engine started.
     os.setpgid(0, 0)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a cluster that ends a job tells every process; the parent decides
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a cluster sends it to every process of a job; the parent decides
     _die_with_parent(parent)
     connection.send(READY)
     while True:
@@ -137,19 +137,19 @@ def _serve(
 
 
 def _die_with_parent(parent: int) -> None:
-    """Let the kernel kill this process when its parent ends, however it ends and whatever this process does."""
+    """Let the kernel kill this process when its parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
-        os._exit(1)  # it had ended before
+        os._exit(1)  # the parent has ended already
 
 
 def _picklable(error: Exception) -> Exception:
-    """The error, or one that says the same where it cannot cross to another process; with its traceback as a note."""
+    """The error with its traceback as a note, or a `ValueError` with its message where it cannot be pickled."""
     note = "".join(traceback.format_exception(error))
     try:
         copy: Exception = pickle.loads(pickle.dumps(error))
         same = type(copy) is type(error) and str(copy) == str(error)
-    except Exception:  # whatever a foreign class does wrong
+    except Exception:  # foreign classes may fail in any way
         same = False
     carried = error if same else ValueError(f"{type(error).__name__}: {error}")
     carried.add_note(f"In the worker process:\n{note}")
@@ -172,12 +172,12 @@ MAX_ATTEMPTS = 3
 
 @dataclass(frozen=True)
 class WorkerLimits:
-    """What a worker may take.
+    """Limits of a worker.
 
     Attributes:
-        timeout_s: for one task, from its start; None for any. [s]
-        tasks_per_process: before a fresh process takes over: renderers keep some memory with every frame.
-        process_gib: a process that holds more after a task is replaced; None for any. [GiB]
+        timeout_s: for one task, from its start; None for no limit. [s]
+        tasks_per_process: after which the process is replaced, since renderers leak some memory with every frame.
+        process_gib: a process that holds more memory after a task is replaced; None for no limit. [GiB]
     """
 
     timeout_s: float | None = None
@@ -198,15 +198,15 @@ class WorkerLimits:
 
 @dataclass(frozen=True)
 class TaskAttempt(Generic[T]):
-    """How one attempt at one task ended.
+    """The outcome of one attempt at a task.
 
     Attributes:
         index: of the task.
         number: 1 for the first attempt.
         value: what the task returned, or None.
         error: what it raised, `WorkerDiedError` when its process died, `TaskTimeoutError` when it took too long.
-        final: whether the task is not tried again.
-        workers_gib: memory that the workers held together when they last told, 0.0 where they do not. [GiB]
+        final: whether this was the last attempt.
+        workers_gib: memory of all workers together after their latest tasks, 0.0 where unknown. [GiB]
     """
 
     index: int
@@ -218,7 +218,7 @@ class TaskAttempt(Generic[T]):
 
 
 def is_accident(error: BaseException | None) -> bool:
-    """Whether an attempt failed in a way that another one may not."""
+    """Whether another attempt may succeed: the process died, took too long, or ran out of memory."""
     return isinstance(error, WorkerDiedError | TaskTimeoutError | MemoryError)
 
 
@@ -237,11 +237,11 @@ def run_tasks(
 
     Args:
         function: can be pickled.
-        indices: of the tasks, without repetition.
+        indices: of the tasks, each once.
         workers: number of processes; 0 runs in this process, for debugging, without limits.
-        limits: what a worker may take.
-        stop: once it is requested, no more tasks begin, and the iterator ends with those that are running.
-        then: follows on a task in the same process and has any time; makes of its index and value what is reported.
+        limits: of each worker.
+        stop: once it is requested, no more tasks start, and the iterator ends after the running ones.
+        then: runs after a task in the same process without time limit; turns index and value into what is reported.
 
     Raises:
         OSError: worker processes cannot be started.
@@ -251,12 +251,12 @@ def run_tasks(
             if stop is None or not stop.is_requested:
                 yield _attempt_here(function, then, index)
         return
-    crew = _WorkerPool[T](partial(Worker, function, then), deque(indices), workers, limits or WorkerLimits())
+    pool = _WorkerPool[T](partial(Worker, function, then), deque(indices), workers, limits or WorkerLimits())
     try:
-        while crew.fill(stop is not None and stop.is_requested):
-            yield from crew.attempts(stop)
+        while pool.fill(stop is not None and stop.is_requested):
+            yield from pool.attempts(stop)
     finally:
-        crew.kill()
+        pool.kill()
 
 
 def _attempt_here(function: Callable[[int], T], then: Callable[[int, T], T] | None, index: int) -> TaskAttempt[T]:
@@ -268,7 +268,7 @@ def _attempt_here(function: Callable[[int], T], then: Callable[[int, T], T] | No
 
 
 class _WorkerPool(Generic[T]):
-    """The workers of one run, the tasks that wait, and how often each task has failed."""
+    """The workers of a run, the waiting tasks, and how often each task has failed."""
 
     def __init__(self, start: Callable[[], Worker], waiting: deque[int], size: int, limits: WorkerLimits) -> None:
         self._start, self._waiting, self._size, self._limits = start, waiting, size, limits
@@ -277,23 +277,23 @@ class _WorkerPool(Generic[T]):
         self._deaths_at_start = 0
 
     def fill(self, stopping: bool) -> bool:
-        """Give every worker that has none a task, and start the workers that are missing.
+        """Give idle workers tasks, and start missing workers.
 
         Returns:
-            Whether there is anything to wait for.
+            Whether any task waits or runs.
         """
         if stopping:
             self._waiting.clear()
         for worker in [worker for worker in self._workers if worker.is_ready and worker.index is None]:
             if self._waiting:
-                worker.give(self._waiting.popleft())
+                worker.assign(self._waiting.popleft())
         starting = sum(not worker.is_ready for worker in self._workers)
         for _ in range(min(self._size - len(self._workers), len(self._waiting) - starting)):
             self._workers.append(self._start())
         return bool(self._waiting) or any(worker.index is not None for worker in self._workers)
 
     def attempts(self, stop: StopRequest | None) -> Iterator[TaskAttempt[T]]:
-        """Wait until something happens, and report the attempts that have ended with it."""
+        """Wait until something happens, and report the attempts that ended."""
         busy = [worker for worker in self._workers if worker.index is not None]
         awaited: list[Any] = [worker.connection for worker in self._workers]
         if stop is not None and not stop.is_requested:
@@ -306,19 +306,19 @@ class _WorkerPool(Generic[T]):
         if stop is not None and stop.fileno() in ready:
             stop.acknowledge(len(busy))
         for worker in [worker for worker in self._workers if worker.connection in ready]:
-            yield from self._hear(worker)
+            yield from self._handle_message(worker)
         for worker in [worker for worker in timed if worker in self._workers and worker.is_timed]:
             if self._limits.timeout_s is not None and worker.seconds_left(self._limits.timeout_s) <= 0:
                 yield self._fail(worker, TaskTimeoutError(self._limits.timeout_s))
 
-    def _hear(self, worker: Worker) -> Iterator[TaskAttempt[T]]:
+    def _handle_message(self, worker: Worker) -> Iterator[TaskAttempt[T]]:
         try:
             message = worker.receive()
         except WorkerDiedError as error:
             if worker.index is not None:
                 yield self._fail(worker, error)
             else:
-                self._lose_idle(worker, error)
+                self._remove_idle(worker, error)
             return
         if message == READY:
             worker.is_ready = True
@@ -339,11 +339,11 @@ class _WorkerPool(Generic[T]):
             self._limits.process_gib is not None and worker.resident_gib > self._limits.process_gib
         ):
             self._workers.remove(worker)
-            worker.dismiss()
+            worker.shut_down()
         yield TaskAttempt(index, self._failures[index] + 1, value, raised, True, workers_gib)
 
     def _fail(self, worker: Worker, error: BaseException) -> TaskAttempt[T]:
-        """End a worker by whose accident a task has failed; the task waits for its next attempt if it has one."""
+        """Kill the worker of a failed task, and queue the task again if it has attempts left."""
         index = cast(int, worker.index)
         self._workers.remove(worker)
         worker.kill()
@@ -356,11 +356,11 @@ class _WorkerPool(Generic[T]):
     def _resident_gib(self) -> float:
         return sum(worker.resident_gib for worker in self._workers)
 
-    def _lose_idle(self, worker: Worker, error: WorkerDiedError) -> None:
-        """A death without a task costs none; but workers that die before their first one are no accident.
+    def _remove_idle(self, worker: Worker, error: WorkerDiedError) -> None:
+        """Remove a worker that died without a task.
 
         Raises:
-            OSError: they die again and again.
+            OSError: workers die again and again before their first task.
         """
         self._workers.remove(worker)
         self._deaths_at_start += not worker.is_ready
@@ -368,14 +368,14 @@ class _WorkerPool(Generic[T]):
             raise OSError(f"worker processes end before their first task; the last: {error}") from error
 
     def kill(self) -> None:
-        """End all workers at once."""
+        """Kill all workers."""
         for worker in self._workers:
             worker.kill()
         self._workers.clear()
 
 
 def run_in_own_process(function: Callable[[], T]) -> T:
-    """Run one function in a worker process of its own and return what it returns.
+    """Run a function in a process of its own and return its value.
 
     Raises:
         Exception: what the function raises, or `WorkerDiedError` when its process dies again and again.

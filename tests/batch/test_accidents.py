@@ -178,12 +178,12 @@ def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
     with waiting_run() as process:
         assert process.stderr is not None
         process.send_signal(number)
-        await_line(process.stderr, "stopping: frames in hand (1) are finished first")
+        await_line(process.stderr, "stopping after the running frames (1)")
         (tmp_path / "go-on").write_text("")
         told = process.stderr.read().splitlines()
     assert process.returncode == INTERRUPTED
     assert told[-2:] == [
-        "stopped after 3 of 8 pairs, all of which are whole",
+        "stopped after 3 of 8 pairs, all of them complete",
         "droguekit: interrupted; run the same command to continue",
     ]
     out = tmp_path / "out"

@@ -131,7 +131,7 @@ def test_a_request_to_stop_finishes_the_frames_in_hand(
     made = len(layout.frame_indices(out))
     # Two were finished, and at most two more were with the one worker.
     assert 2 <= made <= 4
-    assert report.told[-1] == f"stopped after {made} of 24 pairs, all of which are whole"
+    assert report.told[-1] == f"stopped after {made} of 24 pairs, all of them complete"
 
 
 @pytest.mark.slow  # Dask starts the worker anew four times
@@ -247,7 +247,7 @@ def test_workers_of_another_build_are_refused(
         with pytest.raises(FileNotFoundError, match=r"does not see .*elsewhere; give a folder on shared storage"):
             client.submit(lost, 0, pure=False).result()
         late = ClusterTask(FrameTask(parse_recipe(analytic_recipe), tmp_path, "analytic 0.1"), here, 600.0)
-        with pytest.raises(OtherBuildError, match=r"made by analytic 0\.1, but here runs"):
+        with pytest.raises(OtherBuildError, match=r"made by analytic 0\.1, but this is"):
             client.submit(late, 0, pure=False).result()
 
 

@@ -79,7 +79,7 @@ def test_missing_frames_are_named(
     made_shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert merge(tmp_path / "out", *made_shards[:2]) == WRONG_INPUT
-    assert "2 of 8 frames are in none of them: 2, 5; start the commands of their shards" in capsys.readouterr().err
+    assert "2 of 8 frames are in none of them: 2, 5; run the commands of their shards" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -136,7 +136,7 @@ def test_two_frames_of_one_index_are_refused(
     )
     write_manifest(shards[0], with_build(changed, changed.software, changed.cpu_features))
     assert merge(tmp_path / "out", *shards, made_shards[0]) == WRONG_INPUT
-    assert "its frame 0 is not the one of" in capsys.readouterr().err
+    assert "its frame 0 differs from that of" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("shard", "message"), [("3/3", "i from 0 to n - 1"), ("1", "i/n"), ("8/9", "none of the 8")])

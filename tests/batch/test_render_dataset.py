@@ -135,16 +135,14 @@ def test_another_recipe_is_refused_with_the_keys_that_differ(
 ) -> None:
     before = hashes(tiny_dataset)
     other = tiny_recipe.replace("seed = 5", "seed = 4").replace("high_m = 12.0", "high_m = 13.0")
-    with pytest.raises(
-        ValueError, match=r"another recipe, which differs in seed, distance\.high_m; give another folder"
-    ):
+    with pytest.raises(ValueError, match=r"another recipe: they differ in seed, distance\.high_m; give another folder"):
         make(tiny_dataset, text=other)
     assert hashes(tiny_dataset) == before
 
 
 def test_frames_of_another_engine_build_are_not_mixed_in(tiny_recipe: str, tiny_dataset: Path, tmp_path: Path) -> None:
     task = FrameTask(parse_recipe(tiny_recipe), tmp_path, engine_version="mitsuba 0.1")
-    with pytest.raises(ValueError, match=r"made by mitsuba 0\.1, but here runs mitsuba .*, whose pixels differ"):
+    with pytest.raises(ValueError, match=r"made by mitsuba 0\.1, but this is mitsuba .*, whose pixels differ"):
         run_in_own_process(partial(task, 0))
     assert list(tmp_path.iterdir()) == []
 
@@ -158,7 +156,7 @@ def test_frames_that_the_recipe_does_not_have_are_refused(make: Make, tmp_path: 
 
 def test_a_folder_with_other_things_is_refused_and_untouched(make: Make, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
-    with pytest.raises(ValueError, match=r"holds other things \(thesis\.tex\); give a new or empty folder"):
+    with pytest.raises(ValueError, match=r"holds other files \(thesis\.tex\); give a new or empty folder"):
         make(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 

@@ -142,7 +142,7 @@ def test_the_time_of_a_task_ends_before_what_follows_on_it(tasks: ModuleType, mo
     worker = Worker(tasks.square, partial(tasks.add, 10))
     try:
         assert worker.receive() == READY
-        worker.give(3)
+        worker.assign(3)
         assert worker.receive() == UNTIMED
         assert worker.receive()[0] == 19
     finally:

@@ -135,7 +135,7 @@ def test_demo_goes_from_a_recipe_to_a_report_and_keeps_what_is_there(
     shutil.copytree(smoke_dataset, out / "dataset")
     assert run(["demo", "smoke", "--out", str(out)]) == DONE
     told = capsys.readouterr()
-    assert "6 of 6 pairs are there already and whole" in told.err
+    assert "6 of 6 pairs exist already" in told.err
     assert sorted(path.name for path in out.iterdir()) == [
         "benchmark.json",
         "dataset",
