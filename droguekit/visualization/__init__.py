@@ -1,1 +1,1 @@
-"""Pictures of datasets and results for people to look at."""
+"""Draw datasets and results: sheets, videos, pages, the rerun viewer, mesh files and PDF."""

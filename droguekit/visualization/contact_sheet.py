@@ -1,4 +1,4 @@
-"""A contact sheet: left images side by side with their labels drawn in."""
+"""Contact sheets: left images side by side with their labels."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def _check_sheet(out: Path, count: int, columns: int, tile_width: int) -> None:
 def _draw_sheet(
     dataset: Location, count: int, columns: int, tile_width: int, by_family: bool
 ) -> tuple[Picture, int, int]:
-    """The sheet, how many pairs it shows, and how many there are."""
+    """The sheet, the number of pairs that it shows, and of all pairs."""
     is_blind = open_storage(dataset).exists(BLIND_FILE)
     if is_blind and by_family:
         raise ValueError(f"--by-family: {dataset} has no truth, and so no families")
@@ -90,7 +90,7 @@ def draw_contact_sheet(dataset: Dataset, frames: Sequence[int], columns: int, ti
     """Tiles of left images with box, marker and hub centres, and a caption with index and distance.
 
     Args:
-        dataset: where they come from.
+        dataset: of the pairs.
         frames: indices, in reading order; at least one.
         columns: tiles in a row.
         tile_width_px: width of a tile; its height follows the images.
@@ -130,8 +130,8 @@ def draw_family_sheet(dataset: Dataset, count: int, columns: int, tile_width_px:
     """Left images without labels, a row for each family of conditions, with the distance of the drogue in a corner.
 
     Args:
-        dataset: where they come from.
-        count: tiles in all, at most; every family gets as many as the others as long as it has pairs.
+        dataset: of the pairs.
+        count: tiles at most; every family gets the same number, as long as it has pairs.
         columns: families side by side.
         tile_width_px: width of a tile; its height follows the images.
 

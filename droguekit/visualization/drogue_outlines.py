@@ -1,4 +1,4 @@
-"""The circles of a drogue by which a pose can be seen in an image: rim, opening, markers, hub."""
+"""The circles of a drogue that show its pose in an image: rim, opening, markers, hub."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
 
-# Nearer than this to an eye's plane nothing can be drawn. [m]
+# Circles nearer to the camera's plane than this are not drawn. [m]
 NEAREST_M = 0.05
-# The chord of a rim of 700 px diameter then leaves it by 0.4 px, less than the line is wide.
+# The chords of a rim of 700 px diameter are then at most 0.4 px off, less than the line width.
 RIM_POINTS, MARKER_POINTS = 96, 32
 
 
 class Ring(NamedTuple):
-    """A circle across the drogue's axis, in the drogue frame. [m]"""
+    """A circle perpendicular to the drogue's axis, in the drogue frame. [m]"""
 
     kind: Literal["rim", "opening", "marker", "hub"]
     center_m: tuple[float, float, float]
@@ -42,7 +42,7 @@ def drogue_rings(drogue: DrogueParameters) -> tuple[Ring, ...]:
 
 
 def ring_images(rings: tuple[Ring, ...], pose: RigidTransform, rig: StereoRig, eye: Eye) -> list[Array]:
-    """Where the delivered image of an eye shows them.
+    """Project circles into the image of an eye, with lens distortion.
 
     Args:
         rings: of the drogue.
@@ -51,7 +51,7 @@ def ring_images(rings: tuple[Ring, ...], pose: RigidTransform, rig: StereoRig, e
         eye: which image.
 
     Returns:
-        (M, 2) corners of a closed line for each ring, in order [px]; rings that reach behind the eye are left out.
+        (M, 2) corners of a closed line for each ring, in order [px], without rings that reach behind the camera.
     """
     outlines = [disc_outline(pose, ring.center_m, ring.radius_m, ring.points) for ring in rings]
     shown = [outline for outline in outlines if outline[:, 2].min() > NEAREST_M]

@@ -1,4 +1,4 @@
-"""A video of a dataset's left images with labels, a method's estimates and their errors drawn in."""
+"""A video of a dataset's left images with labels, the estimates of a method and their errors."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _TEXT_RGB: Rgb = (235, 238, 242)
 _SOFT_RGB: Rgb = (150, 158, 168)
 _PAPER = 24
 _WHOLE_WIDTH_PX, _BAR_PX = 800, 64
-# The close-up shows the drogue and this much more of its surroundings.
+# Side of the close-up over that of the drogue's box.
 _MARGIN = 1.35
 _SMALLEST_PX = 32.0
-# What lies farther out, in widths of the image, is not drawn.
+# Points farther out than so many image widths are not drawn.
 _FARTHEST_WIDTHS = 8.0
-# Coordinates are handed to OpenCV in 1/16 px.
+# OpenCV gets coordinates in 1/16 px.
 _SHIFT = 4
 
 
@@ -48,15 +48,15 @@ def read_estimates_of_method(path: Path, dataset: Dataset, method: str | None) -
 
     Args:
         path: the file of estimates.
-        dataset: that it belongs to.
-        method: its name, or None where the file holds but one.
+        dataset: of the estimates.
+        method: its name, or None where the file has only one.
 
     Raises:
-        ValueError: the file cannot be used, has no such method, or several where none was named.
+        ValueError: the file cannot be used, does not have the method, or has several and none was named.
     """
     methods = estimates_by_method(read_estimates(path), dataset.frame_indices, str(path))
     if method is None and len(methods) > 1:
-        raise ValueError(f"--method: {path} holds several; name one of {', '.join(methods)}")
+        raise ValueError(f"--method: {path} has several methods; name one of {', '.join(methods)}")
     name = next(iter(methods)) if method is None else method
     if name not in methods:
         raise ValueError(f"--method: {path} holds {', '.join(methods)}, got {name}")
@@ -66,17 +66,17 @@ def read_estimates_of_method(path: Path, dataset: Dataset, method: str | None) -
 def write_overlay_video(
     dataset: Dataset, path: Path, count: int, sequence_id: int | None, estimates: tuple[str, Mapping[int, Estimate]]
 ) -> tuple[int, float]:
-    """Draw pairs of a dataset, spread evenly, and write them as they follow each other in time.
+    """Draw pairs of a dataset, spread evenly, and write them in the order of time.
 
     Args:
-        dataset: where they come from.
-        path: ends in .mp4 or .gif; takes its name when it is whole.
+        dataset: of the pairs.
+        path: ends in .mp4 or .gif; appears when it is complete.
         count: pairs at most.
         sequence_id: only pairs of this sequence, or None for all.
-        estimates: a method's name and its estimates by frame; no name for the truth alone.
+        estimates: a method's name and its estimates by frame; an empty name shows the truth alone.
 
     Returns:
-        How many pairs it shows, and how long it lasts. [s]
+        Number of pairs, and length of the video [s].
 
     Raises:
         ValueError: no such pairs, or one that cannot be read.
@@ -116,21 +116,21 @@ class _Overlay(NamedTuple):
 def draw_overlay(
     record: PairRecord, images: StereoImages, drogue: DrogueParameters, method: str, estimate: Estimate | None
 ) -> Picture:
-    """(H, W, 3) the left image, beside it the drogue enlarged, and a line of numbers above.
+    """(H, W, 3) the left image, the drogue enlarged beside it, and lines of numbers above.
 
     Boxes are yellow, the true outline is green; an estimate's outline is orange, its measured centres white.
 
     Args:
         record: the pair's truth.
         images: its images.
-        drogue: that is there or looked for.
-        method: whose estimate is drawn, empty for the truth alone.
-        estimate: what it says of the pair, or None for nothing.
+        drogue: that is or would be in view.
+        method: whose estimate is drawn; empty for the truth alone.
+        estimate: of the pair, or None.
     """
     lines = _lines(record, drogue, estimate)
     picture = display_picture(images)
     whole, scale = resized(picture, _WHOLE_WIDTH_PX)
-    # Codecs want even sizes.
+    # Video codecs need even sizes.
     height = whole.shape[0] // 2 * 2
     whole = whole[:height]
     _draw(whole, lines, scale, (-0.5, -0.5))
@@ -145,7 +145,7 @@ def draw_overlay(
 
 def _lines(record: PairRecord, drogue: DrogueParameters, estimate: Estimate | None) -> _Overlay:
     rig, rings = record.frame.rig, drogue_rings(drogue)
-    # An estimate may be anywhere: far beyond the picture OpenCV's fixed point overflows.
+    # An estimate may be anywhere, and OpenCV's fixed-point coordinates overflow far outside the picture.
     most_px = _FARTHEST_WIDTHS * rig.camera.width_px
 
     def outlines(pose: RigidTransform | None) -> list[Array]:
@@ -162,7 +162,7 @@ def _lines(record: PairRecord, drogue: DrogueParameters, estimate: Estimate | No
 
 
 def _draw(tile: Picture, lines: _Overlay, scale: float, corner: PixelPoint) -> None:
-    """Draw them into a copy of the left image, or a part of it that begins at `corner`."""
+    """Draw the overlay into the left image, or into a part of it that starts at `corner`."""
     if lines.box is not None:
         draw_box(tile, lines.box, scale, corner)
     for outlines, color in ((lines.true, TRUE_RGB), (lines.estimated, ESTIMATE_RGB)):
@@ -172,7 +172,7 @@ def _draw(tile: Picture, lines: _Overlay, scale: float, corner: PixelPoint) -> N
 
 
 def _region_of_interest(record: PairRecord, lines: _Overlay) -> PixelBox | None:
-    """What the close-up shows: the drogue, or where an estimate puts it; None where there is neither."""
+    """The box of the close-up: around the drogue, else around an estimate, else None."""
     box = lines.box or record.views.left.box_full_xywh_px
     if box is None and lines.estimated:
         low, high = lines.estimated[0].min(axis=0), lines.estimated[0].max(axis=0)
@@ -181,15 +181,15 @@ def _region_of_interest(record: PairRecord, lines: _Overlay) -> PixelBox | None:
 
 
 def _close_up(picture: Picture, box: PixelBox, side: int) -> tuple[Picture, float, PixelPoint]:
-    """A square around a box, its size over that of what it shows, and the low corner of what it shows. [px]"""
+    """A square picture around a box, its scale, and the top left corner of its area in the image. [px]"""
     reach = max(_SMALLEST_PX, _MARGIN * max(box[2], box[3]))
     scale = side / reach
     corner = (box[0] + box[2] / 2 - reach / 2, box[1] + box[3] / 2 - reach / 2)
-    # OpenCV's warp takes single pixels out of a larger picture: it is made smaller first.
+    # OpenCV's warp does not average pixels when it shrinks a picture, so it is resized first.
     source = picture if scale >= 1 else resized(picture, max(1, round(scale * picture.shape[1])))[0]
     step = [got / had / scale for got, had in zip(source.shape[1::-1], picture.shape[1::-1], strict=True)]
     warp = np.array([[step[0], 0, 0.0], [0, step[1], 0.0]])
-    # From pixel centres of the close-up to those of the source, whose corner lies half a pixel before its first centre.
+    # Maps pixel centres of the close-up to those of the source, whose corner is half a pixel before the first centre.
     warp[:, 2] = [(low + 0.5) * scale * each + 0.5 * each - 0.5 for low, each in zip(corner, step, strict=True)]
     flags = cv2.INTER_NEAREST if scale > 1 else cv2.INTER_LINEAR
     part = cv2.warpAffine(source, warp, (side, side), flags=flags | cv2.WARP_INVERSE_MAP)
@@ -200,7 +200,7 @@ def _caption_bar(record: PairRecord, method: str, estimate: Estimate | None, wid
     bar = np.full((_BAR_PX, width, 3), _PAPER, dtype=np.uint8)
     distance_m = record.conditions.distance_m
     where = "no drogue" if distance_m is None else f"drogue at {distance_m:.2f} m"
-    # Time stamps say nothing of pairs that belong to no sequence.
+    # Pairs outside sequences have no meaningful time.
     when = "" if record.sequence_id is None else f", sequence {record.sequence_id}, {record.time_s:.2f} s"
     _write(bar, f"frame {record.frame_index}{when}: {where}", (14, 26), _TEXT_RGB)
     _write(bar, "true", (14, 52), TRUE_RGB)
@@ -212,11 +212,11 @@ def _caption_bar(record: PairRecord, method: str, estimate: Estimate | None, wid
 
 def _error_text(record: PairRecord, estimate: Estimate | None) -> str:
     if estimate is None:
-        return "says nothing of this pair"
+        return "no estimate of this pair"
     if isinstance(estimate, NoFix):
         return f"no fix, {estimate.reason}"[:110]
     if record.left_from_drogue is None:
-        return "a fix, and there is no drogue"
+        return "a fix, but there is no drogue"
     error = pose_error(estimate.left_from_drogue, record.left_from_drogue)
     x_mm, y_mm, z_mm = 1e3 * error.components[:3]
     pitch_deg, yaw_deg = error.components[3:]
@@ -227,6 +227,6 @@ def _error_text(record: PairRecord, estimate: Estimate | None) -> str:
 
 
 def _write(bar: Picture, text: str, place: tuple[int, int], color: Rgb) -> None:
-    # OpenCV's fonts have ASCII only; of other signs it would make question marks anyhow.
+    # OpenCV's fonts have only ASCII.
     shown = text.encode("ascii", "replace").decode("ascii")
     cv2.putText(bar, shown, place, cv2.FONT_HERSHEY_SIMPLEX, 0.56, color, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""A plan as one HTML page that needs nothing from outside, with its pictures."""
+"""A plan as one self-contained HTML page with plots of families, distances, sizes and places."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PlanFigure:
     """One picture.
 
     Attributes:
-        title: what it shows, without its caption.
+        title: what it shows.
         caption: how to read it.
         png: the file's contents.
     """
@@ -44,7 +44,7 @@ class PlanFigure:
 
 
 def plan_figures(recipe: Recipe, planned: RecipePlan) -> Iterator[PlanFigure]:
-    """The pictures of a plan; those of boxes only where there are drogues."""
+    """The pictures of a plan; without drogues there are none of distances and boxes."""
     if planned.by_family:
         yield _figure(
             "Pairs by family of conditions",
@@ -164,7 +164,7 @@ def _logarithmic(axes: Axes) -> None:
     axes.set_xscale("log")
     axes.set_ylabel("Stereo pairs in a bin")
     low, high = axes.get_xlim()
-    # Within a decade or so more of its numbers are named.
+    # An axis of about one decade gets more labels.
     named = (1.0, 2.0, 4.0) if high > 12 * low else (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
     axes.xaxis.set_major_locator(LogLocator(base=10, subs=named, numticks=12))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -172,7 +172,7 @@ def _logarithmic(axes: Axes) -> None:
 
 
 def _figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigure:
-    """Draw without pyplot and without a trace in matplotlib's settings."""
+    """Draw without pyplot, and leave matplotlib's settings unchanged."""
     with matplotlib.rc_context({"font.family": "sans-serif", "font.size": 10.0}):
         figure = Figure(figsize=_PANEL_IN, dpi=_DPI, layout="constrained")
         FigureCanvasAgg(figure)
@@ -224,10 +224,10 @@ def write_plan_page(recipe: Recipe, planned: RecipePlan, lines: Sequence[str], o
     """Write the page; it is replaced as a whole, or not at all.
 
     Args:
-        recipe: that is planned.
+        recipe: of the plan.
         planned: what it will make.
-        lines: what the command said.
-        out: where to write.
+        lines: printed by the command.
+        out: file to write.
 
     Raises:
         OSError: it cannot be written.

@@ -30,9 +30,9 @@ def print_pdf(page: str, out: Path, timeout_s: float = TIMEOUT_S) -> None:
     """Print a page as its style sheet wants it on paper; it is replaced as a whole, or not at all.
 
     Args:
-        page: its HTML.
-        out: where to write.
-        timeout_s: after which the browser is ended. [s]
+        page: HTML.
+        out: file to write.
+        timeout_s: after which the browser is killed. [s]
 
     Raises:
         ValueError: there is no browser, or it did not print.
@@ -41,8 +41,8 @@ def print_pdf(page: str, out: Path, timeout_s: float = TIMEOUT_S) -> None:
     browser = find_browser()
     if browser is None:
         raise ValueError(f"{out}: a PDF needs Chromium or Chrome, and {NO_BROWSER}")
-    # Beside the PDF and by a plain name: a browser in a container of its own, as from snap, has another /tmp and sees
-    # no hidden folders.
+    # The folder is beside the PDF and not hidden: a sandboxed browser, as from snap, has another /tmp and sees no
+    # hidden folders.
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="droguekit-print-", dir=out.parent, ignore_cleanup_errors=True) as name:
         folder = Path(name).resolve()
@@ -56,7 +56,7 @@ def print_pdf(page: str, out: Path, timeout_s: float = TIMEOUT_S) -> None:
 
 
 def _command(browser: str, page: Path, printed: Path, profile: Path) -> list[str]:
-    # As root, as in a container, the browser refuses to start with its sandbox. The page is our own and has no script.
+    # The browser does not start with its sandbox as root, as in a container. The page is our own and has no script.
     sandbox = ["--no-sandbox"] if hasattr(os, "geteuid") and os.geteuid() == 0 else []
     return [
         *(browser, "--headless", *sandbox, "--disable-gpu", "--disable-dev-shm-usage", "--disable-extensions"),
@@ -67,8 +67,8 @@ def _command(browser: str, page: Path, printed: Path, profile: Path) -> list[str
 
 
 def _run(command: Sequence[str], timeout_s: float, out: Path) -> str:
-    """Run the browser to its end; what it says on the error stream."""
-    # In a process group of its own, so that the processes which it starts end with it.
+    """Run the browser and return its error stream."""
+    # In a process group of its own, so that its child processes can be killed with it.
     with subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
     ) as process:

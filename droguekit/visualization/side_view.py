@@ -28,22 +28,22 @@ _PICTURE_PX = 640
 _STEEL, _HOSE, _DROGUE, _RECEIVER, _VIEW = "#8a96a3", "#222222", "#c8102e", "#3d5a80", "#f2c14e"
 # Half the height of the close-up around the drogue. [m]
 _CLOSE_M = 1.6
-# Our sketch of a receiver, which no truth speaks of. [m]
+# Our sketch of a receiver, which is not part of the truth. [m]
 _BODY_RADIUS_M, _BODY_LENGTH_M, _NOSE_LENGTH_M, _BELOW_EYE_M = 0.5, 7.0, 1.6, 0.6
 _RING = 32
 
 
 def write_animation(dataset: Dataset, path: Path, count: int, sequence_id: int | None) -> tuple[int, float]:
-    """Draw pairs of a dataset, spread evenly, and write them as they follow each other in time.
+    """Draw pairs of a dataset, spread evenly, and write them in the order of time.
 
     Args:
-        dataset: where they come from.
-        path: ends in .gif or .mp4; takes its name when it is whole.
+        dataset: of the pairs.
+        path: ends in .gif or .mp4; appears when it is complete.
         count: pairs at most.
         sequence_id: only pairs of this sequence, or None for all.
 
     Returns:
-        How many pairs it shows, and how long it lasts. [s]
+        Number of pairs, and length of the video [s].
 
     Raises:
         ValueError: no such pairs, or one that cannot be read.
@@ -74,10 +74,10 @@ def _with_drogue(dataset: Dataset, sequence_id: int | None) -> Iterator[int]:
 
 
 class SideView:
-    """Draws pairs one after another on the same axes."""
+    """Draws pairs on the same axes."""
 
     def __init__(self, records: list[PairRecord]) -> None:
-        """Choose limits that hold all of them.
+        """Set the limits of the axes to contain all pairs.
 
         Args:
             records: pairs with a drogue and a tanker.
@@ -97,7 +97,7 @@ class SideView:
         places = np.concatenate([_side(_Placed(record).left_eye.translation_m[None]) for record in records])
         farthest_m = float(-places[:, 0].min()) + _BODY_LENGTH_M + 0.5
         whole.set_xlim(-farthest_m, 5.0)
-        # The height follows from the width and the box, with the hose in the middle.
+        # The height follows from the width and the shape of the axes, with the hose in the middle.
         height_m = (farthest_m + 5.0) * (0.31 * _INCHES[1]) / (0.43 * _INCHES[0])
         whole.set_ylim(-3.0 - height_m / 2, -3.0 + height_m / 2)
         whole.text(-4.4, 0.9, "tanker's wing and pod", ha="right", fontsize=8, color=_STEEL)
@@ -119,7 +119,7 @@ class SideView:
         )
         middle = _side(placed.drogue_pose.translation_m[None])[0]
         half_m = _CLOSE_M * (0.43 * _INCHES[0]) / (0.41 * _INCHES[1])
-        # The camera, as soon as it comes near, shares the close-up with the drogue.
+        # Leaves room for the camera when it is near.
         self._close.set_xlim(middle[0] - 1.35 * half_m, middle[0] + 0.65 * half_m)
         self._close.set_ylim(middle[1] - _CLOSE_M, middle[1] + _CLOSE_M)
         self._camera.clear()
@@ -137,7 +137,7 @@ class SideView:
 
 
 class _Placed:
-    """A pair's bodies in the tanker's axes."""
+    """Poses of a pair in the tanker's axes."""
 
     def __init__(self, record: PairRecord) -> None:
         frame = record.frame
@@ -158,7 +158,7 @@ def _side(points_m: Array) -> Array:
 
 
 def _draw_flight(axes: Axes, placed: _Placed) -> list[Artist]:
-    """Hose, drogue, receiver and what its camera can see, as artists to be removed again."""
+    """Hose, drogue, receiver and its camera's field of view, as artists to be removed afterwards."""
     hose = _side(placed.hose_m)
     (line,) = axes.plot(hose[:, 0], hose[:, 1], color=_HOSE, linewidth=2.0, solid_capstyle="round", zorder=3)
     shapes = [(_view_wedge(placed), _VIEW, 0.25, 1), (_drogue_outline(placed), _DROGUE, 1.0, 4)]
@@ -180,7 +180,7 @@ def _drogue_outline(placed: _Placed) -> Array:
     rings = [(drogue.rim_radius_m, 0.0), (drogue.coupling_radius_m, drogue.hub_depth_m)]
     rings.append((drogue.coupling_radius_m, back_m))
     points = np.concatenate([radius_m * circle + np.array([0.0, 0.0, z_m]) for radius_m, z_m in rings])
-    # Basket and coupling are each convex, and together they are not.
+    # Basket and coupling are convex, their union is not.
     hulls = [_hull(_side(placed.drogue_pose.apply(part))) for part in (points[: 2 * _RING], points[_RING:])]
     return _joined(hulls)
 
@@ -191,7 +191,7 @@ def _hull(points: Array) -> Array:
 
 
 def _joined(outlines: list[Array]) -> Array:
-    """One outline that goes around each in turn, with seams that cover each other."""
+    """One outline around all of them in turn; the seams between them coincide."""
     start = outlines[0][:1]
     return np.concatenate([part for outline in outlines for part in (outline, outline[:1], start)])
 
@@ -213,7 +213,7 @@ def _from_eye(outline: Array) -> Array:
 
 
 def _view_wedge(placed: _Placed) -> Array:
-    """(3, 2) what the left eye sees in its middle column, to a little beyond the drogue. [m]"""
+    """(3, 2) field of view of the left eye's middle column, to a little beyond the drogue. [m]"""
     depth_m = 1.1 * float((placed.left_eye.inverse() @ placed.drogue_pose).translation_m[2])
     edges = np.array([[0.0, side * placed.half_height * depth_m, depth_m] for side in (-1, 1)])
     return _side(np.concatenate([placed.left_eye.translation_m[None], placed.left_eye.apply(edges)]))
@@ -230,7 +230,7 @@ def _labelled(record: PairRecord, images: StereoImages) -> Picture:
 
 
 def _in_view(record: PairRecord) -> str:
-    """What the title says of markers and hub in the left image."""
+    """The part of the title about markers and hub in the left image."""
     markers = record.views.left.markers
     text = f", {sum(marker.in_image for marker in markers)} of {len(markers)} markers"
     hub = record.views.left.hub

@@ -1,4 +1,4 @@
-"""Videos of pictures as GIF or MP4, and which pairs of a dataset they show for how long."""
+"""Write pictures as GIF or MP4, and choose which pairs of a dataset to show and for how long."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from droguekit.benchmark.report.label_drawing import Picture, resized
 
 _SUFFIXES = (".gif", ".mp4")
 _MOST_PICTURES = 2000
-# Pairs that have nothing to do with each other are shown as single pictures.
+# Time of a picture where pairs do not follow each other in time.
 _SLIDE_S = 0.5
 _FASTEST_S, _SLOWEST_S = 0.02, 2.0
-# Players of GIFs take time in hundredths of a second.
+# GIF stores times in hundredths of a second.
 _GIF_TICK_MS = 10
 _GIF_COLORS, _GIF_WIDTH_PX = 128, 960
 
 
 def write_video(path: Path, pictures: Iterable[Picture], picture_s: float) -> None:
-    """Write pictures of one size as GIF or MP4, which takes its name when it is whole.
+    """Write pictures of one size as GIF or MP4; the file appears when it is complete.
 
     Args:
         path: ends in .gif or .mp4.
         pictures: (H, W, 3) each, at least one.
-        picture_s: time that each stands. [s]
+        picture_s: time that each is shown. [s]
 
     Raises:
         ValueError: the package that writes MP4 is missing.
@@ -49,7 +49,7 @@ def write_video(path: Path, pictures: Iterable[Picture], picture_s: float) -> No
 
 
 def check_video(option: str, path: Path, count: int) -> None:
-    """See that a video can be made before its pictures are drawn.
+    """Check that a video can be made, before its pictures are drawn.
 
     Raises:
         ValueError: too many pictures or none, or a file of another kind; names the command's option.
@@ -67,7 +67,7 @@ def evenly(indices: Sequence[int], count: int) -> list[int]:
 
 
 def period_s(records: Sequence[PairRecord]) -> float:
-    """Time that each picture stands: as long as in flight for pairs of sequences. [s]"""
+    """Time that each picture is shown: the time between pairs of a sequence. [s]"""
     if records[0].sequence_id is None or len(records) < 2:
         return _SLIDE_S
     return float(np.clip(np.median(np.diff([record.time_s for record in records])), _FASTEST_S, _SLOWEST_S))
@@ -80,7 +80,7 @@ def _write_gif(path: Path, pictures: Iterable[Picture], picture_s: float) -> Non
 
 
 def _with_palette(picture: Picture) -> Image.Image:
-    """A smaller picture in few colours, which an octree spreads over small red markers as well as over the sky."""
+    """A smaller picture in few colours, chosen by an octree, which keeps those of small red markers."""
     small, _ = resized(picture, _GIF_WIDTH_PX)
     return Image.fromarray(small).quantize(_GIF_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 

@@ -98,7 +98,7 @@ def test_a_shard_of_another_recipe_is_refused(
     make(tmp_path / "other", [2, 5], text=analytic_recipe.replace("seed = 5", "seed = 6"))
     assert merge(tmp_path / "out", *made_shards[:2], tmp_path / "other") == WRONG_INPUT
     assert "other: is of another recipe than" in (told := capsys.readouterr().err)
-    assert "differs in seed" in told
+    assert "they differ in seed" in told
     assert not (tmp_path / "out").exists()
 
 

@@ -194,7 +194,7 @@ def test_a_near_drogue_is_made_smaller_without_noise(flight: Path) -> None:
         (["--overlay", "a.mp4", "--out", "a.png"], "--out, --animate, --overlay: give one of them"),
         (["--overlay", "a.mp4", "--method", "own"], "--method: goes with --estimates"),
         (["--animate", "a.mp4", "--estimates", "FILE"], "--estimates, --method: go with --overlay"),
-        (["--overlay", "a.mp4", "--estimates", "FILE"], "holds several; name one of own, blind"),
+        (["--overlay", "a.mp4", "--estimates", "FILE"], "has several methods; name one of own, blind"),
         (["--overlay", "a.mp4", "--estimates", "FILE", "--method", "x"], "holds own, blind, got x"),
         (["--overlay", "a.mp4", "--sequence", "3"], "holds no pairs of sequence 3 to show"),
         (["--overlay", "a.mp4", "--count", "0"], "--count: must be from 1 to 2000"),

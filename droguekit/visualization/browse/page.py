@@ -46,7 +46,7 @@ _SCRIPTS = ("projection.js", "overlay.js", "catalogue.js", "single.js", "page.js
 
 @dataclass(frozen=True)
 class SkippedPair:
-    """A pair that is not on the page, and why."""
+    """A pair that is not on the page, and the reason."""
 
     frame_index: int
     reason: str
@@ -54,18 +54,20 @@ class SkippedPair:
 
 @contextmanager
 def lock_page_folder(out: Path) -> Iterator[None]:
-    """Make the page's folders, or go on with those of an earlier run, and keep other runs out of them.
+    """Make the page's folders or reuse those of an earlier run, and keep other runs out of them.
 
     Raises:
         ValueError: a folder with other things in it, or that another run is writing into.
         OSError: it cannot be written.
     """
     if out.exists() and not _is_ours(out):
-        raise ValueError(f"{out}: is there already and is no page of this command; name a new folder")
+        raise ValueError(f"{out}: exists already and is no page of this command; name a new folder")
     folders = [out / name for name in (SITE_FOLDER, DATA_FOLDER, PICTURES_FOLDER)]
     for path in (out / MARK_FILE, *folders):
         if path.is_symlink():
-            raise ValueError(f"{path}: leads elsewhere, where nothing is written or removed; name a new folder")
+            raise ValueError(
+                f"{path}: is a link, and nothing outside the folder is written or removed; name a new folder"
+            )
     with ExitStack() as stack:
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -83,7 +85,7 @@ def lock_page_folder(out: Path) -> Iterator[None]:
 
 
 def _is_ours(out: Path) -> bool:
-    """Whether a place is a page, a part of one that was never begun, or empty."""
+    """Whether a folder is a page, has only leftovers of an unfinished one, or is empty."""
     if not out.is_dir():
         return False
     others = [path for path in out.iterdir() if not path.name.endswith(PART_SUFFIX)]
@@ -91,11 +93,11 @@ def _is_ours(out: Path) -> bool:
 
 
 def write_labels(out: Path, frame_index: int, labels: dict[str, Any]) -> str:
-    """Write what the page loads when it shows a pair large.
+    """Write the file that the page loads when it enlarges a pair.
 
     Returns:
-        The file's name without its suffix. It holds the contents' hash: until the catalogue is written anew, the page
-        goes on with the files that the old one names.
+        The file's name without suffix. It contains the hash of the content: until the catalogue is replaced, the page
+        keeps using the files that the old one names.
 
     Raises:
         OSError: it cannot be written.
@@ -110,14 +112,14 @@ def write_page(
     out: Path, facts: PageFacts, rows: Sequence[dict[str, Any]], drogues: Iterable[tuple[Ring, ...]],
     methods: Sequence[str], skipped: Sequence[SkippedPair],
 ) -> None:  # fmt: skip
-    """Write the catalogue and the page itself, and remove what earlier runs left of other pairs.
+    """Write the catalogue and the page, and remove files of earlier runs that it does not use.
 
     Args:
         out: the page's folder.
         facts: of the dataset.
         rows: of the catalogue, by frame.
-        drogues: rings of every drogue that is shown or looked for, in any order.
-        methods: whose estimates there are.
+        drogues: circles of every drogue, in any order.
+        methods: names of the methods with estimates.
         skipped: pairs that could not be read.
 
     Raises:
@@ -155,7 +157,7 @@ def _write_site(out: Path, facts: PageFacts, skipped: Sequence[SkippedPair]) -> 
 
 
 def _remove_stale_files(out: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Remove pictures and labels of pairs that are not in the catalogue any more, or have other pixels now."""
+    """Remove pictures and labels that the catalogue does not name."""
     kept = {str(row["picture"]) for row in rows}
     for path in (out / PICTURES_FOLDER).iterdir():
         if path.name.rpartition("-")[0] not in kept:
@@ -195,7 +197,7 @@ class BrowseSummary:
 
     Attributes:
         shown: pairs on the page.
-        kept: of these, pairs whose pictures were there already.
+        kept: how many of these had valid pictures from an earlier run.
         skipped: pairs that could not be read.
     """
 
@@ -207,14 +209,14 @@ class BrowseSummary:
 def write_browse(
     dataset: Location, out: Path, estimates: Path | None, workers: int, report: ProgressReport
 ) -> BrowseSummary:
-    """Write the page of a dataset; pictures of an earlier run that are still right stay.
+    """Write the page of a dataset; valid pictures of an earlier run stay.
 
     Args:
         dataset: folder or URL.
         out: the page's folder, new or of an earlier run.
         estimates: poses to show beside the truth, or None.
-        workers: processes; 0 works in this one.
-        report: hears how it goes.
+        workers: processes; 0 runs in this one.
+        report: is told of the progress.
 
     Raises:
         ValueError: dataset or estimates cannot be used, or the folder holds other things or is written by another run.
@@ -264,16 +266,16 @@ def _write(
 
 
 class _PictureTask:
-    """What a worker does with one pair."""
+    """Writes the pictures of a pair, in a worker process."""
 
     def __init__(self, source: BrowsedPairs, out: Path) -> None:
         self._source, self._out = source, out
 
     def __call__(self, frame_index: int) -> tuple[PageEntry, bool]:
-        """Write a pair's pictures, unless they are there.
+        """Write a pair's pictures, unless they exist.
 
         Returns:
-            What the page says of it, and whether its pictures were there.
+            What the page shows of it, and whether its pictures existed.
         """
         entry = self._source.entry(frame_index)
         files = picture_files(self._out / PICTURES_FOLDER, entry.row["picture"])
@@ -284,7 +286,7 @@ class _PictureTask:
 
 
 def _without_unused_parts(path: Path) -> Iterator[Estimate]:
-    """Estimates without what the page does not show: a file of them may be large."""
+    """Estimates without the fields that the page does not show, to save memory."""
     for estimate in read_estimates(path):
         dropped: dict[str, Any] = {"stage_s": {}, "regions": ()}
         if isinstance(estimate, PoseEstimate):
@@ -296,7 +298,7 @@ def _reason(error: BaseException | None) -> str:
     """Why a pair is skipped, on one line.
 
     Raises:
-        BaseException: it is no fault of the pair, such as a full disk, and ends the run.
+        BaseException: the error itself if it is no fault of the pair, such as a full disk.
     """
     if error is not None and not (isinstance(error, ValueError) or is_accident(error)):
         raise error

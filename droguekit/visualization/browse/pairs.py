@@ -1,4 +1,4 @@
-"""What the page says of each pair: a row of the catalogue, its labels as numbers, and its pictures."""
+"""What the page shows of each pair: a row of the catalogue, its labels as numbers, and its pictures."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def light_of(luminance_cd_m2: float) -> str:
 
 
 def search_text(record: PairRecord, split: str) -> str:
-    """Words by which a pair can be found."""
+    """Text that the page searches for a pair."""
     frame, sky = record.frame, record.frame.environment
     words = [record.conditions.family, split, f"scene {record.scene_id}", record.engine, sky.ground]
     words += [cloud.kind for cloud in sky.clouds]
@@ -54,7 +54,7 @@ def search_text(record: PairRecord, split: str) -> str:
 
 
 def conditions_table(record: PairRecord, split: str) -> list[tuple[str, str]]:
-    """Names and values, the most telling first."""
+    """Rows of name and value, the most important first."""
     frame, conditions = record.frame, record.conditions
     rows = [("Distance", "no drogue" if conditions.distance_m is None else f"{plain_number(conditions.distance_m)} m")]
     if record.pitch_deg is not None and record.yaw_deg is not None and record.roll_deg is not None:
@@ -114,13 +114,13 @@ _PX_DIGITS, _POSE_DIGITS = 3, 9
 
 @dataclass(frozen=True)
 class PageEntry:
-    """What the page says of one pair.
+    """What the page shows of a pair.
 
     Attributes:
-        row: its values by column of the catalogue.
-        labels: numbers of its own file.
-        rings: of the drogue that is there or looked for, which many pairs share.
-        left_from_drogue: its true pose, or None.
+        row: values by column of the catalogue.
+        labels: content of the pair's own file.
+        rings: circles of the drogue that is or would be in view; many pairs share them.
+        left_from_drogue: true pose, or None.
     """
 
     row: dict[str, Any]
@@ -130,13 +130,13 @@ class PageEntry:
 
 
 def page_entry(record: PairRecord, drogue: DrogueParameters, split: str, record_sha256: str) -> PageEntry:
-    """What the page says of a pair, but for estimates.
+    """What the page shows of a pair without estimates.
 
     Args:
-        record: its truth.
-        drogue: that is there or looked for.
-        split: of the dataset that it belongs to.
-        record_sha256: stands for the pair's pixels too.
+        record: truth of the pair.
+        drogue: that is or would be in view.
+        split: of the pair.
+        record_sha256: also identifies the pair's pixels.
     """
     rings = drogue_rings(drogue)
     conditions, distance_m = record.conditions, record.conditions.distance_m
@@ -162,13 +162,13 @@ def page_entry(record: PairRecord, drogue: DrogueParameters, split: str, record_
 
 
 def page_entry_without_truth(frame_index: int, time_s: float, rings: tuple[Ring, ...], pixels_sha256: str) -> PageEntry:
-    """What the page says of a pair without truth.
+    """What the page shows of a pair without truth.
 
     Args:
-        frame_index: place in the dataset.
+        frame_index: of the pair.
         time_s: mid-exposure. [s]
-        rings: of the drogue that is looked for.
-        pixels_sha256: stands for its images.
+        rings: circles of the drogue.
+        pixels_sha256: identifies the images.
     """
     nothing: dict[str, Any] = {"box_full_px": None, "box_visible_px": None, "markers": [], "hub": None}
     view = nothing | {"board_corners_px": []}
@@ -179,7 +179,7 @@ def page_entry_without_truth(frame_index: int, time_s: float, rings: tuple[Ring,
 
 
 def with_estimates(entry: PageEntry, estimates: Sequence[Estimate | None]) -> PageEntry:
-    """The same with what estimators said of the pair: one estimate a method, None where it said nothing."""
+    """The entry with estimates of the pair: one for each method, None where a method has none."""
     truth = entry.left_from_drogue
     answers = [None if estimate is None else _answer(estimate, truth) for estimate in estimates]
     row = entry.row | {"answers": [_in_short(answer) for answer in answers]}
@@ -187,32 +187,32 @@ def with_estimates(entry: PageEntry, estimates: Sequence[Estimate | None]) -> Pa
 
 
 def _in_short(answer: dict[str, Any] | None) -> float | str | None:
-    """The error of position [mm], or what there is instead; None where nothing was said."""
+    """Position error [mm], or `fix` without truth, or `no fix`; None without an estimate."""
     if answer is None:
         return None
     if answer["pose"] is None:
         return "no fix"
-    # There is no truth to compare it with.
+    # Without truth there is no error.
     return "fix" if answer["error"] is None else float(answer["error"][0])
 
 
 def rings_name(rings: tuple[Ring, ...]) -> str:
-    """What pairs call a drogue by."""
+    """A drogue's key in the catalogue."""
     return hashlib.sha256(repr(rings).encode()).hexdigest()[:12]
 
 
 def picture_stem(frame_index: int, record_sha256: str) -> str:
-    """How the names of a pair's pictures begin: other pixels have another name."""
+    """Start of the names of a pair's pictures, which changes with its pixels."""
     return f"{frame_index:06d}-{record_sha256[:12]}"
 
 
 def picture_files(folder: Path, stem: str) -> list[Path]:
-    """A pair's pictures, there or not, in the order of `PICTURE_KINDS`."""
+    """Paths of a pair's pictures, in the order of `PICTURE_KINDS`."""
     return [folder / f"{stem}-{kind}.jpg" for kind in PICTURE_KINDS]
 
 
 def write_pictures(files: Sequence[Path], images: StereoImages) -> None:
-    """Write a pair's pictures as a screen wants them.
+    """Write a pair's pictures in the sRGB curve.
 
     Raises:
         OSError: one cannot be written; names it.
@@ -224,7 +224,7 @@ def write_pictures(files: Sequence[Path], images: StereoImages) -> None:
 
 
 def _jpeg(picture: Picture, quality: int) -> bytes:
-    # Colour at full resolution: small red markers would bleed into their dark face.
+    # Full colour resolution keeps small red markers from bleeding into their dark face.
     sampling = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
     _, data = cv2.imencode(".jpg", picture[..., ::-1], options)
@@ -272,11 +272,11 @@ def _box(box: PixelBox | None) -> list[float] | None:
 
 
 class PageFacts(NamedTuple):
-    """What stands at the top of the page, and the cameras.
+    """The head of the page, and the cameras.
 
     Attributes:
-        facts: sentences on what is in the dataset.
-        is_blind: it has no truth.
+        facts: sentences that describe the dataset.
+        is_blind: whether it has no truth.
     """
 
     name: str
@@ -286,22 +286,22 @@ class PageFacts(NamedTuple):
 
 
 class BrowsedPairs(Protocol):
-    """Pairs by their index; may be pickled for another process."""
+    """A dataset's pairs by index; can be pickled for another process."""
 
     def facts(self) -> PageFacts:
-        """What is to be said of the whole."""
+        """The head of the page."""
         ...
 
     def frame_indices(self) -> tuple[int, ...]:
-        """Of the pairs, ascending."""
+        """Indices of the pairs, ascending."""
         ...
 
     def entry(self, frame_index: int) -> PageEntry:
-        """What the page says of a pair; `ValueError` where it cannot be read."""
+        """What the page shows of a pair; `ValueError` where it cannot be read."""
         ...
 
     def images(self, frame_index: int) -> StereoImages:
-        """What the cameras saw; `ValueError` where it cannot be read."""
+        """The images of a pair; `ValueError` where they cannot be read."""
         ...
 
 
@@ -319,7 +319,7 @@ def open_browsed_pairs(dataset: Location) -> BrowsedPairs:
 
 
 class _ReopenedDataset:
-    """Opens the dataset when it is asked for, in each process anew."""
+    """A dataset that each process opens by itself when it needs it."""
 
     def __init__(self, dataset: Location) -> None:
         self._place = dataset
@@ -358,7 +358,7 @@ class PairsWithTruth(_ReopenedDataset):
         return page_entry(record, drogue, known.split, known.record_sha256)
 
     def images(self, frame_index: int) -> StereoImages:
-        """Decoded, if they are those on record: its hash stands for them in the names of the pictures."""
+        """Decoded images, checked against the record, whose hash identifies them in the names of the pictures."""
         frames, hashes = self._dataset.frames, self._dataset.record(frame_index).file_sha256
         for name in map(image_file, EYES):
             if hashlib.sha256(frames.read(frame_index, name)).hexdigest() != hashes.get(name):
@@ -388,7 +388,7 @@ class PairsWithoutTruth(_ReopenedDataset):
         return self._dataset.frame_indices
 
     def entry(self, frame_index: int) -> PageEntry:
-        """Of the pair's time and drogue; its images' own hash stands for them."""
+        """From the pair's time and drogue; the hash of its images identifies them."""
         pixels = hashlib.sha256()
         for eye in EYES:
             pixels.update(self._frames.read(frame_index, image_file(eye)))

@@ -204,7 +204,7 @@ def test_what_leads_out_of_the_folder_is_refused(
         (mine / "thesis.txt").write_text("do not touch")
     before = contents(tmp_path)
     assert run(["browse", str(tiny), "--out", str(page), "--workers", "0"]) == WRONG_INPUT
-    assert f"{page / name}: leads elsewhere" in capsys.readouterr().err
+    assert f"{page / name}: is a link" in capsys.readouterr().err
     assert contents(tmp_path) == before
 
 
@@ -269,8 +269,8 @@ def test_wrong_orders_are_refused_on_one_line(tiny: Path, tmp_path: Path, capsys
     (tmp_path / "file").write_text("")
     page = str(tmp_path / "page")
     cases = [
-        ([str(tiny), "--out", str(tmp_path / "mine")], "mine: is there already and is no page of this command"),
-        ([str(tiny), "--out", str(tmp_path / "file")], "file: is there already and is no page of this command"),
+        ([str(tiny), "--out", str(tmp_path / "mine")], "mine: exists already and is no page of this command"),
+        ([str(tiny), "--out", str(tmp_path / "file")], "file: exists already and is no page of this command"),
         ([str(tiny), "--out", "/proc/nowhere/page"], "/proc/nowhere/page: cannot be written"),
         ([str(tiny), "--out", page, "--estimates", str(tmp_path / "far.jsonl")], "frame 40 is not in the dataset"),
         ([str(tiny), "--out", page, "--estimates", str(tmp_path / "none.jsonl")], "none.jsonl: cannot be read"),
