@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from datasets_manifest.types.estimates import Estimate
     from droguekit.batch.progress import ProgressReport
-    from nav.sequence_navigator import SkippedPair, PairEstimates, SequenceSettings
+    from nav.sequence_navigator import PairEstimates, SequenceSettings, SkippedPair
 
 
 _SCHEMA = 1
@@ -260,11 +260,11 @@ def _estimate_pairs(
     """Answers to all pairs, as fast as can be or as they come."""
     from nav.detector.detector_registry import DEFAULT_DETECTOR
     from nav.realtime.pipeline import MonotonicClock, replay
-    from nav.runner import answers_of, open_navigator
+    from nav.runner import open_navigator, process_dataset
 
     navigator = open_navigator(settings, DEFAULT_DETECTOR if options.detector is None else options.detector)
     if options.rate_hz is None:
-        return answers_of(blind, navigator)
+        return process_dataset(blind, navigator)
     return replay(blind, navigator, options.rate_hz, MonotonicClock())
 
 

@@ -45,7 +45,7 @@ _SCRIPTS = ("projection.js", "overlay.js", "catalogue.js", "single.js", "page.js
 
 
 @dataclass(frozen=True)
-class SkippedPair:
+class UnreadablePair:
     """A pair that is not on the page, and the reason."""
 
     frame_index: int
@@ -110,7 +110,7 @@ def write_labels(out: Path, frame_index: int, labels: dict[str, Any]) -> str:
 
 def write_page(
     out: Path, facts: PageFacts, rows: Sequence[dict[str, Any]], drogues: Iterable[tuple[Ring, ...]],
-    methods: Sequence[str], skipped: Sequence[SkippedPair],
+    methods: Sequence[str], skipped: Sequence[UnreadablePair],
 ) -> None:  # fmt: skip
     """Write the catalogue and the page, and remove files of earlier runs that it does not use.
 
@@ -141,7 +141,7 @@ def write_page(
     _remove_stale_files(out, rows)
 
 
-def _write_site(out: Path, facts: PageFacts, skipped: Sequence[SkippedPair]) -> None:
+def _write_site(out: Path, facts: PageFacts, skipped: Sequence[UnreadablePair]) -> None:
     folder = files(__package__) / SITE_FOLDER
     for name in ("browse.css", *_SCRIPTS):
         write_text_atomic(out / SITE_FOLDER / name, (folder / name).read_text(encoding="utf-8"))
@@ -203,7 +203,7 @@ class BrowseSummary:
 
     shown: int
     kept: int
-    skipped: tuple[SkippedPair, ...]
+    skipped: tuple[UnreadablePair, ...]
 
 
 def write_browse(
@@ -240,7 +240,7 @@ def _write(
     make = _PictureTask(source, out.resolve())
     rows: dict[int, dict[str, Any]] = {}
     drogues: set[tuple[Ring, ...]] = set()
-    skipped: dict[int, SkippedPair] = {}
+    skipped: dict[int, UnreadablePair] = {}
     kept = 0
     report.begin("pairs", len(indices))
     try:
@@ -254,7 +254,7 @@ def _write(
                     kept += was_there
                     drogues.add(entry.rings)
                 elif attempt.final:
-                    skipped[index] = SkippedPair(index, _reason(attempt.error))
+                    skipped[index] = UnreadablePair(index, _reason(attempt.error))
                     report.note(f"{len(skipped)} skipped")
                 if attempt.final:
                     report.advance()
