@@ -1,4 +1,4 @@
-"""From roughly placed, matched markers to edge-fitted ones, and to the hub that they lead to."""
+"""Refines matched markers by the edge model, and measures the hub where their pose predicts it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from geometry.stereo import EYES, StereoRig
 from nav.centroids.annuli import AnnulusFits, fit_annuli
 from nav.centroids.centroid_uncertainty import NoiseModel
 from nav.centroids.disc_fit import fit_discs
-from nav.centroids.discs import LARGEST_SCALE
+from nav.centroids.discs import LARGEST_SCALE, DiscFits
 from nav.centroids.ellipses import Ellipses, outline_shapes, shape_radii
 from nav.centroids.face_background import VISIBLE_MARGIN_PX, FaceBackground
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
@@ -29,74 +29,104 @@ from nav.pose.monocular import mono_lm
 from nav.pose.pose_method import HUB_EDGES, INNER_EDGE, OUTER_EDGE, NoFixReason, Observation, Solution
 
 _OUTLINE_POINTS = 24
-# A second pose is followed to its hub when it is this likely, and shows the hub this far from the first one's.
+# The hub is also searched by a second pose that is this likely and predicts it this far from the first one's.
 _LEAST_WEIGHT = 0.01
 _LEAST_STEP_PX = 0.5
-# Fewer fitted markers than a pose needs with one to spare: then all of them stay as they were found.
+# With fewer fitted markers, which a pose needs with one to spare, all markers stay as they were.
 _LEAST_MARKERS = 4
-# Markers so small that no part of their edge is clear of the rim's: the other colours are weighted so that it has none.
+# No part of the edge of smaller markers is clear of the rim's, so the other colours get the weight that removes that.
 _BALANCED_BELOW_PX = 8.0
 
 
 def rough_pose(observation: Observation) -> Solution | NoFixReason:
-    """The pose of matched markers without the hub, from both eyes or from the only one that shows any."""
+    """The pose of matched markers without the hub, from both eyes or from the only one that shows markers."""
     return joint(observation) if observation.seen.any(axis=1).all() else mono_lm(observation)
 
 
 def refine(
     images: StereoImages, color: int | None, observation: Observation, rough: Solution, others_weight: float = PLAIN
 ) -> Observation:
-    """The same markers by the edge model, and the hub where it can be seen.
+    """Measure the same markers by the edge model, and the hub where it is visible.
 
     Args:
         images: the pair.
         color: see `nav.matching.marker_channel.marker_color`.
-        observation: matched markers, placed to half a pixel or so.
+        observation: matched markers, right to about half a pixel.
         rough: their pose, see `rough_pose`.
         others_weight: see `nav.matching.marker_channel.marker_channel`.
 
     Returns:
-        Edge-fitted markers; those that the fit rejects (clipped, cut, shadowed, occluded) are left out. Where too few
-        fit, the markers as they were. Hub edges are measured where the pose of the markers shows them.
+        Edge-fitted markers, without those that the fit rejects (clipped, cut, shadowed, occluded). Where too few fit,
+        the observation as given. Hub edges are measured where the pose of the fitted markers predicts them.
     """
+    layout = observation.layout
+    radius_px = observation.rig.camera.fx_px * layout.radius_m / rough.left_from_drogue.translation_m[2]
+    discs = _initial_discs(observation, rough, radius_px)
+    face = _face_background(layout, np.nonzero(observation.seen)[1], radius_px / layout.radius_m)
+    is_narrow = face is not None and face.margin_px <= VISIBLE_MARGIN_PX
+    if is_narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
+        others_weight = _balanced_weight(images, color, observation, rough, others_weight)
+    signals = marker_signals(images, color, _concatenate([discs, *_likely_hubs(observation, rough)]), others_weight)
+    fits = fit_discs(signals, discs, face)
+    if fits.noise is None or _left_in_each_eye(observation, fits).min() < min(_LEAST_MARKERS, layout.count):
+        return observation
+    refined = _with_markers(observation, fits)
+    return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.motion)
+
+
+def _initial_discs(observation: Observation, rough: Solution, radius_px: float) -> Ellipses:
+    """Outlines of the observed markers in the delivered images, by their places and their rough pose."""
     rig, layout = observation.rig, observation.layout
     eyes, index = np.nonzero(observation.seen)
-    depth_m = rough.left_from_drogue.translation_m[2]
-    radius_px = rig.camera.fx_px * layout.radius_m / depth_m
     sizes = np.broadcast_to(radius_px * np.eye(2), (layout.count, 2, 2))
     seen = zip(EYES, observation.pixels_px, strict=True)
-    rough_px = np.stack([distort_points(rig, eye, places, sizes) for eye, places in seen])
-    discs = Ellipses(eyes, rough_px[eyes, index], marker_shapes(rig, layout, rough.left_from_drogue)[eyes, index])
+    centers_px = np.stack([distort_points(rig, eye, places, sizes) for eye, places in seen])
+    return Ellipses(eyes, centers_px[eyes, index], marker_shapes(rig, layout, rough.left_from_drogue)[eyes, index])
+
+
+def _likely_hubs(observation: Observation, rough: Solution) -> list[Ellipses]:
+    """The hub's edges as each of the likely rough poses predicts them."""
     likely = [rough.modes[0], *(mode for mode in rough.modes[1:] if mode.weight >= _LEAST_WEIGHT)]
-    hubs = [hub for mode in likely for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
-    around = _face_background(layout, index, radius_px / layout.radius_m)
-    narrow = around is not None and around.margin_px <= VISIBLE_MARGIN_PX
-    if narrow and color is not None and images.left.ndim == 3 and radius_px < _BALANCED_BELOW_PX:
-        middles_px = np.stack([rig.image(rough.left_from_drogue.translation_m, eye) for eye in EYES])
-        # An eye that shows no markers has no say: far outside of the image there is nothing to weigh.
-        middles_px[~observation.seen.any(axis=1)] = -1e6
-        rim_px = radius_px * layout.face_outer_radius_m / layout.radius_m
-        others_weight = balancing_weight(images, color, middles_px, rim_px, others_weight)
-    signals = marker_signals(images, color, _concatenate([discs, *hubs]), others_weight)
-    fits = fit_discs(signals, discs, around)
+    rig, layout = observation.rig, observation.layout
+    return [hub for mode in likely for hub in _hub_edges(rig, layout, mode.left_from_drogue)]
+
+
+def _balanced_weight(
+    images: StereoImages, color: int, observation: Observation, rough: Solution, others_weight: float
+) -> float:
+    """Weight of the other colours at which the rim casts no step of light, see `balancing_weight`."""
+    rig, layout, translation_m = observation.rig, observation.layout, rough.left_from_drogue.translation_m
+    radius_px = rig.camera.fx_px * layout.radius_m / translation_m[2]
+    middles_px = np.stack([rig.image(translation_m, eye) for eye in EYES])
+    # An eye that shows no markers has no say: far outside of the image there is nothing to weigh.
+    middles_px[~observation.seen.any(axis=1)] = -1e6
+    rim_px = radius_px * layout.face_outer_radius_m / layout.radius_m
+    return balancing_weight(images, color, middles_px, rim_px, others_weight)
+
+
+def _left_in_each_eye(observation: Observation, fits: DiscFits) -> NDArray[np.int64]:
+    """Numbers of accepted markers in the eyes that showed any."""
+    eyes = np.nonzero(observation.seen)[0]
+    counts = np.bincount(eyes[fits.accepted], minlength=len(EYES))
+    left: NDArray[np.int64] = counts[observation.seen.any(axis=1)]
+    return left
+
+
+def _with_markers(observation: Observation, fits: DiscFits) -> Observation:
+    """The observation with the accepted fits as its markers, in the ideal images."""
     good = fits.accepted
-    left_over = np.bincount(eyes[good], minlength=len(EYES))[observation.seen.any(axis=1)]
-    if left_over.min() < min(_LEAST_MARKERS, layout.count) or fits.noise is None:
-        return observation
-    pixels = np.full_like(observation.pixels_px, np.nan)
-    cov = np.full_like(observation.cov_px2, np.nan)
-    pixels[eyes[good], index[good]] = fits.ellipses.centers_px[good]
-    cov[eyes[good], index[good]] = fits.cov_px2[good]
+    eyes, index = (each[good] for each in np.nonzero(observation.seen))
+    pixels, cov = np.full_like(observation.pixels_px, np.nan), np.full_like(observation.cov_px2, np.nan)
     shapes = np.full_like(cov, np.nan)
-    shapes[eyes[good], index[good]] = fits.ellipses.shapes_px[good]
+    pixels[eyes, index], cov[eyes, index] = fits.ellipses.centers_px[good], fits.cov_px2[good]
+    shapes[eyes, index] = fits.ellipses.shapes_px[good]
     for side, eye in enumerate(EYES):
-        pixels[side], cov[side] = undistort_points(rig, eye, pixels[side], shapes[side], cov[side])
-    refined = replace(observation, pixels_px=pixels, cov_px2=cov)
-    return refined if layout.hub_center_m is None else _with_hub(refined, signals, fits.noise, fits.travel)
+        pixels[side], cov[side] = undistort_points(observation.rig, eye, pixels[side], shapes[side], cov[side])
+    return replace(observation, pixels_px=pixels, cov_px2=cov)
 
 
 def _face_background(layout: MarkerLayout, index: NDArray[np.int64], scale_px_per_m: float) -> FaceBackground | None:
-    """The face around the markers, where the drogue has one."""
+    """The face around the markers; None for a drogue without one."""
     places_m = layout.centers_m[:, :2]
     edges_m = layout.face_inner_radius_m, layout.face_outer_radius_m
     if edges_m[1] == 0:
@@ -107,10 +137,10 @@ def _face_background(layout: MarkerLayout, index: NDArray[np.int64], scale_px_pe
 
 
 def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> Array:
-    """(2, N, 2, 2) shapes of the markers' images: circles of one size, or of large ones the ellipses that a pose shows.
+    """(2, N, 2, 2) shapes of the markers' images: equal circles, or for large markers the ellipses of their pose.
 
-    The near side of a tilted drogue is larger by pixels at 1.7 m. A window from a circle would there end within the
-    blur of the edge, and leave no face to fit its light to.
+    At 1.7 m the near side of a tilted drogue is larger by pixels. A circle's window would end within the blur of the
+    edge there, and leave no face to fit its light to.
     """
     depth_m = pose.translation_m[2]
     radius_px = rig.camera.fx_px * layout.radius_m / depth_m
@@ -118,7 +148,7 @@ def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) ->
     outlines_m = np.concatenate(
         [disc_outline(pose, at_m, layout.radius_m, _OUTLINE_POINTS) for at_m in layout.centers_m]
     )
-    # A rough pose may stand so askew that part of the drogue would be beside or behind the eyes.
+    # A wrong rough pose may place part of the drogue beside or behind the eyes.
     if radius_px <= WHOLE_RADIUS_PX or outlines_m[:, 2].min() < depth_m / 2:
         return even
     points = np.stack([rig.image(outlines_m, eye) for eye in EYES]).reshape(-1, _OUTLINE_POINTS, 2)
@@ -129,7 +159,7 @@ def marker_shapes(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) ->
 
 
 def _hub_edges(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> list[Ellipses]:
-    """The hub's inner and outer edge in both eyes as a pose shows them; nothing without a hub or with it behind."""
+    """The hub's inner and outer edge in both eyes by a pose; empty without a hub or with the hub behind the eyes."""
     if layout.hub_center_m is None or pose.apply(layout.hub_center_m)[2] <= 0:
         return []
     radii_m = layout.hub_inner_radius_m, layout.hub_outer_radius_m
@@ -156,9 +186,9 @@ def _with_hub(
     observation: Observation,
     signals: tuple[MarkerSignal, MarkerSignal],
     noise: NoiseModel,
-    travel: ImageMotion | None,
+    motion: ImageMotion | None,
 ) -> Observation:
-    """The hub's outer edge, looked for where the markers' pose shows it, and where its mirror image would."""
+    """The observation with the hub's outer edge, searched by the markers' pose and by its mirrored mode."""
     solution = joint(observation)
     if isinstance(solution, NoFixReason):
         return observation
@@ -166,7 +196,7 @@ def _with_hub(
     found: list[tuple[AnnulusFits, Array]] = []
     for edges in _hub_candidates(observation, solution):
         outer, inner = edges[OUTER_EDGE], edges[INNER_EDGE]
-        found.append((fit_annuli(signals, outer, inner, noise, collar_factor, travel), outer.shapes_px))
+        found.append((fit_annuli(signals, outer, inner, noise, collar_factor, motion), outer.shapes_px))
         if found[-1][0].certain:
             break
     best = max(found, key=lambda each: each[0].evidence_per_px2, default=None)
@@ -184,9 +214,9 @@ def _with_hub(
 
 
 def _hub_candidates(observation: Observation, solution: Solution) -> Iterator[list[Ellipses]]:
-    """The hub's edges by each pose that is likely enough, the likeliest first, unless it shows them at the same place.
+    """The hub's edges by each likely mode, the likeliest first, without those that predict a place again.
 
-    The light on a hub is uneven: a fit that begins where it is not may end on part of it, or on something else.
+    The light on a hub is uneven: a fit that starts beside it may end on part of it, or on something else.
     """
     tried: list[Array] = []
     for mode in solution.modes:

@@ -266,7 +266,7 @@ def fit_annuli(
     inner: Ellipses,
     noise: NoiseModel,
     collar_factor: float = 0.0,
-    travel: ImageMotion | None = None,
+    motion: ImageMotion | None = None,
 ) -> AnnulusFits:
     """Fit every annulus of both eyes.
 
@@ -280,15 +280,15 @@ def fit_annuli(
         noise: of the frame's pixels, from `fit_discs`; what stands out against it is contrast.
         collar_factor: radius of the dark collar around the annulus over that of its outer edge, 0 where unknown. What
             lies beyond is left out, and its blur fitted.
-        travel: how the drogue moves on the images while the shutter is open, None where it stands still.
+        motion: how the drogue moves on the images while the shutter is open, None where it stands still.
     """
     if len(outer) == 0:
         nothing = np.zeros(0)
         return AnnulusFits(np.zeros((0, 2)), np.zeros((0, 2, 2)), nothing, nothing, nothing, ())
     width_px = float((outer.radii_px - inner.radii_px).min())
     thin = width_px < _THIN_PX
-    ways = None if travel is None else travel.of(outer)
-    gathered = annulus_pixels(signals, outer, inner, 0.0 if travel is None else travel.spread_px(outer))
+    ways = None if motion is None else motion.of(outer)
+    gathered = annulus_pixels(signals, outer, inner, 0.0 if motion is None else motion.spread_px(outer))
     pixels, beyond = _within_collar(gathered, signals[0], (outer, inner), collar_factor, ways)
     turns = azimuth_harmonics(pixels, _ORDER_THIN if thin else _ORDER)
     start = initial_annulus_parameters(pixels, outer, inner, turns.shape[1])

@@ -87,7 +87,7 @@ class DiscFits:
         inflation: (M,) factor in `cov_px2` for residuals that hang together.
         reasons: why a disc was rejected, or None.
         noise: of the frame's pixels, None without any disc.
-        travel: how the discs moved while the shutter was open, None where they stood still.
+        motion: of the discs while the shutter was open, None where they stood still.
     """
 
     ellipses: Ellipses
@@ -99,7 +99,7 @@ class DiscFits:
     inflation: Array
     reasons: tuple[str | None, ...]
     noise: NoiseModel | None
-    travel: ImageMotion | None = None
+    motion: ImageMotion | None = None
 
     @property
     def accepted(self) -> NDArray[np.bool_]:
@@ -108,14 +108,23 @@ class DiscFits:
 
 
 def unfitted_discs(discs: Ellipses) -> DiscFits:
-    """Discs as they were, to be replaced by `merged`."""
-    count = len(discs)
-    nothing = np.zeros(count)
-    return DiscFits(discs, np.zeros((count, 2, 2)), nothing, nothing, nothing, nothing, nothing, (None,) * count, None)
+    """Initial outlines without fits, to be replaced part by part, see `with_part`."""
+    nothing = np.zeros(len(discs))
+    return DiscFits(
+        ellipses=discs,
+        cov_px2=np.zeros((len(discs), 2, 2)),
+        contrast_dn=nothing,
+        background_dn=nothing,
+        edge_width_px=nothing,
+        chi2_per_dof=nothing,
+        inflation=nothing,
+        reasons=(None,) * len(discs),
+        noise=None,
+    )
 
 
-def merged(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscFits:
-    """`fits` with those of `index` replaced."""
+def with_part(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscFits:
+    """`fits` with the discs of `index` replaced by `part`."""
 
     def put(old: Array, new: Array) -> Array:
         merged = old.copy()
@@ -128,16 +137,16 @@ def merged(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscFits
     centers = put(fits.ellipses.centers_px, part.ellipses.centers_px)
     shapes = put(fits.ellipses.shapes_px, part.ellipses.shapes_px)
     return DiscFits(
-        Ellipses(fits.ellipses.eyes, centers, shapes),
-        put(fits.cov_px2, part.cov_px2),
-        put(fits.contrast_dn, part.contrast_dn),
-        put(fits.background_dn, part.background_dn),
-        put(fits.edge_width_px, part.edge_width_px),
-        put(fits.chi2_per_dof, part.chi2_per_dof),
-        put(fits.inflation, part.inflation),
-        tuple(reasons),
-        part.noise,
-        fits.travel if part.travel is None else part.travel,
+        ellipses=Ellipses(fits.ellipses.eyes, centers, shapes),
+        cov_px2=put(fits.cov_px2, part.cov_px2),
+        contrast_dn=put(fits.contrast_dn, part.contrast_dn),
+        background_dn=put(fits.background_dn, part.background_dn),
+        edge_width_px=put(fits.edge_width_px, part.edge_width_px),
+        chi2_per_dof=put(fits.chi2_per_dof, part.chi2_per_dof),
+        inflation=put(fits.inflation, part.inflation),
+        reasons=tuple(reasons),
+        noise=part.noise,
+        motion=fits.motion if part.motion is None else part.motion,
     )
 
 

@@ -156,7 +156,7 @@ def detect_motion(fit: Minimum, pixels: OutlinePixels, discs: Ellipses) -> Image
 
 
 def fit_motion(
-    model: Model, pixels: OutlinePixels, start: Array, travel: ImageMotion, discs: Ellipses
+    model: Model, pixels: OutlinePixels, start: Array, motion: ImageMotion, discs: Ellipses
 ) -> ImageMotion | None:
     """The ways of moving discs, in Gauss-Newton steps of them and of the discs at once; None where that leads astray.
 
@@ -164,16 +164,16 @@ def fit_motion(
         model: of still discs.
         pixels: of them.
         start: (N, P) parameters.
-        travel: roughly.
+        motion: roughly.
         discs: where they are, roughly.
     """
-    arms_px = discs.centers_px - travel.middles_px[discs.eyes]
+    arms_px = discs.centers_px - motion.middles_px[discs.eyes]
     size_px = max(float(np.abs(arms_px).max()), 1.0)
     x, y = (arms_px / size_px).astype(np.float32).T[:, :, None]
     parameters = start
     for _ in range(_ROUNDS):
-        fit, by_travel = _evaluate_moving(model, pixels, parameters, travel.of(discs))
-        by_x, by_y = by_travel[:, 0], by_travel[:, 1]
+        fit, by_motion = _evaluate_moving(model, pixels, parameters, motion.of(discs))
+        by_x, by_y = by_motion[:, 0], by_motion[:, 1]
         shared = np.stack([by_x, by_y, x * by_x + y * by_y, x * by_y - y * by_x], axis=1)
         normal, gradient = reduced_equations(fit, shared, pixels.present)
         steps = np.zeros((2, 4))
@@ -183,11 +183,11 @@ def fit_motion(
         left = fit.residuals.copy()
         add_rows(np.ascontiguousarray(shared), (-steps[discs.eyes]).astype(np.float32), left)
         parameters = fit.given(left, pixels.present).parameters
-        travel = ImageMotion(travel.middles_px, travel.means_px + steps[:, :2], travel.turns + steps[:, 2:] / size_px)
+        motion = ImageMotion(motion.middles_px, motion.means_px + steps[:, :2], motion.turns + steps[:, 2:] / size_px)
         # Not a number is not within.
-        if not np.hypot(*travel.of(discs)[:, :2].T).max() < _MOST_TRAVEL_PX:
+        if not np.hypot(*motion.of(discs)[:, :2].T).max() < _MOST_TRAVEL_PX:
             return None
-    return travel
+    return motion
 
 
 def _evaluate_moving(model: Model, pixels: OutlinePixels, parameters: Array, ways: Array) -> tuple[Minimum, Array32]:

@@ -191,7 +191,7 @@ def test_annuli_that_move_are_as_good_as_their_covariance(outer_px, way):
         signals, outer, inner = draw_annuli(outer_px, rng, way=way)
         # The two senses of a way look alike.
         travel = ImageMotion(outer.centers_px, -np.tile(way, (2, 1)), np.zeros((2, 2)))
-        fits = fit_annuli(signals, off(outer, 0.1), off(inner, 0.1), NOISE, travel=travel)
+        fits = fit_annuli(signals, off(outer, 0.1), off(inner, 0.1), NOISE, motion=travel)
         error = fits.centers_px - outer.centers_px
         normalized.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.cov_px2), error) / 2)
     # 120 squared errors: standard deviation 0.13.

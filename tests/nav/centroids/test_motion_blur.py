@@ -52,10 +52,10 @@ def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, rad
         start = rough_start(truth, rng)
         fits = fit_discs(signals, start)
         assert fits.accepted.all(), fits.reasons
-        assert fits.travel is not None
-        sense = np.sign(fits.travel.means_px[0] @ np.array(way))
+        assert fits.motion is not None
+        sense = np.sign(fits.motion.means_px[0] @ np.array(way))
         # The shortest ways, which widen edges least, are told worst: to 0.1 px or so.
-        np.testing.assert_allclose(sense * fits.travel.means_px, [way, way], atol=0.25)
+        np.testing.assert_allclose(sense * fits.motion.means_px, [way, way], atol=0.25)
         error = fits.ellipses.centers_px - truth.centers_px
         errors.append(error)
         normalized.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.cov_px2), error) / 2)
@@ -76,7 +76,7 @@ def test_still_discs_are_not_said_to_move(radius_px, light):
     rng = np.random.default_rng([5, int(radius_px)])
     for _ in range(6):
         signals, truth = draw_discs(radius_px, light, rng)
-        assert fit_discs(signals, rough_start(truth, rng)).travel is None
+        assert fit_discs(signals, rough_start(truth, rng)).motion is None
 
 
 def test_what_has_no_edges_does_not_move():
@@ -85,7 +85,7 @@ def test_what_has_no_edges_does_not_move():
     noise = rng.normal(50, 20, (2, 200, 200)).astype(np.float32)
     signals = [MarkerSignal(values, values >= 1e4, (0.0, 0.0), 1, True) for values in noise]
     fits = fit_discs(signals, truth)
-    assert not fits.accepted.all() and fits.travel is None
+    assert not fits.accepted.all() and fits.motion is None
 
 
 def test_derivatives_are_those_of_the_moving_picture():
