@@ -1,1 +1,1 @@
-"""A frame becomes absolute radiance and passes, then what the camera's sensor makes of them."""
+"""From a frame to absolute radiance and passes, and from radiance to the images of the camera's sensor."""

@@ -1,1 +1,1 @@
-"""Functions from a recipe to frames: sky, cloud, light, ground, distance, attitude, framing."""
+"""From a recipe to frames: sky, clouds, light, ground, distance, attitude and framing."""

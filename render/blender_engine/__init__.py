@@ -1,1 +1,1 @@
-"""Path tracing with Blender's Cycles: a second opinion, in a process of its own that holds the only `bpy`."""
+"""Path tracing with Blender's Cycles, a second engine; only a process of its own imports `bpy`."""

@@ -1,1 +1,1 @@
-"""The camera: lens, scattered light, sensor."""
+"""The camera: exposure, lens and sensor."""

@@ -1,1 +1,1 @@
-"""Path tracing with Mitsuba 3: own rays, only the pixels that something covers, the rest straight from the sky."""
+"""Path tracing with Mitsuba 3: only pixels that an object covers are traced; the others show the background."""

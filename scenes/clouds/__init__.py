@@ -1,1 +1,1 @@
-"""Cloud layers as densities through which rays are marched."""
+"""Cloud layers as densities, rendered by ray marching."""

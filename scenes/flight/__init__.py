@@ -1,1 +1,1 @@
-"""Motion in a sequence: hose, turbulence, receiver, and what hides the drogue."""
+"""Flight of a sequence: hose, airflow, receiver and dropouts."""

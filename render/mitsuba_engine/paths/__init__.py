@@ -1,1 +1,1 @@
-"""Rays and paths of one frame, and the light that they bring."""
+"""Rays and paths of one frame: passes of pixel centres, and the light of drogue and context."""
