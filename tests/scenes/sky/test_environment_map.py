@@ -86,7 +86,7 @@ def test_the_sun_becomes_a_beam_of_the_same_light(tmp_path):
     solid_angle_sr = (edges[0] - edges[1]) * np.pi / HEIGHT
     np.testing.assert_allclose(light.sun_lux, (50e6 - np.array([2e3, 1e3, 1e3])) * solid_angle_sr, rtol=1e-5)
     np.testing.assert_allclose(light.sun_direction, texel_direction(40, 180, 30.0), atol=1e-6)
-    assert light.picture.max() == 2000
+    assert light.image.max() == 2000
 
 
 def test_the_disc_is_drawn_where_the_sun_was(tmp_path):
