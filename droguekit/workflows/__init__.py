@@ -1,1 +1,1 @@
-"""What the commands do: the only place where packages are put together."""
+"""What the commands do; the only package that combines generation, navigation and benchmark."""

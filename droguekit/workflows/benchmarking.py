@@ -25,8 +25,8 @@ class DetectionOptions:
     """Which boxes to score, and how.
 
     Attributes:
-        files: of COCO results, each known by its name without ending.
-        detectors: names or files of networks, to be run first.
+        files: of COCO results; the name without suffix is the detector's.
+        detectors: names or network files of detectors to run first.
         split: to score on, see `score_detections`.
         threshold: operating threshold, see `score_detections`.
     """
@@ -51,7 +51,7 @@ def benchmark_lines(
         estimates: file of poses; None for detections.
         options: which detections.
         outputs: files for the numbers as JSON and for the report as HTML, or None.
-        report: hears how detectors proceed.
+        report: is told of the progress of detectors.
 
     Raises:
         ValueError: estimates and detections together, or inputs that cannot be read.
@@ -93,7 +93,7 @@ def _blind_lines(check: BlindCheck) -> Iterator[str]:
 def benchmark_dataset(
     dataset: Location, estimates: Path, json_out: Path | None, html_out: Path | None
 ) -> BenchmarkResult:
-    """Compare estimates with the truth, and write the numbers and the report where a place is given for them.
+    """Compare estimates with the truth, and write numbers and report where files are given.
 
     Raises:
         ValueError: a dataset or estimates that cannot be read.
@@ -114,7 +114,7 @@ def benchmark_dataset(
 
 
 def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | None, html_out: Path | None) -> BlindCheck:
-    """The same without truth: compare estimates with their own measurements, and with boxes if there are any.
+    """Without truth, compare estimates with their own measurements, and with boxes if there are any.
 
     Raises:
         ValueError: a dataset or estimates that cannot be read.
@@ -136,7 +136,7 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
 def benchmark_detections(
     dataset: Location, options: DetectionOptions, json_out: Path | None, html_out: Path | None, report: ProgressReport
 ) -> DetectionResult:
-    """Compare boxes with the truth, and write the numbers and the report where a place is given for them.
+    """Compare boxes with the truth, and write numbers and report where files are given.
 
     Raises:
         ValueError: a dataset, file or detector that cannot be read, or two of one name.
@@ -150,7 +150,7 @@ def benchmark_detections(
     if options.threshold is not None and not 0 <= options.threshold <= 1:
         raise ValueError(f"--threshold: must be from 0 to 1, got {options.threshold:g}")
     truth = read_detection_truth(dataset)
-    # Whatever is wrong is said before a detector looks at the first image.
+    # Errors are found before a detector runs.
     split = split_to_score(truth.images, options.split)
     scored = score_detections(truth, _runs(dataset, options, report), split, options.threshold)
     if json_out is not None:
@@ -161,7 +161,7 @@ def benchmark_detections(
 
 
 def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorOutput]:
-    """Boxes by the name that they are reported under; everything is opened before the first detector runs."""
+    """Boxes by their name in the report; all files are opened before the first detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
     from droguekit.benchmark.detection.detection_scores import DetectorOutput
     from droguekit.benchmark.detection.detector_runner import DetectorRunner
@@ -169,7 +169,7 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
     from geometry.stereo import EYES
     from nav.detector.detector_registry import detector_factory
 
-    # Also of images that are not scored, for a detector answers for all.
+    # Files may also have boxes of images that are not scored.
     image_ids = frozenset(image_id_of(frame, eye) for frame in read_blind_index(dataset).frames for eye in EYES)
     runs = [(file.stem, DetectorOutput(read_detections(file, image_ids))) for file in options.files]
     passes = [(name, DetectorRunner(dataset, detector_factory(name))) for name in options.detectors]
@@ -182,11 +182,11 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
 
 
 def _detector_run(name_or_file: str, detecting: DetectorRunner, report: ProgressReport) -> DetectorOutput:
-    """What a detector finds in all images."""
+    """Run a detector on all images."""
     from droguekit.benchmark.detection.detection_scores import DetectorOutput
     from droguekit.benchmark.detection.detector_runner import LEAST_SCORE
 
-    report.say(f"{detecting.name}: looking for the drogue, without the truth")
+    report.say(f"{detecting.name}: detecting the drogue, without the truth")
     report.begin("pairs", detecting.pairs)
     try:
         boxes = list(detecting.boxes(LEAST_SCORE, report.advance))
@@ -203,7 +203,7 @@ def _detector_run(name_or_file: str, detecting: DetectorRunner, report: Progress
 
 
 def _network_cost(name_or_file: str, sizes_px: tuple[tuple[int, int], ...]) -> NetworkCost | None:
-    """Of all passes through a network in a file; None where they cannot be counted, or what counts is missing."""
+    """Cost of all passes through a network file; None where it cannot be computed or onnx is missing."""
     from importlib.util import find_spec
 
     from nav.detector.detector_registry import network_file
@@ -216,6 +216,6 @@ def _network_cost(name_or_file: str, sizes_px: tuple[tuple[int, int], ...]) -> N
     try:
         costs = [network_cost(file, size_px) for size_px in sizes_px]
     except ValueError:
-        # The network runs, and its boxes are not lost for operations that nobody can count.
+        # The network runs even if its operations cannot be counted.
         return None
     return NetworkCost(costs[0].parameters, sum(cost.gflops_per_image for cost in costs))

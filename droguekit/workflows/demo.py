@@ -1,4 +1,4 @@
-"""From a recipe to a report in one go."""
+"""Render a recipe, estimate poses, and write the report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DemoFiles:
-    """What a demo leaves in its folder."""
+    """The files of a demo."""
 
     dataset: Path
     estimates: Path
@@ -27,7 +27,7 @@ class DemoFiles:
 
 
 def run_demo(recipe_name: str, out: Path, workers: int | None, report: ProgressReport) -> tuple[DemoFiles, RunSummary]:
-    """From a recipe to a report; pairs that are there already are kept.
+    """Render a recipe, estimate poses by every method, and compare them with the truth; existing pairs are kept.
 
     Raises:
         ValueError: the folder holds another dataset, or the engine cannot be used.
@@ -38,7 +38,7 @@ def run_demo(recipe_name: str, out: Path, workers: int | None, report: ProgressR
     count = source.recipe.frames.count
     report.say(f"1 of 3: rendering {count} stereo pairs into {files.dataset}")
     summary = render_frames(source, files.dataset, range(count), ExecutionOptions(workers), report)
-    report.say("2 of 3: navigating on them, without the truth, by every method")
+    report.say("2 of 3: estimating poses by every method, without the truth")
     navigate_dataset(files.dataset, (), files.estimates, report)
     report.say("3 of 3: comparing the estimates with the truth")
     benchmark_dataset(files.dataset, files.estimates, files.benchmark, files.report)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DetectionSummary:
-    """What `detect_dataset` did."""
+    """What `detect_dataset` found, and how long it took."""
 
     detector: str
     boxes: int
@@ -34,12 +34,12 @@ def detect_dataset(
 ) -> DetectionSummary:
     """Find the drogue in every image without the truth, and write COCO results; the default detector when None.
 
-    With a tracker, pairs are taken to follow each other in time, and the detector looks only where the drogue is lost,
-    and at every so manieth pair to check.
+    With a tracker, pairs must follow each other in time. The detector then runs only when the drogue is lost, and at
+    regular intervals to check the tracker.
 
     Raises:
-        ValueError: no such dataset, detector or tracker, a score that is none, or an image that cannot be read.
-        OSError: the file cannot be written; it is then left as it was.
+        ValueError: no such dataset, detector or tracker, a score outside 0 to 1, or an image that cannot be read.
+        OSError: the file cannot be written; it stays as it was.
     """
     from droguekit.benchmark.detection.detector_runner import DetectorRunner
     from droguekit.benchmark.results.detection_result import write_detections

@@ -1,4 +1,4 @@
-"""What `navigate` does."""
+"""Estimate poses in a dataset without its truth, and measure latencies where pairs arrive at a rate."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SCHEMA = 1
 
 @dataclass(frozen=True)
 class LatencyPercentiles:
-    """Of one time over all pairs that were worked on. [ms]"""
+    """Percentiles of a time over all processed pairs. [ms]"""
 
     p50_ms: float
     p95_ms: float
@@ -36,14 +36,14 @@ class LatencyPercentiles:
 
 @dataclass(frozen=True)
 class LatencyReport:
-    """What became of pairs that came at a rate.
+    """Latencies of pairs that arrived at a rate.
 
     Attributes:
-        rate_hz: at which they came. [Hz]
-        pairs: how many came.
-        late: how many were not worked on because newer ones had come.
-        latency: from a pair's moment to its answers; None where all were late.
-        stages: by stage, in the order of the work.
+        rate_hz: of arrival. [Hz]
+        pairs: how many arrived.
+        late: how many were skipped because newer ones had arrived.
+        latency: from arrival to estimates; None where all were skipped.
+        stages: time of each stage, in the order of processing.
     """
 
     rate_hz: float
@@ -53,11 +53,11 @@ class LatencyReport:
     stages: dict[str, LatencyPercentiles]
 
     def to_json(self) -> str:
-        """The content of a file."""
+        """The content of the latency file."""
         return json.dumps({"schema": _SCHEMA, **asdict(self)}, indent=1) + "\n"
 
     def lines(self) -> list[str]:
-        """As a table for people."""
+        """The report as a table."""
         rows = {"whole": self.latency, **self.stages} if self.latency is not None else {}
         head = [f"{self.pairs} pairs at {self.rate_hz:g} Hz, {self.late} late"]
         if rows:
@@ -70,40 +70,40 @@ class LatencyReport:
 
 
 class LatencyTally:
-    """Counts pair after pair."""
+    """Collects latencies pair by pair."""
 
     def __init__(self, rate_hz: float) -> None:
-        """Begin before the first pair, of those that come at a rate. [Hz]"""
+        """Start without pairs, at a rate of arrival. [Hz]"""
         self._rate_hz = rate_hz
         self._latencies_s: list[float] = []
         self._stages_s: defaultdict[str, list[float]] = defaultdict(list)
         self._late = 0
 
-    def late(self) -> None:
-        """Count a pair that was not worked on."""
+    def skipped(self) -> None:
+        """Count a skipped pair."""
         self._late += 1
 
-    def worked_on(self, latency_s: float, stage_s: dict[str, float]) -> None:
-        """Count a pair with its answers, and the stages that it went through. [s]"""
+    def processed(self, latency_s: float, stage_s: dict[str, float]) -> None:
+        """Add a processed pair's latency and the times of its stages. [s]"""
         self._latencies_s.append(latency_s)
         for stage, spent_s in stage_s.items():
             self._stages_s[stage].append(spent_s)
 
     def report(self) -> LatencyReport:
-        """What was counted."""
+        """The latencies so far."""
         done = len(self._latencies_s)
         return LatencyReport(
             rate_hz=self._rate_hz,
             pairs=done + self._late,
             late=self._late,
             latency=_percentiles(self._latencies_s, done) if done else None,
-            # A stage that only some pairs went through, such as the detector beside a tracker, took the others no time.
+            # A stage that only some pairs need, such as the detector beside a tracker, takes no time for the others.
             stages={stage: _percentiles(spent_s, done) for stage, spent_s in self._stages_s.items()},
         )
 
 
 def _percentiles(times_s: list[float], count: int) -> LatencyPercentiles:
-    """Of times, and of zeros up to a count."""
+    """Percentiles of times, padded with zeros up to a count."""
     padded_ms = 1e3 * np.array(times_s + [0.0] * (count - len(times_s)))
     middle, high, highest, most = np.percentile(padded_ms, [50, 95, 99, 100]).tolist()
     return LatencyPercentiles(middle, high, highest, most)
@@ -114,14 +114,14 @@ class NavigationOptions:
     """How to navigate.
 
     Attributes:
-        centroids: `own`, `binary` or `edge`.
+        centroids: how centres are measured: `own`, `binary` or `edge`.
         detector: name or file of a network; the default one when None.
-        tracker: name; the detector looks at every pair when None.
-        redetect_every: the detector checks the tracker at every so many pairs; the usual number when None.
-        filtered, smoothed: whether there are also filtered and smoothed estimates.
-        capture_radius_m: of the docking quantities; the drogue's own when None. [m]
-        rate_hz: pairs come at this rate; as fast as they are worked on when None. [Hz]
-        latency_out: gets the latencies as JSON.
+        tracker: name; the detector runs on every pair when None.
+        redetect_every: pairs between two checks of the tracker by the detector; the default number when None.
+        filtered, smoothed: whether to add filtered and smoothed estimates.
+        capture_radius_m: of the docking quantities; from the drogue's opening when None. [m]
+        rate_hz: pairs arrive at this rate; as fast as they are processed when None. [Hz]
+        latency_out: file for the latencies as JSON, or None.
     """
 
     centroids: str = "own"
@@ -136,23 +136,25 @@ class NavigationOptions:
 
     def __post_init__(self) -> None:
         if self.redetect_every is not None and self.tracker is None:
-            raise ValueError("--redetect-every: needs --tracker; without one the detector looks at every pair")
+            raise ValueError("--redetect-every: needs --tracker; without one the detector runs on every pair")
         if self.redetect_every is not None and self.redetect_every < 1:
             raise ValueError(f"--redetect-every: must be at least 1, got {self.redetect_every}")
         if self.capture_radius_m is not None:
             if not (self.filtered or self.smoothed):
-                raise ValueError("--capture-radius: needs --filter or --smooth, whose estimates tell of docking")
+                raise ValueError(
+                    "--capture-radius: needs --filter or --smooth, whose estimates have docking quantities"
+                )
             if not 0 < self.capture_radius_m < float("inf"):
                 raise ValueError(f"--capture-radius: must be above 0 m, got {self.capture_radius_m:g}")
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz <= 1e4:
             raise ValueError(f"--rate: must be from 0.001 to 10000 Hz, got {self.rate_hz:g}")
         if self.latency_out is not None and self.rate_hz is None:
-            raise ValueError("--latency: needs --rate; without one nothing comes at a time")
+            raise ValueError("--latency: needs --rate; without one there is no time of arrival")
 
 
 @dataclass(frozen=True)
 class FixCount:
-    """How many poses a method found in how many pairs."""
+    """Number of poses that a method found, and number of pairs."""
 
     method: str
     fixes: int
@@ -165,7 +167,7 @@ class NavigationSummary:
 
     Attributes:
         fixes: of every method.
-        latency: where pairs came at a rate.
+        latency: None where pairs did not arrive at a rate.
     """
 
     fixes: list[FixCount]
@@ -182,8 +184,8 @@ def navigate_dataset(
     """Estimate poses in every pair without the truth, and write them; all methods when `methods` is empty.
 
     Raises:
-        ValueError: no such dataset, method, detector, tracker or way to measure centroids, a place for results that
-            is a folder, or an image that cannot be read.
+        ValueError: no such dataset, method, detector, tracker or way to measure centres, an output that is a folder,
+            or an image that cannot be read.
         OSError: the estimates cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
@@ -205,7 +207,7 @@ def navigate_dataset(
             yield estimate
 
     opened = _estimate_pairs(blind, settings, options)
-    # Whatever stops the writing ends the threads that answers come from.
+    # Closing ends the threads of real-time processing, whatever stops the writing.
     with one_thread(), closing(opened) as answers:
         for file in filter(None, (out, options.latency_out)):
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -223,10 +225,10 @@ def navigate_dataset(
 
 
 def _check_places(out: Path, latency_out: Path | None) -> None:
-    """Find out before the work whether its results can take their names.
+    """Check the output files before the work.
 
     Raises:
-        ValueError: a place is a folder, or the same for both files.
+        ValueError: one is a folder, or both are the same file.
     """
     for option, file in (("--out", out), ("--latency", latency_out)):
         if file is not None and file.is_dir():
@@ -257,7 +259,7 @@ def _settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSet
 def _estimate_pairs(
     blind: BlindDataset, settings: SequenceSettings, options: NavigationOptions
 ) -> Generator[PairEstimates | SkippedPair]:
-    """Answers to all pairs, as fast as can be or as they come."""
+    """Estimates of all pairs, as fast as possible or in real time."""
     from nav.detector.detector_registry import DEFAULT_DETECTOR
     from nav.realtime.pipeline import MonotonicClock, replay
     from nav.runner import open_navigator, process_dataset
@@ -271,7 +273,7 @@ def _estimate_pairs(
 def _with_progress(
     answers: Iterable[PairEstimates | SkippedPair], tally: LatencyTally | None, report: ProgressReport
 ) -> Iterator[PairEstimates | SkippedPair]:
-    """The same, while progress and latencies are told; what happens until the next one is asked for is their output."""
+    """Pass on the estimates, and report progress and latencies; time until the next request counts as output."""
     from nav.sequence_navigator import SkippedPair
 
     for each in answers:
@@ -281,6 +283,6 @@ def _with_progress(
         if tally is None:
             continue
         if isinstance(each, SkippedPair):
-            tally.late()
+            tally.skipped()
         elif each.latency_s is not None:
-            tally.worked_on(each.latency_s, {**each.stage_s, "output": perf_counter() - start})
+            tally.processed(each.latency_s, {**each.stage_s, "output": perf_counter() - start})

@@ -40,7 +40,7 @@ def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> Reci
     if engine is not None:
         settings = recipe.render.model_copy(update={"engine": engine})
         try:
-            # Checked anew, for not every engine can draw everything.
+            # Validated again, since not every engine can render everything.
             recipe = Recipe.model_validate(dict(recipe) | {"render": settings})
         except ValidationError as error:
             raise ValueError(f"--engine {engine}: {explain(error)}") from error
@@ -54,10 +54,10 @@ def open_recipe(name_or_path: str, seed: int | None, engine: str | None) -> Reci
 def render_frames(
     source: RecipeSource, out: Location, frames: Sequence[int], options: ExecutionOptions, report: ProgressReport
 ) -> RunSummary:
-    """Make frames of a recipe into a dataset.
+    """Render frames of a recipe into a dataset.
 
     Raises:
-        ValueError: a folder of another recipe, or an engine that cannot be used.
+        ValueError: a folder of another recipe, wrong options, or an engine that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
     """
     with delay_interrupts():
@@ -69,9 +69,9 @@ def render_frames(
     if options.timeout_s is not None and not options.timeout_s > 0:
         raise ValueError(f"--timeout: must be above 0 s, got {options.timeout_s:g}")
     if options.scheduler is not None and options.workers is not None:
-        raise ValueError("--workers: means processes of this machine; with --scheduler leave it out")
+        raise ValueError("--workers: are processes of this machine; omit it with --scheduler")
     if str(out).startswith("memory:") and options.worker_count() != 0:
-        raise ValueError(f"--out: {out} is the memory of one process; give --workers 0, or another place")
+        raise ValueError(f"--out: {out} is the memory of one process; give --workers 0 or another place")
     notice = engine_notice(source.recipe.render.engine)
     if notice is not None:
         report.say(notice)
@@ -79,7 +79,7 @@ def render_frames(
 
 
 def run_lines(out: Location, summary: RunSummary) -> Iterator[str]:
-    """What a run made and what it cost, for people."""
+    """A run's result as lines: pairs made and kept, CPU time, memory, hash."""
     totals = summary.totals
     cpu_s, retries = sum(totals.stage_s.values()), f", {totals.retries} attempts repeated" if totals.retries else ""
     yield (
@@ -96,10 +96,9 @@ def run_lines(out: Location, summary: RunSummary) -> Iterator[str]:
 
 @contextmanager
 def delay_interrupts() -> Iterator[None]:
-    """Let Ctrl-C wait until the block is done.
+    """Delay Ctrl-C until the end of the block, and then raise it again.
 
-    Mesh libraries try optional imports and catch whatever comes of them, the exception of a Ctrl-C too: it were lost.
-    At the end it goes to whoever handled it before, by default as `KeyboardInterrupt`.
+    Mesh libraries catch every exception of optional imports, so a `KeyboardInterrupt` in the middle would be lost.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

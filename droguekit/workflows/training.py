@@ -26,13 +26,13 @@ class TrainingOptions:
     """What a detector is trained on, and how.
 
     Attributes:
-        sources: folders or URLs of datasets, and recipes.
+        sources: folders or URLs of datasets, and recipes to render.
         settings_file: TOML of training settings, or None.
         changes: to both the file and the defaults; None changes nothing.
         size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
-        cache: folder for images at the network's size, or None for the training's own.
-        start_from: shipped detector or file of weights to start from, or None for random ones.
-        workers: that render, as many as the machine holds when None.
+        cache: folder for resized images, or None for one in the training's folder.
+        start_from: shipped detector or file of initial weights, or None for random ones.
+        workers: processes that render; as many as cores and memory allow when None.
     """
 
     sources: tuple[str, ...]
@@ -53,7 +53,7 @@ def _find_source(source: str) -> Location | RecipeSource:
 
 
 def _render_source(source: RecipeSource, out: Path, workers: int | None, report: ProgressReport) -> Path:
-    """Make the pairs that are not there yet; the dataset's folder."""
+    """Render the missing pairs of a recipe; returns the dataset's folder."""
     recipe, place = source.recipe, out / "datasets" / source.recipe.name
     report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {place}")
     summary = render_frames(source, place, range(recipe.frames.count), ExecutionOptions(workers), report)
@@ -68,7 +68,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     Raises:
         ValueError: a wrong setting, a dataset that cannot be used, or a folder of another training.
         OSError: a file cannot be written.
-        KeyboardInterrupt: it was told to stop, and what was done is saved.
+        KeyboardInterrupt: the user asked to stop, and the state is saved.
     """
     from droguekit.batch.stop_request import StopRequest
     from nav.training.training_settings import build_settings, parse_size
@@ -79,7 +79,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     missing = [name for name in _NEEDED if find_spec(name) is None]
     if missing:
         raise ValueError(f"train: {', '.join(missing)} is missing: pip install 'droguekit[train]'")
-    # Threads of torch that wait for each other by spinning lose most of their time where others use the cores too.
+    # Otherwise torch's threads wait by spinning, which wastes time where other processes use the cores too.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from nav.training.starting_weights import read_starting_weights
 
@@ -89,7 +89,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
     found = [_find_source(source) for source in options.sources]
     from nav.training.training_run import check_training, train
 
-    # Rendering takes hours: what would stop the training afterwards is looked for first.
+    # Rendering takes hours, so errors that would stop the training are found first.
     if not any(not isinstance(each, RecipeSource) or each.recipe.split.train > 0 for each in found):
         raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
     check_training(out, settings, start)
@@ -101,7 +101,7 @@ def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) 
 
 
 def training_lines(result: TrainingResult) -> Iterator[str]:
-    """What a training reached, and where its network is."""
+    """Scores of a training, and the file of its network."""
     for split, reached in (("val", result.validation), ("test", result.test)):
         if reached is not None:
             ap50, ap75, ap, recall50 = (

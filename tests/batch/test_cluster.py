@@ -254,4 +254,4 @@ def test_workers_of_another_build_are_refused(
 def test_workers_and_scheduler_exclude_each_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"]
     assert run(["render", "smoke", "--engine", "analytic", "--out", str(tmp_path / "out"), *options]) == WRONG_INPUT
-    assert "--workers: means processes of this machine" in capsys.readouterr().err
+    assert "--workers: are processes of this machine" in capsys.readouterr().err

@@ -36,7 +36,7 @@ from geometry.stereo import EYES, Eye, StereoRig
 
 
 class ShownPair(NamedTuple):
-    """One pair: its images, the rig, the drogue that is there or looked for, and its truth or None."""
+    """A pair: its images, the rig, the drogue that is or would be in view, and its truth or None."""
 
     frame_index: int
     images: StereoImages
@@ -46,7 +46,7 @@ class ShownPair(NamedTuple):
 
 
 class ShownPairs(NamedTuple):
-    """The indices of a dataset's pairs, ascending, and how to read one."""
+    """Indices of a dataset's pairs, ascending, and a function that reads one."""
 
     frame_indices: tuple[int, ...]
     read: Callable[[int], ShownPair]
@@ -85,7 +85,7 @@ CURVES = ("position_mm", "pitch_deg", "yaw_deg")
 _HUB_RGB: Rgb = (255, 120, 220)
 _STEEL_RGB: Rgb = (138, 150, 163)
 _HOSE_RGB: Rgb = (70, 70, 76)
-# Of as many methods as a legend has room for; further ones begin again. Bright enough for the viewer's black.
+# Colours of methods, repeated if there are more; bright enough for the viewer's black background.
 _METHOD_RGB: tuple[Rgb, ...] = (
     (255, 138, 31),
     (90, 170, 255),
@@ -98,26 +98,26 @@ _METHOD_RGB: tuple[Rgb, ...] = (
 _TRUE_POINTS, _MEASURED_POINTS, _WIRES = (
     np.atleast_1d(np.asarray(rr.Radius.ui_points(size))) for size in (2.5, 1.5, 1.0)
 )
-# The chord of a rim of 0.35 m then leaves it by 0.4 mm.
+# The chords of a rim of 0.35 m are then at most 0.4 mm off.
 _CIRCLE_POINTS = 64
 _QUALITY = 80
 _IMAGE_PLANE_M = 0.6
 
 
 class PairRecorder:
-    """Tells a recording of one pair after another."""
+    """Logs pairs into a recording."""
 
     def __init__(self, recording: rr.RecordingStream, rig: StereoRig, methods: Sequence[str]) -> None:
-        """Tell it of what does not change.
+        """Log what does not change.
 
         Args:
-            recording: a file or a viewer.
+            recording: to a file or a viewer.
             rig: the cameras.
-            methods: whose estimates there will be.
+            methods: names of the methods with estimates.
         """
         self._to = recording
         self._methods = {name: _METHOD_RGB[k % len(_METHOD_RGB)] for k, name in enumerate(methods)}
-        # Bodies that are shown now, and what of.
+        # What each visible body was drawn from.
         self._shown: dict[str, object] = {}
         self._log("rig", rr.ViewCoordinates.RDF, static=True)
         for eye in EYES:
@@ -127,7 +127,7 @@ class PairRecorder:
                 self._log(_path("errors", curve, name), rr.SeriesLine(color=color, name=name), static=True)
 
     def add(self, pair: ShownPair, answers: Mapping[str, Estimate]) -> None:
-        """Tell it of a pair and of what the methods say of it."""
+        """Log a pair and the methods' estimates of it."""
         rr.set_time_sequence(FRAMES, pair.frame_index, recording=self._to)
         rr.set_time_seconds(SECONDS, pair.images.time_s, recording=self._to)
         self._add_images(pair)
@@ -145,7 +145,7 @@ class PairRecorder:
     def _show(
         self, path: str, body: _Body | None, pose: RigidTransform | None, draw: Callable[[_Body], rr.AsComponents]
     ) -> None:
-        """Place a body, or remove it; what it looks like is sent when another one was there before."""
+        """Place a body, or remove it; its shape is sent only when it changes."""
         if body is None or pose is None:
             self._clear(path)
             self._shown.pop(path, None)
@@ -201,7 +201,7 @@ class PairRecorder:
             self._log(_path("rig", eye, "measured", method), points)
         truth = None if pair.record is None else pair.record.left_from_drogue
         if pose is None or truth is None:
-            # A gap in the curves: a line would say that there were fixes.
+            # Leaves a gap in the curves, where a line would suggest fixes.
             for curve in CURVES:
                 self._clear(_path("errors", curve, method))
             return
@@ -212,7 +212,7 @@ class PairRecorder:
 
 
 def blueprint() -> rrb.Blueprint:
-    """Where the viewer puts what: 3-D on the left, all of it and about the drogue, eyes and curves on the right."""
+    """The viewer's layout: two 3-D views on the left, images and error curves on the right."""
     whole = rrb.Spatial3DView(origin="rig", name="left camera's frame")
     close = rrb.Spatial3DView(
         origin="rig/drogue", contents=["rig/drogue/**", "rig/estimates/**"], name="drogue, true and estimated"
@@ -226,7 +226,7 @@ def blueprint() -> rrb.Blueprint:
 
 @lru_cache(maxsize=8)
 def _drogue(drogue: DrogueParameters) -> rr.Mesh3D:
-    """Its parts as one mesh in their own colours."""
+    """The drogue's parts as one coloured mesh."""
     vertices, faces, colors, count = [], [], [], 0
     for part, mesh in drogue_meshes(drogue).items():
         vertices.append(np.asarray(mesh.vertices))
@@ -237,7 +237,7 @@ def _drogue(drogue: DrogueParameters) -> rr.Mesh3D:
 
 
 def _wires(drogue: DrogueParameters, color: Rgb) -> rr.LineStrips3D:
-    """Rim, opening, markers and hub as circles: a second mesh in nearly the same place would flicker with the first."""
+    """Rim, opening, markers and hub as circles; a second mesh in nearly the same place would flicker."""
     middle = (0.0, 0.0, 0.0)
     circles = [(middle, drogue.rim_radius_m), (middle, drogue.face_inner_radius_m)]
     circles += [((x, y, 0.0), drogue.marker_radius_m) for x, y in drogue.marker_positions_m]
@@ -250,7 +250,7 @@ def _wires(drogue: DrogueParameters, color: Rgb) -> rr.LineStrips3D:
 
 
 def _screen_color(drogue: DrogueParameters, part: int) -> Array:
-    """A part's reflectance as a screen shows it, 0 to 255."""
+    """A part's reflectance as screen colour, 0 to 255."""
     if part >= FIRST_MARKER_ID:
         rgb = drogue.marker_reflectance_rgb
     elif part == Part.HUB and drogue.hub is not None:
@@ -266,7 +266,7 @@ def _screen_color(drogue: DrogueParameters, part: int) -> Array:
 
 
 def _mesh(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> rr.Mesh3D:
-    """Triangles with sharp edges: vertices of their own, with the triangle's normal."""
+    """Flat-shaded triangles: each has its own vertices with its normal."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -284,7 +284,7 @@ def _tanker(color: Rgb) -> rr.Mesh3D:
 
 
 def _eye(rig: StereoRig, eye: Eye) -> tuple[rr.Transform3D, rr.Pinhole]:
-    """Pose and intrinsics of the delivered image's camera; the viewer knows no distortion."""
+    """Pose and intrinsics of the camera of an image; the viewer has no distortion."""
     lens = rig.lens(eye)
     camera = rig.camera if lens is None else lens.camera
     rotation = np.eye(3) if lens is None else lens.ideal_from_real
@@ -300,7 +300,7 @@ def _eye(rig: StereoRig, eye: Eye) -> tuple[rr.Transform3D, rr.Pinhole]:
 
 
 def _corner_px(points_px: Sequence[tuple[float, float]]) -> Array:
-    """(M, 2) points counted from the image's corner. [px]"""
+    """(M, 2) points measured from the image's corner. [px]"""
     return np.asarray(points_px, dtype=np.float64).reshape(-1, 2) + 0.5
 
 
@@ -310,5 +310,5 @@ def _box(box: PixelBox) -> rr.Boxes2D:
 
 
 def _path(*parts: str) -> str:
-    """An entity's path; a method may be called anything."""
+    """An entity's path, escaped, since methods may have any name."""
     return rr.new_entity_path(list(parts))

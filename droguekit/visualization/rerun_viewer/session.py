@@ -1,4 +1,4 @@
-"""A dataset into a file of the viewer, or into a viewer that is opened for it."""
+"""Write a dataset into a recording of the rerun viewer, or open a viewer and send it there."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from datasets_manifest.types.estimates import Estimate
 from droguekit.batch.progress import ProgressReport
 from droguekit.visualization.rerun_viewer.recording import APPLICATION, PairRecorder, ShownPairs, blueprint
 
-# Only this machine may tell the viewer anything.
+# Only this machine can connect to the viewer.
 _HOST = "127.0.0.1"
-# How long a slow machine takes to open the viewer, and how long one may take to find that it gets no window. [s]
+# Longest time for the viewer to open, and time in which it fails if it gets no window. [s]
 _OPEN_TIMEOUT_S, _WINDOW_TIMEOUT_S = 30.0, 2.0
 
 
 @dataclass(frozen=True)
 class ViewSummary:
-    """What was shown: indices of pairs, and for those that could not be read a line each."""
+    """Indices of the shown pairs, and a line for each pair that could not be read."""
 
     shown: tuple[int, ...]
     faults: tuple[str, ...]
@@ -41,20 +41,19 @@ def view_pairs(
     save: Path | None,
     report: ProgressReport,
 ) -> ViewSummary:
-    """Show pairs and what methods say of them.
+    """Show pairs with estimates.
 
     Args:
         source: the dataset.
         frames: indices of the pairs, in order.
         answers: estimates by method and frame.
-        save: an .rrd file to write, which takes its name when it is whole, and without a pair to show is not written;
-            a viewer is opened for None.
-        report: hears how it goes.
+        save: an .rrd file, which appears when it is complete and is not written without pairs; None opens a viewer.
+        report: is told of the progress.
 
     Raises:
         OSError: the file cannot be written, or no viewer can be opened.
     """
-    # Each has an id of its own: the viewer joins those that share one.
+    # A new id for each: the viewer would join recordings of the same id.
     recording = rr.new_recording(APPLICATION)
     if save is None:
         _open_viewer(recording)
@@ -62,7 +61,7 @@ def view_pairs(
     part = part_path(save)
     try:
         save.parent.mkdir(parents=True, exist_ok=True)
-        # The library tells of no failed write but this one.
+        # The library reports no failed writes; this one is ours.
         part.touch(exist_ok=False)
         rr.save(part, default_blueprint=blueprint(), recording=recording)
         summary = _log_pairs(recording, source, frames, answers, report)
@@ -81,16 +80,16 @@ def _open_viewer(recording: rr.RecordingStream) -> None:
     """Open a viewer and connect to it.
 
     Raises:
-        OSError: it does not open; the library would drop everything that it is told.
+        OSError: it does not open; the library would silently drop all data.
     """
     port = _free_port()
-    # The one that came with the library, whatever the search path says; it stays when this process ends.
+    # The viewer that came with the library; it stays open when this process ends.
     command = [sys.executable, "-m", "rerun_cli", "--bind", _HOST, "--port", str(port)]
     viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     until_s = time.monotonic() + _OPEN_TIMEOUT_S
     while viewer.poll() is None and not _answers(port) and time.monotonic() < until_s:
         time.sleep(0.2)
-    # It listens before it has a window, and ends when it gets none.
+    # It listens before it has a window, and exits when it gets none.
     with suppress(subprocess.TimeoutExpired):
         viewer.wait(_WINDOW_TIMEOUT_S)
     if viewer.returncode is not None or not _answers(port):
@@ -103,7 +102,7 @@ def _open_viewer(recording: rr.RecordingStream) -> None:
 
 
 def _free_port() -> int:
-    """Not the usual one: whatever listens there may be no viewer, or one for other things."""
+    """A free port instead of the default one, where another program or viewer may listen."""
     with socket.socket() as held:
         held.bind((_HOST, 0))
         return int(held.getsockname()[1])
