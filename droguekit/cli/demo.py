@@ -10,7 +10,7 @@ import typer
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import RecipeArgument, WorkersOption, output_option
 from droguekit.cli.main import FAULT
-from droguekit.workflows.demo import run_demo
+from droguekit.workflows.demonstration import run_demo
 
 EXAMPLES = (
     "droguekit demo",
