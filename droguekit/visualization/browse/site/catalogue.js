@@ -24,7 +24,7 @@
   const ORDERS = {
     near: (row) => row.distance_m ?? Infinity,
     far: (row) => -(row.distance_m ?? -Infinity),
-    // A fix where there is nothing is farther off than any other.
+    // A fix without a drogue counts as the largest error.
     error: (row, state) => {
       const answer = droguekit.answerOf(row, state);
       if (answer === "fix") return -Infinity;
@@ -42,12 +42,12 @@
     return row.box_px === null ? "hidden" : "seen";
   }
 
-  /** The method whose estimates count: the one that is chosen, or the first. */
+  /** The chosen method, or the first one. */
   droguekit.methodOf = function (state) {
     return catalogue.methods.includes(state.method) ? state.method : catalogue.methods[0];
   };
 
-  /** What that method says of a pair: its error [mm], "fix" without a truth, "no fix", or null for nothing. */
+  /** That method's result for a pair: its error [mm], "fix" without truth, "no fix", or null without an estimate. */
   droguekit.answerOf = function (row, state) {
     return row.answers[catalogue.methods.indexOf(droguekit.methodOf(state))];
   };
@@ -59,7 +59,7 @@
     if (!Object.hasOwn(ORDERS, state.order ?? "")) return rows;
     const key = ORDERS[state.order];
     const keyed = rows.map((row) => [key(row, state), row]);
-    // Infinite keys are equal to each other, and their difference is no number.
+    // Infinite keys are equal, but their difference is not a number.
     return keyed.sort((a, b) => (a[0] < b[0] ? -1 : a[0] > b[0] ? 1 : a[1].frame - b[1].frame)).map(([, row]) => row);
   };
 

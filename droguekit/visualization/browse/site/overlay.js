@@ -3,9 +3,9 @@
 
 (function () {
   const SVG = "http://www.w3.org/2000/svg";
-  // Half the length of a cross, as a share of the width that is shown.
+  // Half the length of a cross over the visible width.
   const ARM_SHARE = 0.009;
-  // How much more than the drogue's box is shown of it.
+  // Side of the zoomed view over that of the drogue's box.
   const MARGIN = 1.5;
   const SMALLEST_VIEW_PX = 24;
 
@@ -26,7 +26,7 @@
     return element("rect", { class: kind, x, y, width, height });
   }
 
-  /** A cross or a tilted one at a place of the image; it keeps its size on the screen. */
+  /** An upright or diagonal cross at an image point, of constant size on the screen. */
   function cross(x, y, arm, kind, name) {
     const path = kind.startsWith("measured") ? "M-1-1L1 1M-1 1L1-1" : "M-1 0H1M0-1V1";
     const made = element("path", { class: kind, d: path, transform: `translate(${x} ${y}) scale(${arm})` });
@@ -67,7 +67,7 @@
     return groups;
   }
 
-  /** The box around the drogue in an eye's image, or around where an estimate puts it; null where there is neither. */
+  /** The box around the drogue in an eye's image, else around an estimate, else null. */
   droguekit.surroundings = function (labels, eye, answer) {
     const view = labels[eye];
     if (view.box_visible_px || view.box_full_px) return view.box_visible_px || view.box_full_px;

@@ -15,7 +15,7 @@
     for (const value of values) select.add(new Option(String(value), String(value)));
   }
 
-  /** Offer what occurs in the dataset; hide what would not part it. */
+  /** Fill the filters with values of the dataset; hide filters that all pairs pass. */
   function fillFilters() {
     for (const column of ["family", "split", "sequence", "light"]) {
       const values = droguekit.valuesOf(column);
@@ -39,12 +39,12 @@
     for (const field of form.elements) {
       if (!field.name) continue;
       const wanted = state[field.name] ?? (field.name === "method" ? (catalogue.methods[0] ?? "") : "");
-      // Even its own value, when it is given again, sends the caret of a field to its start.
+      // Setting a field's value, even to the same, moves its caret to the start.
       if (field.value !== wanted) field.value = wanted;
     }
   }
 
-  /** The left eye's small picture, with the box of what is seen of the drogue. */
+  /** The left eye's small picture with the visible box of the drogue. */
   function tile(row) {
     const item = document.createElement("li");
     const link = document.createElement("a");
@@ -68,7 +68,7 @@
 
   function mark([x, y, width, height]) {
     const box = document.createElement("i");
-    // Shares of the picture, whose corner lies half a pixel before the first pixel's centre.
+    // In percent of the picture, whose corner is half a pixel before the first pixel's centre.
     box.style.left = `${(100 * (x + 0.5)) / catalogue.width_px}%`;
     box.style.top = `${(100 * (y + 0.5)) / catalogue.height_px}%`;
     box.style.width = `${(100 * width) / catalogue.width_px}%`;
@@ -84,7 +84,7 @@
     return answer === "fix" && !catalogue.is_blind ? ", false fix" : `, ${answer}`;
   }
 
-  /** How many pages there are, and which of them the state means. */
+  /** The number of pages, and the state's page. */
   function pages() {
     const last = Math.max(1, Math.ceil(rows.length / PER_PAGE));
     return { last, page: Math.min(last, Math.max(1, Math.trunc(Number(state.page)) || 1)) };
@@ -100,7 +100,7 @@
     byId("tiles").replaceChildren(...rows.slice((page - 1) * PER_PAGE, page * PER_PAGE).map(tile));
   }
 
-  /** Rows before and after the one that is shown. */
+  /** Rows before and after the shown one. */
   function neighbours() {
     const place = rows.findIndex((row) => String(row.frame) === state.frame);
     return { place, before: rows[place - 1], after: place < 0 ? rows[0] : rows[place + 1] };
@@ -137,12 +137,12 @@
     byId("all").hidden = single;
     showFilters();
     showAll();
-    // Whoever listens or uses keys goes on where the picture is, or where it was.
+    // Screen readers and keyboard users continue at the picture, or where it was.
     if (single && before === undefined) byId("title").focus();
     if (!single && before !== undefined) document.querySelector(`[data-frame="${Number(before)}"]`)?.focus();
   }
 
-  /** Change the state; a step that one may want to go back to gets a place in the browser's history. */
+  /** Change the state; larger steps get an entry in the browser's history. */
   function change(changes, keep) {
     const address = droguekit.addressOf({ ...state, ...changes });
     if (keep) location.hash = address;
@@ -152,7 +152,7 @@
     }
   }
 
-  /** Write the state into the address. Browsers stop it when it is written too often: nothing is read back from it. */
+  /** Write the state into the address. Browsers block frequent writes, so it is never read back. */
   function mirror() {
     isLate = false;
     try {
@@ -162,7 +162,7 @@
     }
   }
 
-  /** Show another pair; while a key is held, the address waits until it is let go. */
+  /** Show another pair; while a key is held, the address is written only after its release. */
   function step(row, isHeld) {
     if (!row) return;
     show({ ...state, frame: String(row.frame) });

@@ -4,7 +4,7 @@
 var droguekit = {};
 
 (function () {
-  // Nearer than this to an eye's plane nothing can be drawn. [m]
+  // Circles nearer to the camera's plane than this are not drawn. [m]
   const NEAREST_M = 0.05;
 
   /** A point of the drogue in the left camera's frame. [m] `pose` holds the upper three rows of the matrix. */
@@ -18,7 +18,7 @@ var droguekit = {};
     return [camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px];
   }
 
-  /** Where a real lens shows a direction of the rectified rig (Brown and Conrady, with OpenCV's coefficients). [px] */
+  /** Pixel of a distorting lens for a direction in the rectified rig (Brown and Conrady, OpenCV's coefficients). [px] */
   function throughLens(lens, direction) {
     const turn = lens.real_from_ideal;
     const [u, v, w] = [0, 3, 6].map(

@@ -19,7 +19,7 @@
     if (received.size > AT_MOST_KEPT) received.delete(received.keys().next().value);
   };
 
-  /** Load a pair's labels; a page from the file system may not read them in any other way than as a script. */
+  /** Load a pair's labels; a page from the file system can read files only as scripts. */
   function load(name) {
     if (received.has(name)) return Promise.resolve(received.get(name));
     return new Promise((resolve, reject) => {
@@ -110,7 +110,7 @@
       labels = NO_LABELS;
       fault = `This pair's labels cannot be shown: ${error.message}.`;
     }
-    if (wanted !== row) return; // another one was opened meanwhile
+    if (wanted !== row) return; // another pair was opened meanwhile
     faults.clear();
     byId("fault").hidden = true;
     if (fault) complain(fault);
