@@ -1,4 +1,4 @@
-"""The base of every type that comes from a file or goes to one."""
+"""The base class of all types with a JSON or TOML form."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from pydantic import BaseModel, ConfigDict
 
 
 class FrozenModel(BaseModel):
-    """A value that is checked when it is made, refuses unknown keys and never changes."""
+    """An immutable value that is validated when it is made and rejects unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

@@ -1,4 +1,4 @@
-"""Where the features of a drogue lie: what an estimator needs to know of it, as arrays."""
+"""Positions of a drogue's features as arrays: all that pose estimators use of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from drogue_models.parameters import DrogueParameters
 from geometry.se3 import Array, read_only
 
-# Markers count as one even ring when their places agree with it within this, far below any centroid's worth.
+# Tolerance of an even ring of markers, far below the accuracy of any centroid.
 _RING_TOLERANCE_M = 1e-6
 
 
@@ -24,7 +24,7 @@ class MarkerLayout:
         hub_center_m: (3,) centre of the hub annulus, or None. [m]
         hub_inner_radius_m, hub_outer_radius_m: its edges, 0 without a hub. [m]
         face_inner_radius_m, face_outer_radius_m: edges of the dark face around the markers, 0 where unknown. [m]
-        collar_radius_m: edge of what surrounds the hub, 0 where unknown. [m]
+        collar_radius_m: outer edge of the coupling around the hub, 0 where unknown. [m]
     """
 
     centers_m: Array
@@ -54,7 +54,7 @@ class MarkerLayout:
 
     @cached_property
     def symmetry_order(self) -> int:
-        """How many rotations about the axis map the markers onto themselves (8 for an even ring of 8)."""
+        """Number of rotations about the axis that map the markers onto themselves (8 for an even ring of 8)."""
         for order in range(self.count, 1, -1):
             angle = 2 * np.pi / order
             turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

@@ -1,4 +1,8 @@
-"""The drogue as closed meshes by part, in the drogue frame: seen from the camera, front faces look along -z."""
+"""Closed meshes of the drogue by part, of its hose and of obstacles.
+
+In the drogue frame front faces look along -z, towards the camera. `python -m drogue_models.meshes FILE.ply` writes the
+body of the example drogue that ships.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +22,18 @@ from drogue_models.parts import Part, marker_id
 from drogue_models.solids import area_radius_m, bar, circle_m, loft, plate, pocketed_plate, revolve
 from geometry.se3 import Array
 
-# A drogue's body; anything else was most likely drawn in millimetres or inches.
-SMALLEST_M, LARGEST_M = 0.05, 10.0
+# Sizes of a drogue's body; anything outside was most likely drawn in millimetres or inches.
+_SMALLEST_BODY_M, _LARGEST_BODY_M = 0.05, 10.0
 # float32 files round a front at z = 0 by this much for bodies of a few metres.
 _FRONT_TOLERANCE_M = 1e-6
 
 
 def load_body_mesh(body: BodyMesh) -> trimesh.Trimesh:
-    """The body in the drogue frame: metres, z from the mouth to the hose, nothing before z = 0.
+    """A user's mesh of the drogue's body, in the drogue frame (z from the mouth to the hose, z >= 0). [m]
 
     Raises:
-        ValueError: the file is missing, is not the one the drogue was loaded with, cannot be read as a mesh, or is not
-            a closed body of a sane size behind the rim plane.
+        ValueError: the file is missing, has another hash than when the drogue was loaded, cannot be read as a mesh, or
+            is not a closed body of plausible size behind the rim plane.
     """
     file = body.file
     try:
@@ -66,15 +70,17 @@ def _parse(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
 
 
 def _fault(mesh: trimesh.Trimesh) -> str | None:
-    """Why the mesh cannot be used and what to do, or None."""
+    """Why the mesh cannot be used, and what to do; None for a valid mesh."""
     if not np.isfinite(mesh.vertices).all():
         return "has vertices that are not finite; export it again"
     # Formats with normals or texture repeat the vertices along their seams.
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     low, high = mesh.bounds
     size_m = float((high - low).max())
-    if not SMALLEST_M <= size_m <= LARGEST_M:
-        return f"must be {SMALLEST_M:g} to {LARGEST_M:g} m in size, with coordinates in metres, got {size_m:g}"
+    if not _SMALLEST_BODY_M <= size_m <= _LARGEST_BODY_M:
+        return (
+            f"must be {_SMALLEST_BODY_M:g} to {_LARGEST_BODY_M:g} m in size, with coordinates in metres, got {size_m:g}"
+        )
     if low[2] < -_FRONT_TOLERANCE_M:
         return f"must lie behind the rim plane (z >= 0, z from the mouth to the hose), got z down to {low[2]:g} m"
     if not mesh.is_watertight:
@@ -90,12 +96,13 @@ HOSE_END_FRACTION = 0.005
 
 
 def hose_mesh(nodes_m: ArrayLike, radius_m: float) -> trimesh.Trimesh:
-    """A closed tube along a smooth curve through nodes.
+    """The hose: a closed tube along a smooth curve through nodes.
 
-    Vertices and faces depend on the number of nodes only, so that a renderer can move the vertices of a loaded mesh.
+    The numbers of vertices and faces depend on the number of nodes only, so that a renderer can move the vertices of a
+    loaded mesh.
 
     Args:
-        nodes_m: (K, 3) centre line, K >= 2, no node twice in a row. [m]
+        nodes_m: (K, 3) centre line, K >= 2, without equal neighbours. [m]
         radius_m: > 0. [m]
 
     Raises:
@@ -113,7 +120,7 @@ def hose_mesh(nodes_m: ArrayLike, radius_m: float) -> trimesh.Trimesh:
     curve = CubicSpline(knots, nodes, bc_type="natural")
     between = np.arange(HOSE_RINGS_PER_SEGMENT) / HOSE_RINGS_PER_SEGMENT
     inner = (knots[:-1, None] + chord_m[:, None] * between).ravel()[1:]
-    # A ring close to either end keeps the cap's direction out of the tube's interpolated normals.
+    # A ring close to each end keeps the cap's direction out of the tube's interpolated normals.
     ends_m = HOSE_END_FRACTION * chord_m[[0, -1]]
     at = np.concatenate([[0.0, ends_m[0]], inner, [knots[-1] - ends_m[1], knots[-1]]])
     tangents = curve(at, 1)
@@ -125,7 +132,7 @@ def hose_mesh(nodes_m: ArrayLike, radius_m: float) -> trimesh.Trimesh:
 
 
 def _carried_frame(tangents: Array) -> tuple[Array, Array]:
-    """Two (S, 3) unit vectors across the curve that turn with it as little as they can, `side x up = tangent`."""
+    """Two (S, 3) unit vectors across the curve with minimal rotation along it, `side x up = tangent`."""
     side = np.empty_like(tangents)
     seed = np.eye(3)[np.argmin(np.abs(tangents[0]))]
     for index, tangent in enumerate(tangents):
@@ -140,13 +147,13 @@ MARKER_SECTIONS = 128
 RIM_SECTIONS = 256
 RIM_TUBE_SECTIONS = 16
 
-# Our choices, as those of published drogues are not given.
+# Our choices, as dimensions of published drogues do not include them.
 FACE_THICKNESS_M = 0.005
 POCKET_DEPTH_M = 0.004
 MARKER_THICKNESS_M = 0.003
 HUB_THICKNESS_M = 0.002
 GROOVE_PER_HUB_THICKNESS = 1.5
-# A dark sleeve lines the hub's hole: the bright wall of the hole would be seen past the near edge and move it.
+# A dark sleeve lines the hub's hole: its bright wall would be visible past the near edge and shift that edge.
 SLEEVE_THICKNESS_M = 0.00002
 RIB_WIDTH_M = 0.008
 RIB_THICKNESS_M = 0.004
@@ -159,8 +166,8 @@ RECESS_DEPTH_M = 0.10
 def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
     """All parts of a drogue, closed, with outward normals.
 
-    Nothing stands before z = 0, so that nothing throws a shadow's edge over the markers. Markers fill holes of the
-    face, and the hub a groove of the coupling, vertex on vertex.
+    No part reaches before z = 0, so that none casts a shadow's edge onto the markers. Markers fill pockets of the face,
+    and the hub a groove of the coupling, with shared vertices.
 
     Args:
         drogue: its dimensions.
@@ -188,7 +195,7 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
 
 
 def obstacle_mesh(shape: ObstacleShape) -> trimesh.Trimesh:
-    """A closed mesh of a bystander in its own frame. [m]"""
+    """A closed mesh of an obstacle in its own frame. [m]"""
     return revolve(shape.profile_m(), OBSTACLE_SECTIONS)
 
 
@@ -198,7 +205,7 @@ def _marker_outline_m(drogue: DrogueParameters, index: int) -> Array:
 
 
 def _face(drogue: DrogueParameters) -> trimesh.Trimesh:
-    """The plate with a pocket for every marker, deeper than the marker: two surfaces at one place would flicker."""
+    """The plate with a pocket for every marker, deeper than the marker, as coincident surfaces would flicker."""
     opening = circle_m(drogue.face_inner_radius_m, RIM_SECTIONS)
     pockets = [_marker_outline_m(drogue, index) for index in range(drogue.marker_count)]
     outer = circle_m(drogue.rim_radius_m - drogue.rim_tube_radius_m, RIM_SECTIONS)
@@ -209,7 +216,7 @@ def _rim(drogue: DrogueParameters) -> trimesh.Trimesh:
     """A torus that touches z = 0 from behind where the face ends."""
     tube_m = drogue.rim_tube_radius_m
     profile = circle_m(tube_m, RIM_TUBE_SECTIONS, (drogue.rim_radius_m - tube_m, tube_m))
-    # The sine of a multiple of pi is not exactly 0: keep the rounding from standing before the face.
+    # The sine of a multiple of pi is not exactly 0: keep rounding errors from reaching before the face.
     return revolve(np.maximum(profile, [0.0, 0.0]), RIM_SECTIONS)
 
 
@@ -232,7 +239,7 @@ def _ribs(drogue: DrogueParameters) -> trimesh.Trimesh:
 
 
 def _canopy(drogue: DrogueParameters) -> trimesh.Trimesh:
-    """A band of cloth outside the front part of the ribs, bulged by the air that it catches."""
+    """A band of cloth outside the front part of the ribs, bulged by the air stream."""
     front, back = _rib_line_m(drogue)
     share = np.linspace(0.0, 1.0, 9)[:, None]
     across = np.array([(back - front)[1], (front - back)[0]]) / np.linalg.norm(back - front)
@@ -240,7 +247,7 @@ def _canopy(drogue: DrogueParameters) -> trimesh.Trimesh:
     inner = inner + across * CANOPY_BULGE_M * 4 * share * (1 - share)
     outer = inner + across * CANOPY_THICKNESS_M
     profile = np.vstack([outer, inner[::-1]])
-    # Nothing may reach beyond the rim, however narrow its tube is.
+    # The canopy must not reach beyond the rim, however narrow its tube is.
     profile[:, 0] -= max(0.0, profile[:, 0].max() - drogue.rim_radius_m)
     return revolve(profile, MARKER_SECTIONS)
 

@@ -1,4 +1,4 @@
-"""Shapes of what stands around a drogue besides hose and tanker: the receiver's probe, bars, and other round things."""
+"""Shapes of obstacles around a drogue: the receiver's probe, bars, and other round objects as distractors."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from drogue_models.parameters import Metres
 from geometry.se3 import Array
 
 OBSTACLE_SECTIONS = 64
-# (radius, z) of a probe's nozzle per radius of its tube: a bulb, then a waist (our choice of proportions).
+# (radius, z) of a probe's nozzle over the radius of its tube: a bulb, then a waist (our choice of proportions).
 PROBE_PROFILE = ((0.55, 0.0), (0.80, 0.12), (0.95, 0.35), (0.95, 1.6), (0.62, 2.2), (0.62, 5.2), (1.0, 6.0))
 
 
 class ObstacleShape(FrozenModel):
-    """A body of revolution about its own z axis.
+    """An obstacle's dimensions: a body of revolution about its own z axis.
 
     Attributes:
         form: `probe` (tip at the origin, body along +z), `bar` (a rod along z around the origin), `ball`, `disc` (a
             thin round plate facing -z) or `ring` (a torus around z).
-        radius_m: largest radius; of a ring its centre line's. [m]
-        length_m: of probe and bar, thickness of a disc; without meaning for the others. [m]
-        tube_radius_m: of a ring's tube; without meaning for the others. [m]
+        radius_m: largest radius; of a ring that of its centre line. [m]
+        length_m: of probe and bar, thickness of a disc; ignored otherwise. [m]
+        tube_radius_m: of a ring's tube; ignored otherwise. [m]
     """
 
     form: Literal["probe", "bar", "ball", "disc", "ring"]

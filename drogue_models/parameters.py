@@ -1,4 +1,4 @@
-"""Dimensions and surface properties of a drogue, as they come from a preset or a user's TOML file.
+"""Dimensions and surface properties of a drogue, from a preset or a user's TOML file.
 
 Drogue frame: origin at the centre of the marker circle in the rim plane, z along the axis from the mouth to the hose.
 """
@@ -30,8 +30,8 @@ class HubParameters(FrozenModel):
     """The bright annulus around the coupling's mouth.
 
     Attributes:
-        depth_m: how far behind the rim plane its face lies. [m]
-        inner_radius_m, outer_radius_m: its two edges. [m]
+        depth_m: distance of its face behind the rim plane. [m]
+        inner_radius_m, outer_radius_m: of its two edges. [m]
         reflectance_rgb: diffuse reflectance in linear Rec. 709.
     """
 
@@ -48,13 +48,13 @@ class HubParameters(FrozenModel):
 
 
 class BodyMesh(FrozenModel):
-    """A user's mesh of canopy, ribs and coupling in one, pinned by its contents.
+    """A user's mesh that replaces canopy, ribs and coupling, pinned by its hash.
 
     Attributes:
         path: as the user wrote it, relative to `folder` unless absolute.
         sha256: of the file.
-        folder: where the drogue's TOML file lies. It is not stored with a dataset, which must not depend on where it
-            was made; a drogue that is read back looks in the working directory.
+        folder: that of the drogue's TOML file. It is not stored with a dataset, whose contents must not depend on the
+            place where it was made; a drogue that is read back looks in the working directory.
     """
 
     path: str = Field(min_length=1, max_length=1000)
@@ -63,18 +63,18 @@ class BodyMesh(FrozenModel):
 
     @property
     def file(self) -> Path:
-        """Where the mesh lies."""
+        """Path of the mesh."""
         return self.folder / self.path
 
 
 class SatinPaint(FrozenModel):
-    """Rough plastic: microfacets mirror a fixed share of the light, and the paint below scatters the rest.
+    """Rough plastic: microfacets reflect a fixed share of the light, and the paint below scatters the rest.
 
     The facets are those of Trowbridge and Reitz (GGX; B. Walter et al., EGSR 2007, doi:10.2312/EGWR/EGSR07/195-206).
 
     Attributes:
-        parts: which parts have it; markers, face, rim and hub are matt.
-        sheen_fraction: share that the facets mirror.
+        parts: the parts with this paint; markers, face, rim and hub are always matt.
+        sheen_fraction: share that the facets reflect.
         roughness: width of the facets' distribution.
     """
 
@@ -87,10 +87,10 @@ class DrogueParameters(FrozenModel):
     """A drogue with round markers set into its dark face.
 
     Attributes:
-        name: what to call it.
+        name: for tables and messages.
         rim_radius_m: outermost radius. [m]
         face_inner_radius_m: radius of the opening; the face lies between it and the rim. [m]
-        rim_tube_radius_m: radius of the matt black torus that ends the rim, flush with the face in front. [m]
+        rim_tube_radius_m: radius of the matt black torus around the rim, flush with the face in front. [m]
         marker_positions_m: centres of the markers in the rim plane. [m]
         marker_radius_m: [m]
         marker_reflectance_rgb: diffuse reflectance in linear Rec. 709.
@@ -102,7 +102,7 @@ class DrogueParameters(FrozenModel):
         rib_count: struts between rim and coupling.
         coupling_radius_m, coupling_length_m: the body behind the hub face. [m]
         hose_radius_m: [m]
-        body_mesh: a mesh instead of canopy, ribs and coupling, or none. Its part is the coupling.
+        body_mesh: a mesh instead of canopy, ribs and coupling, or none; its pixels count as coupling.
         satin: paint with a sheen on some parts, or none.
     """
 

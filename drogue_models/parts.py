@@ -11,7 +11,7 @@ MAX_MARKERS = 32
 
 
 class Part(IntEnum):
-    """What a pixel centre sees; marker i is `FIRST_MARKER_ID + i`."""
+    """Id of the part that a pixel centre sees; marker i is `FIRST_MARKER_ID + i`."""
 
     SKY = 0
     FACE = 1
@@ -28,9 +28,9 @@ class Part(IntEnum):
     BOARD = 21
 
 
-# What hangs on the drogue or stands around it; none of it belongs to the drogue's box.
+# Parts around the drogue, outside its box.
 SURROUNDING_PARTS = (Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR, Part.BOARD)
-# What the drogue's box covers besides the markers.
+# Parts that the drogue's box covers, besides the markers.
 DROGUE_PARTS = (Part.FACE, Part.RIM, Part.CANOPY, Part.RIBS, Part.COUPLING, Part.HUB)
 
 
@@ -46,12 +46,12 @@ def marker_id(index: int) -> int:
 
 
 def drogue_part_ids(marker_count: int) -> list[int]:
-    """All ids that belong to the drogue's box."""
+    """Ids of all parts that the drogue's box covers."""
     return [int(part) for part in DROGUE_PARTS] + [marker_id(index) for index in range(marker_count)]
 
 
 def part_name(part_id: int) -> str:
-    """Name of a part for people and files: `face`, `marker_3`.
+    """Name of a part in messages and files, such as `face` or `marker_3`.
 
     Raises:
         ValueError: no part has this id.
@@ -66,7 +66,7 @@ TANKER_GREY: ReflectanceRgb = (0.36, 0.37, 0.38)
 
 
 def part_satin(drogue: DrogueParameters, part_id: int) -> SatinPaint | None:
-    """The sheen of a part (see `drogue_models.parts`), None where it is matt."""
+    """The satin paint of a part, or None where it is matt."""
     satin = drogue.satin
     return satin if satin is not None and part_id in {Part[name.upper()] for name in satin.parts} else None
 
@@ -75,8 +75,8 @@ def part_reflectance_rgb(drogue: DrogueParameters, part_id: int) -> tuple[float,
     """Diffuse reflectance of a part in linear Rec. 709.
 
     Args:
-        drogue: whose surfaces.
-        part_id: see `drogue_models.parts`.
+        drogue: with its surfaces.
+        part_id: as in `Part`.
 
     Raises:
         ValueError: no surface has this id.

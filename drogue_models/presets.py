@@ -1,4 +1,4 @@
-"""The drogues that ship, and reading a user's own from TOML."""
+"""The shipped drogues, and the reader of a user's drogue from TOML."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _expand_ring(table: dict[str, Any]) -> None:
 
 
 def _pin_body_mesh(table: dict[str, Any], folder: Path) -> None:
-    """Replace the path of the body's mesh by path, hash and folder."""
+    """Replace the path of the body's mesh by path, hash and folder, in place."""
     if "body_mesh" not in table:
         return
     given = table["body_mesh"]

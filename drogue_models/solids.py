@@ -1,4 +1,4 @@
-"""Closed solids that the parts are made of: plates, bodies of revolution, lofts and bars, with outward normals."""
+"""Closed solids with outward normals, of which parts consist: plates, bodies of revolution, lofts and bars."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def plate(outer_m: Array, holes_m: Sequence[Array], thickness_m: float) -> trime
         holes_m: (M, 2) outline of each hole.
         thickness_m: > 0.
     """
-    # Without processing, plates that are made from one outline keep exactly equal vertices on both sides of it.
+    # Without processing, two plates that share an outline keep exactly equal vertices along it.
     mesh = trimesh.creation.extrude_polygon(Polygon(outer_m, holes_m), thickness_m, engine="earcut", process=False)
     mesh.merge_vertices()
     return mesh
@@ -162,10 +162,10 @@ def bar(start_m: ArrayLike, end_m: ArrayLike, width_along: ArrayLike, size_m: tu
 
 
 def with_creases(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The same surface for interpolated normals: round where it is round, with edges where faces meet at an angle.
+    """The same surface for interpolated normals: smooth on round parts, with creases where faces meet at an angle.
 
-    Faces that meet by more than 15 degrees share no vertices any more, so that the mesh is not closed. That is little
-    more than what round parts have between two faces: a normal that were tilted where a tube ends would look away from
-    a camera close beside the tube over all of its length.
+    Faces that meet at more than 15 degrees share no vertices, so that the mesh is no longer closed. The angle is little
+    more than that between neighbouring faces of round parts: a tilted normal at the end of a tube would be interpolated
+    over its whole length, and face away from a camera close beside the tube.
     """
     return trimesh.graph.smooth_shade(mesh, angle=np.radians(15.0), facet_minarea=None)

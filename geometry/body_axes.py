@@ -1,4 +1,4 @@
-"""Axes of bodies and of the Earth, each a rotation into the next: optical, aviation, robotics, navigation.
+"""Rotations between the axes conventions of optics, aviation, robotics and navigation.
 
 Optical (OpenCV): x right, y down, z forward. FRD (aviation bodies): forward, right, down. FLU (bodies of ROS REP-103):
 forward, left, up. ENU (the project's world): east, north, up. NED (aviation navigation): north, east, down.

@@ -1,4 +1,4 @@
-"""The perspective image of a disc: its centre is not the image of the disc's centre."""
+"""The perspective image of a disc, whose centre differs from the image of the disc's centre."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
 
-# Evenly spaced on a circle: the polygon shrinks about the same centre.
+# Evenly spaced on a circle, so that the polygon has the same centre.
 _OUTLINE_POINTS = 256
 
 
@@ -56,10 +56,10 @@ def project_disc_centers(
 def disc_image_centers(
     rig: StereoRig, left_from_drogue: RigidTransform, centers_drogue_m: ArrayLike, radii_m: ArrayLike, eye: Eye
 ) -> Array:
-    """Centres of gravity of the areas that discs cover in the delivered image; arguments as `project_disc_centers`.
+    """Centroids of the areas that discs cover in the delivered image; arguments as `project_disc_centers`.
 
-    In an ideal eye they are the centres of the image ellipses. Behind a lens that distorts, an image of a disc is no
-    ellipse; its centre is that of a polygon through its edge.
+    In an ideal eye they are the centres of the image ellipses. Behind a distorting lens the image of a disc is not an
+    ellipse; its centroid is that of a polygon through its edge.
 
     Returns:
         (N, 2) pixel coordinates. [px]
@@ -68,11 +68,11 @@ def disc_image_centers(
         return project_disc_centers(rig, left_from_drogue, centers_drogue_m, radii_m, eye)
     places = zip(np.atleast_2d(centers_drogue_m), np.atleast_1d(radii_m), strict=True)
     outlines = [disc_outline(left_from_drogue, center, radius, _OUTLINE_POINTS) for center, radius in places]
-    return np.stack([_center_of_gravity(rig.image(outline, eye)) for outline in outlines])
+    return np.stack([_polygon_centroid(rig.image(outline, eye)) for outline in outlines])
 
 
-def _center_of_gravity(corners: Array) -> Array:
-    """(2,) centre of the area of a polygon with (M, 2) corners."""
+def _polygon_centroid(corners: Array) -> Array:
+    """(2,) centroid of a polygon with (M, 2) corners."""
     origin = corners.mean(axis=0)
     start = corners - origin
     end = np.roll(start, -1, axis=0)

@@ -1,7 +1,7 @@
-"""A real eye: lens distortion, and axes a little off those of the rectified rig.
+"""A real eye: lens distortion, and a small rotation from the axes of the rectified rig.
 
-A rotation about the eye's own centre and a distortion move pixels regardless of depth. So every pixel of the real image
-has one pixel of the ideal, rectified image that sees the same ray, and the rest of the rig's geometry stays ideal.
+A rotation about the eye's centre and a distortion move pixels regardless of depth. So every pixel of the real image
+corresponds to one pixel of the ideal, rectified image with the same ray, and the rest of the rig's geometry is ideal.
 """
 
 from __future__ import annotations
@@ -45,14 +45,14 @@ class BrownConrady:
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
     def distort(self, places: ArrayLike) -> Array:
-        """(..., 2) where rays through (..., 2) ideal places at unit distance meet the distorted image."""
+        """(..., 2) distorted points of (..., 2) ideal points, both in the image plane at unit distance."""
         return self._distort(np.asarray(places, dtype=np.float64))[0]
 
     def undistort(self, places: ArrayLike) -> Array:
-        """(..., 2) ideal places of (..., 2) distorted ones, by Newton's method to rounding.
+        """(..., 2) ideal points of (..., 2) distorted ones, by Newton's method to rounding errors.
 
         Raises:
-            ValueError: a place beyond where the distortion folds the image over.
+            ValueError: a point outside the region where the distortion is invertible.
         """
         wanted = np.asarray(places, dtype=np.float64)
         ideal = wanted.copy()
@@ -69,7 +69,7 @@ class BrownConrady:
         raise ValueError(f"distortion: {self.coefficients().tolist()} folds the image over; make it weaker")
 
     def _distort(self, p: Array) -> tuple[Array, Array, Array, Array]:
-        """Distorted places, and the entries xx, xy, yy of their symmetric Jacobian."""
+        """Distorted points, and the entries xx, xy, yy of their symmetric Jacobian."""
         x, y = p[..., 0], p[..., 1]
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -102,7 +102,7 @@ class Lens:
     ideal_from_real: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
-        # RigidTransform knows what a rotation is.
+        # RigidTransform checks that it is a rotation.
         rotation = RigidTransform(read_only(self.ideal_from_real, (3, 3), "ideal_from_real"), np.zeros(3)).rotation
         object.__setattr__(self, "ideal_from_real", rotation)
         self.rays(border_px(self.camera))
@@ -111,7 +111,7 @@ class Lens:
         """(..., 3) directions in the rig's axes through (..., 2) pixels of the real image, scaled to z = 1.
 
         Raises:
-            ValueError: the distortion folds the image over there.
+            ValueError: the distortion is not invertible there.
         """
         seen = self.camera.rays(real_px)
         seen[..., :2] = self.distortion.undistort(seen[..., :2])

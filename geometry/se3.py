@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-# float64 products of a few rotations stay far within this; a typing slip in a file does not.
+# float64 products of a few rotations stay far within this; a typing error in a file does not.
 _ORTHONORMAL_TOLERANCE = 1e-6
 _MAX_COSINE = 2.0
 
@@ -20,7 +20,7 @@ def read_only(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
     """A read-only float64 copy of `values`.
 
     Args:
-        values: anything numpy can read.
+        values: anything that numpy converts.
         shape: the shape it must have; -1 stands for any length.
         name: the field's name, for the error.
 
@@ -50,7 +50,7 @@ class RigidTransform:
 
     def __post_init__(self) -> None:
         rotation = read_only(self.rotation, (3, 3), "rotation")
-        # Absurd numbers, which would overflow in the product, are no cosines.
+        # Larger numbers are not cosines and could overflow in the product.
         fits = np.abs(rotation).max() < _MAX_COSINE
         fits = fits and np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ORTHONORMAL_TOLERANCE
         if not fits or np.linalg.det(rotation) < 0:
@@ -60,7 +60,7 @@ class RigidTransform:
 
     @staticmethod
     def identity() -> RigidTransform:
-        """The transform that changes nothing."""
+        """The identity transform."""
         return RigidTransform(np.eye(3), np.zeros(3))
 
     @staticmethod
@@ -149,7 +149,7 @@ def angles_from_axis(axis: ArrayLike) -> tuple[Array, Array]:
 
     Source: the seed paper's eqs. 10 and 11 in arctangent form.
     """
-    # On strided input, numpy's arctangent takes one of two ways, by where memory happens to lie, and they differ in the
+    # On strided input, numpy's arctangent takes one of two code paths depending on memory addresses, which differ in the
     # last bit; a copy is not strided.
     x, y, z = np.moveaxis(np.asarray(axis, dtype=np.float64), -1, 0).copy()
     return np.arctan2(-y, np.hypot(x, z)), np.arctan2(x, z)

@@ -1,7 +1,7 @@
-"""The stereo rig: two equal rectified pinholes, the right one `baseline_m` along +x of the left, and real eyes if any.
+"""The stereo rig: two equal rectified pinholes, the right one `baseline_m` along +x of the left, optionally with lenses.
 
-`camera`, `project`, `triangulate` speak of the ideal, rectified images. Where the images that the sensors deliver are
-not those, the rig has lenses, and `real_px` and `ideal_px` go from one to the other.
+`camera`, `project` and `triangulate` refer to the ideal, rectified images. Where the sensors deliver other images, the
+rig has lenses, and `real_px` and `ideal_px` convert between the two.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ class StereoRig:
         return None if self.lenses is None else self.lenses[EYES.index(eye)]
 
     def real_px(self, ideal_px: ArrayLike, eye: Eye) -> Array:
-        """(..., 2) pixels of the delivered image that see the rays of (..., 2) pixels of the ideal one. [px]"""
+        """(..., 2) pixels of the delivered image with the same rays as (..., 2) pixels of the ideal one. [px]"""
         ideal, lens = np.asarray(ideal_px, dtype=np.float64), self.lens(eye)
         return ideal if lens is None else lens.project_rays(self.camera.rays(ideal))
 
     def ideal_px(self, real_px: ArrayLike, eye: Eye) -> Array:
-        """(..., 2) pixels of the ideal image that see the rays of (..., 2) pixels of the delivered one. [px]"""
+        """(..., 2) pixels of the ideal image with the same rays as (..., 2) pixels of the delivered one. [px]"""
         return self.camera.project(self.rays(real_px, eye))
 
     def rays(self, real_px: ArrayLike, eye: Eye) -> Array:
@@ -77,11 +77,11 @@ class StereoRig:
         return self.camera.rays(real_px) if lens is None else lens.rays(real_px)
 
     def image(self, points_left_m: ArrayLike, eye: Eye) -> Array:
-        """(..., 2) where the delivered image shows (..., 3) points given in the left camera frame. [px]"""
+        """(..., 2) projection of (..., 3) points in the left camera frame into the delivered image of an eye. [px]"""
         return self.real_px(self.project(points_left_m, eye), eye)
 
     def largest_shift_px(self) -> float:
-        """How far lenses move what stands on the border of an ideal image, at most; 0 for ideal eyes. [px]"""
+        """Largest displacement by the lenses along the border of an ideal image; 0 for ideal eyes. [px]"""
         if self.lenses is None:
             return 0.0
         border = border_px(self.camera)
@@ -109,14 +109,14 @@ class StereoRig:
         return np.stack([x, y, z], axis=-1)
 
     def common_field_m(self, depth_m: float, radius_m: float) -> tuple[float, float, float, float] | None:
-        """Where the centre of a ball may lie so that both eyes see all of it (to first order, as a disc facing them).
+        """Region of the centres of balls that both eyes see whole (to first order, as a disc facing them).
 
         Args:
             depth_m: Z of the centre. [m]
             radius_m: radius of the ball. [m]
 
         Returns:
-            (x_low, x_high, y_low, y_high) in the left camera frame [m], or None where there is no room.
+            (x_low, x_high, y_low, y_high) in the left camera frame [m], or None for an empty region.
         """
         c = self.camera
         half_pixel = 0.5
