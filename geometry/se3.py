@@ -149,8 +149,8 @@ def angles_from_axis(axis: ArrayLike) -> tuple[Array, Array]:
 
     Source: the seed paper's eqs. 10 and 11 in arctangent form.
     """
-    # On strided input, numpy's arctangent takes one of two code paths depending on memory addresses, which differ in the
-    # last bit; a copy is not strided.
+    # On strided input, numpy's arctangent takes one of two code paths by memory address, and they differ in the last
+    # bit; a copy is not strided.
     x, y, z = np.moveaxis(np.asarray(axis, dtype=np.float64), -1, 0).copy()
     return np.arctan2(-y, np.hypot(x, z)), np.arctan2(x, z)
 

@@ -1,4 +1,4 @@
-"""The stereo rig: two equal rectified pinholes, the right one `baseline_m` along +x of the left, optionally with lenses.
+"""The stereo rig: two equal rectified pinholes, the right one `baseline_m` along +x of the left, and optional lenses.
 
 `camera`, `project` and `triangulate` refer to the ideal, rectified images. Where the sensors deliver other images, the
 rig has lenses, and `real_px` and `ideal_px` convert between the two.
