@@ -22,9 +22,9 @@ from datasets_manifest.types.records import PixelBox
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from droguekit.benchmark.poses.pose_errors import estimates_by_method
+from droguekit.benchmark.report.html_page import RowGroup, Table, page_template
 from droguekit.benchmark.report.label_drawing import Tile, display_picture, evenly_spaced, label_picture, tile_of
 from droguekit.benchmark.report.number_text import percent, plain_number, three_digits
-from droguekit.benchmark.report.pose_report import page_template
 from droguekit.benchmark.results.pose_result import ResultModel
 from geometry.boxes import intersection_over_union
 from geometry.circles import disc_image_centers, disc_outline
@@ -217,10 +217,10 @@ def write_blind_report(dataset: Location, estimates: Path, check: BlindCheck, ou
     """
     # The method with the most poses shows what was found; the first of the file among equals.
     shown_method = max(check.methods, key=lambda name: check.methods[name].fixes)
+    rows = [[name, *row_cells(check, name)] for name in check.methods]
     page = page_template("blind_report.html.j2").render(
         check=check,
-        columns=COLUMNS,
-        rows=[[name, *row_cells(check, name)] for name in check.methods],
+        table=Table("methods", "", list(COLUMNS), [RowGroup("", rows)], first=None),
         shown_method=shown_method,
         tiles=_tiles(dataset, estimates, shown_method),
     )

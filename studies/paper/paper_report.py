@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from pydantic import ValidationError
 
 from datasets_manifest.storage.storage import Location
 from droguekit.benchmark.detection.detection_figures import is_timed, speed_panel
 from droguekit.benchmark.report.figures import MethodStyle, legend_key, method_styles
+from droguekit.benchmark.report.html_page import RowGroup, Table, page_template
 from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
 from droguekit.benchmark.results.detection_result import DetectionResult
 from droguekit.benchmark.sequences.sequence_latency import processing_time_s
@@ -185,18 +185,22 @@ def worst_part(docking: DockingData, number: int) -> dict[str, object]:
     return {"anchor": f"worst-{number}", "method": method, "frames": frames}
 
 
-def failures(docking: DockingData) -> tuple[list[str], list[tuple[str, list[int]]]] | None:
-    """Methods, and for each reason in how many pairs each gave no pose for it; None if all gave one in every pair."""
+def failure_table(docking: DockingData, anchor: str) -> Table | None:
+    """For each reason in how many pairs each method gave no pose for it; None if all gave one in every pair."""
     methods = [contender.method for contender in docking.contenders]
     counts = [Counter(dict(failure_reasons(docking, method))) for method in methods]
     total = sum(counts, Counter[str]())
-    return (methods, [(reason, [of[reason] for of in counts]) for reason, _ in total.most_common()]) if total else None
+    if not total:
+        return None
+    rows = [[reason, *(str(of[reason]) for of in counts)] for reason, _ in total.most_common()]
+    title = f"Pairs with a drogue and without a pose: {docking.source}"
+    return Table(anchor, title, methods, [RowGroup("", rows)], first=None, second="reason")
 
 
-def time_rows(docking: DockingData) -> list[list[str]]:
-    """Median time by method, without waiting and by stage, and percentiles of the latency, where they are told. [ms]
+def time_table(docking: DockingData, anchor: str) -> Table | None:
+    """Median time by method, without waiting and by stage, and percentiles of the latency where reported. [ms]
 
-    The share of the pairs stands behind stages that not all of those with times had.
+    Behind a stage that not all timed pairs had stands their share. None where no method reports times.
     """
     rows = []
     for contender in docking.contenders:
@@ -215,7 +219,12 @@ def time_rows(docking: DockingData) -> list[list[str]]:
                 f"{stage} {_median(times)}{_share(len(times), timed)}" for stage, times in stages.items()
             )
             rows.append([contender.method, _median(totals), " / ".join(told) or ABSENT, listed or ABSENT])
-    return rows
+    title = (
+        "Median by stage (and in how many of the pairs, if not all), and latency where it was measured, on the machine "
+        "that made the estimates (not named in the file) [ms]"
+    )
+    columns, words = ["total", "latency, 50 / 90 / 99 %", "stages"], frozenset({"stages"})
+    return Table(anchor, title, columns, [RowGroup("", rows)], None, text_columns=words) if rows else None
 
 
 def _share(pairs: int, of_pairs: int) -> str:
@@ -305,7 +314,7 @@ def build_page(inputs: ReportInputs) -> str:
         facts += _detection_facts(detection, inputs.detection)
     if corpus is not None:
         facts += dataset_facts(corpus.manifest)
-    return _template().render(
+    return page_template("paper_report.html.j2", "studies.paper").render(
         paper=TITLE,
         contradiction=CONTRADICTION,
         claims=_claims(docking, bench, detection),
@@ -375,8 +384,8 @@ def _docking_part(docking: DockingData, sequence: int | None, number: int) -> di
         "has_filtered": any(contender.is_filtered for contender in docking.contenders),
         "note": absent_sentence(list(docking.methods), docking.file.path),
         "worst": worst_part(docking, number),
-        "failures": failures(docking),
-        "times": time_rows(docking),
+        "failures": failure_table(docking, f"failures-{number}"),
+        "times": time_table(docking, f"times-{number}"),
         "number": number,
     }
 
@@ -395,15 +404,3 @@ def _detection_facts(detection: DetectionResult, path: Path) -> list[tuple[str, 
         (f"Detection scores, {path.name}", file_sha256(path)),
         ("Code that made the detection scores", f"droguekit {detection.code_version}"),
     ]
-
-
-def _template() -> Template:
-    # The style sheet is that of the benchmark's report.
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader("studies.paper"), PackageLoader("droguekit.benchmark")]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("paper_report.html.j2")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from droguekit.benchmark.detection.detection_figures import published_name
 from droguekit.benchmark.detection.detection_report import best_detector
 from droguekit.benchmark.detection.detection_tables import PUBLISHED_DETECTORS, percent_text
+from droguekit.benchmark.report.html_page import RowGroup, Table
 from droguekit.benchmark.report.number_text import ABSENT, interval_text, millimetres, percent, three_digits
 from droguekit.benchmark.results.benchmark_result import MethodResult, PoseRow
 from droguekit.benchmark.results.detection_result import DetectionResult, DetectorResult
@@ -30,27 +30,6 @@ from studies.paper.published_results import (
 )
 from studies.paper.semi_physical import SemiPhysicalRun, StationErrors
 
-
-@dataclass(frozen=True)
-class RowGroup:
-    """Rows under a heading of their own; published ones are marked on the page."""
-
-    title: str
-    rows: list[list[str]]
-    is_published: bool = False
-
-
-@dataclass(frozen=True)
-class PageTable:
-    """A table whose first column names a method; notes stand below it."""
-
-    anchor: str
-    title: str
-    columns: list[str]
-    groups: list[RowGroup]
-    notes: list[str] = field(default_factory=list)
-
-
 _FALSE_POSES = "poses without a drogue"
 
 _THRESHOLD_FROM = {
@@ -61,7 +40,7 @@ _THRESHOLD_FROM = {
 }
 
 
-def table_1(result: DetectionResult) -> PageTable:
+def table_1(result: DetectionResult) -> Table:
     """The paper's Table 1."""
     published = [
         [
@@ -72,17 +51,19 @@ def table_1(result: DetectionResult) -> PageTable:
         ]
         for row in PUBLISHED_DETECTORS
     ]
-    return PageTable(
-        "table-1",
+    return Table(
+        "1",
         "Table 1. Detectors",
-        ["model", "precision", "recall", "mAP at 0.5", "GFLOPs", "s an image"],
+        ["precision", "recall", "mAP at 0.5", "GFLOPs", "s an image"],
         [
             RowGroup(
                 f"measured here: {detection_source(result)}", [_detector_cells(*d) for d in result.detectors.items()]
             ),
             RowGroup("published, on other data; time on an Nvidia Xavier AGX", published, is_published=True),
         ],
-        [_threshold_note(name, detector) for name, detector in result.detectors.items()],
+        first=None,
+        second="model",
+        notes=[_threshold_note(name, detector) for name, detector in result.detectors.items()],
     )
 
 
@@ -93,10 +74,10 @@ def detection_source(result: DetectionResult) -> str:
     return f"{facts.images} images of {facts.name}, {split}"
 
 
-def table_2(runs: Sequence[SemiPhysicalRun]) -> PageTable:
+def table_2(runs: Sequence[SemiPhysicalRun]) -> Table:
     """The paper's Table 2: the largest mean of any station."""
     has_empty = any(errors.empty_pairs for run in runs for errors in run.methods.values())
-    columns = ["method", "X [mm]", "Y [mm]", "Z / distance, reading", "Z / distance, truth", "poses", "stations"]
+    columns = ["X [mm]", "Y [mm]", "Z / distance, reading", "Z / distance, truth", "poses", "stations"]
     groups = [
         RowGroup(
             f"measured here, {run.markers} markers: {run.source}",
@@ -113,17 +94,18 @@ def table_2(runs: Sequence[SemiPhysicalRun]) -> PageTable:
         for row in TABLE_2
     ]
     groups.append(RowGroup("published, on other data", published, is_published=True))
-    return PageTable(
-        "table-2",
+    return Table(
+        "2",
         "Table 2. Location error of the semi-physical experiment, worst station with a pose",
         columns if not has_empty else [*columns, _FALSE_POSES],
         groups if has_empty else [_without_last(group) for group in groups],
+        first=None,
     )
 
 
-def docking_table(docking: DockingData, anchor: str) -> PageTable:
+def docking_table(docking: DockingData, anchor: str) -> Table:
     """Errors of every contender over all docking runs, with what the paper prints of its own."""
-    columns = ["method", "pose found", "mean [mm]", "95 % interval", "p99 [mm]", "largest X, Y, Z [mm]"]
+    columns = ["pose found", "mean [mm]", "95 % interval", "p99 [mm]", "largest X, Y, Z [mm]"]
     columns += ["pitch, yaw p99 [deg]", "published mean [mm]", _FALSE_POSES]
     scores = docking.result.methods
     groups = [RowGroup("all pairs", [_docking_cells(c, scores[c.method]) for c in docking.contenders])]
@@ -133,7 +115,8 @@ def docking_table(docking: DockingData, anchor: str) -> PageTable:
         groups.append(RowGroup(title, [_chosen_cells(docking, contender, frames) for contender in docking.contenders]))
     if not any(method.empty_frames.n for method in scores.values()):
         columns, groups = columns[:-1], [_without_last(group) for group in groups]
-    return PageTable(anchor, f"Position error over {len(docking.records)} pairs of {docking.source}", columns, groups)
+    title = f"Position error over {len(docking.records)} pairs of {docking.source}"
+    return Table(anchor, title, columns, groups, first=None)
 
 
 def worst_station(values: Array) -> float | None:
@@ -164,7 +147,7 @@ def _threshold_note(name: str, detector: DetectorResult) -> str:
 
 
 def _without_last(group: RowGroup) -> RowGroup:
-    return RowGroup(group.title, [row[:-1] for row in group.rows], group.is_published)
+    return RowGroup(group.label, [row[:-1] for row in group.rows], group.is_published)
 
 
 def _station_cells(contender: Contender, errors: StationErrors) -> list[str]:

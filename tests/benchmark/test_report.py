@@ -16,7 +16,7 @@ from droguekit.benchmark.poses.method_comparison import best_method
 from droguekit.benchmark.report.figures import QUANTITIES, error_panel, method_styles
 from droguekit.benchmark.report.label_drawing import contact_tiles, label_picture
 from droguekit.benchmark.report.number_text import distance_text, percent, plain_number, three_digits
-from droguekit.benchmark.report.pose_report import result_sentences, stage_times_ms, write_report
+from droguekit.benchmark.report.pose_report import result_sentences, stage_times_table, write_report
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
 
 DatasetFixture = tuple[Path, list[PairRecord]]
@@ -107,7 +107,9 @@ def test_times_of_a_pair_leave_out_waiting(build: SimpleNamespace, tmp_path: Pat
     stage_s = {"read": 0.512, "wait": 0.256, "handover": 0.128, "track": 0.004, "pose": 0.002}
     told = build.estimate(0, build.pose(0, 0, 5)).model_copy(update={"stage_s": stage_s})
     write_estimates(tmp_path / "e.jsonl", [told])
-    ((method, total, stages),) = stage_times_ms(tmp_path / "e.jsonl")
+    table = stage_times_table(tmp_path / "e.jsonl")
+    assert table is not None
+    ((method, total, stages),) = table.groups[0].rows
     assert (method, total) == ("joint", "6.00")
     assert stages == "read 512, wait 256, handover 128, track 4.00, pose 2.00"
 

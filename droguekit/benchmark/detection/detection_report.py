@@ -26,16 +26,13 @@ from droguekit.benchmark.detection.detection_figures import (
 from droguekit.benchmark.detection.detection_metrics import AT_50, Matches
 from droguekit.benchmark.detection.detection_scores import LEAST_BOXES, LEAST_SCENES, ScoredDetections
 from droguekit.benchmark.detection.detection_tables import (
-    CELL_COLUMNS,
-    SUMMARY_COLUMNS,
-    SUMMARY_COLUMNS_MORE,
     cell_tables,
     percent_text,
-    published_rows,
-    summary_rows,
+    summary_table,
 )
 from droguekit.benchmark.detection.detection_truth import ImageTruth
 from droguekit.benchmark.report.figures import legend_key, method_styles
+from droguekit.benchmark.report.html_page import page_template
 from droguekit.benchmark.report.label_drawing import (
     BOX_RGB,
     ENLARGE_BELOW,
@@ -53,8 +50,7 @@ from droguekit.benchmark.report.label_drawing import (
     tile_of,
 )
 from droguekit.benchmark.report.number_text import plain_number
-from droguekit.benchmark.report.pose_report import page_template
-from droguekit.benchmark.report.sequence_tables import tracking_part
+from droguekit.benchmark.report.sequence_report import tracking_part
 from droguekit.benchmark.results.detection_result import DetectedBox, DetectionResult, center_box
 
 _FOUND_OF_A_FAMILY = 4
@@ -211,10 +207,7 @@ def write_detection_report(dataset: Location, scored: ScoredDetections, out_html
         result=result,
         sentences=detection_sentences(result, best),
         facts=_facts(result),
-        summary_columns=[*SUMMARY_COLUMNS, *SUMMARY_COLUMNS_MORE],
-        summary=summary_rows(result),
-        published=published_rows(),
-        cell_columns=CELL_COLUMNS,
+        summary=summary_table(result),
         tables=cell_tables(result),
         legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
         distance_panels=[Markup(distance_panel(result, measure)) for measure in MEASURES if _has_distances(result)],

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from droguekit.benchmark.confidence_intervals import Interval
+from droguekit.benchmark.report.html_page import RowGroup, Table
 from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
 from droguekit.benchmark.results.detection_result import DetectionResult, DetectionRow, DetectorResult
 
@@ -49,20 +50,23 @@ SUMMARY_COLUMNS_MORE = (
 CELL_COLUMNS = ("scenes", "boxes", "AP50", "95 % interval", "AP", "recall", "95 % interval", "precision", "")
 
 
-class CellGroup(NamedTuple):
-    """Rows of all detectors in one cell."""
-
-    label: str
-    rows: list[list[str]]
-
-
-class CellTable(NamedTuple):
-    """Cells of one kind."""
-
-    anchor: str
-    title: str
-    first: str
-    groups: list[CellGroup]
+def summary_table(result: DetectionResult) -> Table:
+    """All detectors, and those of the seed paper on its own data."""
+    return Table(
+        "summary",
+        "Detectors, and those of the seed paper on its own data",
+        [*SUMMARY_COLUMNS, *SUMMARY_COLUMNS_MORE],
+        [
+            RowGroup("", summary_rows(result)),
+            RowGroup(
+                "published, other data (14,298 photographs) and another machine (Nvidia Xavier AGX)",
+                published_rows(),
+                is_published=True,
+            ),
+        ],
+        first=None,
+        second="detector",
+    )
 
 
 def summary_rows(result: DetectionResult) -> list[list[str]]:
@@ -85,7 +89,7 @@ def published_rows() -> list[list[str]]:
     ]
 
 
-def cell_tables(result: DetectionResult) -> list[CellTable]:
+def cell_tables(result: DetectionResult) -> list[Table]:
     """By distance, family, eye and split."""
     kinds = [
         ("distances", "By distance", "distance", _distance_cells),
@@ -100,7 +104,9 @@ def cell_tables(result: DetectionResult) -> list[CellTable]:
             for label, row in cells(detector):
                 groups.setdefault(label, []).append([name, *_cells(row)])
         if groups:
-            tables.append(CellTable(anchor, title, first, [CellGroup(*group) for group in groups.items()]))
+            rows = [RowGroup(*group) for group in groups.items()]
+            notes = frozenset(CELL_COLUMNS[-1:])
+            tables.append(Table(anchor, title, list(CELL_COLUMNS), rows, first, "detector", notes))
     return tables
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from datasets_manifest.atomic import write_text_atomic
@@ -16,6 +15,7 @@ from datasets_manifest.types.estimates import read_estimates
 from drogue_models.marker_layout import marker_layout
 from droguekit.benchmark.poses.method_comparison import best_method
 from droguekit.benchmark.report.figures import FEW_METHODS, QUANTITIES, error_panel, legend_key, method_styles
+from droguekit.benchmark.report.html_page import RowGroup, Table, page_template
 from droguekit.benchmark.report.label_drawing import contact_tiles
 from droguekit.benchmark.report.number_text import (
     distance_text,
@@ -130,7 +130,8 @@ def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, ou
             f"{dataset}: is not the dataset of this result, whose hash begins {result.dataset.sha256[:12]}"
         )
     styles = method_styles(list(result.methods))
-    page = page_template("report.html.j2").render(
+    times = stage_times_table(estimates)
+    page = page_template("pose_report.html.j2").render(
         result=result,
         sentences=result_sentences(result),
         facts=dataset_facts(data.manifest, estimates.name),
@@ -146,24 +147,12 @@ def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, ou
             *rangefinder_tables(result),
             *check_tables(result),
             centroid_table(result),
+            *([] if times is None else [times]),
         ],
         has_readings=any(method.overall.rangefinder is not None for method in result.methods.values()),
-        times=stage_times_ms(estimates),
         sequences=None if result.sequences is None else sequence_section(result.sequences, styles),
     )
     write_text_atomic(out_html, page)
-
-
-def page_template(name: str) -> Template:
-    """A template of this package; what it is not given is an error."""
-    environment = Environment(
-        loader=PackageLoader("droguekit.benchmark"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(name)
 
 
 def dataset_facts(manifest: Manifest, estimates_name: str) -> list[tuple[str, str]]:
@@ -195,10 +184,10 @@ def dataset_facts(manifest: Manifest, estimates_name: str) -> list[tuple[str, st
     ]
 
 
-def stage_times_ms(estimates: Path) -> list[tuple[str, str, str]]:
-    """Median time for a pair by method: name, total without waiting, and the stages. [ms]
+def stage_times_table(estimates: Path) -> Table | None:
+    """Median time for a pair by method: total without waiting, and the stages. [ms]
 
-    Pairs on which no time was worked, and methods that report none, are left out.
+    Pairs on which no time was spent, and methods that report none, are left out; None without any.
     """
     stages: dict[str, dict[str, list[float]]] = {}
     for estimate in read_estimates(estimates):
@@ -207,11 +196,16 @@ def stage_times_ms(estimates: Path) -> list[tuple[str, str, str]]:
             continue
         for stage, seconds in {**estimate.stage_s, "": work_s}.items():
             stages.setdefault(estimate.method, {}).setdefault(stage, []).append(1e3 * seconds)
-    return [
-        (
+    rows = [
+        [
             method,
             three_digits(float(np.median(times[""]))),
             ", ".join(f"{stage} {three_digits(float(np.median(ms)))}" for stage, ms in times.items() if stage),
-        )
+        ]
         for method, times in stages.items()
     ]
+    title = "Median time for a pair [ms]; the total leaves out read, wait and handover"
+    groups = [RowGroup("", rows)]
+    return (
+        Table("times", title, ["total", "stages"], groups, None, text_columns=frozenset({"stages"})) if rows else None
+    )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
+from droguekit.benchmark.report.html_page import RowGroup, Table
 from droguekit.benchmark.report.number_text import (
     ABSENT,
     distance_text,
@@ -24,43 +24,6 @@ TITLES = {
     "pitch": "Pitch [deg]",
     "yaw": "Yaw [deg]",
 }
-
-MOST_OPEN_ROWS = 24
-"""A table with more lines is folded: some hundred lines of numbers hide what comes after them."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Rows that share their first cell."""
-
-    label: str
-    rows: list[list[str]]
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table whose first two columns are the group's label and the row's name.
-
-    Attributes:
-        first, second: what these two are.
-    """
-
-    anchor: str
-    title: str
-    columns: list[str]
-    groups: list[Group]
-    first: str = "distance"
-    second: str = "method"
-
-    @property
-    def row_count(self) -> int:
-        """Lines of all groups together."""
-        return sum(len(group.rows) for group in self.groups)
-
-    @property
-    def is_long(self) -> bool:
-        """Whether it would fill a screen, and is folded under its title."""
-        return self.row_count > MOST_OPEN_ROWS
 
 
 def overall_table(result: BenchmarkResult) -> Table:
@@ -84,7 +47,7 @@ def overall_table(result: BenchmarkResult) -> Table:
                 f"{empty.false_fixes} of {empty.n}",
             ]
         )
-    return Table("overall", "All distances: position error [mm]", columns, [Group("all", rows)])
+    return Table("overall", "All distances: position error [mm]", columns, [RowGroup("all", rows)])
 
 
 def position_table(result: BenchmarkResult) -> Table:
@@ -190,16 +153,18 @@ def _component_table(result: BenchmarkResult, name: str) -> Table:
     return Table(name, TITLES[name], columns, _by_distance(result, cells))
 
 
-def with_overall(result: BenchmarkResult, names: Sequence[str], cells: Callable[[PoseRow], list[str]]) -> list[Group]:
+def with_overall(
+    result: BenchmarkResult, names: Sequence[str], cells: Callable[[PoseRow], list[str]]
+) -> list[RowGroup]:
     """A group over all distances and one for each bin, with a row for each of the named methods."""
-    groups = [Group("all", [[name, *cells(result.methods[name].overall)] for name in names])]
+    groups = [RowGroup("all", [[name, *cells(result.methods[name].overall)] for name in names])]
     for k, place in enumerate(result.reference):
         rows = [[name, *cells(result.methods[name].bins[k])] for name in names]
-        groups.append(Group(distance_text(place.low_m, place.high_m), rows))
+        groups.append(RowGroup(distance_text(place.low_m, place.high_m), rows))
     return groups
 
 
-def _by_distance(result: BenchmarkResult, cells: Callable[[PoseRow], list[str]]) -> list[Group]:
+def _by_distance(result: BenchmarkResult, cells: Callable[[PoseRow], list[str]]) -> list[RowGroup]:
     return with_overall(result, list(result.methods), cells)[1:]
 
 
@@ -292,11 +257,11 @@ def comparison_tables(result: BenchmarkResult) -> list[Table]:
     return tables
 
 
-def _comparison_groups(result: BenchmarkResult, pairs: Sequence[MethodComparison]) -> list[Group]:
-    groups = [Group("all", [[pair.method, *_ratio_cells(pair.overall)] for pair in pairs])]
+def _comparison_groups(result: BenchmarkResult, pairs: Sequence[MethodComparison]) -> list[RowGroup]:
+    groups = [RowGroup("all", [[pair.method, *_ratio_cells(pair.overall)] for pair in pairs])]
     for k, place in enumerate(result.reference):
         rows = [[pair.method, *_ratio_cells(pair.bins[k])] for pair in pairs]
-        groups.append(Group(distance_text(place.low_m, place.high_m), rows))
+        groups.append(RowGroup(distance_text(place.low_m, place.high_m), rows))
     return groups
 
 

@@ -8,16 +8,23 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from droguekit.benchmark.report.figures import DistanceLine, MethodStyle, Point, distance_lines_panel
+from droguekit.benchmark.report.figures import (
+    DistanceLine,
+    MethodStyle,
+    Point,
+    Styles,
+    distance_lines_panel,
+    legend_key,
+    overlap_panels,
+)
+from droguekit.benchmark.report.html_page import ReportPart
 from droguekit.benchmark.report.number_text import millimetres, percent, plain_number, three_digits
 from droguekit.benchmark.report.sequence_tables import (
-    ReportPart,
     docking_tables,
     filter_tables,
     hiding_table,
     latency_tables,
-    legend_of,
-    tracking_part,
+    tracking_tables,
 )
 from droguekit.benchmark.results.sequence_result import (
     DockingBin,
@@ -28,9 +35,28 @@ from droguekit.benchmark.results.sequence_result import (
     MethodSequences,
     MotionBin,
     SequencesResult,
+    Tracking,
 )
 
 _Bin = TypeVar("_Bin", MotionBin, DockingBin, LatencyBin)
+
+
+# More names than these do not fit in a cell.
+_MOST_NAMES = 3
+
+_TRACKING_NOTES = [
+    "The true box goes around the drogue's visible pixels; images that show less than half of the drogue do not count. "
+    "An image without a box counts as no overlap, and its centre as infinitely far; by source, only images with a box "
+    "of that source count.",
+    "AUC is the area under the success plot: the mean share of overlaps above 0, 0.05, ... 1. As none is above 1, a "
+    "perfect tracker reaches 0.952. Normalised precision is the mean share of centres within 0 to 0.5 of the true "
+    "box's width and height.",
+    "A loss begins when the box is missing, or overlaps the true one by less than 0.1, after an image in which the "
+    "drogue was followed. Both eyes mostly lose it together, so the row of both is that of the eye with more losses. "
+    "The interval of the rate is that of a Poisson law; the others come from resampled sequences, and need two.",
+    "After the drogue was hidden, or lost beside the sun, a box finds it again when it overlaps the true one by half. "
+    "The delay counts from the first image that shows half of it, which is 0.",
+]
 
 
 @dataclass(frozen=True)
@@ -75,6 +101,53 @@ def sequence_sentences(result: SequencesResult) -> list[str]:
         names = ", ".join(f"{name} {count}" for name, count in wrong.items())
         sentences.append(f"Poses while the drogue was hidden: {names or 'none'}.")
     return sentences
+
+
+def tracking_part(trackings: Mapping[str, Tracking], first: str, styles: Styles) -> ReportPart | None:
+    """The part; None where nothing was tracked.
+
+    Args:
+        trackings: by method, detector or tracker.
+        first: what these names are.
+        styles: those of the names everywhere on the page; names that share an entry have the first one's.
+    """
+    if not trackings:
+        return None
+    shared = _without_repeats(trackings)
+    named = {_joined(names): trackings[names[0]] for names in shared}
+    rows = {name: tracking.both.overlap for name, tracking in named.items() if tracking.both.overlap is not None}
+    drawn = {_joined(names): styles[names[0]] for names in shared if _joined(names) in rows}
+    return ReportPart(
+        anchor="tracking",
+        title="Boxes that follow the drogue",
+        legend=legend_of(drawn),
+        panels=[Markup(panel) for panel in (overlap_panels(rows, drawn) if rows else [])],
+        tables=tracking_tables(named, first),
+        notes=_TRACKING_NOTES,
+    )
+
+
+def legend_of(styles: Styles) -> list[tuple[str, Markup]]:
+    """Names and keys for a legend."""
+    return [(name, Markup(legend_key(style))) for name, style in styles.items()]
+
+
+def _without_repeats(trackings: Mapping[str, Tracking]) -> list[list[str]]:
+    """Methods that worked in the same boxes share one entry, for their names would stand on equal numbers."""
+    names: dict[str, list[str]] = {}
+    for name, tracking in trackings.items():
+        same = (other for other in names if _boxes_of(trackings[other]) == _boxes_of(tracking))
+        names.setdefault(next(same, name), []).append(name)
+    return list(names.values())
+
+
+def _boxes_of(tracking: Tracking) -> tuple[object, ...]:
+    """What does not depend on the time that a method took."""
+    return (tracking.both, tracking.eyes, {name: source.overlap for name, source in tracking.sources.items()})
+
+
+def _joined(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= _MOST_NAMES else f"{names[0]} and {len(names) - 1} others"
 
 
 def _tracking_words(method: MethodSequences) -> list[str]:

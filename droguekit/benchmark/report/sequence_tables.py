@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from markupsafe import Markup
-
 from droguekit.benchmark.poses.pose_errors import COMPONENTS
-from droguekit.benchmark.report.figures import Styles, legend_key, overlap_panels
+from droguekit.benchmark.report.html_page import RowGroup, Table
 from droguekit.benchmark.report.number_text import (
     ABSENT,
     distance_text,
@@ -19,7 +16,6 @@ from droguekit.benchmark.report.number_text import (
     plain_number,
     three_digits,
 )
-from droguekit.benchmark.report.pose_tables import Group, Table
 from droguekit.benchmark.results.pose_result import BinRatios, MeanRatios, NeesPart
 from droguekit.benchmark.results.sequence_result import (
     Calibration,
@@ -44,53 +40,6 @@ from droguekit.benchmark.results.sequence_result import (
 _OVERLAP_COLUMNS = ["images", "AUC", "95 % interval", "mean overlap", "within 20 px", "95 % interval"]
 _OVERLAP_COLUMNS += ["normalised precision", "centres, RMS [px]"]
 REACQUISITION_COLUMNS = ["re-appearances", "found again", "within 3 frames", "median delay [frames]", "longest"]
-# More names than these do not fit in a cell.
-_MOST_NAMES = 3
-
-
-@dataclass(frozen=True)
-class ReportPart:
-    """Panels, tables and notes that belong together.
-
-    Attributes:
-        legend: names and their keys in the panels.
-    """
-
-    anchor: str
-    title: str
-    legend: list[tuple[str, Markup]]
-    panels: list[Markup]
-    tables: list[Table]
-    notes: list[str]
-
-
-def tracking_part(trackings: Mapping[str, Tracking], first: str, styles: Styles) -> ReportPart | None:
-    """The part; None where nothing was tracked.
-
-    Args:
-        trackings: by method, detector or tracker.
-        first: what these names are.
-        styles: those of the names everywhere on the page; names that share an entry have the first one's.
-    """
-    if not trackings:
-        return None
-    shared = _without_repeats(trackings)
-    named = {_joined(names): trackings[names[0]] for names in shared}
-    rows = {name: tracking.both.overlap for name, tracking in named.items() if tracking.both.overlap is not None}
-    drawn = {_joined(names): styles[names[0]] for names in shared if _joined(names) in rows}
-    return ReportPart(
-        anchor="tracking",
-        title="Boxes that follow the drogue",
-        legend=legend_of(drawn),
-        panels=[Markup(panel) for panel in (overlap_panels(rows, drawn) if rows else [])],
-        tables=[_overlap_table(named, first), *_source_tables(named, first), _loss_table(named, first)],
-        notes=_NOTES,
-    )
-
-
-def legend_of(styles: Styles) -> list[tuple[str, Markup]]:
-    """Names and keys for a legend."""
-    return [(name, Markup(legend_key(style))) for name, style in styles.items()]
 
 
 def reacquisition_cells(row: Reacquisition) -> list[str]:
@@ -99,27 +48,14 @@ def reacquisition_cells(row: Reacquisition) -> list[str]:
     return [str(row.n), str(row.found), str(row.within_3), *delays]
 
 
-def _without_repeats(trackings: Mapping[str, Tracking]) -> list[list[str]]:
-    """Methods that worked in the same boxes share one entry, for their names would stand on equal numbers."""
-    names: dict[str, list[str]] = {}
-    for name, tracking in trackings.items():
-        same = (other for other in names if _boxes_of(trackings[other]) == _boxes_of(tracking))
-        names.setdefault(next(same, name), []).append(name)
-    return list(names.values())
-
-
-def _boxes_of(tracking: Tracking) -> tuple[object, ...]:
-    """What does not depend on the time that a method took."""
-    return (tracking.both, tracking.eyes, {name: source.overlap for name, source in tracking.sources.items()})
-
-
-def _joined(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) <= _MOST_NAMES else f"{names[0]} and {len(names) - 1} others"
+def tracking_tables(trackings: Mapping[str, Tracking], first: str) -> list[Table]:
+    """Overlaps, by source of the box, and losses; `first` is what the names are."""
+    return [_overlap_table(trackings, first), *_source_tables(trackings, first), _loss_table(trackings, first)]
 
 
 def _overlap_table(trackings: Mapping[str, Tracking], first: str) -> Table:
     groups = [
-        Group(name, [[label, *_overlap_cells(row.overlap)] for label, row in _by_eye(tracking)])
+        RowGroup(name, [[label, *_overlap_cells(row.overlap)] for label, row in _by_eye(tracking)])
         for name, tracking in trackings.items()
     ]
     return Table("overlap", "Boxes against the true ones (OTB)", _OVERLAP_COLUMNS, groups, first, "eye")
@@ -128,7 +64,7 @@ def _overlap_table(trackings: Mapping[str, Tracking], first: str) -> Table:
 def _source_tables(trackings: Mapping[str, Tracking], first: str) -> list[Table]:
     """By who gave the box; none where nobody says so."""
     groups = [
-        Group(name, [[source, *_source_cells(row)] for source, row in tracking.sources.items()])
+        RowGroup(name, [[source, *_source_cells(row)] for source, row in tracking.sources.items()])
         for name, tracking in trackings.items()
         if tracking.sources
     ]
@@ -138,7 +74,7 @@ def _source_tables(trackings: Mapping[str, Tracking], first: str) -> list[Table]
 
 def _loss_table(trackings: Mapping[str, Tracking], first: str) -> Table:
     groups = [
-        Group(name, [[label, *_loss_cells(row)] for label, row in _by_eye(tracking)])
+        RowGroup(name, [[label, *_loss_cells(row)] for label, row in _by_eye(tracking)])
         for name, tracking in trackings.items()
     ]
     columns = ["minutes in sight", "losses", "a minute", "95 % interval", "images lost", *REACQUISITION_COLUMNS]
@@ -198,21 +134,6 @@ def _shares(ends: tuple[float, float] | None) -> str:
     return ABSENT if ends is None else f"{percent(round(ends[0], 3))} to {percent(round(ends[1], 3))}"
 
 
-_NOTES = [
-    "The true box goes around the drogue's visible pixels; images that show less than half of the drogue do not count. "
-    "An image without a box counts as no overlap, and its centre as infinitely far; by source, only images with a box "
-    "of that source count.",
-    "AUC is the area under the success plot: the mean share of overlaps above 0, 0.05, ... 1. As none is above 1, a "
-    "perfect tracker reaches 0.952. Normalised precision is the mean share of centres within 0 to 0.5 of the true "
-    "box's width and height.",
-    "A loss begins when the box is missing, or overlaps the true one by less than 0.1, after an image in which the "
-    "drogue was followed. Both eyes mostly lose it together, so the row of both is that of the eye with more losses. "
-    "The interval of the rate is that of a Poisson law; the others come from resampled sequences, and need two.",
-    "After the drogue was hidden, or lost beside the sun, a box finds it again when it overlaps the true one by half. "
-    "The delay counts from the first image that shows half of it, which is 0.",
-]
-
-
 Methods = Mapping[str, MethodSequences]
 
 
@@ -239,7 +160,7 @@ def hiding_table(methods: Methods) -> Table:
         for name, method in methods.items()
     ]
     columns = ["pairs without the drogue", "poses in them", *REACQUISITION_COLUMNS]
-    return Table("hiding", "Poses while the drogue is hidden, and after", columns, [Group("all", rows)], "sequences")
+    return Table("hiding", "Poses while the drogue is hidden, and after", columns, [RowGroup("all", rows)], "sequences")
 
 
 def filter_tables(filters: Mapping[str, FilterErrors]) -> list[Table]:
@@ -278,13 +199,15 @@ def latency_tables(latencies: Mapping[str, Latency]) -> list[Table]:
         for name, part in latencies.items()
     ]
     stages = [
-        Group(name, [[stage, *_time_cells(times)] for stage, times in part.stages.items()])
+        RowGroup(name, [[stage, *_time_cells(times)] for stage, times in part.stages.items()])
         for name, part in latencies.items()
         if part.stages
     ]
     tables = [
         Table("latency", "From the arrival of the images to the answer [ms]", columns, _by_distance(rows, _time_cells)),
-        Table("late", "Pairs that were not worked on", ["pairs", "late", "share"], [Group("all", late)], "sequences"),
+        Table(
+            "late", "Pairs that were not worked on", ["pairs", "late", "share"], [RowGroup("all", late)], "sequences"
+        ),
     ]
     if stages:
         tables.append(Table("stages", "The stages [ms]", columns, stages, "method", "stage"))
@@ -293,14 +216,14 @@ def latency_tables(latencies: Mapping[str, Latency]) -> list[Table]:
 
 def _by_distance(
     rows: Mapping[str, tuple[_Row, Sequence[_Bin]]], cells: Callable[[_Row | _Bin], list[str]]
-) -> list[Group]:
+) -> list[RowGroup]:
     """A group over all distances and one for each bin that any method has."""
     groups = {"all": [[name, *cells(overall)] for name, (overall, _) in rows.items()]}
     for low_m, high_m in sorted({(row.low_m, row.high_m) for _, bins in rows.values() for row in bins}):
         groups[distance_text(low_m, high_m)] = [
             [name, *cells(row)] for name, (_, bins) in rows.items() for row in bins if row.low_m == low_m
         ]
-    return [Group(label, lines) for label, lines in groups.items()]
+    return [RowGroup(label, lines) for label, lines in groups.items()]
 
 
 def _motion_table(rows: Mapping[str, tuple[MotionRow, Sequence[MotionBin]]]) -> Table:
@@ -333,7 +256,7 @@ def _nees_table(filters: Mapping[str, FilterErrors]) -> Table:
             parts = [cell for one in (nees.velocity, nees.rate, nees.motion) for cell in _nees_cells(one)]
             rows.append([name, str(nees.n), *parts, interval_text(nees.interval), str(nees.unusable)])
     title = "Squared error of the motion over its covariance and the degrees of freedom (NEES)"
-    return Table("motion-nees", title, columns, [Group("all", rows)])
+    return Table("motion-nees", title, columns, [RowGroup("all", rows)])
 
 
 def _lag_table(filters: Mapping[str, FilterErrors]) -> Table:
@@ -346,7 +269,7 @@ def _lag_table(filters: Mapping[str, FilterErrors]) -> Table:
             cells.append(interval_text(lag.interval if lag is not None else None, 1e3))
         rows.append([name, *cells])
     columns = [cell for name in ("X", "Y", "Z", "pitch", "yaw") for cell in (name, "95 % interval")]
-    return Table("lag", "Lag behind the truth [ms]", columns, [Group("all", rows)])
+    return Table("lag", "Lag behind the truth [ms]", columns, [RowGroup("all", rows)])
 
 
 def _raw_tables(filters: Mapping[str, FilterErrors]) -> list[Table]:
@@ -409,7 +332,7 @@ def _capture_tables(errors: Mapping[str, DockingErrors]) -> list[Table]:
             if found is not None:
                 rows.append([f"{name}, {label}", *_capture_cells(found)])
     columns = ["radius [mm]", "rightly yes", "wrongly yes", "wrongly no", "rightly no"]
-    return [Table("captures", "Captures called and true", columns, [Group("all", rows)])] if rows else []
+    return [Table("captures", "Captures called and true", columns, [RowGroup("all", rows)])] if rows else []
 
 
 def _capture_cells(found: Captures) -> list[str]:

@@ -14,9 +14,10 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
+from droguekit.benchmark.report.html_page import Table
 from droguekit.benchmark.report.number_text import ABSENT
 from studies.paper.docking_experiment import read_docking
-from studies.paper.paper_report import failures, time_rows
+from studies.paper.paper_report import failure_table, time_table
 from studies.paper.paper_tables import docking_claims, docking_table
 from studies.paper.worst_frames import clipped, failure_reasons, outlines_px, worst_frames
 
@@ -60,7 +61,7 @@ def test_poses_without_a_drogue_are_counted(single_pairs: Path, docking: Path, e
     table = docking_table(data, "t")
     assert table.columns[-1] == "poses without a drogue"
     assert [row[-1] for row in table.groups[0].rows] == ["2 of 2", "1 of 2"]
-    assert all(len(row) == len(table.columns) for group in table.groups for row in group.rows)
+    assert all(len(row) == table.width for group in table.groups for row in group.rows)
     (claim,) = [claim for claim in docking_claims(data) if claim.what.endswith("poses without a drogue")]
     assert (claim.ours, claim.rebuilt) == ("2 of 2", "1 of 2")
     # Where every pair shows one there is nothing to count.
@@ -72,14 +73,23 @@ def test_poses_without_a_drogue_are_counted(single_pairs: Path, docking: Path, e
 def test_filtered_poses_have_no_interval(docking: Path, estimates_of: WriteEstimates) -> None:
     offsets = {"joint-hub": (0, 0, 1e-4), "joint-hub+filter": (0, 0, 2e-4)}
     table = docking_table(read_docking(docking, estimates_of(docking, offsets)), "t")
-    column = table.columns.index("95 % interval")
+    # Behind the name of the method.
+    column = 1 + table.columns.index("95 % interval")
     for group in table.groups:
         assert [row[column] == ABSENT for row in group.rows] == [False, True]
 
 
+def rows_of(table: Table | None) -> list[list[str]]:
+    assert table is not None
+    (group,) = table.groups
+    return group.rows
+
+
 def test_times_are_medians_of_the_pairs(docking: Path, estimates_of: WriteEstimates) -> None:
     data = read_docking(docking, estimates_of(docking, OFFSETS))
-    assert time_rows(data) == [[m, "12.0", ABSENT, "detect 10.0, pose 2.00"] for m in ("joint-hub", "paper")]
+    assert rows_of(time_table(data, "times")) == [
+        [m, "12.0", ABSENT, "detect 10.0, pose 2.00"] for m in ("joint-hub", "paper")
+    ]
 
 
 def test_times_of_a_pair_leave_out_waiting(docking: Path, estimates_of: WriteEstimates) -> None:
@@ -87,7 +97,7 @@ def test_times_of_a_pair_leave_out_waiting(docking: Path, estimates_of: WriteEst
     waiting = {"read": 0.512, "wait": 0.256, "handover": 0.128, "track": 0.004, "pose": 0.002}
     told = [estimate.model_copy(update={"stage_s": waiting}) for estimate in read_estimates(path)]
     write_estimates(path, told)
-    (row,) = time_rows(read_docking(docking, path))
+    (row,) = rows_of(time_table(read_docking(docking, path), "times"))
     assert row == ["paper", "6.00", ABSENT, "read 512, wait 256, handover 128, track 4.00, pose 2.00"]
 
 
@@ -100,7 +110,7 @@ def test_times_say_in_how_many_pairs_a_stage_was_at_work(docking: Path, estimate
     ]
     # Pairs without times are none that a stage left out.
     write_estimates(path, [*asked, *(estimate.model_copy(update={"stage_s": {}}) for estimate in told[4:])])
-    (row,) = time_rows(read_docking(docking, path))
+    (row,) = rows_of(time_table(read_docking(docking, path), "times"))
     assert row == ["paper", "2.00", ABSENT, "pose 2.00, detect 50.0 (25%)"]
 
 
@@ -132,11 +142,12 @@ def test_failures_stand_beside_each_other_by_method(docking: Path, estimates_of:
         text = text.replace("hidden by the test", f"no ring among {regions} regions of the left image", 1)
     path.write_text(text, encoding="utf-8")
     read = read_docking(docking, path)
-    methods, rows = failures(read)
-    assert methods == ["joint-hub", "paper"]
+    table = failure_table(read, "failures")
+    assert table is not None and table.columns == ["joint-hub", "paper"]
     # However many regions there were, it is one reason.
-    assert rows == [("hidden by the test", [2, 0]), ("no ring among the regions of the left image", [1, 1])]
-    assert failures(read_docking(docking, estimates_of(docking, OFFSETS))) is None
+    expected = [["hidden by the test", "2", "0"], ["no ring among the regions of the left image", "1", "1"]]
+    assert rows_of(table) == expected
+    assert failure_table(read_docking(docking, estimates_of(docking, OFFSETS)), "failures") is None
 
 
 def test_pictures_show_both_models(docking: Path, estimates_of: WriteEstimates) -> None:

@@ -87,7 +87,7 @@ def test_the_page_needs_nothing_from_outside_and_is_well_formed(whole_page: str)
 def test_the_page_has_its_parts_and_says_what_is_missing(whole_page: str) -> None:
     for anchor in ("claims", "contradiction", "table-2", "left-out", "figure-10"):
         assert f'id="{anchor}"' in whole_page
-    for anchor in ("docking-errors", "worst", "table-times", "figure-16", "figure-17", "figure-18", "figure-19"):
+    for anchor in ("table-docking-errors", "worst", "table-times", "figure-16", "figure-17", "figure-18", "figure-19"):
         assert f'id="{anchor}-1"' in whole_page and f'id="{anchor}-2"' in whole_page
     assert 'id="table-1"' not in whole_page and "Table 1 and Figure 11:" in whole_page
     assert "Sequence 1 of docking-10m, analytic: 2 pairs" in whole_page

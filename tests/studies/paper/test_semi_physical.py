@@ -61,7 +61,7 @@ def test_the_table_has_the_published_rows_as_printed(bench: Path, estimates_of: 
         "Ours-7 Points (the paper's)",
     ]
     assert published.rows[-1][1:4] == ["≤ 40", "≤ 40", "≤ 1.03 %"]
-    assert all(len(row) == len(table_2([run]).columns) for group in (measured, published) for row in group.rows)
+    assert all(len(row) == table_2([run]).width for group in (measured, published) for row in group.rows)
 
 
 def test_estimates_of_another_drogue_are_refused(bench: Path, estimates_of: WriteEstimates) -> None:
@@ -103,7 +103,7 @@ def test_stations_without_a_pose_are_told(bench: Path, estimates_of: WriteEstima
     """The worst station is the worst of those with a pose, however few these are."""
     run = read_semi_physical(bench, estimates_of(bench, {"joint-hub": (0.001, 0, 0)}, {"joint-hub": (0, 1)}))
     table = table_2([run])
-    row = dict(zip(table.columns, table.groups[0].rows[0], strict=True))
+    row = dict(zip([table.second, *table.columns], table.groups[0].rows[0], strict=True))
     assert (row["poses"], row["stations"]) == ("1 of 3", "1 of 9")
     claims = list(semi_physical_claims([run]))
     assert len(claims) == 2
