@@ -1,1 +1,1 @@
-"""Estimates against the truth: numbers, plots, report. Knows estimators only by what they wrote to disk."""
+"""Compares estimates with the truth: scores, figures, reports. It knows estimators only by the files they wrote."""

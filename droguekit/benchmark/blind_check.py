@@ -1,4 +1,4 @@
-"""Estimates where nobody knows the true pose: do they agree with their own measurements, and with boxes?"""
+"""Estimates without a true pose: do they agree with their own measurements, and with boxes? Numbers and page."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _RIM_POINTS = 64
 
 
 class BlindFacts(ResultModel):
-    """Which dataset this is about."""
+    """The dataset that was checked."""
 
     name: str
     pairs: int
@@ -47,7 +47,7 @@ class BlindRow(ResultModel):
 
     Attributes:
         n, fixes, fix_fraction: pairs, and those of them with a pose.
-        residual_rms_px: of the centroids that the poses rest on, each coordinate; None without any. [px]
+        residual_rms_px: of the centroids that the poses were computed from, each coordinate; None without any. [px]
         boxes: views of pairs with a pose that have a box.
         middle_in_box_fraction: share of these whose box holds the middle of the rim; None without any.
         rim_box_iou_median: intersection over union of the box and the one around the rim; None without any.
@@ -77,7 +77,7 @@ class BlindCheck(ResultModel):
 
 
 class BlindScene(NamedTuple):
-    """What is known of a pair: cameras, drogue, and the box of each view that has one."""
+    """The known data of a pair: cameras, drogue, and the box of each view that has one."""
 
     rig: StereoRig
     drogue: DrogueParameters
@@ -101,7 +101,7 @@ def check_blind(dataset: Location, estimates: Path) -> BlindCheck:
 
 
 def blind_scenes(dataset: Location, index: BlindIndex) -> dict[int, BlindScene]:
-    """What is known of each pair.
+    """The known data of each pair.
 
     Raises:
         ValueError: a pair or the boxes cannot be read; names the file.
@@ -156,7 +156,7 @@ def _row(estimates: Mapping[int, Estimate], scenes: Mapping[int, BlindScene]) ->
 
 
 def _residuals_px(estimate: PoseEstimate, scene: BlindScene) -> Iterator[float]:
-    """Measured minus expected, both coordinates of every feature that the pose rests on."""
+    """Measured minus expected, both coordinates of every feature that the pose was computed from."""
     for eye in EYES:
         used = [feature for feature in estimate.features if feature.eye == eye and feature.used]
         expected = marker_images_px(scene, estimate.left_from_drogue, eye)

@@ -29,9 +29,9 @@ def root_mean_square(values: Array) -> float:
 def rms_interval(values: Array) -> Interval:
     """Confidence interval of the root mean square of independent errors about zero, by the chi-square law.
 
-    Errors that are no sample of one normal law, such as those of a mixture of distances or with outliers, know their
-    mean square less well than their number says: the degrees of freedom are what matches the measured variance of the
-    squares, and never more than the number of errors.
+    The mean square of errors that do not follow one normal law, such as a mixture of distances or errors with outliers,
+    is less certain than their number suggests. The degrees of freedom match the measured variance of the squares, and
+    never exceed the number of errors.
 
     Args:
         values: (n,) errors.
@@ -54,13 +54,15 @@ def rms_upper_limit(rms: float, count: int) -> float:
 
 
 def mean_square_region(freedom: int) -> Interval:
-    """Where the mean of that many squared standard normal numbers lies with 95 % probability."""
+    """Interval that holds the mean of `freedom` squared standard normal numbers with 95 % probability."""
     low, high = (chi2.ppf(p, freedom) / freedom for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return float(low), float(high)
 
 
 def fraction_interval(hits: int, count: int) -> Interval:
-    """Confidence interval of a fraction.
+    """Wilson's score interval of a fraction.
+
+    scipy's `binomtest` agrees but for the last bits, which published results hold, so the formula stays here.
 
     Source: E. B. Wilson, J. Am. Stat. Assoc. 22 (1927) 209, doi:10.1080/01621459.1927.10502953.
     """
@@ -68,7 +70,7 @@ def fraction_interval(hits: int, count: int) -> Interval:
     share = hits / count
     middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
     half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
-    # Where none or all hit, an end is exactly 0 or 1, which rounding misses.
+    # With no hits or only hits an end is exactly 0 or 1, which rounding would miss.
     return (float(middle - half) if hits else 0.0), (float(middle + half) if hits < count else 1.0)
 
 
@@ -107,7 +109,7 @@ def ratio_intervals(numerators: Array, denominators: Array, blocks: Sequence[int
 
     Args:
         numerators, denominators: (n, C) errors of two methods, one row a frame.
-        blocks: (n,) what each frame belongs to; frames of a block are drawn together, for they are not independent.
+        blocks: (n,) number of each frame's block; frames of a block are not independent and are drawn together.
         key: of the random stream.
 
     Returns:
@@ -140,7 +142,7 @@ def _ratio_ends(above: Array, below: Array) -> Interval | None:
 
 
 def rate_interval(count: int, exposure: float) -> Interval:
-    """Confidence interval of a rate from a number of events; also where none happened.
+    """Confidence interval of a rate from a number of events, which may be zero.
 
     Source: F. Garwood, Biometrika 28 (1936) 437, doi:10.1093/biomet/28.3-4.437.
     """
@@ -149,14 +151,14 @@ def rate_interval(count: int, exposure: float) -> Interval:
 
 
 def mean_interval(values: Array, blocks: Sequence[int], key: str) -> Interval | None:
-    """Bootstrap interval of the mean of values of which those of a block are drawn together.
+    """Bootstrap interval of a mean; values of a block are drawn together.
 
     Args:
         values: (n,).
-        blocks: (n,) what each belongs to.
+        blocks: (n,) number of each value's block.
         key: of the random stream.
 
     Returns:
-        None with fewer than two blocks, which cannot tell how much they differ.
+        None with fewer than two blocks, whose scatter cannot be estimated.
     """
     return ratio_intervals(values[:, None], np.ones((len(values), 1)), blocks, key)[0]

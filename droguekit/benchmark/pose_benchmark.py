@@ -1,4 +1,4 @@
-"""A dataset and a file of estimates in, the numbers of `benchmark.json` out."""
+"""Scores a file of pose estimates on a dataset; the result is the content of `benchmark.json`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ Methods = Mapping[str, Mapping[int, Estimate]]
 def score_sequences(
     sequences: Sequence[TrueSequence], drogues: Mapping[int, DrogueTruth], methods: Methods
 ) -> SequencesResult | None:
-    """Score what estimates say of boxes, motion, docking and time.
+    """Score boxes, motion, docking quantities and times of estimates over sequences.
 
     Args:
         sequences: of the dataset.
@@ -53,13 +53,13 @@ def score_sequences(
         methods: estimates by method and frame.
 
     Returns:
-        None where there are no sequences, or no estimate of one says anything of these.
+        None where there are no sequences, or no estimate of one has any of these.
     """
     if not sequences:
         return None
     data = sequence_data(sequences, drogues)
     dockings = true_dockings(sequences, data.motions)
-    # Where some report boxes, those who have none failed to.
+    # Where some methods report boxes, the others count as having lost the drogue.
     has_regions = any(answer.regions for estimates in methods.values() for answer in estimates.values())
     scored: dict[str, MethodSequences] = {}
     for name, estimates in methods.items():
@@ -213,7 +213,7 @@ def _comparisons(
     scores: Mapping[str, Mapping[int, FrameScore]],
     reference: Reference,
 ) -> list[MethodComparison]:
-    """Every method beside the best one and beside the seed paper's."""
+    """Every method compared with the best one and with the seed paper's."""
     errors = {
         name: {index: score.pose.error for index, score in frames.items() if score.pose is not None}
         for name, frames in scores.items()

@@ -1,1 +1,1 @@
-"""The accuracy bars: what navigation must reach, what it reaches, and whether that is enough."""
+"""Acceptance criteria of navigation: the required accuracy, the measured one with its 95 % limit, and the verdict."""

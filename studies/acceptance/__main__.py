@@ -43,12 +43,14 @@ def acceptance(
             "e: swing sequences, docking: whole flights and the paper's bench, speed.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Keeps what is finished; gets bars.json, bars.md.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Gets bars.json and bars.md, and keeps finished results.")
+    ],
     pairs_per_station: Annotated[
         int | None, typer.Option("--pairs-per-station", help="Tiers a and b: pairs at each distance; all by default.")
     ] = None,
     light: Annotated[
-        list[LightLevel] | None, typer.Option("--light", help="Tiers a and b: only this; both by default.")
+        list[LightLevel] | None, typer.Option("--light", help="Tiers a and b: only this light level; both by default.")
     ] = None,
     draws: Annotated[
         int | None, typer.Option("--draws", help="Tiers c and d: frames a cell; the protocol's by default.")
@@ -75,7 +77,7 @@ def acceptance(
         typer.Option(
             "--rig",
             metavar="NAME",
-            help=f"Tiers e and docking: may be repeated; {DEFAULT_RIG} by default, figures of others stand beside.",
+            help=f"Tiers e and docking: may be repeated; by default {DEFAULT_RIG}. Others are for comparison.",
         ),
     ] = None,
     tracker: Annotated[
@@ -84,13 +86,13 @@ def acceptance(
             "--tracker", metavar="NAME", help=f"Tiers e and docking: in the loop; {DEFAULT_TRACKER} by default."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything drawn; 1 is for development.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all draws; 1 is for development.")] = 1,
     workers: WorkersOption = None,
 ) -> None:
-    """Measure the accuracy criteria of a tier: criterion, measured value, its 95 % limit, met or not.
+    """Measure the acceptance criteria of a tier: required value, measured value, its 95 % limit, met or not.
 
-    Stopped and started again, it goes on with what is finished; results of other code are made again. Exit code 1 says
-    that a criterion is missed.
+    A run that was stopped continues from its finished results; results of other code are measured again. Exit code 1
+    means that a criterion is missed.
     """
     has_images, has_flights = tier in _IMAGE_TIERS, tier in _FLIGHT_TIERS
     if (has_images or has_flights) and draws is not None:
@@ -126,7 +128,7 @@ def acceptance(
         typer.echo(line)
     typer.echo(f"wrote {out / 'bars.json'} and {out / 'bars.md'}")
     if table.missed:
-        typer.echo(f"{table.missed} bars are missed", err=True)
+        typer.echo(f"{table.missed} criteria are missed", err=True)
         raise typer.Exit(FAULT)
 
 

@@ -32,10 +32,10 @@ _TIMED_PAIRS = 8
 
 @dataclass(frozen=True)
 class FlightOptions:
-    """What of the tiers `e` and `docking` to measure, and with what.
+    """What to measure of the tiers `e` and `docking`, and with which rigs and tracker.
 
     Attributes:
-        recipes: names of those recipes of the tier to take; all when empty.
+        recipes: names of the tier's recipes to use; all when empty.
         rigs: camera rigs. The criteria judge `rgb-ideal`; figures of other rigs are given for comparison. Recipes of a
             bench ignore this.
         sequences: of each recipe; as many as a full measurement takes when None.
@@ -54,12 +54,12 @@ class AcceptanceOptions:
 
     Attributes:
         tier: `a`, `b`, `c`, `d`, `e`, `docking` or `speed`.
-        seed: of everything drawn.
+        seed: of all draws.
         pairs_per_station: rendered pairs at each distance, the recipe's when None; tiers a and b.
         draws: frames of a cell, the protocol's when None; tiers c and d, and speed.
-        engines: that render; the recipes' own when empty. Tiers b, e and docking.
+        engines: that render; empty means those of the recipes. Tiers b, e and docking.
         lights: to measure by, in tiers a and b.
-        workers: that render, as many as the machine holds when None.
+        workers: rendering processes; None means as many as the machine has memory for.
         flights: of the tiers e and docking.
     """
 
@@ -74,10 +74,10 @@ class AcceptanceOptions:
 
 
 def measure_tier(options: AcceptanceOptions, out: Path, report: ProgressReport) -> AcceptanceTable:
-    """Measure the criteria of a tier and write bars.json and bars.md; what an earlier run finished is kept.
+    """Measure the criteria of a tier and write bars.json and bars.md; finished results of an earlier run are kept.
 
     Raises:
-        ValueError: no such tier, a wrong number, or a folder of something else.
+        ValueError: no such tier, a number out of range, or a folder with other content.
         OSError: the folder cannot be written.
     """
     from importlib.metadata import version
@@ -112,8 +112,8 @@ class PlannedData:
 
     Attributes:
         source: the recipe.
-        count: its first so many pairs.
-        names: of engine, recipe or light, and rig, as far as they are told apart: folder and title.
+        count: number of pairs, from the first on.
+        names: of engine, recipe or light, and rig, where several are measured; they make up folder and title.
     """
 
     source: RecipeSource
@@ -145,7 +145,7 @@ def measure_image_tier(options: AcceptanceOptions, out: Path, report: ProgressRe
 
 
 def plan_images(options: AcceptanceOptions) -> list[tuple[LightLevel, PlannedData]]:
-    """The datasets to make; an engine has folders of its own where it is asked for by name.
+    """The datasets to make; an engine that is asked for by name has folders of its own.
 
     Raises:
         ValueError: no such engine, or a wrong number.
@@ -192,9 +192,9 @@ def measure_flight_tier(
 
 
 def plan_flights(options: AcceptanceOptions, data: Sequence[FlightData]) -> list[tuple[FlightData, PlannedData]]:
-    """The datasets to make. The first sequences of a recipe are the same however many are asked for.
+    """The datasets to make.
 
-    That holds up to a full measurement; beyond it the recipe is another.
+    The first sequences of a recipe do not depend on how many are asked for, up to a full measurement.
 
     Raises:
         ValueError: no such recipe in the tier, engine or rig, or a wrong number.
@@ -231,24 +231,28 @@ def _flight_rows(
     from studies.acceptance.rendered.scored_frames import BEST, METHODS
     from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
 
-    title, folder, is_beside = ", ".join(plan.names), out.joinpath(*plan.names), len(plan.names) > _NAMES_OF_CRITERIA
+    title, folder, is_comparison = (
+        ", ".join(plan.names),
+        out.joinpath(*plan.names),
+        len(plan.names) > _NAMES_OF_CRITERIA,
+    )
     sha256 = _render(plan, folder, options, report)
     tracked = NavigationOptions(tracker=options.flights.tracker, filtered=True) if data.follows else NavigationOptions()
     estimates = _navigated(folder, "estimates", sha256, METHODS, tracked, report)
     result = benchmark_dataset(folder / "dataset", estimates, folder / "benchmark.json", folder / "report.html")
     scores = score_pairs(folder / "dataset", estimates)
-    # The paper's method tells no covariance, so that a filter has nothing to go by.
+    # The paper's method reports no covariance, so there is no filtered version of it.
     scores = {name: scores[name] for name in (*METHODS, FILTERED) if name in scores}
-    rows = data.rows(title, scores, is_beside)
+    rows = data.rows(title, scores, is_comparison)
     if data.follows:
         rows += tracking_filter_rows(title, scores, result)
     untracked = f"{title}, detector at every pair"
     if data.times:
-        rows += processing_time_rows(f"{title}, {options.flights.tracker}", scores[FILTERED], is_beside)
+        rows += processing_time_rows(f"{title}, {options.flights.tracker}", scores[FILTERED], is_comparison)
         alone = _navigated(folder, "detector-alone", sha256, (BEST,), NavigationOptions(filtered=True), report)
         rows += processing_time_rows(untracked, score_pairs(folder / "dataset", alone)[FILTERED], True)
     if data.compares:
-        # Apart, so that the time of many methods is in that of no pair above.
+        # A separate run: the times above must not include other methods.
         all_methods = _navigated(folder, "all-methods", sha256, method_names(), NavigationOptions(), report)
         rows += data.rows(untracked, score_pairs(folder / "dataset", all_methods), True)
     return rows
@@ -267,7 +271,7 @@ def _check_engines(plans: Sequence[PlannedData]) -> None:
 
 
 def _with_rig(recipe: Recipe, rig: str) -> Recipe:
-    """The recipe with another of the rigs that ship, and a lens as clean as its own; the default leaves it as it is.
+    """The recipe with another of the shipped rigs and the recipe's own stray light; the default rig changes nothing.
 
     Raises:
         ValueError: no such rig, or one that the engine cannot draw.
@@ -292,10 +296,10 @@ def _with_rig(recipe: Recipe, rig: str) -> Recipe:
 
 
 def _render(plan: PlannedData, folder: Path, options: AcceptanceOptions, report: ProgressReport) -> str:
-    """Make what is missing of a dataset's first pairs; its hash.
+    """Render what is missing of a dataset's first pairs, and return the dataset's hash.
 
     Raises:
-        ValueError: pairs could not be made; without them criteria would look better than they are.
+        ValueError: pairs could not be rendered; leaving them out would flatter the results.
     """
     dataset = folder / "dataset"
     report.say(f"{folder.name}: rendering {plan.count} pairs of {plan.source.recipe.name} into {dataset}")
@@ -313,7 +317,7 @@ def _render(plan: PlannedData, folder: Path, options: AcceptanceOptions, report:
 def _navigated(
     folder: Path, name: str, sha256: str, methods: Sequence[str], how: NavigationOptions, report: ProgressReport
 ) -> Path:
-    """Estimates of a folder's dataset, made unless they are there already; what they were made with counts."""
+    """Estimates of a folder's dataset, made unless a file from the same methods and options is there already."""
     from studies.acceptance.finished_results import is_navigated, mark_navigated
 
     estimates = folder / f"{name}.jsonl"

@@ -1,4 +1,4 @@
-"""Criteria with what was measured, as a table for people and for programs."""
+"""Criteria and measured values as a table, for people (bars.md, terminal) and programs (bars.json)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ class AcceptanceRow(BaseModel):
     """One criterion.
 
     Attributes:
-        bar: its number in docs/explanation/acceptance.md, `goal` for an aim that is not demanded, or `beside` for a
-            figure to compare with.
+        bar: its number in docs/explanation/acceptance.md, `goal` for an aim that is not required, or `beside` for a
+            figure given for comparison.
         quantity: what is measured, with its unit.
-        low, high: between which limits it must lie; no lower one when None.
+        low, high: required range; None means no lower end.
         measured: None where nothing could be measured.
         limit_low, limit_high: one-sided 95 % limits of what is measured.
-        n: how many numbers it rests on.
-        met: whether the limits lie within the criterion; False where nothing could be measured.
-        note: what the reader should know, in one sentence; empty when there is nothing.
+        n: sample size.
+        met: whether the limits lie within `low` and `high`; False where nothing could be measured.
+        note: a remark for the reader, may be empty.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -100,7 +100,7 @@ def at_most(
 def between(
     bar: str, quantity: str, wanted: tuple[float, float], measured: tuple[float, float, float], n: int
 ) -> AcceptanceRow:
-    """A quantity with a criterion on either side; `measured` is its value, lower and upper limit."""
+    """A quantity with a required range; `measured` is its value, lower and upper limit."""
     (low, high), (value, limit_low, limit_high) = wanted, measured
     return AcceptanceRow(
         bar=bar,
@@ -116,7 +116,7 @@ def between(
 
 
 def not_measured(bar: str, quantity: str, high: float, note: str) -> AcceptanceRow:
-    """A criterion for which there is nothing to measure, and why; it counts as missed."""
+    """A criterion that could not be measured, and why; it counts as missed."""
     return AcceptanceRow(bar=bar, quantity=quantity, high=high, measured=None, n=0, met=False, note=note)
 
 

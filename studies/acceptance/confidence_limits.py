@@ -1,4 +1,10 @@
-"""One-sided 95 % limits of what is measured."""
+"""One-sided 95 % limits of measured values.
+
+Pairs of a sequence are not independent of their neighbours; sequences are independent of each other. The `block` limits
+are those of the sequences' own means, by Student's law, or of resampled sequences. They are never less than those of
+independent pairs: a few sequences that happen to agree would promise too much. Pairs of a single sequence count as
+independent, as nothing shows how much sequences differ.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +30,7 @@ def rms_limit(values: ArrayLike) -> ValueWithLimit:
 
 
 def mean_limit(values: ArrayLike) -> ValueWithLimit:
-    """Mean, by Student's law; no limit but the value itself with a single number."""
+    """Mean, by Student's law; with a single number the limit is the value itself."""
     numbers = np.asarray(values, dtype=np.float64)
     mean, count = float(numbers.mean()), numbers.size
     if count < 2:
@@ -47,7 +53,7 @@ def share_limit(hits: int, count: int) -> ValueWithLimit:
 def percentile_limit(values: ArrayLike, percent: float) -> ValueWithLimit:
     """Percentile of absolute values, and the smallest order statistic that covers the true one with 95 %.
 
-    With too few values none does, and the largest stands in.
+    With too few values the largest one is used.
     """
     ordered = np.sort(np.abs(np.asarray(values, dtype=np.float64)))
     rank = int(binom.ppf(CONFIDENCE, ordered.size, percent / 100))

@@ -1,4 +1,4 @@
-"""Finished results on disk, so that a stopped run goes on where it was."""
+"""Whether results on disk were made by this code, so that a stopped run can continue."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ROOMS = ("geometry", "drogue_models", "nav", "studies.acceptance", "droguekit.b
 
 
 def code_fingerprint(rooms: Sequence[str] = _ROOMS) -> str:
-    """Hash of the sources and networks on which results rest: others make other results."""
+    """Hash of the sources and networks that determine results."""
     digest = hashlib.sha256()
     for room in rooms:
         folder = Path(str(files(room)))
@@ -25,12 +25,12 @@ def code_fingerprint(rooms: Sequence[str] = _ROOMS) -> str:
     return digest.hexdigest()
 
 
-# Whatever lies between the pixels and the estimates; those of readers and estimates among it.
+# Packages between the pixels and the estimates, readers and file formats included.
 _ROOMS_OF_ESTIMATES = ("geometry", "drogue_models", "datasets_manifest", "nav")
 
 
 def is_navigated(estimates: Path, dataset_sha256: str, methods: Sequence[str]) -> bool:
-    """Whether the file is there, whole, and made by this code from this dataset."""
+    """Whether the file exists unchanged and was made by this code, with these methods, from this dataset."""
     stamp = _stamp_path(estimates)
     if not (estimates.exists() and stamp.exists()):
         return False
@@ -38,7 +38,7 @@ def is_navigated(estimates: Path, dataset_sha256: str, methods: Sequence[str]) -
 
 
 def mark_navigated(estimates: Path, dataset_sha256: str, methods: Sequence[str]) -> None:
-    """Note beside the file what it was made from.
+    """Record beside the file what it was made from.
 
     Raises:
         OSError: it cannot be written.

@@ -1,1 +1,1 @@
-"""The seed paper's tables and figures, measured here, with its published numbers beside them."""
+"""The seed paper's tables and figures, measured here and compared with its published numbers."""

@@ -1,4 +1,4 @@
-"""A docking dataset with estimates."""
+"""A docking dataset with estimates: scores of all pairs or of those in view, and one run over its image number."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class DockingRun:
 
 @dataclass(frozen=True, eq=False)
 class DockingData(ExperimentData):
-    """Everything that the page needs of the docking runs.
+    """A docking dataset with estimates and their scores.
 
     Attributes:
         records: of every pair that shows a drogue, by frame.

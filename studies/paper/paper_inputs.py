@@ -1,4 +1,4 @@
-"""What the page rests on."""
+"""Inputs of the page: files of estimates with their datasets, and the hashes of data, files and code."""
 
 from __future__ import annotations
 
@@ -73,10 +73,10 @@ def _roots() -> list[Path]:
 
 @dataclass(frozen=True, eq=False)
 class EstimatesFile:
-    """What a file of estimates says of the contenders.
+    """The contenders' estimates in a file.
 
     Attributes:
-        path: where it lies.
+        path: of the file.
         sha256: of its contents.
         methods: by name and frame.
     """
@@ -91,7 +91,7 @@ class ExperimentData:
     """A dataset with estimates.
 
     Attributes:
-        dataset: that was navigated.
+        dataset: the images.
         file: the estimates on it.
     """
 
@@ -110,7 +110,7 @@ class ExperimentData:
 
     @property
     def contenders(self) -> list[Contender]:
-        """Those of which there are estimates."""
+        """Contenders with estimates."""
         return present(self.file.methods)
 
 

@@ -252,7 +252,7 @@ def _legend(figure_name: str, contenders: Sequence[Contender]) -> list[tuple[str
 
 
 def _key(name: str, style: MethodStyle) -> Markup:
-    """A line of a legend; one page has many, and `name` keeps the ids in them apart."""
+    """A line of a legend; `name` makes its ids unique on the page."""
     plain = re.sub(r"\W", "-", name)
     return Markup(re.sub(r"([\"#])key-", rf"\g<1>{plain}-key-", legend_key(style)))
 
@@ -270,7 +270,7 @@ class DatasetWithEstimates(NamedTuple):
 
 @dataclass(frozen=True)
 class ReportInputs:
-    """What the page is made from; a part whose input is missing is left out with a line that says how to make it.
+    """Inputs of the page. A part whose input is missing is left out, with a line that says how to make it.
 
     Attributes:
         docking: docking runs.
@@ -288,7 +288,7 @@ class ReportInputs:
 
 
 class MissingPart(NamedTuple):
-    """A part that is not on the page, and the commands that make its input."""
+    """A part that is missing on the page, and the commands that make its input."""
 
     what: str
     commands: tuple[str, ...]

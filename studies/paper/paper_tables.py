@@ -1,4 +1,4 @@
-"""Tables of the page."""
+"""Tables and claims of the page as text, measured and published numbers in the same columns."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def _station_cells(contender: Contender, errors: StationErrors) -> list[str]:
 
 
 def count_text(count: int, total: int) -> str:
-    """How many of how many; nothing where there are none."""
+    """A count of a total; absent where the total is 0."""
     return f"{count} of {total}" if total else ABSENT
 
 
@@ -283,7 +283,7 @@ def _depth(errors: StationErrors | None) -> str:
 
 
 def _of_stations(errors: StationErrors) -> str:
-    """What the worst one is the worst of."""
+    """Number of poses and stations behind a worst station."""
     return f"; poses in {errors.poses} of {errors.pairs} pairs, at {errors.stations_text} stations"
 
 

@@ -1,4 +1,4 @@
-"""Figures 16 to 19."""
+"""The paper's Figures 16 to 19: a docking run over the image number, and the bench experiment against distance."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from studies.paper.semi_physical import SemiPhysicalRun, StationErrors
 
 _PANEL_IN = (4.4, 2.7)
 
-# A few mistaken poses would flatten the rest: where the largest error is so much larger than nearly all of them, those
-# are shown and the others counted.
+# A few outliers would flatten the curves: where the largest error is that much larger than the 99th percentile, the
+# panel ends there and the errors beyond are counted.
 _NEARLY_ALL_PERCENTILE = 99.0
 _FAR_LARGER = 4.0
 
-# About how many poses of a line bear its mark, and how many lines take turns at that.
+# About how many poses of a line have its marker, and how many lines alternate their markers.
 _MARKS = 12
 _ORDERS = 4
 
@@ -69,7 +69,7 @@ def error_series(figure_name: str, run: DockingRun, contenders: Sequence[Contend
     Args:
         figure_name: that keeps ids apart from those of other figures.
         run: the sequence.
-        contenders: who is drawn, the first one on top.
+        contenders: methods to draw, the first one on top.
         quantity: which component.
 
     Returns:

@@ -76,7 +76,7 @@ CONTRADICTION = (
     f"{NOISE_OF_THE_MEAN_PX:g} px, and with such centroids pitch and yaw by the paper's plane fit err by about "
     f"{TILT_AT_THAT_NOISE_DEG:g}° RMS, not within ±{ANGLE_LIMIT_DEG:g}°."
 )
-"""The honest sentence about what does not fit together."""
+"""Which published claims contradict each other."""
 
 
 class Contender(NamedTuple):

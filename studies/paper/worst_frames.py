@@ -1,4 +1,4 @@
-"""The frames in which a method errs most, as pictures with what it measured, what it concluded, and the truth."""
+"""Pictures of the frames with the largest errors of a method: its measurements, its pose and the truth."""
 
 from __future__ import annotations
 

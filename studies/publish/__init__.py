@@ -1,1 +1,1 @@
-"""The published manifests, made anew."""
+"""Renders the published datasets again and writes their manifests."""

@@ -1,4 +1,4 @@
-"""Makes the published manifests anew: renders the small recipes and locks what comes out.
+"""Writes the published manifests: renders the small recipes and records the hashes of the results.
 
 Run as `python -m studies.publish --work DIR --out datasets_manifest/published`.
 """
@@ -28,14 +28,14 @@ PUBLISHED: Mapping[str, int | None] = {
 
 
 def publish(name: str, pairs: int | None, work: Path, out: Path, report: ProgressReport) -> Path:
-    """Render a recipe from nothing and write its published manifest.
+    """Render a recipe from scratch and write its published manifest.
 
     Args:
         name: of a recipe that ships.
         pairs: how many, from the first on; None for all.
         work: folder for the dataset, which must not be there yet.
         out: folder of the published manifests.
-        report: hears how it goes.
+        report: of progress.
 
     Returns:
         The file.
@@ -46,7 +46,7 @@ def publish(name: str, pairs: int | None, work: Path, out: Path, report: Progres
     """
     dataset = work / name
     if dataset.exists():
-        raise ValueError(f"{dataset}: is there already; what is published is made anew, so delete it first")
+        raise ValueError(f"{dataset}: exists already; published datasets are rendered from scratch, so delete it first")
     source = load_recipe(name)
     count = source.recipe.frames.count if pairs is None else pairs
     render_dataset(source, dataset, range(count), default_workers(), report)

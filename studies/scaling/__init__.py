@@ -1,1 +1,1 @@
-"""What spreading frames over workers gains and costs."""
+"""Speed-up and overhead of rendering frames with several workers."""

@@ -1,7 +1,7 @@
-"""What spreading frames gains and costs: two workers against one, and what a frame costs besides its own work.
+"""Measures speed-up and overhead of several workers: two against one, and the cost of a frame besides its rendering.
 
-Run as `python -m studies.scaling --out out/scaling` on a machine that does nothing else. It goes on where it
-stopped: what `results.json` in that folder has is not measured again.
+Run as `python -m studies.scaling --out out/scaling` on a machine that does nothing else. A stopped run
+continues: results in `results.json` of that folder are not measured again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from droguekit.batch.progress import ProgressReport, progress_report
 from studies.scaling.spreading_cost import children_cpu_s, dask_cost, local_cost
 
 RESULTS_FILE = "results.json"
-# Every pair as dear as the next but for its distance, which goes through the whole range.
+# All pairs cost about the same; only the distance varies, over the whole range.
 UNIFORM_RECIPE = """
 name = "uniform"
 seed = 1
@@ -41,13 +41,13 @@ _BUSY_LOAD = 0.3
 
 
 def speed(recipe_text: str, workers: int, folder: Path, report: ProgressReport) -> dict[str, Any]:
-    """What the whole command takes to make a dataset.
+    """Time that the whole command takes to make a dataset.
 
     Args:
         recipe_text: the recipe.
         workers: how many processes.
-        folder: for the dataset, which is made anew.
-        report: hears what is being made.
+        folder: for the dataset; emptied first.
+        report: of progress.
 
     Returns:
         Seconds on the clock and CPU seconds of all its processes, those of making frames and of the frames' own
@@ -80,7 +80,7 @@ def measure(out: Path, pairs: int, tasks: int, parts: tuple[str, ...], report: P
         pairs: of the datasets by which speed is measured.
         tasks: that do nothing, by which the cost of spreading is measured.
         parts: of `speed`, `local`, `dask`.
-        report: hears how it goes.
+        report: of progress.
 
     Returns:
         All results in the folder by their names.
@@ -99,19 +99,21 @@ def measure(out: Path, pairs: int, tasks: int, parts: tuple[str, ...], report: P
     }
     missing = {name: work for name, (part, work) in planned.items() if part in parts and name not in known}
     if any(name.startswith(f"{pairs} pairs") for name in missing):
-        # Compiled kernels are kept on disk, and would favour whoever comes second.
+        # Compiled kernels are cached on disk, which would favour the second run.
         speed(UNIFORM_RECIPE.format(pairs=6), 2, out / "warm", report)
     for name, work in missing.items():
         load = os.getloadavg()[0]
         if load > _BUSY_LOAD:
-            report.say(f"the machine is at other work too (load {load:.1f}): of what follows only CPU time tells")
+            report.say(
+                f"the machine is busy with other work (load {load:.1f}): of the following results only CPU time counts"
+            )
         known[name] = dict(work())
         write_text_atomic(out / RESULTS_FILE, json.dumps(known, indent=1) + "\n")
     return known
 
 
 def table(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The results as lines for people."""
+    """The results as lines of text."""
     lines = []
     speeds = [result for result in results.values() if "cpu_s" in result]
     if speeds:

@@ -1,4 +1,4 @@
-"""What a frame costs besides its own work, by frames that take no work at all."""
+"""Overhead of a frame, measured with frames that need no work."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _START_S = 120.0
 
 @dataclass(frozen=True)
 class EmptyFrameTask(FrameTask):
-    """Takes the way of a frame through recipe, processes and reports, and makes nothing."""
+    """Goes through recipe, processes and reports like a frame, but renders nothing."""
 
     def __call__(self, frame_index: int) -> FrameReport:
         """The report of a frame that took no time."""
@@ -54,10 +54,10 @@ class EmptyFrameTask(FrameTask):
 
 @dataclass
 class MemorySamples:
-    """Passes progress on, and notes the memory of this process as it goes.
+    """Forwards progress reports, and samples the memory of this process.
 
     Attributes:
-        shown: hears what it passes on.
+        shown: the report that everything is forwarded to.
         every: frames between two samples.
         client_mib: resident memory by the number of finished frames. [MiB]
     """
@@ -95,10 +95,10 @@ def local_cost(folder: Path, frames: int, workers: int, report: ProgressReport) 
     """CPU time and wall time a frame, and the parent's memory, with worker processes of this machine.
 
     Args:
-        folder: to work in, made anew.
+        folder: to work in; emptied first.
         frames: how many.
         workers: how many processes.
-        report: hears how it goes.
+        report: of progress.
 
     Returns:
         `cpu_ms` of the client and of the workers a frame, their start and replacement included, `wall_ms` a frame,
@@ -117,10 +117,10 @@ def dask_cost(folder: Path, frames: int, workers: int, report: ProgressReport) -
     """The same with the workers of a Dask scheduler on loopback, without the start of these processes.
 
     Args:
-        folder: to work in, made anew.
+        folder: to work in; emptied first.
         frames: how many.
         workers: how many processes.
-        report: hears how it goes.
+        report: of progress.
 
     Returns:
         As `local_cost`, with the scheduler beside client and workers.

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binom
+from scipy.stats import binom, binomtest
 
 from datasets_manifest.random_streams import named_generator
 from droguekit.benchmark.confidence_intervals import (
@@ -55,6 +55,14 @@ def test_fraction_interval_of_known_cases() -> None:
     # By hand from Wilson's formula with z = 1.95996: none of 10 reaches up to z^2 / (10 + z^2).
     assert fraction_interval(0, 10) == pytest.approx((0.0, 0.27753), abs=1e-5)
     assert fraction_interval(5, 10) == pytest.approx((0.23659, 0.76341), abs=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 64, 600, 4000])
+def test_fraction_interval_is_wilsons(count: int) -> None:
+    for hits in {0, 1, count // 3, count // 2, count - 1, count}:
+        expected = binomtest(hits, count).proportion_ci(CONFIDENCE, method="wilson")
+        # Rounding only: the formula in another order of operations.
+        assert fraction_interval(hits, count) == pytest.approx((expected.low, expected.high), abs=1e-14)
 
 
 @given(st.integers(1, 200), st.data())

@@ -1,4 +1,4 @@
-"""Figures of the detection report, as inline SVG."""
+"""Panels of the detection report as inline SVG: accuracy against distance and speed, curves, histograms."""
 
 from __future__ import annotations
 
@@ -113,19 +113,19 @@ def size_panel(name: str, number: int, matches: Matches, threshold: float) -> st
 
 
 def _plain(name: str) -> str:
-    """A name that matplotlib does not take for a formula."""
+    """A name that matplotlib does not parse as a formula."""
     return name.replace("$", r"\$")
 
 
 class _Bars(NamedTuple):
-    """Edges of the bars, and what the two heaps are called."""
+    """Edges of the bars, and labels of the two stacked histograms."""
 
     edges: Array
     labels: tuple[str, str]
 
 
 def _draw_bars(axes: Axes, bars: _Bars, heaps: tuple[Array, Array]) -> None:
-    """Two heaps on top of each other; heights go with the square root, so that a single one can be seen."""
+    """Two stacked histograms with a square-root axis, so that single counts are visible."""
     below = np.zeros(len(bars.edges) - 1)
     for values, label, color in zip(heaps, bars.labels, (_TRUE_COLOR, _FALSE_COLOR), strict=True):
         counts, _ = np.histogram(values, bars.edges)
@@ -199,7 +199,7 @@ def _finish_share_axes(axes: Axes, title: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-# On a phone a panel stands a little smaller than drawn, and letters must not come below 8 px there.
+# A phone shows a panel a little smaller than drawn; letters must stay above 8 px there.
 _NAME_PT = 9.0
 _LINE_HEIGHT = 1.3
 
@@ -224,12 +224,12 @@ _Point = tuple[float, float]
 
 
 def is_timed(result: DetectionResult) -> bool:
-    """Whether there is anything to show: a detector that was run for this result."""
+    """Whether a detector was run for this result, so that there is a time to show."""
     return any(detector.times is not None for detector in result.detectors.values())
 
 
 def published_name(name: str) -> str:
-    """What the seed paper calls a method, where it is not mistaken for one of ours."""
+    """The seed paper's name of a method, marked where it could be mistaken for one of ours."""
     return f"{name} (the paper's)" if name.lower().startswith("ours") else name
 
 
@@ -288,7 +288,7 @@ def _write_names(figure: Figure, axes: Axes, names: dict[str, _Point], others: S
             for step in _STEPS_PT
             for side in _SIDES
         ]
-        # Where all is full, the name stands over others rather than nowhere.
+        # Without free space the name overlaps others rather than being left out.
         step, side, box = next((c for c in choices if _is_free(c[2], area, taken)), choices[0])
         label.set(position=(side[0] * step, side[1] * step), ha=side[2], va=side[3])
         if step >= _FAR_PT:

@@ -1,4 +1,9 @@
-"""Matching of boxes with drogues, precision and recall, average precision and its intervals."""
+"""Matching of boxes with drogues, precision and recall, average precision and its intervals.
+
+pycocotools matches the boxes of every image once, by descending score, at ten overlaps from 0.5 to 0.95. Scores of a
+family, a distance or an eye accumulate the same matches over fewer images. Intervals come from resampled scenes, as
+images of one scene are not independent.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +49,7 @@ class Matches:
     """The boxes found on some images, best first, and which of them are drogues.
 
     Attributes:
-        images: those that were looked at.
+        images: the images.
         image: (n,) place of each box's image among them.
         score: (n,) descending.
         is_true: (10, n) whether it is the first box on its drogue, at each of `IOU_THRESHOLDS`.
@@ -73,7 +78,7 @@ class Matches:
 
 
 class Evaluation:
-    """A detector's boxes on a dataset, matched."""
+    """A detector's boxes on a dataset, matched with the true ones."""
 
     def __init__(self, images: Sequence[ImageTruth], found: Sequence[DetectedBox]) -> None:
         """Match boxes with truth; those on ignored drogues and on images that are not given do not count."""
@@ -169,7 +174,7 @@ def _coco(images: Sequence[ImageTruth], boxes: Sequence[tuple[Any, ...]]) -> COC
 
 
 class OperatingPoint(NamedTuple):
-    """What a detector does when boxes of at least a score count.
+    """Precision and recall of the boxes with at least a score.
 
     Attributes:
         threshold: the score.
@@ -207,8 +212,8 @@ def precision_recall(matches: Matches) -> PrecisionRecallCurve:
 def best_f1(matches: Matches) -> OperatingPoint | None:
     """The threshold with the highest F1, midway to the next lower score or to 0; None where no box is right.
 
-    Of equally good ones it is the lowest: what more it lets through is half right. A training chooses the threshold of
-    its network by the same rule, of the best box of each image.
+    Of equally good thresholds it is the lowest: half of the boxes that it adds are right. Training chooses the
+    threshold of its network by the same rule, with the best box of each image.
     """
     threshold, boxes, true = _passing(matches)
     if not true.any():
@@ -255,8 +260,8 @@ def average_precision_interval(matches: Matches, overlaps: tuple[int, ...], key:
         key: of the random stream.
 
     Returns:
-        None with fewer than two scenes that show a drogue, or where all resamples are alike, as without a single fault:
-        scenes drawn again cannot tell how rare a fault is that none of them shows.
+        None with fewer than two scenes that show a drogue, or where all resamples are equal, as without a single
+        error: resampled scenes cannot tell how rare an error is that none of them shows.
 
     Source: B. Efron, Ann. Statist. 7 (1979) 1, doi:10.1214/aos/1176344552; 1000 resamples of scenes.
     """
@@ -273,12 +278,12 @@ def average_precision_interval(matches: Matches, overlaps: tuple[int, ...], key:
 
 
 def resampled_precision(matches: Matches, overlap: int, times: Counts) -> Array:
-    """Average precision where scenes are there several times, or not at all.
+    """Average precision of resamples, in which a scene occurs several times or not at all.
 
     Args:
         matches: on the images of a cell.
         overlap: place among `IOU_THRESHOLDS`.
-        times: (R, S) how often each scene is there, in ascending order of their ids; some drogue must be.
+        times: (R, S) how often each scene occurs, in ascending order of their ids; at least one drogue must occur.
 
     Returns:
         (R,) average precision at that overlap.

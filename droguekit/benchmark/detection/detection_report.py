@@ -65,11 +65,11 @@ class PictureGroup(NamedTuple):
 
 
 class PicturedImage(NamedTuple):
-    """An image to be shown.
+    """An image for the page.
 
     Attributes:
         image: with its true box.
-        box: that is drawn in besides, None where nothing was found.
+        box: found box to draw, None where nothing was found.
         is_miss: the box is the best one of an image whose drogue was not found.
     """
 
@@ -230,7 +230,7 @@ def best_detector(result: DetectionResult) -> str:
 
 
 def detection_sentences(result: DetectionResult, name: str) -> list[str]:
-    """What came out, in words."""
+    """The result in sentences."""
     data, detector = result.dataset, result.detectors[name]
     row, alarms = detector.overall, detector.false_alarms
     images = (

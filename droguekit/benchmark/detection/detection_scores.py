@@ -1,4 +1,4 @@
-"""Detectors scored on a dataset."""
+"""Scores of detectors on a dataset: overall, by distance, family, eye and split, with the operating threshold."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from geometry.stereo import EYES
 DISTANCE_EDGES_M = (0.0, 3.0, 5.0, 10.0, 20.0, 30.0, 40.0, math.inf)
 """The same for every dataset, so that detectors can be compared across them. [m]"""
 LEAST_BOXES, LEAST_SCENES = 300, 5
-"""A row with fewer says little: at 300 boxes a recall of 99 % is known within 1 to 2 %."""
+"""A row with fewer gets a note: at 300 boxes a recall of 99 % is known within 1 to 2 %."""
 FALSE_ALARM_FRAMES = 600
 
 SPLITS = ("train", "val", "test")
@@ -47,7 +47,7 @@ Images = Sequence[ImageTruth]
 
 
 class Threshold(NamedTuple):
-    """The score from which boxes count, and where it is from."""
+    """The score from which boxes count, and its source."""
 
     score: float
     source: Literal["given", "detector", "val", "scored images"]
@@ -67,7 +67,7 @@ def images_of_split(images: Images, split: str) -> list[ImageTruth]:
 
 
 def split_to_score(images: Images, split: str | None) -> str:
-    """The split that is meant: by None `test` where a dataset has one, else `all`.
+    """The split to score on; None means `test` where a dataset has it, else `all`.
 
     Raises:
         ValueError: no image of that split, or none that shows a drogue.
@@ -133,7 +133,7 @@ def false_alarms(matches: Matches, threshold: float) -> FalseAlarms | None:
         return None
     passing = matches.image[matches.score >= threshold]
     hit = [matches.images[k].frame_index for k in passing.tolist() if matches.images[k].is_known_empty]
-    # The images of a pair are not independent, nor are the boxes of an image: pairs with any are.
+    # Images of a pair and boxes of an image are not independent, so pairs with any box are counted.
     low, high = fraction_interval(len(set(hit)), len(frames))
     return FalseAlarms(
         frames=len(frames),
@@ -151,7 +151,7 @@ def _best_threshold(evaluation: Evaluation, images: Images, split: str) -> Thres
     if best is not None:
         return Threshold(best.threshold, "val")
     best = best_f1(evaluation.matches(images_of_split(images, split)))
-    # Without a single right box any threshold is as good: all boxes count.
+    # Without a single right box every threshold is equally good: all boxes count.
     return Threshold(best.threshold if best is not None else 0.0, "scored images")
 
 
@@ -193,12 +193,12 @@ def _distance_rows(images: Images, row: Callable[[Images, str], DetectionRow]) -
 
 
 class DetectorOutput(NamedTuple):
-    """What a detector found.
+    """Output of a detector on a dataset.
 
     Attributes:
         boxes: in all images.
-        times: that it took, where it was run just now.
-        score_threshold: that the detector asks for itself, or None.
+        times: of a pair, where the detector was run for this result.
+        score_threshold: the detector's own threshold, or None.
         parameters, gflops_per_image: of its network, where they could be counted.
     """
 

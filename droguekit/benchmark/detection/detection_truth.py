@@ -1,7 +1,7 @@
-"""What a detector should find in every image of a dataset.
+"""The boxes that a detector should find in every image of a dataset.
 
 The box to be found goes around the drogue's visible pixels. A drogue of which too little is seen is *ignored*: neither
-finding nor missing it counts. `ignored_boxes` says which boxes that concerns.
+finding nor missing it counts. `scored_boxes` leaves out the boxes on such a drogue.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from droguekit.benchmark.results.detection_result import DetectedBox, clipped_bo
 from droguekit.benchmark.sequences.sequence_truth import TrueSequence, true_sequences, true_state
 from geometry.stereo import EYES, Eye
 
-# So much of a box must lie in an ignored drogue's for it to count as that drogue's: COCO's rule for crowds at IoU 0.5.
+# A box of which at least this share lies in an ignored drogue's box belongs to it: COCO's rule for crowds at IoU 0.5.
 _LEAST_SHARE_INSIDE = 0.5
 
 
@@ -32,11 +32,11 @@ class ImageTruth:
 
     Attributes:
         frame_index, eye: which image.
-        scene_id, split, family: what it is counted under; a scene is drawn as a whole by the bootstrap.
-        distance_m: Z of the rim's centre in the left camera; None without a drogue, or where nobody knows. [m]
+        scene_id, split, family: groups that it belongs to; the bootstrap draws whole scenes.
+        distance_m: Z of the rim's centre in the left camera; None without a drogue, or where it is unknown. [m]
         box_xywh: to be found; None where there is nothing to find. [px]
         ignored_xywh: full box, clipped to the image, of a drogue that counts neither way. [px]
-        is_known_empty: there is no drogue in the pair, as the truth says.
+        is_known_empty: the truth says that there is no drogue in the pair.
     """
 
     frame_index: int
@@ -139,13 +139,13 @@ def _is_ignored(box: DetectedBox, image: ImageTruth) -> bool:
 
 
 def _given_truth(dataset: Location) -> DetectionTruth:
-    """Boxes that came with imported images; an image without one is left out, for nobody said that it is empty."""
+    """Boxes that came with imported images; an image without one may show a drogue, so it is left out."""
     index = read_blind_index(dataset)
     images = [
         ImageTruth(
             frame_index=frame,
             eye=eye,
-            # Nothing is known of scenes: pairs stand for themselves.
+            # Scenes are unknown, so every pair counts as one.
             scene_id=frame,
             split="all",
             family="imported",

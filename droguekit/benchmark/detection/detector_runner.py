@@ -16,18 +16,18 @@ from geometry.stereo import EYES
 from nav.detector.detector import Detector
 
 LEAST_SCORE = 0.001
-"""From so low a score on boxes are kept for average precision, which looks at all of them."""
+"""Boxes with at least this score are kept: average precision needs low scores too."""
 
 
 class DetectorRunner:
-    """One look at every pair.
+    """Runs a detector once over every pair.
 
     Attributes:
         name: of the detector.
         pairs: how many there are.
-        score_threshold: that the detector asks for itself, or None.
+        score_threshold: the detector's own threshold, or None.
         pass_sizes_px: width and height of a network's input in each of its passes; none where there is no network. [px]
-        wall_s, cpu_s: time of each pair that was looked at, images already read. [s]
+        wall_s, cpu_s: time of each processed pair, without reading its images. [s]
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class DetectorRunner:
         Args:
             dataset: its folder or URL.
             detector_of: the detector of a drogue; pairs may name different ones.
-            frame_indices: pairs to look at, all of them by default.
+            frame_indices: pairs to process, all by default.
 
         Raises:
             ValueError: no such dataset, or one without pairs.
@@ -73,7 +73,7 @@ class DetectorRunner:
         """
         for index in self._frame_indices:
             pair = self._dataset.pair(index)
-            yield from self._look(index, self._detector_of(pair.drogue), pair.images, least_score)
+            yield from self._detect(index, self._detector_of(pair.drogue), pair.images, least_score)
             advance()
 
     def times(self) -> PairTimes:
@@ -81,7 +81,9 @@ class DetectorRunner:
         wall_ms, cpu_ms = (1e3 * float(np.median(seconds)) for seconds in (self.wall_s, self.cpu_s))
         return PairTimes(wall_ms=wall_ms, cpu_ms=cpu_ms, pairs=len(self.wall_s))
 
-    def _look(self, index: int, detector: Detector, images: StereoImages, least_score: float) -> Iterator[DetectedBox]:
+    def _detect(
+        self, index: int, detector: Detector, images: StereoImages, least_score: float
+    ) -> Iterator[DetectedBox]:
         wall_s, cpu_s = time.perf_counter(), time.process_time()
         found = detector.candidates(images, least_score)
         self.wall_s.append(time.perf_counter() - wall_s)

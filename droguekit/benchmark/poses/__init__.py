@@ -1,1 +1,1 @@
-"""Errors of poses in single pairs, beside bounds and covariances."""
+"""Errors of poses in single pairs, compared with bounds and covariances."""

@@ -27,7 +27,7 @@ class CentroidErrors:
         outward_px: (K,) part of the offset that points away from the image of the drogue's middle. [px]
         is_hub, used: (K,) whether the feature is the hub, and whether the pose rests on it.
         weight: (K,) inverse of the variance that the estimator gives it; all 1 where it gives no proper one. [1/px^2]
-        mistaken: how many measurements lie farther from their feature than its own image is wide, and so belong to
+        mistaken: number of measurements that lie farther from their feature than its image is wide, and so belong to
             something else; they are not among the K.
     """
 

@@ -21,7 +21,7 @@ VISIBLE_FRACTION = 0.9
 
 @dataclass(frozen=True, eq=False)
 class DrogueTruth:
-    """The drogue of one pair.
+    """The true drogue of one pair.
 
     Features are in one order everywhere: the markers, then the hub where there is one. The first axis of the images is
     the eye, left before right.
@@ -33,7 +33,7 @@ class DrogueTruth:
         centers_px: (2, M, 2) centres of the image ellipses. [px]
         visible: (2, M) whether the feature lies in the image and is visible.
         sequence_id: of the sequence that the pair belongs to, or None for a single one.
-        rangefinder_reading_m: what a rangefinder says of the distance, or None without one. [m]
+        rangefinder_reading_m: distance that a rangefinder reads, or None without one. [m]
     """
 
     left_from_drogue: RigidTransform
@@ -93,7 +93,7 @@ def _features(view: ViewRecord) -> tuple[FeatureView, ...]:
 
 
 LEAST_SEEN_FRACTION = 0.5
-"""A drogue of which a smaller share is seen is neither to be found nor missed (our choice)."""
+"""A drogue of which a smaller share is seen counts neither as found nor as missed (our choice)."""
 
 # The pixel centres next to a marker's own, from its nearest. [px]
 _AROUND = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
@@ -103,7 +103,7 @@ def seen_fraction(record: PairRecord, eye: Eye) -> float:
     """How much of the drogue an image shows: the lesser of two shares, 0 where nothing is seen.
 
     They are the visible box's area over the full one's, which falls where the image's edge cuts the drogue off, and the
-    mean visible fraction of the markers, which falls where something stands before it too. Where the markers on the
+    mean visible fraction of the markers, which also falls where something hides it. Where the markers on the
     image are so small that no pixel centre lies in any, they tell nothing, and only the first share counts.
     """
     view = record.views.left if eye == "left" else record.views.right

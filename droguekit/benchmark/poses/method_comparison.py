@@ -19,7 +19,7 @@ Errors = Mapping[str, Mapping[int, PoseError]]
 
 @dataclass(frozen=True)
 class PairGroups:
-    """How the pairs of a dataset belong together.
+    """Bins and sequences of a dataset's pairs.
 
     Attributes:
         bins: of distance.
@@ -33,7 +33,7 @@ class PairGroups:
 
 
 def compare_methods(errors: Errors, against: Sequence[str], groups: PairGroups) -> list[MethodComparison]:
-    """Every method beside each of some others.
+    """Every method compared with each of some others, on the pairs in which both found a pose.
 
     Args:
         errors: by method and frame, of the pairs with a pose.
@@ -86,10 +86,10 @@ def _with_ends(above: float, below: float, ends: Interval | None) -> tuple[float
     return (above / below, ends) if below > 0 else (None, None)
 
 
-# Whatever it is compared with, a method is also compared with the seed paper's.
+# Every method is also compared with the seed paper's.
 PAPER_METHOD = "paper"
 
-# A method that finds the drogue only where that is easy is not the best one.
+# A method that finds the drogue in easy pairs only cannot be the best one.
 _FIXES_OF_MOST = 0.9
 
 

@@ -44,7 +44,7 @@ _PERCENTILES = (95.0, 99.0)
 
 @dataclass(frozen=True, eq=False)
 class PoseScore:
-    """One pose.
+    """Scores of one pose.
 
     Attributes:
         error: estimate minus truth.
@@ -67,10 +67,10 @@ class PoseScore:
 
 @dataclass(frozen=True, eq=False)
 class FrameScore:
-    """One method in one pair that shows a drogue.
+    """Scores of one method in one pair that shows a drogue.
 
     Attributes:
-        pose: how good its pose is, or None without one.
+        pose: scores of its pose, or None without one.
         bound: (5,) Cramer-Rao bound at the noise of the pair's bin [m, deg], or None where there is none.
         centroids: errors of its features.
         from_centroids_m: (3,) position error that its centroids alone would make, or None. [m]
@@ -173,7 +173,7 @@ def _with_failures(poses: Sequence[PoseScore], count: int, truth_spread: Array) 
 
 
 def _centroid_share(fixed: Sequence[FrameScore]) -> dict[str, float | None]:
-    """What the centroids explain, over the frames where they determine a pose."""
+    """Share of the position error that centroid errors explain, over the frames where they determine a pose."""
     pairs = [(s.pose.error.components[:3], s.from_centroids_m) for s in fixed if s.pose is not None]
     known = [(error, predicted) for error, predicted in pairs if predicted is not None]
     if not known:

@@ -33,7 +33,7 @@ from geometry.se3 import Array, RigidTransform, angles_from_axis, rotation_from_
 COMPONENTS = ("x", "y", "z", "pitch", "yaw")
 """Order of errors and bounds: X, Y, Z in the left camera [m], then pitch and yaw [deg]."""
 
-# Larger than anything that flies, and its square far from overflow.
+# Larger than any length, speed or time in flight; its square is far from overflow.
 _LARGEST_PLAUSIBLE = 1e9
 
 
@@ -80,8 +80,8 @@ def estimates_by_method(
         source: what to call the file in errors.
 
     Raises:
-        ValueError: no estimates at all, one for a pair that the dataset lacks, two of a method for the same pair, or a
-            number that is no measure of anything here, and whose square no float can hold.
+        ValueError: no estimates, one for a pair that the dataset lacks, two of a method for the same pair, or a
+            number that is implausibly large.
     """
     known = set(frame_indices)
     methods: dict[str, dict[int, Estimate]] = {}
@@ -121,11 +121,11 @@ def _largest_number(estimate: Estimate) -> float:
 
 @dataclass(frozen=True)
 class RangefinderSample:
-    """One pair in three ways, all along the left camera's optical axis.
+    """Three depths of one pair, all along the left camera's optical axis.
 
     Attributes:
         estimated_m, true_m: of the rim's centre. [m]
-        reading_m: what the rangefinder says of it. [m]
+        reading_m: the rangefinder's reading of it. [m]
     """
 
     estimated_m: float
@@ -134,7 +134,7 @@ class RangefinderSample:
 
 
 def rangefinder_errors(depths: Sequence[RangefinderSample]) -> RangefinderErrors | None:
-    """What an experiment with a rangefinder would find, and what it would not; None without a depth."""
+    """Depth errors against the readings and against the truth; None without a depth."""
     if not depths:
         return None
     estimated, true, reading = np.array([[depth.estimated_m, depth.true_m, depth.reading_m] for depth in depths]).T
@@ -158,7 +158,7 @@ def _errors(values_m: NDArray[np.float64], reference_m: NDArray[np.float64]) -> 
 
 Parts = Mapping[str, slice]
 
-# A square beyond this tells of a covariance that is no measure of anything, and means of such squares of no method.
+# A larger square means that the covariance is meaningless; it would dominate every mean.
 _MOST_SQUARE = 1e100
 
 # Position, attitude and both together, as slices of the five components.
@@ -249,7 +249,7 @@ def normalized_errors(pairs: Sequence[tuple[PoseError, Array]]) -> NormalizedErr
     return NormalizedErrors(n=len(pairs), nrms=ComponentRatios(**nrms), upper=ComponentRatios(**upper))
 
 
-# A tilt below this many standard deviations is not told from none, and so has no sign to get wrong.
+# A tilt below this many standard deviations cannot be told from zero, so its sign means nothing.
 _CLEAR_TILT = 5.0
 
 _OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
@@ -297,9 +297,9 @@ def flip_trials(
 
 
 def ring_tilt_scale(truth: DrogueTruth, centroids: CentroidErrors, sigma_px: float) -> float | None:
-    """Scale of the flip law for the markers that a pose rests on, None where it rests on more or less than a ring.
+    """Scale of the flip law for the markers that a pose was computed from; None unless these form a ring in each eye.
 
-    With the distance along the line of sight, about which a tilt is mirrored, in place of the depth.
+    The distance along the line of sight, about which a tilt is mirrored, replaces the depth.
 
     Args:
         truth: the drogue.

@@ -1,4 +1,4 @@
-"""What all methods of a file are measured against: bins of distance, centroid noise, bounds."""
+"""The reference that all methods of a file are compared with: bins of distance, centroid noise, bounds."""
 
 from __future__ import annotations
 
@@ -92,13 +92,13 @@ def _log_edges(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> np.ndarr
     return edges
 
 
-# A method whose centroids are the best of the file, but which shows only the easy ones, sets no standard.
+# A method that measures only the easy centroids may not set the reference noise.
 _FEWEST_OF_MOST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What all methods of a file are measured against.
+    """Bins, noise and bounds that are the same for all methods of a file.
 
     Attributes:
         bins: with their noise and bound.
@@ -169,9 +169,9 @@ def mean_bound(bounds: Sequence[Array | None]) -> Bound | None:
 
 
 def feature_noise(marker_px: float | None, hub_px: float | None) -> FeatureNoise | None:
-    """Measured noise; a hub that nobody measured counts as good as a marker.
+    """Measured noise; a hub that no method measured gets the noise of the markers.
 
-    Centroids without any error, such as those of another program's truth, set no limit: None.
+    None where the centroids have no error at all, as those of another program's truth: they set no bound.
     """
     if not marker_px or hub_px == 0:
         return None

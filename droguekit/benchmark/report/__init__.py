@@ -1,1 +1,1 @@
-"""The benchmark as a page."""
+"""The benchmark report as an HTML page: tables, figures and pictures."""

@@ -29,14 +29,14 @@ from droguekit.benchmark.sequences.tracking_scores import (
 )
 from geometry.se3 import Array
 
-# Mid-tones, our choice: each stands out on white and on black, and neighbours differ in lightness as well as in hue.
+# Mid-tones (our choice): each is visible on white and on black, and neighbours differ in lightness and hue.
 _COLORS = (
     *("#1f78c8", "#e0660a", "#12946a", "#c2589c", "#b58900", "#3ba7d6", "#8a63d2", "#d03a3a", "#9a6a3a", "#7f8890"),
     *("#7aa61e", "#e58fb0", "#3d5ba9"),
 )
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "p", "*", "d")
 
-# Stands for the page's own text colour while matplotlib draws.
+# Placeholder for the page's text colour while matplotlib draws.
 INK = "#010203"
 
 _STYLE = {
@@ -53,14 +53,14 @@ _STYLE = {
 
 PANEL_IN = (4.4, 3.3)
 
-# With more methods than this, panels are larger and intervals fainter, or nothing could be told apart.
+# With more methods than this, panels are larger and intervals fainter, so that lines can be told apart.
 FEW_METHODS = 6
 LARGE_PANEL_IN = (6.6, 5.0)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a panel shows.
+    """The quantity of a panel.
 
     Attributes:
         key: of the row.
@@ -140,7 +140,7 @@ def _draw_method(
     """One line; `place` is its shift in distance and the opacity of its intervals."""
     shift, opacity = place
     rows = [(row, row.value(quantity.key)) for row in method.bins]
-    # A logarithmic axis has no place for an error of exactly nothing.
+    # A logarithmic axis cannot show an error of exactly 0.
     points = [(row, value) for row, value in rows if value is not None and value > 0]
     if not points:
         return
@@ -166,7 +166,7 @@ def _draw_bound(axes: Axes, reference: Sequence[ReferenceBin], quantity: Quantit
     places = [(middle_m(b.low_m, b.high_m), getattr(b.bound, quantity.bound_key)) for b in reference if b.bound]
     drawn = [(x, y * quantity.scale) for x, y in places if y > 0]
     if drawn:
-        # A single distance has no line: a cross stands for it.
+        # A single distance has no line, so a cross marks it.
         x, y = zip(*drawn, strict=True)
         axes.plot(x, y, color=INK, linestyle=(0, (4, 2)), linewidth=1.6, marker="+", markersize=5, zorder=5)
 
@@ -196,7 +196,7 @@ def middle_m(low_m: float, high_m: float) -> float:
 
 @contextmanager
 def drawing(size_in: tuple[float, float]) -> Iterator[tuple[Figure, Axes]]:
-    """A figure of its own, without pyplot and without a trace in matplotlib's settings."""
+    """A figure without pyplot, which leaves matplotlib's settings unchanged."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size_in, layout="constrained" if size_in[1] > 1 else None)
         FigureCanvasSVG(figure)
@@ -265,13 +265,13 @@ def distance_lines_panel(name: str, title: str, lines: Sequence[DistanceLine], s
         styles: by method.
 
     Returns:
-        An `<svg>` element, or nothing where no line has a point.
+        An `<svg>` element, or an empty text where no line has a point.
     """
     if not any(point.value for line in lines for point in line.points):
         return ""
     with drawing(_size_in(len({line.method for line in lines}))) as (figure, axes):
         for line in lines:
-            # A logarithmic axis has no place for nothing.
+            # A logarithmic axis cannot show 0.
             known = [(middle_m(p.low_m, p.high_m), p.value) for p in line.points if p.value is not None and p.value > 0]
             if known:
                 style = styles[line.method]
@@ -292,7 +292,7 @@ def distance_lines_panel(name: str, title: str, lines: Sequence[DistanceLine], s
 
 
 def _widen(axes: Axes) -> None:
-    """Values that are nearly alike look so, and the axis has numbers to read."""
+    """Widen the axis, so that nearly equal values look equal and the axis has labels."""
     low, high = axes.dataLim.intervaly
     spare = max(1.15, (_LEAST_SPAN * low / high) ** 0.5)
     axes.set_ylim(low / spare, high * spare)

@@ -1,4 +1,4 @@
-"""Images with boxes and centres drawn in, and small pictures of pairs as data URIs."""
+"""Images for screens with boxes and marker centres drawn in, and thumbnails of pairs as data URIs."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ MARKER_RGB: Rgb = (51, 238, 255)
 # Low corner of an image in pixel-centre coordinates.
 _IMAGE_CORNER = (-0.5, -0.5)
 
-# Coordinates are handed to OpenCV in 1/16 px, so that lines stand where the labels say.
+# OpenCV gets coordinates in 1/16 px, so that lines lie where the labels say.
 _SHIFT = 4
 
 
 def display_picture(images: StereoImages) -> Picture:
-    """(H, W, 3) left image in sRGB, as a screen wants it."""
+    """(H, W, 3) left image in sRGB, for a screen."""
     span = 2**images.bits - 1 - images.black_level_dn
     level = np.clip((images.left.astype(np.float32) - images.black_level_dn) / span, 0, 1)
     if images.encoding == "linear":
@@ -100,8 +100,8 @@ ENLARGE_BELOW = 0.3
 _INSET_SHARE = 0.38
 _INSET_MARGIN = 1.25
 
-# Pairs looked at for their distance: enough to spread a dozen over any range of distances.
-_MOST_LOOKED_AT = 240
+# Records read for their distance: enough to spread a dozen pairs over any range of distances.
+_MOST_CANDIDATES = 240
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ class Tile:
 def contact_tiles(dataset: Dataset, count: int = 12) -> list[Tile]:
     """Up to `count` pairs spread over the distances, nearest first; empty if no pair shows a drogue."""
     indices = dataset.frame_indices
-    looked_at = [indices[k] for k in evenly_spaced(len(indices), _MOST_LOOKED_AT)]
-    records = [record for record in map(dataset.record, looked_at) if record.left_from_drogue is not None]
+    candidates = [indices[k] for k in evenly_spaced(len(indices), _MOST_CANDIDATES)]
+    records = [record for record in map(dataset.record, candidates) if record.left_from_drogue is not None]
     records.sort(key=lambda record: (_distance_m(record), record.frame_index))
     tiles = []
     for record in (records[k] for k in evenly_spaced(len(records), count)):
@@ -138,7 +138,7 @@ def contact_tiles(dataset: Dataset, count: int = 12) -> list[Tile]:
 
 
 def tile_of(frame_index: int, distance_m: float, picture: Picture) -> Tile:
-    """A picture as a page holds it."""
+    """A picture as a thumbnail."""
     return Tile(frame_index, distance_m, jpeg_uri(picture), picture.shape[1], picture.shape[0])
 
 
@@ -148,7 +148,7 @@ def label_picture(picture: Picture, box: PixelBox | None, centers: Sequence[Pixe
     Args:
         picture: (H, W, 3) the image.
         box: around the drogue, or None where it is not seen; nothing is drawn then.
-        centers: of the markers in sight. [px]
+        centers: of the visible markers. [px]
     """
     width = picture.shape[1]
     tile, scale = resized(picture, TILE_WIDTH_PX)

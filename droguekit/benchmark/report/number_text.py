@@ -1,4 +1,4 @@
-"""Numbers as a reader wants them: a sensible unit and three significant digits, never an exponent."""
+"""Numbers as text: a sensible unit and three significant digits, never an exponent."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ def three_digits(value: float | None) -> str:
 
 
 def millimetres(value_m: float | None) -> str:
-    """A length in metres, told in millimetres."""
+    """A length in metres, as millimetres."""
     return three_digits(None if value_m is None else value_m * 1e3)
 
 
 def percent(fraction: float | None) -> str:
-    """A fraction, told in percent with one decimal, and none where it is whole."""
+    """A fraction in percent with one decimal, without it where the percentage is whole."""
     if fraction is None:
         return ABSENT
-    # Less than all is never told as all, nor more than none as none.
+    # A fraction below 1 is never shown as 100 %, nor one above 0 as 0 %.
     shown = min(max(round(fraction * 100, 1), 0.1), 99.9) if 0 < fraction < 1 else fraction * 100
     return f"{shown:g} %"
 

@@ -39,7 +39,7 @@ from droguekit.benchmark.sequences.sequence_latency import processing_time_s
 
 
 def result_sentences(result: BenchmarkResult) -> list[str]:
-    """What came out, one thought a sentence."""
+    """The result in plain sentences, computed from the numbers."""
     low, high = (plain_number(end) for end in (result.reference[0].low_m, result.reference[-1].high_m))
     shown = sum(place.n for place in result.reference)
     best = best_method(result.methods)
@@ -117,7 +117,7 @@ def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, ou
     Args:
         dataset: the dataset's folder, for its facts and pictures.
         estimates: the file that was scored, for the times that its methods took.
-        result: what `run_benchmark` made of the two.
+        result: of `run_benchmark` for both.
         out_html: where to write.
 
     Raises:
@@ -156,7 +156,7 @@ def write_report(dataset: Location, estimates: Path, result: BenchmarkResult, ou
 
 
 def dataset_facts(manifest: Manifest, estimates_name: str) -> list[tuple[str, str]]:
-    """What was measured on, as pairs of a name and a value."""
+    """Facts of the dataset, as pairs of a name and a value."""
     recipe = manifest.recipe
     camera, layout = recipe.rig.camera, marker_layout(recipe.drogue)
     markers = f"{layout.count} markers of {plain_number(200 * layout.radius_m)} cm diameter"

@@ -1,4 +1,4 @@
-"""The report's tables of single poses, as text ready to print."""
+"""Tables of the pose report as text: errors, bounds, covariances, mirrored tilts, failures, methods compared."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def component_tables(result: BenchmarkResult) -> list[Table]:
 
 
 def centroid_table(result: BenchmarkResult) -> Table:
-    """What each method's centroids are worth, and how much of its position error they explain."""
+    """Errors of each method's centroids, and how much of its position error they explain."""
     columns = ["centroids", "RMS", "bias right", "bias down", "bias outward", "hub RMS", "mistaken"]
     columns += ["position from centroids [mm]", "share"]
 
@@ -97,7 +97,7 @@ def centroid_table(result: BenchmarkResult) -> Table:
 
 
 def rangefinder_tables(result: BenchmarkResult) -> list[Table]:
-    """Depth errors as an experiment with a rangefinder sees them, beside the true ones; none without readings."""
+    """Depth errors against the rangefinder's readings and against the truth; none without readings."""
     names = [name for name, method in result.methods.items() if method.overall.rangefinder is not None]
     if not names:
         return []
@@ -172,7 +172,7 @@ _NAMES = {"x": "X", "y": "Y", "z": "Z", "pitch": "pitch", "yaw": "yaw"}
 
 
 def check_tables(result: BenchmarkResult) -> list[Table]:
-    """All of them; those that would say nothing are left out."""
+    """Tables of consistency checks; tables without content are left out."""
     return [
         *comparison_tables(result),
         normalized_table(result, "normalized", "Error over the bound of all features, pair by pair"),

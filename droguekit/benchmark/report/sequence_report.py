@@ -61,7 +61,7 @@ _TRACKING_NOTES = [
 
 @dataclass(frozen=True)
 class SequenceSection:
-    """What the page says of sequences.
+    """The section about sequences.
 
     Attributes:
         sentences: the result in words.
@@ -86,16 +86,16 @@ def sequence_section(result: SequencesResult, styles: Mapping[str, MethodStyle])
 
 
 def sequence_sentences(result: SequencesResult) -> list[str]:
-    """What came out over sequences, one thought a sentence."""
+    """The result over sequences, in sentences."""
     sequences = "One sequence" if result.count == 1 else f"{result.count} sequences"
     sentences = [f"{sequences} of {plain_number(60 * result.minutes)} s in all, {result.pairs} pairs."]
     for name, method in result.methods.items():
-        told = [*_filter_words(method), *_docking_words(method)]
+        words = [*_filter_words(method), *_docking_words(method)]
         if method.filtering is None or method.filtering.raw is None:
-            # A filter works in the boxes of what it filters, and answers at the same time.
-            told = [*_tracking_words(method), *told, *_latency_words(method)]
-        if told:
-            sentences.append(f"{name}: {'; '.join(told)}.")
+            # A filter shares the boxes and the latency of the method that it filters.
+            words = [*_tracking_words(method), *words, *_latency_words(method)]
+        if words:
+            sentences.append(f"{name}: {'; '.join(words)}.")
     if any(method.hiding.hidden for method in result.methods.values()):
         wrong = {name: m.hiding.poses_while_hidden for name, m in result.methods.items() if m.hiding.poses_while_hidden}
         names = ", ".join(f"{name} {count}" for name, count in wrong.items())
@@ -104,7 +104,7 @@ def sequence_sentences(result: SequencesResult) -> list[str]:
 
 
 def tracking_part(trackings: Mapping[str, Tracking], first: str, styles: Styles) -> ReportPart | None:
-    """The part; None where nothing was tracked.
+    """The part about tracked boxes; None where nothing was tracked.
 
     Args:
         trackings: by method, detector or tracker.
@@ -133,7 +133,7 @@ def legend_of(styles: Styles) -> list[tuple[str, Markup]]:
 
 
 def _without_repeats(trackings: Mapping[str, Tracking]) -> list[list[str]]:
-    """Methods that worked in the same boxes share one entry, for their names would stand on equal numbers."""
+    """Methods with the same boxes share one entry, as their numbers are equal."""
     names: dict[str, list[str]] = {}
     for name, tracking in trackings.items():
         same = (other for other in names if _boxes_of(trackings[other]) == _boxes_of(tracking))
@@ -142,7 +142,7 @@ def _without_repeats(trackings: Mapping[str, Tracking]) -> list[list[str]]:
 
 
 def _boxes_of(tracking: Tracking) -> tuple[object, ...]:
-    """What does not depend on the time that a method took."""
+    """All scores that do not depend on the method's processing time."""
     return (tracking.both, tracking.eyes, {name: source.overlap for name, source in tracking.sources.items()})
 
 

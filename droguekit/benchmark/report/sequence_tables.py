@@ -1,4 +1,4 @@
-"""The report's tables of sequences, as text ready to print."""
+"""Tables of the report about sequences as text: tracking, motion, docking quantities, latency."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The types of benchmark.json and of the detector benchmark's file."""
+"""Types of `benchmark.json` and of the files of the detector benchmark."""

@@ -39,7 +39,7 @@ class PoseRow(ResultModel):
             pose. Null where there is none.
         bound_ratio: root mean square error over the bound, of the same frames.
         centroids: of this method's own features.
-        position_from_centroids_rmse_m: what least squares would make of these very centroids. [m]
+        position_from_centroids_rmse_m: position error that least squares would have with these centroids. [m]
         centroid_share: share of the mean squared position error that this explains, in [0, 1]; the rest is the
             method's own.
         normalized: errors over the bound of their own frame, of all visible features, markers and hub each at the
@@ -140,7 +140,7 @@ class MethodResult(ResultModel):
 
 
 class ReferenceBin(ResultModel):
-    """What every method is measured against at these distances.
+    """Reference noise and bound at these distances.
 
     Attributes:
         n: pairs that show a drogue.
@@ -161,7 +161,7 @@ class ReferenceBin(ResultModel):
 
 
 class DatasetFacts(ResultModel):
-    """Which dataset this is about."""
+    """The dataset that was scored on."""
 
     name: str
     sha256: str
@@ -172,7 +172,7 @@ class BenchmarkResult(ResultModel):
     """Everything that `benchmark.json` holds.
 
     Attributes:
-        sequences: left out where the dataset has none, or no estimate says what is only defined over them.
+        sequences: left out where the dataset has none, or no estimate has regions, motion, docking quantities or times.
     """
 
     schema_version: Literal[1] = Field(default=1, alias="schema")

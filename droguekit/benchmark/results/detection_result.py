@@ -19,12 +19,12 @@ from geometry.stereo import EYES, Eye
 
 
 class DetectionDataset(ResultModel):
-    """What was scored on.
+    """The dataset that was scored on.
 
     Attributes:
         sha256: null for an imported dataset.
         split: whose images the rows are of, `all` for every one.
-        images, boxes: in that split, and how many drogues are to be found in them.
+        images, boxes: number of images in that split, and of drogues to be found in them.
         ignored: drogues of which too little is seen, see `least_seen_fraction`.
         empty_frames: pairs without a drogue in that split.
     """
@@ -48,7 +48,7 @@ class DetectionRow(ResultModel):
         ap50_interval: null with fewer than two scenes, or where all resamples of scenes are alike.
         precision, recall: at overlap 0.5, of boxes with at least the operating threshold; null without any.
         recall_interval: Wilson's, which takes images as independent.
-        note: why the row says little, or null.
+        note: why the row is uncertain, or null.
     """
 
     images: int
@@ -203,7 +203,7 @@ def center_box(box_xywh: PixelBox) -> PixelBox:
 
 
 def clipped_box(box_xywh: PixelBox, size_px: tuple[int, int]) -> PixelBox | None:
-    """The part of a corner-counted box that lies on the image, or None where a file would hold nothing of it."""
+    """The part of a box that lies on the image, counted from its corner; None where a file would hold nothing of it."""
     lows = [min(max(low, 0.0), float(size)) for low, size in zip(box_xywh[:2], size_px, strict=True)]
     highs = [
         min(max(low + extent, 0.0), float(size))

@@ -1,4 +1,4 @@
-"""What the rows of `benchmark.json` are made of."""
+"""Parts of the rows of `benchmark.json`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from droguekit.benchmark.confidence_intervals import Interval
 
 
 class ResultModel(BaseModel):
-    """A part of the result; numbers are finite, what is not defined is null."""
+    """A part of the result; numbers are finite, undefined values are null."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True)
 
@@ -43,7 +43,7 @@ class CentroidStatistics(ResultModel):
         bias_u_px, bias_v_px: mean errors to the right and down. [px]
         bias_outward_px: mean error away from the drogue's middle. [px]
         hub_count, hub_sigma_px: the same of the hub.
-        mistaken: measurements of something else.
+        mistaken: number of measurements that belong to something else.
     """
 
     count: int
@@ -145,11 +145,11 @@ class DepthErrors(ResultModel):
 
 
 class RangefinderErrors(ResultModel):
-    """Depths as an experiment sees them that has a rangefinder's reading for the truth.
+    """Depth errors of an experiment that takes a rangefinder's reading for the truth.
 
     Attributes:
         n: pairs with a pose and a reading.
-        against_reading: estimate minus reading, what such an experiment would report.
+        against_reading: estimate minus reading, which such an experiment would report.
         against_truth: estimate minus truth, over the same pairs.
         reading: reading minus truth, over the same pairs.
     """
@@ -165,7 +165,7 @@ class MeanRatios(ResultModel):
 
     Attributes:
         n: how many pairs.
-        blocks: what was resampled: sequences, or pairs that belong to none.
+        blocks: number of resampled units: sequences, or pairs that belong to none.
         position: of the lengths of the position errors; null where the other's mean is zero, or n is.
         attitude: of the sizes of pitch and yaw errors together.
         position_interval, attitude_interval: 95 %, by bootstrap; null with fewer than two blocks.
@@ -187,7 +187,7 @@ class BinRatios(MeanRatios):
 
 
 class MethodComparison(ResultModel):
-    """One method beside another on the same pairs."""
+    """One method compared with another on the same pairs."""
 
     method: str
     against: str

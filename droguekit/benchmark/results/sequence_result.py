@@ -1,4 +1,4 @@
-"""What `benchmark.json` says of estimates over sequences: tracking, motion, docking, latency."""
+"""Types of the part `sequences` of `benchmark.json`: tracking, motion, docking, latency."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class BodyAxes(ResultModel):
 
 
 class Calibration(ResultModel):
-    """How often errors stay within what they should; a normal law leaves 68.3 and 95.4 %.
+    """How often errors stay within their standard deviations; 68.3 and 95.4 % for a normal law.
 
     Attributes:
         n: errors that come with a standard deviation above 0.
@@ -49,9 +49,9 @@ class Captures(ResultModel):
     """Predicted against true captures.
 
     Attributes:
-        radius_m: that the answers tell, or the drogue's own; each pair is judged by its own, and null where they
-            differ. [m]
-        true_yes, false_yes, false_no, true_no: whether it was called one, and whether that is true.
+        radius_m: capture radius that the estimates report, or the drogue's own; null where pairs differ. Each pair is
+            judged by its own. [m]
+        true_yes, false_yes, false_no, true_no: number of captures that were predicted or not, rightly or wrongly.
     """
 
     radius_m: float | None
@@ -74,7 +74,7 @@ class DockingRow(ResultModel):
         miss: against the miss that the true motion of that instant leads to.
         miss_in_the_end: against what the sequence later brought; null where the tip never comes to the rim, or only
             after a gap between pairs.
-        captures, captures_in_the_end: of the same two; null where none was told.
+        captures, captures_in_the_end: of the same two; null where none was reported.
     """
 
     n: int
@@ -137,16 +137,16 @@ class OverlapRow(ResultModel):
 
 
 class TrackLosses(ResultModel):
-    """How often a drogue that was followed got lost while it was there to be seen.
+    """How often a tracked drogue was lost while it was visible.
 
     A loss begins with the first image without a box, or with one that overlaps the true one by less than 0.1, after an
-    image in which it was followed; no image in between hid or outshone the drogue.
+    image in which it was tracked; in no image in between was the drogue hidden or dazzled by the sun.
 
-    Of both eyes, it is that one which lost the drogue more often: mostly both lose it together, and two losses of one
-    cause would make the interval too narrow.
+    Of both eyes, the one with more losses counts: mostly both lose the drogue together, and counting one cause twice
+    would make the interval too narrow.
 
     Attributes:
-        minutes: for which the drogue was to be found.
+        minutes: for which the drogue was visible.
         count: losses.
         per_minute: count over minutes; `per_minute_interval` by the Poisson law.
         lost_fraction: share of the images without such a box, found again or not.
@@ -160,11 +160,11 @@ class TrackLosses(ResultModel):
 
 
 class Reacquisition(ResultModel):
-    """How soon an answer comes after the drogue was hidden, or lost beside the sun, and is seen again.
+    """How soon an estimate comes after the drogue was hidden, or lost beside the sun, and is visible again.
 
     Attributes:
         n: re-appearances, and appearances in a sequence that begins with a hidden drogue.
-        found: of these, how often an answer came before it hid again, or the sequence ended.
+        found: of these, how often an estimate came before it was hidden again or the sequence ended.
         within_3: how often it came within 3 frames of the first one that shows the drogue again.
         median_frames, max_frames: delay where it came, 0 for that very first frame; null without any.
     """
@@ -201,7 +201,7 @@ class SourceTracking(ResultModel):
         overlap: null where none of them was on an image that shows enough of the drogue.
         pairs: in which at least one box is its own.
         box_ms: median time of the stages `detect`, `track` and `correct`, which find or follow the box, in those
-            pairs; null where none is told. [ms]
+            pairs; null where none is reported. [ms]
         frame_ms, frame_p95_ms: median and 95th percentile of the time of all stages together, but for those in which a
             pair only waits (`read`, `wait`, `handover`). [ms]
     """
@@ -293,10 +293,10 @@ class MotionNees(ResultModel):
 
 
 class Lag(ResultModel):
-    """By how much an estimate is late.
+    """Delay of an estimate behind the truth.
 
     Attributes:
-        lag_s: shift with the least squared error; null where none stands out. [s]
+        lag_s: shift with the least squared error; null where there is no clear minimum. [s]
         interval: by resampled sequences.
     """
 
@@ -305,7 +305,7 @@ class Lag(ResultModel):
 
 
 class FilterErrors(ResultModel):
-    """What a filter makes of a method's poses.
+    """Errors of a filter that works on a method's poses.
 
     Attributes:
         motion: null where no pair has both an estimate and a true motion; `bins` by distance.
@@ -342,11 +342,11 @@ class Latency(ResultModel):
     """From the arrival of the images to the answer.
 
     Attributes:
-        overall: all pairs of sequences that tell it and were worked on; null without any.
+        overall: pairs of sequences that report it and were processed; null without any.
         bins: by true distance.
         stages: of the stages' own times.
         answers: pairs with an estimate or a reason.
-        late: of these, those that were not worked on, because newer ones had come.
+        late: of these, those that were skipped because newer ones had arrived.
     """
 
     overall: TimePercentiles | None
@@ -365,7 +365,7 @@ class MethodSequences(ResultModel):
         tracking: of its regions; null where no method has any.
         filtering: null where it reports no motion.
         docking: null without docking quantities.
-        latency: null where no answer tells one, and no pair was late.
+        latency: null where no estimate reports one, and no pair was late.
     """
 
     hiding: HiddenPairs
@@ -376,7 +376,7 @@ class MethodSequences(ResultModel):
 
 
 class SequencesResult(ResultModel):
-    """All that is only defined over sequences.
+    """All scores that are only defined over sequences.
 
     Attributes:
         count, pairs: sequences, and pairs in them.

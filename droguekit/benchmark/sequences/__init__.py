@@ -1,1 +1,1 @@
-"""What is only defined over sequences: motion, docking, latency, tracking."""
+"""Scores that are only defined over sequences: motion, docking, latency, tracking."""

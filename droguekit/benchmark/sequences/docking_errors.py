@@ -1,4 +1,4 @@
-"""Docking quantities against the true ones."""
+"""Docking quantities, mouth position, closure, predicted miss and capture, against the true ones."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
 from nav.docking import capture_radius_m
 
-# No flight goes straight for longer; where the drogue hardly comes nearer, nothing is predicted.
+# Longest straight flight that is predicted: where the drogue hardly comes nearer, a prediction means nothing.
 _LONGEST_WAY_S = 60.0
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """How the tip comes to the plane of the rim.
+    """Arrival of the probe's tip at the plane of the rim.
 
     Attributes:
         miss_m: distance from the drogue's axis there. [m]
@@ -48,10 +48,10 @@ class TrueDocking:
 
     Attributes:
         mouth_from_tip_m: (3,) centre of the rim from the tip, in the receiver's body axes. [m]
-        capture_radius_m: within which the drogue takes the tip in. [m]
+        capture_radius_m: largest miss at which the drogue captures the tip. [m]
         closure_m_s: how fast its forward part shrinks; None where the motion is not known. [m/s]
-        predicted: if both go on as they truly move at this instant; None unless they close.
-        actual: what the sequence brings; None where the tip never comes to the rim, or only after a gap.
+        predicted: if both keep their true motion of this instant; None unless they close.
+        actual: later in the sequence; None where the tip never comes to the rim, or only after a gap.
     """
 
     mouth_from_tip_m: Array
@@ -78,7 +78,7 @@ def tip_in_left_m(rig: StereoRig) -> Array:
 
 
 def predicted_arrival(left_from_drogue: RigidTransform, velocity_m_s: Array, tip_m: Array) -> Arrival | None:
-    """Where the tip comes to the plane of the rim if the drogue keeps its velocity and attitude.
+    """Arrival of the tip at the plane of the rim if the drogue keeps its velocity and attitude.
 
     Args:
         left_from_drogue: pose now.
@@ -98,7 +98,7 @@ def predicted_arrival(left_from_drogue: RigidTransform, velocity_m_s: Array, tip
 
 
 def actual_arrivals(run: Sequence[TrueState]) -> list[Arrival | None]:
-    """For each pair of a run how the tip next comes through the plane of the rim, from the mouth's side."""
+    """For each pair of a run the next arrival of the tip at the plane of the rim, from the mouth's side."""
     poses = [state.left_from_drogue for state in run if state.left_from_drogue is not None]
     tip_m = tip_in_left_m(run[0].rig)
     tips = np.array([pose.inverse().apply(tip_m) for pose in poses])

@@ -1,4 +1,4 @@
-"""Errors of filtered estimates."""
+"""Errors of filtered estimates: velocity and rate, covariances, lag, and position relative to unfiltered poses."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from droguekit.benchmark.sequences.sequence_truth import (
 from geometry.se3 import Array, RigidTransform, angles_from_axis
 
 MOST_LAG_S = 0.5
-"""Shifts up to this are looked at, forward and back. [s]"""
+"""Largest shift that is tried, forward and back. [s]"""
 _SHIFTS: Array = np.linspace(-MOST_LAG_S, MOST_LAG_S, 201)
-# Less is rounding, where the drogue does not move or moves evenly. [m^2, deg^2]
+# A smaller bend is rounding: the drogue does not move, or moves evenly. [m^2, deg^2]
 _LEAST_BEND = 1e-12
-# Fewer estimates tell nothing; a second at 25 Hz.
+# With fewer estimates the lag is unknown; a second at 25 Hz.
 _FEWEST = 25
 _FEWEST_PER_RUN = 5
 
@@ -39,7 +39,7 @@ def lags(sequences: Sequence[TrueSequence], estimates: Mapping[int, PoseEstimate
     """Lag of every component of the pose; None where no sequence is long enough.
 
     The squared error against the truth of `lag` seconds ago is summed over all sequences. A constant error of each
-    sequence does not count, for on a steady approach nothing tells it from a lag. The truth is without vibration, see
+    sequence does not count: on a steady approach it looks like a lag. The truth is without vibration, see
     `sequence_motion`. Between the shifts that are tried, the least sum lies at the vertex of a parabola.
 
     Args:
@@ -115,12 +115,12 @@ def _vertex(total: Array) -> float | None:
     return float(_SHIFTS[k] + (before - after) / (2 * bend) * (_SHIFTS[1] - _SHIFTS[0]))
 
 
-# A method that works on the poses of another is called by its name, this, and its own.
+# Between the name of a method and that of the filter on its poses.
 _FILTER_SEPARATOR = "+"
 
 
 class SequenceData(NamedTuple):
-    """The truth that sequences are scored with.
+    """The truth that all methods are scored with over sequences.
 
     Attributes:
         sequences: in the order of their numbers.

@@ -1,4 +1,4 @@
-"""How long answers took over sequences, and how many pairs were too late to be worked on."""
+"""Latency of estimates over sequences, and the number of pairs that were skipped because newer ones had arrived."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from droguekit.benchmark.results.sequence_result import Latency, LatencyBin, Tim
 from droguekit.benchmark.sequences.filter_errors import SequenceData
 
 LATE = "late:"
-"""How the reason begins of a pair that was not worked on, because newer ones had come."""
-# Stages in which a pair waits, or is only on its way, and nobody works on it.
+"""Begin of the reason of a pair that was skipped because newer ones had arrived."""
+# Stages in which a pair waits or is handed over, and is not processed.
 _WAITING = frozenset({"read", "wait", "handover"})
 
 
 def processing_time_s(stage_s: Mapping[str, float]) -> float | None:
-    """Time that was worked on a pair; None where no such stage is told. [s]
+    """Processing time of a pair without waiting; None where no such stage is reported. [s]
 
     Args:
         stage_s: seconds by stage, of an estimate.
@@ -27,7 +27,7 @@ def processing_time_s(stage_s: Mapping[str, float]) -> float | None:
 
 
 def latency(data: SequenceData, estimates: Mapping[int, Estimate]) -> Latency | None:
-    """Percentiles of a method; None where no answer tells how long it took, and no pair was late.
+    """Latency of a method; None where no estimate reports one and no pair was late.
 
     Args:
         data: the truth.

@@ -1,4 +1,11 @@
-"""The truth of a sequence."""
+"""The truth of sequences: when each pair was taken, where the drogue was, whether it was visible, and how it moved.
+
+Records hold the twists of camera and drogue at the instant of a pair. The camera's vibration of some tens of hertz is
+part of that: at the drogue's distance it amounts to tenths of a metre a second, and pairs at 25 Hz cannot resolve it. A
+filter can only know the motion from pair to pair, and docking needs no more. The true motion here is the derivative of
+a cubic spline through the true positions of neighbouring pairs, and a spline through their rates of turn: both follow
+changes within some tenths of a second, and vibration averages out.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +26,8 @@ from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 
 Visibility = Literal["seen", "partly", "hidden", "dazzled"]
-"""`seen`: enough of the drogue to be found; `hidden`: nothing of it, or of none of its markers; `dazzled`: the sun in
-the lens may or may not outshine it, so that neither answer is wrong."""
+"""`seen`: enough of the drogue to be found; `hidden`: nothing of the drogue, or of none of its markers; `dazzled`: the
+sun in the lens may outshine it, so that neither a pose nor its absence is wrong."""
 
 # A pair that comes later than this many periods follows a gap.
 _GAP_PERIODS = 1.5
@@ -33,7 +40,7 @@ class EyeTruth:
     Attributes:
         box_px: around its visible pixels, in pixel-centre coordinates; None where there are none. [px]
         seen_fraction: see `visibility.seen_fraction`.
-        is_dazzled: the sequence has the sun beside the drogue just now.
+        is_dazzled: the sun stands beside the drogue.
     """
 
     box_px: PixelBox | None
@@ -42,7 +49,7 @@ class EyeTruth:
 
     @property
     def visibility(self) -> Visibility:
-        """Whether it is to be found there."""
+        """Whether the drogue should be found in this image."""
         if self.seen_fraction == 0:
             return "hidden"
         if self.is_dazzled:
@@ -52,16 +59,16 @@ class EyeTruth:
 
 @dataclass(frozen=True, eq=False)
 class TrueState:
-    """One pair of a sequence.
+    """The true state at one pair of a sequence.
 
     Attributes:
-        frame_index, sequence_id, time_s: which pair, and the middle of its exposure.
+        frame_index, sequence_id, time_s: of the pair, at the middle of its exposure.
         rig: the cameras and the probe.
         drogue: None without one.
         left_from_drogue: None without a drogue.
         instant_velocity_m_s: of the drogue's origin in the left camera at that instant, vibration included; None
             without a drogue. [m/s]
-        eyes: what each image shows.
+        eyes: the drogue in each image.
     """
 
     frame_index: int
@@ -169,12 +176,12 @@ _DEGREE = 3
 
 @dataclass(frozen=True, eq=False)
 class TrueMotion:
-    """How the drogue moves against the left camera at one pair.
+    """Motion of the drogue relative to the left camera at one pair.
 
     Attributes:
         velocity_m_s: (3,) of its origin, in the left camera. [m/s]
         rate_rad_s: (3,) `R' = [w]x R`, in the left camera. [rad/s]
-        vibration_m_s: (3,) what the instant's velocity has besides; None where that is not known. [m/s]
+        vibration_m_s: (3,) velocity of the instant minus `velocity_m_s`; None where it is not known. [m/s]
     """
 
     velocity_m_s: Array
@@ -183,7 +190,7 @@ class TrueMotion:
 
 
 def pairs_per_knot(period_s: float, knot_s: float = KNOT_S) -> int:
-    """How many pairs come in the time from knot to knot, at least one."""
+    """Number of pairs from knot to knot, at least one."""
     return max(1, round(knot_s / period_s))
 
 

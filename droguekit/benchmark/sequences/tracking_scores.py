@@ -1,4 +1,9 @@
-"""Boxes that follow the drogue through sequences, against the true ones."""
+"""Boxes that track the drogue through sequences: overlap with the true boxes, losses, and finding the drogue again.
+
+Source of the curves: Y. Wu, J. Lim, M.-H. Yang, CVPR 2013, doi:10.1109/CVPR.2013.312, success and precision plots;
+M. Mueller et al., TrackingNet, ECCV 2018, doi:10.1007/978-3-030-01246-5_19, precision normalised by the size of the
+true box.
+"""
 
 from __future__ import annotations
 
@@ -75,14 +80,14 @@ def _shares(passed: NDArray[np.bool_]) -> Array:
 LEAST_TRACKED_OVERLAP = 0.1
 """A box that overlaps the true one by less has lost the drogue (our choice)."""
 LEAST_FOUND_OVERLAP = 0.5
-"""From which overlap on a box has the drogue again, as a detector's."""
+"""A box with at least this overlap has found the drogue again, as for a detector."""
 REACQUISITION_LIMIT_FRAMES = 3
-"""Within which a drogue should be found again."""
+"""A drogue should be found again within so many frames."""
 
 
 @dataclass(frozen=True)
 class SourcedBox:
-    """A box in pixel-centre coordinates, and who gave it, or an empty name."""
+    """A box in pixel-centre coordinates, and the name of its source, which may be empty."""
 
     box_px: PixelBox
     source: str
@@ -185,10 +190,10 @@ def overlap_row(
 
 
 def reacquisition(courses: Iterable[tuple[Sequence[Visibility], Sequence[bool]]]) -> Reacquisition:
-    """How soon answers come after the drogue was hidden, or had no answer beside the sun.
+    """How soon estimates come after the drogue was hidden, or had none beside the sun.
 
     Args:
-        courses: for each sequence what was to be seen frame by frame, and whether there was an answer.
+        courses: for each sequence the visibility frame by frame, and whether there was an estimate.
     """
     delays = [delay for visibilities, answers in courses for delay in _delays(visibilities, answers)]
     came = [delay for delay in delays if delay is not None]
@@ -202,7 +207,7 @@ def reacquisition(courses: Iterable[tuple[Sequence[Visibility], Sequence[bool]]]
 
 
 def _delays(visibilities: Sequence[Visibility], answers: Sequence[bool]) -> Iterator[int | None]:
-    """Of each re-appearance, the frames until an answer, or None where none came before the drogue hid again."""
+    """Frames from each re-appearance to an estimate, or None where none came before the drogue was hidden again."""
     hidden, since = False, None
     for k, (visibility, answer) in enumerate(zip(visibilities, answers, strict=True)):
         if visibility == "seen" and hidden:
@@ -273,12 +278,12 @@ def _on_image(box: SourcedBox | None, size_px: tuple[int, int]) -> SourcedBox | 
 Boxes = Mapping[tuple[int, Eye], SourcedBox]
 StageTimes = Mapping[int, Mapping[str, float]]
 
-# The stages of an estimate that find or follow the drogue's box, and teach the tracker.
+# Stages of an estimate that detect or track the box, or update the tracker.
 _BOX_STAGES = frozenset({"detect", "track", "correct"})
 
 
 def score_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> Tracking:
-    """Scores of the regions that a method reports; one that reports none has lost the drogue everywhere.
+    """Scores of the regions that a method reports; without any, the drogue counts as lost everywhere.
 
     Args:
         sequences: the truth.
@@ -297,7 +302,7 @@ def score_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Est
 def score_detected_boxes(
     sequences: Sequence[TrueSequence], found: Iterable[DetectedBox], threshold: float
 ) -> Tracking | None:
-    """Scores of a file of boxes: of each image the best one, if it scores at least the threshold.
+    """Scores of detected boxes: the best box of each image, if its score reaches the threshold.
 
     Returns:
         None without sequences.
@@ -347,5 +352,5 @@ def _source_tracking(source: str, tracks: Sequence[EyeTrack], stages_s: StageTim
 
 
 def _has_area(region: Region) -> bool:
-    """Whether the box is one; others are as good as none."""
+    """Whether the box has an area; a box without one counts as none."""
     return min(region.box_xywh_px[2:]) > 0

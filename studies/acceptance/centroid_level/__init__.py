@@ -1,1 +1,1 @@
-"""Tiers C and D and speed: drawn poses, exact centres and noise, without images."""
+"""Tiers C, D and speed: poses drawn at random, exact feature centres and noise, without images."""

@@ -47,16 +47,18 @@ Results = Mapping[Cell, CellResult]
 
 
 def measure_tier_c(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[AcceptanceRow]:
-    """Run what is not there yet, and compare it with criteria 5, 6, 7, 9 and 10.
+    """Tier C, criteria 5, 6, 7, 9 and 10: noise, flips, covariances and tolerances.
+
+    Cells that are finished already are not run again.
 
     Args:
         out: keeps finished cells.
         seed: of the draws.
         draws: frames a cell, the protocol's when None.
-        report: hears how it goes.
+        report: of progress.
 
     Raises:
-        ValueError: a wrong seed or number, or a folder of something else.
+        ValueError: a seed or number out of range, or a folder with other content.
         OSError: the folder cannot be written.
     """
     count = draws or BATCHED_DRAWS
@@ -86,7 +88,7 @@ def as_built_cells(method: str, seed: int, draws: int) -> list[Cell]:
 
 
 def toleranced_cells(tolerances: Tolerances, seed: int, draws: int) -> list[Cell]:
-    """Eight markers at all stations and noises; the method is told of the tolerances."""
+    """Eight markers at all stations and noises; the tolerances are stated to the method."""
     stated = stated_tolerances(tolerances, paper_rig())
     return [
         Cell("joint-hub", 8, (station, station), sigma, draws, seed, tolerances=tolerances, stated=stated)
@@ -116,7 +118,7 @@ def _nrms_rows(
 
 
 def _without_hub_rows(results: Results) -> list[AcceptanceRow]:
-    """Attitude where the tilt has a sign, and how often it is mirrored where it has none."""
+    """Attitude where the tilt is clear, and how often it is mirrored elsewhere."""
     clear = [(cell, r) for cell, r in results.items() if r.clear_nrms is not None and r.clear_n]
     rows = []
     if clear:
@@ -195,7 +197,7 @@ _BAD = {
 
 
 def measure_tier_d(out: Path, seed: int, draws: int | None, report: ProgressReport) -> list[AcceptanceRow]:
-    """Run what is not there yet, and compare it with criteria 11 and 12.
+    """Tier D, criteria 11 and 12: some markers measured wrongly.
 
     Arguments and errors as `measure_tier_c`.
     """
@@ -253,7 +255,7 @@ def _order(method: str, sigmas_px: tuple[float, ...], cell: CellMaker, results: 
 
 
 def _literal(cell: CellMaker, results: Results) -> AcceptanceRow:
-    """The baseline over the literal reading: below 1 when the literal one brings nothing."""
+    """Mean error of `paper` over that of `paper-literal`: below 1 where the literal reading is no better."""
     rows = [
         (
             f"{sigma:g} px",

@@ -1,4 +1,8 @@
-"""Frames drawn by the law of the protocol."""
+"""Frames drawn at random: poses by the protocol's law, corrupted markers, toleranced drogues and cameras.
+
+The estimator knows the nominal drogue and rig, and the tolerances that are stated to it. The text of `Corruption` and
+`Tolerances` is part of the key of the random streams: renamed classes or fields would draw other frames.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +38,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class RightEyeErrors:
-    """How the right camera departs from the calibration in each draw.
+    """Error of the right camera's calibration in each draw.
 
     Attributes:
         yaw_rad: (n,) turn about the vertical axis, to the right.
@@ -53,12 +57,12 @@ def draw_poses(
     Args:
         rng: the stream.
         rig: the cameras.
-        rim_radius_m: of the drogue, all of which both eyes see. [m]
+        rim_radius_m: of the drogue, which both eyes see completely. [m]
         distance_m: nearest and farthest.
         count: how many.
 
     Raises:
-        ValueError: nearer than the whole drogue fits into both views.
+        ValueError: so near that the drogue does not fit into both views.
     """
     low, high = distance_m
     if low < rig.nearest_full_view_m(rim_radius_m):
@@ -83,7 +87,7 @@ def ellipse_centers_px(
         poses: of the drogue.
         centers_m: (F, 3) or (n, F, 3) centres in the drogue frame.
         radii_m: (F,).
-        right: how the right camera departs from `rig`, None for not at all.
+        right: errors of the right camera against `rig`; None for none.
 
     Returns:
         (n, 2, F, 2) left before right. [px]
@@ -111,11 +115,11 @@ LEAST_PX, MOST_PX = 3.0, 10.0
 
 @dataclass(frozen=True)
 class Corruption:
-    """What is wrong.
+    """Markers whose centres are measured wrongly by several pixels.
 
     Attributes:
-        markers: how many markers, drawn for each frame.
-        where: in one drawn eye, in both eyes by different shifts, or in one eye along its rows only.
+        markers: how many; which ones is drawn for each frame.
+        where: in one eye that is drawn, in both eyes by different shifts, or in one eye along its rows only.
     """
 
     markers: int
@@ -133,7 +137,7 @@ def draw_shifts(rng: np.random.Generator, corruption: Corruption, count: int, ma
 
     Args:
         rng: the stream.
-        corruption: what is wrong.
+        corruption: number and place of the bad markers.
         count: how many frames.
         markers: of the drogue.
 
@@ -185,7 +189,7 @@ TOLERANCED = Tolerances(0.5e-3, 0.3e-3, 0.002, 1e-3, 0.005, 0.05)
 
 
 def stated_tolerances(tolerances: Tolerances, rig: StereoRig) -> StatedTolerances:
-    """The same, as a user would state it to an estimator."""
+    """The same tolerances as a user would state them to an estimator."""
     yaw_px = rig.camera.fx_px * float(np.radians(tolerances.right_yaw_deg))
     return StatedTolerances(
         ring_radius_m=tolerances.ring_radius_m,
@@ -198,7 +202,7 @@ def stated_tolerances(tolerances: Tolerances, rig: StereoRig) -> StatedTolerance
 
 @dataclass(frozen=True, eq=False)
 class TrueFeatures:
-    """What is really there in each draw.
+    """True feature centres and camera errors of each draw.
 
     Attributes:
         centers_m: (n, F, 3) markers, then the hub where there is one.
@@ -215,7 +219,7 @@ def draw_features(rng: np.random.Generator, layout: MarkerLayout, tolerances: To
     Args:
         rng: the stream.
         layout: the nominal drogue, its markers on one circle.
-        tolerances: how far it departs.
+        tolerances: of drogue and cameras.
         count: how many draws.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Accuracy at the level of centroids: drawn poses, exact centres, noise, and what a method makes of them."""
+"""Monte-Carlo accuracy at the level of centroids: drawn poses, exact centres plus noise, and a method's errors."""
 
 from __future__ import annotations
 
@@ -141,8 +141,8 @@ class Cell:
         distance_m: nearest and farthest. [m]
         sigma_px: noise of the markers' centres.
         draws: how many frames.
-        corruption, tolerances: what is wrong with centroids, drogue and cameras.
-        stated: tolerances as the method is told.
+        corruption, tolerances: errors of centroids, drogue and cameras.
+        stated: tolerances that the method knows.
         seed: of the draws.
     """
 
@@ -163,7 +163,7 @@ class Cell:
 
 
 class DepthAlternative(BaseModel):
-    """Another way to the depth, on the same draws.
+    """Another depth estimate on the same draws.
 
     Attributes:
         z_rms_m: of its errors. [m]
@@ -177,7 +177,7 @@ class DepthAlternative(BaseModel):
 
 
 class CellResult(BaseModel):
-    """What came out of a cell.
+    """Scores of a cell.
 
     Attributes:
         n, fixes: frames, and those with a pose.
@@ -188,7 +188,7 @@ class CellResult(BaseModel):
         nees_n, nees: frames with a covariance, and mean normalised square error over its five degrees of freedom.
         flips, flip_law: mirrored tilts, and their share by the law.
         stereo: the mean of the triangulated markers.
-        untold: the same method, told of no tolerances; None where it was told of none anyway.
+        untold: the same method without stated tolerances; None where none were stated anyway.
 
     A frame without a pose counts with the standard deviation of the drawn poses.
     """
@@ -216,7 +216,7 @@ class CellResult(BaseModel):
 
 
 def run_cell(cell: Cell) -> CellResult:
-    """Draw, measure, solve and score one cell, the same to the last bit every time.
+    """Draw, measure, solve and score one cell, reproducible to the last bit.
 
     Raises:
         ValueError: a method that does not exist, or a distance at which the drogue is not in view.
@@ -340,7 +340,7 @@ ROBUST_ORDER_DRAWS = 2000
 
 
 def run_cells(cells: Sequence[Cell], out: Path, report: ProgressReport) -> dict[Cell, CellResult]:
-    """Results of all cells; those that `out` holds already, made by the same code, are not made again.
+    """Results of all cells; those in `out` that the same code made are used again.
 
     Raises:
         ValueError: a cell that cannot be run, or `cells.json` is not ours.

@@ -1,4 +1,4 @@
-"""Pose methods on many drawn frames: batched where navigation can, frame by frame otherwise."""
+"""Pose methods on many drawn frames: batched where navigation has a batched solver, frame by frame otherwise."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class MeasuredFrames:
         rig, layout: as the estimator knows them.
         markers_px: (n, 2, N, 2).
         hub_px: (n, 2, 2) centres of the hub's outer edge, or None where no hub is measured.
-        sigma_px, hub_sigma_px: standard deviations that the estimator is told.
-        tolerances: as the estimator is told.
+        sigma_px, hub_sigma_px: standard deviations that are stated to the estimator.
+        tolerances: that are stated to the estimator.
     """
 
     rig: StereoRig
@@ -42,10 +42,10 @@ class MeasuredFrames:
 
 @dataclass(frozen=True, eq=False)
 class SolvedFrames:
-    """What a method made of many frames.
+    """Poses that a method found in many frames.
 
     Attributes:
-        poses: n of them; those without a fix mean nothing.
+        poses: n of them; meaningless where `fixed` is False.
         best: the pose with the smallest residuals, where the method reports a mean over several or weighs them by what
             is likely; the flip law is about these.
         covariances: (n, 6, 6), or None for a method without.

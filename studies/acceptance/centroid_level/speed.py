@@ -41,12 +41,12 @@ def measure_speed(dataset: Path, seed: int, draws: int | None, report: ProgressR
         dataset: pairs at the distances that centroids are timed at, among others.
         seed: of the drawn frames.
         draws: frames for single calls, 100 when None.
-        report: hears how it goes.
+        report: of progress.
     """
     count = _SINGLE_FRAMES if draws is None else draws
     good = _measured(seed, max(count, _BATCH_FRAMES), Corruption(0))
     bad = _measured(seed, count, Corruption(2, "both eyes"))
-    report.say("timing; leave the machine alone for a few seconds")
+    report.say("timing: please run nothing else for a few seconds")
     with one_thread():
         hub = _single_ms("joint-hub", good, count)
         robust = _single_ms("joint-robust", bad, count)

@@ -15,13 +15,13 @@ from geometry.se3 import Array
 # The trapezoidal rule on a smooth closed curve converges faster than any power; so many points per pixel of
 # circumference carry it beyond single precision for blurs down to 0.3 px.
 _POINTS_PER_PX = 8
-# Beyond so many deviations of the blur nothing changes.
+# Beyond this many standard deviations of the blur the image is flat.
 _REACH_SIGMA = 6.0
 
 
 @dataclass(frozen=True)
 class PixelLight:
-    """What pixels on and beside a disc receive, and the sensor's own noise.
+    """Electrons in pixels on and beside a disc, and the sensor's noise.
 
     Attributes:
         background_e, contrast_e: electrons beside the disc, and the disc's above those.
@@ -40,7 +40,7 @@ class PixelLight:
 
 
 def outline_coverage(outline_px: Array, tangent_px: Array, x_px: Array, y_px: Array, psf_sigma_px: float) -> Array:
-    """Share of light from within a smooth outline that each pixel of a grid receives, exact for box and Gaussian blur.
+    """Fraction of each pixel's response that falls inside a smooth outline, exact for box and Gaussian blur.
 
     Args:
         outline_px: (K, 2) points of the closed outline at even steps of its parameter, in the sense from x to y. [px]

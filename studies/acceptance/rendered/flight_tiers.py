@@ -1,4 +1,8 @@
-"""Tiers E and docking: whole flights and the bench."""
+"""Tiers E and docking: criteria on whole flights and on the seed paper's bench.
+
+Accuracy of pairs in view, either no pose or a wide covariance for the others, losing and finding the drogue, processing
+time, and the gain by tracker and filter.
+"""
 
 from __future__ import annotations
 
@@ -31,36 +35,36 @@ CONDITIONS = {"sky": 0.01, "cloud": 0.01, "low-light": 0.03, "ground": 0.03}
 _P99_MM = 3.0
 # Poses in view with which one out of view is compared: those nearest in distance (our choice).
 _NEIGHBOURS = 25
-# A pose that is off by more of the distance has not found the drogue again (our choice).
+# A pose whose error is a larger share of the distance has not found the drogue again (our choice).
 _FOUND_FRACTION = 0.1
 
 
-def approach_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
-    """Criteria 17 to 21 on every method; those of all but our best one stand beside.
+def approach_rows(title: str, scores: Scores, is_comparison: bool) -> list[AcceptanceRow]:
+    """Criteria 17 to 21 on every method; rows of all but our best method are for comparison.
 
     Args:
         title: of the data.
         scores: by method.
-        is_beside: whether all of it does.
+        is_comparison: whether all rows are.
     """
     rows = []
     for name, pairs in scores.items():
-        beside = is_beside or name != BEST
+        compared_only = is_comparison or name != BEST
         rows += [
-            *_accuracy_rows(f"{title}, {name}", pairs, beside),
-            _overconfidence_row(f"{title}, {name}", pairs, beside),
+            *_accuracy_rows(f"{title}, {name}", pairs, compared_only),
+            _overconfidence_row(f"{title}, {name}", pairs, compared_only),
         ]
     return rows
 
 
-def condition_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
-    """Criteria 22 and 23 by family, and beside them the same of our best method by number of markers."""
+def condition_rows(title: str, scores: Scores, is_comparison: bool) -> list[AcceptanceRow]:
+    """Criteria 22 and 23 by family, and for comparison the same of our best method by number of markers."""
     rows = []
     for name, pairs in scores.items():
         for family, bar in CONDITIONS.items():
             seen = [pair for pair in pairs if pair.pair.family == family and pair.pair.in_view]
-            label, beside = f"{title}, {name}, {family}", is_beside or name != BEST
-            rows += [_unfixed_row(_bar("22", beside), label, seen, bar), _bound_row(label, seen, beside)]
+            label, compared_only = f"{title}, {name}, {family}", is_comparison or name != BEST
+            rows += [_unfixed_row(_bar("22", compared_only), label, seen, bar), _bound_row(label, seen, compared_only)]
     in_view = [pair for pair in scores.get(BEST, ()) if pair.pair.in_view]
     for count in sorted({pair.pair.truth.layout.count for pair in in_view}):
         alike, label = [p for p in in_view if p.pair.truth.layout.count == count], f"{title}, {BEST}, {count} markers"
@@ -71,14 +75,14 @@ def condition_rows(title: str, scores: Scores, is_beside: bool) -> list[Acceptan
     return rows
 
 
-def lost_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
+def lost_rows(title: str, scores: Scores, is_comparison: bool) -> list[AcceptanceRow]:
     """Criteria 24 and 25: poses of a hidden drogue, and how soon poses return; and 21 on partly seen or dazzled pairs.
 
     They judge filtered poses too: a filter may neither invent poses nor delay new ones.
     """
     rows = []
     for name, pairs in scores.items():
-        label, beside = f"{title}, {name}", is_beside or name not in (BEST, FILTERED)
+        label, compared_only = f"{title}, {name}", is_comparison or name not in (BEST, FILTERED)
         hidden = [pair for pair in pairs if pair.pair.visibility == "hidden"]
         found = reacquisition(
             ([pair.pair.visibility for pair in flight], [_has_found(pair) for pair in flight])
@@ -87,14 +91,14 @@ def lost_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow
         soon = f"{label}: re-appearances not re-acquired within {REACQUISITION_LIMIT_FRAMES} pairs"
         late = found.n - found.within_3
         rows += [
-            _count_row(_bar("24", beside), soon, late, found.n),
+            _count_row(_bar("24", compared_only), soon, late, found.n),
             _count_row(
-                _bar("25", beside),
+                _bar("25", compared_only),
                 f"{label}: poses while hidden",
                 sum(p.error is not None for p in hidden),
                 len(hidden),
             ),
-            _overconfidence_row(label, pairs, beside),
+            _overconfidence_row(label, pairs, compared_only),
         ]
     return rows
 
@@ -110,28 +114,28 @@ def bound_ratio(pairs: Iterable[ScoredPair]) -> tuple[str, ValueWithLimit, int] 
     return COMPONENTS[worst], limits[worst], len(known)
 
 
-def _accuracy_rows(label: str, pairs: Sequence[ScoredPair], beside: bool) -> list[AcceptanceRow]:
+def _accuracy_rows(label: str, pairs: Sequence[ScoredPair], is_comparison: bool) -> list[AcceptanceRow]:
     seen = [pair for pair in pairs if pair.pair.in_view]
     fixed = [pair for pair in seen if pair.error is not None]
     mean, p99 = f"{label}: mean position error [mm]", f"{label}: 99th percentile of position error [mm]"
     angles = [f"{label}: 99th percentile of {angle} error [deg]" for angle in ("pitch", "yaw")]
-    unfixed = _unfixed_row(_bar("20", beside), label, seen, 0.005)
+    unfixed = _unfixed_row(_bar("20", is_comparison), label, seen, 0.005)
     if not fixed:
         why = "no pair in view has a pose"
         bars = [("17", mean, 0.6), ("18", p99, _P99_MM), *(("19", angle, 0.5) for angle in angles)]
-        return [*(not_measured(_bar(bar, beside), title, high, why) for bar, title, high in bars), unfixed]
+        return [*(not_measured(_bar(bar, is_comparison), title, high, why) for bar, title, high in bars), unfixed]
     blocks = [pair.pair.sequence_id for pair in fixed]
     position_mm = [1e3 * pair.position_m for pair in fixed]
     note, n = _failures(seen), len(fixed)
     limit = block_percentile_limit(position_mm, blocks, 99.0, p99)
     rows = [
-        at_most(_bar("17", beside), mean, 0.6, block_mean_limit(position_mm, blocks), n, note),
-        at_most(_bar("18", beside), p99, _P99_MM, limit, n, note),
+        at_most(_bar("17", is_comparison), mean, 0.6, block_mean_limit(position_mm, blocks), n, note),
+        at_most(_bar("18", is_comparison), p99, _P99_MM, limit, n, note),
     ]
     for column, angle in ((3, angles[0]), (4, angles[1])):
         values = [float(pair.error[column]) for pair in fixed if pair.error is not None]
         rows.append(
-            at_most(_bar("19", beside), angle, 0.5, block_percentile_limit(values, blocks, 99.0, angle), n, note)
+            at_most(_bar("19", is_comparison), angle, 0.5, block_percentile_limit(values, blocks, 99.0, angle), n, note)
         )
     return [*rows, unfixed]
 
@@ -144,8 +148,8 @@ def _unfixed_row(bar: str, label: str, seen: Sequence[ScoredPair], high: float) 
     return at_most(bar, quantity, high, block_share_limit(missing, [pair.pair.sequence_id for pair in seen]), len(seen))
 
 
-def _bound_row(label: str, seen: Sequence[ScoredPair], beside: bool) -> AcceptanceRow:
-    quantity, bar = f"{label}: error over its bound, worst component, RMS", _bar("23", beside)
+def _bound_row(label: str, seen: Sequence[ScoredPair], is_comparison: bool) -> AcceptanceRow:
+    quantity, bar = f"{label}: error over its bound, worst component, RMS", _bar("23", is_comparison)
     ratio = bound_ratio(seen)
     if ratio is None:
         return not_measured(bar, quantity, 1.5, "no pose in view has a bound")
@@ -154,8 +158,8 @@ def _bound_row(label: str, seen: Sequence[ScoredPair], beside: bool) -> Acceptan
     return at_most(bar, quantity, 1.5, measured, n, note)
 
 
-def _overconfidence_row(label: str, pairs: Sequence[ScoredPair], beside: bool) -> AcceptanceRow:
-    """Criterion 21: of what is not in view, either a reason, or a wider covariance, or a pose as good as in view."""
+def _overconfidence_row(label: str, pairs: Sequence[ScoredPair], is_comparison: bool) -> AcceptanceRow:
+    """Criterion 21: a pair out of view needs a reason for no pose, a wider covariance, or a pose as good as in view."""
     others = [pair for pair in pairs if not pair.pair.in_view]
     seen = [pair for pair in pairs if pair.pair.in_view and pair.sd_m is not None]
     bold, quantity = (
@@ -163,13 +167,13 @@ def _overconfidence_row(label: str, pairs: Sequence[ScoredPair], beside: bool) -
         f"{label}: pairs out of view answered without care",
     )
     if not others:
-        # What never happened was never answered wrongly.
-        return at_most(_bar("21", beside), quantity, 0.0, (0.0, 0.0), 0, "all pairs are in view")
-    return _count_row(_bar("21", beside), quantity, bold, len(others))
+        # Without such a pair there was no wrong estimate.
+        return at_most(_bar("21", is_comparison), quantity, 0.0, (0.0, 0.0), 0, "all pairs are in view")
+    return _count_row(_bar("21", is_comparison), quantity, bold, len(others))
 
 
 def _is_overconfident(pair: ScoredPair, seen: Sequence[ScoredPair]) -> bool:
-    """Whether an answer to a pair out of view is neither reasoned, nor modest, nor exact all the same."""
+    """Whether an estimate out of view has neither a reason, nor a wider covariance, nor a small error."""
     if pair.error is None:
         return not pair.reason
     if 1e3 * pair.position_m <= _P99_MM and pair.pair.visibility != "hidden":
@@ -181,7 +185,7 @@ def _is_overconfident(pair: ScoredPair, seen: Sequence[ScoredPair]) -> bool:
 
 
 def _count_row(bar: str, quantity: str, count: int, n: int) -> AcceptanceRow:
-    """A number of events of which none may happen."""
+    """A number of events that must be zero."""
     if n == 0:
         return not_measured(bar, quantity, 0.0, "there was no occasion")
     return at_most(bar, quantity, 0.0, (float(count), float(count)), n)
@@ -196,8 +200,8 @@ def _flights(pairs: Sequence[ScoredPair]) -> list[list[ScoredPair]]:
     return [list(flight) for _, flight in groupby(ordered, key=lambda pair: pair.pair.sequence_id)]
 
 
-def _bar(number: str, beside: bool) -> str:
-    return COMPARISON if beside else number
+def _bar(number: str, is_comparison: bool) -> str:
+    return COMPARISON if is_comparison else number
 
 
 def _failures(seen: Sequence[ScoredPair]) -> str:
@@ -214,14 +218,14 @@ _FEWEST_FIXES = 2
 _SPEEDS = ((5.0, np.inf, 30.0, "beyond 5 m"), (1.8, 2.2, 70.0, "at 2 m"))
 
 
-def bench_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRow]:
+def bench_rows(title: str, scores: Scores, is_comparison: bool) -> list[AcceptanceRow]:
     """Criterion 26: mean absolute errors at the worst station of a bench, and the share of pairs without a pose.
 
     Every station must have poses.
     """
     rows = []
     for name, pairs in scores.items():
-        bar = COMPARISON if is_beside or name != BEST else "26"
+        bar = COMPARISON if is_comparison or name != BEST else "26"
         fixed = [pair for pair in pairs if pair.error is not None]
         missing = len(pairs) - len(fixed)
         failed = f"; {missing} of {len(pairs)} pairs without a pose" if missing else ""
@@ -245,8 +249,8 @@ def bench_rows(title: str, scores: Scores, is_beside: bool) -> list[AcceptanceRo
     return rows
 
 
-def processing_time_rows(title: str, pairs: Sequence[ScoredPair], is_beside: bool) -> list[AcceptanceRow]:
-    """Criterion 27: median time of all stages of a pair, by distance; no pose takes its time too."""
+def processing_time_rows(title: str, pairs: Sequence[ScoredPair], is_comparison: bool) -> list[AcceptanceRow]:
+    """Criterion 27: median processing time of a pair, by distance; pairs without a pose count."""
     rows = []
     for low_m, high_m, bar_ms, where in _SPEEDS:
         told = [
@@ -254,7 +258,7 @@ def processing_time_rows(title: str, pairs: Sequence[ScoredPair], is_beside: boo
             for pair in pairs
             if pair.work_s is not None and low_m <= pair.pair.distance_m <= high_m
         ]
-        bar, quantity = COMPARISON if is_beside else "27", f"{title}: median time of a pair {where} [ms]"
+        bar, quantity = COMPARISON if is_comparison else "27", f"{title}: median time of a pair {where} [ms]"
         if not told:
             rows.append(not_measured(bar, quantity, bar_ms, "no pair there tells its time"))
             continue
@@ -290,9 +294,9 @@ class FlightData:
         recipe: name of a shipped one, or a file.
         parts: how many sequences, or parts of 90 pairs of a bench, a full measurement takes.
         rows: which criteria.
-        follows: whether tracker and filter have something to follow.
-        times: whether the run time of a pair is told.
-        compares: whether all methods there are stand beside, on the same pairs.
+        follows: whether it has sequences, for tracker and filter.
+        times: whether processing times are judged.
+        compares: whether all methods are measured on the same pairs for comparison.
     """
 
     recipe: str
@@ -321,7 +325,7 @@ def part_length(recipe: Recipe) -> int:
 
 
 def with_parts(recipe: Recipe, parts: int) -> Recipe:
-    """The recipe with at least so many sequences, each of those that it lacks in a scene of its own."""
+    """The recipe with at least that many sequences; each added one has a scene of its own."""
     wanted = parts * part_length(recipe)
     if wanted <= recipe.frames.count:
         return recipe
@@ -336,7 +340,7 @@ _NEES = (0.85, 1.20)
 
 
 def tracking_filter_rows(title: str, scores: Scores, result: BenchmarkResult) -> list[AcceptanceRow]:
-    """Goals of tracker and filter on one dataset; those that nothing was measured for are left out.
+    """Goals of tracker and filter on one dataset; goals without a measurement are left out.
 
     Args:
         title: of the data.

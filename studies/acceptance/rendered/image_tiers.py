@@ -1,4 +1,4 @@
-"""Tiers A and B: rendered pairs, navigated blind and benchmarked."""
+"""Tiers A and B: criteria on rendered pairs, in daylight and at dusk."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def paper_rows(images: ImageScores) -> list[AcceptanceRow]:
     return [at_most("15", quantity, bar, (ratio, ratio if ends is None else ends[1]), len(common))]
 
 
-# Z m, transverse m, pitch and yaw deg at each distance: what rendered daylight is expected to allow.
+# Z [m], transverse [m], pitch and yaw [deg] at each distance that rendered daylight should allow.
 _GOALS = {
     2.0: (0.015e-3, 0.010e-3, 0.005),
     5.0: (0.15e-3, 0.024e-3, 0.012),
@@ -166,7 +166,7 @@ _GOALS = {
 
 
 def goal_rows(images: ImageScores) -> list[AcceptanceRow]:
-    """What is aimed at by distance."""
+    """Goals by distance."""
     rows = []
     for station, (z_m, transverse_m, angle_deg) in _GOALS.items():
         frames = {i: f for i, f in between_m(images.best, station, station).items() if f.pose is not None}
@@ -303,7 +303,7 @@ def _pooled(bar: str, quantity: str, names: Sequence[str], high: float, bins: Se
 
 @dataclass(frozen=True)
 class TierData:
-    """What was made of one dataset of a tier."""
+    """One dataset of a tier with its estimates and benchmark result."""
 
     light: LightLevel
     dataset: Path
@@ -331,7 +331,7 @@ def tier_a_rows(data: TierData) -> list[AcceptanceRow]:
 
 
 def tier_b_rows(data: TierData) -> list[AcceptanceRow]:
-    """Criteria 2, 3, 4, 8, 13, 14 and 15 on one dataset, and in daylight what is aimed at by distance.
+    """Criteria 2, 3, 4, 8, 13, 14 and 15 on one dataset, and in daylight the goals by distance.
 
     Raises:
         ValueError: estimates that cannot be read, or that lack a method.

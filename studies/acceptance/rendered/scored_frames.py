@@ -19,7 +19,7 @@ from studies.acceptance.rendered.centroid_bounds import center_bounds_px
 BEST, CHAIN = "joint-hub", "paper"
 """Our best method, and the seed paper's."""
 METHODS = (BEST, CHAIN)
-"""What must be navigated to judge a tier."""
+"""Methods that a tier runs."""
 
 
 @dataclass(frozen=True, eq=False)

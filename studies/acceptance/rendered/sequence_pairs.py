@@ -1,4 +1,4 @@
-"""Pairs of sequences, scored one by one against the records: what the criteria of whole flights rest on."""
+"""Every pair of a sequence scored against its record; the criteria of whole flights are computed from these."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _FEWEST_MARKERS = 4
 
 @dataclass(frozen=True, eq=False)
 class TruePair:
-    """What the truth says of one pair.
+    """The truth of one pair.
 
     Attributes:
-        frame_index: which pair.
+        frame_index: of the pair.
         sequence_id: of its sequence; a pair that belongs to none is one of its own.
         family: of its conditions.
         truth: of the drogue.
-        in_view: whether both images show four markers and the hub, if the drogue has one, and no sun outshines them.
+        in_view: whether both images show four markers and the hub, if the drogue has one, and the sun dazzles neither.
         visibility: of the pair; `seen` for a single one.
     """
 
@@ -54,15 +54,15 @@ class TruePair:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPair:
-    """One method's answer to a pair.
+    """One method's estimate of a pair.
 
     Attributes:
         pair: the truth.
         error: (5,) X, Y, Z [m], pitch and yaw [deg], estimate minus truth; None without a pose.
         sd_m: root of the trace of the position's reported covariance; None without one. [m]
         over_bound: (5,) error over its bound at the noise measured in its family, of markers and of hubs; None without.
-        reason: why there is no pose; empty where there is one, or no word at all.
-        work_s: of all stages but those in which the pair waits, where they are told. [s]
+        reason: why there is no pose; empty where there is one or the method gave no estimate.
+        work_s: processing time without waiting; None where it is not reported. [s]
     """
 
     pair: TruePair
@@ -83,7 +83,7 @@ Scores = Mapping[str, Sequence[ScoredPair]]
 
 
 def score_pairs(dataset: Path, estimates: Path) -> dict[str, list[ScoredPair]]:
-    """Every method's answers to all pairs that have a drogue, in the order of frames.
+    """Every method's scores of all pairs that show a drogue, in the order of frames.
 
     Raises:
         ValueError: a dataset or estimates that cannot be read.

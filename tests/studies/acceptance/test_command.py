@@ -86,8 +86,8 @@ def options(engines: tuple[str, ...] = (), **changes: object) -> AcceptanceOptio
     return AcceptanceOptions("docking", 3, engines=engines, workers=0, flights=FlightOptions(**changes))  # type: ignore[arg-type]
 
 
-def rows_of(title: str, scores: object, is_beside: bool) -> list[AcceptanceRow]:
-    return [*approach_rows(title, scores, is_beside), *lost_rows(title, scores, is_beside)]  # type: ignore[arg-type]
+def rows_of(title: str, scores: object, is_comparison: bool) -> list[AcceptanceRow]:
+    return [*approach_rows(title, scores, is_comparison), *lost_rows(title, scores, is_comparison)]  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")

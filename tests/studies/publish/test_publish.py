@@ -165,7 +165,7 @@ def test_a_dataset_with_another_pixel_fails(tmp_path: Path, dataset: Path, capsy
 
 def test_publishing_never_keeps_old_frames(tmp_path: Path) -> None:
     (tmp_path / "smoke").mkdir()
-    with pytest.raises(ValueError, match="is there already; what is published is made anew"):
+    with pytest.raises(ValueError, match="exists already; published datasets are rendered from scratch"):
         publish("smoke", None, tmp_path, tmp_path, PlainProgress(io.StringIO()))
 
 
