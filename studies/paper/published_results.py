@@ -66,7 +66,8 @@ CORPUS_SENTENCE = (
 )
 
 # Centroids of this noise give the published mean error by the method as it is rebuilt here, and this error of the tilt
-# by its plane fit, over 1.7 to 10 m, tilts to 10 degrees and the shipped drogue: tests/studies/paper/test_published.py.
+# by its plane fit, over 1.7 to 10 m, tilts to 10 degrees and the shipped drogue, as
+# tests/studies/paper/test_published_results.py measures.
 NOISE_OF_THE_MEAN_PX = 0.2
 TILT_AT_THAT_NOISE_DEG = 6.0
 
