@@ -40,89 +40,7 @@ from droguekit.benchmark.sequences.sequence_truth import (
 from droguekit.benchmark.sequences.tracking_scores import reacquisition, score_regions
 
 Methods = Mapping[str, Mapping[int, Estimate]]
-
-
-def score_sequences(
-    sequences: Sequence[TrueSequence], drogues: Mapping[int, DrogueTruth], methods: Methods
-) -> SequencesResult | None:
-    """Score boxes, motion, docking quantities and times of estimates over sequences.
-
-    Args:
-        sequences: of the dataset.
-        drogues: the truth of all pairs that show one, in ascending order of frames.
-        methods: estimates by method and frame.
-
-    Returns:
-        None where there are no sequences, or no estimate of one has any of these.
-    """
-    if not sequences:
-        return None
-    data = sequence_data(sequences, drogues)
-    dockings = true_dockings(sequences, data.motions)
-    # Where some methods report boxes, the others count as having lost the drogue.
-    has_regions = any(answer.regions for estimates in methods.values() for answer in estimates.values())
-    scored: dict[str, MethodSequences] = {}
-    for name, estimates in methods.items():
-        parts = {
-            "tracking": score_regions(sequences, estimates) if has_regions else None,
-            "filtering": filter_errors(data, name, methods),
-            "docking": docking_errors(data, dockings, estimates, f"{name}, docking"),
-            "latency": latency(data, estimates),
-        }
-        if any(part is not None for part in parts.values()):
-            scored[name] = MethodSequences(hiding=_hidden_pairs(sequences, estimates), **parts)
-    if not scored:
-        return None
-    spans = [sequence.states[-1].time_s - sequence.states[0].time_s for sequence in sequences]
-    return SequencesResult(
-        count=len(sequences),
-        pairs=sum(len(sequence.states) for sequence in sequences),
-        minutes=float(np.sum(spans)) / 60,
-        vibration_rms_m_s=rms_length(
-            [motion.vibration_m_s for motion in data.motions.values() if motion.vibration_m_s is not None]
-        ),
-        methods=scored,
-    )
-
-
-def sequence_data(sequences: Sequence[TrueSequence], drogues: Mapping[int, DrogueTruth]) -> SequenceData:
-    """The truth that sequences are scored with; arguments as those of `score_sequences`."""
-    bins, labels = distance_bins([truth.distance_m for truth in drogues.values()])
-    groups = PairGroups(
-        bins,
-        dict(zip(drogues, labels, strict=True)),
-        {index: truth.sequence_id for index, truth in drogues.items()},
-    )
-    return SequenceData(sequences, drogues, true_motions(sequences), groups)
-
-
-def _hidden_pairs(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> HiddenPairs:
-    states = [state for sequence in sequences for state in sequence.states if state.visibility == "hidden"]
-    courses = [
-        (
-            [state.visibility for state in sequence.states],
-            [_has_found(state, estimates.get(state.frame_index)) for state in sequence.states],
-        )
-        for sequence in sequences
-    ]
-    return HiddenPairs(
-        hidden=len(states),
-        poses_while_hidden=sum(isinstance(estimates.get(state.frame_index), PoseEstimate) for state in states),
-        reacquisition=reacquisition(courses),
-    )
-
-
-def _has_found(state: TrueState, estimate: Estimate | None) -> bool:
-    """Whether an answer is a pose that lies within the rim of the drogue."""
-    pose, drogue = state.left_from_drogue, state.drogue
-    if pose is None or drogue is None or not isinstance(estimate, PoseEstimate):
-        return False
-    error_m = estimate.left_from_drogue.translation_m - pose.translation_m
-    return float(np.linalg.norm(error_m)) <= drogue.rim_radius_m
-
-
 __all__ = ["BenchmarkResult", "run_benchmark", "score"]
-
 Truths = Mapping[int, DrogueTruth | None]
 
 
@@ -186,17 +104,58 @@ def score(
     )
 
 
-def _centroids(
-    method: str, drogues: Mapping[int, DrogueTruth], estimates: Mapping[int, Estimate]
-) -> dict[int, CentroidErrors]:
-    found = {}
-    for index, truth in drogues.items():
-        estimate = estimates.get(index)
-        try:
-            found[index] = centroid_errors(truth, estimate.features if estimate is not None else ())
-        except ValueError as error:
-            raise ValueError(f"estimates: method {method!r}: frame {index}: {error}") from error
-    return found
+def score_sequences(
+    sequences: Sequence[TrueSequence], drogues: Mapping[int, DrogueTruth], methods: Methods
+) -> SequencesResult | None:
+    """Score boxes, motion, docking quantities and times of estimates over sequences.
+
+    Args:
+        sequences: of the dataset.
+        drogues: the truth of all pairs that show one, in ascending order of frames.
+        methods: estimates by method and frame.
+
+    Returns:
+        None where there are no sequences, or no estimate of one has any of these.
+    """
+    if not sequences:
+        return None
+    data = sequence_data(sequences, drogues)
+    dockings = true_dockings(sequences, data.motions)
+    # Where some methods report boxes, the others count as having lost the drogue.
+    has_regions = any(answer.regions for estimates in methods.values() for answer in estimates.values())
+    scored: dict[str, MethodSequences] = {}
+    for name, estimates in methods.items():
+        parts = {
+            "tracking": score_regions(sequences, estimates) if has_regions else None,
+            "filtering": filter_errors(data, name, methods),
+            "docking": docking_errors(data, dockings, estimates, f"{name}, docking"),
+            "latency": latency(data, estimates),
+        }
+        if any(part is not None for part in parts.values()):
+            scored[name] = MethodSequences(hiding=_hidden_pairs(sequences, estimates), **parts)
+    if not scored:
+        return None
+    spans = [sequence.states[-1].time_s - sequence.states[0].time_s for sequence in sequences]
+    return SequencesResult(
+        count=len(sequences),
+        pairs=sum(len(sequence.states) for sequence in sequences),
+        minutes=float(np.sum(spans)) / 60,
+        vibration_rms_m_s=rms_length(
+            [motion.vibration_m_s for motion in data.motions.values() if motion.vibration_m_s is not None]
+        ),
+        methods=scored,
+    )
+
+
+def sequence_data(sequences: Sequence[TrueSequence], drogues: Mapping[int, DrogueTruth]) -> SequenceData:
+    """The truth that sequences are scored with; arguments as those of `score_sequences`."""
+    bins, labels = distance_bins([truth.distance_m for truth in drogues.values()])
+    groups = PairGroups(
+        bins,
+        dict(zip(drogues, labels, strict=True)),
+        {index: truth.sequence_id for index, truth in drogues.items()},
+    )
+    return SequenceData(sequences, drogues, true_motions(sequences), groups)
 
 
 def _rows(scores: Mapping[int, FrameScore], reference: Reference) -> dict[str, object]:
@@ -227,6 +186,19 @@ def _comparisons(
     return compare_methods(errors, [name for name in (best, PAPER_METHOD) if name in errors], groups)
 
 
+def _centroids(
+    method: str, drogues: Mapping[int, DrogueTruth], estimates: Mapping[int, Estimate]
+) -> dict[int, CentroidErrors]:
+    found = {}
+    for index, truth in drogues.items():
+        estimate = estimates.get(index)
+        try:
+            found[index] = centroid_errors(truth, estimate.features if estimate is not None else ())
+        except ValueError as error:
+            raise ValueError(f"estimates: method {method!r}: frame {index}: {error}") from error
+    return found
+
+
 def _empty_frames(truths: Truths, estimates: Mapping[int, Estimate]) -> EmptyFrames:
     empty = [index for index, truth in truths.items() if truth is None]
     false = sum(isinstance(estimates.get(index), PoseEstimate) for index in empty)
@@ -236,3 +208,28 @@ def _empty_frames(truths: Truths, estimates: Mapping[int, Estimate]) -> EmptyFra
         false_fix_fraction=false / len(empty) if empty else None,
         interval=fraction_interval(false, len(empty)) if empty else None,
     )
+
+
+def _hidden_pairs(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> HiddenPairs:
+    states = [state for sequence in sequences for state in sequence.states if state.visibility == "hidden"]
+    courses = [
+        (
+            [state.visibility for state in sequence.states],
+            [_has_found(state, estimates.get(state.frame_index)) for state in sequence.states],
+        )
+        for sequence in sequences
+    ]
+    return HiddenPairs(
+        hidden=len(states),
+        poses_while_hidden=sum(isinstance(estimates.get(state.frame_index), PoseEstimate) for state in states),
+        reacquisition=reacquisition(courses),
+    )
+
+
+def _has_found(state: TrueState, estimate: Estimate | None) -> bool:
+    """Whether an answer is a pose that lies within the rim of the drogue."""
+    pose, drogue = state.left_from_drogue, state.drogue
+    if pose is None or drogue is None or not isinstance(estimate, PoseEstimate):
+        return False
+    error_m = estimate.left_from_drogue.translation_m - pose.translation_m
+    return float(np.linalg.norm(error_m)) <= drogue.rim_radius_m

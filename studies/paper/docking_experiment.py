@@ -21,6 +21,8 @@ from droguekit.benchmark.results.benchmark_result import BenchmarkResult, Datase
 from geometry.se3 import Array, RigidTransform
 from studies.paper.paper_inputs import ExperimentData, read_estimates_file
 
+LEAST_MARKERS = 4
+
 
 @dataclass(frozen=True, eq=False)
 class DockingRun:
@@ -92,34 +94,6 @@ class DockingData(ExperimentData):
         return DockingRun(sequence_id, np.array(indices) - self.first_frames[sequence_id], truth, errors)
 
 
-def read_docking(dataset: Location, estimates: Path) -> DockingData:
-    """Read and score a dataset with its estimates.
-
-    Raises:
-        ValueError: dataset or file cannot be read, do not belong together, or hold none of the contenders.
-    """
-    data = Dataset(dataset)
-    file = read_estimates_file(estimates, data.frame_indices)
-    records = {index: data.record(index) for index in sorted(data.frame_indices)}
-    first_frames: dict[int | None, int] = {}
-    for index, record in records.items():
-        first_frames.setdefault(record.sequence_id, index)
-    manifest = data.manifest
-    facts = DatasetFacts(name=manifest.name, sha256=manifest.dataset_sha256, pairs=len(records))
-    result = score(facts, {index: drogue_truth(record) for index, record in records.items()}, file.methods)
-    shown = {index: record for index, record in records.items() if record.left_from_drogue is not None}
-    return DockingData(data, file, shown, first_frames, result)
-
-
-def _pose(record: PairRecord) -> RigidTransform:
-    if record.left_from_drogue is None:
-        raise ValueError(f"frame {record.frame_index}: shows no drogue")
-    return record.left_from_drogue
-
-
-LEAST_MARKERS = 4
-
-
 @dataclass(frozen=True, eq=False)
 class SubsetScores:
     """A method over some pairs; errors are over those with a pose, and None without any.
@@ -139,13 +113,23 @@ class SubsetScores:
     angles_p99_deg: Array | None = None
 
 
-def frames_in_view(records: Mapping[int, PairRecord]) -> list[int]:
-    """Pairs of which both eyes see at least four markers and the hub: wholly on the image, at most a tenth hidden."""
-    return [
-        index
-        for index, record in records.items()
-        if all(_is_enough(view) for view in (record.views.left, record.views.right))
-    ]
+def read_docking(dataset: Location, estimates: Path) -> DockingData:
+    """Read and score a dataset with its estimates.
+
+    Raises:
+        ValueError: dataset or file cannot be read, do not belong together, or hold none of the contenders.
+    """
+    data = Dataset(dataset)
+    file = read_estimates_file(estimates, data.frame_indices)
+    records = {index: data.record(index) for index in sorted(data.frame_indices)}
+    first_frames: dict[int | None, int] = {}
+    for index, record in records.items():
+        first_frames.setdefault(record.sequence_id, index)
+    manifest = data.manifest
+    facts = DatasetFacts(name=manifest.name, sha256=manifest.dataset_sha256, pairs=len(records))
+    result = score(facts, {index: drogue_truth(record) for index, record in records.items()}, file.methods)
+    shown = {index: record for index, record in records.items() if record.left_from_drogue is not None}
+    return DockingData(data, file, shown, first_frames, result)
 
 
 def subset_scores(errors: Mapping[int, Array], frames: Sequence[int], key: str) -> SubsetScores:
@@ -170,6 +154,21 @@ def subset_scores(errors: Mapping[int, Array], frames: Sequence[int], key: str) 
         largest_m=sizes[:, :3].max(axis=0),
         angles_p99_deg=np.percentile(sizes[:, 3:], 99.0, axis=0),
     )
+
+
+def frames_in_view(records: Mapping[int, PairRecord]) -> list[int]:
+    """Pairs of which both eyes see at least four markers and the hub: wholly on the image, at most a tenth hidden."""
+    return [
+        index
+        for index, record in records.items()
+        if all(_is_enough(view) for view in (record.views.left, record.views.right))
+    ]
+
+
+def _pose(record: PairRecord) -> RigidTransform:
+    if record.left_from_drogue is None:
+        raise ValueError(f"frame {record.frame_index}: shows no drogue")
+    return record.left_from_drogue
 
 
 def _is_enough(view: ViewRecord) -> bool:

@@ -18,59 +18,6 @@ from studies.paper.published_results import CONTENDERS, Contender, present
 _PACKAGES = ("datasets_manifest", "drogue_models", "droguekit", "geometry", "labelgen", "nav", "render", "scenes")
 
 
-def code_facts() -> list[tuple[str, str]]:
-    """Version of the code that wrote the page, and a hash of all its modules."""
-    return [
-        ("Code that wrote this page", f"droguekit {version('droguekit')}"),
-        ("Its hash (SHA-256)", code_sha256(_roots())),
-    ]
-
-
-def source_text(manifest: Manifest) -> str:
-    """What a dataset is called and which engines made it, for titles and captions."""
-    # An engine's name stands before its version.
-    engines = sorted({engine.partition(",")[0] for engine in manifest.engines})
-    return ", ".join([manifest.name, *engines])
-
-
-def dataset_facts(manifest: Manifest) -> list[tuple[str, str]]:
-    """A dataset's hash, and what it was made with."""
-    engines = "; ".join(sorted(manifest.engines)) or "nothing"
-    software = ", ".join(f"{name} {number}" for name, number in sorted(manifest.software.items()))
-    return [
-        (f"Dataset {source_text(manifest)}, {manifest.counts.pairs} pairs", manifest.dataset_sha256),
-        (f"Made by, {source_text(manifest)}", f"{engines}; with {software}"),
-    ]
-
-
-def code_sha256(roots: Sequence[Path]) -> str:
-    """Hash of the names and contents of all Python modules below some folders, wherever these lie."""
-    digest = hashlib.sha256()
-    for root in sorted(roots, key=lambda path: path.name):
-        for path in sorted(root.rglob("*.py")):
-            digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
-            digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()
-
-
-def file_sha256(path: Path) -> str:
-    """Hash of a file.
-
-    Raises:
-        ValueError: it cannot be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def _roots() -> list[Path]:
-    places = [find_spec(name) for name in _PACKAGES]
-    return [Path(place) for spec in places if spec is not None for place in spec.submodule_search_locations or ()]
-
-
 @dataclass(frozen=True, eq=False)
 class EstimatesFile:
     """The contenders' estimates in a file.
@@ -128,3 +75,56 @@ def read_estimates_file(path: Path, frame_indices: Sequence[int]) -> EstimatesFi
             f"{path}: holds none of the methods {', '.join(names)}; name them to droguekit navigate by --method"
         )
     return EstimatesFile(path, file_sha256(path), methods)
+
+
+def code_facts() -> list[tuple[str, str]]:
+    """Version of the code that wrote the page, and a hash of all its modules."""
+    return [
+        ("Code that wrote this page", f"droguekit {version('droguekit')}"),
+        ("Its hash (SHA-256)", code_sha256(_roots())),
+    ]
+
+
+def source_text(manifest: Manifest) -> str:
+    """What a dataset is called and which engines made it, for titles and captions."""
+    # An engine's name stands before its version.
+    engines = sorted({engine.partition(",")[0] for engine in manifest.engines})
+    return ", ".join([manifest.name, *engines])
+
+
+def dataset_facts(manifest: Manifest) -> list[tuple[str, str]]:
+    """A dataset's hash, and what it was made with."""
+    engines = "; ".join(sorted(manifest.engines)) or "nothing"
+    software = ", ".join(f"{name} {number}" for name, number in sorted(manifest.software.items()))
+    return [
+        (f"Dataset {source_text(manifest)}, {manifest.counts.pairs} pairs", manifest.dataset_sha256),
+        (f"Made by, {source_text(manifest)}", f"{engines}; with {software}"),
+    ]
+
+
+def code_sha256(roots: Sequence[Path]) -> str:
+    """Hash of the names and contents of all Python modules below some folders, wherever these lie."""
+    digest = hashlib.sha256()
+    for root in sorted(roots, key=lambda path: path.name):
+        for path in sorted(root.rglob("*.py")):
+            digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def file_sha256(path: Path) -> str:
+    """Hash of a file.
+
+    Raises:
+        ValueError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _roots() -> list[Path]:
+    places = [find_spec(name) for name in _PACKAGES]
+    return [Path(place) for spec in places if spec is not None for place in spec.submodule_search_locations or ()]

@@ -71,6 +71,40 @@ from studies.paper.worst_frames import (
 _PERCENTILES = (50, 90, 99)
 
 
+class DatasetWithEstimates(NamedTuple):
+    """A dataset with the estimates that were made on it."""
+
+    dataset: Location
+    estimates: Path
+
+
+@dataclass(frozen=True)
+class ReportInputs:
+    """Inputs of the page. A part whose input is missing is left out, with a line that says how to make it.
+
+    Attributes:
+        docking: docking runs.
+        docking_sequence: which run of each the figures show, the first one when None.
+        semi_physical: bench experiments.
+        detection: the JSON file of `droguekit benchmark` on detections.
+        corpus: the detectors' dataset.
+    """
+
+    docking: tuple[DatasetWithEstimates, ...] = ()
+    docking_sequence: int | None = None
+    semi_physical: tuple[DatasetWithEstimates, ...] = ()
+    detection: Path | None = None
+    corpus: Location | None = None
+
+
+class MissingPart(NamedTuple):
+    """A part that is missing on the page, and the commands that make its input."""
+
+    what: str
+    commands: tuple[str, ...]
+    option: str
+
+
 @dataclass(frozen=True)
 class FigureGroup:
     """Panels under one caption.
@@ -88,6 +122,86 @@ class FigureGroup:
     caption: str
     panels: list[Markup]
     legend: list[tuple[str, Markup]] = field(default_factory=list)
+
+
+def build_page(inputs: ReportInputs) -> str:
+    """The whole page.
+
+    Raises:
+        ValueError: no input at all, or one that cannot be read or does not fit the others.
+    """
+    docking = [read_docking(*navigated) for navigated in inputs.docking]
+    bench = [read_semi_physical(*navigated) for navigated in inputs.semi_physical]
+    detection = None if inputs.detection is None else read_detection(inputs.detection)
+    corpus = None if inputs.corpus is None else read_corpus(inputs.corpus)
+    if not (docking or bench or detection or corpus):
+        raise ValueError("report: nothing to report on; give --docking, --semi-physical, --detection or --corpus")
+    facts = code_facts()
+    for data in (*docking, *bench):
+        facts += [*dataset_facts(data.manifest), (f"Estimates {data.file.path.name}", data.file.sha256)]
+    if detection is not None and inputs.detection is not None:
+        facts += _detection_facts(detection, inputs.detection)
+    if corpus is not None:
+        facts += dataset_facts(corpus.manifest)
+    return page_template("paper_report.html.j2", "studies.paper").render(
+        paper=TITLE,
+        contradiction=CONTRADICTION,
+        claims=_claims(docking, bench, detection),
+        missing_parts=missing_parts(inputs),
+        detection=None if detection is None else table_1(detection),
+        detection_figures=[
+            *([] if corpus is None else corpus_figures(corpus)),
+            *([] if detection is None else speed_figures(detection)),
+        ],
+        docking=[_docking_part(data, inputs.docking_sequence, k) for k, data in enumerate(docking, start=1)],
+        bench=table_2(bench) if bench else None,
+        bench_figures=[bench_figures(run, number) for number, run in enumerate(bench, start=1)],
+        bench_notes=[note for run in bench if (note := absent_sentence(list(run.methods), run.file.path))],
+        colors={"true": TRUE_COLOR, "estimated": ESTIMATED_COLOR, "centroid": CENTROID_COLOR, "box": BOX_COLOR},
+        facts=facts,
+    )
+
+
+def read_detection(path: Path) -> DetectionResult:
+    """A file of detection scores.
+
+    Raises:
+        ValueError: it cannot be read, or is none.
+    """
+    try:
+        result = DetectionResult.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValidationError as error:
+        raise ValueError(
+            f"{path}: holds no detection scores; they come from droguekit benchmark DIR --detector NETWORK --json FILE"
+        ) from error
+    if not result.detectors:
+        raise ValueError(f"{path}: detectors: must not be empty")
+    return result
+
+
+def missing_parts(inputs: ReportInputs) -> list[MissingPart]:
+    """The parts whose inputs are missing."""
+    docking = (
+        "droguekit render docking-10m --out docking",
+        f"droguekit navigate docking {NAVIGATE_OPTIONS} --out docking.jsonl",
+    )
+    bench = (
+        "droguekit render semi-physical-7 --out bench-7",
+        f"droguekit navigate bench-7 {NAVIGATE_OPTIONS} --out bench-7.jsonl",
+    )
+    scores = ("droguekit benchmark CORPUS --detector NETWORK.onnx --json detection.json",)
+    parts = [
+        (inputs.corpus, MissingPart("Figure 10", ("droguekit render paper-corpus --out corpus",), "--corpus corpus")),
+        (inputs.detection, MissingPart("Table 1 and Figure 11", scores, "--detection detection.json")),
+        (
+            inputs.docking,
+            MissingPart("Figures 16 to 18, worst frames and times", docking, "--docking docking:docking.jsonl"),
+        ),
+        (inputs.semi_physical, MissingPart("Table 2 and Figure 19", bench, "--semi-physical bench-7:bench-7.jsonl")),
+    ]
+    return [part for given, part in parts if not given]
 
 
 def corpus_figures(corpus: CorpusBoxes) -> list[FigureGroup]:
@@ -259,120 +373,6 @@ def _key(name: str, style: MethodStyle) -> Markup:
 
 def _ends(run: DockingRun) -> str:
     return " to ".join(plain_number(float(z)) for z in (run.truth[0, 2], run.truth[-1, 2]))
-
-
-class DatasetWithEstimates(NamedTuple):
-    """A dataset with the estimates that were made on it."""
-
-    dataset: Location
-    estimates: Path
-
-
-@dataclass(frozen=True)
-class ReportInputs:
-    """Inputs of the page. A part whose input is missing is left out, with a line that says how to make it.
-
-    Attributes:
-        docking: docking runs.
-        docking_sequence: which run of each the figures show, the first one when None.
-        semi_physical: bench experiments.
-        detection: the JSON file of `droguekit benchmark` on detections.
-        corpus: the detectors' dataset.
-    """
-
-    docking: tuple[DatasetWithEstimates, ...] = ()
-    docking_sequence: int | None = None
-    semi_physical: tuple[DatasetWithEstimates, ...] = ()
-    detection: Path | None = None
-    corpus: Location | None = None
-
-
-class MissingPart(NamedTuple):
-    """A part that is missing on the page, and the commands that make its input."""
-
-    what: str
-    commands: tuple[str, ...]
-    option: str
-
-
-def build_page(inputs: ReportInputs) -> str:
-    """The whole page.
-
-    Raises:
-        ValueError: no input at all, or one that cannot be read or does not fit the others.
-    """
-    docking = [read_docking(*navigated) for navigated in inputs.docking]
-    bench = [read_semi_physical(*navigated) for navigated in inputs.semi_physical]
-    detection = None if inputs.detection is None else read_detection(inputs.detection)
-    corpus = None if inputs.corpus is None else read_corpus(inputs.corpus)
-    if not (docking or bench or detection or corpus):
-        raise ValueError("report: nothing to report on; give --docking, --semi-physical, --detection or --corpus")
-    facts = code_facts()
-    for data in (*docking, *bench):
-        facts += [*dataset_facts(data.manifest), (f"Estimates {data.file.path.name}", data.file.sha256)]
-    if detection is not None and inputs.detection is not None:
-        facts += _detection_facts(detection, inputs.detection)
-    if corpus is not None:
-        facts += dataset_facts(corpus.manifest)
-    return page_template("paper_report.html.j2", "studies.paper").render(
-        paper=TITLE,
-        contradiction=CONTRADICTION,
-        claims=_claims(docking, bench, detection),
-        missing_parts=missing_parts(inputs),
-        detection=None if detection is None else table_1(detection),
-        detection_figures=[
-            *([] if corpus is None else corpus_figures(corpus)),
-            *([] if detection is None else speed_figures(detection)),
-        ],
-        docking=[_docking_part(data, inputs.docking_sequence, k) for k, data in enumerate(docking, start=1)],
-        bench=table_2(bench) if bench else None,
-        bench_figures=[bench_figures(run, number) for number, run in enumerate(bench, start=1)],
-        bench_notes=[note for run in bench if (note := absent_sentence(list(run.methods), run.file.path))],
-        colors={"true": TRUE_COLOR, "estimated": ESTIMATED_COLOR, "centroid": CENTROID_COLOR, "box": BOX_COLOR},
-        facts=facts,
-    )
-
-
-def read_detection(path: Path) -> DetectionResult:
-    """A file of detection scores.
-
-    Raises:
-        ValueError: it cannot be read, or is none.
-    """
-    try:
-        result = DetectionResult.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ValidationError as error:
-        raise ValueError(
-            f"{path}: holds no detection scores; they come from droguekit benchmark DIR --detector NETWORK --json FILE"
-        ) from error
-    if not result.detectors:
-        raise ValueError(f"{path}: detectors: must not be empty")
-    return result
-
-
-def missing_parts(inputs: ReportInputs) -> list[MissingPart]:
-    """The parts whose inputs are missing."""
-    docking = (
-        "droguekit render docking-10m --out docking",
-        f"droguekit navigate docking {NAVIGATE_OPTIONS} --out docking.jsonl",
-    )
-    bench = (
-        "droguekit render semi-physical-7 --out bench-7",
-        f"droguekit navigate bench-7 {NAVIGATE_OPTIONS} --out bench-7.jsonl",
-    )
-    scores = ("droguekit benchmark CORPUS --detector NETWORK.onnx --json detection.json",)
-    parts = [
-        (inputs.corpus, MissingPart("Figure 10", ("droguekit render paper-corpus --out corpus",), "--corpus corpus")),
-        (inputs.detection, MissingPart("Table 1 and Figure 11", scores, "--detection detection.json")),
-        (
-            inputs.docking,
-            MissingPart("Figures 16 to 18, worst frames and times", docking, "--docking docking:docking.jsonl"),
-        ),
-        (inputs.semi_physical, MissingPart("Table 2 and Figure 19", bench, "--semi-physical bench-7:bench-7.jsonl")),
-    ]
-    return [part for given, part in parts if not given]
 
 
 def _docking_part(docking: DockingData, sequence: int | None, number: int) -> dict[str, Any]:

@@ -31,13 +31,27 @@ from studies.paper.published_results import (
 from studies.paper.semi_physical import SemiPhysicalRun, StationErrors
 
 _FALSE_POSES = "poses without a drogue"
-
 _THRESHOLD_FROM = {
     "given": "as given to the command",
     "detector": "the detector's own",
     "val": "the best F1 on the split val",
     "scored images": "the best F1 on the scored images themselves, which flatters precision and recall",
 }
+
+
+class Claim(NamedTuple):
+    """A line of the summary.
+
+    Attributes:
+        what: is claimed.
+        published: by the paper, on its own data.
+        ours, rebuilt: measured here, of our method and of the paper's as it is rebuilt here.
+    """
+
+    what: str
+    published: str
+    ours: str
+    rebuilt: str
 
 
 def table_1(result: DetectionResult) -> Table:
@@ -197,21 +211,6 @@ def _chosen_cells(docking: DockingData, contender: Contender, frames: Sequence[i
         ABSENT,
         ABSENT,
     ]
-
-
-class Claim(NamedTuple):
-    """A line of the summary.
-
-    Attributes:
-        what: is claimed.
-        published: by the paper, on its own data.
-        ours, rebuilt: measured here, of our method and of the paper's as it is rebuilt here.
-    """
-
-    what: str
-    published: str
-    ours: str
-    rebuilt: str
 
 
 def docking_claims(docking: DockingData) -> list[Claim]:

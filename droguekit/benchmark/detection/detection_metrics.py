@@ -34,6 +34,9 @@ RECALLS: Array = np.linspace(0.0, 1.0, 101)
 MOST_BOXES = 100
 """Of an image, the best ones: COCO's limit."""
 _ALL_AREAS = (0.0, 1e10)
+Counts = NDArray[np.signedinteger[Any]]
+# Numbers held at once: some tens of megabytes.
+_NUMBERS_AT_ONCE = 4_000_000
 
 
 class AveragePrecision(NamedTuple):
@@ -137,42 +140,6 @@ class Evaluation:
         )
 
 
-def _evaluator(images: Sequence[ImageTruth], boxes: dict[int, DetectedBox]) -> COCOeval:
-    """The evaluator, with all images evaluated."""
-    truth = [(image.image_id, image.image_id, image.box_xywh) for image in images if image.box_xywh is not None]
-    found = [(number, box.image_id, box.box_xywh, box.score) for number, box in boxes.items()]
-    with contextlib.redirect_stdout(io.StringIO()):
-        evaluator = COCOeval(_coco(images, truth), _coco(images, found), iouType="bbox")
-        evaluator.params.iouThrs = np.asarray(IOU_THRESHOLDS)
-        evaluator.params.areaRng, evaluator.params.areaRngLbl = [list(_ALL_AREAS)], ["all"]
-        evaluator.params.maxDets = [MOST_BOXES]
-        evaluator.evaluate()
-    return evaluator
-
-
-def _coco(images: Sequence[ImageTruth], boxes: Sequence[tuple[Any, ...]]) -> COCO:
-    """An index of boxes: id, image's id, box, and the score where there is one."""
-    table = COCO()
-    table.dataset = {
-        "images": [{"id": image.image_id} for image in images],
-        "categories": [{"id": DROGUE_CATEGORY}],
-        "annotations": [
-            {
-                "id": number,
-                "image_id": image_id,
-                "category_id": DROGUE_CATEGORY,
-                "bbox": list(box),
-                "area": box[2] * box[3],
-                "iscrowd": 0,
-                **({"score": score[0]} if score else {}),
-            }
-            for number, image_id, box, *score in boxes
-        ],
-    }
-    table.createIndex()
-    return table
-
-
 class OperatingPoint(NamedTuple):
     """Precision and recall of the boxes with at least a score.
 
@@ -238,19 +205,6 @@ def operating_point(matches: Matches, threshold: float) -> OperatingPoint:
     return OperatingPoint(threshold, precision, recall, f1)
 
 
-def _passing(matches: Matches) -> tuple[Array, Array, Array]:
-    """(m,) scores, highest first, and how many boxes have at least each of them, all and right ones."""
-    # Boxes of equal score pass a threshold together.
-    last = np.flatnonzero(np.append(np.diff(matches.score) != 0, True)[: len(matches.score)])
-    return matches.score[last], last + 1.0, np.cumsum(matches.is_true[AT_50])[last].astype(np.float64)
-
-
-Counts = NDArray[np.signedinteger[Any]]
-
-# Numbers held at once: some tens of megabytes.
-_NUMBERS_AT_ONCE = 4_000_000
-
-
 def average_precision_interval(matches: Matches, overlaps: tuple[int, ...], key: str) -> Interval | None:
     """Percentile-bootstrap interval of average precision.
 
@@ -312,6 +266,54 @@ def resampled_precision(matches: Matches, overlap: int, times: Counts) -> Array:
     return np.concatenate(parts)
 
 
+def scene_count(matches: Matches) -> int:
+    """Scenes that show a drogue to be found."""
+    return len({image.scene_id for image in matches.images if image.box_xywh is not None})
+
+
+def _evaluator(images: Sequence[ImageTruth], boxes: dict[int, DetectedBox]) -> COCOeval:
+    """The evaluator, with all images evaluated."""
+    truth = [(image.image_id, image.image_id, image.box_xywh) for image in images if image.box_xywh is not None]
+    found = [(number, box.image_id, box.box_xywh, box.score) for number, box in boxes.items()]
+    with contextlib.redirect_stdout(io.StringIO()):
+        evaluator = COCOeval(_coco(images, truth), _coco(images, found), iouType="bbox")
+        evaluator.params.iouThrs = np.asarray(IOU_THRESHOLDS)
+        evaluator.params.areaRng, evaluator.params.areaRngLbl = [list(_ALL_AREAS)], ["all"]
+        evaluator.params.maxDets = [MOST_BOXES]
+        evaluator.evaluate()
+    return evaluator
+
+
+def _coco(images: Sequence[ImageTruth], boxes: Sequence[tuple[Any, ...]]) -> COCO:
+    """An index of boxes: id, image's id, box, and the score where there is one."""
+    table = COCO()
+    table.dataset = {
+        "images": [{"id": image.image_id} for image in images],
+        "categories": [{"id": DROGUE_CATEGORY}],
+        "annotations": [
+            {
+                "id": number,
+                "image_id": image_id,
+                "category_id": DROGUE_CATEGORY,
+                "bbox": list(box),
+                "area": box[2] * box[3],
+                "iscrowd": 0,
+                **({"score": score[0]} if score else {}),
+            }
+            for number, image_id, box, *score in boxes
+        ],
+    }
+    table.createIndex()
+    return table
+
+
+def _passing(matches: Matches) -> tuple[Array, Array, Array]:
+    """(m,) scores, highest first, and how many boxes have at least each of them, all and right ones."""
+    # Boxes of equal score pass a threshold together.
+    last = np.flatnonzero(np.append(np.diff(matches.score) != 0, True)[: len(matches.score)])
+    return matches.score[last], last + 1.0, np.cumsum(matches.is_true[AT_50])[last].astype(np.float64)
+
+
 def _scenes(matches: Matches) -> tuple[Counts, Counts, Counts]:
     """Ids of the scenes, the place of each image's among them, and how many drogues each shows."""
     ids, scene = np.unique([image.scene_id for image in matches.images], return_inverse=True)
@@ -321,8 +323,3 @@ def _scenes(matches: Matches) -> tuple[Counts, Counts, Counts]:
 def _sampled_mean(recall: Array, envelope: Array) -> float:
     place = np.searchsorted(recall, RECALLS, side="left")
     return float(envelope[place[place < len(envelope)]].sum() / len(RECALLS))
-
-
-def scene_count(matches: Matches) -> int:
-    """Scenes that show a drogue to be found."""
-    return len({image.scene_id for image in matches.images if image.box_xywh is not None})

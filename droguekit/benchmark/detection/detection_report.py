@@ -78,6 +78,81 @@ class PicturedImage(NamedTuple):
     is_miss: bool = False
 
 
+def write_detection_report(dataset: Location, scored: ScoredDetections, out_html: Path) -> None:
+    """Write the page; it is replaced as a whole, or not at all.
+
+    Args:
+        dataset: the dataset's folder or URL, for pictures.
+        scored: what `score_detections` made of it.
+        out_html: where to write.
+
+    Raises:
+        ValueError: an image cannot be read.
+        OSError: the page cannot be written.
+    """
+    result = scored.result
+    matches = {name: evaluation.matches(scored.images) for name, evaluation in scored.evaluations.items()}
+    thresholds = {name: detector.operating_threshold for name, detector in result.detectors.items()}
+    best = best_detector(result)
+    styles = method_styles(list(matches))
+    histograms = [
+        Markup(panel(name, number, matches[name], thresholds[name]))
+        for number, name in enumerate(matches)
+        for panel in (score_panel, size_panel)
+    ]
+    page = page_template("detection_report.html.j2").render(
+        result=result,
+        sentences=detection_sentences(result, best),
+        facts=_facts(result),
+        summary=summary_table(result),
+        tables=cell_tables(result),
+        legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
+        distance_panels=[Markup(distance_panel(result, measure)) for measure in MEASURES if _has_distances(result)],
+        curve=Markup(curve_panel(matches)),
+        speed=Markup(speed_panel(result)) if is_timed(result) else None,
+        histograms=histograms,
+        tracking=tracking_part(
+            {name: d.sequences for name, d in result.detectors.items() if d.sequences is not None}, "detector", styles
+        ),
+        pictured=best,
+        pictures=detection_pictures(dataset, matches[best], thresholds[best]),
+        least=(LEAST_BOXES, LEAST_SCENES),
+    )
+    write_text_atomic(out_html, page)
+
+
+def best_detector(result: DetectionResult) -> str:
+    """The name of the one with the highest AP, the first among equals."""
+    return max(result.detectors, key=lambda name: result.detectors[name].overall.ap or 0.0)
+
+
+def detection_sentences(result: DetectionResult, name: str) -> list[str]:
+    """The result in sentences."""
+    data, detector = result.dataset, result.detectors[name]
+    row, alarms = detector.overall, detector.false_alarms
+    images = (
+        f"{data.images} images of {data.name}"
+        if data.split == "all"
+        else f"the {data.images} images of split {data.split}"
+    )
+    chosen = {
+        "given": "which was given",
+        "detector": "which is its own threshold",
+        "val": "which is the best one on split val",
+        "scored images": "which is the best one on these same images",
+    }
+    sentences = [
+        f"On {images}, with {data.boxes} drogues of {row.scenes} scenes to be found, {name} reaches an AP50 of "
+        f"{percent_text(row.ap50)} and an AP of {percent_text(row.ap)}.",
+        f"With a score of {plain_number(detector.operating_threshold)} or more, {chosen[detector.threshold_from]}, "
+        f"it finds {percent_text(row.recall)} of the drogues, and {percent_text(row.precision)} of its boxes "
+        "are right.",
+    ]
+    if alarms is not None:
+        sentences.append(f"In {alarms.frames} pairs without a drogue it sees {alarms.boxes}.")
+    return sentences
+
+
 def detection_pictures(dataset: Location, matches: Matches, threshold: float) -> list[PictureGroup]:
     """Groups of pictures; those without any are left out.
 
@@ -179,81 +254,6 @@ def _caption(shown: PicturedImage) -> str:
     else:
         parts.append(f"the best box scores {box.score:.2f}" if is_miss else f"score {box.score:.2f}")
     return ", ".join(parts)
-
-
-def write_detection_report(dataset: Location, scored: ScoredDetections, out_html: Path) -> None:
-    """Write the page; it is replaced as a whole, or not at all.
-
-    Args:
-        dataset: the dataset's folder or URL, for pictures.
-        scored: what `score_detections` made of it.
-        out_html: where to write.
-
-    Raises:
-        ValueError: an image cannot be read.
-        OSError: the page cannot be written.
-    """
-    result = scored.result
-    matches = {name: evaluation.matches(scored.images) for name, evaluation in scored.evaluations.items()}
-    thresholds = {name: detector.operating_threshold for name, detector in result.detectors.items()}
-    best = best_detector(result)
-    styles = method_styles(list(matches))
-    histograms = [
-        Markup(panel(name, number, matches[name], thresholds[name]))
-        for number, name in enumerate(matches)
-        for panel in (score_panel, size_panel)
-    ]
-    page = page_template("detection_report.html.j2").render(
-        result=result,
-        sentences=detection_sentences(result, best),
-        facts=_facts(result),
-        summary=summary_table(result),
-        tables=cell_tables(result),
-        legend=[(name, Markup(legend_key(style))) for name, style in styles.items()],
-        distance_panels=[Markup(distance_panel(result, measure)) for measure in MEASURES if _has_distances(result)],
-        curve=Markup(curve_panel(matches)),
-        speed=Markup(speed_panel(result)) if is_timed(result) else None,
-        histograms=histograms,
-        tracking=tracking_part(
-            {name: d.sequences for name, d in result.detectors.items() if d.sequences is not None}, "detector", styles
-        ),
-        pictured=best,
-        pictures=detection_pictures(dataset, matches[best], thresholds[best]),
-        least=(LEAST_BOXES, LEAST_SCENES),
-    )
-    write_text_atomic(out_html, page)
-
-
-def best_detector(result: DetectionResult) -> str:
-    """The name of the one with the highest AP, the first among equals."""
-    return max(result.detectors, key=lambda name: result.detectors[name].overall.ap or 0.0)
-
-
-def detection_sentences(result: DetectionResult, name: str) -> list[str]:
-    """The result in sentences."""
-    data, detector = result.dataset, result.detectors[name]
-    row, alarms = detector.overall, detector.false_alarms
-    images = (
-        f"{data.images} images of {data.name}"
-        if data.split == "all"
-        else f"the {data.images} images of split {data.split}"
-    )
-    chosen = {
-        "given": "which was given",
-        "detector": "which is its own threshold",
-        "val": "which is the best one on split val",
-        "scored images": "which is the best one on these same images",
-    }
-    sentences = [
-        f"On {images}, with {data.boxes} drogues of {row.scenes} scenes to be found, {name} reaches an AP50 of "
-        f"{percent_text(row.ap50)} and an AP of {percent_text(row.ap)}.",
-        f"With a score of {plain_number(detector.operating_threshold)} or more, {chosen[detector.threshold_from]}, "
-        f"it finds {percent_text(row.recall)} of the drogues, and {percent_text(row.precision)} of its boxes "
-        "are right.",
-    ]
-    if alarms is not None:
-        sentences.append(f"In {alarms.frames} pairs without a drogue it sees {alarms.boxes}.")
-    return sentences
 
 
 def _has_distances(result: DetectionResult) -> bool:

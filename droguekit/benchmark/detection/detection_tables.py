@@ -11,6 +11,13 @@ from droguekit.benchmark.report.html_page import RowGroup, Table
 from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
 from droguekit.benchmark.results.detection_result import DetectionResult, DetectionRow, DetectorResult
 
+SUMMARY_COLUMNS = ("precision", "recall", "AP50", "95 % interval", "AP", "95 % interval", "AP75")
+SUMMARY_COLUMNS_MORE = (
+    *("parameters [10⁶]", "GFLOPs", "time of an image [ms]"),
+    *("false alarms in 600 empty frames", "of 600, frames with any", "95 % interval"),
+)
+CELL_COLUMNS = ("scenes", "boxes", "AP50", "95 % interval", "AP", "recall", "95 % interval", "precision", "")
+
 
 class PublishedDetector(NamedTuple):
     """A row of the seed paper's table of detectors.
@@ -40,14 +47,6 @@ PUBLISHED_DETECTORS = (
     PublishedDetector("ours-l", 0.93, 0.995, 0.9823, 9.3, 0.0243),
     PublishedDetector("ours-s", 0.9429, 0.9149, 0.9629, 6.0, 0.0202),
 )
-
-
-SUMMARY_COLUMNS = ("precision", "recall", "AP50", "95 % interval", "AP", "95 % interval", "AP75")
-SUMMARY_COLUMNS_MORE = (
-    *("parameters [10⁶]", "GFLOPs", "time of an image [ms]"),
-    *("false alarms in 600 empty frames", "of 600, frames with any", "95 % interval"),
-)
-CELL_COLUMNS = ("scenes", "boxes", "AP50", "95 % interval", "AP", "recall", "95 % interval", "precision", "")
 
 
 def summary_table(result: DetectionResult) -> Table:

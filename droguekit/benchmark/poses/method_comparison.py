@@ -15,6 +15,10 @@ from droguekit.benchmark.results.pose_result import BinRatios, MeanRatios, Metho
 from geometry.se3 import Array
 
 Errors = Mapping[str, Mapping[int, PoseError]]
+# Every method is also compared with the seed paper's.
+PAPER_METHOD = "paper"
+# A method that finds the drogue in easy pairs only cannot be the best one.
+_FIXES_OF_MOST = 0.9
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,17 @@ class PairGroups:
     bins: Sequence[DistanceBin]
     bin_of_frame: Mapping[int, int]
     sequence_of_frame: Mapping[int, int | None]
+
+
+def best_method(methods: Mapping[str, MethodResult]) -> str | None:
+    """Smallest mean position error among the methods that found nearly as many poses as any; None without a pose."""
+    most = max(method.overall.fix_fraction for method in methods.values())
+    means = {
+        name: method.overall.position_mean_m
+        for name, method in methods.items()
+        if method.overall.position_mean_m is not None and method.overall.fix_fraction >= _FIXES_OF_MOST * most
+    }
+    return min(means, key=lambda name: means[name]) if means else None
 
 
 def compare_methods(errors: Errors, against: Sequence[str], groups: PairGroups) -> list[MethodComparison]:
@@ -84,21 +99,3 @@ def _ratios(above: Array, below: Array, blocks: list[int], key: str) -> MeanRati
 
 def _with_ends(above: float, below: float, ends: Interval | None) -> tuple[float | None, Interval | None]:
     return (above / below, ends) if below > 0 else (None, None)
-
-
-# Every method is also compared with the seed paper's.
-PAPER_METHOD = "paper"
-
-# A method that finds the drogue in easy pairs only cannot be the best one.
-_FIXES_OF_MOST = 0.9
-
-
-def best_method(methods: Mapping[str, MethodResult]) -> str | None:
-    """Smallest mean position error among the methods that found nearly as many poses as any; None without a pose."""
-    most = max(method.overall.fix_fraction for method in methods.values())
-    means = {
-        name: method.overall.position_mean_m
-        for name, method in methods.items()
-        if method.overall.position_mean_m is not None and method.overall.fix_fraction >= _FIXES_OF_MOST * most
-    }
-    return min(means, key=lambda name: means[name]) if means else None

@@ -82,6 +82,40 @@ class FrameScore:
     from_centroids_m: Array | None
 
 
+def frame_scores(
+    drogues: Mapping[int, DrogueTruth],
+    estimates: Mapping[int, Estimate],
+    centroids: Mapping[int, CentroidErrors],
+    reference: Reference,
+) -> dict[int, FrameScore]:
+    """Score a method on every pair that shows a drogue.
+
+    Args:
+        drogues: the truth by frame.
+        estimates: of the method, by frame; one may be missing.
+        centroids: of the method, for every frame of `drogues`.
+        reference: of the file.
+    """
+    noise = [
+        _used_noise([centroids[i] for i in drogues if reference.bin_of_frame[i] == k])
+        for k in range(len(reference.bins))
+    ]
+    scores = {}
+    for index, truth in drogues.items():
+        estimate, found = estimates.get(index), centroids[index]
+        pose = None
+        if isinstance(estimate, PoseEstimate):
+            own_noise = noise[reference.bin_of_frame[index]]
+            pose = _pose_score(estimate, truth, found, own_noise, reference.covariances[index])
+        scores[index] = FrameScore(
+            pose=pose,
+            bound=reference.bounds[index],
+            centroids=found,
+            from_centroids_m=position_error_from_centroids(truth, found),
+        )
+    return scores
+
+
 def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> PoseRow:
     """The row of some pairs, of which there is at least one.
 
@@ -116,6 +150,46 @@ def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> Po
             "rangefinder": rangefinder_errors([pose.depth for pose in poses if pose.depth is not None]),
         }
     )
+
+
+def _pose_score(
+    estimate: PoseEstimate,
+    truth: DrogueTruth,
+    centroids: CentroidErrors,
+    noise: FeatureNoise | None,
+    common: Array | None,
+) -> PoseScore:
+    pose = estimate.left_from_drogue
+    error = pose_error(pose, truth.left_from_drogue)
+    own = bound_covariance(truth, _used(truth, centroids), noise)
+    covariance = common if own is None else own
+    reading_m = truth.rangefinder_reading_m
+    scale_rad = None if noise is None else ring_tilt_scale(truth, centroids, noise.marker_px)
+    return PoseScore(
+        error=error,
+        common_bound=None if common is None else component_deviations(truth.left_from_drogue, common),
+        own_bound=None if own is None else component_deviations(truth.left_from_drogue, own),
+        has_covariance=estimate.covariance is not None,
+        squared_errors=squared_errors(estimate, error),
+        flips=None if covariance is None else flip_trials(pose, truth, covariance, scale_rad),
+        depth=None
+        if reading_m is None
+        else RangefinderSample(float(pose.translation_m[2]), truth.distance_m, reading_m),
+    )
+
+
+def _used(truth: DrogueTruth, centroids: CentroidErrors) -> NDArray[np.bool_]:
+    used = np.zeros_like(truth.visible)
+    used[centroids.eye[centroids.used], centroids.feature[centroids.used]] = True
+    return used
+
+
+def _used_noise(errors: Sequence[CentroidErrors]) -> FeatureNoise | None:
+    """Noise of the centroids on which a method's poses rest."""
+    offsets = np.concatenate([e.offset_px[e.used] for e in errors])
+    hub = np.concatenate([e.is_hub[e.used] for e in errors])
+    marker_px, hub_px = (root_mean_square(part) if len(part) else None for part in (offsets[~hub], offsets[hub]))
+    return feature_noise(marker_px, hub_px)
 
 
 def _error_numbers(errors: Sequence[PoseError], key: str) -> tuple[dict[str, float], dict[str, Interval]]:
@@ -183,77 +257,3 @@ def _centroid_share(fixed: Sequence[FrameScore]) -> dict[str, float | None]:
     share = None if total == 0 else max(0.0, 1 - rest / total)
     from_centroids = float(np.sqrt(np.square(predicted).sum(axis=1).mean()))
     return {"position_from_centroids_rmse_m": from_centroids, "centroid_share": share}
-
-
-def frame_scores(
-    drogues: Mapping[int, DrogueTruth],
-    estimates: Mapping[int, Estimate],
-    centroids: Mapping[int, CentroidErrors],
-    reference: Reference,
-) -> dict[int, FrameScore]:
-    """Score a method on every pair that shows a drogue.
-
-    Args:
-        drogues: the truth by frame.
-        estimates: of the method, by frame; one may be missing.
-        centroids: of the method, for every frame of `drogues`.
-        reference: of the file.
-    """
-    noise = [
-        _used_noise([centroids[i] for i in drogues if reference.bin_of_frame[i] == k])
-        for k in range(len(reference.bins))
-    ]
-    scores = {}
-    for index, truth in drogues.items():
-        estimate, found = estimates.get(index), centroids[index]
-        pose = None
-        if isinstance(estimate, PoseEstimate):
-            own_noise = noise[reference.bin_of_frame[index]]
-            pose = _pose_score(estimate, truth, found, own_noise, reference.covariances[index])
-        scores[index] = FrameScore(
-            pose=pose,
-            bound=reference.bounds[index],
-            centroids=found,
-            from_centroids_m=position_error_from_centroids(truth, found),
-        )
-    return scores
-
-
-def _pose_score(
-    estimate: PoseEstimate,
-    truth: DrogueTruth,
-    centroids: CentroidErrors,
-    noise: FeatureNoise | None,
-    common: Array | None,
-) -> PoseScore:
-    pose = estimate.left_from_drogue
-    error = pose_error(pose, truth.left_from_drogue)
-    own = bound_covariance(truth, _used(truth, centroids), noise)
-    covariance = common if own is None else own
-    reading_m = truth.rangefinder_reading_m
-    scale_rad = None if noise is None else ring_tilt_scale(truth, centroids, noise.marker_px)
-    return PoseScore(
-        error=error,
-        common_bound=None if common is None else component_deviations(truth.left_from_drogue, common),
-        own_bound=None if own is None else component_deviations(truth.left_from_drogue, own),
-        has_covariance=estimate.covariance is not None,
-        squared_errors=squared_errors(estimate, error),
-        flips=None if covariance is None else flip_trials(pose, truth, covariance, scale_rad),
-        depth=None
-        if reading_m is None
-        else RangefinderSample(float(pose.translation_m[2]), truth.distance_m, reading_m),
-    )
-
-
-def _used(truth: DrogueTruth, centroids: CentroidErrors) -> NDArray[np.bool_]:
-    used = np.zeros_like(truth.visible)
-    used[centroids.eye[centroids.used], centroids.feature[centroids.used]] = True
-    return used
-
-
-def _used_noise(errors: Sequence[CentroidErrors]) -> FeatureNoise | None:
-    """Noise of the centroids on which a method's poses rest."""
-    offsets = np.concatenate([e.offset_px[e.used] for e in errors])
-    hub = np.concatenate([e.is_hub[e.used] for e in errors])
-    marker_px, hub_px = (root_mean_square(part) if len(part) else None for part in (offsets[~hub], offsets[hub]))
-    return feature_noise(marker_px, hub_px)

@@ -32,9 +32,16 @@ from geometry.se3 import Array, RigidTransform, angles_from_axis, rotation_from_
 
 COMPONENTS = ("x", "y", "z", "pitch", "yaw")
 """Order of errors and bounds: X, Y, Z in the left camera [m], then pitch and yaw [deg]."""
-
 # Larger than any length, speed or time in flight; its square is far from overflow.
 _LARGEST_PLAUSIBLE = 1e9
+Parts = Mapping[str, slice]
+# A larger square means that the covariance is meaningless; it would dominate every mean.
+_MOST_SQUARE = 1e100
+# Position, attitude and both together, as slices of the five components.
+_PARTS: Parts = {"position": slice(0, 3), "attitude": slice(3, 5), "pose": slice(0, 5)}
+# A tilt below this many standard deviations cannot be told from zero, so its sign means nothing.
+_CLEAR_TILT = 5.0
+_OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,15 +163,6 @@ def _errors(values_m: NDArray[np.float64], reference_m: NDArray[np.float64]) -> 
     )
 
 
-Parts = Mapping[str, slice]
-
-# A larger square means that the covariance is meaningless; it would dominate every mean.
-_MOST_SQUARE = 1e100
-
-# Position, attitude and both together, as slices of the five components.
-_PARTS: Parts = {"position": slice(0, 3), "attitude": slice(3, 5), "pose": slice(0, 5)}
-
-
 def squared_errors(estimate: PoseEstimate, error: PoseError) -> Array | None:
     """Normalized estimation error squared of position, attitude and both.
 
@@ -247,12 +245,6 @@ def normalized_errors(pairs: Sequence[tuple[PoseError, Array]]) -> NormalizedErr
     nrms = dict(zip(COMPONENTS, (root_mean_square(column) for column in ratios.T), strict=True))
     upper = {name: rms_upper_limit(value, len(pairs)) for name, value in nrms.items()}
     return NormalizedErrors(n=len(pairs), nrms=ComponentRatios(**nrms), upper=ComponentRatios(**upper))
-
-
-# A tilt below this many standard deviations cannot be told from zero, so its sign means nothing.
-_CLEAR_TILT = 5.0
-
-_OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)

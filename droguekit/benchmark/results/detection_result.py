@@ -17,6 +17,27 @@ from droguekit.benchmark.results.pose_result import ResultModel
 from droguekit.benchmark.results.sequence_result import Tracking
 from geometry.stereo import EYES, Eye
 
+DROGUE_CATEGORY = 1
+# COCO counts from the image's corner, records from the centre of the first pixel.
+CORNER_FROM_CENTER_PX = 0.5
+# Finer than any detector's box is meant, and files stay small.
+_BOX_DECIMALS = 3
+_SCORE_DECIMALS = 6
+
+
+class DetectedBox(NamedTuple):
+    """One box.
+
+    Attributes:
+        image_id: of the image, as in the COCO files of the dataset.
+        box_xywh: low corner and size, counted from the image's corner. [px]
+        score: 0 to 1.
+    """
+
+    image_id: int
+    box_xywh: PixelBox
+    score: float
+
 
 class DetectionDataset(ResultModel):
     """The dataset that was scored on.
@@ -161,28 +182,6 @@ class DetectionResult(ResultModel):
     def to_json(self) -> str:
         """The text of the file."""
         return json.dumps(self.model_dump(mode="json", by_alias=True), indent=1, allow_nan=False) + "\n"
-
-
-DROGUE_CATEGORY = 1
-# COCO counts from the image's corner, records from the centre of the first pixel.
-CORNER_FROM_CENTER_PX = 0.5
-# Finer than any detector's box is meant, and files stay small.
-_BOX_DECIMALS = 3
-_SCORE_DECIMALS = 6
-
-
-class DetectedBox(NamedTuple):
-    """One box.
-
-    Attributes:
-        image_id: of the image, as in the COCO files of the dataset.
-        box_xywh: low corner and size, counted from the image's corner. [px]
-        score: 0 to 1.
-    """
-
-    image_id: int
-    box_xywh: PixelBox
-    score: float
 
 
 def image_id_of(frame_index: int, eye: Eye) -> int:

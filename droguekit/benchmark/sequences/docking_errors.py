@@ -27,6 +27,7 @@ from nav.docking import capture_radius_m
 
 # Longest straight flight that is predicted: where the drogue hardly comes nearer, a prediction means nothing.
 _LONGEST_WAY_S = 60.0
+_AXES = ("forward", "right", "down")
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,47 @@ class TrueDocking:
     closure_m_s: float | None
     predicted: Arrival | None
     actual: Arrival | None
+
+
+class DockingPair(NamedTuple):
+    """One pair with docking quantities, reported and true."""
+
+    frame_index: int
+    reported: Docking
+    true: TrueDocking
+
+    @property
+    def capture_radius_m(self) -> float:
+        """The radius that captures are judged by: the estimate's own if it reports one, else the drogue's. [m]"""
+        reported_m = self.reported.capture_radius_m
+        return self.true.capture_radius_m if reported_m is None else reported_m
+
+
+def docking_errors(
+    data: SequenceData, truth: Mapping[int, TrueDocking], estimates: Mapping[int, Estimate], key: str
+) -> DockingErrors | None:
+    """The scores of a method; None where it reports no docking quantities.
+
+    Args:
+        data: the truth of the sequences.
+        truth: of docking, by frame.
+        estimates: of the method, by frame.
+        key: of the bootstrap's random streams.
+    """
+    pairs = [
+        DockingPair(index, estimate.docking, truth[index])
+        for index, estimate in sorted(estimates.items())
+        if isinstance(estimate, PoseEstimate) and estimate.docking is not None and index in truth
+    ]
+    if not pairs:
+        return None
+    bin_of, bins = data.groups.bin_of_frame, []
+    for k, place in enumerate(data.groups.bins):
+        inside = [pair for pair in pairs if bin_of[pair.frame_index] == k]
+        if inside:
+            row = _row(data, inside, sum(bin_of[index] == k for index in truth), f"{key}, bin {k}")
+            bins.append(DockingBin(**dict(row), low_m=place.low_m, high_m=place.high_m))
+    return DockingErrors(overall=_row(data, pairs, len(truth), key), bins=tuple(bins))
 
 
 def true_dockings(sequences: Sequence[TrueSequence], motions: Mapping[int, TrueMotion]) -> dict[int, TrueDocking]:
@@ -129,50 +171,6 @@ def _true_docking(state: TrueState, motion: TrueMotion | None, actual: Arrival |
     closure = -float(rig.body_from_left.rotate(motion.velocity_m_s)[0])
     predicted = predicted_arrival(pose, motion.velocity_m_s, tip_in_left_m(rig))
     return TrueDocking(mouth, radius_m, closure, predicted, actual)
-
-
-_AXES = ("forward", "right", "down")
-
-
-class DockingPair(NamedTuple):
-    """One pair with docking quantities, reported and true."""
-
-    frame_index: int
-    reported: Docking
-    true: TrueDocking
-
-    @property
-    def capture_radius_m(self) -> float:
-        """The radius that captures are judged by: the estimate's own if it reports one, else the drogue's. [m]"""
-        reported_m = self.reported.capture_radius_m
-        return self.true.capture_radius_m if reported_m is None else reported_m
-
-
-def docking_errors(
-    data: SequenceData, truth: Mapping[int, TrueDocking], estimates: Mapping[int, Estimate], key: str
-) -> DockingErrors | None:
-    """The scores of a method; None where it reports no docking quantities.
-
-    Args:
-        data: the truth of the sequences.
-        truth: of docking, by frame.
-        estimates: of the method, by frame.
-        key: of the bootstrap's random streams.
-    """
-    pairs = [
-        DockingPair(index, estimate.docking, truth[index])
-        for index, estimate in sorted(estimates.items())
-        if isinstance(estimate, PoseEstimate) and estimate.docking is not None and index in truth
-    ]
-    if not pairs:
-        return None
-    bin_of, bins = data.groups.bin_of_frame, []
-    for k, place in enumerate(data.groups.bins):
-        inside = [pair for pair in pairs if bin_of[pair.frame_index] == k]
-        if inside:
-            row = _row(data, inside, sum(bin_of[index] == k for index in truth), f"{key}, bin {k}")
-            bins.append(DockingBin(**dict(row), low_m=place.low_m, high_m=place.high_m))
-    return DockingErrors(overall=_row(data, pairs, len(truth), key), bins=tuple(bins))
 
 
 def calibration(errors: Array, deviations: Array) -> Calibration | None:

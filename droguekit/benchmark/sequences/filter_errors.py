@@ -33,6 +33,63 @@ _LEAST_BEND = 1e-12
 # With fewer estimates the lag is unknown; a second at 25 Hz.
 _FEWEST = 25
 _FEWEST_PER_RUN = 5
+# Between the name of a method and that of the filter on its poses.
+_FILTER_SEPARATOR = "+"
+
+
+class SequenceData(NamedTuple):
+    """The truth that all methods are scored with over sequences.
+
+    Attributes:
+        sequences: in the order of their numbers.
+        drogues: of all pairs of the dataset that show one.
+        motions: true ones by frame.
+        groups: the pairs' bins and sequences.
+    """
+
+    sequences: Sequence[TrueSequence]
+    drogues: Mapping[int, DrogueTruth]
+    motions: Mapping[int, TrueMotion]
+    groups: PairGroups
+
+    def sequence_of(self, frame_index: int) -> int:
+        """The number of a pair's sequence."""
+        number = self.groups.sequence_of_frame[frame_index]
+        return -1 if number is None else number
+
+
+class _MotionScore(NamedTuple):
+    frame_index: int
+    error: Array
+    squares: Array | None
+
+
+def filter_errors(data: SequenceData, name: str, methods: Mapping[str, Mapping[int, Estimate]]) -> FilterErrors | None:
+    """The scores of a method that reports motion; None where it does not.
+
+    Args:
+        data: the truth.
+        name: of the method.
+        methods: all of the file.
+    """
+    estimates = {i: e for i, e in methods[name].items() if isinstance(e, PoseEstimate)}
+    if all(estimate.motion is None for estimate in estimates.values()):
+        return None
+    scores = _motion_scores(data, estimates)
+    bins = []
+    for k, place in enumerate(data.groups.bins):
+        inside = [score for score in scores if data.groups.bin_of_frame[score.frame_index] == k]
+        if inside:
+            of = sum(data.groups.bin_of_frame[index] == k for index in data.motions)
+            row = _motion_row(data, inside, of, f"{name}, bin {k}")
+            bins.append(MotionBin(**dict(row), low_m=place.low_m, high_m=place.high_m))
+    return FilterErrors(
+        motion=_motion_row(data, scores, len(data.motions), name) if scores else None,
+        bins=tuple(bins),
+        nees=_motion_nees(data, scores, name) if scores else None,
+        lags=lags(data.sequences, estimates, f"{name}, lag"),
+        raw=_against_raw(data, name, methods),
+    )
 
 
 def lags(sequences: Sequence[TrueSequence], estimates: Mapping[int, PoseEstimate], key: str) -> dict[str, Lag] | None:
@@ -113,65 +170,6 @@ def _vertex(total: Array) -> float | None:
     if bend < _LEAST_BEND:
         return None
     return float(_SHIFTS[k] + (before - after) / (2 * bend) * (_SHIFTS[1] - _SHIFTS[0]))
-
-
-# Between the name of a method and that of the filter on its poses.
-_FILTER_SEPARATOR = "+"
-
-
-class SequenceData(NamedTuple):
-    """The truth that all methods are scored with over sequences.
-
-    Attributes:
-        sequences: in the order of their numbers.
-        drogues: of all pairs of the dataset that show one.
-        motions: true ones by frame.
-        groups: the pairs' bins and sequences.
-    """
-
-    sequences: Sequence[TrueSequence]
-    drogues: Mapping[int, DrogueTruth]
-    motions: Mapping[int, TrueMotion]
-    groups: PairGroups
-
-    def sequence_of(self, frame_index: int) -> int:
-        """The number of a pair's sequence."""
-        number = self.groups.sequence_of_frame[frame_index]
-        return -1 if number is None else number
-
-
-class _MotionScore(NamedTuple):
-    frame_index: int
-    error: Array
-    squares: Array | None
-
-
-def filter_errors(data: SequenceData, name: str, methods: Mapping[str, Mapping[int, Estimate]]) -> FilterErrors | None:
-    """The scores of a method that reports motion; None where it does not.
-
-    Args:
-        data: the truth.
-        name: of the method.
-        methods: all of the file.
-    """
-    estimates = {i: e for i, e in methods[name].items() if isinstance(e, PoseEstimate)}
-    if all(estimate.motion is None for estimate in estimates.values()):
-        return None
-    scores = _motion_scores(data, estimates)
-    bins = []
-    for k, place in enumerate(data.groups.bins):
-        inside = [score for score in scores if data.groups.bin_of_frame[score.frame_index] == k]
-        if inside:
-            of = sum(data.groups.bin_of_frame[index] == k for index in data.motions)
-            row = _motion_row(data, inside, of, f"{name}, bin {k}")
-            bins.append(MotionBin(**dict(row), low_m=place.low_m, high_m=place.high_m))
-    return FilterErrors(
-        motion=_motion_row(data, scores, len(data.motions), name) if scores else None,
-        bins=tuple(bins),
-        nees=_motion_nees(data, scores, name) if scores else None,
-        lags=lags(data.sequences, estimates, f"{name}, lag"),
-        raw=_against_raw(data, name, methods),
-    )
 
 
 def _motion_scores(data: SequenceData, estimates: Mapping[int, PoseEstimate]) -> list[_MotionScore]:

@@ -28,9 +28,19 @@ from geometry.stereo import EYES, Eye, StereoRig
 Visibility = Literal["seen", "partly", "hidden", "dazzled"]
 """`seen`: enough of the drogue to be found; `hidden`: nothing of the drogue, or of none of its markers; `dazzled`: the
 sun in the lens may outshine it, so that neither a pose nor its absence is wrong."""
-
 # A pair that comes later than this many periods follows a gap.
 _GAP_PERIODS = 1.5
+# Of 2, 3, 4, 5, 6 and 8 pairs at 25 Hz, 4 and 2 err least against the simulated motion of docking runs without its
+# vibration: attitude follows gusts faster than the place does.
+KNOT_S = 0.16
+"""From knot to knot of the spline through places. [s]"""
+RATE_KNOT_S = 0.08
+"""The same through rates. [s]"""
+# Four pairs in 0.2 s, which is 20 Hz; over fewer, vibration does not average out. The rest is room for rounding.
+_LONGEST_PERIOD_S = 0.0501
+_DEGREE = 3
+MOTION_PARTS: Parts = {"velocity": slice(0, 3), "rate": slice(3, 6), "motion": slice(0, 6)}
+"""Of errors and covariances of a motion."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +125,21 @@ class TrueSequence:
             yield tuple(run)
 
 
+@dataclass(frozen=True, eq=False)
+class TrueMotion:
+    """Motion of the drogue relative to the left camera at one pair.
+
+    Attributes:
+        velocity_m_s: (3,) of its origin, in the left camera. [m/s]
+        rate_rad_s: (3,) `R' = [w]x R`, in the left camera. [rad/s]
+        vibration_m_s: (3,) velocity of the instant minus `velocity_m_s`; None where it is not known. [m/s]
+    """
+
+    velocity_m_s: Array
+    rate_rad_s: Array
+    vibration_m_s: Array | None
+
+
 def true_state(record: PairRecord) -> TrueState | None:
     """A record as the true state of a pair in its sequence; None where it belongs to none."""
     if record.sequence_id is None:
@@ -153,45 +178,19 @@ def true_sequences(states: Iterable[TrueState | None]) -> tuple[TrueSequence, ..
     return tuple(_sequence(number, by_id[number]) for number in sorted(by_id) if len(by_id[number]) > 1)
 
 
-def _sequence(number: int, states: list[TrueState]) -> TrueSequence:
-    ordered = sorted(states, key=lambda one: one.time_s)
-    steps = np.diff([one.time_s for one in ordered])
-    if not (steps > 0).all():
-        at = ordered[int(np.argmin(steps))].frame_index
-        raise ValueError(f"frame {at}: time_s: must differ from that of the next pair of sequence {number}")
-    # A mean of two steps is the length of neither, where one of them is a gap.
-    return TrueSequence(number, float(np.percentile(steps, 50, method="lower")), tuple(ordered))
+def true_motions(sequences: Sequence[TrueSequence]) -> dict[int, TrueMotion]:
+    """Motion by frame; none within `KNOT_S` of the ends of a run of pairs, nor of pairs at less than 20 Hz."""
+    motions: dict[int, TrueMotion] = {}
+    for sequence in sequences:
+        if sequence.period_s <= _LONGEST_PERIOD_S:
+            for run in sequence.runs():
+                motions |= _run_motions(run, sequence.period_s)
+    return motions
 
 
-# Of 2, 3, 4, 5, 6 and 8 pairs at 25 Hz, 4 and 2 err least against the simulated motion of docking runs without its
-# vibration: attitude follows gusts faster than the place does.
-KNOT_S = 0.16
-"""From knot to knot of the spline through places. [s]"""
-RATE_KNOT_S = 0.08
-"""The same through rates. [s]"""
-# Four pairs in 0.2 s, which is 20 Hz; over fewer, vibration does not average out. The rest is room for rounding.
-_LONGEST_PERIOD_S = 0.0501
-_DEGREE = 3
-
-
-@dataclass(frozen=True, eq=False)
-class TrueMotion:
-    """Motion of the drogue relative to the left camera at one pair.
-
-    Attributes:
-        velocity_m_s: (3,) of its origin, in the left camera. [m/s]
-        rate_rad_s: (3,) `R' = [w]x R`, in the left camera. [rad/s]
-        vibration_m_s: (3,) velocity of the instant minus `velocity_m_s`; None where it is not known. [m/s]
-    """
-
-    velocity_m_s: Array
-    rate_rad_s: Array
-    vibration_m_s: Array | None
-
-
-def pairs_per_knot(period_s: float, knot_s: float = KNOT_S) -> int:
-    """Number of pairs from knot to knot, at least one."""
-    return max(1, round(knot_s / period_s))
+def motion_errors(motion: Motion, truth: TrueMotion) -> Array:
+    """(6,) estimate minus truth: velocity [m/s], then rate [rad/s]."""
+    return np.concatenate([motion.velocity_m_s - truth.velocity_m_s, motion.rate_rad_s - truth.rate_rad_s])
 
 
 def smoothing_spline(times_s: Array, values: Array, period_s: float, knot_s: float = KNOT_S) -> BSpline:
@@ -212,23 +211,19 @@ def smoothing_spline(times_s: Array, values: Array, period_s: float, knot_s: flo
     return make_lsq_spline(times_s, values, knots, k=_DEGREE)
 
 
-def true_motions(sequences: Sequence[TrueSequence]) -> dict[int, TrueMotion]:
-    """Motion by frame; none within `KNOT_S` of the ends of a run of pairs, nor of pairs at less than 20 Hz."""
-    motions: dict[int, TrueMotion] = {}
-    for sequence in sequences:
-        if sequence.period_s <= _LONGEST_PERIOD_S:
-            for run in sequence.runs():
-                motions |= _run_motions(run, sequence.period_s)
-    return motions
+def pairs_per_knot(period_s: float, knot_s: float = KNOT_S) -> int:
+    """Number of pairs from knot to knot, at least one."""
+    return max(1, round(knot_s / period_s))
 
 
-def motion_errors(motion: Motion, truth: TrueMotion) -> Array:
-    """(6,) estimate minus truth: velocity [m/s], then rate [rad/s]."""
-    return np.concatenate([motion.velocity_m_s - truth.velocity_m_s, motion.rate_rad_s - truth.rate_rad_s])
-
-
-MOTION_PARTS: Parts = {"velocity": slice(0, 3), "rate": slice(3, 6), "motion": slice(0, 6)}
-"""Of errors and covariances of a motion."""
+def _sequence(number: int, states: list[TrueState]) -> TrueSequence:
+    ordered = sorted(states, key=lambda one: one.time_s)
+    steps = np.diff([one.time_s for one in ordered])
+    if not (steps > 0).all():
+        at = ordered[int(np.argmin(steps))].frame_index
+        raise ValueError(f"frame {at}: time_s: must differ from that of the next pair of sequence {number}")
+    # A mean of two steps is the length of neither, where one of them is a gap.
+    return TrueSequence(number, float(np.percentile(steps, 50, method="lower")), tuple(ordered))
 
 
 def _run_motions(run: Sequence[TrueState], period_s: float) -> dict[int, TrueMotion]:

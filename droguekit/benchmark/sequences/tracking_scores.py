@@ -40,49 +40,15 @@ NORMALIZED_ERRORS: Array = np.linspace(0.0, 0.5, 51)
 PRECISION_AT_PX = 20.0
 """Where the precision plot is read off. [px]"""
 NO_BOX = (np.nan, np.nan, np.nan, np.nan)
-
-
-def center_errors_px(found: Array, truth: Array) -> Array:
-    """(n,) distances of the centres of (n, 4) boxes; infinite where a box is `NO_BOX`. [px]"""
-    return _lengths(_center_offsets(found, truth))
-
-
-def normalized_center_errors(found: Array, truth: Array) -> Array:
-    """(n,) the same with offsets to the side over the true box's width, and up or down over its height."""
-    return _lengths(_center_offsets(found, truth) / truth[:, 2:])
-
-
-def success_curve(overlap: Array) -> Array:
-    """(21,) share of the images whose overlap is larger than each of `OVERLAPS`."""
-    return _shares(overlap[:, None] > OVERLAPS)
-
-
-def precision_curve(errors: Array, limits: Array) -> Array:
-    """(len(limits),) share of the images whose error is at most each of the limits."""
-    return _shares(errors[:, None] <= limits)
-
-
-def _center_offsets(found: Array, truth: Array) -> Array:
-    offsets: Array = found[:, :2] + found[:, 2:] / 2 - truth[:, :2] - truth[:, 2:] / 2
-    return offsets
-
-
-def _lengths(offsets: Array) -> Array:
-    lengths: Array = np.nan_to_num(np.hypot(offsets[:, 0], offsets[:, 1]), nan=np.inf)
-    return lengths
-
-
-def _shares(passed: NDArray[np.bool_]) -> Array:
-    shares: Array = np.mean(passed, axis=0)
-    return shares
-
-
 LEAST_TRACKED_OVERLAP = 0.1
 """A box that overlaps the true one by less has lost the drogue (our choice)."""
 LEAST_FOUND_OVERLAP = 0.5
 """A box with at least this overlap has found the drogue again, as for a detector."""
 REACQUISITION_LIMIT_FRAMES = 3
 """A drogue should be found again within so many frames."""
+StageTimes = Mapping[int, Mapping[str, float]]
+# Stages of an estimate that detect or track the box, or update the tracker.
+_BOX_STAGES = frozenset({"detect", "track", "correct"})
 
 
 @dataclass(frozen=True)
@@ -91,6 +57,9 @@ class SourcedBox:
 
     box_px: PixelBox
     source: str
+
+
+Boxes = Mapping[tuple[int, Eye], SourcedBox]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +93,41 @@ class EyeTrack:
         return intersection_over_union(self.found, self.truth)
 
 
+def score_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> Tracking:
+    """Scores of the regions that a method reports; without any, the drogue counts as lost everywhere.
+
+    Args:
+        sequences: the truth.
+        estimates: of the method, by frame.
+    """
+    boxes = {
+        (index, region.eye): SourcedBox(region.box_xywh_px, region.source)
+        for index, estimate in estimates.items()
+        # Of several in one eye the last one stays, which is the best.
+        for region in sorted(estimate.regions, key=lambda region: region.score)
+        if _has_area(region)
+    }
+    return _tracking(sequences, boxes, {i: estimate.stage_s for i, estimate in estimates.items()})
+
+
+def score_detected_boxes(
+    sequences: Sequence[TrueSequence], found: Iterable[DetectedBox], threshold: float
+) -> Tracking | None:
+    """Scores of detected boxes: the best box of each image, if its score reaches the threshold.
+
+    Returns:
+        None without sequences.
+    """
+    if not sequences:
+        return None
+    best: dict[tuple[int, Eye], SourcedBox] = {}
+    for box in sorted(found, key=lambda box: box.score):
+        if box.score >= threshold:
+            frame, eye = divmod(box.image_id - 1, len(EYES))
+            best[frame, EYES[eye]] = SourcedBox(center_box(box.box_xywh), "")
+    return _tracking(sequences, best, {})
+
+
 def eye_tracks(
     sequences: Iterable[TrueSequence], boxes: Mapping[tuple[int, Eye], SourcedBox]
 ) -> dict[Eye, list[EyeTrack]]:
@@ -141,19 +145,6 @@ def both_eyes_tracking(by_eye: Mapping[Eye, Sequence[EyeTrack]]) -> EyeTracking:
     losses = [found for found in map(_losses, by_eye.values()) if found is not None]
     worse = max(losses, key=lambda found: (found.count, found.per_minute), default=None)
     return _track_scores([track for eye in EYES for track in by_eye[eye]], worse, "both eyes")
-
-
-def _track_scores(tracks: Sequence[EyeTrack], losses: TrackLosses | None, key: str) -> EyeTracking:
-    boxed = [box is not None for track in tracks for box in track.sources]
-    hidden = [visibility == "hidden" for track in tracks for visibility in track.visibilities]
-    found = [(track.overlap >= LEAST_FOUND_OVERLAP).tolist() for track in tracks]
-    return EyeTracking(
-        overlap=overlap_row(tracks, lambda track: track.seen, key),
-        losses=losses,
-        reacquisition=reacquisition((track.visibilities, hits) for track, hits in zip(tracks, found, strict=True)),
-        hidden=sum(hidden),
-        hidden_with_box=sum(h and b for h, b in zip(hidden, boxed, strict=True)),
-    )
 
 
 def overlap_row(
@@ -203,6 +194,54 @@ def reacquisition(courses: Iterable[tuple[Sequence[Visibility], Sequence[bool]]]
         within_3=sum(delay <= REACQUISITION_LIMIT_FRAMES for delay in came),
         median_frames=float(np.median(came)) if came else None,
         max_frames=max(came, default=None),
+    )
+
+
+def center_errors_px(found: Array, truth: Array) -> Array:
+    """(n,) distances of the centres of (n, 4) boxes; infinite where a box is `NO_BOX`. [px]"""
+    return _lengths(_center_offsets(found, truth))
+
+
+def normalized_center_errors(found: Array, truth: Array) -> Array:
+    """(n,) the same with offsets to the side over the true box's width, and up or down over its height."""
+    return _lengths(_center_offsets(found, truth) / truth[:, 2:])
+
+
+def success_curve(overlap: Array) -> Array:
+    """(21,) share of the images whose overlap is larger than each of `OVERLAPS`."""
+    return _shares(overlap[:, None] > OVERLAPS)
+
+
+def precision_curve(errors: Array, limits: Array) -> Array:
+    """(len(limits),) share of the images whose error is at most each of the limits."""
+    return _shares(errors[:, None] <= limits)
+
+
+def _center_offsets(found: Array, truth: Array) -> Array:
+    offsets: Array = found[:, :2] + found[:, 2:] / 2 - truth[:, :2] - truth[:, 2:] / 2
+    return offsets
+
+
+def _lengths(offsets: Array) -> Array:
+    lengths: Array = np.nan_to_num(np.hypot(offsets[:, 0], offsets[:, 1]), nan=np.inf)
+    return lengths
+
+
+def _shares(passed: NDArray[np.bool_]) -> Array:
+    shares: Array = np.mean(passed, axis=0)
+    return shares
+
+
+def _track_scores(tracks: Sequence[EyeTrack], losses: TrackLosses | None, key: str) -> EyeTracking:
+    boxed = [box is not None for track in tracks for box in track.sources]
+    hidden = [visibility == "hidden" for track in tracks for visibility in track.visibilities]
+    found = [(track.overlap >= LEAST_FOUND_OVERLAP).tolist() for track in tracks]
+    return EyeTracking(
+        overlap=overlap_row(tracks, lambda track: track.seen, key),
+        losses=losses,
+        reacquisition=reacquisition((track.visibilities, hits) for track, hits in zip(tracks, found, strict=True)),
+        hidden=sum(hidden),
+        hidden_with_box=sum(h and b for h, b in zip(hidden, boxed, strict=True)),
     )
 
 
@@ -273,48 +312,6 @@ def _on_image(box: SourcedBox | None, size_px: tuple[int, int]) -> SourcedBox | 
         return None
     clipped = clipped_box(corner_box(box.box_px), size_px)
     return None if clipped is None else SourcedBox(center_box(clipped), box.source)
-
-
-Boxes = Mapping[tuple[int, Eye], SourcedBox]
-StageTimes = Mapping[int, Mapping[str, float]]
-
-# Stages of an estimate that detect or track the box, or update the tracker.
-_BOX_STAGES = frozenset({"detect", "track", "correct"})
-
-
-def score_regions(sequences: Sequence[TrueSequence], estimates: Mapping[int, Estimate]) -> Tracking:
-    """Scores of the regions that a method reports; without any, the drogue counts as lost everywhere.
-
-    Args:
-        sequences: the truth.
-        estimates: of the method, by frame.
-    """
-    boxes = {
-        (index, region.eye): SourcedBox(region.box_xywh_px, region.source)
-        for index, estimate in estimates.items()
-        # Of several in one eye the last one stays, which is the best.
-        for region in sorted(estimate.regions, key=lambda region: region.score)
-        if _has_area(region)
-    }
-    return _tracking(sequences, boxes, {i: estimate.stage_s for i, estimate in estimates.items()})
-
-
-def score_detected_boxes(
-    sequences: Sequence[TrueSequence], found: Iterable[DetectedBox], threshold: float
-) -> Tracking | None:
-    """Scores of detected boxes: the best box of each image, if its score reaches the threshold.
-
-    Returns:
-        None without sequences.
-    """
-    if not sequences:
-        return None
-    best: dict[tuple[int, Eye], SourcedBox] = {}
-    for box in sorted(found, key=lambda box: box.score):
-        if box.score >= threshold:
-            frame, eye = divmod(box.image_id - 1, len(EYES))
-            best[frame, EYES[eye]] = SourcedBox(center_box(box.box_xywh), "")
-    return _tracking(sequences, best, {})
 
 
 def _tracking(sequences: Sequence[TrueSequence], boxes: Boxes, stages_s: StageTimes) -> Tracking:

@@ -37,6 +37,55 @@ _P99_MM = 3.0
 _NEIGHBOURS = 25
 # A pose whose error is a larger share of the distance has not found the drogue again (our choice).
 _FOUND_FRACTION = 0.1
+# A tenth of what the paper's Table 2 gives for its 7 markers: 40 mm, 40 mm, 1.03 % of Z.
+_TABLE_2 = (("|X| error [mm]", 4.0), ("|Y| error [mm]", 4.0), ("|Z| error [% of Z]", 0.103))
+_UNFIXED = 0.005
+# Of fewer fixes a mean has no limit.
+_FEWEST_FIXES = 2
+# Beyond 5 m, and at 2 m within a tenth. [m], [ms]
+_SPEEDS = ((5.0, np.inf, 30.0, "beyond 5 m"), (1.8, 2.2, 70.0, "at 2 m"))
+# Of recipes without sequences, the bench's: ten sets at each of its nine stations.
+_BENCH_PART = 90
+Rows = Callable[[str, Scores, bool], list[AcceptanceRow]]
+# What is aimed at, our choice: half a pair at 25 a second, and a loss in as long as a docking takes.
+_LAG_S, _LOSSES_PER_MINUTE = 0.02, 1.0
+_NEES = (0.85, 1.20)
+
+
+@dataclass(frozen=True)
+class FlightData:
+    """One recipe that criteria are measured on.
+
+    Attributes:
+        recipe: name of a shipped one, or a file.
+        parts: how many sequences, or parts of 90 pairs of a bench, a full measurement takes.
+        rows: which criteria.
+        follows: whether it has sequences, for tracker and filter.
+        times: whether processing times are judged.
+        compares: whether all methods are measured on the same pairs for comparison.
+    """
+
+    recipe: str
+    parts: int
+    rows: Rows
+    follows: bool = True
+    times: bool = False
+    compares: bool = False
+
+
+def part_length(recipe: Recipe) -> int:
+    """How many pairs one sequence, or one part of a bench, has."""
+    return _BENCH_PART if recipe.sequence is None else recipe.sequence.frames_per_sequence
+
+
+def with_parts(recipe: Recipe, parts: int) -> Recipe:
+    """The recipe with at least that many sequences; each added one has a scene of its own."""
+    wanted = parts * part_length(recipe)
+    if wanted <= recipe.frames.count:
+        return recipe
+    scenes = max(recipe.frames.scenes, parts)
+    frames = FrameCounts.model_validate({**recipe.frames.model_dump(), "count": wanted, "scenes": scenes})
+    return recipe.model_copy(update={"frames": frames})
 
 
 def approach_rows(title: str, scores: Scores, is_comparison: bool) -> list[AcceptanceRow]:
@@ -101,6 +150,103 @@ def lost_rows(title: str, scores: Scores, is_comparison: bool) -> list[Acceptanc
             _overconfidence_row(label, pairs, compared_only),
         ]
     return rows
+
+
+def bench_rows(title: str, scores: Scores, is_comparison: bool) -> list[AcceptanceRow]:
+    """Criterion 26: mean absolute errors at the worst station of a bench, and the share of pairs without a pose.
+
+    Every station must have poses.
+    """
+    rows = []
+    for name, pairs in scores.items():
+        bar = COMPARISON if is_comparison or name != BEST else "26"
+        fixed = [pair for pair in pairs if pair.error is not None]
+        missing = len(pairs) - len(fixed)
+        failed = f"; {missing} of {len(pairs)} pairs without a pose" if missing else ""
+        stations = {z: [pair for pair in fixed if _station_m(pair) == z] for z in sorted(set(map(_station_m, pairs)))}
+        bare = ", ".join(f"{z:g} m" for z, there in stations.items() if len(there) < _FEWEST_FIXES)
+        for axis, (quantity, high) in enumerate(_TABLE_2):
+            label = f"{title}, {name}: mean {quantity}, worst station"
+            if bare or not stations:
+                why = f"too few poses at {bare}" if bare else "there are no pairs"
+                rows.append(not_measured(bar, label, high, why))
+                continue
+            means = [(f"{z:g} m", *_mean_error(there, axis)) for z, there in stations.items()]
+            where, value, limit = worst(means)
+            rows.append(at_most(bar, label, high, (value, limit), len(fixed), f"{where}{failed}"))
+        share = f"{title}, {name}: share of pairs without a pose"
+        rows.append(
+            at_most(bar, share, _UNFIXED, share_limit(missing, len(pairs)), len(pairs))
+            if pairs
+            else not_measured(bar, share, _UNFIXED, "there are no pairs")
+        )
+    return rows
+
+
+FLIGHT_TIERS: dict[str, tuple[FlightData, ...]] = {
+    "e": (FlightData("pose-tier-e", 20, approach_rows),),
+    "docking": (
+        FlightData("docking-10m", 4, approach_rows, times=True, compares=True),
+        FlightData("docking-conditions", 12, condition_rows),
+        FlightData("drogue-lost", 6, lost_rows),
+        FlightData("semi-physical-5", 10, bench_rows, follows=False),
+        FlightData("semi-physical-7", 10, bench_rows, follows=False),
+    ),
+}
+
+
+def processing_time_rows(title: str, pairs: Sequence[ScoredPair], is_comparison: bool) -> list[AcceptanceRow]:
+    """Criterion 27: median processing time of a pair, by distance; pairs without a pose count."""
+    rows = []
+    for low_m, high_m, bar_ms, where in _SPEEDS:
+        told = [
+            (1e3 * pair.work_s, pair.pair.sequence_id)
+            for pair in pairs
+            if pair.work_s is not None and low_m <= pair.pair.distance_m <= high_m
+        ]
+        bar, quantity = COMPARISON if is_comparison else "27", f"{title}: median time of a pair {where} [ms]"
+        if not told:
+            rows.append(not_measured(bar, quantity, bar_ms, "no pair there tells its time"))
+            continue
+        took, flights = zip(*told, strict=True)
+        rows.append(at_most(bar, quantity, bar_ms, block_percentile_limit(took, flights, 50.0, quantity), len(took)))
+    return rows
+
+
+def tracking_filter_rows(title: str, scores: Scores, result: BenchmarkResult) -> list[AcceptanceRow]:
+    """Goals of tracker and filter on one dataset; goals without a measurement are left out.
+
+    Args:
+        title: of the data.
+        scores: by method, of pairs in view and out of it.
+        result: of the benchmark of the same estimates.
+    """
+    sequences = result.sequences
+    if sequences is None:
+        return []
+    rows = []
+    for name, method in sequences.methods.items():
+        label = f"{title}, {name}"
+        if name == BEST and method.tracking is not None and method.tracking.both.losses is not None:
+            losses = method.tracking.both.losses
+            measured = losses.per_minute, losses.per_minute_interval[1]
+            rows.append(
+                at_most(GOAL, f"{label}: losses of the tracker per minute", _LOSSES_PER_MINUTE, measured, losses.count)
+            )
+        if name != FILTERED or method.filtering is None:
+            continue
+        filtering = method.filtering
+        nees = None if filtering.nees is None else filtering.nees.motion
+        if nees is not None and filtering.nees is not None:
+            ends = filtering.nees.interval or (nees.per_freedom, nees.per_freedom)
+            quantity = f"{label}: NEES/dof of velocity and rate"
+            rows.append(between(GOAL, quantity, _NEES, (nees.per_freedom, *ends), filtering.nees.n))
+        for component, lag in (filtering.lags or {}).items():
+            if lag.lag_s is not None:
+                high_s = max(abs(end) for end in lag.interval or (lag.lag_s,))
+                quantity = f"{label}: lag of {component} [s]"
+                rows.append(at_most(GOAL, quantity, _LAG_S, (abs(lag.lag_s), high_s), sequences.count))
+    return [*rows, *_filter_gain_rows(title, scores)]
 
 
 def bound_ratio(pairs: Iterable[ScoredPair]) -> tuple[str, ValueWithLimit, int] | None:
@@ -209,64 +355,6 @@ def _failures(seen: Sequence[ScoredPair]) -> str:
     return f"{missing} of {len(seen)} pairs without a pose" if missing else ""
 
 
-# A tenth of what the paper's Table 2 gives for its 7 markers: 40 mm, 40 mm, 1.03 % of Z.
-_TABLE_2 = (("|X| error [mm]", 4.0), ("|Y| error [mm]", 4.0), ("|Z| error [% of Z]", 0.103))
-_UNFIXED = 0.005
-# Of fewer fixes a mean has no limit.
-_FEWEST_FIXES = 2
-# Beyond 5 m, and at 2 m within a tenth. [m], [ms]
-_SPEEDS = ((5.0, np.inf, 30.0, "beyond 5 m"), (1.8, 2.2, 70.0, "at 2 m"))
-
-
-def bench_rows(title: str, scores: Scores, is_comparison: bool) -> list[AcceptanceRow]:
-    """Criterion 26: mean absolute errors at the worst station of a bench, and the share of pairs without a pose.
-
-    Every station must have poses.
-    """
-    rows = []
-    for name, pairs in scores.items():
-        bar = COMPARISON if is_comparison or name != BEST else "26"
-        fixed = [pair for pair in pairs if pair.error is not None]
-        missing = len(pairs) - len(fixed)
-        failed = f"; {missing} of {len(pairs)} pairs without a pose" if missing else ""
-        stations = {z: [pair for pair in fixed if _station_m(pair) == z] for z in sorted(set(map(_station_m, pairs)))}
-        bare = ", ".join(f"{z:g} m" for z, there in stations.items() if len(there) < _FEWEST_FIXES)
-        for axis, (quantity, high) in enumerate(_TABLE_2):
-            label = f"{title}, {name}: mean {quantity}, worst station"
-            if bare or not stations:
-                why = f"too few poses at {bare}" if bare else "there are no pairs"
-                rows.append(not_measured(bar, label, high, why))
-                continue
-            means = [(f"{z:g} m", *_mean_error(there, axis)) for z, there in stations.items()]
-            where, value, limit = worst(means)
-            rows.append(at_most(bar, label, high, (value, limit), len(fixed), f"{where}{failed}"))
-        share = f"{title}, {name}: share of pairs without a pose"
-        rows.append(
-            at_most(bar, share, _UNFIXED, share_limit(missing, len(pairs)), len(pairs))
-            if pairs
-            else not_measured(bar, share, _UNFIXED, "there are no pairs")
-        )
-    return rows
-
-
-def processing_time_rows(title: str, pairs: Sequence[ScoredPair], is_comparison: bool) -> list[AcceptanceRow]:
-    """Criterion 27: median processing time of a pair, by distance; pairs without a pose count."""
-    rows = []
-    for low_m, high_m, bar_ms, where in _SPEEDS:
-        told = [
-            (1e3 * pair.work_s, pair.pair.sequence_id)
-            for pair in pairs
-            if pair.work_s is not None and low_m <= pair.pair.distance_m <= high_m
-        ]
-        bar, quantity = COMPARISON if is_comparison else "27", f"{title}: median time of a pair {where} [ms]"
-        if not told:
-            rows.append(not_measured(bar, quantity, bar_ms, "no pair there tells its time"))
-            continue
-        took, flights = zip(*told, strict=True)
-        rows.append(at_most(bar, quantity, bar_ms, block_percentile_limit(took, flights, 50.0, quantity), len(took)))
-    return rows
-
-
 def _station_m(pair: ScoredPair) -> float:
     return round(pair.pair.distance_m, 3)
 
@@ -278,101 +366,6 @@ def _mean_error(pairs: Sequence[ScoredPair], axis: int) -> ValueWithLimit:
             scale = 100.0 / pair.pair.distance_m if axis == 2 else 1e3
             errors.append(scale * abs(float(pair.error[axis])))
     return mean_limit(errors)
-
-
-# Of recipes without sequences, the bench's: ten sets at each of its nine stations.
-_BENCH_PART = 90
-
-Rows = Callable[[str, Scores, bool], list[AcceptanceRow]]
-
-
-@dataclass(frozen=True)
-class FlightData:
-    """One recipe that criteria are measured on.
-
-    Attributes:
-        recipe: name of a shipped one, or a file.
-        parts: how many sequences, or parts of 90 pairs of a bench, a full measurement takes.
-        rows: which criteria.
-        follows: whether it has sequences, for tracker and filter.
-        times: whether processing times are judged.
-        compares: whether all methods are measured on the same pairs for comparison.
-    """
-
-    recipe: str
-    parts: int
-    rows: Rows
-    follows: bool = True
-    times: bool = False
-    compares: bool = False
-
-
-FLIGHT_TIERS: dict[str, tuple[FlightData, ...]] = {
-    "e": (FlightData("pose-tier-e", 20, approach_rows),),
-    "docking": (
-        FlightData("docking-10m", 4, approach_rows, times=True, compares=True),
-        FlightData("docking-conditions", 12, condition_rows),
-        FlightData("drogue-lost", 6, lost_rows),
-        FlightData("semi-physical-5", 10, bench_rows, follows=False),
-        FlightData("semi-physical-7", 10, bench_rows, follows=False),
-    ),
-}
-
-
-def part_length(recipe: Recipe) -> int:
-    """How many pairs one sequence, or one part of a bench, has."""
-    return _BENCH_PART if recipe.sequence is None else recipe.sequence.frames_per_sequence
-
-
-def with_parts(recipe: Recipe, parts: int) -> Recipe:
-    """The recipe with at least that many sequences; each added one has a scene of its own."""
-    wanted = parts * part_length(recipe)
-    if wanted <= recipe.frames.count:
-        return recipe
-    scenes = max(recipe.frames.scenes, parts)
-    frames = FrameCounts.model_validate({**recipe.frames.model_dump(), "count": wanted, "scenes": scenes})
-    return recipe.model_copy(update={"frames": frames})
-
-
-# What is aimed at, our choice: half a pair at 25 a second, and a loss in as long as a docking takes.
-_LAG_S, _LOSSES_PER_MINUTE = 0.02, 1.0
-_NEES = (0.85, 1.20)
-
-
-def tracking_filter_rows(title: str, scores: Scores, result: BenchmarkResult) -> list[AcceptanceRow]:
-    """Goals of tracker and filter on one dataset; goals without a measurement are left out.
-
-    Args:
-        title: of the data.
-        scores: by method, of pairs in view and out of it.
-        result: of the benchmark of the same estimates.
-    """
-    sequences = result.sequences
-    if sequences is None:
-        return []
-    rows = []
-    for name, method in sequences.methods.items():
-        label = f"{title}, {name}"
-        if name == BEST and method.tracking is not None and method.tracking.both.losses is not None:
-            losses = method.tracking.both.losses
-            measured = losses.per_minute, losses.per_minute_interval[1]
-            rows.append(
-                at_most(GOAL, f"{label}: losses of the tracker per minute", _LOSSES_PER_MINUTE, measured, losses.count)
-            )
-        if name != FILTERED or method.filtering is None:
-            continue
-        filtering = method.filtering
-        nees = None if filtering.nees is None else filtering.nees.motion
-        if nees is not None and filtering.nees is not None:
-            ends = filtering.nees.interval or (nees.per_freedom, nees.per_freedom)
-            quantity = f"{label}: NEES/dof of velocity and rate"
-            rows.append(between(GOAL, quantity, _NEES, (nees.per_freedom, *ends), filtering.nees.n))
-        for component, lag in (filtering.lags or {}).items():
-            if lag.lag_s is not None:
-                high_s = max(abs(end) for end in lag.interval or (lag.lag_s,))
-                quantity = f"{label}: lag of {component} [s]"
-                rows.append(at_most(GOAL, quantity, _LAG_S, (abs(lag.lag_s), high_s), sequences.count))
-    return [*rows, *_filter_gain_rows(title, scores)]
 
 
 def _filter_gain_rows(title: str, scores: Scores) -> list[AcceptanceRow]:

@@ -36,6 +36,17 @@ from studies.acceptance.rendered.scored_frames import (
 )
 
 NEAR_M, FAR_M = 1.7, 40.0
+# Z [m], transverse [m], pitch and yaw [deg] at each distance that rendered daylight should allow.
+_GOALS = {
+    2.0: (0.015e-3, 0.010e-3, 0.005),
+    5.0: (0.15e-3, 0.024e-3, 0.012),
+    10.0: (0.9e-3, 0.06e-3, 0.04),
+    20.0: (5e-3, 0.20e-3, 0.09),
+    40.0: (40e-3, 1.0e-3, 0.3),
+}
+_POSITION, _ATTITUDE = COMPONENTS[:3], COMPONENTS[3:]
+# Stations lie in bins of their own; a bin counts as within a distance when its upper end does, by this leeway.
+_LEEWAY = 1.02
 
 
 class LightLevel(StrEnum):
@@ -65,6 +76,55 @@ class ImageScores:
     def title(self, quantity: str) -> str:
         """A quantity with the light in front."""
         return f"{self.light}: {quantity}"
+
+
+@dataclass(frozen=True)
+class TierData:
+    """One dataset of a tier with its estimates and benchmark result."""
+
+    light: LightLevel
+    dataset: Path
+    estimates: Path
+    result: BenchmarkResult
+
+
+def tier_a_rows(data: TierData) -> list[AcceptanceRow]:
+    """Criteria 1, 4, 5, 6 and 9 on one dataset.
+
+    Raises:
+        ValueError: estimates that cannot be read, or that lack a method.
+    """
+    images = _image_scores(data)
+    return [
+        *centroid_bound_rows(images),
+        *chain_rows(images, 1 / 5 if data.light == "day" else 1 / 2.5),
+        *normalized_error_rows(data.light, data.result),
+    ]
+
+
+def tier_b_rows(data: TierData) -> list[AcceptanceRow]:
+    """Criteria 2, 3, 4, 8, 13, 14 and 15 on one dataset, and in daylight the goals by distance.
+
+    Raises:
+        ValueError: estimates that cannot be read, or that lack a method.
+    """
+    images, day = _image_scores(data), data.light == "day"
+    return [
+        *centroid_rows(images),
+        *chain_rows(images, 1 / 4 if day else 1 / 3),
+        *normalized_near_rows(data.light, data.result),
+        *absolute_rows(images),
+        *paper_rows(images),
+        *(goal_rows(images) if day else []),
+    ]
+
+
+IMAGE_TIERS: dict[str, Callable[[TierData], list[AcceptanceRow]]] = {"a": tier_a_rows, "b": tier_b_rows}
+
+
+def recipe_of(tier: str, light: str) -> str:
+    """Name of the recipe that a tier renders."""
+    return f"pose-tier-{tier}" if light == "day" else f"pose-tier-{tier}-{light}"
 
 
 def centroid_bound_rows(images: ImageScores) -> list[AcceptanceRow]:
@@ -155,16 +215,6 @@ def paper_rows(images: ImageScores) -> list[AcceptanceRow]:
     return [at_most("15", quantity, bar, (ratio, ratio if ends is None else ends[1]), len(common))]
 
 
-# Z [m], transverse [m], pitch and yaw [deg] at each distance that rendered daylight should allow.
-_GOALS = {
-    2.0: (0.015e-3, 0.010e-3, 0.005),
-    5.0: (0.15e-3, 0.024e-3, 0.012),
-    10.0: (0.9e-3, 0.06e-3, 0.04),
-    20.0: (5e-3, 0.20e-3, 0.09),
-    40.0: (40e-3, 1.0e-3, 0.3),
-}
-
-
 def goal_rows(images: ImageScores) -> list[AcceptanceRow]:
     """Goals by distance."""
     rows = []
@@ -232,11 +282,6 @@ def _none(bar: str, quantity: str, high: float) -> AcceptanceRow:
     return not_measured(bar, quantity, high, "nothing was measured there")
 
 
-_POSITION, _ATTITUDE = COMPONENTS[:3], COMPONENTS[3:]
-# Stations lie in bins of their own; a bin counts as within a distance when its upper end does, by this leeway.
-_LEEWAY = 1.02
-
-
 def normalized_error_rows(name: str, result: BenchmarkResult) -> list[AcceptanceRow]:
     """Criteria 5, 6 and 9."""
     bins = result.methods[BEST].bins
@@ -299,55 +344,6 @@ def _pooled(bar: str, quantity: str, names: Sequence[str], high: float, bins: Se
     means = np.sqrt(counts @ squares / counts.sum())
     value, n = float(means.max()), int(counts.sum())
     return at_most(bar, quantity, high, (value, rms_upper_limit(value, n)), n, names[int(means.argmax())])
-
-
-@dataclass(frozen=True)
-class TierData:
-    """One dataset of a tier with its estimates and benchmark result."""
-
-    light: LightLevel
-    dataset: Path
-    estimates: Path
-    result: BenchmarkResult
-
-
-def recipe_of(tier: str, light: str) -> str:
-    """Name of the recipe that a tier renders."""
-    return f"pose-tier-{tier}" if light == "day" else f"pose-tier-{tier}-{light}"
-
-
-def tier_a_rows(data: TierData) -> list[AcceptanceRow]:
-    """Criteria 1, 4, 5, 6 and 9 on one dataset.
-
-    Raises:
-        ValueError: estimates that cannot be read, or that lack a method.
-    """
-    images = _image_scores(data)
-    return [
-        *centroid_bound_rows(images),
-        *chain_rows(images, 1 / 5 if data.light == "day" else 1 / 2.5),
-        *normalized_error_rows(data.light, data.result),
-    ]
-
-
-def tier_b_rows(data: TierData) -> list[AcceptanceRow]:
-    """Criteria 2, 3, 4, 8, 13, 14 and 15 on one dataset, and in daylight the goals by distance.
-
-    Raises:
-        ValueError: estimates that cannot be read, or that lack a method.
-    """
-    images, day = _image_scores(data), data.light == "day"
-    return [
-        *centroid_rows(images),
-        *chain_rows(images, 1 / 4 if day else 1 / 3),
-        *normalized_near_rows(data.light, data.result),
-        *absolute_rows(images),
-        *paper_rows(images),
-        *(goal_rows(images) if day else []),
-    ]
-
-
-IMAGE_TIERS: dict[str, Callable[[TierData], list[AcceptanceRow]]] = {"a": tier_a_rows, "b": tier_b_rows}
 
 
 def _image_scores(data: TierData) -> ImageScores:
