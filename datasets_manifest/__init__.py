@@ -1,1 +1,1 @@
-"""The data types that cross rooms or touch disk, and the disk itself. No drawing, no rendering."""
+"""Recipes, the data types that packages share, and datasets on disk. No drawing, no rendering."""

@@ -1,4 +1,4 @@
-"""Keyed random streams: every draw follows from a key of numbers and names, whatever else was drawn before.
+"""Keyed random streams: every draw depends on a key of numbers and names alone, not on earlier draws.
 
 Streams are numpy's `SeedSequence` over 32-bit words: a seed takes two, a name one (its CRC-32).
 """
@@ -25,7 +25,7 @@ def frame_generator(seed: int, index: int, stream: str) -> np.random.Generator:
 
 
 def bulk_frame_generator(seed: int, index: int, stream: str) -> np.random.Generator:
-    """The same for millions of draws: SFC64 is three times as fast as Philox at float32 normals.
+    """Like `frame_generator`, for millions of draws: SFC64 is three times as fast as Philox at float32 normals.
 
     Raises:
         ValueError: a negative seed or index.
@@ -34,7 +34,7 @@ def bulk_frame_generator(seed: int, index: int, stream: str) -> np.random.Genera
 
 
 def seeded_generator(seed: int, *names: str) -> np.random.Generator:
-    """The stream of a seed and any number of names, apart from all streams of frames.
+    """The stream of a seed and any number of names, independent of all streams of frames.
 
     Raises:
         ValueError: a negative seed.
@@ -54,7 +54,7 @@ def sample_generator(seed: int, epoch: int, sample: int, stream: str) -> np.rand
 
 
 def named_generator(name: str) -> np.random.Generator:
-    """A stream of its own for every name, without a seed."""
+    """The stream of a name, without a seed."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(_name_word(name))))
 
 

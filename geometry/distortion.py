@@ -66,7 +66,9 @@ class BrownConrady:
                 break
             ideal[..., 0] += (j_yy * error[..., 0] - j_xy * error[..., 1]) / determinant
             ideal[..., 1] += (j_xx * error[..., 1] - j_xy * error[..., 0]) / determinant
-        raise ValueError(f"distortion: {self.coefficients().tolist()} folds the image over; make it weaker")
+        raise ValueError(
+            f"distortion: {self.coefficients().tolist()} is not invertible over the whole image; make it weaker"
+        )
 
     def _distort(self, p: Array) -> tuple[Array, Array, Array, Array]:
         """Distorted points, and the entries xx, xy, yy of their symmetric Jacobian."""

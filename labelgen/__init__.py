@@ -1,1 +1,1 @@
-"""Labels from frames and passes, their validation, and exports."""
+"""Labels computed from frames and rendered passes, their validation, and exports."""

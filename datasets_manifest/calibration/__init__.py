@@ -1,1 +1,1 @@
-"""The rig's calibration in the files of other programs."""
+"""Stereo calibrations in the files of other programs: writing and reading."""

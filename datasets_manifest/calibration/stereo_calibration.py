@@ -62,7 +62,7 @@ def read_opencv_stereo(path: Path, unit_m: float = 1.0) -> StereoCalibration:
         sizes = [storage.getNode(name) for name in ("image_width", "image_height")]
         width, height = (int(node.real()) if node.isInt() or node.isReal() else 0 for node in sizes)
     except (cv2.error, SystemError, OverflowError, ValueError) as error:
-        raise ValueError(f"{path}: is no OpenCV storage: {' '.join(str(error).split())[:200]}") from error
+        raise ValueError(f"{path}: is not an OpenCV storage file: {' '.join(str(error).split())[:200]}") from error
     missing = [name for name, value in found.items() if value is None]
     missing += [name for name, value in (("image_width", width), ("image_height", height)) if value < 1]
     if missing:
@@ -88,7 +88,7 @@ def rig_of_calibration(calibration: StereoCalibration) -> StereoRig:
     RigidTransform(calibration.R, calibration.T)  # raises where R is no rotation
     baseline_m = float(np.linalg.norm(calibration.T))
     if not _BASELINES_M[0] <= baseline_m <= _BASELINES_M[1]:
-        raise ValueError(f"T: must be in metres, and cameras {baseline_m:g} m apart are none; give its unit")
+        raise ValueError(f"T: must be in metres, and {baseline_m:g} m is not a plausible baseline; give its unit")
     if _is_ideal(calibration, left, right):
         return StereoRig(left.camera, baseline_m)
     R1, R2, P1, P2, *_ = cv2.stereoRectify(

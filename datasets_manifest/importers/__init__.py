@@ -1,1 +1,1 @@
-"""Real stereo images of anybody's camera as a dataset without truth."""
+"""Import of real stereo images as a dataset without truth."""

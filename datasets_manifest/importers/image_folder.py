@@ -79,7 +79,7 @@ def read_image(path: Path) -> Pixels:
     except (OSError, cv2.error) as error:
         raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())[:200]}") from error
     if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{path}: is truncated, or no image of 8 or 16 bits")
+        raise ValueError(f"{path}: is truncated, or not an image of 8 or 16 bits")
     if image.ndim == 2:
         return np.asarray(image)
     if image.shape[2] not in (3, 4):

@@ -241,7 +241,7 @@ def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: is no COCO file of boxes: {type(error).__name__} {error}") from error
+        raise ValueError(f"{path}: is not a COCO file of boxes: {type(error).__name__} {error}") from error
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from error
     return boxes

@@ -124,7 +124,7 @@ class RosBag:
             reader.open()
         except Exception as error:  # whatever a damaged bag makes its reader raise
             message = " ".join(str(error).split()) or type(error).__name__
-            raise ValueError(f"{self._path}: is no bag: {message}") from error
+            raise ValueError(f"{self._path}: is not a ROS bag: {message}") from error
         try:
             yield reader
         finally:
@@ -148,7 +148,7 @@ def decode_image(message: Any, name: str) -> Pixels:
     kind, dtype = found[1], np.dtype(f"{'>' if message.is_bigendian else '<'}u{int(found[2]) // 8}")
     row_bytes = message.width * channels * dtype.itemsize
     if not row_bytes or message.step < row_bytes or len(message.data) != message.step * message.height:
-        raise ValueError(f"{name}: {len(message.data)} bytes are no image of {message.width}x{message.height}")
+        raise ValueError(f"{name}: {len(message.data)} bytes are not an image of {message.width}x{message.height}")
     rows = np.asarray(message.data).reshape(message.height, message.step)[:, :row_bytes]
     values = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
     image = values.reshape(message.height, message.width, channels)
@@ -165,7 +165,7 @@ def _decompressed(message: Any, name: str) -> Pixels:
     except cv2.error as error:
         raise ValueError(f"{name}: {' '.join(str(error).split())[:200]}") from error
     if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{name}: is truncated, or no compressed image of 8 or 16 bits")
+        raise ValueError(f"{name}: is truncated, or not a compressed image of 8 or 16 bits")
     return np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, 2::-1])
 
 

@@ -1,1 +1,1 @@
-"""What dataset to make: the sections of a recipe's TOML, checked."""
+"""Recipes, which describe datasets to make: the sections of their TOML, with validation."""

@@ -189,7 +189,7 @@ class Recipe(FrozenModel):
         if self.rig.lenses is not None and self.render.engine not in _ENGINES_WITH_LENSES:
             raise ValueError(
                 f"render.engine: {self.render.engine} draws ideal eyes only, and the rig has real lenses; use "
-                f"{' or '.join(_ENGINES_WITH_LENSES)}, or a rig without eyes"
+                f"{' or '.join(_ENGINES_WITH_LENSES)}, or a rig without lenses"
             )
         return self
 
@@ -287,7 +287,8 @@ def load_recipe(name_or_path: str, seed: int | None = None) -> RecipeSource:
         path = Path(name_or_path)
         if path.suffix != ".toml":
             raise ValueError(
-                f"recipe: no {name_or_path!r} ships; there are {', '.join(recipe_names())}, or give a .toml file"
+                f"recipe: no shipped recipe is named {name_or_path!r}; there are {', '.join(recipe_names())}, "
+                "or give a .toml file"
             )
         base = path.parent
         try:

@@ -329,7 +329,7 @@ class SequenceRanges(FrozenModel):
                 )
         if self.losses is not None and span_s < self.losses.end_s:
             raise ValueError(
-                f"frames_per_sequence: losses last until {self.losses.end_s:.4g} s, which is "
+                f"frames_per_sequence: dropouts last until {self.losses.end_s:.4g} s, which is "
                 f"{int(self.losses.end_s * self.frame_rate_hz) + 2} frames, got {self.frames_per_sequence}"
             )
         return self

@@ -1,1 +1,1 @@
-"""A dataset's descriptions for others: card, Croissant, provenance, published manifests."""
+"""Descriptions of a dataset for publication: card, Croissant metadata, published manifests."""

@@ -108,7 +108,7 @@ def read_publication(name: str) -> Publication:
     try:
         return Publication.model_validate_json(text)
     except ValidationError as error:
-        raise ValueError(f"published/{name}.json: {explain(error)}; `make publish` makes it anew") from error
+        raise ValueError(f"published/{name}.json: {explain(error)}; `make publish` renews it") from error
 
 
 def build_publication(dataset: Location) -> Publication:
@@ -193,16 +193,18 @@ def differing_labels(published: FrameLabels, own: FrameLabels) -> list[str]:
     return [f"frame {published.frame_index}: {where}: differs from what was published" for where in found]
 
 
-def _differing(there: Any, here: Any, where: str = "") -> list[str]:
+def _differing(published: Any, own: Any, where: str = "") -> list[str]:
     """Dotted keys at which two JSON values differ by more than the last bits of numbers."""
-    if isinstance(there, dict) and isinstance(here, dict) and there.keys() == here.keys():
-        return [found for key in there for found in _differing(there[key], here[key], f"{where}.{key}".lstrip("."))]
-    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
-        pairs = enumerate(zip(there, here, strict=True))
+    if isinstance(published, dict) and isinstance(own, dict) and published.keys() == own.keys():
+        return [
+            found for key in published for found in _differing(published[key], own[key], f"{where}.{key}".lstrip("."))
+        ]
+    if isinstance(published, list) and isinstance(own, list) and len(published) == len(own):
+        pairs = enumerate(zip(published, own, strict=True))
         return [found for k, (a, b) in pairs for found in _differing(a, b, f"{where}[{k}]")]
-    if isinstance(there, float) and isinstance(here, float):
-        return [] if math.isclose(there, here, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE) else [where]
-    return [] if there == here else [where]
+    if isinstance(published, float) and isinstance(own, float):
+        return [] if math.isclose(published, own, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE) else [where]
+    return [] if published == own else [where]
 
 
 def _build_differences(theirs: Manifest, mine: Manifest) -> tuple[str, ...]:

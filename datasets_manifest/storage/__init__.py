@@ -1,1 +1,1 @@
-"""The disk: where files lie, how they appear whole, how they are read."""
+"""Datasets on disk or in object stores: layout, atomic writing, reading."""

@@ -108,9 +108,9 @@ def read_shard_index(storage: Storage, number: int) -> ShardIndex:
         size = storage.size(shard_file(number))
     except FileNotFoundError as error:
         missing = name if not storage.exists(name) else shard_file(number)
-        raise ValueError(f"{storage.where(missing)}: is missing; render the recipe again to mend it") from error
+        raise ValueError(f"{storage.where(missing)}: is missing; render the recipe again to repair it") from error
     except ValidationError as error:
-        raise ValueError(f"{where}: {explain(error)}; delete it and render the recipe again to mend it") from error
+        raise ValueError(f"{where}: {explain(error)}; delete it and render the recipe again to repair it") from error
     except OSError as error:
         raise ValueError(f"{where}: cannot be read: {error.strerror}") from error
     if size != index.size:
@@ -136,12 +136,12 @@ def index_of_archive(stream: BinaryIO) -> ShardIndex:
                 key, _, name = member.name.partition(".")
                 data = archive.extractfile(member)
                 if data is None or not key.isdecimal():
-                    raise ValueError(f"holds {member.name}, which is no file of a frame")
+                    raise ValueError(f"holds {member.name}, which is not a file of a frame")
                 digest = sha256_of(data)
                 files = frames.setdefault(int(key), {})
                 files[name] = PackedFile(member.offset_data, member.size, digest)
     except tarfile.TarError as error:
-        raise ValueError(f"is no whole tar file: {error}") from error
+        raise ValueError(f"is not a complete tar file: {error}") from error
     while hashed.read(_BLOCK_BYTES):
         pass
     try:

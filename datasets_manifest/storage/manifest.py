@@ -227,7 +227,7 @@ def _read_entry(store: FrameStore, frame_index: int, split_of_scene: Mapping[int
         )
         engine = str(table["engine_version"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path}: is not a whole record; delete the frame's folder and render it again") from error
+        raise ValueError(f"{path}: is not a complete record; delete the frame's folder and render it again") from error
     if entry.frame_index != frame_index:
         raise ValueError(f"{path}: belongs to frame {entry.frame_index}")
     return entry, engine

@@ -179,7 +179,9 @@ def repair_shards(dataset: Location) -> None:
                 index = index_of_archive(stream)
         except ValueError as error:
             where = storage.where(shard_file(number))
-            raise ValueError(f"{where}: {error}; delete it, and the same command makes its frames again") from error
+            raise ValueError(
+                f"{where}: {error}; delete it and run the same command to make its frames again"
+            ) from error
         storage.write(shard_index_file(number), index_text(index).encode())
 
 

@@ -105,7 +105,9 @@ class Dataset:
 
     def _check_hash(self, frame_index: int, name: str, data: bytes, expected: str) -> None:
         if hashlib.sha256(data).hexdigest() != expected:
-            raise ValueError(f"{self.frames.where(frame_index, name)}: was changed, its hash is not the one on record")
+            raise ValueError(
+                f"{self.frames.where(frame_index, name)}: was changed: its hash differs from the recorded one"
+            )
 
     def images(self, frame_index: int) -> StereoImages:
         """Both images of a pair.

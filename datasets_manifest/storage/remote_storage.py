@@ -266,5 +266,5 @@ def _connect(url: str, process: int) -> tuple[Any, str]:
     except ImportError as error:
         raise ValueError(f'{url}: {error.name or error} is missing: pip install "droguekit[remote]"') from error
     except ValueError as error:
-        raise ValueError(f"{url}: is no place that can be used: {error}") from error
+        raise ValueError(f"{url}: cannot be used as storage: {error}") from error
     return system, str(root).rstrip("/")

@@ -281,7 +281,7 @@ def as_location(text: str) -> Location:
     if scheme == "file" and name:
         return Path(name)
     if not name.strip("/"):
-        raise ValueError(f"{text}: names no place; give {scheme}://NAME")
+        raise ValueError(f"{text}: is incomplete; give {scheme}://NAME")
     return text.rstrip("/")
 
 

@@ -1,1 +1,1 @@
-"""The types that cross packages or touch the disk: frames, images, records, estimates."""
+"""Data types that packages share or store: frames, images, records, estimates."""

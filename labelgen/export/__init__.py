@@ -1,1 +1,1 @@
-"""Other people's formats, each in one module."""
+"""Exports of datasets to the formats of other programs, one module for each."""

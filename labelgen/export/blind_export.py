@@ -1,7 +1,7 @@
-"""A dataset without its truth, for challenges: what the blind reader gives to navigation, and nothing else.
+"""Exports a dataset without its truth, for challenges: all that the blind reader gives to navigation.
 
-Neither the recipe nor its seed is there, for they would make the truth again, nor scenes, splits, conditions, part ids
-or the hashes of the records. Indices stay, so that whoever has the dataset can score estimates.
+It contains neither the recipe nor its seed, which would reproduce the truth, nor scenes, splits, conditions, part ids
+or the hashes of the records. Frame indices stay, so that the owner of the dataset can score estimates.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ def write_blind(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Args:
         dataset: the dataset's folder.
         out: new folder.
-        log: is told how far the work is.
+        log: receives the progress.
 
     Returns:
         The folder.
 
     Raises:
         ValueError: the dataset cannot be read, or `out` is not empty.
-        OSError: the folder cannot be written; it is then not there.
+        OSError: the folder cannot be written; nothing is left of it.
     """
     source = Dataset(dataset)
     index = read_blind_index(dataset)
@@ -61,7 +61,7 @@ def write_blind(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
 
 def _blind_record(record: PairRecord, drogues_differ: bool) -> dict[str, Any]:
-    """Time stamp, exposure and black level as a whole record names them, and the drogue where each has its own."""
+    """Time stamp, exposure and black level under the keys of a record, and the drogue where drogues differ."""
     frame = record.frame
     sought = frame.drogue or frame.sought
     named = {"sought": sought.model_dump(mode="json")} if drogues_differ and sought is not None else {}

@@ -58,7 +58,7 @@ def object_id(recipe: Recipe, record: PairRecord) -> int:
     """
     drogues = dataset_drogues(recipe)
     if record.frame.drogue not in drogues:
-        raise ValueError(f"frame {record.frame_index}: drogue: is none of the recipe's")
+        raise ValueError(f"frame {record.frame_index}: drogue: is not in the recipe")
     return drogues.index(record.frame.drogue) + 1
 
 

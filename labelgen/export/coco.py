@@ -297,7 +297,7 @@ def _drogue_mask(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> di
     pixels = _drogue_pixels(record, eye, part_id).drogue()
     if not len(pixels):
         path = f"{FRAMES_FOLDER}/{record.frame_index:06d}/{parts_file(eye)}"
-        raise ValueError(f"{path}: no pixel is the drogue's in the visible box of the record; run droguekit validate")
+        raise ValueError(f"{path}: no pixel shows the drogue in the visible box of the record; run droguekit validate")
     return pixels.segmentation()
 
 

@@ -45,7 +45,7 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
     Raises:
         ValueError: the dataset cannot be read, its eyes are not rectified, or `out` is not empty.
-        OSError: the folder cannot be written; it is then not there.
+        OSError: the folder cannot be written; nothing is left of it.
     """
     source = Dataset(dataset)
     rig, splits = source.manifest.recipe.rig, source.manifest.split_of_frame()

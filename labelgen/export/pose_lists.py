@@ -46,7 +46,7 @@ def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
     Raises:
         ValueError: the dataset cannot be read, or `out` is not empty.
-        OSError: the folder cannot be written; it is then not there.
+        OSError: the folder cannot be written; nothing is left of it.
     """
     source = Dataset(dataset)
     recipe, splits = source.manifest.recipe, source.manifest.split_of_frame()

@@ -1,4 +1,4 @@
-"""Tar shards for the `webdataset` package: a sample a stereo pair, with images, part ids and the record.
+"""Tar shards for the `webdataset` package, with a sample for each stereo pair: images, part ids and the record.
 
 A sample's key is the pair's index; its files are those of the frame's folder with the key before their names, such as
 `000123.left.png`, and `000123.json`: the record, its split and the hash of the dataset.
@@ -35,7 +35,7 @@ def write_webdataset(dataset: Location, out: Path, log: ExportLog, shard_bytes: 
 
     Raises:
         ValueError: the dataset cannot be read, or `out` is not empty.
-        OSError: the folder cannot be written; it is then not there.
+        OSError: the folder cannot be written; nothing is left of it.
     """
     source = Dataset(dataset)
     splits = source.manifest.split_of_frame()

@@ -1,6 +1,6 @@
 """Datasets as ultralytics reads them: `data.yaml`, `images/SPLIT` and `labels/SPLIT`, both eyes as images of their own.
 
-A label file has a row a object, `class cx cy w h`, for poses followed by `x y flag` of each keypoint; all lengths are
+A label file has one row for each object: `class cx cy w h`, and for poses `x y flag` of each keypoint. All lengths are
 shares of the image's width and height, counted from its corner. A file without rows is an image without a drogue.
 """
 
@@ -49,7 +49,7 @@ def write_yolo(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
 
     Raises:
         ValueError: the dataset cannot be read, or `out` is not empty.
-        OSError: the folder cannot be written; it is then not there.
+        OSError: the folder cannot be written; nothing is left of it.
     """
     return _write_pose(dataset, out, log, in_image_order=False)
 

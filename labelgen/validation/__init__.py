@@ -1,1 +1,1 @@
-"""Labels and datasets checked from the outside."""
+"""Checks of labels and datasets."""

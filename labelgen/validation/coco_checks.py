@@ -64,7 +64,7 @@ class CocoFiles:
             faults = _annotation_faults(annotation, record, eye)
             mask = self._all.annToMask(annotation).astype(bool)
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            return [f"{where}: annotation cannot be used: {type(error).__name__} {error}"]
+            return [f"{where}: annotation is invalid: {type(error).__name__} {error}"]
         if not np.array_equal(mask, np.isin(part_id, drogue_part_ids(len(view.markers)))):
             faults.append("segmentation: differs from the part ids")
         return [f"{where}: {fault}" for fault in faults]
@@ -82,7 +82,7 @@ class CocoFiles:
             self._faults.append(f"{path}: is missing")
             return None
         except (OSError, ValueError, KeyError, TypeError, RecursionError, AssertionError) as error:
-            self._faults.append(f"{path}: is truncated or no COCO file: {error}")
+            self._faults.append(f"{path}: is truncated or not a COCO file: {error}")
             return None
         if set(coco.imgs) != ids:
             self._faults.append(f"{path}: has {len(coco.imgs)} images, its pairs have {len(ids)}")

@@ -269,12 +269,12 @@ def _drop_faults(manifest: Manifest) -> list[str]:
     indices = [entry.frame_index for entry in manifest.frames]
     dropped = [drop.frame_index for drop in manifest.drops]
     count = manifest.recipe.frames.count
-    faults = [f"manifest.json: frame {index} is both there and dropped" for index in sorted({*indices} & {*dropped})]
+    faults = [f"manifest.json: frame {index} is both made and dropped" for index in sorted({*indices} & {*dropped})]
     if len({*indices}) < len(indices) or len({*dropped}) < len(dropped):
         faults.append("manifest.json: frames, drops: must name each frame once")
     beyond = sorted(index for index in {*indices, *dropped} if index >= count)
     if beyond:
-        faults.append(f"manifest.json: frame {beyond[0]} is none of the recipe's {count}")
+        faults.append(f"manifest.json: frame {beyond[0]} is not among the recipe's {count}")
     if sum(manifest.engines.values()) != len(indices):
         faults.append(f"manifest.json: engines: give {sum(manifest.engines.values())} pairs, there are {len(indices)}")
     return faults

@@ -164,7 +164,10 @@ def test_a_changed_tar_file_is_found(make: Make, text: str, place: str) -> None:
     storage.write("shards/000000.tar", bytes(data))
     faults = validate_dataset(place).faults
     assert f"{place}/shards/000000.json: is not the list of {place}/shards/000000.tar, which was changed" in faults
-    assert f"{place}/shards/000000.tar/000001.left_parts.png: was changed, its hash is not the one on record" in faults
+    assert (
+        f"{place}/shards/000000.tar/000001.left_parts.png: was changed: its hash differs from the recorded one"
+        in faults
+    )
     assert run(["validate", place]) == FAULT
     assert make(place, range(2), 0, text).totals.made == [1]
     assert validate_dataset(place).passed
@@ -322,8 +325,8 @@ def test_places_that_cannot_be_used_are_one_clear_line(
         (["render", "smoke", "--out", "memory://x"], "is the memory of one process; give --workers 0"),
         (["render", "smoke", "--out", f"s3://{BUCKET}/none", "--tar", "0"], "--tar: must be from 1 to 100000 pairs"),
         (["merge", f"s3://{BUCKET}/none", str(local), "--tar", "100001"], "--tar: must be from 1 to 100000 pairs"),
-        (["validate", "s3:///"], "s3:///: names no place; give s3://NAME"),
-        (["merge", f"s3://{BUCKET}/none", "memory://"], "memory://: names no place; give memory://NAME"),
+        (["validate", "s3:///"], "s3:///: is incomplete; give s3://NAME"),
+        (["merge", f"s3://{BUCKET}/none", "memory://"], "memory://: is incomplete; give memory://NAME"),
         (
             ["navigate", str(local), "--out", "s3://b/x"],
             "--out: must be a folder or file of this machine, got s3://b/x",
@@ -335,7 +338,7 @@ def test_places_that_cannot_be_used_are_one_clear_line(
         (["plan", "smoke", "--html", "s3://b/x"], "--html: must be a folder or file of this machine"),
         (["report", "--corpus", str(local), "--pdf", "s3://b/x"], "--pdf: must be a folder or file of this machine"),
         (["train", "smoke", "--out", "s3://b/x"], "--out: must be a folder or file of this machine, got s3://b/x"),
-        (["render", "smoke", "--out", "s4://b/x"], "s4://b/x: is no place that can be used: Protocol not known: s4"),
+        (["render", "smoke", "--out", "s4://b/x"], "s4://b/x: cannot be used as storage: Protocol not known: s4"),
     ):
         assert run([*words, *(["--engine", "analytic"] if words[0] == "render" else [])]) == WRONG_INPUT
         told = capsys.readouterr().err

@@ -157,7 +157,7 @@ def test_the_preview_shows_imported_pairs(smoke_dataset: Path, pictures: Path, t
         (("--encoding", "log"), "--encoding"),
         (("--rate", "0"), "--rate"),
         (("--calibration-unit", "ft"), "--calibration-unit"),
-        (("--topics", "a,b"), "is no bag"),
+        (("--topics", "a,b"), "is not a ROS bag"),
         (("--boxes", "none.json"), "none.json"),
     ],
 )

@@ -109,7 +109,7 @@ def test_a_damaged_record_cannot_be_described(tiny, maker, contents):
     make_recipe, *_ = maker
     path = frame_folder(tiny, 1) / "record.json"
     path.write_text(contents)
-    with pytest.raises(ValueError, match=r"000001/record\.json: is not a whole record"):
+    with pytest.raises(ValueError, match=r"000001/record\.json: is not a complete record"):
         build_manifest(tiny, make_recipe(), "1", SPLIT_OF_SCENE)
 
 

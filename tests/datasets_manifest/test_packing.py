@@ -121,7 +121,7 @@ def test_a_frame_that_is_made_again_replaces_the_packed_one(staged, maker):
     data = bytearray(tar.read_bytes())
     data[place] ^= 1
     tar.write_bytes(data)
-    assert Dataset(staged).verify(1) == [f"{tar}/000001.left.png: was changed, its hash is not the one on record"]
+    assert Dataset(staged).verify(1) == [f"{tar}/000001.left.png: was changed: its hash differs from the recorded one"]
     make_recipe, _, _, _, add_frame = maker
     add_frame(staged, make_recipe(), 1)
     assert contents(staged) == before
@@ -230,8 +230,8 @@ def place(request, tmp_path):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda data: b"no archive" * 100, "is no whole tar file: "),
-        (lambda data: data[: len(data) // 2], "is no whole tar file: "),
+        (lambda data: b"no archive" * 100, "is not a complete tar file: "),
+        (lambda data: data[: len(data) // 2], "is not a complete tar file: "),
         (lambda data: data.replace(b"000000.record.json", b"000000.rec0rd.json"), ""),
         (lambda data: data.replace(b"000000.", b"xxxxxx."), ""),
     ],
@@ -276,7 +276,7 @@ def test_a_list_is_made_again_from_its_archive(staged):
     pack_all(staged)
     before = shards(staged)
     (staged / "shards/000000.json").unlink()
-    with pytest.raises(ValueError, match=r"000000\.json: is missing; render the recipe again to mend it"):
+    with pytest.raises(ValueError, match=r"000000\.json: is missing; render the recipe again to repair it"):
         list_frames(staged)
     repair_shards(staged)
     assert shards(staged) == before

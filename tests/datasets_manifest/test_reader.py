@@ -42,12 +42,12 @@ def test_verify_finds_what_changed(tiny):
     (folder / "left.png").write_bytes((folder / "right.png").read_bytes())
     (folder / "right_parts.png").unlink()
     assert dataset.verify(1) == [
-        f"{folder / 'left.png'}: was changed, its hash is not the one on record",
+        f"{folder / 'left.png'}: was changed: its hash differs from the recorded one",
         f"{folder / 'right_parts.png'}: is missing",
     ]
     record = frame_folder(tiny, 0) / "record.json"
     record.write_bytes(record.read_bytes() + b" ")
-    assert dataset.verify(0) == [f"{record}: was changed, its hash is not the one on record"]
+    assert dataset.verify(0) == [f"{record}: was changed: its hash differs from the recorded one"]
     assert dataset.verify(2) == [f"{frame_folder(tiny, 2)}: is not in the manifest"]
 
 

@@ -132,7 +132,7 @@ def test_a_dataset_reads_the_same_from_both(place, maker):
     assert (dataset.part_ids(2, "left") == make_parts(recipe, 2)["left"]).all()
     assert dataset.record(0).frame_index == 0 and dataset.verify(0) == dataset.verify(2) == []
     open_storage(place).write("frames/000002/left.png", b"changed")
-    assert dataset.verify(2) == [f"{place}/frames/000002/left.png: was changed, its hash is not the one on record"]
+    assert dataset.verify(2) == [f"{place}/frames/000002/left.png: was changed: its hash differs from the recorded one"]
     open_storage(place).delete("frames/000002/left.png")
     with pytest.raises(ValueError, match=r"frames/000002/left\.png: is missing"):
         dataset.images(2)
@@ -150,7 +150,9 @@ def test_a_frame_is_handed_on_as_it_is_on_record_or_not_at_all(place, maker):
     for name in ("right.png", "record.json"):
         whole = storage.read(f"frames/000000/{name}")
         storage.write(f"frames/000000/{name}", whole + b" ")
-        with pytest.raises(ValueError, match=rf"frames/000000/{name}: was changed, its hash is not the one on record"):
+        with pytest.raises(
+            ValueError, match=rf"frames/000000/{name}: was changed: its hash differs from the recorded one"
+        ):
             Dataset(place).whole_frame(0)
         storage.write(f"frames/000000/{name}", whole)
 
@@ -170,7 +172,7 @@ def test_places_by_their_names(tmp_path, monkeypatch):
     assert as_location("data/demo") == as_location("data/demo/") and join("s3://b/n", "x") == "s3://b/n/x"
     assert as_location(f"file://{tmp_path}") == tmp_path
     for nothing in ("s3://", "s3:///", "memory://", "file://"):
-        with pytest.raises(ValueError, match=f"{nothing}: names no place; give {nothing.rstrip('/')}//NAME"):
+        with pytest.raises(ValueError, match=f"{nothing}: is incomplete; give {nothing.rstrip('/')}//NAME"):
             as_location(nothing)
     monkeypatch.chdir(tmp_path)
     assert absolute("data") == tmp_path / "data" and absolute("s3://b/n") == "s3://b/n"

@@ -67,7 +67,7 @@ def test_a_changed_pixel_is_a_fault(small_dataset, full_pairs):
     one, other = (folder_of(small_dataset, pair) / "left.png" for pair in full_pairs[:2])
     shutil.copy(other, one)
     (fault,) = faults_of(small_dataset)
-    assert fault == f"{one}: was changed, its hash is not the one on record"
+    assert fault == f"{one}: was changed: its hash differs from the recorded one"
 
 
 @pytest.mark.parametrize("damage", [lambda text: text[: len(text) // 2], lambda text: "[]", lambda text: "[" * 100_000])
@@ -156,7 +156,7 @@ def test_annotations_that_disagree_are_faults(small_dataset):
     for wanted in (
         "area: is",
         "segmentation: differs",
-        "annotation cannot be used: KeyError",
+        "annotation is invalid: KeyError",
         "all.json: has 11 images",
     ):
         assert any(wanted in fault for fault in faults), wanted

@@ -82,7 +82,7 @@ def test_a_damaged_pass_does_not_reach_the_decoder(with_passes, full_pairs):
     path = frame_folder(dataset, full_pairs[0].frame.frame_index) / "left.exr"
     path.write_bytes(path.read_bytes()[:-50])
     (fault,) = validate_dataset(dataset).faults
-    assert fault == f"{path}: was changed, its hash is not the one on record"
+    assert fault == f"{path}: was changed: its hash differs from the recorded one"
 
 
 def test_a_pass_of_another_size_is_refused(full_pairs):
@@ -117,8 +117,8 @@ def test_drops_are_compared_with_the_frames(small_dataset):
     describe(small_dataset, [Drop(frame_index=2, reason="tried"), Drop(frame_index=77, reason="tried")])
     faults = validate_dataset(small_dataset).faults
     assert faults == [
-        "manifest.json: frame 2 is both there and dropped",
-        "manifest.json: frame 77 is none of the recipe's 6",
+        "manifest.json: frame 2 is both made and dropped",
+        "manifest.json: frame 77 is not among the recipe's 6",
     ]
 
 

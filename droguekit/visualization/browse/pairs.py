@@ -363,7 +363,7 @@ class PairsWithTruth(_ReopenedDataset):
         for name in map(image_file, EYES):
             if hashlib.sha256(frames.read(frame_index, name)).hexdigest() != hashes.get(name):
                 where = frames.where(frame_index, name)
-                raise ValueError(f"{where}: was changed, its hash is not the one on record")
+                raise ValueError(f"{where}: was changed: its hash differs from the recorded one")
         return self._dataset.images(frame_index)
 
 

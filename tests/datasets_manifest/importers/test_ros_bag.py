@@ -118,5 +118,5 @@ def test_what_cannot_be_paired_or_rectified_is_refused(tmp_path: Path) -> None:
         RosBag(write_bag2(tmp_path / "rectified", rectified)).calibration()
     with pytest.raises(ValueError, match="no images on /a"):
         RosBag(tmp_path / "rectified", ("/a", "/b"))
-    with pytest.raises(ValueError, match="is no bag"):
+    with pytest.raises(ValueError, match="is not a ROS bag"):
         RosBag(tmp_path / "nowhere")

@@ -232,7 +232,7 @@ def test_wrong_losses_are_named_on_one_line(kind, changes, fault):
     ("before", "after", "fault"),
     [
         ("begins_s = 0.6", "begins_s = 0.3", r"begins_s: must be at least onset_s, 0.4 s"),
-        ("lasts_s = 0.5", "lasts_s = 5", r"losses last until 6 s, which is 122 frames, got 40"),
+        ("lasts_s = 0.5", "lasts_s = 5", r"dropouts last until 6 s, which is 122 frames, got 40"),
         (
             "camera_pitch_deg = 10",
             "camera_pitch_deg = 0",

@@ -167,7 +167,9 @@ def test_an_image_that_was_changed_is_left_out(tiny: Path, tmp_path: Path, capsy
     image = layout.frame_folder(changed, 1) / "right.png"
     shutil.copy(layout.frame_folder(tiny, 2) / "right.png", image)
     assert run(["browse", str(changed), "--out", str(page), "--workers", "0"]) == FAULT
-    assert f"frame 1 is left out: {image}: was changed, its hash is not the one on record" in capsys.readouterr().err
+    assert (
+        f"frame 1 is left out: {image}: was changed: its hash differs from the recorded one" in capsys.readouterr().err
+    )
     shutil.copy(layout.frame_folder(tiny, 1) / "right.png", image)
     assert run(["browse", str(changed), "--out", str(page), "--workers", "0"]) == DONE
     write_browse(tiny, tmp_path / "plain", None, 0, told())
