@@ -122,7 +122,7 @@ def score_sequences(
     data = sequence_data(sequences, drogues)
     dockings = true_dockings(sequences, data.motions)
     # Where some methods report boxes, the others count as having lost the drogue.
-    has_regions = any(answer.regions for estimates in methods.values() for answer in estimates.values())
+    has_regions = any(estimate.regions for estimates in methods.values() for estimate in estimates.values())
     scored: dict[str, MethodSequences] = {}
     for name, estimates in methods.items():
         parts = {
@@ -227,7 +227,7 @@ def _hidden_pairs(sequences: Sequence[TrueSequence], estimates: Mapping[int, Est
 
 
 def _has_found(state: TrueState, estimate: Estimate | None) -> bool:
-    """Whether an answer is a pose that lies within the rim of the drogue."""
+    """Whether an estimate is a pose whose position errs by no more than the radius of the rim."""
     pose, drogue = state.left_from_drogue, state.drogue
     if pose is None or drogue is None or not isinstance(estimate, PoseEstimate):
         return False

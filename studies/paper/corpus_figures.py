@@ -1,4 +1,4 @@
-"""Where the drogue stands in the images of a corpus and how large it is, as the paper's Figure 10 shows it."""
+"""Position and size of the drogue in the images of a corpus, as in the paper's Figure 10."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from droguekit.benchmark.report.number_text import plain_number
 from geometry.se3 import Array
 from studies.paper.paper_inputs import source_text
 
-# Blue that stands out on white and on black; how many drogues are meant is told by its opacity.
+# A blue that is visible on white and on black; its opacity grows with the number of drogues.
 _COLOR = "#1f78c8"
 _CELLS_ACROSS = 24
 _SIZE_BARS = 20

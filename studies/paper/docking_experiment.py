@@ -48,7 +48,7 @@ class DockingData(ExperimentData):
 
     Attributes:
         records: of every pair that shows a drogue, by frame.
-        first_frames: first pair of every sequence, whether it shows a drogue or not; None stands for no sequence.
+        first_frames: first pair of every sequence, whether it shows a drogue or not; None means no sequence.
         result: scores of the contenders.
     """
 
@@ -83,8 +83,8 @@ class DockingData(ExperimentData):
         indices = [index for index, record in self.records.items() if record.sequence_id == sequence_id]
         if not indices:
             known = [str(number) for number in self.sequences() if number is not None]
-            told = f"must be one of {', '.join(known)}" if known else "must be left out, for there are no sequences"
-            raise ValueError(f"--docking-sequence: {told} in {self.source}, got {sequence_id}")
+            rule = f"must be one of {', '.join(known)}" if known else "must be left out, for there are no sequences"
+            raise ValueError(f"--docking-sequence: {rule} in {self.source}, got {sequence_id}")
         errors = {}
         for contender in self.contenders:
             found = self.pose_errors(contender.method)

@@ -87,7 +87,7 @@ def code_facts() -> list[tuple[str, str]]:
 
 def source_text(manifest: Manifest) -> str:
     """What a dataset is called and which engines made it, for titles and captions."""
-    # An engine's name stands before its version.
+    # An engine's name comes before its version.
     engines = sorted({engine.partition(",")[0] for engine in manifest.engines})
     return ", ".join([manifest.name, *engines])
 

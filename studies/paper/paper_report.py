@@ -114,7 +114,7 @@ class FigureGroup:
         title: with the paper's number.
         caption: below the title.
         panels: `<svg>` elements.
-        legend: names with the lines that stand for them; empty where there is nothing to tell apart.
+        legend: names with their lines; empty where there is only one.
     """
 
     anchor: str
@@ -233,7 +233,7 @@ def speed_figures(result: DetectionResult) -> list[FigureGroup]:
 
 
 def docking_figures(docking: DockingData, run: DockingRun, number: int) -> list[FigureGroup]:
-    """The paper's Figures 16 to 18; `number` tells those of several datasets apart."""
+    """The paper's Figures 16 to 18; `number` keeps several datasets apart."""
     chosen = docking.contenders
     own = [contender for contender in chosen if contender.method in (OURS, FILTERED)]
     rivals = [contender for contender in chosen if contender.method != FILTERED]
@@ -278,7 +278,7 @@ def docking_figures(docking: DockingData, run: DockingRun, number: int) -> list[
 
 
 def bench_figures(run: SemiPhysicalRun, number: int) -> FigureGroup:
-    """The paper's Figure 19; `number` tells those of several experiments apart."""
+    """The paper's Figure 19; `number` keeps several experiments apart."""
     anchor = f"figure-19-{number}"
     panels = [Markup(measured_panel(run, anchor)), *(Markup(station_panel(run, anchor, axis)) for axis in AXES)]
     most = max(errors.pairs for errors in run.methods.values())
@@ -292,7 +292,7 @@ def bench_figures(run: SemiPhysicalRun, number: int) -> FigureGroup:
 
 
 def worst_part(docking: DockingData, number: int) -> dict[str, object]:
-    """Pictures of the worst frames, of our method where the file has it; `number` tells several datasets apart."""
+    """Pictures of the worst frames, of our method where the file has it; `number` keeps several datasets apart."""
     names = [contender.method for contender in docking.contenders]
     method = next(name for name in (OURS, FILTERED, PAPER, *names) if name in names)
     frames = [(frame, Markup(frame.svg)) for frame in worst_frames(docking, method)]
@@ -314,25 +314,25 @@ def failure_table(docking: DockingData, anchor: str) -> Table | None:
 def time_table(docking: DockingData, anchor: str) -> Table | None:
     """Median time by method, without waiting and by stage, and percentiles of the latency where reported. [ms]
 
-    Behind a stage that not all timed pairs had stands their share. None where no method reports times.
+    A stage that only some timed pairs had is followed by their share. None where no method reports times.
     """
     rows = []
     for contender in docking.contenders:
         estimates = docking.methods[contender.method].values()
         latencies = [1e3 * estimate.latency_s for estimate in estimates if estimate.latency_s is not None]
-        told = [three_digits(float(value)) for value in np.percentile(latencies, _PERCENTILES)] if latencies else []
+        latency = [three_digits(float(value)) for value in np.percentile(latencies, _PERCENTILES)] if latencies else []
         stages: dict[str, list[float]] = {}
         for estimate in estimates:
             for stage, seconds in estimate.stage_s.items():
                 stages.setdefault(stage, []).append(1e3 * seconds)
         work = [processing_time_s(estimate.stage_s) for estimate in estimates]
         totals = [1e3 * work_s for work_s in work if work_s is not None]
-        if totals or told:
+        if totals or latency:
             timed = sum(bool(estimate.stage_s) for estimate in estimates)
             listed = ", ".join(
                 f"{stage} {_median(times)}{_share(len(times), timed)}" for stage, times in stages.items()
             )
-            rows.append([contender.method, _median(totals), " / ".join(told) or ABSENT, listed or ABSENT])
+            rows.append([contender.method, _median(totals), " / ".join(latency) or ABSENT, listed or ABSENT])
     title = (
         "Median by stage (and in how many of the pairs, if not all), and latency where it was measured, on the machine "
         "that made the estimates (not named in the file) [ms]"

@@ -155,9 +155,11 @@ def _detector_cells(name: str, detector: DetectorResult) -> list[str]:
 
 
 def _threshold_note(name: str, detector: DetectorResult) -> str:
-    told = f"{name}: precision and recall are of boxes that score at least {three_digits(detector.operating_threshold)}"
+    sentence = (
+        f"{name}: precision and recall are of boxes that score at least {three_digits(detector.operating_threshold)}"
+    )
     remark = "" if detector.overall.note is None else f" ({detector.overall.note})"
-    return f"{told}, {_THRESHOLD_FROM[detector.threshold_from]}{remark}."
+    return f"{sentence}, {_THRESHOLD_FROM[detector.threshold_from]}{remark}."
 
 
 def _without_last(group: RowGroup) -> RowGroup:

@@ -135,14 +135,14 @@ def length_series(figure_name: str, run: DockingRun, contenders: Sequence[Conten
 
 
 def _draw_series(axes: Axes, run: DockingRun, values: Array, style: MethodStyle, order: int) -> None:
-    """A line with gaps where there is no pose, or no pair; single poses stand as dots, and some bear the method's mark.
+    """A line with gaps where there is no pose, or no pair; single poses are dots, and some have the method's marker.
 
     Args:
         axes: to draw on.
         run: the sequence.
         values: (N,) NaN where there is no pose.
         style: of the method.
-        order: its place among the drawn ones; the first one is on top, and marks of no two stand at the same numbers.
+        order: its place among the drawn ones; the first one is on top, and markers of no two are at the same numbers.
     """
     places = np.arange(run.numbers[0], run.numbers[-1] + 1)
     whole = np.full(len(places), np.nan)
@@ -268,7 +268,7 @@ def axis_errors(errors: StationErrors, axis: Axis) -> Array:
 
 
 def published_row(markers: int) -> PublishedStation | None:
-    """What the paper prints of its own method with so many markers."""
+    """The published row of the paper's own method with that number of markers."""
     return next((row for row in TABLE_2 if row.markers == markers), None)
 
 

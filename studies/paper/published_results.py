@@ -1,7 +1,7 @@
 """What the seed paper prints of its experiments, digit for digit; all of it is of data that are not public.
 
 Source: "Research of an Unmanned Aerial Vehicle Autonomous Aerial Refueling Docking Method Based on Binocular Vision"
-(docs/explanation/paper.md). Its table of detectors stands in `droguekit.benchmark.detection.detection_tables`.
+(docs/explanation/paper.md). Its table of detectors is in `droguekit.benchmark.detection.detection_tables`.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class Contender(NamedTuple):
     Attributes:
         method: its name in a file of estimates.
         label: what it is called on the page.
-        published: what it stands for in the paper's docking runs; None for ours.
-        is_filtered: its poses rest on those of pairs before, so their errors go from pair to pair.
+        published: its result in the paper's docking runs; None for ours.
+        is_filtered: its poses depend on earlier pairs, so errors of neighbouring pairs are not independent.
     """
 
     method: str

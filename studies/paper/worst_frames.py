@@ -68,7 +68,7 @@ def worst_frames(docking: DockingData, method: str) -> list[WorstFrame]:
 def failure_reasons(docking: DockingData, method: str) -> list[tuple[str, int]]:
     """Why a method gave no pose of a drogue, and how often; pairs that its file leaves out count too.
 
-    Reasons that differ only in how many regions of an image were looked at are one.
+    Reasons that differ only in the number of regions of an image are one.
     """
     estimates = docking.methods[method]
     reasons: Counter[str] = Counter()

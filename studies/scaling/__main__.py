@@ -73,7 +73,7 @@ def speed(recipe_text: str, workers: int, folder: Path, report: ProgressReport) 
 
 
 def measure(out: Path, pairs: int, tasks: int, parts: tuple[str, ...], report: ProgressReport) -> dict[str, Any]:
-    """Measure what is asked for and not known yet.
+    """Measure the requested parts that have no result yet.
 
     Args:
         out: folder of the results.
@@ -161,7 +161,7 @@ def main() -> int:
         print(f"scaling: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("scaling: interrupted; the same command goes on with what is measured", file=sys.stderr)
+        print("scaling: interrupted; the same command continues from the finished results", file=sys.stderr)
         return 130
     print("\n".join(table(results)))
     return 0

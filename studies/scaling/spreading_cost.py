@@ -72,7 +72,7 @@ class MemorySamples:
         self.shown.begin(what, total)
 
     def advance(self) -> None:
-        """Count it, and look at the memory now and then."""
+        """Count it, and sample the memory at intervals."""
         self._done += 1
         if self._done % self.every == 0:
             self.client_mib[self._done] = round(resident_gib() * 1024, 1)

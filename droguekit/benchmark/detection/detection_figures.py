@@ -271,7 +271,7 @@ def speed_panel(result: DetectionResult) -> str:
 
 
 def _write_names(figure: Figure, axes: Axes, names: dict[str, _Point], others: Sequence[_Point]) -> None:
-    """Each name as near to its mark as it can stand without touching another name, a mark, or the panel's edge."""
+    """Place each name as near to its mark as possible without touching another name, a mark, or the panel's edge."""
     figure.draw_without_rendering()
     area, point_px = axes.get_window_extent(), figure.dpi / 72
     marks = [axes.transData.transform(point) for point in [*names.values(), *others]]
@@ -279,7 +279,7 @@ def _write_names(figure: Figure, axes: Axes, names: dict[str, _Point], others: S
     taken = [Bbox([mark - reach, mark + reach]) for mark in marks]
     for name, point in names.items():
         label = axes.annotate(name, point, (0, 0), textcoords="offset points", fontsize=_NAME_PT)
-        # Names stand inside the panel, so they need no room around it.
+        # Names lie inside the panel, so they need no room around it.
         label.set_in_layout(False)
         # A line of letters with its ascenders and descenders; a browser's font may be a little wider than ours.
         size = np.array([1.05 * label.get_window_extent().width, _LINE_HEIGHT * _NAME_PT * point_px])
@@ -309,7 +309,7 @@ def _write_names(figure: Figure, axes: Axes, names: dict[str, _Point], others: S
 
 
 def _box(mark: Array, side: tuple[int, int, str, str], step: float, size: Array) -> Bbox:
-    """Where a name of some size stands, in the canvas's pixels."""
+    """Box of a name of some size, in pixels of the canvas."""
     x, y = mark[0] + side[0] * step, mark[1] + side[1] * step
     left = x - {"left": 0.0, "center": 0.5, "right": 1.0}[side[2]] * size[0]
     low = y - {"bottom": 0.0, "center": 0.5, "top": 1.0}[side[3]] * size[1]

@@ -83,7 +83,7 @@ def write_detection_report(dataset: Location, scored: ScoredDetections, out_html
 
     Args:
         dataset: the dataset's folder or URL, for pictures.
-        scored: what `score_detections` made of it.
+        scored: the result of `score_detections`.
         out_html: where to write.
 
     Raises:
@@ -236,7 +236,7 @@ def detection_picture(
         draw_box(tile, box, scale, color=color)
     if enlarged is not None and max(enlarged[2] / picture.shape[1], enlarged[3] / picture.shape[0]) < ENLARGE_BELOW:
         x, y, width, height = center_box(enlarged)
-        # A little wider, so that a box stands apart from the inset's frame.
+        # A little wider, so that a box is apart from the inset's frame.
         wide = (x - 0.1 * width, y - 0.1 * height, 1.2 * width, 1.2 * height)
         inset, larger, corner = enlarged_surroundings(picture, wide, tile.shape[0])
         for box, color in drawn:

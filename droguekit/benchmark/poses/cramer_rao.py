@@ -17,8 +17,8 @@ from geometry.stereo import EYES, Eye, StereoRig
 # Three points fix six unknowns; fewer leave a pose open.
 _FEWEST_FEATURES = 3
 
-# Of the information matrix with unit diagonal. One eye's view of a ring at 1000 m is at 1e9; beyond this, what is left
-# of float64's 16 digits no longer tells an open pose from a determined one.
+# Of the information matrix with unit diagonal. One eye's view of a ring at 1000 m is at 1e9; beyond this, the
+# rest of float64's 16 digits cannot separate an open pose from a determined one.
 _LARGEST_CONDITION = 1e12
 
 
@@ -145,7 +145,7 @@ def _inverse(information: Array) -> Array | None:
 
 
 def component_covariance(left_from_drogue: RigidTransform, covariance: Array) -> Array:
-    """Covariance of what is scored, with roll marginalised.
+    """Covariance of the scored components, with roll marginalised.
 
     Args:
         left_from_drogue: pose to which the covariance belongs.
@@ -272,7 +272,7 @@ class FacingRing:
         return self.distance_m**2 / (self.focal_px * self.ring_radius_m * math.sqrt(spread))
 
     def hub_tilt_rad(self, depth_m: float, noise_factor: float = 1.0) -> float:
-        """Tilt about one axis from the sideways shift of a hub against the ring, which knows the sign. [rad/px]
+        """Tilt about one axis from the sideways shift of a hub against the ring, which gives its sign too. [rad/px]
 
         Args:
             depth_m: of the hub behind the ring. [m]

@@ -104,7 +104,7 @@ def seen_fraction(record: PairRecord, eye: Eye) -> float:
 
     They are the visible box's area over the full one's, which falls where the image's edge cuts the drogue off, and the
     mean visible fraction of the markers, which also falls where something hides it. Where the markers on the
-    image are so small that no pixel centre lies in any, they tell nothing, and only the first share counts.
+    image are so small that no pixel centre lies in any, they say nothing, and only the first share counts.
     """
     view = record.views.left if eye == "left" else record.views.right
     full, visible = view.box_full_xywh_px, view.box_visible_xywh_px
@@ -118,7 +118,7 @@ def seen_fraction(record: PairRecord, eye: Eye) -> float:
 
 
 def _covers_pixels(record: PairRecord, eye: Eye) -> bool:
-    """Whether a pixel centre lies in a marker, whatever stands before it; also where no marker is on the image."""
+    """Whether a pixel centre lies in a marker, hidden or not; also where no marker is on the image."""
     view = record.views.left if eye == "left" else record.views.right
     pose, drogue, rig = record.left_from_drogue, record.frame.drogue, record.frame.rig
     on_image = [marker.in_image for marker in view.markers]

@@ -1,4 +1,4 @@
-"""Methods of one file beside each other: ratios of mean errors on the same pairs, and which method is best."""
+"""Methods of one file compared: ratios of mean errors on the same pairs, and which method is best."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _comparison(name: str, other: str, errors: Errors, groups: PairGroups) -> Me
     common = sorted(errors[name].keys() & errors[other].keys())
     above, below = (_sizes([errors[method][i] for i in common]) for method in (name, other))
     bins = np.array([groups.bin_of_frame[i] for i in common], dtype=np.intp)
-    # Single pairs are blocks of their own, told from sequences by their sign.
+    # Single pairs are blocks of their own; their sign separates them from sequences.
     sequences = [groups.sequence_of_frame[i] for i in common]
     blocks = np.array([-1 - i if s is None else s for i, s in zip(common, sequences, strict=True)], dtype=np.int64)
     rows = []

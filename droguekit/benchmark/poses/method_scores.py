@@ -53,7 +53,7 @@ class PoseScore:
         has_covariance: whether the estimate carries one.
         squared_errors: (3,) see `consistency.squared_errors`.
         flips: None where no bound is known.
-        depth: beside the rangefinder's reading, or None without one.
+        depth: with the rangefinder's reading, or None without one.
     """
 
     error: PoseError

@@ -39,7 +39,7 @@ Parts = Mapping[str, slice]
 _MOST_SQUARE = 1e100
 # Position, attitude and both together, as slices of the five components.
 _PARTS: Parts = {"position": slice(0, 3), "attitude": slice(3, 5), "pose": slice(0, 5)}
-# A tilt below this many standard deviations cannot be told from zero, so its sign means nothing.
+# A tilt below this many standard deviations cannot be docking from zero, so its sign means nothing.
 _CLEAR_TILT = 5.0
 _OPTICAL_AXIS = np.array([0.0, 0.0, 1.0])
 
@@ -119,10 +119,15 @@ def _largest_number(estimate: Estimate) -> float:
         if estimate.motion is not None:
             numbers += [*estimate.motion.velocity_m_s, *estimate.motion.rate_rad_s]
         if estimate.docking is not None:
-            told = estimate.docking
-            numbers += [*told.mouth_from_tip_m, *told.mouth_sd_m]
-            numbers += [told.closure_m_s or 0.0, told.miss_m or 0.0, told.miss_sd_m or 0.0, told.contact_s or 0.0]
-            numbers.append(told.capture_radius_m or 0.0)
+            docking = estimate.docking
+            numbers += [*docking.mouth_from_tip_m, *docking.mouth_sd_m]
+            numbers += [
+                docking.closure_m_s or 0.0,
+                docking.miss_m or 0.0,
+                docking.miss_sd_m or 0.0,
+                docking.contact_s or 0.0,
+            ]
+            numbers.append(docking.capture_radius_m or 0.0)
     return max(abs(number) for number in numbers)
 
 
@@ -172,7 +177,7 @@ def squared_errors(estimate: PoseEstimate, error: PoseError) -> Array | None:
 
     Returns:
         (3,) of 3, 2 and 5 degrees of freedom, or None where the covariance is not positive definite, too small or too
-        large for floats, or stands in another tangent than ours.
+        large for floats, or in another tangent than ours.
 
     Source: e^T C^-1 e, Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
     """

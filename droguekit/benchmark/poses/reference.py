@@ -84,7 +84,7 @@ def build_reference(
 def distance_bins(distances_m: Sequence[float]) -> tuple[list[DistanceBin], list[int]]:
     """Bins, nearest first, and the bin of each frame.
 
-    One bin for each station when the distances stand at stations within 1 %, else bins between log-spaced edges from
+    One bin for each station when the distances form stations within 1 %, else bins between log-spaced edges from
     the smallest to the largest distance, without those that hold no frame.
 
     Args:

@@ -35,7 +35,7 @@ class Table:
         title: caption; empty for none.
         columns: headings of all columns behind the row's name.
         groups: the rows.
-        first: heading of the groups' labels, which share a cell at the left; None where they stand above their rows.
+        first: heading of the groups' labels, which are cells at the left; None where labels are above their rows.
         second: heading of the rows' names.
         text_columns: headings of columns of words instead of numbers.
         notes: sentences below.

@@ -33,7 +33,7 @@ def percent(fraction: float | None) -> str:
 
 def distance_text(low_m: float, high_m: float) -> str:
     """A bin's distances: one number for a station."""
-    # A station's frames stand within 1 % of it.
+    # Frames of a station lie within 1 % of it.
     if high_m <= low_m * 1.0201:
         return f"{plain_number((low_m * high_m) ** 0.5)} m"
     return f"{plain_number(low_m)}–{plain_number(high_m)} m"

@@ -220,7 +220,7 @@ def _filter_part(
         "Lag is the shift in time that makes estimates agree best with such a curve, apart from a constant error of "
         "each sequence. Where the drogue hardly moves along an axis, it is not known well.",
         "Errors of neighbouring pairs are alike, so means of true covariances scatter more than the range of "
-        "independent ones; the interval from resampled sequences knows of that.",
+        "independent ones; the interval from resampled sequences allows for that.",
     ]
     return ReportPart(
         "filter", "Motion and filter", _legend(filters, styles), _drawn(panels), filter_tables(filters), notes
@@ -256,7 +256,7 @@ def _latency_part(latencies: Mapping[str, Latency], styles: Mapping[str, MethodS
     lines = [*_lines(bins, lambda row: row.p50_ms), *_lines(bins, lambda row: row.p99_ms, is_dashed=True)]
     panels = [distance_lines_panel("latency", "Latency, median and (dashed) 99th percentile [ms]", lines, styles)]
     notes = [
-        "From the arrival of a pair's images to its answer, on the machine that made the estimates. A late pair was "
+        "From the arrival of a pair's images to its estimate, on the machine that made the estimates. A late pair was "
         "not worked on, because newer ones had come; it has no time here, and counts as a pair without a pose "
         "everywhere.",
     ]

@@ -62,7 +62,7 @@ def _overlap_table(trackings: Mapping[str, Tracking], first: str) -> Table:
 
 
 def _source_tables(trackings: Mapping[str, Tracking], first: str) -> list[Table]:
-    """By who gave the box; none where nobody says so."""
+    """By source of the box; none where no box names its source."""
     groups = [
         RowGroup(name, [[source, *_source_cells(row)] for source, row in tracking.sources.items()])
         for name, tracking in trackings.items()
@@ -164,7 +164,7 @@ def hiding_table(methods: Methods) -> Table:
 
 
 def filter_tables(filters: Mapping[str, FilterErrors]) -> list[Table]:
-    """Motion, its covariances, lag, and errors beside the raw method's."""
+    """Motion, its covariances, lag, and errors relative to the unfiltered method."""
     motion = {name: (part.motion, part.bins) for name, part in filters.items() if part.motion is not None}
     return [
         *([_motion_table(motion)] if motion else []),
@@ -175,7 +175,7 @@ def filter_tables(filters: Mapping[str, FilterErrors]) -> list[Table]:
 
 
 def docking_tables(errors: Mapping[str, DockingErrors]) -> list[Table]:
-    """The place of the mouth, what is ahead, and captures."""
+    """Position of the mouth, closure and predicted miss, and captures."""
     rows = {name: (part.overall, part.bins) for name, part in errors.items()}
     mouth = ["pairs", "of", "forward", "right", "down", "length", "95 % interval", "bias forward", "right", "down"]
     within = [cell for name in ("forward", "right", "down", "miss") for cell in (f"{name} within 1 sd", "2 sd")]
@@ -204,10 +204,10 @@ def latency_tables(latencies: Mapping[str, Latency]) -> list[Table]:
         if part.stages
     ]
     tables = [
-        Table("latency", "From the arrival of the images to the answer [ms]", columns, _by_distance(rows, _time_cells)),
         Table(
-            "late", "Pairs that were not worked on", ["pairs", "late", "share"], [RowGroup("all", late)], "sequences"
+            "latency", "From the arrival of the images to the estimate [ms]", columns, _by_distance(rows, _time_cells)
         ),
+        Table("late", "Pairs that were skipped", ["pairs", "late", "share"], [RowGroup("all", late)], "sequences"),
     ]
     if stages:
         tables.append(Table("stages", "The stages [ms]", columns, stages, "method", "stage"))

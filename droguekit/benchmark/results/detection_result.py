@@ -87,7 +87,7 @@ class DetectionRow(ResultModel):
 
 
 class DistanceRow(DetectionRow):
-    """The images of pairs whose drogue stands from `low_m` to below `high_m`; null has no limit. [m]"""
+    """The images of pairs whose drogue is from `low_m` to below `high_m`; null has no limit. [m]"""
 
     low_m: float
     high_m: float | None

@@ -81,12 +81,12 @@ class NormalizedErrors(ResultModel):
 
 
 class NeesPart(ResultModel):
-    """Normalized estimation error squared, over its degrees of freedom; 1 for covariances that tell the truth.
+    """Normalized estimation error squared, over its degrees of freedom; 1 for true covariances.
 
     Attributes:
         freedom: degrees of freedom of one pose.
         per_freedom: mean over the poses.
-        low, high: where 95 % of such means lie when the covariances tell the truth, by the chi-square law.
+        low, high: where 95 % of such means lie for true covariances, by the chi-square law.
     """
 
     freedom: int

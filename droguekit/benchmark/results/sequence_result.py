@@ -182,7 +182,7 @@ class EyeTracking(ResultModel):
     Attributes:
         overlap: images without a box count as an overlap of nothing; null where no image shows enough of the drogue.
         losses: null where `overlap` is.
-        reacquisition: answers are boxes that overlap the true one by half or more.
+        reacquisition: by boxes that overlap the true one by half or more.
         hidden: images in which nothing of the drogue is seen.
         hidden_with_box: of these, those with a box all the same.
     """
@@ -240,7 +240,7 @@ class HiddenPairs(ResultModel):
     Attributes:
         hidden: pairs of sequences that show nothing of the drogue, or of none of its markers, in either image.
         poses_while_hidden: of these, those with a pose all the same; should be 0.
-        reacquisition: after the drogue was hidden, or lost beside the sun, and both images show it again; answers are
+        reacquisition: after the drogue was hidden, or lost beside the sun, and both images show it again; by
             poses that err in position by the radius of the drogue's rim at the most.
     """
 
@@ -332,14 +332,14 @@ class TimePercentiles(ResultModel):
 
 
 class LatencyBin(TimePercentiles):
-    """The pairs whose drogue stands from `low_m` to `high_m`. [m]"""
+    """The pairs whose drogue is from `low_m` to `high_m`. [m]"""
 
     low_m: float
     high_m: float
 
 
 class Latency(ResultModel):
-    """From the arrival of the images to the answer.
+    """From the arrival of the images to the estimate.
 
     Attributes:
         overall: pairs of sequences that report it and were processed; null without any.

@@ -135,7 +135,7 @@ def _run_sums(
     sums = np.empty((len(COMPONENTS), len(_SHIFTS)))
     for k, shift_s in enumerate(_SHIFTS):
         errors = found - truth(times[chosen] - shift_s)
-        # Estimates may stand on the other side of the turn.
+        # Angles of estimates may differ by a whole turn.
         errors[:, 3:] = 180.0 - np.mod(180.0 - errors[:, 3:], 360.0)
         sums[:, k] = np.square(errors - errors.mean(axis=0)).sum(axis=0)
     return sums, len(chosen)

@@ -34,15 +34,15 @@ def latency(data: SequenceData, estimates: Mapping[int, Estimate]) -> Latency | 
         estimates: of the method, by frame.
     """
     frames = [state.frame_index for sequence in data.sequences for state in sequence.states]
-    answers = {index: estimates[index] for index in sorted(frames) if index in estimates}
-    in_time = {index: answer for index, answer in answers.items() if not _is_late(answer)}
-    late = len(answers) - len(in_time)
+    answered = {index: estimates[index] for index in sorted(frames) if index in estimates}
+    in_time = {index: estimate for index, estimate in answered.items() if not _is_late(estimate)}
+    late = len(answered) - len(in_time)
     took_ms = {index: 1e3 * a.latency_s for index, a in in_time.items() if a.latency_s is not None}
     if not took_ms and not late:
         return None
     stages: dict[str, list[float]] = {}
-    for answer in in_time.values():
-        for stage, seconds in answer.stage_s.items():
+    for estimate in in_time.values():
+        for stage, seconds in estimate.stage_s.items():
             stages.setdefault(stage, []).append(1e3 * seconds)
     bins = []
     for k, place in enumerate(data.groups.bins):
@@ -53,14 +53,14 @@ def latency(data: SequenceData, estimates: Mapping[int, Estimate]) -> Latency | 
         overall=time_percentiles(list(took_ms.values())) if took_ms else None,
         bins=tuple(bins),
         stages={stage: time_percentiles(times) for stage, times in stages.items()},
-        answers=len(answers),
+        answers=len(answered),
         late=late,
-        late_fraction=late / len(answers),
+        late_fraction=late / len(answered),
     )
 
 
-def _is_late(answer: Estimate) -> bool:
-    return isinstance(answer, NoFix) and answer.reason.startswith(LATE)
+def _is_late(estimate: Estimate) -> bool:
+    return isinstance(estimate, NoFix) and estimate.reason.startswith(LATE)
 
 
 def time_percentiles(times_ms: Sequence[float]) -> TimePercentiles:

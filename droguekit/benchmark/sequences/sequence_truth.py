@@ -50,7 +50,7 @@ class EyeTruth:
     Attributes:
         box_px: around its visible pixels, in pixel-centre coordinates; None where there are none. [px]
         seen_fraction: see `visibility.seen_fraction`.
-        is_dazzled: the sun stands beside the drogue.
+        is_dazzled: the sun is beside the drogue.
     """
 
     box_px: PixelBox | None

@@ -45,7 +45,7 @@ LEAST_TRACKED_OVERLAP = 0.1
 LEAST_FOUND_OVERLAP = 0.5
 """A box with at least this overlap has found the drogue again, as for a detector."""
 REACQUISITION_LIMIT_FRAMES = 3
-"""A drogue should be found again within so many frames."""
+"""A drogue should be found again within this number of frames."""
 StageTimes = Mapping[int, Mapping[str, float]]
 # Stages of an estimate that detect or track the box, or update the tracker.
 _BOX_STAGES = frozenset({"detect", "track", "correct"})
@@ -186,7 +186,7 @@ def reacquisition(courses: Iterable[tuple[Sequence[Visibility], Sequence[bool]]]
     Args:
         courses: for each sequence the visibility frame by frame, and whether there was an estimate.
     """
-    delays = [delay for visibilities, answers in courses for delay in _delays(visibilities, answers)]
+    delays = [delay for visibilities, estimated in courses for delay in _delays(visibilities, estimated)]
     came = [delay for delay in delays if delay is not None]
     return Reacquisition(
         n=len(delays),
@@ -245,17 +245,17 @@ def _track_scores(tracks: Sequence[EyeTrack], losses: TrackLosses | None, key: s
     )
 
 
-def _delays(visibilities: Sequence[Visibility], answers: Sequence[bool]) -> Iterator[int | None]:
+def _delays(visibilities: Sequence[Visibility], estimated: Sequence[bool]) -> Iterator[int | None]:
     """Frames from each re-appearance to an estimate, or None where none came before the drogue was hidden again."""
     hidden, since = False, None
-    for k, (visibility, answer) in enumerate(zip(visibilities, answers, strict=True)):
+    for k, (visibility, has_estimate) in enumerate(zip(visibilities, estimated, strict=True)):
         if visibility == "seen" and hidden:
             hidden, since = False, k
-        elif visibility == "hidden" or (visibility == "dazzled" and not answer):
+        elif visibility == "hidden" or (visibility == "dazzled" and not has_estimate):
             if since is not None:
                 yield None
             hidden, since = True, None
-        if since is not None and answer:
+        if since is not None and has_estimate:
             yield k - since
             since = None
     if since is not None:
@@ -332,11 +332,11 @@ def _source_tracking(source: str, tracks: Sequence[EyeTrack], stages_s: StageTim
     pairs = {
         index for track in tracks for index, own in zip(track.frame_index, is_own(track).tolist(), strict=True) if own
     }
-    told = [stages_s[index] for index in sorted(pairs & stages_s.keys())]
-    times_ms = [1e3 * work_s for work_s in map(processing_time_s, told) if work_s is not None]
+    reported = [stages_s[index] for index in sorted(pairs & stages_s.keys())]
+    times_ms = [1e3 * work_s for work_s in map(processing_time_s, reported) if work_s is not None]
     box_ms = [
         1e3 * sum(spent_s for stage, spent_s in stages.items() if stage in _BOX_STAGES)
-        for stages in told
+        for stages in reported
         if _BOX_STAGES & stages.keys()
     ]
     return SourceTracking(

@@ -165,7 +165,7 @@ def _predicted_row(quantity: str, results: Results) -> AcceptanceRow:
 
 
 def _never_worse_row(results: Results) -> AcceptanceRow:
-    """Z of the method that knows the tolerances against the better of stereo alone and itself without knowing them."""
+    """Z errors of the method with stated tolerances over the better of stereo alone and itself without them."""
     rows = []
     for cell, result in results.items():
         assert result.untold is not None

@@ -41,10 +41,10 @@ from studies.acceptance.finished_results import code_fingerprint
 _STEP = 1e-5
 # Noise of an evenly lit hub's centre over that of a marker's: between 1.3 and 1.5 on rendered frames.
 HUB_NOISE_FACTOR = 1.5
-# Enough for a variance good to 16 %, which shifts a 95 % limit by little.
+# Enough for a variance within 16 %, which hardly changes a 95 % limit.
 BLOCKS = 40
 CELLS_FILE = "cells.json"
-# Above so many deviations of the flip law a tilt has a sign.
+# A tilt above this many standard deviations of the flip law is clear.
 CLEAR_TILT_SCALES = 3.0
 STATIONS_M = (1.7, 2.0, 3.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0)
 SIGMAS_PX = (0.05, 0.1, 0.2, 0.35)
@@ -54,11 +54,11 @@ DOCKING_RANGE_M = (1.7, 10.0)
 # Draws of a cell for methods that are solved in batches, and for those that are not.
 BATCHED_DRAWS = 10_000
 SINGLE_DRAWS = 1000
-# The binomial error of a rate is then at most 0.0025: of 108 cells the unluckiest is still told from 0.02.
+# The binomial error of a rate is then at most 0.0025: the worst of 108 cells can still be told from 0.02.
 FLIP_DRAWS = 40_000
-# The order of 5, 7 and 8 markers differs by two percent in the mean at least: so many draws tell it.
+# The order of 5, 7 and 8 markers differs by at least two percent in the mean, which needs this many draws.
 ORDER_DRAWS = 48_000
-# By ten and more for the robust method, which takes longer.
+# By at least ten percent for the robust method, which takes longer.
 ROBUST_ORDER_DRAWS = 2000
 
 
@@ -234,7 +234,7 @@ def bound_deviations(rig: StereoRig, truth: Poses, centers_m: Array, radii_m: Ar
 
 
 def squared_errors(estimates: Poses, covariances: Array, errors: Array) -> Array:
-    """(n,) normalised squares of the five errors, of mean 5 where covariances (n, 6, 6) tell the truth."""
+    """(n,) normalised squares of the five errors, of mean 5 where covariances (n, 6, 6) are true."""
     slopes = component_slopes(estimates.rotations)
     covariance = slopes @ covariances @ np.swapaxes(slopes, 1, 2)
     squares: Array = np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
@@ -309,7 +309,7 @@ def _measure(cell: Cell, layout: MarkerLayout, poses: Poses) -> MeasuredFrames:
     true = draw_features(seeded_generator(cell.seed, key, "features"), layout, cell.tolerances, cell.draws)
     _, radii = feature_points(layout)
     exact = ellipse_centers_px(paper_rig(), poses, true.centers_m, radii, true.right)
-    # The same noise with and without bad markers, so that their effect stands out.
+    # The same noise with and without bad markers, so that only their effect differs.
     noise_key = f"{cell.stream}, {cell.markers} markers, {cell.sigma_px:g} px"
     noise = seeded_generator(cell.seed, noise_key, "noise").standard_normal(exact.shape)
     hub_sigma_px = HUB_NOISE_FACTOR * cell.sigma_px

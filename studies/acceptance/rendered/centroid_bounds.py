@@ -12,7 +12,7 @@ from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.records import FeatureView, PairRecord
 from geometry.se3 import Array
 
-# The trapezoidal rule on a smooth closed curve converges faster than any power; so many points per pixel of
+# The trapezoidal rule on a smooth closed curve converges faster than any power; this many points per pixel of
 # circumference carry it beyond single precision for blurs down to 0.3 px.
 _POINTS_PER_PX = 8
 # Beyond this many standard deviations of the blur the image is flat.

@@ -199,16 +199,16 @@ def processing_time_rows(title: str, pairs: Sequence[ScoredPair], is_comparison:
     """Criterion 27: median processing time of a pair, by distance; pairs without a pose count."""
     rows = []
     for low_m, high_m, bar_ms, where in _SPEEDS:
-        told = [
+        timed = [
             (1e3 * pair.work_s, pair.pair.sequence_id)
             for pair in pairs
             if pair.work_s is not None and low_m <= pair.pair.distance_m <= high_m
         ]
         bar, quantity = COMPARISON if is_comparison else "27", f"{title}: median time of a pair {where} [ms]"
-        if not told:
+        if not timed:
             rows.append(not_measured(bar, quantity, bar_ms, "no pair there tells its time"))
             continue
-        took, flights = zip(*told, strict=True)
+        took, flights = zip(*timed, strict=True)
         rows.append(at_most(bar, quantity, bar_ms, block_percentile_limit(took, flights, 50.0, quantity), len(took)))
     return rows
 

@@ -93,8 +93,8 @@ def score_pairs(dataset: Path, estimates: Path) -> dict[str, list[ScoredPair]]:
     pairs = [pair for pair in (_true_pair(data, index) for index in data.frame_indices) if pair is not None]
     bounds = _bounds(pairs, found)
     return {
-        name: [_scored(pair, answers.get(pair.frame_index), bounds[pair.frame_index]) for pair in pairs]
-        for name, answers in found.items()
+        name: [_scored(pair, estimated.get(pair.frame_index), bounds[pair.frame_index]) for pair in pairs]
+        for name, estimated in found.items()
     }
 
 
@@ -123,10 +123,10 @@ def _bounds(pairs: Sequence[TruePair], methods: Mapping[str, Mapping[int, Estima
         truths = {pair.frame_index: pair.truth for pair in pairs if pair.family == family}
         centroids = {
             name: {
-                index: centroid_errors(truth, answers[index].features if index in answers else ())
+                index: centroid_errors(truth, estimated[index].features if index in estimated else ())
                 for index, truth in truths.items()
             }
-            for name, answers in methods.items()
+            for name, estimated in methods.items()
         }
         for index, covariance in build_reference(truths, centroids).covariances.items():
             pose = truths[index].left_from_drogue
@@ -134,11 +134,11 @@ def _bounds(pairs: Sequence[TruePair], methods: Mapping[str, Mapping[int, Estima
     return bounds
 
 
-def _scored(pair: TruePair, answer: Estimate | None, bound: Array | None) -> ScoredPair:
-    work_s = None if answer is None else processing_time_s(answer.stage_s)
-    if not isinstance(answer, PoseEstimate):
-        reason = "" if answer is None else answer.reason
+def _scored(pair: TruePair, estimate: Estimate | None, bound: Array | None) -> ScoredPair:
+    work_s = None if estimate is None else processing_time_s(estimate.stage_s)
+    if not isinstance(estimate, PoseEstimate):
+        reason = "" if estimate is None else estimate.reason
         return ScoredPair(pair, None, None, None, reason, work_s)
-    error = pose_error(answer.left_from_drogue, pair.truth.left_from_drogue).components
-    sd_m = None if answer.covariance is None else float(np.sqrt(max(np.trace(answer.covariance[:3, :3]), 0.0)))
+    error = pose_error(estimate.left_from_drogue, pair.truth.left_from_drogue).components
+    sd_m = None if estimate.covariance is None else float(np.sqrt(max(np.trace(estimate.covariance[:3, :3]), 0.0)))
     return ScoredPair(pair, error, sd_m, None if bound is None else error / bound, "", work_s)
