@@ -1,4 +1,4 @@
-"""Part id, depth and normal where the rays through the pixel centres of an eye meet flat rings."""
+"""Part id, depth and normal where the rays through the pixel centres of an eye hit flat rings."""
 
 from __future__ import annotations
 
@@ -21,50 +21,6 @@ from render.surfaces import missing_parts
 _OUTLINE_POINTS = 128
 # Covers the chords of the outline, which deviate from the circle by 3e-4 of its radius.
 _MARGIN_PX = 2
-
-
-@dataclass(frozen=True, eq=False)
-class RingPixels:
-    """A window of the image and its pixels that a ring covers.
-
-    Attributes:
-        rows, columns: where the window lies.
-        inside: (h, w) whether the ray through a pixel centre meets the ring.
-        depth_m: (h, w) planar depth at which it meets the ring's plane. [m]
-    """
-
-    rows: slice
-    columns: slice
-    inside: NDArray[np.bool_]
-    depth_m: NDArray[np.float32]
-
-
-@lru_cache(maxsize=2)
-def _pixel_rays(lens: Lens) -> Array:
-    """(H, W, 2) x and y at z = 1 of the rays through all pixel centres."""
-    u, v = np.meshgrid(np.arange(lens.camera.width_px), np.arange(lens.camera.height_px))
-    rays: Array = lens.rays(np.stack([u, v], axis=-1))[..., :2]
-    return rays
-
-
-def lens_ring_pixels(ring: FlatRing, view: EyeView, lens: Lens) -> RingPixels | None:
-    """The pixel centres, of an eye with a lens, whose rays hit a ring; None for a ring outside the image."""
-    outline_px = view.rig.image(
-        disc_outline(view.left_from_drogue, ring.center_m, ring.outer_radius_m, _OUTLINE_POINTS), view.eye
-    )
-    size = np.array([lens.camera.width_px, lens.camera.height_px])
-    low = np.clip(np.floor(outline_px.min(axis=0)).astype(int) - _MARGIN_PX, 0, size)
-    high = np.clip(np.ceil(outline_px.max(axis=0)).astype(int) + _MARGIN_PX + 1, 0, size)
-    if (low >= high).any():
-        return None
-    rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
-    rays = _pixel_rays(lens)[rows, columns]
-    center_m, axis = view.center_m(ring), view.left_from_drogue.rotation[:, 2]
-    x, y = rays[..., 0], rays[..., 1]
-    depth_m = (center_m @ axis) / (x * axis[0] + y * axis[1] + axis[2])
-    square_m2 = (x * depth_m - center_m[0]) ** 2 + (y * depth_m - center_m[1]) ** 2 + (depth_m - center_m[2]) ** 2
-    inside = (square_m2 <= ring.outer_radius_m**2) & (square_m2 >= ring.inner_radius_m**2)
-    return RingPixels(rows, columns, inside, depth_m.astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +94,7 @@ def _ideal_ring_pixels(ring: FlatRing, view: EyeView) -> RingPixels | None:
 def _plane_depth_m(
     center_m: Array, axis: Array, camera: PinholeCamera, rows: slice, columns: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """(h, w) planar depth at which rays through pixel centres meet a plane across the axis. [m]"""
+    """(h, w) planar depth at which rays through pixel centres hit a plane across the axis. [m]"""
     along_x = axis[0] / camera.fx_px * (columns - camera.cx_px) + axis[2]
     along_y = axis[1] / camera.fy_px * (np.arange(rows.start, rows.stop) - camera.cy_px)
     depth: NDArray[np.float32] = ((center_m @ axis) / (along_y[:, None] + along_x)).astype(np.float32)
@@ -146,7 +102,7 @@ def _plane_depth_m(
 
 
 def _disc_spans(ring: FlatRing, radius_m: float, view: EyeView) -> _RowSpans:
-    """The pixel centres on the image whose rays meet a disc.
+    """The pixel centres on the image whose rays hit a disc.
 
     The ray x hits the plane at `x (t.n) / (x.n)`, and lies within the radius of t where
     `|x (t.n) - t (x.n)|^2 <= r^2 (x.n)^2`: a conic in the image, solved for the two columns of every row.
@@ -175,6 +131,50 @@ def _disc_spans(ring: FlatRing, radius_m: float, view: EyeView) -> _RowSpans:
     last = np.floor((-half[rows] + width) / conic[0, 0] + middle[0])
     on_image = np.clip(first, 0, camera.width_px), np.clip(last, -1, camera.width_px - 1)
     return _RowSpans(int(rows.start), on_image[0].astype(np.int64), on_image[1].astype(np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class RingPixels:
+    """A window of the image and its pixels that a ring covers.
+
+    Attributes:
+        rows, columns: where the window lies.
+        inside: (h, w) whether the ray through a pixel centre hits the ring.
+        depth_m: (h, w) planar depth at which it hits the ring's plane. [m]
+    """
+
+    rows: slice
+    columns: slice
+    inside: NDArray[np.bool_]
+    depth_m: NDArray[np.float32]
+
+
+@lru_cache(maxsize=2)
+def _pixel_rays(lens: Lens) -> Array:
+    """(H, W, 2) x and y at z = 1 of the rays through all pixel centres."""
+    u, v = np.meshgrid(np.arange(lens.camera.width_px), np.arange(lens.camera.height_px))
+    rays: Array = lens.rays(np.stack([u, v], axis=-1))[..., :2]
+    return rays
+
+
+def lens_ring_pixels(ring: FlatRing, view: EyeView, lens: Lens) -> RingPixels | None:
+    """The pixel centres, of an eye with a lens, whose rays hit a ring; None for a ring outside the image."""
+    outline_px = view.rig.image(
+        disc_outline(view.left_from_drogue, ring.center_m, ring.outer_radius_m, _OUTLINE_POINTS), view.eye
+    )
+    size = np.array([lens.camera.width_px, lens.camera.height_px])
+    low = np.clip(np.floor(outline_px.min(axis=0)).astype(int) - _MARGIN_PX, 0, size)
+    high = np.clip(np.ceil(outline_px.max(axis=0)).astype(int) + _MARGIN_PX + 1, 0, size)
+    if (low >= high).any():
+        return None
+    rows, columns = slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+    rays = _pixel_rays(lens)[rows, columns]
+    center_m, axis = view.center_m(ring), view.left_from_drogue.rotation[:, 2]
+    x, y = rays[..., 0], rays[..., 1]
+    depth_m = (center_m @ axis) / (x * axis[0] + y * axis[1] + axis[2])
+    square_m2 = (x * depth_m - center_m[0]) ** 2 + (y * depth_m - center_m[1]) ** 2 + (depth_m - center_m[2]) ** 2
+    inside = (square_m2 <= ring.outer_radius_m**2) & (square_m2 >= ring.inner_radius_m**2)
+    return RingPixels(rows, columns, inside, depth_m.astype(np.float32))
 
 
 def flat_part_masks(frame: FrameSpec, eye: Eye) -> dict[int, NDArray[np.bool_]]:

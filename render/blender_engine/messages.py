@@ -69,7 +69,7 @@ class StageLight:
     """Sky, and sun or moon, as lights of the stage.
 
     Attributes:
-        sky: (H, 2H, 3) map: row 0 is the zenith, column 0 appearances along +x, the next ones turn towards +y. [unit]
+        sky: (H, 2H, 3) map: row 0 is the zenith, column 0 looks along +x, the next ones turn towards +y. [unit]
         world_from_stage: (3, 3) rotation.
         to_sun: (3,) direction in the stage's axes.
         sun: (3,) illuminance of a plane that faces it. [unit times sr]

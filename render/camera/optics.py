@@ -17,7 +17,7 @@ from render.engine import EyeRadiance
 from scenes.environment_radiance import environment_radiance
 from scenes.sky.photometry import SUN_RADIUS_RAD
 
-# Polished and coated glass scatters 1 / (a^2 + theta^2) ambient a source (the ABg law of optical
+# Polished and coated glass scatters 1 / (a^2 + theta^2) around a source (the ABg law of optical
 # design with g = 2); the core is our choice for a lens of several elements.
 _CORE_RAD = 0.01
 _WIDEST_RAD = np.pi / 2

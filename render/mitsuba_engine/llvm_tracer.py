@@ -64,7 +64,7 @@ class LlvmTracer:
 
 
 def _by_eye(sampled: SampledLight, eyes: dict[Eye, TracedEye], stage_s: dict[str, float]) -> TraceResult:
-    """The samples of both eyes, told apart; the right eye's flat indices come after all of the left's."""
+    """The samples of both eyes, separated by eye; the right eye's flat indices come after all of the left's."""
     lit, duplicates, errors = {}, {}, {}
     for index, eye in enumerate(EYES):
         size = eyes[eye].part_id.size

@@ -57,7 +57,7 @@ class SensorNoise:
         left_by_lens = 1.0
         if sensor.psf_sigma_px > 0:
             reach = int(np.ceil(4 * sensor.psf_sigma_px))
-            # Twice the square root of the kernel's energy along one axis: rows and columns.
+            # The root of the kernel's energy, once for the rows and once for the columns.
             left_by_lens = float(np.sum(cv2.getGaussianKernel(2 * reach + 1, sensor.psf_sigma_px) ** 2))
         weights = MONO_WEIGHTS.T.astype(np.float64) if sensor.color == "mono" else np.eye(3)
         return cls(

@@ -51,8 +51,8 @@ def leaked_rays(
     """Which rays hit a surface that no ray can reach, because they passed exactly between two triangles.
 
     All parts are closed, so a surface that faces away from the camera was hit from inside. A marker fills its pocket up
-    to the front, so a hit on its side wall came from within the face. A ray that grazes an edge may hit the part with
-    some neighbour, but never nothing: its normal is 0.
+    to the front, so a hit on its side wall came from within the face. A ray that grazes an edge may hit the part when
+    it is traced among other rays and miss it when it is traced alone: its normal is then 0.
 
     Args:
         part_id: (...,) part that each ray hit.

@@ -186,7 +186,7 @@ class DenoisedPaths:
 
 
 def _without_duplicates(groups: list[tuple[NDArray[np.int64], NDArray[np.float32]]]) -> SampledLight:
-    """Pixels and their (P + A, 7) light, the A duplicates of each group told apart."""
+    """Pixels and their (P + A, 7) light, separated into first samples and the A duplicates of each group."""
     duplicates = [found[len(pixel) :] for pixel, found in groups]
     return SampledLight(
         pixel=np.concatenate([pixel for pixel, _ in groups]),
