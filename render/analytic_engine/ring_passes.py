@@ -88,7 +88,8 @@ def _ideal_ring_pixels(ring: FlatRing, view: EyeView) -> RingPixels | None:
         here = slice(hole.top - spans.top, hole.top - spans.top + len(hole.first))
         inside[here] &= (u < hole.first[:, None]) | (u > hole.last[:, None])
     axis = view.left_from_drogue.rotation[:, 2]
-    return RingPixels(rows, columns, inside, _plane_depth_m(view.center_m(ring), axis, view.rig.camera, rows, u))
+    depth_m = _plane_depth_m(view.center_m(ring), axis, view.rig.camera, rows, u)
+    return RingPixels(rows=rows, columns=columns, inside=inside, depth_m=depth_m)
 
 
 def _plane_depth_m(
@@ -174,7 +175,7 @@ def lens_ring_pixels(ring: FlatRing, view: EyeView, lens: Lens) -> RingPixels | 
     depth_m = (center_m @ axis) / (x * axis[0] + y * axis[1] + axis[2])
     square_m2 = (x * depth_m - center_m[0]) ** 2 + (y * depth_m - center_m[1]) ** 2 + (depth_m - center_m[2]) ** 2
     inside = (square_m2 <= ring.outer_radius_m**2) & (square_m2 >= ring.inner_radius_m**2)
-    return RingPixels(rows, columns, inside, depth_m.astype(np.float32))
+    return RingPixels(rows=rows, columns=columns, inside=inside, depth_m=depth_m.astype(np.float32))
 
 
 def flat_part_masks(frame: FrameSpec, eye: Eye) -> dict[int, NDArray[np.bool_]]:

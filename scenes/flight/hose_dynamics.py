@@ -83,7 +83,8 @@ class HoseModel:
         links, tensions = self._equilibrium_links()
         nodes = np.zeros((3, self._sequences, self.links + 1))
         nodes[:, :, 1:] = np.cumsum(links, axis=1)[:, None]
-        return HoseState(nodes, np.zeros_like(nodes), np.tile(tensions, (self._sequences, 1)))
+        tensions = np.tile(tensions, (self._sequences, 1))
+        return HoseState(nodes_m=nodes, velocities_m_s=np.zeros_like(nodes), tensions_n=tensions)
 
     def check_step(self, time_step_s: float) -> None:
         """Check that a time step resolves waves along the links and drag.

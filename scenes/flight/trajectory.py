@@ -136,7 +136,8 @@ def _released_hose(hose: HoseParameters, release_m: Array, sequences: int) -> Ho
     links = hose.length_m / LINKS * (np.cos(angles) * along[:, None] + np.sin(angles) * down[:, None])
     nodes = np.zeros((3, sequences, LINKS + 1))
     nodes[:, :, 1:] = np.cumsum(links, axis=1)[:, None]
-    return HoseState(nodes, np.zeros_like(nodes), np.zeros((sequences, LINKS)))
+    tensions = np.zeros((sequences, LINKS))
+    return HoseState(nodes_m=nodes, velocities_m_s=np.zeros_like(nodes), tensions_n=tensions)
 
 
 class Trajectory:

@@ -77,8 +77,7 @@ def test_airlight_is_the_background_where_nothing_can_be_seen(make_recipe):
 def test_a_pixel_is_as_hazy_alone_as_among_others():
     rng = np.random.default_rng(8)
     depth_m = np.where(rng.random((12, 9)) < 0.6, np.inf, rng.uniform(5, 40, (12, 9))).astype(np.float32)
-    nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32)
-    seen = TracedEye(depth_m > 0, depth_m, np.zeros((12, 9, 3)), {}, *nothing)
+    seen = TracedEye.untraced(part_id=depth_m > 0, depth_m=depth_m, normal=np.zeros((12, 9, 3)), amodal_px={})
     per_m = rng.uniform(0.01, 0.05, depth_m.size).astype(np.float32)
     all_of_them = seen.air_transmittance(np.arange(depth_m.size), per_m)
     # By the definition: the nearest depth of the 25 pixels around, and clear air where none has one.

@@ -24,7 +24,14 @@ def eye(frame, coverage=0.0):
     shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)
     nothing = np.zeros((*shape, 3), dtype=np.float32)
     full = np.full(shape, coverage, dtype=np.float32)
-    return EyeRadiance(nothing, full, np.zeros(shape, dtype=np.uint8), full, nothing, {})
+    return EyeRadiance(
+        radiance_cd_m2=nothing,
+        coverage=full,
+        part_id=np.zeros(shape, dtype=np.uint8),
+        depth_m=full,
+        normal=nothing,
+        amodal_px={},
+    )
 
 
 @pytest.mark.parametrize("fraction", [0.01, 0.1])

@@ -31,8 +31,22 @@ def flat_numbers(frame: FrameSpec, electrons: float, gain: float, time_s: float,
     level = electrons / sensor.electrons_per_cd_m2(exposure)
     light = np.full((*SHAPE, 3), level, dtype=np.float32)
     none = np.zeros(SHAPE, dtype=np.float32)
-    eye = EyeRadiance(light, none, none.astype(np.uint8), none, np.zeros_like(light), {})
-    radiance = StereoRadiance(eye, eye, "flat field", "1", 0.0, {})
+    eye = EyeRadiance(
+        radiance_cd_m2=light,
+        coverage=none,
+        part_id=none.astype(np.uint8),
+        depth_m=none,
+        normal=np.zeros_like(light),
+        amodal_px={},
+    )
+    radiance = StereoRadiance(
+        left=eye,
+        right=eye,
+        engine="flat field",
+        engine_version="1",
+        monte_carlo_noise_fraction=0.0,
+        stage_s={},
+    )
     shots = []
     for index in range(IMAGES):
         changes = {"sensor": sensor, "exposure": exposure, "frame_index": index}

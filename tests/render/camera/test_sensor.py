@@ -18,8 +18,22 @@ SHAPE = (96, 128)
 def flat_pair(level_cd_m2, rgb=(1.0, 1.0, 1.0)):
     radiance = np.full((*SHAPE, 3), level_cd_m2, dtype=np.float32) * np.array(rgb, dtype=np.float32)
     nothing = np.zeros(SHAPE, dtype=np.float32)
-    eye = EyeRadiance(radiance, nothing, nothing.astype(np.uint8), nothing, np.zeros((*SHAPE, 3), np.float32), {})
-    return StereoRadiance(eye, eye, "test pattern", "1", 0.0, {})
+    eye = EyeRadiance(
+        radiance_cd_m2=radiance,
+        coverage=nothing,
+        part_id=nothing.astype(np.uint8),
+        depth_m=nothing,
+        normal=np.zeros((*SHAPE, 3), np.float32),
+        amodal_px={},
+    )
+    return StereoRadiance(
+        left=eye,
+        right=eye,
+        engine="test pattern",
+        engine_version="1",
+        monte_carlo_noise_fraction=0.0,
+        stage_s={},
+    )
 
 
 @pytest.fixture
