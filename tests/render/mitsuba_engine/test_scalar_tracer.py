@@ -57,7 +57,7 @@ from render.mitsuba_engine.scalar_tracer import _MITSUBA_FROM_OPENCV, _View
 from scenes.sampler import sample_frame
 recipe = parse_recipe(open(sys.argv[1]).read())
 view = _View(sample_frame(recipe, 0), "left")
-camera, pose = recipe.rig.camera, view._drogue_from_eye(0.0)
+camera, pose = recipe.rig.camera, view._stage_from_eye(0.0)
 def plate(pixel, depth_m, radius_m, turn):
     place = np.eye(4)
     place[:3, :3] = turn * radius_m
