@@ -49,14 +49,14 @@ def load_body_mesh(body: BodyMesh) -> trimesh.Trimesh:
             f"body_mesh: {file} has changed since the drogue was loaded; restore the file with sha256 {body.sha256}, "
             f"got {sha256}"
         )
-    mesh = _parse(data, file.suffix.lower().removeprefix("."), str(file))
-    fault = _fault(mesh)
+    mesh = _parse_body_mesh(data, file.suffix.lower().removeprefix("."), str(file))
+    fault = _body_mesh_fault(mesh)
     if fault:
         raise ValueError(f"body_mesh: {file} {fault}")
     return mesh
 
 
-def _parse(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
+def _parse_body_mesh(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
     readable = sorted(trimesh.available_formats())
     if file_type not in readable:
         raise ValueError(f"body_mesh: {name} is of a kind that cannot be read; use one of {', '.join(readable)}")
@@ -69,7 +69,7 @@ def _parse(data: bytes, file_type: str, name: str) -> trimesh.Trimesh:
     return mesh
 
 
-def _fault(mesh: trimesh.Trimesh) -> str | None:
+def _body_mesh_fault(mesh: trimesh.Trimesh) -> str | None:
     """Why the mesh cannot be used, and what to do; None for a valid mesh."""
     if not np.isfinite(mesh.vertices).all():
         return "has vertices that are not finite; export it again"

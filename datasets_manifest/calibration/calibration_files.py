@@ -12,6 +12,44 @@ from geometry.distortion import Lens
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
 
+OPENCV_STEREO_FILE = "opencv_stereo.yaml"
+
+KALIBR_FILE = "kalibr_camchain.yaml"
+
+
+def calibration_files(rig: StereoRig) -> dict[str, str]:
+    """All calibration files of a rig by name; without Kalibr's where it cannot describe the lenses."""
+    files = {OPENCV_STEREO_FILE: opencv_stereo(rig)}
+    if kalibr_fault(rig) is None:
+        files[KALIBR_FILE] = kalibr_camchain(rig)
+    return files | {camera_info_file(eye): camera_info(rig, eye) for eye in EYES}
+
+
+def write_calibration(dataset: Location, rig: StereoRig) -> list[Location]:
+    """Write all calibration files into the dataset's calibration folder.
+
+    Returns:
+        Locations of the files, OpenCV's first.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    storage, files = open_storage(dataset), calibration_files(rig)
+    for name, text in files.items():
+        storage.write(f"{CALIBRATION_FOLDER}/{name}", text.encode())
+    return [join(dataset, f"{CALIBRATION_FOLDER}/{name}") for name in files]
+
+
+def opencv_stereo(rig: StereoRig) -> str:
+    """The text of a YAML file for `cv2.FileStorage`: image size and `opencv_stereo_matrices`."""
+    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", rig.camera.width_px)
+    storage.write("image_height", rig.camera.height_px)
+    for name, matrix in opencv_stereo_matrices(rig).items():
+        storage.write(name, matrix)
+    text: str = storage.releaseAndGetString()
+    return text
+
 
 def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
     """A rig in the names and conventions of `cv2.stereoRectify`; the true values, without calibration errors.
@@ -51,56 +89,6 @@ def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
         "P2": right,
         "Q": reprojection,
     }
-
-
-def yaml_number(value: float) -> str:
-    """Shortest digits that read back the same.
-
-    YAML 1.1, which ROS and Kalibr read, takes `1e-05` for text: a number needs a point before the exponent.
-    """
-    digits = repr(float(value))
-    mantissa, sign, exponent = digits.partition("e")
-    return digits if not sign or "." in mantissa else f"{mantissa}.0e{exponent}"
-
-
-def yaml_list(values: ArrayLike) -> str:
-    """All numbers of an array, row by row, on one line."""
-    return f"[{', '.join(yaml_number(value) for value in np.asarray(values, dtype=np.float64).ravel())}]"
-
-
-def camera_info_file(eye: Eye) -> str:
-    """Name of one eye's `camera_info` file."""
-    return f"ros_{eye}.yaml"
-
-
-def camera_info(rig: StereoRig, eye: Eye) -> str:
-    """Text of one eye's `camera_info` file, as ROS camera drivers read it.
-
-    Matrix and distortion are those of the delivered images; rectification and projection map to the rectified pair:
-    `P[0, 3]` of the right eye is `-fx * baseline`. [px m]
-
-    Source: the definition of `sensor_msgs/CameraInfo`; file format of the package `camera_calibration_parsers`.
-    """
-    m, number = opencv_stereo_matrices(rig), EYES.index(eye) + 1
-    lines = [
-        f"image_width: {rig.camera.width_px}",
-        f"image_height: {rig.camera.height_px}",
-        f"camera_name: {eye}",
-        *_matrix("camera_matrix", m[f"M{number}"]),
-        "distortion_model: plumb_bob",
-        *_matrix("distortion_coefficients", m[f"D{number}"]),
-        *_matrix("rectification_matrix", m[f"R{number}"]),
-        *_matrix("projection_matrix", m[f"P{number}"]),
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _matrix(name: str, values: Array) -> list[str]:
-    rows, columns = values.shape
-    return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: {yaml_list(values)}"]
-
-
-KALIBR_FILE = "kalibr_camchain.yaml"
 
 
 def kalibr_fault(rig: StereoRig) -> str | None:
@@ -143,38 +131,48 @@ def kalibr_camchain(rig: StereoRig) -> str:
     return "\n".join(lines) + "\n"
 
 
-OPENCV_STEREO_FILE = "opencv_stereo.yaml"
+def camera_info_file(eye: Eye) -> str:
+    """Name of one eye's `camera_info` file."""
+    return f"ros_{eye}.yaml"
 
 
-def opencv_stereo(rig: StereoRig) -> str:
-    """The text of a YAML file for `cv2.FileStorage`: image size and `opencv_stereo_matrices`."""
-    storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
-    storage.write("image_width", rig.camera.width_px)
-    storage.write("image_height", rig.camera.height_px)
-    for name, matrix in opencv_stereo_matrices(rig).items():
-        storage.write(name, matrix)
-    text: str = storage.releaseAndGetString()
-    return text
+def camera_info(rig: StereoRig, eye: Eye) -> str:
+    """Text of one eye's `camera_info` file, as ROS camera drivers read it.
 
+    Matrix and distortion are those of the delivered images; rectification and projection map to the rectified pair:
+    `P[0, 3]` of the right eye is `-fx * baseline`. [px m]
 
-def calibration_files(rig: StereoRig) -> dict[str, str]:
-    """All calibration files of a rig by name; without Kalibr's where it cannot describe the lenses."""
-    files = {OPENCV_STEREO_FILE: opencv_stereo(rig)}
-    if kalibr_fault(rig) is None:
-        files[KALIBR_FILE] = kalibr_camchain(rig)
-    return files | {camera_info_file(eye): camera_info(rig, eye) for eye in EYES}
-
-
-def write_calibration(dataset: Location, rig: StereoRig) -> list[Location]:
-    """Write all calibration files into the dataset's calibration folder.
-
-    Returns:
-        Locations of the files, OpenCV's first.
-
-    Raises:
-        OSError: they cannot be written.
+    Source: the definition of `sensor_msgs/CameraInfo`; file format of the package `camera_calibration_parsers`.
     """
-    storage, files = open_storage(dataset), calibration_files(rig)
-    for name, text in files.items():
-        storage.write(f"{CALIBRATION_FOLDER}/{name}", text.encode())
-    return [join(dataset, f"{CALIBRATION_FOLDER}/{name}") for name in files]
+    m, number = opencv_stereo_matrices(rig), EYES.index(eye) + 1
+    lines = [
+        f"image_width: {rig.camera.width_px}",
+        f"image_height: {rig.camera.height_px}",
+        f"camera_name: {eye}",
+        *_matrix("camera_matrix", m[f"M{number}"]),
+        "distortion_model: plumb_bob",
+        *_matrix("distortion_coefficients", m[f"D{number}"]),
+        *_matrix("rectification_matrix", m[f"R{number}"]),
+        *_matrix("projection_matrix", m[f"P{number}"]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _matrix(name: str, values: Array) -> list[str]:
+    rows, columns = values.shape
+    return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: {yaml_list(values)}"]
+
+
+def yaml_number(value: float) -> str:
+    """Shortest digits that read back the same.
+
+    YAML 1.1, which ROS and Kalibr read, takes `1e-05` for text: a number needs a point before the exponent.
+    """
+    digits = repr(float(value))
+    mantissa, sign, exponent = digits.partition("e")
+    return digits if not sign or "." in mantissa else f"{mantissa}.0e{exponent}"
+
+
+def yaml_list(values: ArrayLike) -> str:
+    """All numbers of an array, row by row, on one line."""
+    return f"[{', '.join(yaml_number(value) for value in np.asarray(values, dtype=np.float64).ravel())}]"

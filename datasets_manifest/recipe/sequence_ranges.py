@@ -77,7 +77,7 @@ _SMALL_UAV = HoseParameters(
 HOSES: dict[str, HoseParameters] = {hose.name: hose for hose in (_FULL_SIZE, _SMALL_UAV)}
 
 
-def _resolve(value: Any) -> Any:
+def _resolve_hose(value: Any) -> Any:
     """All parameters, from a preset's name or from a table that changes a preset."""
     table = {"preset": value} if isinstance(value, str) else value
     if not isinstance(table, dict) or "preset" not in table:
@@ -88,7 +88,7 @@ def _resolve(value: Any) -> Any:
     return {**HOSES[table["preset"]].model_dump(), **changes}
 
 
-Hose = Annotated[HoseParameters, BeforeValidator(_resolve)]
+Hose = Annotated[HoseParameters, BeforeValidator(_resolve_hose)]
 """In TOML the name of a preset, a table with `preset` and what differs from it, or all parameters."""
 
 

@@ -27,7 +27,131 @@ from drogue_models.frozen_model import FrozenModel
 from drogue_models.presets import explain
 
 MAX_PAIRS_PER_TAR = 100_000
+
 _BLOCK_BYTES = 2**20
+
+# The index of a tar file of 1000 frames takes some 2 MB of memory.
+_MAX_CACHED_INDICES = 64
+
+# Reads run in threads. The lock is global, because stores are pickled for the processes of data loaders.
+_CACHE_LOCK = Lock()
+
+
+class FrameStore:
+    """Reads frames of one dataset; a frame's folder, where it exists, takes precedence over its tar file."""
+
+    def __init__(self, dataset: Location) -> None:
+        """Open a dataset in either layout.
+
+        Raises:
+            ValueError: a URL that cannot be used, or a damaged `shards/layout.json`.
+        """
+        self.storage = open_storage(dataset)
+        self.pairs_per_tar = read_pairs_per_tar(self.storage)
+        self._shards: dict[int, ShardIndex] = {}
+
+    def indices(self) -> list[int]:
+        """Indices of the stored frames, ascending.
+
+        Raises:
+            ValueError: a list of tar files is missing or damaged; names the file.
+        """
+        found = set(self.staged)
+        if self.pairs_per_tar is not None:
+            read = partial(read_shard_index, self.storage)
+            for shard in map_in_order(read, shard_numbers(self.storage), self.storage):
+                found.update(shard.frames)
+        return sorted(found)
+
+    @cached_property
+    def staged(self) -> frozenset[int]:
+        """Indices of the frames that have folders of their own."""
+        folders = self.storage.folders_with(FRAMES_FOLDER, RECORD_FILE)
+        return frozenset(int(name) for name in folders if name.isdecimal())
+
+    def names(self, frame_index: int) -> list[str]:
+        """Names of the files of a frame, sorted.
+
+        Raises:
+            ValueError: a list of tar files is missing or damaged.
+        """
+        shard = self._shard_of(frame_index)
+        return self.storage.names(frame_name(frame_index)) if shard is None else sorted(shard.frames[frame_index])
+
+    def where(self, frame_index: int, name: str = "") -> str:
+        """Path or URL of a file of a frame, or of the frame, for messages."""
+        if self._is_packed(frame_index):
+            tar = shard_file(frame_index // (self.pairs_per_tar or 1))
+            return self.storage.where(f"{tar}/{member_name(frame_index, name) if name else f'{frame_index:06d}'}")
+        folder = frame_name(frame_index)
+        return self.storage.where(f"{folder}/{name}" if name else folder)
+
+    def read(self, frame_index: int, name: str) -> bytes:
+        """A file of a frame.
+
+        Raises:
+            ValueError: it is missing, leads out of the frame's folder or cannot be read; names the file.
+        """
+        path = f"{frame_name(frame_index)}/{name}"
+        try:
+            if not is_plain_name(name) or self.storage.leads_outside(path):
+                raise ValueError(f"{self.where(frame_index, name)}: leads outside the frame's folder")
+            shard = self._shard_of(frame_index)
+            if shard is None:
+                return self.storage.read(path)
+            file = shard.frames[frame_index].get(name)
+            if file is None:
+                raise FileNotFoundError
+            tar = shard_file(frame_index // (self.pairs_per_tar or 1))
+            return self.storage.read(tar, file.offset, file.size)
+        except FileNotFoundError as error:
+            raise ValueError(f"{self.where(frame_index, name)}: is missing") from error
+        except OSError as error:
+            raise ValueError(f"{self.where(frame_index, name)}: cannot be read: {error}") from error
+
+    def path(self, frame_index: int, name: str) -> Path | None:
+        """Path of a file of a frame, or None where it is remote or inside a tar file.
+
+        Raises:
+            ValueError: it is missing or leads out of the frame's folder; names the file.
+        """
+        inside = f"{frame_name(frame_index)}/{name}"
+        path = None if self._is_packed(frame_index) else self.storage.path(inside)
+        if path is None:
+            return None
+        if not is_plain_name(name) or path.is_symlink() or self.storage.leads_outside(inside):
+            raise ValueError(f"{path}: leads outside the frame's folder")
+        if not path.is_file():
+            raise ValueError(f"{path}: is missing")
+        return path
+
+    def _is_packed(self, frame_index: int) -> bool:
+        return self.pairs_per_tar is not None and frame_index not in self.staged
+
+    def _shard_of(self, frame_index: int) -> ShardIndex | None:
+        """Index of the tar file that holds a frame, or None where the frame has a folder or does not exist."""
+        if not self._is_packed(frame_index) or self.pairs_per_tar is None:
+            return None
+        shard = self._shard(frame_index // self.pairs_per_tar)
+        return shard if frame_index in shard.frames else None
+
+    def _shard(self, number: int) -> ShardIndex:
+        """Index of a tar file; the most recently used are cached."""
+        with _CACHE_LOCK:
+            shard = self._shards.pop(number, None) or read_shard_index(self.storage, number)
+            self._shards[number] = shard
+            if len(self._shards) > _MAX_CACHED_INDICES:
+                del self._shards[next(iter(self._shards))]
+        return shard
+
+
+def list_frames(dataset: Location) -> list[int]:
+    """Indices of the frames that a dataset holds, ascending.
+
+    Raises:
+        ValueError: a list of tar files is missing or damaged; names the file.
+    """
+    return FrameStore(dataset).indices()
 
 
 class ShardLayout(FrozenModel):
@@ -188,126 +312,3 @@ def index_text(index: ShardIndex) -> str:
 
 def _compact(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"))
-
-
-# The index of a tar file of 1000 frames takes some 2 MB of memory.
-_MAX_CACHED_INDICES = 64
-# Reads run in threads. The lock is global, because stores are pickled for the processes of data loaders.
-_CACHE_LOCK = Lock()
-
-
-class FrameStore:
-    """Reads frames of one dataset; a frame's folder, where it exists, takes precedence over its tar file."""
-
-    def __init__(self, dataset: Location) -> None:
-        """Open a dataset in either layout.
-
-        Raises:
-            ValueError: a URL that cannot be used, or a damaged `shards/layout.json`.
-        """
-        self.storage = open_storage(dataset)
-        self.pairs_per_tar = read_pairs_per_tar(self.storage)
-        self._shards: dict[int, ShardIndex] = {}
-
-    def indices(self) -> list[int]:
-        """Indices of the stored frames, ascending.
-
-        Raises:
-            ValueError: a list of tar files is missing or damaged; names the file.
-        """
-        found = set(self.staged)
-        if self.pairs_per_tar is not None:
-            read = partial(read_shard_index, self.storage)
-            for shard in map_in_order(read, shard_numbers(self.storage), self.storage):
-                found.update(shard.frames)
-        return sorted(found)
-
-    @cached_property
-    def staged(self) -> frozenset[int]:
-        """Indices of the frames that have folders of their own."""
-        folders = self.storage.folders_with(FRAMES_FOLDER, RECORD_FILE)
-        return frozenset(int(name) for name in folders if name.isdecimal())
-
-    def names(self, frame_index: int) -> list[str]:
-        """Names of the files of a frame, sorted.
-
-        Raises:
-            ValueError: a list of tar files is missing or damaged.
-        """
-        shard = self._shard_of(frame_index)
-        return self.storage.names(frame_name(frame_index)) if shard is None else sorted(shard.frames[frame_index])
-
-    def where(self, frame_index: int, name: str = "") -> str:
-        """Path or URL of a file of a frame, or of the frame, for messages."""
-        if self._is_packed(frame_index):
-            tar = shard_file(frame_index // (self.pairs_per_tar or 1))
-            return self.storage.where(f"{tar}/{member_name(frame_index, name) if name else f'{frame_index:06d}'}")
-        folder = frame_name(frame_index)
-        return self.storage.where(f"{folder}/{name}" if name else folder)
-
-    def read(self, frame_index: int, name: str) -> bytes:
-        """A file of a frame.
-
-        Raises:
-            ValueError: it is missing, leads out of the frame's folder or cannot be read; names the file.
-        """
-        path = f"{frame_name(frame_index)}/{name}"
-        try:
-            if not is_plain_name(name) or self.storage.leads_outside(path):
-                raise ValueError(f"{self.where(frame_index, name)}: leads outside the frame's folder")
-            shard = self._shard_of(frame_index)
-            if shard is None:
-                return self.storage.read(path)
-            file = shard.frames[frame_index].get(name)
-            if file is None:
-                raise FileNotFoundError
-            tar = shard_file(frame_index // (self.pairs_per_tar or 1))
-            return self.storage.read(tar, file.offset, file.size)
-        except FileNotFoundError as error:
-            raise ValueError(f"{self.where(frame_index, name)}: is missing") from error
-        except OSError as error:
-            raise ValueError(f"{self.where(frame_index, name)}: cannot be read: {error}") from error
-
-    def path(self, frame_index: int, name: str) -> Path | None:
-        """Path of a file of a frame, or None where it is remote or inside a tar file.
-
-        Raises:
-            ValueError: it is missing or leads out of the frame's folder; names the file.
-        """
-        inside = f"{frame_name(frame_index)}/{name}"
-        path = None if self._is_packed(frame_index) else self.storage.path(inside)
-        if path is None:
-            return None
-        if not is_plain_name(name) or path.is_symlink() or self.storage.leads_outside(inside):
-            raise ValueError(f"{path}: leads outside the frame's folder")
-        if not path.is_file():
-            raise ValueError(f"{path}: is missing")
-        return path
-
-    def _is_packed(self, frame_index: int) -> bool:
-        return self.pairs_per_tar is not None and frame_index not in self.staged
-
-    def _shard_of(self, frame_index: int) -> ShardIndex | None:
-        """Index of the tar file that holds a frame, or None where the frame has a folder or does not exist."""
-        if not self._is_packed(frame_index) or self.pairs_per_tar is None:
-            return None
-        shard = self._shard(frame_index // self.pairs_per_tar)
-        return shard if frame_index in shard.frames else None
-
-    def _shard(self, number: int) -> ShardIndex:
-        """Index of a tar file; the most recently used are cached."""
-        with _CACHE_LOCK:
-            shard = self._shards.pop(number, None) or read_shard_index(self.storage, number)
-            self._shards[number] = shard
-            if len(self._shards) > _MAX_CACHED_INDICES:
-                del self._shards[next(iter(self._shards))]
-        return shard
-
-
-def list_frames(dataset: Location) -> list[int]:
-    """Indices of the frames that a dataset holds, ascending.
-
-    Raises:
-        ValueError: a list of tar files is missing or damaged; names the file.
-    """
-    return FrameStore(dataset).indices()

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from datasets_manifest.types.images import Pixels
 from geometry.pinhole import PinholeCamera
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # Noise has no repeats to search for: Huffman coding alone takes half the time of level 1 and a sixth less space. Part
 # ids consist of runs. Without a level, OpenCV filters every row by the difference to the left, the cheapest filter.
-_OF_NOISE = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
-_OF_RUNS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+_PNG_NOISE_OPTIONS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
+_PNG_RUNS_OPTIONS = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
 
 
 def encode_png(pixels: Pixels, is_piecewise_constant: bool = False) -> bytes:
@@ -36,7 +36,7 @@ def encode_png(pixels: Pixels, is_piecewise_constant: bool = False) -> bytes:
     """
     # OpenCV's channel order is blue, green, red.
     image = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-    done, data = cv2.imencode(".png", image, _OF_RUNS if is_piecewise_constant else _OF_NOISE)
+    done, data = cv2.imencode(".png", image, _PNG_RUNS_OPTIONS if is_piecewise_constant else _PNG_NOISE_OPTIONS)
     if not done:
         raise ValueError(f"image: cannot be written as PNG, got {pixels.shape} {pixels.dtype}")
     return data.tobytes()
@@ -68,9 +68,9 @@ def png_fault(data: bytes) -> str | None:
 
     Source: PNG specification (ISO/IEC 15948), section 5.3: length, type, data, CRC of type and data.
     """
-    if not data.startswith(_SIGNATURE):
+    if not data.startswith(_PNG_SIGNATURE):
         return "not a PNG file"
-    position = len(_SIGNATURE)
+    position = len(_PNG_SIGNATURE)
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
         end = position + 12 + length
@@ -86,10 +86,10 @@ def png_fault(data: bytes) -> str | None:
 
 
 EXR_CHANNELS = ("R", "G", "B", "depth.Z", "normal.X", "normal.Y", "normal.Z", "id.X")
-_MAGIC = 20000630
+_EXR_MAGIC = 20000630
 # Version 2 with none of the flags for tiles, deep pixels and several parts; long names alone are harmless.
-_PLAIN_VERSIONS = (2, 2 | 0x400)
-_MAX_HEADER_BYTES = 65536
+_EXR_PLAIN_VERSIONS = (2, 2 | 0x400)
+_EXR_MAX_HEADER_BYTES = 65536
 
 
 def read_passes(data: bytes, name: str, camera: PinholeCamera) -> dict[str, NDArray[np.float32]]:
@@ -143,10 +143,12 @@ def _data_window(data: bytes) -> tuple[int, int, int, int] | None:
     Source: OpenEXR's description of its file layout: magic number, version, then attributes, each a name, a type, both
     ended by 0, a size and a value; an empty name ends the header.
     """
-    if len(data) < 8 or struct.unpack_from("<ii", data) not in [(_MAGIC, version) for version in _PLAIN_VERSIONS]:
+    if len(data) < 8 or struct.unpack_from("<ii", data) not in [
+        (_EXR_MAGIC, version) for version in _EXR_PLAIN_VERSIONS
+    ]:
         return None
     position = 8
-    while position < min(len(data), _MAX_HEADER_BYTES):
+    while position < min(len(data), _EXR_MAX_HEADER_BYTES):
         name_end = data.find(b"\0", position)
         type_end = data.find(b"\0", name_end + 1)
         if name_end in (-1, position) or type_end == -1 or type_end + 5 > len(data):

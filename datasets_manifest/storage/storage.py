@@ -22,155 +22,11 @@ from datasets_manifest.atomic import (
 )
 from datasets_manifest.storage.remote_storage import RemoteStorage
 
-
-class LocalStorage:
-    """A local folder as `Storage`: everything appears by one rename and is synced to the disk."""
-
-    is_remote = False
-
-    def __init__(self, root: Path) -> None:
-        self._root = root
-
-    def where(self, name: str = "") -> str:
-        """Path of a file."""
-        return str(self._root / name)
-
-    def path(self, name: str) -> Path | None:
-        """The file itself."""
-        return self._root / name
-
-    def root_exists(self) -> bool:
-        """Whether the folder exists."""
-        return self._root.is_dir()
-
-    def exists(self, name: str) -> bool:
-        """Whether there is a file of that name."""
-        return (self._root / name).is_file()
-
-    def leads_outside(self, name: str) -> bool:
-        """Whether the file is a link that leads out of its folder."""
-        path = self._root / name
-        # Links are few, and to follow every part of a path takes as long as to read a small file.
-        return path.is_symlink() and Path(os.path.realpath(path)).parent != Path(os.path.realpath(path.parent))
-
-    def size(self, name: str) -> int:
-        """Of a file. [bytes]"""
-        return (self._root / name).stat().st_size
-
-    def read(self, name: str, offset: int = 0, size: int | None = None) -> bytes:
-        """A file or a part of it."""
-        if offset == 0 and size is None:
-            return (self._root / name).read_bytes()
-        with (self._root / name).open("rb") as stream:
-            stream.seek(offset)
-            return stream.read(size)
-
-    def open(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """The file itself."""
-        return (self._root / name).open("rb")
-
-    @contextmanager
-    def local_copy(self, name: str) -> Iterator[Path]:
-        """The file itself."""
-        yield self._root / name
-
-    def names(self, folder: str) -> list[str]:
-        """Names directly in a folder."""
-        try:
-            return sorted(entry.name for entry in os.scandir(self._root / folder))
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-
-    def files_ending(self, suffix: str) -> list[str]:
-        """All files with the suffix, at any depth."""
-        found = self._root.rglob(f"*{suffix}")
-        return sorted(
-            path.relative_to(self._root).as_posix() for path in found if path.is_file() and not path.is_symlink()
-        )
-
-    def folders_with(self, folder: str, mark: str) -> list[str]:
-        """Folders that hold the file `mark`."""
-        return [name for name in self.names(folder) if (self._root / folder / name / mark).is_file()]
-
-    def leftovers(self, folder: str, mark: str) -> list[str]:
-        """Whatever still has a temporary name; a folder gets its final one only with all its files."""
-        folders = [name for name in self.names("") if not name.startswith(".") and (self._root / name).is_dir()]
-        return sorted(
-            f"{place}/{name}".lstrip("/")
-            for place in ["", *folders]
-            for name in self.names(place)
-            if name.startswith(".") and name.endswith(PART_SUFFIX)
-        )
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write or replace a file by one rename."""
-        write_bytes_atomic(self._root / name, data)
-
-    def write_text(self, name: str) -> AbstractContextManager[TextIO]:
-        """A text stream whose file appears by one rename."""
-        return open_text_atomic(self._root / name)
-
-    def write_large(self, name: str) -> AbstractContextManager[BinaryIO]:
-        """A stream of bytes whose file appears by one rename."""
-        return open_bytes_atomic(self._root / name)
-
-    def spool(self, folder: str) -> TextIO:
-        """An unnamed file on the disk of the folder, and not in /tmp, which is in memory on many machines."""
-        place = self._root / folder
-        place.mkdir(parents=True, exist_ok=True)
-        return cast(TextIO, tempfile.TemporaryFile("w+", encoding="utf-8", newline="\n", dir=place))
-
-    def write_together(self, folder: str, files: Mapping[str, bytes], mark: str) -> None:
-        """Write all files into a temporary folder, then rename it."""
-        target = self._root / folder
-        part = part_path(target)
-        try:
-            part.mkdir(parents=True)
-            for name in sorted(files):
-                _write_synced(part / name, files[name])
-            sync_folder(part)
-            self._remove_atomically(target)
-            part.rename(target)
-            sync_folder(target.parent)
-        except OSError as error:
-            raise OSError(error.errno, f"{target}: cannot be written: {error.strerror}") from error
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-
-    def delete(self, name: str) -> None:
-        """Remove a file, or a leftover folder of a killed run."""
-        path = self._root / name
-        try:
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-        except OSError as error:
-            raise OSError(error.errno, f"{path}: cannot be removed: {error.strerror}") from error
-
-    def delete_folder(self, folder: str, mark: str) -> None:
-        """Rename the folder, then delete it."""
-        self._remove_atomically(self._root / folder)
-
-    def _remove_atomically(self, target: Path) -> None:
-        if not target.exists():
-            return
-        renamed = part_path(target)
-        target.rename(renamed)
-        shutil.rmtree(renamed)
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    with path.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
 Location = Path | str
 """A folder, or a URL such as `s3://bucket/name`; text without `://` is a folder too."""
 
 T = TypeVar("T")
+
 R = TypeVar("R")
 
 # A response takes some 50 ms regardless of its size; this many concurrent requests saturate the connection.
@@ -328,3 +184,147 @@ def map_in_order(function: Callable[[T], R], items: Iterable[T], storage: Storag
         finally:
             for future in waiting:
                 future.cancel()
+
+
+class LocalStorage:
+    """A local folder as `Storage`: everything appears by one rename and is synced to the disk."""
+
+    is_remote = False
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def where(self, name: str = "") -> str:
+        """Path of a file."""
+        return str(self._root / name)
+
+    def path(self, name: str) -> Path | None:
+        """The file itself."""
+        return self._root / name
+
+    def root_exists(self) -> bool:
+        """Whether the folder exists."""
+        return self._root.is_dir()
+
+    def exists(self, name: str) -> bool:
+        """Whether there is a file of that name."""
+        return (self._root / name).is_file()
+
+    def leads_outside(self, name: str) -> bool:
+        """Whether the file is a link that leads out of its folder."""
+        path = self._root / name
+        # Links are few, and to follow every part of a path takes as long as to read a small file.
+        return path.is_symlink() and Path(os.path.realpath(path)).parent != Path(os.path.realpath(path.parent))
+
+    def size(self, name: str) -> int:
+        """Of a file. [bytes]"""
+        return (self._root / name).stat().st_size
+
+    def read(self, name: str, offset: int = 0, size: int | None = None) -> bytes:
+        """A file or a part of it."""
+        if offset == 0 and size is None:
+            return (self._root / name).read_bytes()
+        with (self._root / name).open("rb") as stream:
+            stream.seek(offset)
+            return stream.read(size)
+
+    def open(self, name: str) -> AbstractContextManager[BinaryIO]:
+        """The file itself."""
+        return (self._root / name).open("rb")
+
+    @contextmanager
+    def local_copy(self, name: str) -> Iterator[Path]:
+        """The file itself."""
+        yield self._root / name
+
+    def names(self, folder: str) -> list[str]:
+        """Names directly in a folder."""
+        try:
+            return sorted(entry.name for entry in os.scandir(self._root / folder))
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+
+    def files_ending(self, suffix: str) -> list[str]:
+        """All files with the suffix, at any depth."""
+        found = self._root.rglob(f"*{suffix}")
+        return sorted(
+            path.relative_to(self._root).as_posix() for path in found if path.is_file() and not path.is_symlink()
+        )
+
+    def folders_with(self, folder: str, mark: str) -> list[str]:
+        """Folders that hold the file `mark`."""
+        return [name for name in self.names(folder) if (self._root / folder / name / mark).is_file()]
+
+    def leftovers(self, folder: str, mark: str) -> list[str]:
+        """Whatever still has a temporary name; a folder gets its final one only with all its files."""
+        folders = [name for name in self.names("") if not name.startswith(".") and (self._root / name).is_dir()]
+        return sorted(
+            f"{place}/{name}".lstrip("/")
+            for place in ["", *folders]
+            for name in self.names(place)
+            if name.startswith(".") and name.endswith(PART_SUFFIX)
+        )
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write or replace a file by one rename."""
+        write_bytes_atomic(self._root / name, data)
+
+    def write_text(self, name: str) -> AbstractContextManager[TextIO]:
+        """A text stream whose file appears by one rename."""
+        return open_text_atomic(self._root / name)
+
+    def write_large(self, name: str) -> AbstractContextManager[BinaryIO]:
+        """A stream of bytes whose file appears by one rename."""
+        return open_bytes_atomic(self._root / name)
+
+    def spool(self, folder: str) -> TextIO:
+        """An unnamed file on the disk of the folder, and not in /tmp, which is in memory on many machines."""
+        place = self._root / folder
+        place.mkdir(parents=True, exist_ok=True)
+        return cast(TextIO, tempfile.TemporaryFile("w+", encoding="utf-8", newline="\n", dir=place))
+
+    def write_together(self, folder: str, files: Mapping[str, bytes], mark: str) -> None:
+        """Write all files into a temporary folder, then rename it."""
+        target = self._root / folder
+        part = part_path(target)
+        try:
+            part.mkdir(parents=True)
+            for name in sorted(files):
+                _write_synced(part / name, files[name])
+            sync_folder(part)
+            self._remove_atomically(target)
+            part.rename(target)
+            sync_folder(target.parent)
+        except OSError as error:
+            raise OSError(error.errno, f"{target}: cannot be written: {error.strerror}") from error
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+    def delete(self, name: str) -> None:
+        """Remove a file, or a leftover folder of a killed run."""
+        path = self._root / name
+        try:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OSError(error.errno, f"{path}: cannot be removed: {error.strerror}") from error
+
+    def delete_folder(self, folder: str, mark: str) -> None:
+        """Rename the folder, then delete it."""
+        self._remove_atomically(self._root / folder)
+
+    def _remove_atomically(self, target: Path) -> None:
+        if not target.exists():
+            return
+        renamed = part_path(target)
+        target.rename(renamed)
+        shutil.rmtree(renamed)
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    with path.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())

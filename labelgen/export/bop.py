@@ -40,76 +40,17 @@ from labelgen.segmentation_masks import Mask, amodal_masks, union_of_masks
 
 MM_PER_M = 1000.0
 
-
-def dataset_drogues(recipe: Recipe) -> list[DrogueParameters]:
-    """The drogues of a dataset in the order of their object ids, which begin at 1."""
-    drogues: list[DrogueParameters] = []
-    for drogue in [variant.drogue for variant in recipe.variants] or [recipe.drogue]:
-        if drogue not in drogues:
-            drogues.append(drogue)
-    return drogues
-
-
-def object_id(recipe: Recipe, record: PairRecord) -> int:
-    """The object id of a pair's drogue.
-
-    Raises:
-        ValueError: the pair has none, or one that is not in the recipe.
-    """
-    drogues = dataset_drogues(recipe)
-    if record.frame.drogue not in drogues:
-        raise ValueError(f"frame {record.frame_index}: drogue: is not in the recipe")
-    return drogues.index(record.frame.drogue) + 1
-
-
-def write_models(recipe: Recipe, folder: Path) -> None:
-    """Write `models` and `models_eval`, which are the same.
-
-    Raises:
-        ValueError: a user's body mesh that is missing or was changed.
-    """
-    info = {}
-    for name in ("models", "models_eval"):
-        (folder / name).mkdir()
-    for number, drogue in enumerate(dataset_drogues(recipe), start=1):
-        mesh = trimesh.util.concatenate(list(drogue_meshes(drogue).values()))
-        mesh.apply_scale(MM_PER_M)
-        ply = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
-        for name in ("models", "models_eval"):
-            (folder / name / f"obj_{number:06d}.ply").write_bytes(ply)
-        info[str(number)] = model_info(drogue, np.asarray(mesh.vertices, dtype=np.float64))
-    for name in ("models", "models_eval"):
-        (folder / name / "models_info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
-
-
-def model_info(drogue: DrogueParameters, vertices_mm: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
-    """Diameter, extent and symmetries of a model, from its (V, 3) vertices. [mm]
-
-    The symmetries are those of the markers: turns about the axis as 4x4 matrices, row by row, without the identity.
-    """
-    low, size = vertices_mm.min(axis=0), np.ptp(vertices_mm, axis=0)
-    hull = vertices_mm[ConvexHull(vertices_mm).vertices]
-    order = marker_layout(drogue).symmetry_order
-    info: dict[str, Any] = {"diameter": float(pdist(hull).max())}
-    info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
-    info |= {f"size_{axis}": float(value) for axis, value in zip("xyz", size, strict=True)}
-    if order > 1:
-        info["symmetries_discrete"] = [_turn(2 * np.pi * index / order) for index in range(1, order)]
-    return info
-
-
-def _turn(angle: float) -> list[float]:
-    cosine, sine = float(np.cos(angle)), float(np.sin(angle))
-    return [cosine, -sine, 0.0, 0.0, sine, cosine, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-
-
 SPLIT_FOLDERS: dict[SplitName, str] = {"train": "train_pbr", "val": "val", "test": "test"}
+
 TARGETS_FILE = "test_targets_bop19.json"
+
 # The challenge's targets are objects with at least this visible share.
 _TARGET_FROM_FRACTION = 0.1
+
 # Millimetres per depth number: the finest that holds the farthest thing in the image.
 _DEPTH_SCALES = (0.1, 1.0, 10.0, 100.0)
-_MOST_DEPTH = 65535
+
+_MAX_DEPTH_NUMBER = 65535
 
 _INFO = """# {name}
 
@@ -248,9 +189,9 @@ def depth_numbers(depth_m: NDArray[np.float32]) -> tuple[NDArray[np.uint16], flo
     known = np.isfinite(depth_m)
     depth_mm = np.where(known, depth_m, 0.0).astype(np.float64) * MM_PER_M
     farthest = float(depth_mm.max(initial=0.0))
-    scale = next((scale for scale in _DEPTH_SCALES if farthest / scale <= _MOST_DEPTH), _DEPTH_SCALES[-1])
+    scale = next((scale for scale in _DEPTH_SCALES if farthest / scale <= _MAX_DEPTH_NUMBER), _DEPTH_SCALES[-1])
     numbers = np.rint(depth_mm / scale)
-    return np.where(numbers <= _MOST_DEPTH, numbers, 0).astype(np.uint16), scale
+    return np.where(numbers <= _MAX_DEPTH_NUMBER, numbers, 0).astype(np.uint16), scale
 
 
 def _write_json(path: Path, value: Any) -> None:
@@ -333,3 +274,65 @@ def _box(mask: Mask) -> list[int]:
         return [-1, -1, -1, -1]
     column, row, width, height = cv2.boundingRect(mask.view(np.uint8))
     return [column, row, width - 1, height - 1]
+
+
+def dataset_drogues(recipe: Recipe) -> list[DrogueParameters]:
+    """The drogues of a dataset in the order of their object ids, which begin at 1."""
+    drogues: list[DrogueParameters] = []
+    for drogue in [variant.drogue for variant in recipe.variants] or [recipe.drogue]:
+        if drogue not in drogues:
+            drogues.append(drogue)
+    return drogues
+
+
+def object_id(recipe: Recipe, record: PairRecord) -> int:
+    """The object id of a pair's drogue.
+
+    Raises:
+        ValueError: the pair has none, or one that is not in the recipe.
+    """
+    drogues = dataset_drogues(recipe)
+    if record.frame.drogue not in drogues:
+        raise ValueError(f"frame {record.frame_index}: drogue: is not in the recipe")
+    return drogues.index(record.frame.drogue) + 1
+
+
+def write_models(recipe: Recipe, folder: Path) -> None:
+    """Write `models` and `models_eval`, which are the same.
+
+    Raises:
+        ValueError: a user's body mesh that is missing or was changed.
+    """
+    info = {}
+    for name in ("models", "models_eval"):
+        (folder / name).mkdir()
+    for number, drogue in enumerate(dataset_drogues(recipe), start=1):
+        mesh = trimesh.util.concatenate(list(drogue_meshes(drogue).values()))
+        mesh.apply_scale(MM_PER_M)
+        ply = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply")
+        for name in ("models", "models_eval"):
+            (folder / name / f"obj_{number:06d}.ply").write_bytes(ply)
+        info[str(number)] = model_info(drogue, np.asarray(mesh.vertices, dtype=np.float64))
+    for name in ("models", "models_eval"):
+        (folder / name / "models_info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+
+
+def model_info(drogue: DrogueParameters, vertices_mm: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, Any]:
+    """Diameter, extent and symmetries of a model, from its (V, 3) vertices. [mm]
+
+    The symmetries are those of the markers: turns about the axis as 4x4 matrices, row by row, without the identity.
+    """
+    low, size = vertices_mm.min(axis=0), np.ptp(vertices_mm, axis=0)
+    hull = vertices_mm[ConvexHull(vertices_mm).vertices]
+    order = marker_layout(drogue).symmetry_order
+    info: dict[str, Any] = {"diameter": float(pdist(hull).max())}
+    info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
+    info |= {f"size_{axis}": float(value) for axis, value in zip("xyz", size, strict=True)}
+    if order > 1:
+        info["symmetries_discrete"] = [_turn(2 * np.pi * index / order) for index in range(1, order)]
+    return info
+
+
+def _turn(angle: float) -> list[float]:
+    cosine, sine = float(np.cos(angle)), float(np.sin(angle))
+    return [cosine, -sine, 0.0, 0.0, sine, cosine, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]

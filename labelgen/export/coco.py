@@ -40,92 +40,121 @@ from labelgen.export.keypoints import (
 )
 from labelgen.part_pixels import FeaturePixels, drogue_mask
 
-Indices = NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class MaskPixels:
-    """The pixels of one mask, column by column as in COCO.
-
-    Attributes:
-        columns, rows: (N,) of each pixel. [px]
-        size_px: (width, height) of the image. [px]
-    """
-
-    columns: Indices
-    rows: Indices
-    size_px: tuple[int, int]
-
-    def segmentation(self) -> dict[str, Any]:
-        """COCO's compressed run lengths, the first of them outside the set.
-
-        Source: the mask format of the COCO API (runs of the column-major image, beginning with zeros).
-        """
-        width, height = self.size_px
-        flat = self.columns * height + self.rows
-        breaks = np.flatnonzero(np.diff(flat) != 1)
-        starts, ends = flat[np.r_[0, breaks + 1]], flat[np.r_[breaks, len(flat) - 1]] + 1
-        edges = np.stack([starts, ends], axis=1).ravel()
-        counts = np.diff(np.concatenate([[0], edges, [width * height]]))
-        runs = counts[:-1] if counts[-1] == 0 else counts
-        packed = coco_mask.frPyObjects({"size": [height, width], "counts": runs.tolist()}, height, width)
-        return {"size": [height, width], "counts": packed["counts"].decode("ascii")}
-
-    def corner_box(self) -> list[float]:
-        """x, y, width and height of the box around the pixels' areas, counted from the image's corner. [px]"""
-        low_u, low_v = int(self.columns.min()), int(self.rows.min())
-        return [
-            float(low_u),
-            float(low_v),
-            float(int(self.columns.max()) - low_u + 1),
-            float(int(self.rows.max()) - low_v + 1),
-        ]
-
-    def __len__(self) -> int:
-        return len(self.columns)
-
-
-class DroguePixels:
-    """Masks of the drogue and its features in one eye's image, computed within the drogue's visible box."""
-
-    def __init__(self, part_id: NDArray[np.uint8], box: PixelBox, marker_count: int) -> None:
-        """Crop the part ids.
-
-        Args:
-            part_id: (H, W) of the whole image.
-            box: `box_visible_xywh_px` of the view.
-            marker_count: of the drogue.
-        """
-        u, v = round(box[0] + 0.5), round(box[1] + 0.5)
-        crop = part_id[v : v + round(box[3]), u : u + round(box[2])]
-        # Transposed, rows come in the order of the image's columns, which is COCO's.
-        self._turned = np.ascontiguousarray(crop.T)
-        self._low = u, v
-        self._size_px = part_id.shape[1], part_id.shape[0]
-        self._marker_count = marker_count
-        self._features = FeaturePixels(self._turned)
-
-    def drogue(self) -> MaskPixels:
-        """The whole drogue."""
-        return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count)))
-
-    def feature(self, part: int) -> MaskPixels:
-        """One marker, or the hub."""
-        return self._set(*self._features.indices(part))
-
-    def _set(self, columns: Indices, rows: Indices) -> MaskPixels:
-        return MaskPixels(columns + self._low[0], rows + self._low[1], self._size_px)
-
-
 DROGUE, MARKER, HUB = 1, 2, 3
 """Ids of the categories."""
+
 NAMESPACE = "droguekit"
+
 # Ids of markers and hubs: the feature's number in the upper bits, the image's id in the lower ones.
 _FEATURE_ID_STEP = 2**32
+
 # COCO's OKS is exp(-d^2 / (2 area (2 sigma)^2)). Ours falls to exp(-1/2) where d is half a marker's radius, 0.025 m,
 # of a disc of the drogue's radius, whose area is pi (0.33 m)^2: sigma = 0.025 / (sqrt(pi) 0.33) / 2.
 KEYPOINT_SIGMA = 0.0214
 """COCO's `kpt_oks_sigmas` for every keypoint of a drogue."""
+
+Indices = NDArray[np.int64]
+
+
+def write_annotations(dataset: Location, out: Location) -> list[Location]:
+    """Write the files that every dataset has under `annotations`: drogues alone.
+
+    Arguments, result and errors as those of `write_coco`; `out` may be a URL too.
+    """
+    return [join(out, name) for name in _write(dataset, out, ExportLog(), with_features=False)]
+
+
+def write_coco(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
+    """Write `all.json` and one file for each split that has pairs: drogues, markers and hubs.
+
+    Args:
+        dataset: the dataset's folder.
+        out: folder to write into; files of these names are replaced.
+        log: counts what the format cannot hold.
+
+    Returns:
+        The files, `all.json` first.
+
+    Raises:
+        ValueError: the dataset cannot be read; names the file.
+        OSError: a file cannot be written; an existing one stays as it was.
+    """
+    return [out / name for name in _write(dataset, out, log, with_features=True)]
+
+
+def read_part_ids(source: Dataset, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
+    """(H, W) part ids of a view, or None where its record lists none.
+
+    Raises:
+        ValueError: they are on record but cannot be read; names the file.
+    """
+    return source.part_ids(record.frame_index, eye) if parts_file(eye) in record.file_sha256 else None
+
+
+def _write(dataset: Location, out: Location, log: ExportLog, with_features: bool) -> list[str]:
+    """Write the files, and return their names in `out`."""
+    source, target = Dataset(dataset), open_storage(out)
+    splits = source.manifest.split_of_frame()
+    names = ["all", *(split for split in ("train", "val", "test") if split in splits.values())]
+    header = canonical_json(coco_header(source.manifest, with_features))
+    count = keypoint_count(source.manifest)
+    with ExitStack() as stack:
+        writers = {name: _CocoFile(stack, target, f"{name}.json", header) for name in names}
+        for record in log.records(source):
+            split = splits[record.frame_index]
+            for eye in EYES:
+                part_id = read_part_ids(source, record, eye)
+                drogue = coco_annotation(record, eye, part_id, count)
+                annotations = [] if drogue is None else [drogue]
+                if with_features and part_id is not None:
+                    annotations += coco_features(record, eye, part_id, count)
+                image = coco_image(record, eye, split)
+                for name in ("all", split):
+                    writers[name].add(image, annotations)
+                _log_missing_labels(log, record, eye, annotations)
+        for writer in writers.values():
+            writer.finish()
+    return [f"{name}.json" for name in names]
+
+
+def _log_missing_labels(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[str, Any]]) -> None:
+    """Log what the annotations of a view lack."""
+    log_cut_labels(log, record, eye)
+    if not annotations:
+        return
+    view = view_of(record, eye)
+    log_absent_keypoints(log, view_keypoints(view, record.frame.rig.camera, 0), len(view.markers))
+    if "segmentation" not in annotations[0]:
+        log.lost("views without masks, markers and hub: the dataset has no part ids of them")
+        return
+    features = len(view.markers) + (view.hub is not None)
+    log.lost("markers and hubs of which no pixel is seen: without a label", features - len(annotations) + 1)
+
+
+class _CocoFile:
+    """A COCO file, written entry by entry: images directly, annotations by way of a temporary file."""
+
+    def __init__(self, stack: ExitStack, target: Storage, name: str, header: str) -> None:
+        self._stream: IO[str] = stack.enter_context(target.write_text(name))
+        self._annotations: IO[str] = stack.enter_context(target.spool(""))
+        self._stream.write(header.removesuffix("}") + ',"images":[')
+        self._images = 0
+        self._annotated = 0
+
+    def add(self, image: dict[str, Any], annotations: list[dict[str, Any]]) -> None:
+        """Append one image and what is on it."""
+        self._stream.write((",\n" if self._images else "\n") + canonical_json(image))
+        self._images += 1
+        for annotation in annotations:
+            self._annotations.write((",\n" if self._annotated else "\n") + canonical_json(annotation))
+            self._annotated += 1
+
+    def finish(self) -> None:
+        """Append the annotations and close the JSON."""
+        self._stream.write('\n],"annotations":[')
+        self._annotations.seek(0)
+        shutil.copyfileobj(self._annotations, self._stream)
+        self._stream.write("\n]}\n")
 
 
 def coco_image_id(frame_index: int, eye: Eye) -> int:
@@ -315,6 +344,80 @@ def _corner_box(box: PixelBox) -> list[float]:
     return [*_corner_point((box[0], box[1])), box[2], box[3]]
 
 
+@dataclass(frozen=True, eq=False)
+class MaskPixels:
+    """The pixels of one mask, column by column as in COCO.
+
+    Attributes:
+        columns, rows: (N,) of each pixel. [px]
+        size_px: (width, height) of the image. [px]
+    """
+
+    columns: Indices
+    rows: Indices
+    size_px: tuple[int, int]
+
+    def segmentation(self) -> dict[str, Any]:
+        """COCO's compressed run lengths, the first of them outside the set.
+
+        Source: the mask format of the COCO API (runs of the column-major image, beginning with zeros).
+        """
+        width, height = self.size_px
+        flat = self.columns * height + self.rows
+        breaks = np.flatnonzero(np.diff(flat) != 1)
+        starts, ends = flat[np.r_[0, breaks + 1]], flat[np.r_[breaks, len(flat) - 1]] + 1
+        edges = np.stack([starts, ends], axis=1).ravel()
+        counts = np.diff(np.concatenate([[0], edges, [width * height]]))
+        runs = counts[:-1] if counts[-1] == 0 else counts
+        packed = coco_mask.frPyObjects({"size": [height, width], "counts": runs.tolist()}, height, width)
+        return {"size": [height, width], "counts": packed["counts"].decode("ascii")}
+
+    def corner_box(self) -> list[float]:
+        """x, y, width and height of the box around the pixels' areas, counted from the image's corner. [px]"""
+        low_u, low_v = int(self.columns.min()), int(self.rows.min())
+        return [
+            float(low_u),
+            float(low_v),
+            float(int(self.columns.max()) - low_u + 1),
+            float(int(self.rows.max()) - low_v + 1),
+        ]
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+
+class DroguePixels:
+    """Masks of the drogue and its features in one eye's image, computed within the drogue's visible box."""
+
+    def __init__(self, part_id: NDArray[np.uint8], box: PixelBox, marker_count: int) -> None:
+        """Crop the part ids.
+
+        Args:
+            part_id: (H, W) of the whole image.
+            box: `box_visible_xywh_px` of the view.
+            marker_count: of the drogue.
+        """
+        u, v = round(box[0] + 0.5), round(box[1] + 0.5)
+        crop = part_id[v : v + round(box[3]), u : u + round(box[2])]
+        # Transposed, rows come in the order of the image's columns, which is COCO's.
+        self._turned = np.ascontiguousarray(crop.T)
+        self._low = u, v
+        self._size_px = part_id.shape[1], part_id.shape[0]
+        self._marker_count = marker_count
+        self._features = FeaturePixels(self._turned)
+
+    def drogue(self) -> MaskPixels:
+        """The whole drogue."""
+        return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count)))
+
+    def feature(self, part: int) -> MaskPixels:
+        """One marker, or the hub."""
+        return self._set(*self._features.indices(part))
+
+    def _set(self, columns: Indices, rows: Indices) -> MaskPixels:
+        return MaskPixels(columns + self._low[0], rows + self._low[1], self._size_px)
+
+
 def align_keypoint_orders(truth: COCO, results: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Keypoint results in the symmetric order that fits the truth best, to be scored by `COCOeval`.
 
@@ -357,104 +460,3 @@ def _best_roll(result: dict[str, Any], drogues: list[dict[str, Any]]) -> dict[st
 def _squared_distance_px2(points: Array, want: Array) -> float:
     shown = want[:, 2] > 0
     return float(((points[shown, :2] - want[shown, :2]) ** 2).sum())
-
-
-def write_annotations(dataset: Location, out: Location) -> list[Location]:
-    """Write the files that every dataset has under `annotations`: drogues alone.
-
-    Arguments, result and errors as those of `write_coco`; `out` may be a URL too.
-    """
-    return [join(out, name) for name in _write(dataset, out, ExportLog(), with_features=False)]
-
-
-def write_coco(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """Write `all.json` and one file for each split that has pairs: drogues, markers and hubs.
-
-    Args:
-        dataset: the dataset's folder.
-        out: folder to write into; files of these names are replaced.
-        log: counts what the format cannot hold.
-
-    Returns:
-        The files, `all.json` first.
-
-    Raises:
-        ValueError: the dataset cannot be read; names the file.
-        OSError: a file cannot be written; an existing one stays as it was.
-    """
-    return [out / name for name in _write(dataset, out, log, with_features=True)]
-
-
-def read_part_ids(source: Dataset, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
-    """(H, W) part ids of a view, or None where its record lists none.
-
-    Raises:
-        ValueError: they are on record but cannot be read; names the file.
-    """
-    return source.part_ids(record.frame_index, eye) if parts_file(eye) in record.file_sha256 else None
-
-
-def _write(dataset: Location, out: Location, log: ExportLog, with_features: bool) -> list[str]:
-    """Write the files, and return their names in `out`."""
-    source, target = Dataset(dataset), open_storage(out)
-    splits = source.manifest.split_of_frame()
-    names = ["all", *(split for split in ("train", "val", "test") if split in splits.values())]
-    header = canonical_json(coco_header(source.manifest, with_features))
-    count = keypoint_count(source.manifest)
-    with ExitStack() as stack:
-        writers = {name: _CocoFile(stack, target, f"{name}.json", header) for name in names}
-        for record in log.records(source):
-            split = splits[record.frame_index]
-            for eye in EYES:
-                part_id = read_part_ids(source, record, eye)
-                drogue = coco_annotation(record, eye, part_id, count)
-                annotations = [] if drogue is None else [drogue]
-                if with_features and part_id is not None:
-                    annotations += coco_features(record, eye, part_id, count)
-                image = coco_image(record, eye, split)
-                for name in ("all", split):
-                    writers[name].add(image, annotations)
-                _tell(log, record, eye, annotations)
-        for writer in writers.values():
-            writer.finish()
-    return [f"{name}.json" for name in names]
-
-
-def _tell(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[str, Any]]) -> None:
-    """Log what the annotations of a view lack."""
-    log_cut_labels(log, record, eye)
-    if not annotations:
-        return
-    view = view_of(record, eye)
-    log_absent_keypoints(log, view_keypoints(view, record.frame.rig.camera, 0), len(view.markers))
-    if "segmentation" not in annotations[0]:
-        log.lost("views without masks, markers and hub: the dataset has no part ids of them")
-        return
-    features = len(view.markers) + (view.hub is not None)
-    log.lost("markers and hubs of which no pixel is seen: without a label", features - len(annotations) + 1)
-
-
-class _CocoFile:
-    """A COCO file, written entry by entry: images directly, annotations by way of a temporary file."""
-
-    def __init__(self, stack: ExitStack, target: Storage, name: str, header: str) -> None:
-        self._stream: IO[str] = stack.enter_context(target.write_text(name))
-        self._annotations: IO[str] = stack.enter_context(target.spool(""))
-        self._stream.write(header.removesuffix("}") + ',"images":[')
-        self._images = 0
-        self._annotated = 0
-
-    def add(self, image: dict[str, Any], annotations: list[dict[str, Any]]) -> None:
-        """Append one image and what is on it."""
-        self._stream.write((",\n" if self._images else "\n") + canonical_json(image))
-        self._images += 1
-        for annotation in annotations:
-            self._annotations.write((",\n" if self._annotated else "\n") + canonical_json(annotation))
-            self._annotated += 1
-
-    def finish(self) -> None:
-        """Append the annotations and close the JSON."""
-        self._stream.write('\n],"annotations":[')
-        self._annotations.seek(0)
-        shutil.copyfileobj(self._annotations, self._stream)
-        self._stream.write("\n]}\n")

@@ -30,7 +30,7 @@ from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
 from labelgen.export.frame_files import export_image
 
-_LISTS = {"train": "train.json", "val": "validation.json", "test": "test.json"}
+_SPEED_LISTS = {"train": "train.json", "val": "validation.json", "test": "test.json"}
 
 
 def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
@@ -57,7 +57,7 @@ def write_speed(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             camera = canonical_json(speed_camera(recipe.rig, recipe.sensor, eye)) + "\n"
             (folder / eye / "camera.json").write_text(camera, encoding="utf-8", newline="\n")
             for split in sorted(set(splits.values())):
-                lists[eye, split] = _PoseList(stack, folder / eye / _LISTS[split])
+                lists[eye, split] = _PoseList(stack, folder / eye / _SPEED_LISTS[split])
         for record in log.records(source):
             for eye in EYES:
                 name = f"img{record.frame_index:06d}.png"
@@ -127,7 +127,7 @@ class _PoseList:
         self._stream.write("\n]\n")
 
 
-_HEADER = (
+_TUM_HEADER = (
     "# drogue in the left camera (x right, y down, z forward) at mid-exposure\n# time_s tx_m ty_m tz_m qx qy qz qw\n"
 )
 
@@ -155,12 +155,12 @@ def write_tum(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
         for sequence_id, pairs in groupby(stamped, key=lambda pair: pair[0].sequence_id):
             names.append(f"{sequence_name(sequence_id)}.txt")
             with (folder / names[-1]).open("w", encoding="utf-8") as stream:
-                stream.write(_HEADER)
+                stream.write(_TUM_HEADER)
                 for record, stamp_ns in pairs:
                     if record.left_from_drogue is None:
                         log.lost("pairs without a drogue are left out")
                         continue
-                    stream.write(_line(record, stamp_ns))
+                    stream.write(_tum_line(record, stamp_ns))
     return [out / name for name in names]
 
 
@@ -169,7 +169,7 @@ def _stamped(order: SequenceOrder, records: Iterator[PairRecord]) -> Iterator[tu
         yield record, order.stamp_ns(record)
 
 
-def _line(record: PairRecord, stamp_ns: int) -> str:
+def _tum_line(record: PairRecord, stamp_ns: int) -> str:
     assert record.left_from_drogue is not None
     pose = record.left_from_drogue
     seconds, nanoseconds = divmod(stamp_ns, 10**9)

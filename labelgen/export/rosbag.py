@@ -31,11 +31,118 @@ from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
 
 MAP_FRAME, BASE_FRAME = "map", "base_link"
+
 LEFT_FRAME, RIGHT_FRAME, DROGUE_FRAME = "stereo_left_optical", "stereo_right_optical", "drogue"
+
+POSE_TOPIC = "/drogue/pose"
+
+_TOPICS = {
+    **{f"/stereo/{eye}/image_raw": "sensor_msgs/msg/Image" for eye in EYES},
+    **{f"/stereo/{eye}/camera_info": "sensor_msgs/msg/CameraInfo" for eye in EYES},
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    POSE_TOPIC: "geometry_msgs/msg/PoseStamped",
+}
 
 # Message definitions of the oldest ROS 2 release that is still maintained; later ones read them.
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
+
 _NANOSECONDS = 10**9
+
+_NEVER = QosTime(2147483647, 4294967295)
+
+
+def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
+    """Write a bag a sequence: images, CameraInfo, transforms, and the true pose of the drogue.
+
+    Args:
+        dataset: folder.
+        out: folder to make; it holds a folder a bag.
+        log: receives the progress, and counts pairs without a pose.
+
+    Returns:
+        The bags' folders.
+
+    Raises:
+        ValueError: a pair that cannot be read, or times that do not ascend.
+        OSError: it cannot be written; nothing incomplete is left.
+    """
+    source = Dataset(dataset)
+    order = SequenceOrder()
+    names = []
+    with new_folder(out) as folder, ExitStack() as bag_is_open:
+        bag: _Bag | None = None
+        for record in log.records(source):
+            stamp_ns = order.stamp_ns(record)
+            if bag is None or order.is_first:
+                bag_is_open.close()
+                names.append(sequence_name(record.sequence_id))
+                bag = bag_is_open.enter_context(_open_bag(folder / names[-1], record.frame.rig, stamp_ns))
+            bag.write_pair(source, record, stamp_ns)
+            if record.left_from_drogue is None:
+                log.lost("pairs without a drogue have no pose")
+    return [out / name for name in names]
+
+
+class _Bag:
+    """One open bag."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._connections = {
+            topic: writer.add_connection(
+                topic, type_name, typestore=TYPES, offered_qos_profiles=[_qos(topic == "/tf_static")]
+            )
+            for topic, type_name in _TOPICS.items()
+        }
+
+    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
+        data = TYPES.serialize_cdr(message, _TOPICS[topic])
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+    def write_pair(self, source: Dataset, record: PairRecord, stamp_ns: int) -> None:
+        rig, images = record.frame.rig, source.images(record.frame_index)
+        moving = moving_transforms(rig, record.frame.world_from_left, record.left_from_drogue)
+        self.write("/tf", transforms_message(moving, stamp_ns), stamp_ns)
+        for eye in EYES:
+            self.write(camera_info_topic(eye), camera_info_message(rig, eye, stamp_ns), stamp_ns)
+            self.write(image_topic(eye), image_message(images, eye, stamp_ns), stamp_ns)
+        if record.left_from_drogue is not None:
+            self.write(POSE_TOPIC, pose_message(record.left_from_drogue, stamp_ns), stamp_ns)
+
+
+@contextmanager
+def _open_bag(path: Path, rig: StereoRig, start_ns: int) -> Iterator[_Bag]:
+    """A new bag with the fixed transforms."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        bag = _Bag(writer)
+        bag.write("/tf_static", transforms_message(fixed_transforms(rig), start_ns), start_ns)
+        yield bag
+
+
+def _qos(is_kept: bool) -> Qos:
+    """Reliable delivery; with `is_kept` later subscribers receive the last message too."""
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if is_kept else 10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if is_kept else QosDurability.VOLATILE,
+        deadline=_NEVER,
+        lifespan=_NEVER,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_NEVER,
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+def image_topic(eye: str) -> str:
+    """Topic of an eye's images."""
+    return f"/stereo/{eye}/image_raw"
+
+
+def camera_info_topic(eye: str) -> str:
+    """Topic of an eye's calibration."""
+    return f"/stereo/{eye}/camera_info"
 
 
 def message(type_name: str, *values: Any) -> Any:
@@ -124,107 +231,3 @@ def moving_transforms(
 def _quaternion(transform: RigidTransform) -> Any:
     """In ROS's order: x, y, z, w."""
     return message("geometry_msgs/msg/Quaternion", *Rotation.from_matrix(transform.rotation).as_quat().tolist())
-
-
-POSE_TOPIC = "/drogue/pose"
-_TOPICS = {
-    **{f"/stereo/{eye}/image_raw": "sensor_msgs/msg/Image" for eye in EYES},
-    **{f"/stereo/{eye}/camera_info": "sensor_msgs/msg/CameraInfo" for eye in EYES},
-    "/tf": "tf2_msgs/msg/TFMessage",
-    "/tf_static": "tf2_msgs/msg/TFMessage",
-    POSE_TOPIC: "geometry_msgs/msg/PoseStamped",
-}
-_NEVER = QosTime(2147483647, 4294967295)
-
-
-def image_topic(eye: str) -> str:
-    """Topic of an eye's images."""
-    return f"/stereo/{eye}/image_raw"
-
-
-def camera_info_topic(eye: str) -> str:
-    """Topic of an eye's calibration."""
-    return f"/stereo/{eye}/camera_info"
-
-
-def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """Write a bag a sequence: images, CameraInfo, transforms, and the true pose of the drogue.
-
-    Args:
-        dataset: folder.
-        out: folder to make; it holds a folder a bag.
-        log: receives the progress, and counts pairs without a pose.
-
-    Returns:
-        The bags' folders.
-
-    Raises:
-        ValueError: a pair that cannot be read, or times that do not ascend.
-        OSError: it cannot be written; nothing incomplete is left.
-    """
-    source = Dataset(dataset)
-    order = SequenceOrder()
-    names = []
-    with new_folder(out) as folder, ExitStack() as bag_is_open:
-        bag: _Bag | None = None
-        for record in log.records(source):
-            stamp_ns = order.stamp_ns(record)
-            if bag is None or order.is_first:
-                bag_is_open.close()
-                names.append(sequence_name(record.sequence_id))
-                bag = bag_is_open.enter_context(_open_bag(folder / names[-1], record.frame.rig, stamp_ns))
-            bag.write_pair(source, record, stamp_ns)
-            if record.left_from_drogue is None:
-                log.lost("pairs without a drogue have no pose")
-    return [out / name for name in names]
-
-
-class _Bag:
-    """One open bag."""
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-        self._connections = {
-            topic: writer.add_connection(
-                topic, type_name, typestore=TYPES, offered_qos_profiles=[_qos(topic == "/tf_static")]
-            )
-            for topic, type_name in _TOPICS.items()
-        }
-
-    def write(self, topic: str, message: Any, stamp_ns: int) -> None:
-        data = TYPES.serialize_cdr(message, _TOPICS[topic])
-        self._writer.write(self._connections[topic], stamp_ns, data)
-
-    def write_pair(self, source: Dataset, record: PairRecord, stamp_ns: int) -> None:
-        rig, images = record.frame.rig, source.images(record.frame_index)
-        moving = moving_transforms(rig, record.frame.world_from_left, record.left_from_drogue)
-        self.write("/tf", transforms_message(moving, stamp_ns), stamp_ns)
-        for eye in EYES:
-            self.write(camera_info_topic(eye), camera_info_message(rig, eye, stamp_ns), stamp_ns)
-            self.write(image_topic(eye), image_message(images, eye, stamp_ns), stamp_ns)
-        if record.left_from_drogue is not None:
-            self.write(POSE_TOPIC, pose_message(record.left_from_drogue, stamp_ns), stamp_ns)
-
-
-@contextmanager
-def _open_bag(path: Path, rig: StereoRig, start_ns: int) -> Iterator[_Bag]:
-    """A new bag with the fixed transforms."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        bag = _Bag(writer)
-        bag.write("/tf_static", transforms_message(fixed_transforms(rig), start_ns), start_ns)
-        yield bag
-
-
-def _qos(is_kept: bool) -> Qos:
-    """Reliable delivery; with `is_kept` later subscribers receive the last message too."""
-    return Qos(
-        history=QosHistory.KEEP_LAST,
-        depth=1 if is_kept else 10,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL if is_kept else QosDurability.VOLATILE,
-        deadline=_NEVER,
-        lifespan=_NEVER,
-        liveliness=QosLiveliness.AUTOMATIC,
-        liveliness_lease_duration=_NEVER,
-        avoid_ros_namespace_conventions=False,
-    )

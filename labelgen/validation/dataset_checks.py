@@ -46,77 +46,7 @@ from labelgen.validation.label_checks import (
 )
 
 # The files hold 16 digits.
-_TOLERANCE = 1e-14
-
-
-def calibration_faults(dataset: Location, rig: StereoRig) -> list[str]:
-    """Faults of the calibration files; all but OpenCV's may be missing."""
-    storage, faults = open_storage(dataset), []
-    for name, text in calibration_files(rig).items():
-        path = storage.where(f"{CALIBRATION_FOLDER}/{name}")
-        try:
-            found = storage.read(f"{CALIBRATION_FOLDER}/{name}")
-        except FileNotFoundError:
-            if name == OPENCV_STEREO_FILE:
-                faults.append(f"{path}: is missing")
-            continue
-        except OSError as error:
-            faults.append(f"{path}: cannot be read: {error.strerror}")
-            continue
-        if found != text.encode():
-            faults.append(f"{path}: is not that of the manifest's rig")
-        elif name == OPENCV_STEREO_FILE:
-            # Only a file that is known to be undamaged reaches OpenCV's parser.
-            faults += _opencv_faults(path, text, rig)
-    return faults
-
-
-def _opencv_faults(path: str, text: str, rig: StereoRig) -> list[str]:
-    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    faults = []
-    for name, want in opencv_stereo_matrices(rig).items():
-        found = storage.getNode(name).mat()
-        if found is None or found.shape != want.shape or not np.allclose(found, want, rtol=_TOLERANCE, atol=1e-300):
-            faults.append(f"{path}: {name}: OpenCV reads {None if found is None else found.tolist()}")
-    return faults
-
-
-def shard_faults(storage: Storage) -> Iterator[tuple[str, list[str]]]:
-    """What is wrong with each tar file of a dataset, under the name of the check; nothing where it has none.
-
-    That the files in them are those of the records is checked frame by frame.
-    """
-    try:
-        pairs_per_tar = read_pairs_per_tar(storage)
-    except ValueError as error:
-        yield "tar files", [str(error)]
-        return
-    if pairs_per_tar is None:
-        return
-    for number in shard_numbers(storage):
-        yield "tar files", _faults(storage, number, pairs_per_tar)
-
-
-def _faults(storage: Storage, number: int, pairs_per_tar: int) -> list[str]:
-    where = storage.where(shard_file(number))
-    try:
-        listed = read_shard_index(storage, number)
-    except ValueError as error:
-        return [str(error)]
-    try:
-        with storage.open(shard_file(number)) as stream:
-            found = index_of_archive(stream)
-    except ValueError as error:
-        return [f"{where}: {error}"]
-    except OSError as error:
-        return [f"{where}: cannot be read: {error.strerror}"]
-    faults = []
-    if found != listed:
-        faults.append(f"{storage.where(shard_index_file(number))}: is not the list of {where}, which was changed")
-    stray = sorted(index for index in found.frames if index // pairs_per_tar != number)
-    if stray:
-        faults.append(f"{where}: frame {stray[0]} belongs to another tar file")
-    return faults
+_CALIBRATION_TOLERANCE = 1e-14
 
 
 class Check(FrozenModel):
@@ -224,6 +154,80 @@ def validate_dataset(path: Location) -> ValidationReport:
     for entry in manifest.frames:
         _check_frame(dataset, entry, coco, tally)
     return tally.report(len(manifest.frames))
+
+
+def calibration_faults(dataset: Location, rig: StereoRig) -> list[str]:
+    """Faults of the calibration files; all but OpenCV's may be missing."""
+    storage, faults = open_storage(dataset), []
+    for name, text in calibration_files(rig).items():
+        path = storage.where(f"{CALIBRATION_FOLDER}/{name}")
+        try:
+            found = storage.read(f"{CALIBRATION_FOLDER}/{name}")
+        except FileNotFoundError:
+            if name == OPENCV_STEREO_FILE:
+                faults.append(f"{path}: is missing")
+            continue
+        except OSError as error:
+            faults.append(f"{path}: cannot be read: {error.strerror}")
+            continue
+        if found != text.encode():
+            faults.append(f"{path}: is not that of the manifest's rig")
+        elif name == OPENCV_STEREO_FILE:
+            # Only a file that is known to be undamaged reaches OpenCV's parser.
+            faults += _opencv_faults(path, text, rig)
+    return faults
+
+
+def _opencv_faults(path: str, text: str, rig: StereoRig) -> list[str]:
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    faults = []
+    for name, want in opencv_stereo_matrices(rig).items():
+        found = storage.getNode(name).mat()
+        if (
+            found is None
+            or found.shape != want.shape
+            or not np.allclose(found, want, rtol=_CALIBRATION_TOLERANCE, atol=1e-300)
+        ):
+            faults.append(f"{path}: {name}: OpenCV reads {None if found is None else found.tolist()}")
+    return faults
+
+
+def shard_faults(storage: Storage) -> Iterator[tuple[str, list[str]]]:
+    """What is wrong with each tar file of a dataset, under the name of the check; nothing where it has none.
+
+    That the files in them are those of the records is checked frame by frame.
+    """
+    try:
+        pairs_per_tar = read_pairs_per_tar(storage)
+    except ValueError as error:
+        yield "tar files", [str(error)]
+        return
+    if pairs_per_tar is None:
+        return
+    for number in shard_numbers(storage):
+        yield "tar files", _faults(storage, number, pairs_per_tar)
+
+
+def _faults(storage: Storage, number: int, pairs_per_tar: int) -> list[str]:
+    where = storage.where(shard_file(number))
+    try:
+        listed = read_shard_index(storage, number)
+    except ValueError as error:
+        return [str(error)]
+    try:
+        with storage.open(shard_file(number)) as stream:
+            found = index_of_archive(stream)
+    except ValueError as error:
+        return [f"{where}: {error}"]
+    except OSError as error:
+        return [f"{where}: cannot be read: {error.strerror}"]
+    faults = []
+    if found != listed:
+        faults.append(f"{storage.where(shard_index_file(number))}: is not the list of {where}, which was changed")
+    stray = sorted(index for index in found.frames if index // pairs_per_tar != number)
+    if stray:
+        faults.append(f"{where}: frame {stray[0]} belongs to another tar file")
+    return faults
 
 
 def _check_frame(dataset: Dataset, entry: FrameEntry, coco: CocoFiles, tally: _Tally) -> None:

@@ -34,6 +34,12 @@ _OUTLINE_TOLERANCE = 5e-4
 # Rays, vertices and the product of a few transforms, each rounded to float32 at the scale of the distance.
 _DEPTH_ROUNDINGS = 32.0
 
+# Two projections in float64 agree far better; a wrong pixel convention exceeds it.
+_PROJECTION_TOLERANCE_PX = 1e-6
+
+# The rows of both eyes are computed from the same numbers.
+_EPIPOLAR_TOLERANCE_PX = 1e-9
+
 
 def check_against_passes(record: PairRecord, radiance: StereoRadiance) -> list[str]:
     """Faults between the labels of a pair and its passes, one line each; empty if there are none.
@@ -208,12 +214,6 @@ def _contains(outer: PixelBox, inner: PixelBox, margin_px: float) -> bool:
         and inner[0] + inner[2] <= outer[0] + outer[2] + margin_px
         and inner[1] + inner[3] <= outer[1] + outer[3] + margin_px
     )
-
-
-# Two projections in float64 agree far better; a wrong pixel convention exceeds it.
-_PROJECTION_TOLERANCE_PX = 1e-6
-# The rows of both eyes are computed from the same numbers.
-_EPIPOLAR_TOLERANCE_PX = 1e-9
 
 
 def projection_faults(record: PairRecord) -> list[str]:

@@ -45,7 +45,7 @@ def test_an_engine_reaches_all_bars_against_itself_and_is_not_asked_twice(tmp_pa
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nowhere", "no 'nowhere' ships"),
+        ("nowhere", "no shipped recipe is named 'nowhere'"),
         ("world-89/fog", "family: recipe world-89 has none named 'fog'; there are clear, "),
         ("demo/clear", "family: recipe demo has none named 'clear'; there are none"),
     ],
