@@ -26,6 +26,10 @@ from scenes.sampler import scene_of_frame
 
 # Fewer than three cannot separate distance from scene; more than a dozen hardly improve the mean.
 _FEWEST_PROBES, _MOST_PROBES = 3, 12
+# Constant, inverse and inverse square of the distance.
+_TERMS = 3
+# The stage that makes a scene's environment; every process does it once for each of its scenes.
+_SCENE_STAGE = "sample"
 
 
 @dataclass(frozen=True)
@@ -159,12 +163,6 @@ def make_in_turn(
 def cpu_s(report: FrameReport) -> float:
     """Processor time of all stages of a frame. [s]"""
     return sum(report.stage_s.values())
-
-
-# Constant, inverse and inverse square of the distance.
-_TERMS = 3
-# The stage that makes a scene's environment; every process does it once for each of its scenes.
-_SCENE_STAGE = "sample"
 
 
 @dataclass(frozen=True)

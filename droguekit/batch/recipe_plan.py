@@ -33,6 +33,11 @@ _S_PER_SAMPLE = 20e-6
 _MOST_SAMPLED = 10_000
 # Distance, middle and side of the box, room of its middle.
 _COLUMNS = 8
+SIZE_BINS = 10
+PLACE_COLUMNS, PLACE_ROWS = 8, 6
+# Cochran's rule: with fewer expected in a cell the statistic does not follow chi-square.
+_FEWEST_EXPECTED = 5.0
+_RANK_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,13 +196,6 @@ def _box(drogue: DrogueParameters, rig: StereoRig, pose: RigidTransform) -> tupl
     limit = np.array([rig.camera.width_px, rig.camera.height_px]) - 1 - edge
     lowest, highest = center - (low.min(axis=0) - edge), center + (limit - (low + size).max(axis=0))
     return center, float(np.sqrt(size[0].prod())), np.stack([lowest, highest], axis=1).ravel()
-
-
-SIZE_BINS = 10
-PLACE_COLUMNS, PLACE_ROWS = 8, 6
-# Cochran's rule: with fewer expected in a cell the statistic does not follow chi-square.
-_FEWEST_EXPECTED = 5.0
-_RANK_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)

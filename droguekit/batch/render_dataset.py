@@ -32,6 +32,9 @@ from labelgen.export.coco import write_annotations
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
+# With so many pairs, a step of milliseconds a pair takes long enough to be announced.
+_MANY_PAIRS = 1000
+
 
 @dataclass
 class RunTotals:
@@ -174,10 +177,6 @@ def _failure_reason(attempt: TaskAttempt[FrameReport], made: int, dropped: int, 
         if is_common or isinstance(error, FATAL_ERRORS):
             raise error
     return error_reason(error)
-
-
-# With so many pairs, a step of milliseconds a pair takes long enough to be announced.
-_MANY_PAIRS = 1000
 
 
 @dataclass(frozen=True)

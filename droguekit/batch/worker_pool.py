@@ -24,6 +24,8 @@ from droguekit.numerical_threads import one_thread_in_new_processes
 READY, UNTIMED = "ready", "untimed"
 _CONTEXT = multiprocessing.get_context("spawn")
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+T = TypeVar("T")
+MAX_ATTEMPTS = 3
 
 
 class WorkerDiedError(OSError):
@@ -163,11 +165,6 @@ def _exit_text(exit_code: int | None) -> str:
         return signal.Signals(-exit_code).name
     except ValueError:
         return f"signal {-exit_code}"
-
-
-T = TypeVar("T")
-
-MAX_ATTEMPTS = 3
 
 
 @dataclass(frozen=True)

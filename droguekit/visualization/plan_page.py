@@ -26,6 +26,38 @@ _DPI = 130
 _BAR, _LAW = "#7aa9d8", "#b03a2e"
 _BINS = 24
 _CELL_PX = 40
+_TEMPLATE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>What {{ name }} will make</title>
+<style>
+body { margin: 0 auto; padding: 1.5rem; max-width: 80rem; background: #fff; color: #1c2026;
+  font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
+h1 { font-size: 1.6rem; margin: 0; }
+h2 { font-size: 1.2rem; margin: 2rem 0 0.5rem; }
+.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 1.2rem; }
+figure { margin: 0; }
+figure img { display: block; width: 100%; height: auto; }
+figcaption { color: #5b6470; font-size: 0.88rem; }
+pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.82rem; line-height: 1.35; }
+</style>
+</head>
+<body>
+<h1>What {{ name }} will make</h1>
+<p>{{ description }}</p>
+<div class="panels">
+{% for figure in figures %}
+<figure><img alt="{{ figure.title }}" src="data:image/png;base64,{{ figure.data }}">
+<figcaption>{{ figure.caption }}</figcaption></figure>
+{% endfor %}
+</div>
+<h2>In numbers</h2>
+<pre>{{ lines }}</pre>
+</body>
+</html>
+"""
 
 
 @dataclass(frozen=True)
@@ -184,40 +216,6 @@ def _figure(title: str, caption: str, draw: Callable[[Axes], None]) -> PlanFigur
         stream = io.BytesIO()
         figure.savefig(stream, format="png", metadata={"Software": None})
     return PlanFigure(title, caption, stream.getvalue())
-
-
-_TEMPLATE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>What {{ name }} will make</title>
-<style>
-body { margin: 0 auto; padding: 1.5rem; max-width: 80rem; background: #fff; color: #1c2026;
-  font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
-h1 { font-size: 1.6rem; margin: 0; }
-h2 { font-size: 1.2rem; margin: 2rem 0 0.5rem; }
-.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 28rem), 1fr)); gap: 1.2rem; }
-figure { margin: 0; }
-figure img { display: block; width: 100%; height: auto; }
-figcaption { color: #5b6470; font-size: 0.88rem; }
-pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.82rem; line-height: 1.35; }
-</style>
-</head>
-<body>
-<h1>What {{ name }} will make</h1>
-<p>{{ description }}</p>
-<div class="panels">
-{% for figure in figures %}
-<figure><img alt="{{ figure.title }}" src="data:image/png;base64,{{ figure.data }}">
-<figcaption>{{ figure.caption }}</figcaption></figure>
-{% endfor %}
-</div>
-<h2>In numbers</h2>
-<pre>{{ lines }}</pre>
-</body>
-</html>
-"""
 
 
 def write_plan_page(recipe: Recipe, planned: RecipePlan, lines: Sequence[str], out: Path) -> None:

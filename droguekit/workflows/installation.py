@@ -33,6 +33,7 @@ _BLENDER_LIBRARIES = {
     "libSM.so.6": "libsm6",
     "libGL.so.1": "libgl1",
 }
+_LIBATOMIC = ("libatomic.so.1", "apt-get install libatomic1")
 
 
 def installation_lines() -> Generator[str, None, bool]:
@@ -153,9 +154,6 @@ def _loads(library: str) -> bool:
     except OSError:
         return False
     return True
-
-
-_LIBATOMIC = ("libatomic.so.1", "apt-get install libatomic1")
 
 
 def _missing_libraries() -> list[tuple[str, str]]:

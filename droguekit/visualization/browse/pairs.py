@@ -34,6 +34,11 @@ from geometry.stereo import EYES, StereoRig
 # Our choice: night, dusk, a dull day's shade and a bright sky, by the luminance behind the drogue. [cd/m2]
 LIGHTS = ("below 1 cd/m²", "1 to 100 cd/m²", "100 to 3000 cd/m²", "from 3000 cd/m²")
 LIGHT_EDGES_CD_M2 = (1.0, 100.0, 3000.0)
+PICTURE_KINDS = ("small", "left", "right")
+_SMALL_WIDTH_PX = 240
+_QUALITY, _SMALL_QUALITY = 85, 78
+# A thousandth of a pixel is far below what a screen shows, and a page of thousands of pairs half as large.
+_PX_DIGITS, _POSE_DIGITS = 3, 9
 
 
 def light_of(luminance_cd_m2: float) -> str:
@@ -103,13 +108,6 @@ def _objects(frame: FrameSpec) -> list[tuple[str, str]]:
     if frame.rangefinder_reading_m is not None:
         rows.append(("Rangefinder", f"{plain_number(frame.rangefinder_reading_m)} m"))
     return rows
-
-
-PICTURE_KINDS = ("small", "left", "right")
-_SMALL_WIDTH_PX = 240
-_QUALITY, _SMALL_QUALITY = 85, 78
-# A thousandth of a pixel is far below what a screen shows, and a page of thousands of pairs half as large.
-_PX_DIGITS, _POSE_DIGITS = 3, 9
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,32 @@ from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 
+Faces = NDArray[np.int64]
+_Body = TypeVar("_Body")
+APPLICATION = "droguekit"
+FRAMES, SECONDS = "frame", "time"
+CURVES = ("position_mm", "pitch_deg", "yaw_deg")
+_HUB_RGB: Rgb = (255, 120, 220)
+_STEEL_RGB: Rgb = (138, 150, 163)
+_HOSE_RGB: Rgb = (70, 70, 76)
+# Colours of methods, repeated if there are more; bright enough for the viewer's black background.
+_METHOD_RGB: tuple[Rgb, ...] = (
+    (255, 138, 31),
+    (90, 170, 255),
+    (90, 210, 110),
+    (255, 95, 115),
+    (185, 145, 255),
+    (60, 210, 220),
+)
+# Sizes on the screen, whatever the image's scale.
+_TRUE_POINTS, _MEASURED_POINTS, _WIRES = (
+    np.atleast_1d(np.asarray(rr.Radius.ui_points(size))) for size in (2.5, 1.5, 1.0)
+)
+# The chords of a rim of 0.35 m are then at most 0.4 mm off.
+_CIRCLE_POINTS = 64
+_QUALITY = 80
+_IMAGE_PLANE_M = 0.6
+
 
 class ShownPair(NamedTuple):
     """A pair: its images, the rig, the drogue that is or would be in view, and its truth or None."""
@@ -74,34 +100,6 @@ def open_pairs(dataset: Location) -> ShownPairs:
         return ShownPair(index, source.images(index), record.frame.rig, drogue, record)
 
     return ShownPairs(source.frame_indices, read)
-
-
-Faces = NDArray[np.int64]
-_Body = TypeVar("_Body")
-
-APPLICATION = "droguekit"
-FRAMES, SECONDS = "frame", "time"
-CURVES = ("position_mm", "pitch_deg", "yaw_deg")
-_HUB_RGB: Rgb = (255, 120, 220)
-_STEEL_RGB: Rgb = (138, 150, 163)
-_HOSE_RGB: Rgb = (70, 70, 76)
-# Colours of methods, repeated if there are more; bright enough for the viewer's black background.
-_METHOD_RGB: tuple[Rgb, ...] = (
-    (255, 138, 31),
-    (90, 170, 255),
-    (90, 210, 110),
-    (255, 95, 115),
-    (185, 145, 255),
-    (60, 210, 220),
-)
-# Sizes on the screen, whatever the image's scale.
-_TRUE_POINTS, _MEASURED_POINTS, _WIRES = (
-    np.atleast_1d(np.asarray(rr.Radius.ui_points(size))) for size in (2.5, 1.5, 1.0)
-)
-# The chords of a rim of 0.35 m are then at most 0.4 mm off.
-_CIRCLE_POINTS = 64
-_QUALITY = 80
-_IMAGE_PLANE_M = 0.6
 
 
 class PairRecorder:
