@@ -186,13 +186,13 @@ def check_frames(dataset: Location, manifest: Manifest) -> ExistingFrames:
         ValueError: frames were made by different engine versions, or the index of a tar file is damaged.
         OSError: the connection to an object store fails, which is no damage of the frames.
     """
-    vouched = {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
+    record_hashes = {entry.frame_index: entry.record_sha256 for entry in manifest.frames}
     whole: list[int] = []
     damaged: list[int] = []
     versions: dict[str, int] = {}
     store = FrameStore(dataset)
     indices = store.indices()
-    records = map_in_order(lambda index: _read_whole(store, index, vouched.get(index)), indices, store.storage)
+    records = map_in_order(lambda index: _read_whole(store, index, record_hashes.get(index)), indices, store.storage)
     for frame_index, record in zip(indices, records, strict=True):
         if record is None or record.frame_index != frame_index:
             damaged.append(frame_index)
