@@ -1,4 +1,8 @@
-"""Annuli."""
+"""Both edges of bright annuli in one fit: the hub around the coupling's mouth, often partly in shadow.
+
+The model is two blurred edges with light between them that varies with the azimuth. The shapes of the edges, and the
+step between their centres, follow the pose that the markers give.
+"""
 
 from __future__ import annotations
 
@@ -39,45 +43,45 @@ from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations, ev
 SLOPE_HARMONICS = 5
 
 
-def annulus_model(pixels: OutlinePixels, turns: Array32, beyond: Array32) -> Model:
-    """`I = b (1 - So) + A(azimuth) (So - Si) + b' Si + k(azimuth) F`.
+def annulus_model(pixels: OutlinePixels, harmonics: Array32, beyond: Array32) -> Model:
+    """Intensity of an annulus, `I = b (1 - So) + A(azimuth) (So - Si) + b' Si + k(azimuth) F`.
 
     Args:
-        pixels: where.
-        turns: (N, T, K) functions of the azimuth whose sum is A.
-        beyond: (N, K) share F of what lies beyond the annulus's surroundings and is lighter by k than they are.
+        pixels: at which the model is evaluated.
+        harmonics: (N, T, K) functions of the azimuth whose weighted sum is A.
+        beyond: (N, K) share F of light from beyond the annulus's surroundings, brighter than those by k.
     """
     x, y = pixels.x_px, pixels.y_px
-    count = ANNULUS_AMPLITUDE + turns.shape[1]
+    count = ANNULUS_AMPLITUDE + harmonics.shape[1]
 
     def model(parameters: Array) -> tuple[Array32, Array32]:
         picture, jacobian = np.empty_like(x), np.empty((len(x), count, x.shape[1]), np.float32)
         given, widths = parameters.astype(np.float32), edge_widths(parameters[:, ANNULUS_WIDTH])
-        draw_annuli(given, widths, x, y, turns, beyond, picture, jacobian)
+        draw_annuli(given, widths, x, y, harmonics, beyond, picture, jacobian)
         return picture, jacobian
 
     return model
 
 
 def area_shares(fit: Minimum, ties: Array) -> tuple[Array32, Array32]:
-    """(N, K) how much of each pixel lies on the annulus, and how much in the hole.
+    """(N, K) share of each pixel that lies on the annulus, and share in the hole.
 
-    They are the derivatives by the annulus's mean light and by the hole's, whose parameters are free ones.
+    They are the derivatives by the mean level of the annulus and by the level of the hole, both free parameters.
     """
     tied = ties.shape[2] - (ties.shape[1] - ANNULUS_WIDTH)
     between, in_hole = (fit.jacobian[:, tied + place - ANNULUS_WIDTH] for place in (ANNULUS_AMPLITUDE, ANNULUS_HOLE))
     return np.ascontiguousarray(between), np.ascontiguousarray(in_hole)
 
 
-def light_above_background(parameters: Array, turns: Array32) -> Array32:
-    """(N, K) the annulus's light above the background. [DN]"""
+def light_above_background(parameters: Array, harmonics: Array32) -> Array32:
+    """(N, K) level of the annulus above the background. [DN]"""
     rest = parameters[:, ANNULUS_BACKGROUND:].astype(np.float32)
-    light: Array32 = np.matmul(rest[:, None, ANNULUS_AMPLITUDE - ANNULUS_BACKGROUND :], turns)[:, 0]
+    light: Array32 = np.matmul(rest[:, None, ANNULUS_AMPLITUDE - ANNULUS_BACKGROUND :], harmonics)[:, 0]
     return light - rest[:, 0, None]
 
 
 def azimuth_harmonics(pixels: OutlinePixels, order: int) -> Array32:
-    """(N, 2 order + 1, K): one, then cosines and sines of multiples of the azimuth."""
+    """(N, 2 order + 1, K) harmonics: one, then cosines and sines of multiples of the azimuth."""
     angle = np.arctan2(pixels.y_px, pixels.x_px)
     rows = [np.ones_like(angle)]
     for multiple in range(1, order + 1):
@@ -85,20 +89,20 @@ def azimuth_harmonics(pixels: OutlinePixels, order: int) -> Array32:
     return np.stack(rows, axis=1)
 
 
-def radial_slopes(pixels: OutlinePixels, turns: Array32, outer: Ellipses, inner: Ellipses) -> Array32:
-    """(N, 5, K): the first two orders of the azimuth, growing outwards from nothing in the annulus's middle.
+def radial_slopes(pixels: OutlinePixels, harmonics: Array32, outer: Ellipses, inner: Ellipses) -> Array32:
+    """(N, 5, K) the first two orders of the azimuth times the radial distance from the annulus's middle.
 
-    Without them a slope of light across the annulus, steeper at the outer edge than at the inner one, moves both.
+    Without them a slope of light across the annulus, steeper at the outer edge than at the inner one, moves both edges.
     """
     middle = ((outer.radii_px + inner.radii_px) / 2).astype(np.float32)[:, None]
     outwards = np.hypot(pixels.x_px, pixels.y_px) / middle - 1
-    slopes: Array32 = outwards[:, None] * turns[:, :SLOPE_HARMONICS]
+    slopes: Array32 = outwards[:, None] * harmonics[:, :SLOPE_HARMONICS]
     return slopes
 
 
-def initial_annulus_parameters(pixels: OutlinePixels, outer: Ellipses, inner: Ellipses, turn_count: int) -> Array:
+def initial_annulus_parameters(pixels: OutlinePixels, outer: Ellipses, inner: Ellipses, harmonic_count: int) -> Array:
     """(N, P) parameters of the predicted edges with the mean levels outside, on and within the annulus."""
-    parameters = np.zeros((len(outer), ANNULUS_AMPLITUDE + turn_count))
+    parameters = np.zeros((len(outer), ANNULUS_AMPLITUDE + harmonic_count))
     shift = inner.centers_px - outer.centers_px
     parameters[:, ANNULUS_OUTER] = ellipse_parameters(np.zeros((len(outer), 2)), outer.shapes_px)
     parameters[:, ANNULUS_INNER] = ellipse_parameters(shift, inner.shapes_px)
@@ -118,9 +122,9 @@ def initial_annulus_parameters(pixels: OutlinePixels, outer: Ellipses, inner: El
 
 
 def pose_constraints(start: Array, thin: bool) -> Array:
-    """(N, P, Q) how the model's parameters follow the free ones.
+    """(N, P, Q) derivatives of the model's parameters by the free ones.
 
-    A common shift of both edges is free, and the size of each, or of thin annuli of both; their shapes are not.
+    Free are a common shift of both edges and the size of each edge, of thin annuli one common size; shapes are fixed.
     """
     count = start.shape[1]
     moved = np.zeros((len(start), count, 3 if thin else 4))
@@ -132,8 +136,8 @@ def pose_constraints(start: Array, thin: bool) -> Array:
 
 
 def constrained_model(model: Model, start: Array, ties: Array) -> Model:
-    """The model in its free parameters, counted from the start."""
-    # Both ellipses follow the first few; all others are free themselves.
+    """The model as a function of its free parameters, which are zero at the start."""
+    # Both ellipses depend on the first few free parameters; all further parameters are free themselves.
     tied = ties.shape[2] - (ties.shape[1] - ANNULUS_WIDTH)
     across = np.ascontiguousarray(ties[:, :ANNULUS_WIDTH, :tied].transpose(0, 2, 1), np.float32)
 
@@ -147,7 +151,7 @@ def constrained_model(model: Model, start: Array, ties: Array) -> Model:
 
 
 def expand_parameters(start: Array, ties: Array, fit: Minimum) -> Array:
-    """(N, P) the model's parameters where a fit in the free ones, and what else follows them, ended."""
+    """(N, P) the model's parameters at the end of a fit of the free ones, whose vector comes first."""
     parameters: Array = start + np.einsum("npq,nq->np", ties, fit.parameters[:, : ties.shape[2]])
     return parameters
 
@@ -155,64 +159,64 @@ def expand_parameters(start: Array, ties: Array, fit: Minimum) -> Array:
 def response_images(
     pixels: OutlinePixels, parameters: Array, shares: tuple[Array32, Array32], light: Array32
 ) -> Array32:
-    """(N, 3, K) what edges of pixel boxes show beyond Gaussian ones, at both edges of an annulus. [DN]
+    """(N, 3, K) differences of box responses from Gaussian edges, at both edges of annuli. [DN]
 
     Args:
         pixels: of the annuli.
-        parameters: (N, P) where the edges are, see `nav.centroids.annuli`.
+        parameters: (N, P) of the annuli.
         shares: (N, K) of the pixels that lie on the annulus, and in the hole.
         light: (N, K) of the annulus above the background.
     """
     hole = (parameters[:, ANNULUS_HOLE] - parameters[:, ANNULUS_BACKGROUND]).astype(np.float32)[:, None]
-    pictures = np.zeros((len(parameters), RESPONSE_BOXES, pixels.x_px.shape[1]), np.float32)
+    responses = np.zeros((len(parameters), RESPONSE_BOXES, pixels.x_px.shape[1]), np.float32)
     between, in_hole = shares
     for place, inside, step in ((ANNULUS_OUTER, between + in_hole, light), (ANNULUS_INNER, in_hole, hole - light)):
         ellipses = parameters[:, place].astype(np.float32)
-        add_box_responses(ellipses, pixels.x_px, pixels.y_px, pixels.present, inside, step, pictures)
-    return pictures
+        add_box_responses(ellipses, pixels.x_px, pixels.y_px, pixels.present, inside, step, responses)
+    return responses
 
 
-def start_with_response(fit: Minimum, pictures: Array32) -> Minimum:
-    """Where a fit of the model without pictures (N, S, K) ended, as a start of that with them: there are none yet."""
-    jacobian = np.concatenate([fit.jacobian, pictures], axis=1)
+def start_with_response(fit: Minimum, responses: Array32) -> Minimum:
+    """The end of a fit without responses (N, S, K) as a start of the fit with them, their amounts zero."""
+    jacobian = np.concatenate([fit.jacobian, responses], axis=1)
     normal = NormalEquations(jacobian, fit.residuals, fit.normal.weights)
-    parameters = np.pad(fit.parameters, ((0, 0), (0, pictures.shape[1])))
+    parameters = np.pad(fit.parameters, ((0, 0), (0, responses.shape[1])))
     return Minimum(parameters, fit.residuals, jacobian, normal)
 
 
-def with_response(model: Model, pictures: Array32) -> Model:
-    """The model with given pictures (N, S, K) added, in amounts that are its last parameters."""
-    count = pictures.shape[1]
+def with_response(model: Model, responses: Array32) -> Model:
+    """The model plus responses (N, S, K), whose amounts are its last parameters."""
+    count = responses.shape[1]
 
     def extended(parameters: Array) -> tuple[Array32, Array32]:
         values, jacobian = model(parameters[:, :-count])
         amounts = parameters[:, None, -count:].astype(np.float32)
-        return values + np.matmul(amounts, pictures)[:, 0], np.concatenate([jacobian, pictures], axis=1)
+        return values + np.matmul(amounts, responses)[:, 0], np.concatenate([jacobian, responses], axis=1)
 
     return extended
 
 
-# Azimuthal order of the light on the annulus; a thin one has too few pixels to tell high orders from its outline.
+# Azimuthal order of the light on the annulus; thin annuli have too few pixels to separate high orders from the outline.
 _ORDER, _ORDER_THIN, _THIN_PX = 4, 2, 2.5
-# Light this uneven about the azimuth, as a share of its mean, changes across the annulus too; evenly lit ones, within
-# 0.015 of the mean on path-traced daylight frames, are better off without.
+# Light this uneven about the azimuth, as a share of its mean, also changes across the annulus, and the fit gets radial
+# slopes. Evenly lit annuli, within 0.015 of the mean on path-traced daylight frames, are fitted better without.
 _UNEVEN_SHARE = 0.02
-# Ribs and sky around the hub are many and small, their light by the azimuth is fitted: more of it is taken than beside
-# a marker.
+# Largest share of light from beyond in a used pixel. Ribs and sky around the hub are many and small, and their light by
+# the azimuth is fitted, so more is allowed than beside a marker.
 _MOST_BEYOND = 0.8
 _FIRST_STEPS, _RESPONSE_STEPS, _SECOND_STEPS = 6, 2, 3
 _MOST_LEVERAGE = np.float32(0.9)
 _SECTORS = 16
-# Both eyes see the same shadow: what it adds does not average out between them; and the light's azimuthal terms hide
-# much of it from the residuals (path-traced frames of partly shaded hubs, 1.7 to 5 m).
+# Both eyes see the same shadow, so its errors do not average out between them, and the azimuthal harmonics hide much of
+# it from the residuals (path-traced frames of partly shaded hubs, 1.7 to 5 m).
 _SHADOW_FACTOR = 3.0
-# Mean square of a sector's summed noise that one even annulus in six exceeds. In little light noise hides most of what
-# a shadow leaves in the residuals, and none of what it does to the centre: a higher limit would overlook it.
+# Mean square of a sector's summed noise that one even annulus in six exceeds. In low light, noise hides most of a
+# shadow's residuals but none of its effect on the centre, which a higher limit would overlook.
 _EVEN_SECTOR_CHI2 = 1.35
-# Share of a pixel's light that comes from the annulus where it lies beside it.
+# Largest share of the annulus in a pixel that counts as beside it.
 _BESIDE = 0.03
 _LEAST_CONTRAST_SIGMA = 4.0
-# So much of the annulus must be lit: less does not tell where its middle is.
+# Least lit share of the annulus: less does not determine its centre.
 _LEAST_LIT_FRACTION = 0.5
 _LIT_SHARE = 0.3
 _MOST_CLIPPED_FRACTION = 0.05
@@ -224,7 +228,7 @@ _CERTAIN_SIGMA_PX = 0.1
 
 @dataclass(frozen=True, eq=False)
 class AnnulusFits:
-    """Refined annuli, in the order of the predicted ones.
+    """Fitted annuli, in the order of the predicted ones.
 
     Attributes:
         centers_px: (M, 2) centres of the outer edges, the predicted ones where a fit was rejected; the inner ones lie
@@ -232,7 +236,7 @@ class AnnulusFits:
         cov_px2: (M, 2, 2) their covariances.
         contrast_dn: (M,) mean light of the annulus above that beside it. [DN]
         lit_fraction: (M,) share of the azimuth that is lit.
-        inflation: (M,) factor in `cov_px2` for residuals that hang together, as shadows leave them.
+        inflation: (M,) factor in `cov_px2` for correlated residuals, as shadows leave them.
         reasons: why an annulus was rejected, or None.
     """
 
@@ -250,14 +254,24 @@ class AnnulusFits:
 
     @property
     def certain(self) -> bool:
-        """Whether all annuli were found, and none so vaguely that it may be another thing."""
+        """Whether all annuli were found with centres precise enough to rule out another object."""
         return bool(self.accepted.all() and (np.einsum("nii->n", self.cov_px2) < 2 * _CERTAIN_SIGMA_PX**2).all())
 
     @property
     def evidence_per_px2(self) -> float:
-        """How precisely the accepted ones are placed, together. [1/px^2]"""
+        """Summed inverse variances of the accepted centres. [1/px^2]"""
         accepted = self.accepted
         return float((1 / np.einsum("nii->n", self.cov_px2[accepted])).sum())
+
+
+_NO_ANNULI = AnnulusFits(
+    centers_px=np.zeros((0, 2)),
+    cov_px2=np.zeros((0, 2, 2)),
+    contrast_dn=np.zeros(0),
+    lit_fraction=np.zeros(0),
+    inflation=np.zeros(0),
+    reasons=(),
+)
 
 
 def fit_annuli(
@@ -270,43 +284,42 @@ def fit_annuli(
 ) -> AnnulusFits:
     """Fit every annulus of both eyes.
 
-    Shapes, and the step between the centres, are those that the pose of the markers predicts, up to the size of each
-    edge; of annuli too thin to show each edge by itself, up to a common size. Free shapes would follow shadows.
+    Shapes and the step between the centres are those of the predicted edges; the size of each edge is free. Annuli too
+    thin to show each edge by itself have one common size. Free shapes would follow shadows.
 
     Args:
         signals: left and right, around the annuli.
         outer: predicted outer edges, within a third of their radius.
         inner: predicted inner edges, of the same annuli.
-        noise: of the frame's pixels, from `fit_discs`; what stands out against it is contrast.
+        noise: of the frame's pixels, from `fit_discs`; it limits the contrast of accepted annuli.
         collar_factor: radius of the dark collar around the annulus over that of its outer edge, 0 where unknown. What
-            lies beyond is left out, and its blur fitted.
-        motion: how the drogue moves on the images while the shutter is open, None where it stands still.
+            lies beyond is left out, and its blur is fitted.
+        motion: of the drogue's image while the shutter is open, None where it stands still.
     """
     if len(outer) == 0:
-        nothing = np.zeros(0)
-        return AnnulusFits(np.zeros((0, 2)), np.zeros((0, 2, 2)), nothing, nothing, nothing, ())
+        return _NO_ANNULI
     width_px = float((outer.radii_px - inner.radii_px).min())
     thin = width_px < _THIN_PX
     ways = None if motion is None else motion.of(outer)
     gathered = annulus_pixels(signals, outer, inner, 0.0 if motion is None else motion.spread_px(outer))
     pixels, beyond = _within_collar(gathered, signals[0], (outer, inner), collar_factor, ways)
-    turns = azimuth_harmonics(pixels, _ORDER_THIN if thin else _ORDER)
-    start = initial_annulus_parameters(pixels, outer, inner, turns.shape[1])
-    first = _first_fit(pixels, (turns, beyond), start, thin, ways)
+    harmonics = azimuth_harmonics(pixels, _ORDER_THIN if thin else _ORDER)
+    start = initial_annulus_parameters(pixels, outer, inner, harmonics.shape[1])
+    first = _first_fit(pixels, (harmonics, beyond), start, thin, ways)
     rough = expand_parameters(start, pose_constraints(start, thin), first)
     if not thin and _unevenness(rough) > _UNEVEN_SHARE:
-        turns = np.concatenate([turns, radial_slopes(pixels, turns, outer, inner)], axis=1)
+        harmonics = np.concatenate([harmonics, radial_slopes(pixels, harmonics, outer, inner)], axis=1)
         start = np.pad(rough, ((0, 0), (0, SLOPE_HARMONICS)))
-        first = _first_fit(pixels, (turns, beyond), start, thin, ways)
+        first = _first_fit(pixels, (harmonics, beyond), start, thin, ways)
     ties = pose_constraints(start, thin)
-    model = constrained_model(_annulus_model_of(pixels, (turns, beyond), ways), start, ties)
-    final, weights, edge_factor = _weighted_fit(pixels, turns, (start, ties), model, first, ways is None)
+    model = constrained_model(_annulus_model_of(pixels, (harmonics, beyond), ways), start, ties)
+    final, weights, edge_factor = _weighted_fit(pixels, harmonics, (start, ties), model, first, ways is None)
     parameters = expand_parameters(start, ties, final)
-    between, light = area_shares(final, ties)[0], light_above_background(parameters, turns)
+    between, light = area_shares(final, ties)[0], light_above_background(parameters, harmonics)
     contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
     uneven = _sector_chi2(final, weights, pixels, contrast)
     if edge_factor < 1:
-        # What lies beside the annulus drowns what is on it.
+        # The noise beside the annulus hides the residuals on it.
         judged = weights * (between > _BESIDE) / np.float32(edge_factor)
         uneven = np.maximum(uneven, _sector_chi2(final, judged, pixels, contrast))
     inflation = 1 + _SHADOW_FACTOR * np.maximum(uneven - _EVEN_SECTOR_CHI2, 0)
@@ -316,7 +329,14 @@ def fit_annuli(
     reasons, lit = _reasons(pixels, parameters, on_it, light, noise, (outer, inner))
     good = np.array([reason is None for reason in reasons])
     centers = np.where(good[:, None], pixels.origins_px + parameters[:, ANNULUS_OUTER][:, :2], outer.centers_px)
-    return AnnulusFits(centers, cov, contrast, lit, inflation, reasons)
+    return AnnulusFits(
+        centers_px=centers,
+        cov_px2=cov,
+        contrast_dn=contrast,
+        lit_fraction=lit,
+        inflation=inflation,
+        reasons=reasons,
+    )
 
 
 def _annulus_model_of(pixels: OutlinePixels, light: tuple[Array32, Array32], ways: Array | None) -> Model:
@@ -327,7 +347,7 @@ def _annulus_model_of(pixels: OutlinePixels, light: tuple[Array32, Array32], way
 def _first_fit(
     pixels: OutlinePixels, light: tuple[Array32, Array32], start: Array, thin: bool, ways: Array | None
 ) -> Minimum:
-    """The fit of equal weights, for the noise by what each pixel sees; `light` is that on the annulus and beyond."""
+    """Fit with equal weights, to measure the noise; `light` is the basis of that on the annulus and beyond."""
     ties = pose_constraints(start, thin)
     model = constrained_model(_annulus_model_of(pixels, light, ways), start, ties)
     begin = evaluate(model, pixels.values, pixels.present, np.zeros((len(start), ties.shape[2])))
@@ -335,29 +355,32 @@ def _first_fit(
 
 
 def _weighted_fit(
-    pixels: OutlinePixels, turns: Array32, shape: tuple[Array, Array], model: Model, first: Minimum, is_still: bool
+    pixels: OutlinePixels, harmonics: Array32, shape: tuple[Array, Array], model: Model, first: Minimum, is_still: bool
 ) -> tuple[Minimum, Array32, float]:
-    """The fit of inverse variances, with the pixels' response, the weights, and the factor of `NoiseModel` in them.
+    """Fit with inverse variances and the pixels' response.
 
-    The noise is the annuli's own: what lies around them is lighter than a marker's face, and so noisier.
+    The noise comes from the annuli: their surroundings are brighter than a marker's face, and so noisier.
 
     Args:
-        pixels, turns: of the annuli.
+        pixels, harmonics: of the annuli.
         shape: start and ties, see `all_parameters`.
         model: in the free parameters.
         first: fit of equal weights.
         is_still: whether edges are so sharp that the pixels' response shows.
+
+    Returns:
+        The fit, the weights (N, K), and the edge factor of their noise model.
     """
     parameters, ties = expand_parameters(*shape, first), shape[1]
     if is_still:
-        pictures = response_images(
-            pixels, parameters, area_shares(first, ties), light_above_background(parameters, turns)
+        responses = response_images(
+            pixels, parameters, area_shares(first, ties), light_above_background(parameters, harmonics)
         )
-        model = with_response(model, pictures)
-        begin = start_with_response(first, pictures)
+        model = with_response(model, responses)
+        begin = start_with_response(first, responses)
         first = minimise(model, pixels.values, pixels.present, begin, _RESPONSE_STEPS, FIRST_SMALL_STEP_PX)
         parameters = expand_parameters(*shape, first)
-    between, light = area_shares(first, ties)[0], light_above_background(parameters, turns)
+    between, light = area_shares(first, ties)[0], light_above_background(parameters, harmonics)
     leverages = np.minimum(first.leverages(first.covariance(), pixels.present), _MOST_LEVERAGE)
     contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
     noise = measure_noise(first.residuals**2 / (1 - leverages), pixels.present, between, contrast)
@@ -371,10 +394,10 @@ def _sector_chi2(fit: Minimum, weights: Array32, pixels: OutlinePixels, contrast
 
 
 def _unevenness(parameters: Array) -> float:
-    """Root mean square of the light's change with the azimuth over its mean, of the less even annulus."""
-    turns = parameters[:, ANNULUS_AMPLITUDE:]
-    mean = np.maximum(turns[:, 0] - parameters[:, ANNULUS_BACKGROUND], 1.0)  # at least 1 DN
-    return float((np.sqrt((turns[:, 1:] ** 2).sum(axis=1) / 2) / mean).max())
+    """Root mean square of the light's azimuthal change over its mean, of the least even annulus."""
+    harmonics = parameters[:, ANNULUS_AMPLITUDE:]
+    mean = np.maximum(harmonics[:, 0] - parameters[:, ANNULUS_BACKGROUND], 1.0)  # at least 1 DN
+    return float((np.sqrt((harmonics[:, 1:] ** 2).sum(axis=1) / 2) / mean).max())
 
 
 def _within_collar(
@@ -384,7 +407,7 @@ def _within_collar(
     collar_factor: float,
     ways: Array | None,
 ) -> tuple[OutlinePixels, Array32]:
-    """The pixels without those beyond the collar, and the share of what lies beyond it in each."""
+    """The pixels without those beyond the collar, and the share of light from beyond it in each, (N, K)."""
     if collar_factor == 0:
         return pixels, np.zeros_like(pixels.x_px)
     outer, inner = edges
@@ -397,7 +420,7 @@ def _within_collar(
     if not signal.shows_glare:
         return pixels.only(shares < _MOST_BEYOND), shares
     to_outer = edge_distances(outer.shapes_px, pixels.x_px, pixels.y_px)
-    # Into the annulus from either edge; the hole is as dark as the collar.
+    # Distance into the annulus from the nearer edge; the hole is as dark as the collar.
     inwards = np.minimum(to_outer, (outer.radii_px - inner.radii_px).astype(np.float32)[:, None] - to_outer)
     clear = pixels_without_glare(pixels, signal, inwards, beyond)
     return pixels.only(shares < _MOST_BEYOND if clear is None else clear), shares
@@ -411,7 +434,7 @@ def _reasons(
     noise: NoiseModel,
     predicted: tuple[Ellipses, Ellipses],
 ) -> tuple[tuple[str | None, ...], Array]:
-    """Why each annulus is rejected, the plainest reason first, and the share of it that is lit."""
+    """Reason to reject each annulus, None for accepted ones, and (N,) the lit share of each."""
     count = np.maximum(on_it.sum(axis=1, dtype=np.float64), 1)
     clipped = (on_it * pixels.clipped).sum(axis=1) / count
     brightest = np.where(on_it > 0, light, 0).max(axis=1, keepdims=True)

@@ -1,4 +1,12 @@
-"""Intensities of blurred elliptic edges and their derivatives, pixel by pixel, compiled."""
+"""Intensities of blurred elliptic edges and their derivatives, pixel by pixel, in compiled loops.
+
+An edge at the inward distance D has the share `S = (1 + erf(D / (sqrt2 s))) / 2` of light from within, with
+`D = (1 - q) / |grad q|` and `q = |L (x - c)|`, L the inverse shape. Each inner loop reads and writes few arrays and
+calls nothing that cannot be vectorised: only then does the compiler process many pixels at once. All numbers are single
+precision; a literal without `_F` would make them double.
+
+Source of the error function: M. Abramowitz and I. Stegun, Handbook of Mathematical Functions, 7.1.26.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +17,35 @@ from nav.centroids.ellipses import shape_inverses
 from nav.numerics.compiled import Array32, compiled, float_of_bits
 from nav.numerics.least_squares_loops import add_row, multiply_rows
 
-# Centre x, y; elements xx, yy, xy of the inverse shape: an ellipse's own, which come first.
+# Indices into the parameter vectors. The ellipse comes first: centre x, y; elements xx, yy, xy of the inverse shape.
 ELLIPSE_PARAMETER_COUNT = 5
 DISC_WIDTH, DISC_BACKGROUND, DISC_LEVEL = (
     ELLIPSE_PARAMETER_COUNT,
     ELLIPSE_PARAMETER_COUNT + 1,
     ELLIPSE_PARAMETER_COUNT + 2,
 )
-# Slopes of light outside and inside, if there are any, then lights of other backgrounds.
+# Parameters that every disc has; slopes of the light outside and inside and levels of other backgrounds may follow.
 DISC_FIXED_COUNT = DISC_LEVEL + 1
-
 
 ANNULUS_OUTER = slice(0, ELLIPSE_PARAMETER_COUNT)
 ANNULUS_INNER = slice(ELLIPSE_PARAMETER_COUNT, 2 * ELLIPSE_PARAMETER_COUNT)
 ANNULUS_CENTERS = np.array([0, 1, ELLIPSE_PARAMETER_COUNT, ELLIPSE_PARAMETER_COUNT + 1])
 ANNULUS_WIDTH, ANNULUS_BACKGROUND, ANNULUS_HOLE = (2 * ELLIPSE_PARAMETER_COUNT + i for i in range(3))
-# What lies beyond is lighter towards one side than towards another: a constant and the first two orders of the azimuth.
+# Light beyond the annulus's surroundings: a constant and the first two orders of the azimuth.
 ANNULUS_SURROUND, ANNULUS_SURROUND_COUNT = ANNULUS_HOLE + 1, 5
 # Light on the annulus by the azimuth, the constant first.
 ANNULUS_AMPLITUDE = ANNULUS_SURROUND + ANNULUS_SURROUND_COUNT
 
-
 _F = np.float32
 _ONE, _HALF = _F(1), _F(0.5)
-# Keeps the middle of the ellipse, where the distance has no gradient, finite.
+# Keeps the distance finite in the middle of the ellipse, where it has no gradient.
 _TINY = _F(1e-12)
 # Of Abramowitz and Stegun's rational form of the error function (7.1.26), the coefficients halved.
 _ERF_P = _F(0.3275911)
 _ERF_HALVES = tuple(_F(a / 2) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
 _ERF_1, _ERF_2, _ERF_3, _ERF_4, _ERF_5 = _ERF_HALVES
-# Of z^2. Beyond it S is 0 or 1 in single precision, and exp(-z^2) adds nothing to any sum. Left as it is, it and its
-# products become denormal numbers a little further out, for each of which a processor takes a hundred times as long.
+# Largest z^2: beyond it S is 0 or 1 in single precision, and exp(-z^2) adds nothing to any sum. Without the limit it
+# and its products become denormal numbers further out, which take a processor a hundred times as long.
 _FAR = _F(36)
 # exp(r) for |r| <= ln(2) / 2 is its Taylor polynomial of sixth order to 1.2e-7; ln(2) in two parts, of which
 # multiples of the first are exact.
@@ -86,7 +92,7 @@ def _place(
     by_q: Array32,
     by_gradient: Array32,
 ) -> None:
-    """Distances inwards of a row, and what their slopes need of them."""
+    """Fill the inward distances of a row, and the terms that their derivatives need."""
     cx, cy, a, c, b = ellipse
     tiny = _TINY * (a * a + c * c)
     for k in range(len(x)):
@@ -125,7 +131,7 @@ def _slopes_by_center(
         by_y[k] = -steepness[k] * (b * g0 + c * g1)
 
 
-# As above once more: with five rows to fill at once the compiler would take one pixel at a time.
+# Repeats the terms above: with five rows to fill in one loop the compiler would not vectorise it.
 @compiled
 def _slopes_by_shape(
     x: Array32,
@@ -151,7 +157,7 @@ def _slopes_by_shape(
 
 @compiled
 def _shade(x: Array32, y: Array32, slope: Array32, share: Array32, light: Array32, rows: Array32) -> None:
-    """Add a slope of light over a row, and fill the picture's slopes by it."""
+    """Add a plane's slope of light to a row, and fill the derivatives by the slope."""
     by_x, by_y = slope[0], slope[1]
     for k in range(len(x)):
         light[k] += by_x * x[k] + by_y * y[k]
@@ -179,12 +185,12 @@ def draw_discs(
     picture: Array32,
     jacobian: Array32,
 ) -> None:
-    """Fill pictures and derivatives of N discs; see `nav.centroids.discs.disc_model`.
+    """Fill intensities and derivatives of N discs; see `nav.centroids.discs.disc_model`.
 
     Args:
-        parameters: (N, P) as `disc_places` says: slopes of those lights that have any, lights of other backgrounds.
-        widths: (N,) as they are drawn.
-        slopes: whether the light outside has any, and that inside.
+        parameters: (N, P), the `DISC_` indices; then slopes where the light has any, and levels of other backgrounds.
+        widths: (N,) of the edges, see `edge_widths`.
+        slopes: whether the light outside has a slope, and whether the light inside has one.
         x, y: (N, K).
         further: (N, E, K) shares of other backgrounds.
         picture: (N, K).
@@ -227,11 +233,11 @@ def draw_annuli(
     picture: Array32,
     jacobian: Array32,
 ) -> None:
-    """Fill pictures and derivatives of N annuli; see `nav.centroids.annuli.annulus_model`.
+    """Fill intensities and derivatives of N annuli; see `nav.centroids.annuli.annulus_model`.
 
     Args:
-        parameters: (N, P) as `annulus_places` says, lights beyond and on the annulus by the azimuth.
-        widths: (N,) as they are drawn.
+        parameters: (N, P), the `ANNULUS_` indices.
+        widths: (N,) of the edges, see `edge_widths`.
         x, y: (N, K).
         turns: (N, T, K) functions of the azimuth.
         beyond: (N, K).
@@ -249,8 +255,8 @@ def draw_annuli(
         light[:] = _F(0)
         for turn in range(turns.shape[1]):
             add_row(turns[n, turn], own[ANNULUS_AMPLITUDE + turn], light)
-        # The slopes need what `_place` leaves, so one edge is done before the other; `between` is the outer share till
-        # the inner one is known.
+        # The derivatives need the terms of `_place`, so one edge follows the other; `between` holds the outer edge's
+        # share until the inner edge's is known.
         _place(xs, ys, outer, to_outer, by_q, by_gradient)
         blurred_steps(to_outer, _F(_SQRT_HALF) / width, between, up)
         peak = _F(_BELL_PEAK) / width
@@ -283,9 +289,9 @@ def draw_annuli(
 
 # Sides of the pixel and its neighbours, from its middle. [px]
 _SIDE_0, _SIDE_1, _SIDE_2, _SIDE_3 = _F(-1.5), _F(-0.5), _F(0.5), _F(1.5)
-# Edges nearer to an image axis are taken as this far from it (sine of the angle): the closed form divides by it.
+# Least sine of the angle between edge and image axis: the closed form divides by it.
 _LEAST_SINE = _F(0.05)
-# Shares of light from within between which an edge is seen.
+# A pixel sees the edge where its share of light from within lies between these.
 _SEEN_LOW, _SEEN_HIGH = _F(1e-3), _F(1 - 1e-3)
 
 
@@ -297,7 +303,7 @@ def _half_square(inwards: np.float32) -> np.float32:
 
 @compiled
 def _boxes_along(inwards: np.float32, down: np.float32) -> tuple[np.float32, np.float32, np.float32]:
-    """First differences by the lower and upper side, of three boxes above each other."""
+    """First differences between the upper and lower sides of three boxes above each other."""
     s0, s1 = _half_square(inwards + _SIDE_0 * down), _half_square(inwards + _SIDE_1 * down)
     s2, s3 = _half_square(inwards + _SIDE_2 * down), _half_square(inwards + _SIDE_3 * down)
     return s1 - s0, s2 - s1, s3 - s2
@@ -348,29 +354,27 @@ def add_box_responses(
     steps: Array32,
     pictures: Array32,
 ) -> None:
-    """Add to pictures (N, 3, K) what boxes take beyond a Gaussian edge, see `nav.centroids.pixel_response`."""
+    """Add (N, 3, K) differences of box responses from a Gaussian edge, see `nav.centroids.pixel_response`."""
     for n in range(len(x)):
         e = ellipses[n]
         _add_box_row(x[n], y[n], (e[0], e[1], e[2], e[3], e[4]), present[n], inside[n], steps[n], pictures[n])
 
 
-# Blur of the pixel's box (1/12 px^2) and of a lens and sensor with a Gaussian of 0.5 px: where the fit starts. [px]
+# Initial width of the fit: the pixel's box (1/12 px^2) and a Gaussian blur of lens and sensor of 0.5 px. [px]
 START_WIDTH_PX = float(np.sqrt(0.25 + 1 / 12))
-# Below this an edge lies within one pixel and its width says nothing. [px]
+# A narrower edge lies within one pixel, and its width has no effect. [px]
 _SMALLEST_WIDTH_PX = 0.2
 
 
 def edge_widths(width_px: Array) -> Array32:
-    """(N,) widths as an edge is drawn with them: within one pixel it says nothing. [px]"""
+    """(N,) widths that the model uses; a width far below a pixel has no effect and is raised to a limit. [px]"""
     return np.maximum(width_px, _SMALLEST_WIDTH_PX).astype(np.float32)
 
 
 def blurred_step(z: Array32) -> tuple[Array32, Array32]:
-    """`(1 + erf(z)) / 2` to 2.5e-7, single precision's rounding included, and `exp(-z^2)`, which it is made of.
+    """`(1 + erf(z)) / 2` to 2.5e-7, rounding of single precision included, and `exp(-z^2)`, zero below 2.4e-16.
 
-    The latter is zero where it is smaller than 2.4e-16.
-
-    Both sides of the step are alike.
+    The step is symmetric.
 
     Source: M. Abramowitz and I. Stegun, Handbook of Mathematical Functions, 7.1.26.
     """

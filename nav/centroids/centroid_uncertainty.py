@@ -1,4 +1,7 @@
-"""How far a fitted centre can be trusted."""
+"""Uncertainty of fitted centres: pixel noise from the residuals, their spread about the outline, and covariances.
+
+The sums over pixels are compiled.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from nav.numerics.levenberg_marquardt import Minimum
 
 _F = np.float32
 _ONE, _HALF, _QUARTER = _F(1), _F(0.5), _F(0.25)
-# Keeps the middle of an outline, which lies in no sector, in one.
+# Puts the middle of an outline, which lies in no sector, into one.
 _TINY_SINGLE = _F(1e-12)
 
 
@@ -25,7 +28,7 @@ _ATAN_1, _ATAN_2, _ATAN_3, _ATAN_4, _ATAN_5 = (_F(a / (2 * np.pi)) for a in _ATA
 
 @compiled
 def _sector(x: np.float32, y: np.float32, count: int) -> int:
-    """Which of so many equal sectors about the origin a place lies in, their limits to 1e-5 radians."""
+    """Index of the sector, of `count` equal ones about the origin, that holds a position; limits to 1e-5 radians."""
     wide, high = abs(x), abs(y)
     slope = min(wide, high) / (max(wide, high) + _TINY_SINGLE)
     square = slope * slope
@@ -111,21 +114,21 @@ def zone_sums(squares: Array32, present: Array32, inside: Array32, zones: Array3
 _QUANTISATION_DN2 = 1 / 12
 # Shares of light from within that count as outside, as the edge, and as inside.
 _ZONES = np.array([(-np.inf, 0.03), (0.2, 0.8), (0.97, np.inf)], np.float32)
-# Of an outline whose residuals are so much above the usual, none tells of the sensor.
+# Outlines with residuals this far above the median are not used to measure the sensor's noise.
 _ODD_FACTOR = 3.0
-# Of the noise on a marker, what is left beside it at least: coarse numbers may hide the noise of a dark background.
+# Least variance beside a marker, as a share of that on it: quantisation may hide the noise of a dark background.
 _LEAST_DARK_SHARE = 0.05
 SECTORS = 8
-# Of an outline; twice as many as the fit of an ellipse follows leave enough to tell.
+# Pieces of an outline, twice as many as the fit of an ellipse follows.
 _PIECES = 16
-# Outlines that are as restless as their pixels tell, beside those of the frame: few pieces know the factor badly.
+# Weight of a prior factor of one, in pieces: few pieces determine the factor badly.
 _PRIOR_PIECES = 8.0
 _STEEP_SHARE = 0.03
 _TINY = 1e-12
-# Deviation of a centre of which a linear fit tells half the variance.
+# Standard deviation of a centre at which a linear fit states half the variance.
 _NOT_LINEAR_PX = 0.2
-# A shadow or a thing before the disc leaves residuals beyond so many deviations of a sector's mean, and beyond this
-# share of the contrast; what is smaller moves the centre by less than the noise of one edge pixel.
+# A shadow or an object before the disc moves a sector's mean by more than this many standard deviations and this share of
+# the contrast; smaller residuals move the centre by less than the noise of one edge pixel.
 _SECTOR_SIGMA = 4.0
 _SECTOR_SHARE = 0.04
 # Mean square of a sector's summed noise that 5 % of even discs exceed (chi-square of 8).
@@ -134,14 +137,14 @@ _USUAL_SECTOR_CHI2 = 1.94
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance of a pixel by what it sees, from the images themselves.
+    """Variance of a pixel by its level, from the images themselves.
 
     Attributes:
         dark_dn2: beside the markers.
         per_signal_dn: shot noise: growth with the signal above the background.
         edge_share2: further variance on an edge, in squared steps of light (render noise, unevenness of the pixels).
-        edge_factor: what edges vary over what the others say of them, at most 1: things that lie beside an outline pass
-            for noise there.
+        edge_factor: variance on edges over that predicted from the other zones, at most 1: objects beside an outline
+            count as noise there.
     """
 
     dark_dn2: float
@@ -150,7 +153,7 @@ class NoiseModel:
     edge_factor: float = 1.0
 
     def variances(self, inside: Array32, contrast: Array32) -> Array32:
-        """Variances where the share `inside` of the light comes from `contrast` above the background. [DN^2]"""
+        """Variances of pixels whose share `inside` of the light is `contrast` above the background. [DN^2]"""
         shot = np.float32(self.per_signal_dn) * np.maximum(contrast, 0) * inside
         edge = np.float32(4 * self.edge_share2) * contrast * contrast * inside * (1 - inside)
         variances: Array32 = np.float32(self.dark_dn2) + shot + edge
@@ -161,7 +164,7 @@ def measure_noise(squares: Array32, present: Array32, inside: Array32, contrast:
     """Noise from the squared residuals of many outlines.
 
     Args:
-        squares: (N, K) squared residuals, corrected for what the fit swallowed. [DN^2]
+        squares: (N, K) squared residuals, corrected for the leverages of the fit. [DN^2]
         present: (N, K) 0 for padding.
         inside: (N, K) share of the light from within.
         contrast: (N,) [DN]
@@ -177,14 +180,14 @@ def measure_noise(squares: Array32, present: Array32, inside: Array32, contrast:
     mean_shape = 0.83  # of 4 S (1 - S) over the edge's zone
     usual_edge = (dark + bright) / 2
     further = max(0.0, edge - usual_edge) / mean_shape
-    # One pixel more, as noisy as the others tell: without an edge's pixels they are all there is.
+    # One pixel of the predicted variance is added, which gives a factor of one without any edge pixels.
     factor = min((totals[1] / usual_edge + 1) / (counts[1] + 1), 1.0)
     return NoiseModel(dark, (bright - dark) / max(level, 1e-6), further / max(level, 1e-6) ** 2, float(factor))
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualSpread:
-    """What is left of N patches after the fit.
+    """Statistics of the residuals of N fits.
 
     Attributes:
         chi2_per_dof: (N,) mean square of the residuals over their variances.
@@ -200,13 +203,13 @@ class ResidualSpread:
 
     @property
     def uneven(self) -> NDArray[np.bool_]:
-        """(N,) whether a shadow or something before the disc shows."""
+        """(N,) whether a shadow or an object before the disc shows in the residuals."""
         found: NDArray[np.bool_] = (self.worst_sector_sigma > _SECTOR_SIGMA) & (self.worst_sector_share > _SECTOR_SHARE)
         return found
 
     @property
     def inflation(self) -> Array:
-        """(N,) factor by which residuals that hang together widen the covariance."""
+        """(N,) factor by which correlated residuals widen the covariance."""
         factor: Array = np.maximum(1.0, self.sector_chi2 / _USUAL_SECTOR_CHI2)
         return factor
 
@@ -219,8 +222,8 @@ def residual_spread(
     Args:
         residuals: (N, K). [DN]
         weights: (N, K) inverse variances, 0 for padding. [1/DN^2]
-        pixels: whose they are.
-        sectors: how many about the centre.
+        pixels: of the residuals.
+        sectors: their number about the centre.
         contrast: (N,) [DN]
         fitted: number of parameters.
     """
@@ -241,11 +244,11 @@ def residual_spread(
 
 
 def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array32) -> float:
-    """Variance with which the outlines of a frame move about, piece by piece, over what their pixels' noise tells.
+    """Variance of the shifts of an outline's pieces over the variance that the pixels' noise predicts.
 
-    Noise that a lens has spread over neighbouring pixels, as that of a renderer, is stronger along an outline than
-    pixel by pixel; what lies beside narrow faces passes for noise of the pixels and does not move an outline. Every
-    piece's own shift, against what its pixels' variances and the fit's freedom lead one to expect, tells.
+    Noise that a lens spreads over neighbouring pixels, such as a renderer's, is stronger along an outline than pixel by
+    pixel. Light from beside narrow faces counts as noise of the pixels and does not move an outline. The factor
+    compares the shift of every piece with its expectation from the pixels' variances and the fit's leverage.
 
     Args:
         fit: of N outlines; its first two parameters are the centre.
@@ -253,9 +256,9 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
         x_px, y_px: (N, K) places about the centres.
 
     Returns:
-        Factor in the variance of the frame's outlines.
+        The factor, common to all outlines of the frame.
     """
-    # Along the outline the derivative by the centre is as steep as the edge; elsewhere no pixel tells of its place.
+    # The derivative by the centre is the edge's slope along the outline, and about zero elsewhere.
     sums = np.zeros((len(weights), _PIECES, 2 + fit.jacobian.shape[1]))
     piece_sums(x_px, y_px, fit.jacobian, fit.residuals, weights, np.float32(_STEEP_SHARE), sums)
     shift, alone, coupled = sums[..., 0], np.maximum(sums[..., 1], _TINY), sums[..., 2:]
@@ -267,10 +270,10 @@ def edge_noise_factor(fit: Minimum, weights: Array32, x_px: Array32, y_px: Array
 
 
 def widen_for_nonlinearity(cov_px2: Array) -> Array:
-    """Covariances of centres, widened by what the derivatives at the solution do not tell of faint discs.
+    """Covariances of centres, widened for the nonlinearity of the fits of faint discs.
 
-    Where the noise moves a centre by a fifth of a pixel, a third of an edge's width, its square is twice what they say;
-    half as much adds a quarter (measured on discs of 3 to 20 px and contrasts of 1.5 to 6 deviations of a pixel).
+    Where noise moves a centre by a fifth of a pixel, a third of an edge's width, the variance is twice the linear one;
+    half that shift adds a quarter (measured on discs of 3 to 20 px and contrasts of 1.5 to 6 deviations of a pixel).
 
     Args:
         cov_px2: (N, 2, 2). [px^2]

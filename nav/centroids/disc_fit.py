@@ -273,14 +273,14 @@ def restore_even_colors(
     if pixels.others is None or noise.dark_dn2 > _MOST_DARK_SHARE * bright_dn2:
         return fit, pixels
     weights = pixels.present
-    shift = replace(fit, parameters=np.zeros_like(fit.parameters)).given(pixels.others, weights)
+    shift = replace(fit, parameters=np.zeros_like(fit.parameters)).after_linear_step(pixels.others, weights)
     freedom = np.maximum(weights.sum(axis=1) - fit.parameters.shape[1], 1)
     variance = (shift.residuals**2 * weights).sum(axis=1) / freedom
     unit_cov = fit.covariance()[:, :2, :2]
     moved: Array = np.einsum("ni,nij,nj->n", shift.parameters[:, :2], np.linalg.inv(unit_cov), shift.parameters[:, :2])
     even = (moved < _LARGEST_SHIFT_CHI2 * variance) & (variance < noise.dark_dn2)
     back = pixels.others * even[:, None]
-    return fit.given(fit.residuals + back, weights), replace(pixels, values=pixels.values + back)
+    return fit.after_linear_step(fit.residuals + back, weights), replace(pixels, values=pixels.values + back)
 
 
 @cache

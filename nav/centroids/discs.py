@@ -1,4 +1,4 @@
-"""Discs."""
+"""The model of a blurred disc, its initial parameters, the fitted discs, and the reasons to reject a fit."""
 
 from __future__ import annotations
 
@@ -29,18 +29,31 @@ from nav.centroids.outline_pixels import WHOLE_RADIUS_PX, OutlinePixels, coarse_
 from nav.numerics.compiled import Array32
 from nav.numerics.levenberg_marquardt import Minimum, Model
 
-# An initial outline may be this far off; pixels this far from it show one side only. [px]
+# Largest error of an initial outline: pixels further than this from it show one side only. [px]
 _CLEAR_PX = 1.0
+# In standard deviations of a pixel: fits of fainter discs start from noise and end anywhere. Small discs have so few
+# pixels that the standard deviation of the centre [px] shows when they are too faint.
+_LEAST_CONTRAST_SIGMA = 2.5
+_LARGEST_SIGMA_PX = 0.2
+# Share of a disc's own pixels; clipping all of a disc keeps its centre, clipping part of it does not.
+_MOST_CLIPPED_FRACTION = 0.05
+# Residuals of twice the frame's noise that exceed this share of the contrast come from another object.
+_LARGEST_CHI2, _ROUGH_SHARE = 4.0, 0.04
+# Largest move of an outline from its start, as a share of its radius; beyond, it is another object's.
+_LARGEST_MOVE_FRACTION = 0.5
+LARGEST_SCALE = 1.6
 
 
 def disc_model(pixels: OutlinePixels, slope_outside: bool, slope_inside: bool, further: Array32 | None = None) -> Model:
-    """`I = (b + g.x) (1 - S) + (A + h.x) S + k.F`.
+    """Intensity of a blurred edge between two planes of light, `I = (b + g.x) (1 - S) + (A + h.x) S + k.F`.
+
+    S is the share of light from within, see `nav.centroids.blurred_edges`.
 
     Args:
-        pixels: where.
+        pixels: at which the model is evaluated.
         slope_outside: whether the background's plane g is fitted.
         slope_inside: whether the disc's plane h is fitted.
-        further: (N, E, K) shares F of other backgrounds, whose lights k above b are fitted, the last parameters.
+        further: (N, E, K) shares F of other backgrounds, whose lights k above b are the last parameters.
     """
     x, y = pixels.x_px, pixels.y_px
     if further is None:
@@ -56,8 +69,30 @@ def disc_model(pixels: OutlinePixels, slope_outside: bool, slope_inside: bool, f
     return model
 
 
+def initialize_from_moments(signals: Sequence[MarkerSignal], discs: Ellipses) -> Ellipses:
+    """Initial outlines of large discs from second moments; a circle would miss a tilted disc's edge by pixels."""
+    if discs.radii_px.max() <= WHOLE_RADIUS_PX:
+        return discs
+    pixels = coarse_pixels(signals, discs)
+    distance = edge_distances(discs.shapes_px, pixels.x_px, pixels.y_px)
+    levels = []
+    for side in (distance < 0, distance > 0):
+        weight = pixels.present * side
+        levels.append((weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1))
+    bright = pixels.present * (pixels.values > ((levels[0] + levels[1]) / 2)[:, None])
+    places = np.stack([pixels.x_px, pixels.y_px], axis=-1).astype(np.float64)
+    total = np.maximum(bright.sum(axis=1), 1)
+    center = np.einsum("nk,nki->ni", bright, places) / total[:, None]
+    arms = places - center[:, None]
+    shapes = moment_shapes(np.einsum("nk,nki,nkj->nij", bright, arms, arms) / total[:, None, None])
+    scale = shape_radii(shapes) / discs.radii_px
+    good = (scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE)
+    centers = np.where(good[:, None], discs.centers_px + center, discs.centers_px)
+    return Ellipses(discs.eyes, centers, np.where(good[:, None, None], shapes, discs.shapes_px))
+
+
 def initial_disc_parameters(pixels: OutlinePixels, shapes_px: Array, further_count: int) -> Array:
-    """(N, P) parameters of the initial outlines with the mean levels on either side of them, all further ones zero."""
+    """(N, P) parameters of initial outlines with the mean level on each side, and zero for all further parameters."""
     parameters = np.zeros((len(shapes_px), DISC_FIXED_COUNT + further_count))
     parameters[:, :ELLIPSE_PARAMETER_COUNT] = ellipse_parameters(np.zeros((len(shapes_px), 2)), shapes_px)
     parameters[:, DISC_WIDTH] = START_WIDTH_PX
@@ -69,7 +104,7 @@ def initial_disc_parameters(pixels: OutlinePixels, shapes_px: Array, further_cou
 
 
 def contrasts(fit: Minimum) -> Array:
-    """(N,) light of fitted discs above that beside them. [DN]"""
+    """(N,) level of fitted discs above the background. [DN]"""
     contrast: Array = fit.parameters[:, DISC_LEVEL] - fit.parameters[:, DISC_BACKGROUND]
     return contrast
 
@@ -79,12 +114,12 @@ class DiscFits:
     """Refined discs, in the order of the initial ones.
 
     Attributes:
-        ellipses: fitted outlines; the initial ones where a fit was rejected.
+        ellipses: fitted outlines; initial ones where the fit was rejected.
         cov_px2: (M, 2, 2) covariances of the centres.
-        contrast_dn, background_dn: (M,) light of the disc above that beside it, and the latter. [DN]
-        edge_width_px: (M,) Gaussian width of the edge, pixel's box included.
-        chi2_per_dof: (M,) of the residuals against the frame's own noise.
-        inflation: (M,) factor in `cov_px2` for residuals that hang together.
+        contrast_dn, background_dn: (M,) level of the disc above the background, and of the background. [DN]
+        edge_width_px: (M,) standard deviation of the Gaussian edge blur, the pixel's box included. [px]
+        chi2_per_dof: (M,) of the residuals, by the frame's own noise.
+        inflation: (M,) factor in `cov_px2` for correlated residuals.
         reasons: why a disc was rejected, or None.
         noise: of the frame's pixels, None without any disc.
         motion: of the discs while the shutter was open, None where they stood still.
@@ -150,19 +185,6 @@ def with_part(fits: DiscFits, index: NDArray[np.int64], part: DiscFits) -> DiscF
     )
 
 
-# Of a pixel's noise: fainter discs start from noise and end anywhere. Small ones are told by so few pixels that their
-# centre's own deviation [px] says when they are too faint.
-_LEAST_CONTRAST_SIGMA = 2.5
-_LARGEST_SIGMA_PX = 0.2
-# Of a disc's own pixels; a wholly clipped disc keeps its middle, one clipped in part does not.
-_MOST_CLIPPED_FRACTION = 0.05
-# Residuals of twice the frame's noise and of more than this share of the contrast are those of another thing.
-_LARGEST_CHI2, _ROUGH_SHARE = 4.0, 0.04
-# An outline that ends this far from its start, as a share of its radius, is another thing's.
-_LARGEST_MOVE_FRACTION = 0.5
-LARGEST_SCALE = 1.6
-
-
 def rejection_reasons(
     discs: Ellipses,
     pixels: OutlinePixels,
@@ -172,7 +194,7 @@ def rejection_reasons(
     noise: NoiseModel,
     spread: ResidualSpread,
 ) -> tuple[str | None, ...]:
-    """Why each disc is rejected, the plainest reason first."""
+    """Reason to reject each disc, None for accepted ones; where several apply, the first of this order."""
     contrast, own = contrasts(fit), pixels.present * (inside > 0.5)
     clipped = (own * pixels.clipped).sum(axis=1) / np.maximum(own.sum(axis=1), 1)
     bright = noise.dark_dn2 + noise.per_signal_dn * np.maximum(contrast, 0)
@@ -194,25 +216,3 @@ def rejection_reasons(
         (~placed, "too faint to be placed"),
     )
     return tuple(next((reason for failed, reason in tests if failed[i]), None) for i in range(len(discs)))
-
-
-def initialize_from_moments(signals: Sequence[MarkerSignal], discs: Ellipses) -> Ellipses:
-    """Initial outlines of large discs from second moments, since a circle misses a tilted disc's edge by pixels."""
-    if discs.radii_px.max() <= WHOLE_RADIUS_PX:
-        return discs
-    pixels = coarse_pixels(signals, discs)
-    distance = edge_distances(discs.shapes_px, pixels.x_px, pixels.y_px)
-    levels = []
-    for side in (distance < 0, distance > 0):
-        weight = pixels.present * side
-        levels.append((weight * pixels.values).sum(axis=1) / np.maximum(weight.sum(axis=1), 1))
-    bright = pixels.present * (pixels.values > ((levels[0] + levels[1]) / 2)[:, None])
-    places = np.stack([pixels.x_px, pixels.y_px], axis=-1).astype(np.float64)
-    total = np.maximum(bright.sum(axis=1), 1)
-    center = np.einsum("nk,nki->ni", bright, places) / total[:, None]
-    arms = places - center[:, None]
-    shapes = moment_shapes(np.einsum("nk,nki,nkj->nij", bright, arms, arms) / total[:, None, None])
-    scale = shape_radii(shapes) / discs.radii_px
-    good = (scale > 1 / LARGEST_SCALE) & (scale < LARGEST_SCALE)
-    centers = np.where(good[:, None], discs.centers_px + center, discs.centers_px)
-    return Ellipses(discs.eyes, centers, np.where(good[:, None, None], shapes, discs.shapes_px))

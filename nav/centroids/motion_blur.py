@@ -1,7 +1,7 @@
-"""Outlines that move while the shutter is open: how far, and the picture of them.
+"""Motion blur of outlines: the motion during the exposure, and the model of moving outlines.
 
-A moving outline shows the mean of its pictures along its way. The way is straight and even within an exposure, so both
-ends of it are alike: what is measured is where the outline was at mid-exposure.
+The intensity of a moving outline is the mean over the positions along its path. The path is straight and the speed
+constant within an exposure, so the measured position is that at mid-exposure.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from nav.numerics.compiled import Array32
 from nav.numerics.least_squares_loops import add_rows
 from nav.numerics.levenberg_marquardt import Minimum, Model, NormalEquations
 
-# Shorter ways leave an edge that the fit of a still one follows, and cannot be told from its noise. [px]
+# The fit of a still edge follows shorter motions, and noise hides them. [px]
 _LEAST_TRAVEL_PX = 1.0
 _LEAST_SIGMA = 5.0
-# Pictures along a way lie this far apart at most: Gaussian edges of a pixel's box and a lens are even then. [px]
+# Largest step along the path: at this step Gaussian edges of a pixel's box and a lens still sum to an even blur. [px]
 _STEP_PX = 1.0
-# There the room around outlines ends (`nav.centroids.marker_signal`). [px]
+# Longest motion for which the margin around outlines is enough (`nav.centroids.marker_signal`). [px]
 _MOST_TRAVEL_PX = 30.0
-# Of places spread evenly over a unit of length.
+# Variance of a uniform distribution of unit length.
 _BOX_VARIANCE = 1 / 12
 _ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class ImageMotion:
-    """How outlines move on the images while the shutter is open, forwards or backwards alike.
+    """Motion of outlines on the images while the shutter is open; its sign is not determined.
 
-    Each eye's outlines move as one, and may turn and grow about their middle meanwhile.
+    The outlines of an eye move together, and may rotate and grow about their middle.
 
     Attributes:
-        middles_px: (2, 2) of the eyes' outlines. [px]
-        means_px: (2, 2) way of the middles. [px]
-        turns: (2, 2) growth over the exposure, and turn. [1, rad]
+        middles_px: (2, 2) middles of the eyes' outlines. [px]
+        means_px: (2, 2) displacements of the middles. [px]
+        turns: (2, 2) growth and rotation over the exposure. [1, rad]
     """
 
     middles_px: Array
@@ -48,7 +48,7 @@ class ImageMotion:
     turns: Array
 
     def of(self, outlines: Ellipses) -> Array:
-        """(N, 3) ways of outlines, along x and y [px], and by how much of themselves they grow on them."""
+        """(N, 3) motions of outlines: displacements along x and y [px], and relative growth."""
         x, y = (outlines.centers_px - self.middles_px[outlines.eyes]).T
         growth, turn = self.turns[outlines.eyes].T
         along_x, along_y = self.means_px[outlines.eyes].T
@@ -56,12 +56,12 @@ class ImageMotion:
         return ways
 
     def spread_px(self, outlines: Ellipses) -> float:
-        """How far to either side the edge of outlines is spread at most. [px]"""
+        """Largest distance by which the motion spreads an edge to either side. [px]"""
         return float(np.hypot(*self.of(outlines)[:, :2].T).max(initial=0.0)) / 2
 
 
 def motion_steps(ways: Array) -> tuple[Array, Array]:
-    """(T, N, 3) parts of ways (N, 3), from their middles, and (T,) shares of them."""
+    """(T, N, 3) steps of motions (N, 3) from mid-exposure, and (T,) their shares of the motion."""
     longest_px = float(np.hypot(*ways[:, :2].T).max(initial=0.0))
     count = max(1, int(np.ceil(longest_px / _STEP_PX)))
     shares = (np.arange(count) + 0.5) / count - 0.5
@@ -69,7 +69,7 @@ def motion_steps(ways: Array) -> tuple[Array, Array]:
 
 
 def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float) -> Array32:
-    """(N, K) how much of the light at places (N, K) comes from outside ellipses (N, 2, 2) about the origin."""
+    """(N, K) share of the light at (N, K) that comes from outside ellipses (N, 2, 2) about the origin."""
     distance = edge_distances(shapes_px, x_px, y_px)
     return blurred_step(distance * np.float32(-np.sqrt(0.5) / width_px))[0]
 
@@ -77,7 +77,7 @@ def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: floa
 def blurred_share_outside(
     shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float, ways: Array | None
 ) -> Array32:
-    """As `share_outside`, of ellipses that move by (N, 3), or stand still."""
+    """As `share_outside`, of ellipses that move by (N, 3), or stand still where that is None."""
     if ways is None:
         return share_outside(shapes_px, x_px, y_px, width_px)
     steps = motion_steps(ways)[0].astype(np.float32)[..., None]
@@ -89,12 +89,12 @@ def blurred_share_outside(
 
 
 def motion_blurred(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Model:
-    """A model of still outlines, of moving ones.
+    """The model of moving outlines, from one of still outlines.
 
     Args:
-        model: of outlines.
-        ways: (N, 3).
-        ellipses: where the parameters of each outline's ellipses begin.
+        model: of still outlines.
+        ways: (N, 3) motions.
+        ellipses: indices at which the parameters of each outline's ellipses begin.
     """
     steps = motion_steps(ways)[0]
 
@@ -111,7 +111,7 @@ def motion_blurred(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Mode
 
 
 def _moved_by(parameters: Array, step: Array, ellipses: tuple[int, ...]) -> Array:
-    """Parameters (N, P) of outlines a step (N, 3) further on."""
+    """Parameters (N, P) of outlines after a step (N, 3)."""
     there = parameters.copy()
     for first in ellipses:
         there[:, first : first + 2] += step[:, :2]
@@ -121,10 +121,10 @@ def _moved_by(parameters: Array, step: Array, ellipses: tuple[int, ...]) -> Arra
 
 
 def detect_motion(fit: Minimum, pixels: OutlinePixels, discs: Ellipses) -> ImageMotion | None:
-    """How outlines moved, roughly, from what the fit of still ones with even blur left; None where they stood still.
+    """Estimate the motion from the residuals of a fit of still outlines; None where the outlines stood still.
 
-    Along its way an outline is blurred, across it is not: what is left changes with twice the azimuth. To first order
-    that tells way and direction, of long ways three quarters.
+    Motion blurs an edge along its direction and not across it, so the residuals vary with twice the azimuth. To first
+    order they give length and direction of the motion, of long motions three quarters of the length.
 
     Args:
         fit: of the discs.
@@ -150,7 +150,7 @@ def detect_motion(fit: Minimum, pixels: OutlinePixels, discs: Ellipses) -> Image
     middles = np.zeros((2, 2))
     for eye in np.unique(discs.eyes):
         middles[eye] = discs.centers_px[discs.eyes == eye].mean(axis=0)
-    # Both eyes see the same way, but for what the distance changes.
+    # Both eyes see the same motion, but for the change of distance.
     way = length_px * np.array([np.cos(direction), np.sin(direction)])
     return ImageMotion(middles, np.tile(way, (2, 1)), np.zeros((2, 2)))
 
@@ -158,7 +158,7 @@ def detect_motion(fit: Minimum, pixels: OutlinePixels, discs: Ellipses) -> Image
 def fit_motion(
     model: Model, pixels: OutlinePixels, start: Array, motion: ImageMotion, discs: Ellipses
 ) -> ImageMotion | None:
-    """The ways of moving discs, in Gauss-Newton steps of them and of the discs at once; None where that leads astray.
+    """Refine the motion and the discs together by Gauss-Newton steps; None where the steps diverge.
 
     Args:
         model: of still discs.
@@ -182,16 +182,16 @@ def fit_motion(
             steps[eye] = solve_shared(normal[mine].sum(axis=0), gradient[mine].sum(axis=0))
         left = fit.residuals.copy()
         add_rows(np.ascontiguousarray(shared), (-steps[discs.eyes]).astype(np.float32), left)
-        parameters = fit.given(left, pixels.present).parameters
+        parameters = fit.after_linear_step(left, pixels.present).parameters
         motion = ImageMotion(motion.middles_px, motion.means_px + steps[:, :2], motion.turns + steps[:, 2:] / size_px)
-        # Not a number is not within.
+        # NaN counts as diverged.
         if not np.hypot(*motion.of(discs)[:, :2].T).max() < _MOST_TRAVEL_PX:
             return None
     return motion
 
 
 def _evaluate_moving(model: Model, pixels: OutlinePixels, parameters: Array, ways: Array) -> tuple[Minimum, Array32]:
-    """The picture of moving discs, and (N, 2, K) its derivatives by their ways along x and y."""
+    """The fit of moving discs at given parameters, and (N, 2, K) derivatives by the displacements along x and y."""
     values, jacobian = np.zeros_like(pixels.values), None
     by_way = np.zeros((len(parameters), 2, pixels.values.shape[1]), np.float32)
     for step, share in zip(*motion_steps(ways), strict=True):

@@ -15,14 +15,14 @@ from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
 from nav.centroids.marker_signal import MarkerSignal
 from nav.numerics.compiled import Array32, compiled
 
-# Of whole numbers, or a picture's.
+# Arrays of integers, or of an image's numbers.
 Cells = NDArray[Any]
 _ONE = np.float32(1)
 
 
 @compiled
 def _inwards(y: np.float32, x: Array32, inverse: Array32, radius: np.float32, inwards: Array32) -> None:
-    """Rough distances inwards from an outline about the origin, along a row."""
+    """Approximate inward distances from an outline about the origin, along a row."""
     a, b, c = inverse[0, 0], inverse[0, 1], inverse[1, 1]
     for k in range(len(x)):
         w0, w1 = a * x[k] + b * y, b * x[k] + c * y
@@ -40,20 +40,20 @@ def choose_cells(
     frames: Cells,
     cells: Cells,
 ) -> tuple[Cells, NDArray[np.bool_]]:
-    """Choose the pixels of square windows that tell of outlines; see `nav.centroids.outline_pixels`.
+    """Choose the pixels of square windows that a fit of the outlines needs; see `_gather`.
 
     Args:
         offsets: (S,) of the windows' columns, and rows, from their middles.
         starts: (N, 2) the middles, from the outlines' centres.
         outlines: inverse shapes (N, 2, 2) and radii (N,).
-        holes: centres (N, 2), inverse shapes and radii of what lies within them, of none of them.
-        limits: how far outwards pixels are taken, and how far from an edge all of them are.
-        thin: elsewhere one in so many by so many is taken; 1 for all.
-        frames: (N, 4) of the windows' cells on the image: first column, first row, and behind the last ones.
+        holes: centres (N, 2), inverse shapes (N, 2, 2) and radii (N,) of holes in the outlines; empty arrays for none.
+        limits: largest distance outside the outline, and distance from an edge within which every pixel is taken. [px]
+        thin: elsewhere every `thin`-th row and column is taken.
+        frames: (N, 4) left, top, right, bottom of the windows' cells on the image, the last two exclusive.
         cells: (N, S S) to be filled with row S + column.
 
     Returns:
-        (N,) how many were chosen, and whether some of an outline's lie beside the image.
+        (N,) numbers of chosen cells, and whether cells of an outline lie outside the image.
     """
     size, (reach, band), has_holes = len(offsets), limits, len(holes[0]) > 0
     counts, cut = np.zeros(len(starts), np.int64), np.zeros(len(starts), np.bool_)
@@ -111,9 +111,9 @@ def take_cells(picture: Cells, firsts: Cells, every: int, size: int, cells: Cell
             filled[n, k] = picture[row, column]
 
 
-# Discs up to this radius are taken whole. Of larger ones the pixels within the band of the edge are, and of the rest,
-# which tells only level and shading, one in four by four: 8 % more noise where shading is fitted, half the time. Of a
-# mosaic's sites, which lie two pixels apart, that is one in two by two.
+# Discs up to this radius are used whole. Of larger discs the pixels within the band of the edge are used, and every
+# fourth row and column of the rest, which determines only level and shading: 8 % more noise where shading is fitted,
+# half the time. Of a mosaic's sites, which lie two pixels apart, that is every second row and column.
 WHOLE_RADIUS_PX = 24.0
 _BAND_PX = 2.5
 _THIN_PX = 4
@@ -128,11 +128,11 @@ class OutlinePixels:
     Attributes:
         x_px, y_px: (N, K) places relative to `origins_px`.
         values: (N, K) signal, 0 in the padding.
-        others: (N, K) what a difference of colours has taken off, up to a constant, None where that is not known.
+        others: (N, K) the other colours that a difference subtracts, up to a constant, None where not known.
         present: (N, K) 1, or 0 in the padding.
         clipped: (N, K).
         origins_px: (N, 2) initial centres.
-        truncated: (N,) whether the window reaches over the edge of the image.
+        truncated: (N,) whether the window reaches beyond the image.
     """
 
     x_px: Array32
@@ -150,7 +150,7 @@ class OutlinePixels:
 
 
 def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
-    """Rough distances inwards from outlines about the origin, exact for circles. [px]
+    """Approximate inward distances from outlines about the origin, exact for circles. [px]
 
     Args:
         shapes_px: (N, 2, 2).
@@ -159,7 +159,7 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
     inverse = shape_inverses(shapes_px).astype(np.float32)
     a, b, c = (inverse[:, i, j].reshape((-1,) + (1,) * (x_px.ndim - 1)) for i, j in ((0, 0), (0, 1), (1, 1)))
     radii = shape_radii(shapes_px).astype(np.float32).reshape(a.shape)
-    # Of x (N, 1, W) and y (N, H, 1) only what needs both is computed on the whole grid.
+    # For x (N, 1, W) and y (N, H, 1) only the terms of both are computed on the whole grid.
     w0, w1 = a * x_px + b * y_px, b * x_px + c * y_px
     w0 *= w0
     w1 *= w1
@@ -173,9 +173,9 @@ def edge_distances(shapes_px: Array, x_px: Array32, y_px: Array32) -> Array32:
 def disc_pixels(
     signals: Sequence[MarkerSignal], discs: Ellipses, everything: bool = False, blur_px: float = 0.0
 ) -> OutlinePixels:
-    """Pixels in and around discs whose edges a motion spreads by `blur_px` to either side.
+    """Pixels in and around discs, whose edges motion spreads by `blur_px` to either side.
 
-    With `everything`, those far from the edge of large discs too.
+    With `everything`, all pixels of large discs, not only every fourth row and column far from the edge.
     """
     whole = everything or bool(discs.radii_px.max() <= WHOLE_RADIUS_PX)
     return _gather(signals, discs, thin=1 if whole else _thin_cells(signals), blur_px=blur_px)
@@ -189,12 +189,12 @@ def coarse_pixels(signals: Sequence[MarkerSignal], discs: Ellipses) -> OutlinePi
 def annulus_pixels(
     signals: Sequence[MarkerSignal], outer: Ellipses, inner: Ellipses, blur_px: float = 0.0
 ) -> OutlinePixels:
-    """Pixels on and around annuli, `blur_px` as above; of the hole only what lies near its edge."""
+    """Pixels on and around annuli, `blur_px` as for `disc_pixels`; of the hole only those near its edge."""
     return _gather(signals, outer, thin=_thin_cells(signals), holes=inner, blur_px=blur_px)
 
 
 def _thin_cells(signals: Sequence[MarkerSignal]) -> int:
-    """Sites from one to the next where they are thinned."""
+    """Distance in sites between the rows and columns that are used far from edges."""
     return _THIN_PX // signals[0].pitch_px
 
 
@@ -211,10 +211,10 @@ def _gather(
     Args:
         signals: of both eyes.
         outlines: of both eyes.
-        every: pixels between the rows, and the columns, that are looked at.
-        thin: far from edges, one in so many by so many of those is taken.
+        every: pixels between the rows and columns of the window.
+        thin: far from edges, every `thin`-th of those rows and columns is used.
         holes: within the outlines.
-        blur_px: how far beyond a still one's an edge may be seen.
+        blur_px: distance by which motion spreads an edge to either side.
     """
     pitch = signals[0].pitch_px
     reach_px = blur_px + signals[0].outer_px

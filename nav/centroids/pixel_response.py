@@ -1,4 +1,11 @@
-"""What a pixel takes of the light beside it."""
+"""How the pixels' response shapes edges, beyond the blur of a Gaussian.
+
+A pixel integrates the light of a square, and gets a share of the light on its eight neighbours. The resulting edge is
+not Gaussian, and its shape differs between the image axes and the diagonals. A Gaussian in its place shifts centres by
+one or two thousandths of a pixel, depending on where in its pixel the edge lies: as much as the noise of bright days.
+
+The shares are common to all outlines of a frame; they are fitted with each outline's own parameters eliminated.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +18,20 @@ from nav.numerics.compiled import Array32
 from nav.numerics.least_squares_loops import add_rows, normal_equations, weighted_products
 from nav.numerics.levenberg_marquardt import Minimum
 
-# Of a normal matrix with unit diagonal: what light too dim cannot tell apart is shared out.
+# Added to a normal matrix with unit diagonal: dim light does not separate the shared amounts.
 _RIDGE = 1e-3
 
 
 def reduced_equations(fit: Minimum, pictures: Array32, weights: Array32) -> tuple[Array, Array]:
-    """Normal equations of shared amounts of pictures, outline by outline, its own parameters left free.
+    """Normal equations of amounts that all outlines share, with each outline's own parameters eliminated.
 
     Args:
         fit: of N outlines.
-        pictures: (N, S, K) by what the shared amounts change the data.
+        pictures: (N, S, K) derivatives of the data by the shared amounts.
         weights: (N, K).
 
     Returns:
-        (N, S, S) matrices and (N, S) gradients, whose sums are those of the amounts.
+        (N, S, S) matrices and (N, S) gradients; their sums over N are the equations of the amounts.
     """
     count, shared = fit.parameters.shape[1], pictures.shape[1]
     pictures = np.ascontiguousarray(pictures)
@@ -40,26 +47,26 @@ def reduced_equations(fit: Minimum, pictures: Array32, weights: Array32) -> tupl
 
 
 def solve_shared(normal: Array, gradient: Array) -> Array:
-    """(S,) amounts that solve summed equations."""
+    """(S,) amounts that solve the summed equations."""
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(np.float32).tiny))
     unit = normal * scale[:, None] * scale + _RIDGE * np.eye(len(scale))
     amounts: Array = scale * np.linalg.solve(unit, gradient * scale)
     return amounts
 
 
-# The pixel's own box, those beside it, and those across its corners.
+# The pixel's own box, the four beside it, and the four across its corners.
 RESPONSE_BOXES = 3
 
 
 def correct_pixel_response(
     fit: Minimum, pixels: OutlinePixels, inside: Array32, contrast: Array
 ) -> tuple[Minimum, Array32]:
-    """A fit of Gaussian edges, corrected for the frame's own shape of edges.
+    """Correct a fit of Gaussian edges for the frame's own edge shape.
 
-    The edge is a mixture of the Gaussian, of the pixel's own box, and of the boxes beside it and across its corners.
-    Their shares are one for all outlines of the frame. Within the nine boxes the outline is taken as a straight line:
-    what a box takes is then the second difference, by both its sides, of the half square of the distance inwards. All
-    are alike on opposite sides of an outline, so that fitting them takes nothing from what is known of a centre.
+    The edge is a mixture of the Gaussian, of the pixel's own box, and of the boxes beside it and across its corners,
+    with the same shares for all outlines of the frame. Within the nine boxes the outline is taken as a straight line:
+    the response of a box is then the second difference, along both its sides, of half the squared inward distance. All
+    responses are equal on opposite sides of an outline, so fitting them does not weaken the estimate of its centre.
 
     Args:
         fit: of N outlines, its first parameters those of the ellipse.
@@ -68,7 +75,7 @@ def correct_pixel_response(
         contrast: (N,) step of light at the edge. [DN]
 
     Returns:
-        The fit after one linear step with the shares free, and (N, K) what the data have beyond Gaussian edges.
+        The fit after one linear step with free shares, and (N, K) the difference of the edges from Gaussian ones.
     """
     weights = pixels.present
     shapes = np.zeros((len(weights), RESPONSE_BOXES, weights.shape[1]), np.float32)
@@ -79,4 +86,4 @@ def correct_pixel_response(
     shares = solve_shared(normal.sum(axis=0), gradient.sum(axis=0))
     beyond = np.zeros_like(weights)
     add_rows(shapes, np.tile(shares.astype(np.float32), (len(weights), 1)), beyond)
-    return fit.given(fit.residuals - beyond, weights), beyond
+    return fit.after_linear_step(fit.residuals - beyond, weights), beyond

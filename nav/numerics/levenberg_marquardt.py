@@ -24,17 +24,17 @@ Model = Callable[[Array], tuple[Array32, Array32]]
 
 _FIRST_DAMPING = 1e-4
 _SMALLEST_DAMPING = 1e-9
-# Keeps a parameter that no pixel tells of where it is.
+# Keeps a parameter that no pixel depends on at its value.
 _TINY_CURVATURE = 1e-12
-# Of a normal matrix with unit diagonal: what single precision leaves uncertain.
+# Added to a normal matrix with unit diagonal: the uncertainty of single precision.
 _RIDGE = 1e-6
-# Relative to the cost, below which single precision tells no better from worse.
+# Relative change of the cost that is below the rounding of single precision.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Of N problems; each part is computed when it is first asked for, which for many it never is.
+    """Normal equations of N problems; each part is computed at its first use, which many problems never reach.
 
     Attributes:
         jacobian: (N, P, K).
@@ -63,7 +63,7 @@ class NormalEquations:
 
     @cached_property
     def inverse(self) -> Array:
-        """(N, P, P) inverse matrices, of those with a diagonal of one kept invertible where single precision is not."""
+        """(N, P, P) inverse matrices, kept invertible by a ridge on the matrices scaled to a unit diagonal."""
         scales = self._scales[:, :, None] * self._scales[:, None, :]
         inverse: Array = np.linalg.inv(self._products[0] * scales + _RIDGE * np.eye(scales.shape[1])) * scales
         return inverse
@@ -76,7 +76,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where the iteration ended.
+    """The point at which the iteration ended.
 
     Attributes:
         parameters: (N, P).
@@ -94,8 +94,8 @@ class Minimum:
         """(N, P, P) inverse of the normal matrices."""
         return self.normal.inverse
 
-    def given(self, residuals: Array32, weights: Array32) -> Minimum:
-        """Where one undamped step ends from here if the residuals were these; (N, K) each."""
+    def after_linear_step(self, residuals: Array32, weights: Array32) -> Minimum:
+        """The minimum after one undamped linear step from here with other residuals and weights, (N, K) each."""
         gradient = np.empty((*self.parameters.shape, 1))
         weighted_products(self.jacobian, residuals[:, None], weights, gradient)
         step = np.matmul(self.covariance(), gradient)[..., 0]
@@ -104,14 +104,14 @@ class Minimum:
         return replace(self, parameters=self.parameters + step, residuals=left)
 
     def leverages(self, covariance: Array, weights: Array32) -> Array32:
-        """(N, K) share of each pixel's noise that its own fit swallows."""
+        """(N, K) leverages: the share of each pixel's noise that the fit follows."""
         filled = np.empty_like(weights)
         leverages(self.jacobian, np.linalg.cholesky(covariance).astype(np.float32), weights, filled)
         return filled
 
 
 def evaluate(model: Model, data: Array32, weights: Array32, parameters: Array) -> Minimum:
-    """Where an iteration starts: the model at (N, P) parameters; other arguments as for `minimise`."""
+    """Evaluate the model at (N, P) parameters as the start of an iteration; other arguments as for `minimise`."""
     values, jacobian = model(parameters)
     residuals = data - values
     normal = NormalEquations(jacobian, residuals, weights)
@@ -121,15 +121,15 @@ def evaluate(model: Model, data: Array32, weights: Array32, parameters: Array) -
 def minimise(
     model: Model, data: Array32, weights: Array32, start: Minimum, most_steps: int, small_step_px: float
 ) -> Minimum:
-    """Weighted least squares of `data - model`; the first two parameters are a place in pixels.
+    """Weighted least squares of `data - model`; the first two parameters are a position in pixels.
 
     Args:
         model: values and derivatives.
         data: (N, K).
         weights: (N, K), 0 for padding.
         start: an evaluated start, or the end of an iteration with other weights.
-        most_steps: evaluations of the model at most.
-        small_step_px: the iteration ends when no place moves more.
+        most_steps: largest number of evaluations of the model.
+        small_step_px: the iteration ends when no position moves by more. [px]
     """
     parameters, residuals, jacobian = start.parameters, start.residuals, start.jacobian
     cost = _costs(residuals, weights)
@@ -138,7 +138,7 @@ def minimise(
     for _ in range(most_steps):
         step = normal.step(damping)
         tried = parameters + step
-        # A step gone astray may overflow: its cost is infinite then, and it is not taken.
+        # A diverging step may overflow: its cost is infinite then, and the step is rejected.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             values, new_jacobian = model(tried)
             new_residuals = data - values

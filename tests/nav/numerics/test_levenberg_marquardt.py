@@ -36,7 +36,7 @@ def test_a_linear_step_shares_the_curvature():
     x = rng.uniform(-1, 1, (3, 50)).astype(np.float32)
     design, weights = np.stack([np.ones_like(x), x], axis=1), np.ones_like(x)
     start = evaluate(lambda p: (np.einsum("np,npk->nk", p, design), design), x, weights, np.zeros((3, 2)))
-    moved = start.given(start.residuals + 1, weights)
+    moved = start.after_linear_step(start.residuals + 1, weights)
     # The data x + 1 lie on a line: single precision, and the ridge.
     np.testing.assert_allclose(moved.parameters, np.ones((3, 2)), atol=1e-5)
     np.testing.assert_allclose(moved.residuals, 0, atol=1e-5)
