@@ -16,11 +16,11 @@ from nav.matching.blobs import Blobs, disc_like_blobs
 from nav.matching.marker_channel import Window
 from nav.matching.ring_matching import RingMatch, match_ring
 
-# Share of the box added on every side, so that a box that is a little too small cuts no marker.
+# Share of the box added on every side, so that a slightly small box cuts no marker.
 _BOX_MARGIN_FRACTION = 0.06
 _LEAST_AREA_PX2 = 7.0
 _LEAST_SIDE_PX = 3
-# From the whole picture's range to what lies below a marker's tenth of it, each threshold leaving a half or less.
+# Thresholds of ever darker classes; each leaves half of the range or less, the last a tenth of a marker's.
 _MOST_DARKER = 5
 # Below this there is only noise.
 _LEAST_RANGE_DN = 4
@@ -42,7 +42,7 @@ class BinaryCentroids:
     Attributes:
         blobs: centres [px] and areas, in full-image coordinates.
         cov_px2: (M, 2, 2) covariances of the centres.
-        ring: the drogue's ring among them, where it has been looked for and found.
+        ring: the drogue's ring among them, None where it was not searched or not found.
     """
 
     blobs: Blobs
@@ -50,7 +50,7 @@ class BinaryCentroids:
     ring: RingMatch | None = None
 
 
-NO_CENTROIDS = BinaryCentroids(Blobs(np.zeros((0, 2)), np.zeros(0)), np.zeros((0, 2, 2)))
+NO_CENTROIDS = BinaryCentroids(blobs=Blobs(np.zeros((0, 2)), np.zeros(0)), cov_px2=np.zeros((0, 2, 2)))
 
 
 def binary_centroids(
@@ -70,11 +70,11 @@ def binary_centroids(
 def window_centroids(channel: Pixels, corner_px: tuple[int, int], layout: MarkerLayout) -> BinaryCentroids:
     """Centres of mass of the regions above Otsu's threshold in a part of an image.
 
-    Where that does not show all markers that the part's edge leaves whole, Otsu's thresholds of its brighter
-    class (white markers that run together with a bright sky) and of its darker class (markers in shade beside sunlit
-    ones) are tried; where none of them shows a ring, that of what is darker still, again and again (grey markers before
-    a bright sky). Median and opening are left out where the discs are smaller than they can stand. Regions that touch
-    the edge of the part or of the image are dropped: their centre of mass is not the marker's.
+    Where the threshold does not show all markers that the part's edge leaves whole, Otsu's thresholds of the brighter
+    class (white markers that merge with a bright sky) and of the darker class (markers in shade beside sunlit ones)
+    are tried. Where none of them shows a ring, thresholds of ever darker classes follow (grey markers before a bright
+    sky). Small discs get no median and opening, which would erode them. Regions that touch the edge of the part or of
+    the image are dropped, since their centre of mass is not the marker's.
 
     Args:
         channel: (H, W) marker channel of the part, see `box_window`.
@@ -99,10 +99,10 @@ def _otsu(levels: Pixels) -> float:
 
 
 def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool, RingMatch | None]:
-    """Regions by the first of several thresholds that shows most of the ring of markers, and that ring.
+    """Regions by the threshold that shows most markers of the ring, the first of equals, and that ring.
 
-    Where all markers that the part's edge does not cut are found, no other threshold is tried, and none in the dark
-    where any ring is.
+    No further threshold is tried once all markers are found that the part's edge does not cut, and none within the
+    darker classes once there is any ring.
     """
     best, most = (Blobs(np.zeros((0, 2)), np.zeros(0)), False), -1
     shown: RingMatch | None = None
@@ -120,10 +120,10 @@ def _best_regions(roi: Pixels, layout: MarkerLayout) -> tuple[Blobs, bool, RingM
 
 
 def _thresholds(roi: Pixels) -> Iterator[tuple[float, Mask | None]]:
-    """Otsu's threshold, then those of its brighter and its darker class; then of what is dark, with where that is.
+    """Otsu's threshold, those of its brighter and darker class, then those of ever darker classes with their masks.
 
-    A pixel at the rim of the dark has a share of the light beside it, which may be as bright as a marker and would join
-    a marker near the rim to the sky: what is dark is what lies a pixel within.
+    A pixel at the border of a dark class gets light from beside it, which may be as bright as a marker and would join
+    a nearby marker to the sky. The masks are therefore eroded by one pixel.
     """
     level = _otsu(roi.ravel())
     yield level, None
@@ -140,7 +140,7 @@ def _thresholds(roi: Pixels) -> Iterator[tuple[float, Mask | None]]:
 
 
 def _regions(roi: Pixels, level: float, dark: Mask | None) -> tuple[Blobs, bool]:
-    """Disc-like regions above a level, or of what is dark, and whether they went through median and opening."""
+    """Disc-like regions above a level, within the dark mask if given, and whether median and opening were applied."""
     inside = roi > level if dark is None else (roi > level) & dark
     mask: NDArray[np.uint8] = inside.view(np.uint8)
     blobs = disc_like_blobs(mask, _LEAST_AREA_PX2, _MOST_BLOBS)
@@ -170,7 +170,7 @@ def morphology_variance_px2(radii_px: Array) -> Array:
 
 
 def box_window(size_px: tuple[int, int], box_xywh_px: tuple[float, float, float, float]) -> Window:
-    """The widened box on an image of (width, height), empty where it lies beside it."""
+    """The widened box on an image of (width, height); empty where the box lies outside the image."""
     x, y, width, height = box_xywh_px
     margin_x, margin_y = _BOX_MARGIN_FRACTION * width + 1, _BOX_MARGIN_FRACTION * height + 1
     left, top = max(0, int(np.floor(x - margin_x))), max(0, int(np.floor(y - margin_y)))

@@ -127,8 +127,8 @@ _STEEP_SHARE = 0.03
 _TINY = 1e-12
 # Standard deviation of a centre at which a linear fit states half the variance.
 _NOT_LINEAR_PX = 0.2
-# A shadow or an object before the disc moves a sector's mean by more than this many standard deviations and this share of
-# the contrast; smaller residuals move the centre by less than the noise of one edge pixel.
+# A shadow or an object before the disc moves a sector's mean by more than this many standard deviations and this share
+# of the contrast; smaller residuals move the centre by less than the noise of one edge pixel.
 _SECTOR_SIGMA = 4.0
 _SECTOR_SHARE = 0.04
 # Mean square of a sector's summed noise that 5 % of even discs exceed (chi-square of 8).

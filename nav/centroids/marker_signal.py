@@ -1,4 +1,4 @@
-"""The marker channel of both eyes on the sites where the sensor measured it, cut to where discs are."""
+"""The marker channel of both eyes at the sites where the sensor measured it, cut to the region of the outlines."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from nav.centroids.ellipses import Ellipses
 from nav.matching.marker_channel import PLAIN, color_difference, marker_channel
 from nav.numerics.compiled import Array32
 
-# Room around an outline: the widest window about it, of one that moves by 30 px while the shutter is open, and what an
-# initial centre may be off. [px]
+# Margin around an outline: half the motion of up to 30 px while the shutter is open, the window, and the error of an
+# initial centre. [px]
 _MARGIN_PX = 20
-# Pixels this far outside the edge are seen; a plain picture needs more of them to know its background. [px]
+# Pixels up to this distance outside the edge are used; a plain picture needs more of them for its background. [px]
 OUTER_DIFFERENCE_PX, _OUTER_PLAIN_PX = 2.5, 5.0
 # First site of each colour in an RGGB cell, as row and column.
 _FIRST_SITE = ((0, 0), (0, 1), (1, 1))
@@ -34,12 +34,12 @@ class MarkerSignal:
     """Part of one image.
 
     Attributes:
-        values: (H, W) linear signal; of a difference also below zero.
-        clipped: (H, W) where the sensor's range ended.
+        values: (H, W) linear signal; a difference may be negative.
+        clipped: (H, W) pixels at the upper end of the sensor's range.
         first_px: x and y of the first site in the image. [px]
-        pitch_px: from site to site; 2 on one colour of a mosaic. [px]
-        is_difference: a colour's lead over the others, dark beside the markers, or a plain picture.
-        own: (H, W) the colour of a difference, in the same numbers up to a constant, None where that is not at hand.
+        pitch_px: distance of neighbouring sites; 2 for one colour of a mosaic. [px]
+        is_difference: whether it is a colour minus the others, dark beside the markers, or a plain picture.
+        own: (H, W) the colour of a difference before the subtraction, up to a constant, None where not available.
     """
 
     values: Array32
@@ -51,20 +51,20 @@ class MarkerSignal:
 
     @property
     def outer_px(self) -> float:
-        """How far outside an edge pixels are seen. [px]"""
+        """Distance outside an edge up to which pixels are used. [px]"""
         return OUTER_DIFFERENCE_PX if self.is_difference else _OUTER_PLAIN_PX
 
     @property
     def beside_px(self) -> float:
-        """How far beside a site some of the light in its value fell: a mosaic has the other colours there. [px]"""
+        """Distance from a site at which light enters its value: a mosaic measures the other colours beside it. [px]"""
         return float(self.pitch_px - 1)
 
     @property
     def shows_glare(self) -> bool:
-        """Whether light of a bright sky stays in it where the lens, or the sites beside, spread it over a dark face.
+        """Whether the signal contains light of a bright sky that the lens or other sites spread over a dark face.
 
-        A difference of colours of the same place takes it off, all but its colour. A plain picture shows it whole; of a
-        mosaic's difference, whose colours lie side by side, sites along the rim get it with either sign.
+        A difference of colours measured at the same place removes all of it but its colour. A plain picture contains
+        all of it. In a mosaic's difference, whose colours lie side by side, sites along the rim get it with any sign.
         """
         return not self.is_difference or self.beside_px > 0
 
@@ -74,13 +74,13 @@ def marker_signals(
 ) -> tuple[MarkerSignal, MarkerSignal]:
     """Signals of the left and the right eye around the given outlines.
 
-    From a mosaic only the sites of the markers' colour are taken, with the means of their neighbours for the other two
-    colours: interpolation between sites moves the edges of discs of a few pixels.
+    From a mosaic only the sites of the markers' colour are used, with the means of their neighbours for the other two
+    colours; interpolation between sites would move the edges of discs of a few pixels.
 
     Args:
         images: the pair.
         color: see `nav.matching.marker_channel.marker_color`.
-        ellipses: where to look; outlines over the image's edge are allowed.
+        ellipses: the outlines; they may reach beyond the image.
         others_weight: see `nav.matching.marker_channel.marker_channel`.
     """
     signals = []

@@ -1,1 +1,1 @@
-"""Which region of which image is which marker."""
+"""Finds markers among image regions: the marker channel, blobs, and the ring that they form."""

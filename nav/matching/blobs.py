@@ -38,12 +38,12 @@ class Blobs:
 
 
 def disc_like_blobs(mask: NDArray[np.uint8], least_area_px2: float, most: int) -> Blobs:
-    """Regions that may be the image of a disc: compact, filled, clear of the picture's edge.
+    """Regions that may be images of discs: compact, filled, clear of the picture's edge.
 
     Args:
         mask: (H, W), nonzero inside.
         least_area_px2: smaller ones are noise.
-        most: keep the largest so many; the time of what follows grows with the square of it.
+        most: number of the largest regions to keep; the time of the matching grows with its square.
 
     Returns:
         Blobs in descending order of area.

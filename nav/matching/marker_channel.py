@@ -1,4 +1,4 @@
-"""The single picture in which markers are sought: bright where a marker is, dark elsewhere."""
+"""The single-channel picture for marker detection: bright on markers, dark elsewhere."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from geometry.stereo import Eye
 
 # Left, top, right, bottom of a part of an image, the last two exclusive. [px]
 Window = tuple[int, int, int, int]
-# A paint counts as coloured when its strongest component leads the others by this share of itself; the shipped red
-# leads by 0.95, white by 0.
+# A paint counts as coloured when its strongest component exceeds the others by this share of itself: 0.95 for the
+# shipped red, 0 for white.
 _SATURATED_FRACTION = 0.5
 
-# How much of the other colours is taken off. A low sun makes haze so warm that its red leads too; then more is taken:
-# haze of an orange horizon has a third more red than green, red paint twenty times as much.
+# Weight at which the other colours are subtracted. A low sun makes haze so warm that red exceeds the others there too,
+# and a larger weight is needed: orange haze has a third more red than green, red paint twenty times as much.
 PLAIN, AGAINST_WARM_SKY = 1.0, 1.4
 OTHERS_WEIGHTS = (PLAIN, AGAINST_WARM_SKY)
-# What lies beyond the rim is looked at from where the lens no longer mixes it with the rim, out to this many rims.
+# Range of the pixels beyond the rim: from where the lens no longer mixes them with the rim [px] to this many rim radii.
 _CLEAR_OF_RIM_PX, _BEYOND_RIM = 2.5, 1.4
-# Of the other colours: from blue skies to warm ones.
+# Limits of the balancing weight, from blue skies to warm ones.
 _WEIGHTS = (0.0, 1.6)
 
 # Where the first site of each colour lies in an RGGB cell; the mean of both greens lies between them. [px]
@@ -32,7 +32,7 @@ _RED, _GREEN = 0, 1
 
 
 def marker_color(drogue: DrogueParameters) -> int | None:
-    """Index of the colour that sets the markers apart (0 red, 1 green, 2 blue), or None for white and grey ones."""
+    """Index of the markers' own colour (0 red, 1 green, 2 blue), or None for white and grey markers."""
     lit = drogue.marker_luminance_cd_m2 > 0
     rgb = drogue.marker_emission_rgb if lit else drogue.marker_reflectance_rgb
     strongest = int(np.argmax(rgb))
@@ -43,7 +43,7 @@ def marker_color(drogue: DrogueParameters) -> int | None:
 def marker_channel(
     images: StereoImages, eye: Eye, color: int | None, others_weight: float = PLAIN, window: Window | None = None
 ) -> Pixels:
-    """Linear picture of how much a pixel looks like a marker.
+    """The marker channel of one eye, linear in light.
 
     With a colour it is `max(c - max(the other two), 0)`, the paper's subtraction of channels; sites of that colour in a
     raw mosaic are preferred to a demosaiced image. Without a colour, or from a mono sensor, it is the brightness: the
@@ -53,8 +53,8 @@ def marker_channel(
         images: the pair.
         eye: which of the two.
         color: see `marker_color`.
-        others_weight: how much of the stronger of the other two colours is taken off.
-        window: left, top, right, bottom (the last two exclusive) of the part that is wanted; everything when None.
+        others_weight: weight at which the stronger of the other two colours is subtracted.
+        window: left, top, right, bottom (the last two exclusive) of the part to compute; the whole image when None.
 
     Returns:
         (H, W) of unsigned integers on the image's own grid, proportional to light above the black level.
@@ -62,7 +62,7 @@ def marker_channel(
     image, mosaic = (images.left, images.left_mosaic) if eye == "left" else (images.right, images.right_mosaic)
     left, top, right, bottom = window or (0, 0, *images.size_px)
     if color is not None and mosaic is not None:
-        # Whole cells, and one more on each side, so that what is brought to the full grid is that of the whole mosaic.
+        # Whole cells, and one more on each side, so that the interpolation equals that of the whole mosaic.
         low_x, low_y = max(0, left // 2 * 2 - 2), max(0, top // 2 * 2 - 2)
         cells = mosaic[low_y : bottom // 2 * 2 + 4, low_x : right // 2 * 2 + 4]
         channel = _from_mosaic(cells, color, others_weight)
@@ -78,16 +78,16 @@ def marker_channel(
 
 
 def color_difference(images: StereoImages, eye: Eye, color: int, others_weight: float = PLAIN) -> NDArray[np.float32]:
-    """As `marker_channel` of a colour image, below zero where another colour leads.
+    """As `marker_channel` of a colour image, but negative where another colour is stronger.
 
-    Light of a blue sky that the lens spreads over a marker's edge takes from the marker's lead; cut off at zero it
-    would move the edge and leave no trace beside it.
+    Light of a blue sky that the lens spreads over a marker's edge reduces the difference there. Clipping at zero would
+    move the edge and leave no trace beside it.
 
     Returns:
         (H, W)
     """
     image = images.left if eye == "left" else images.right
-    # The difference needs no subtraction of the black level beforehand, which would cut off noise below it.
+    # The black level is not subtracted beforehand, which would clip the noise below it.
     linear, black = (image, images.black_level_dn) if images.encoding == "linear" else (_linear(image, images), 0.0)
     planes = cv2.split(linear)
     first, second = (planes[index] for index in range(3) if index != color)
@@ -97,17 +97,17 @@ def color_difference(images: StereoImages, eye: Eye, color: int, others_weight: 
 
 
 def balancing_weight(images: StereoImages, color: int, middles_px: Array, rim_px: float, usual: float = PLAIN) -> float:
-    """Weight of the other colours at which what lies beyond the rim leads as little as the dark face.
+    """Weight of the other colours at which the background beyond the rim is as dark in the channel as the face.
 
-    The step of light at the rim then goes from the channel, and with it what the lens spreads of the sky over a small
-    marker's edge: a blue sky would take from it, a warm one would add to it.
+    This removes the step of light at the rim from the channel, and with it the light that the lens spreads from the sky
+    over a small marker's edge: a blue sky would subtract from the edge, a warm one would add to it.
 
     Args:
         images: the pair, in colour.
         color: of the markers.
         middles_px: (2, 2) the drogue's middle in the left and the right image.
         rim_px: radius of its rim.
-        usual: what to return where the images show nothing beyond the rim.
+        usual: returned where the images show nothing beyond the rim.
     """
     beyond = []
     for image, (u, v) in zip((images.left, images.right), middles_px, strict=True):
@@ -134,7 +134,7 @@ def _linear(image: Pixels, images: StereoImages) -> Pixels:
     """The image proportional to light, black level removed."""
     if images.encoding == "linear":
         black = round(images.black_level_dn)
-        # OpenCV's subtraction ends at zero.
+        # OpenCV's subtraction clips at zero.
         return image if black == 0 or image.size == 0 else np.asarray(cv2.subtract(image, (black, black, black, 0)))
     codes = np.arange(2**images.bits) / (2**images.bits - 1)
     black = images.black_level_dn / (2**images.bits - 1)
@@ -151,10 +151,10 @@ def _srgb_to_linear(
 
 
 def _from_mosaic(mosaic: Pixels, color: int, others_weight: float) -> Pixels:
-    """Difference of the sites of one RGGB cell, brought bilinearly to the full grid at the colour's own place.
+    """Colour difference within each RGGB cell, interpolated bilinearly from the colour's sites to the full grid.
 
-    Where other sites beside one of red or blue are as bright as it is, it does not lead: before a bright sky the rim
-    would else lead over the others of its cell by more than the markers do, wherever the colour comes first.
+    It is zero at a red or blue site that does not exceed the other colours' sites around it as well. Before a bright
+    sky the rim would otherwise show larger differences than the markers, where the colour's site is the brighter one.
     """
     height, width = mosaic.shape
     even = mosaic[: height // 2 * 2, : width // 2 * 2]
@@ -176,9 +176,9 @@ def _from_mosaic(mosaic: Pixels, color: int, others_weight: float) -> Pixels:
 
 
 def _brightest_beside(planes: tuple[Pixels, Pixels, Pixels, Pixels], color: int) -> Pixels:
-    """The most that the four squares of 2 x 2 sites around each of red or blue show of another colour.
+    """The brightest other colour in the four squares of 2 x 2 sites around each red or blue site.
 
-    One of them lies on the brighter side of any edge.
+    One of the squares lies on the brighter side of any edge.
 
     Args:
         planes: red, green beside red, green beside blue, and blue sites, of all cells.

@@ -1,8 +1,8 @@
-"""Which blobs of one image are the markers: the largest set that one affine map carries the drogue's layout onto.
+"""Finds the markers among the blobs of one image: the largest set onto which one affine map carries the layout.
 
-An affine map is the image of a flat pattern up to perspective within it, which moves a marker by less than a third of
-its radius where the whole drogue is in view. Missing markers, false blobs and the hub (near the middle, where no marker
-is) need no rule of their own.
+The image of a flat pattern is an affine map up to perspective, which moves a marker by less than a third of its radius
+where the whole drogue is in view. Missing markers, false blobs and the hub (near the middle, where no marker is) need
+no special rules.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ _SIZE_FACTOR = 1.6
 # Tolerances as a share of a marker's radius: for two-point guesses, which ignore tilt, and for the fitted map.
 _GUESS_TOLERANCE = 0.8
 _FIT_TOLERANCE = 0.4
-# Markers whose places span less than this across their longest line lie on it; the smallest singular value of the fit.
+# Least singular value of the fit: markers with a smaller one lie on a line.
 _ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
-FEW = 4  # markers, where the ring is known to be or another image shows the same
-# A disc that touches the picture's edge is dropped, and perspective puts it off the map by up to a third of its radius.
+FEW = 4  # markers are enough where the ring is predicted or another image shows the same ones
+# A disc that touches the picture's edge is dropped, and perspective shifts it by up to a third of its radius.
 _REACH = 1.4
-# A marker that was not found lies this many times as far off the map as the others at most.
+# Largest distance of an undetected marker from the map, in multiples of that of the others.
 _MOST_OFF = 3.0
-# A complete ring this near its map needs no second guess.
+# A complete ring this close to its map ends the search.
 _GOOD_RMS_FRACTION = 0.1
 _CHUNK = 2048
 
@@ -42,8 +42,8 @@ class RingMatch:
 
     Attributes:
         affine: (2, 3) map from the rim plane [m] to pixels.
-        blob_of_marker: (N,) index of each marker's blob, -1 where it was not found; modulo the layout's symmetry.
-        rms_fraction: distance of blobs from the map, as a share of a marker's radius.
+        blob_of_marker: (N,) index of each marker's blob, -1 for a missing one; modulo the layout's symmetry.
+        rms_fraction: root mean square distance of the blobs from the map, as a share of a marker's radius.
     """
 
     affine: Array
@@ -57,20 +57,20 @@ class RingMatch:
 
     @property
     def scale_px_per_m(self) -> float:
-        """Largest stretch of the map: focal length over distance. [px/m]"""
-        return _stretches(self.affine)[0]
+        """Largest scale of the map: focal length over distance. [px/m]"""
+        return _singular_values(self.affine)[0]
 
     def cut(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-        """(N,) markers whose images surely do not lie wholly within a picture of (width, height)."""
-        # As far as a disc reaches to all sides, less what the map may be off.
-        return ~self._inside(layout, size_px, _stretches(self.affine)[1] * (1 - _MOST_OFF * self.rms_fraction))
+        """(N,) markers whose images certainly reach beyond a picture of (width, height)."""
+        # The least extent of a disc, less the error of the map.
+        return ~self._inside(layout, size_px, _singular_values(self.affine)[1] * (1 - _MOST_OFF * self.rms_fraction))
 
     def clear(self, layout: MarkerLayout, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-        """(N,) markers whose images surely lie wholly within a picture of (width, height)."""
-        return self._inside(layout, size_px, _stretches(self.affine)[0] * _REACH)
+        """(N,) markers whose images certainly lie within a picture of (width, height)."""
+        return self._inside(layout, size_px, _singular_values(self.affine)[0] * _REACH)
 
     def _inside(self, layout: MarkerLayout, size_px: tuple[int, int], reach_px_per_m: float) -> NDArray[np.bool_]:
-        """(N,) markers whose places are further from the picture's edge than their radius times a stretch."""
+        """(N,) markers whose centres are further from the picture's edge than their radius times a scale."""
         places_px = layout.centers_m[:, :2] @ self.affine[:, :2].T + self.affine[:, 2]
         reach_px = layout.radius_m * reach_px_per_m
         inside: NDArray[np.bool_] = ((places_px > reach_px) & (places_px < np.array(size_px) - 1 - reach_px)).all(
@@ -79,20 +79,20 @@ class RingMatch:
         return inside
 
     def moved(self, shift_px: tuple[float, float]) -> RingMatch:
-        """The same where all blobs lie further right and down by x and y. [px]"""
+        """The match with all blobs moved right and down by x and y. [px]"""
         affine = self.affine.copy()
         affine[:, 2] += shift_px
         return replace(self, affine=affine)
 
 
 def least_markers(layout: MarkerLayout) -> int:
-    """Fewest markers that are taken for the drogue: 3/5 of them, and at least four where there are four."""
+    """Least number of markers that counts as the drogue: 3/5 of them, and at least four where there are four."""
     return min(layout.count, max(4, -(-3 * layout.count // 5)))
 
 
 @lru_cache(maxsize=16)
 def symmetry_permutations(layout: MarkerLayout) -> NDArray[np.int64]:
-    """(order, N) for each turn that maps the layout onto itself: which marker comes to lie on marker i."""
+    """(order, N) for each rotation that maps the layout onto itself: the marker that comes to lie on marker i."""
     turns = np.exp(2j * np.pi * np.arange(layout.symmetry_order) / layout.symmetry_order)
     places = _complex(layout.centers_m[:, :2])
     gaps = np.abs(turns[:, None, None] * places[None, None, :] - places[None, :, None])
@@ -112,9 +112,9 @@ def match_ring(blobs: Blobs, layout: MarkerLayout) -> RingMatch | None:
 
 
 def match_cut_ring(blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int]) -> RingMatch | None:
-    """Four markers or more of a ring whose others the picture's edge cuts off, or None.
+    """At least four markers of a ring whose other markers the picture's edge cuts off, or None.
 
-    Not enough to take it for the drogue, unless the other eye shows the same.
+    These do not count as the drogue unless the other eye shows the same.
 
     Args:
         blobs: of one image.
@@ -128,7 +128,7 @@ def match_cut_ring(blobs: Blobs, layout: MarkerLayout, size_px: tuple[int, int])
 
 
 def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
-    """The set of at least so many markers that has most of them, and fits best, or None."""
+    """The match with most markers, at least `least`, the best fitting one of equals; None if there is none."""
     if len(blobs) < least:
         return None
     best: RingMatch | None = None
@@ -137,7 +137,7 @@ def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | N
     for turn, shift in _best_guesses(blobs, layout):
         affine = np.array([[turn.real, -turn.imag, shift.real], [turn.imag, turn.real, shift.imag]])
         blob_of_marker = _nearest_blobs(affine, blobs, layout, _GUESS_TOLERANCE)
-        # Most guesses are turns of one ring: from the same blobs, named after another turn, comes the same map turned.
+        # Most guesses are rotations of one ring: the same blobs in a rotated order give the same map, rotated.
         key = min(blob_of_marker[permutation].tobytes() for permutation in permutations)
         if key in tried:
             continue
@@ -151,15 +151,15 @@ def _best_match(blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | N
 
 
 def match_ring_near(blobs: Blobs, layout: MarkerLayout, affine: Array, least: int = FEW) -> RingMatch | None:
-    """The markers among blobs where a ring is known to be, or None.
+    """The markers among blobs where the ring is predicted, or None.
 
-    Few are enough then, where a ring that may be anywhere needs more to be told from other things.
+    Few markers are enough there; a ring anywhere in the image needs more to be distinguished from other objects.
 
     Args:
         blobs: of one image.
         layout: the drogue's markers.
         affine: (2, 3) map from the rim plane [m] to pixels, right to some tenths of a marker's radius.
-        least: so many must be there, three at least.
+        least: least number of markers, three or more.
     """
     if len(blobs) < least:
         return None
@@ -192,14 +192,14 @@ def _best_guesses(blobs: Blobs, layout: MarkerLayout) -> list[tuple[complex, com
             (gap_x**2 + gap_y**2 + np.where(fits, np.float32(0), np.float32(np.inf))[:, None]).min(axis=2)
         )
         nearness = np.maximum(0, 1 - nearest / (_GUESS_TOLERANCE * radius))
-        # A marker hit counts one, its nearness breaks ties.
+        # A matched marker counts one, and its closeness breaks ties.
         votes[start : start + _CHUNK] = (nearness > 0).sum(axis=1) + nearness.mean(axis=1) / 2
     order = np.argsort(-votes, kind="stable")[:_REFINED_GUESSES]
     return [(complex(turns[i]), complex(shifts[i])) for i in order if votes[i] >= 3]
 
 
 def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Maps that carry two markers onto two blobs of a size that goes with their distance."""
+    """Maps that carry two markers onto two blobs whose sizes agree with their distance."""
     places, image = _complex(layout.centers_m[:, :2]), _complex(blobs.centers_px)
     radii = blobs.radii_px
     size_scale = np.sqrt(radii[:, None] * radii) / layout.radius_m
@@ -221,11 +221,11 @@ def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.comple
 
 
 def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
-    """Affine map refined from the blobs that a guess hits, or None where they cannot be the drogue."""
+    """Affine map refined from the blobs that a guess matches, or None where they cannot be the drogue."""
     places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
     fitted = None
     for tolerance in (_GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE, None):
-        # Mostly the first guess hits the right blobs already, and the same blobs have the same map.
+        # Mostly the first guess already matches the right blobs, and the same blobs give the same map.
         if fitted is None or (blob_of_marker != fitted).any():
             fitted, hit = blob_of_marker, blob_of_marker >= 0
             if hit.sum() < least:
@@ -237,7 +237,7 @@ def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, 
             affine = solution.T
         if tolerance is not None:
             blob_of_marker = _nearest_blobs(affine, blobs, layout, tolerance)
-    largest, smallest = _stretches(affine)
+    largest, smallest = _singular_values(affine)
     if _determinant(affine) <= 0 or smallest < _STRONGEST_TILT_COSINE * largest:
         return None
     residual = seen @ affine.T - centers_px
@@ -247,7 +247,7 @@ def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, 
 
 
 def _nearest_blobs(affine: Array, blobs: Blobs, layout: MarkerLayout, tolerance: float) -> NDArray[np.int64]:
-    """(N,) the blob nearest to each marker's image, -1 where none of about its size lies within the tolerance."""
+    """(N,) the blob nearest to each marker's image, -1 where no blob of similar size lies within the tolerance."""
     places_px = layout.centers_m[:, :2] @ affine[:, :2].T + affine[:, 2]
     radius_px = layout.radius_m * np.sqrt(abs(_determinant(affine)))
     gaps = places_px[:, None] - blobs.centers_px
@@ -263,8 +263,8 @@ def _determinant(affine: Array) -> float:
     return float(affine[0, 0] * affine[1, 1] - affine[0, 1] * affine[1, 0])
 
 
-def _stretches(affine: Array) -> tuple[float, float]:
-    """Largest and smallest stretch of a map: the singular values of its linear part, in closed form."""
+def _singular_values(affine: Array) -> tuple[float, float]:
+    """Largest and smallest singular value of a map's linear part, in closed form."""
     (a, b), (c, d) = affine[:, :2].tolist()
     even, odd = np.hypot(a + d, b - c) / 2, np.hypot(a - d, b + c) / 2
     return float(even + odd), float(abs(even - odd))

@@ -1,1 +1,1 @@
-"""Compiled loops and least squares that centroids and poses share."""
+"""Compiled loops and the least-squares solver that centroids and poses share."""

@@ -1,4 +1,4 @@
-"""Loops of least squares over many small problems, compiled."""
+"""Compiled loops of least squares over many small problems; see `nav.numerics.levenberg_marquardt`."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def weighted_squares(residuals: Array32, weights: Array32) -> Array:
 
 @compiled
 def constrain_jacobian(jacobian: Array32, ties: Array32, tied: Array32) -> None:
-    """Fill derivatives (N, Q, K) by free parameters, which the first R of others (N, P, K) follow by ties (N, T, R)."""
+    """Fill derivatives (N, Q, K) by free parameters, of which ties (N, T, R) move the first R of (N, P, K)."""
     count, followers = ties.shape[1], ties.shape[2]
     for n in range(len(jacobian)):
         for q in range(count):
@@ -111,10 +111,10 @@ def constrain_jacobian(jacobian: Array32, ties: Array32, tied: Array32) -> None:
 
 @compiled
 def solve_damped(matrix: Array, scale: Array, gradient: Array, damping: float, root: Array, step: Array) -> None:
-    """Fill the solution (P,) of a system with a matrix (P, P) and a right side (P,), by Cholesky.
+    """Fill the solution (P,) of a system with a matrix (P, P) and a right side (P,), by Cholesky decomposition.
 
-    Rows and columns are scaled (P,), and then the damping added to the diagonal. What a matrix that is not positive
-    would give is no number. (P, P) numbers of `root` are overwritten.
+    Rows and columns are scaled by (P,), and then the damping is added to the diagonal. A matrix that is not positive
+    definite gives NaN. `root` (P, P) is overwritten.
     """
     size = len(gradient)
     for i in range(size):

@@ -60,7 +60,7 @@ def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, rad
         errors.append(error)
         normalized.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.cov_px2), error) / 2)
         with monkeypatch.context() as context:
-            context.setattr(disc_fit, "seen_travel", lambda *_: None)
+            context.setattr(disc_fit, "detect_motion", lambda *_: None)
             unaware.append(fit_discs(signals, start).ellipses.centers_px - truth.centers_px)
     # 64 squared errors: standard deviation 0.18.
     assert 0.5 < np.mean(normalized) < 1.6
