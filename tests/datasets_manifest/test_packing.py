@@ -285,7 +285,7 @@ def test_a_list_is_made_again_from_its_archive(staged):
 def test_threads_read_one_store_while_lists_come_and_go(staged, monkeypatch):
     wanted = contents(staged)
     pack_all(staged)
-    monkeypatch.setattr("datasets_manifest.storage.frame_store._LISTS_KEPT", 1)
+    monkeypatch.setattr("datasets_manifest.storage.frame_store._MAX_CACHED_INDICES", 1)
     store = FrameStore(staged)
     places = [*wanted] * 20
     with ThreadPoolExecutor(16) as threads:
