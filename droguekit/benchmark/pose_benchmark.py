@@ -40,7 +40,6 @@ from droguekit.benchmark.sequences.sequence_truth import (
 from droguekit.benchmark.sequences.tracking_scores import reacquisition, score_regions
 
 Methods = Mapping[str, Mapping[int, Estimate]]
-__all__ = ["BenchmarkResult", "run_benchmark", "score"]
 Truths = Mapping[int, DrogueTruth | None]
 
 
@@ -63,10 +62,10 @@ def run_benchmark(dataset: Location, estimates: Path) -> BenchmarkResult:
         truths[index] = drogue_truth(record)
         states.append(true_state(record))
     facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(data.frame_indices))
-    return score(facts, truths, methods, true_sequences(states))
+    return score_methods(facts, truths, methods, true_sequences(states))
 
 
-def score(
+def score_methods(
     facts: DatasetFacts,
     truths: Truths,
     methods: Mapping[str, Mapping[int, Estimate]],

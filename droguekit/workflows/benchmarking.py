@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from droguekit.benchmark.blind_check import BlindCheck
     from droguekit.benchmark.detection.detection_scores import DetectorOutput
     from droguekit.benchmark.detection.detector_runner import DetectorRunner
-    from droguekit.benchmark.pose_benchmark import BenchmarkResult
+    from droguekit.benchmark.results.benchmark_result import BenchmarkResult
     from droguekit.benchmark.results.detection_result import DetectionResult
     from nav.detector.onnx_cost import NetworkCost
 

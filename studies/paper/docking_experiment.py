@@ -14,7 +14,7 @@ from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from datasets_manifest.types.records import PairRecord, ViewRecord
 from droguekit.benchmark.confidence_intervals import Interval, bootstrap_intervals
-from droguekit.benchmark.pose_benchmark import score
+from droguekit.benchmark.pose_benchmark import score_methods
 from droguekit.benchmark.poses.drogue_truth import VISIBLE_FRACTION, drogue_truth
 from droguekit.benchmark.poses.pose_errors import pose_error
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
@@ -127,7 +127,7 @@ def read_docking(dataset: Location, estimates: Path) -> DockingData:
         first_frames.setdefault(record.sequence_id, index)
     manifest = data.manifest
     facts = DatasetFacts(name=manifest.name, sha256=manifest.dataset_sha256, pairs=len(records))
-    result = score(facts, {index: drogue_truth(record) for index, record in records.items()}, file.methods)
+    result = score_methods(facts, {index: drogue_truth(record) for index, record in records.items()}, file.methods)
     shown = {index: record for index, record in records.items() if record.left_from_drogue is not None}
     return DockingData(data, file, shown, first_frames, result)
 

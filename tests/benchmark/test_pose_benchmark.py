@@ -9,7 +9,7 @@ import pytest
 
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimates
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.pose_benchmark import run_benchmark, score
+from droguekit.benchmark.pose_benchmark import run_benchmark, score_methods
 from droguekit.benchmark.poses.centroid_errors import centroid_errors
 from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.poses.pose_errors import estimates_by_method
@@ -34,7 +34,7 @@ def shifted(pose: RigidTransform, offset_m: tuple[float, float, float]) -> Rigid
 
 def score_records(records: list[PairRecord], estimates: list[PoseEstimate | NoFix]) -> BenchmarkResult:
     truths = {record.frame_index: drogue_truth(record) for record in records}
-    return score(FACTS, truths, estimates_by_method(estimates, truths, "estimates"))
+    return score_methods(FACTS, truths, estimates_by_method(estimates, truths, "estimates"))
 
 
 def test_the_json_has_the_fixed_keys(

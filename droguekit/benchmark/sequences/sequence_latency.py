@@ -11,7 +11,7 @@ from droguekit.benchmark.results.sequence_result import Latency, LatencyBin, Tim
 from droguekit.benchmark.sequences.filter_errors import SequenceData
 
 LATE = "late:"
-"""Begin of the reason of a pair that was skipped because newer ones had arrived."""
+"""Beginning of the reason of a pair that was skipped because newer ones had arrived."""
 # Stages in which a pair waits or is handed over, and is not processed.
 _WAITING = frozenset({"read", "wait", "handover"})
 

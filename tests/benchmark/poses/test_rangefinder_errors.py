@@ -9,7 +9,7 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.estimates import write_estimates
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.pose_benchmark import run_benchmark, score
+from droguekit.benchmark.pose_benchmark import run_benchmark, score_methods
 from droguekit.benchmark.poses.drogue_truth import drogue_truth
 from droguekit.benchmark.poses.pose_errors import estimates_by_method
 from droguekit.benchmark.report.pose_report import write_report
@@ -26,7 +26,7 @@ def read(record: PairRecord, reading_m: float) -> PairRecord:
 def scored(records: list[PairRecord], estimates: list[object]) -> BenchmarkResult:
     truths = {record.frame_index: drogue_truth(record) for record in records}
     facts = DatasetFacts(name="test", sha256="0" * 64, pairs=len(records))
-    return score(facts, truths, estimates_by_method(estimates, truths, "estimates"))
+    return score_methods(facts, truths, estimates_by_method(estimates, truths, "estimates"))
 
 
 def deeper(build: SimpleNamespace, record: PairRecord, by_m: float) -> object:
