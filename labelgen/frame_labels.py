@@ -33,7 +33,7 @@ _SURROUNDINGS_REACH = 1.8
 
 
 def label_frame(frame: FrameSpec, radiance: StereoRadiance, images: StereoImages) -> PairRecord:
-    """The truth of one pair.
+    """All labels of one pair.
 
     Args:
         frame: its specification.
@@ -253,7 +253,7 @@ def _electrons(frame: FrameSpec, radiance_cd_m2: NDArray[np.float32]) -> Array:
 
 
 def _is_structure(part_id: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Whether pixels see a part of the drogue that is no marker and no hub."""
+    """Whether pixels see a part of the drogue other than markers and hub."""
     is_marker = (part_id >= FIRST_MARKER_ID) & (part_id < FIRST_MARKER_ID + MAX_MARKERS)
     others: NDArray[np.bool_] = ~is_marker & ~np.isin(part_id, (Part.SKY, Part.HUB, *SURROUNDING_PARTS))
     return others

@@ -47,7 +47,7 @@ _ENGINES_WITH_LENSES = ("analytic", "mitsuba", "blender")
 
 
 class FrameCounts(FrozenModel):
-    """How many pairs, over how many scenes, how many without a drogue.
+    """Numbers of pairs and scenes, and the share of pairs without a drogue.
 
     Attributes:
         in_turn: whether scenes go through families and drogue variants in the given order, so that a few sequences have

@@ -102,7 +102,7 @@ _LARGEST_SUN_DROP_FRACTION = 0.71
 
 
 class DropoutRanges(FrozenModel):
-    """Distribution of the dropouts: one period in each sequence in which the cameras hardly see the drogue, or not.
+    """Distribution of the dropouts: one period in each sequence in which the drogue is hidden or hard to see.
 
     Attributes:
         kinds: used in turn, sequence by sequence. `occlusion` moves a bar before both cameras that hides all of the

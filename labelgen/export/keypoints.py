@@ -45,7 +45,7 @@ def keypoint_count(manifest: Manifest) -> int:
 
 
 def view_of(record: PairRecord, eye: Eye) -> ViewRecord:
-    """The truth of one eye."""
+    """The labels of one eye."""
     return record.views.left if eye == "left" else record.views.right
 
 

@@ -133,7 +133,7 @@ _TUM_HEADER = (
 
 
 def write_tum(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """Write a file a sequence, a line a pair.
+    """Write a file for each sequence, with a line for each pair.
 
     Args:
         dataset: folder.

@@ -53,11 +53,11 @@ _NEVER = QosTime(2147483647, 4294967295)
 
 
 def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """Write a bag a sequence: images, CameraInfo, transforms, and the true pose of the drogue.
+    """Write a bag for each sequence: images, CameraInfo, transforms, and the true pose of the drogue.
 
     Args:
         dataset: folder.
-        out: folder to make; it holds a folder a bag.
+        out: folder to make; it holds a folder for each bag.
         log: receives the progress, and counts pairs without a pose.
 
     Returns:

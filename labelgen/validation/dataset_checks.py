@@ -193,7 +193,7 @@ def _opencv_faults(path: str, text: str, rig: StereoRig) -> list[str]:
 
 
 def shard_faults(storage: Storage) -> Iterator[tuple[str, list[str]]]:
-    """What is wrong with each tar file of a dataset, under the name of the check; nothing where it has none.
+    """Faults of each tar file of a dataset, with the name of the check; empty for a dataset without tar files.
 
     That the files in them are those of the records is checked frame by frame.
     """

@@ -42,7 +42,7 @@ _EPIPOLAR_TOLERANCE_PX = 1e-9
 
 
 def check_against_passes(record: PairRecord, radiance: StereoRadiance) -> list[str]:
-    """Faults between the labels of a pair and its passes, one line each; empty if there are none.
+    """Contradictions between the labels of a pair and its passes, one line each; empty without faults.
 
     Checked: the part id at the centre of every unoccluded marker; that every pixel of a marker or the hub lies on it
     and has the depth of its plane; the centroid of every unoccluded marker's pixels against `center_ellipse_px`;
