@@ -1,1 +1,1 @@
-"""From stereo images to the drogue's pose. Sees images, rig and drogue, and nothing of how they were made."""
+"""Estimates the drogue's pose from stereo images; knows images, rig and drogue, and nothing of how they were made."""

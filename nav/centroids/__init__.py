@@ -1,1 +1,1 @@
-"""Where in an image the markers are, to a fraction of a pixel."""
+"""Measures the centres of markers and hub in images to a fraction of a pixel."""

@@ -300,29 +300,24 @@ def fit_annuli(
         return _NO_ANNULI
     width_px = float((outer.radii_px - inner.radii_px).min())
     thin = width_px < _THIN_PX
-    ways = None if motion is None else motion.of(outer)
+    motions = None if motion is None else motion.of(outer)
     gathered = annulus_pixels(signals, outer, inner, 0.0 if motion is None else motion.spread_px(outer))
-    pixels, beyond = _within_collar(gathered, signals[0], (outer, inner), collar_factor, ways)
+    pixels, beyond = _within_collar(gathered, signals[0], (outer, inner), collar_factor, motions)
     harmonics = azimuth_harmonics(pixels, _ORDER_THIN if thin else _ORDER)
     start = initial_annulus_parameters(pixels, outer, inner, harmonics.shape[1])
-    first = _first_fit(pixels, (harmonics, beyond), start, thin, ways)
+    first = _first_fit(pixels, (harmonics, beyond), start, thin, motions)
     rough = expand_parameters(start, pose_constraints(start, thin), first)
     if not thin and _unevenness(rough) > _UNEVEN_SHARE:
         harmonics = np.concatenate([harmonics, radial_slopes(pixels, harmonics, outer, inner)], axis=1)
         start = np.pad(rough, ((0, 0), (0, SLOPE_HARMONICS)))
-        first = _first_fit(pixels, (harmonics, beyond), start, thin, ways)
+        first = _first_fit(pixels, (harmonics, beyond), start, thin, motions)
     ties = pose_constraints(start, thin)
-    model = constrained_model(_annulus_model_of(pixels, (harmonics, beyond), ways), start, ties)
-    final, weights, edge_factor = _weighted_fit(pixels, harmonics, (start, ties), model, first, ways is None)
+    model = constrained_model(_annulus_model_of(pixels, (harmonics, beyond), motions), start, ties)
+    final, weights, edge_factor = _weighted_fit(pixels, harmonics, (start, ties), model, first, motions is None)
     parameters = expand_parameters(start, ties, final)
     between, light = area_shares(final, ties)[0], light_above_background(parameters, harmonics)
     contrast = parameters[:, ANNULUS_AMPLITUDE] - parameters[:, ANNULUS_BACKGROUND]
-    uneven = _sector_chi2(final, weights, pixels, contrast)
-    if edge_factor < 1:
-        # The noise beside the annulus hides the residuals on it.
-        judged = weights * (between > _BESIDE) / np.float32(edge_factor)
-        uneven = np.maximum(uneven, _sector_chi2(final, judged, pixels, contrast))
-    inflation = 1 + _SHADOW_FACTOR * np.maximum(uneven - _EVEN_SECTOR_CHI2, 0)
+    inflation = _shadow_inflation(final, weights, pixels, contrast, between, edge_factor)
     # The first two free parameters are the common shift.
     cov = widen_for_nonlinearity(final.covariance()[:, :2, :2] * edge_factor * inflation[:, None, None])
     on_it = pixels.present * (between > 0.5)
@@ -339,17 +334,17 @@ def fit_annuli(
     )
 
 
-def _annulus_model_of(pixels: OutlinePixels, light: tuple[Array32, Array32], ways: Array | None) -> Model:
+def _annulus_model_of(pixels: OutlinePixels, light: tuple[Array32, Array32], motions: Array | None) -> Model:
     still = annulus_model(pixels, *light)
-    return still if ways is None else motion_blurred(still, ways, (ANNULUS_OUTER.start, ANNULUS_INNER.start))
+    return still if motions is None else motion_blurred(still, motions, (ANNULUS_OUTER.start, ANNULUS_INNER.start))
 
 
 def _first_fit(
-    pixels: OutlinePixels, light: tuple[Array32, Array32], start: Array, thin: bool, ways: Array | None
+    pixels: OutlinePixels, light: tuple[Array32, Array32], start: Array, thin: bool, motions: Array | None
 ) -> Minimum:
     """Fit with equal weights, to measure the noise; `light` is the basis of that on the annulus and beyond."""
     ties = pose_constraints(start, thin)
-    model = constrained_model(_annulus_model_of(pixels, light, ways), start, ties)
+    model = constrained_model(_annulus_model_of(pixels, light, motions), start, ties)
     begin = evaluate(model, pixels.values, pixels.present, np.zeros((len(start), ties.shape[2])))
     return minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
 
@@ -389,6 +384,19 @@ def _weighted_fit(
     return final, weights, noise.edge_factor
 
 
+def _shadow_inflation(
+    fit: Minimum, weights: Array32, pixels: OutlinePixels, contrast: Array, between: Array32, edge_factor: float
+) -> Array:
+    """(N,) factor in the covariances for the correlated residuals that a shadow leaves."""
+    uneven = _sector_chi2(fit, weights, pixels, contrast)
+    if edge_factor < 1:
+        # The noise beside the annulus hides the residuals on it.
+        judged = weights * (between > _BESIDE) / np.float32(edge_factor)
+        uneven = np.maximum(uneven, _sector_chi2(fit, judged, pixels, contrast))
+    inflation: Array = 1 + _SHADOW_FACTOR * np.maximum(uneven - _EVEN_SECTOR_CHI2, 0)
+    return inflation
+
+
 def _sector_chi2(fit: Minimum, weights: Array32, pixels: OutlinePixels, contrast: Array) -> Array:
     return residual_spread(fit.residuals, weights, pixels, _SECTORS, contrast, fit.parameters.shape[1]).sector_chi2
 
@@ -405,7 +413,7 @@ def _within_collar(
     signal: MarkerSignal,
     edges: tuple[Ellipses, Ellipses],
     collar_factor: float,
-    ways: Array | None,
+    motions: Array | None,
 ) -> tuple[OutlinePixels, Array32]:
     """The pixels without those beyond the collar, and the share of light from beyond it in each, (N, K)."""
     if collar_factor == 0:
@@ -414,7 +422,7 @@ def _within_collar(
 
     def beyond(nearer_px: float) -> Array32:
         factor = np.maximum(collar_factor - nearer_px / outer.radii_px, 0.5)[:, None, None]
-        return blurred_share_outside(factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX, ways)
+        return blurred_share_outside(factor * outer.shapes_px, pixels.x_px, pixels.y_px, START_WIDTH_PX, motions)
 
     shares = beyond(0.0)
     if not signal.shows_glare:

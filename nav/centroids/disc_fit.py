@@ -154,16 +154,16 @@ def _fit_given_motion(
     Returns:
         The pixels of the discs, the model of still discs, and the fit of the moving ones.
     """
-    is_difference, ways = signals[0].is_difference, None if motion is None else motion.of(start)
+    is_difference, motions = signals[0].is_difference, None if motion is None else motion.of(start)
     spread_px = 0.0 if motion is None else motion.spread_px(start)
     pixels, beyond = disc_pixels(signals, start, blur_px=spread_px), None
     if face is not None and face.margin_px <= visible_margin_px(signals[0]) + spread_px:
-        beyond = background_shares(face, start, pixels, START_WIDTH_PX, ways)
+        beyond = background_shares(face, start, pixels, START_WIDTH_PX, motions)
         if beyond is not None:
-            pixels = pixels_on_face(face, start, pixels, beyond, ways, signals[0])
+            pixels = pixels_on_face(face, start, pixels, beyond, motions, signals[0])
     sloped = not is_difference or (shaded and bool(start.radii_px.min() >= _LEAST_RADIUS_FOR_FACE_SLOPE_PX))
     still = disc_model(pixels, sloped, shaded, beyond)
-    model = still if ways is None else motion_blurred(still, ways, (0,))
+    model = still if motions is None else motion_blurred(still, motions, (0,))
     count = 2 * sloped + 2 * shaded + (0 if beyond is None else beyond.shape[1])
     begin = evaluate(model, pixels.values, pixels.present, initial_disc_parameters(pixels, start.shapes_px, count))
     minimum = minimise(model, pixels.values, pixels.present, begin, _FIRST_STEPS, FIRST_SMALL_STEP_PX)
@@ -173,8 +173,8 @@ def _fit_given_motion(
     # wide that tenths are enough.
     found = _fitted_ellipses(start, pixels, minimum, (None,) * len(start))
     width_px = float(np.median(minimum.parameters[:, DISC_WIDTH]))
-    still = disc_model(pixels, sloped, shaded, background_shares(face, found, pixels, width_px, ways))
-    model = still if ways is None else motion_blurred(still, ways, (0,))
+    still = disc_model(pixels, sloped, shaded, background_shares(face, found, pixels, width_px, motions))
+    model = still if motions is None else motion_blurred(still, motions, (0,))
     return pixels, still, evaluate(model, pixels.values, pixels.present, minimum.parameters)
 
 

@@ -102,13 +102,13 @@ def pixels_on_face(
     discs: Ellipses,
     pixels: OutlinePixels,
     further: Array32,
-    ways: Array | None,
+    motions: Array | None,
     signal: MarkerSignal,
 ) -> OutlinePixels:
     """The pixels without those that get too much light from beyond the face.
 
     Args:
-        face, discs, pixels, ways: see `shares_beyond`.
+        face, discs, pixels, motions: see `shares_beyond`.
         further: from there.
         signal: one of those that the pixels are from.
     """
@@ -117,7 +117,7 @@ def pixels_on_face(
         return pixels.only(chosen)
 
     def beyond(nearer_px: float) -> Array32:
-        shares = background_shares(face, discs, pixels, START_WIDTH_PX, ways, nearer_px) if nearer_px else further
+        shares = background_shares(face, discs, pixels, START_WIDTH_PX, motions, nearer_px) if nearer_px else further
         assert shares is not None
         most: Array32 = shares.max(axis=1)
         return most
@@ -131,7 +131,7 @@ def background_shares(
     discs: Ellipses,
     pixels: OutlinePixels,
     width_px: float,
-    ways: Array | None,
+    motions: Array | None,
     nearer_px: float = 0.0,
 ) -> Array32 | None:
     """Shares of each pixel's light from the face's opening and from beyond the rim.
@@ -144,7 +144,7 @@ def background_shares(
         discs: the markers, placed to a tenth of a pixel or so.
         pixels: of the discs.
         width_px: Gaussian width of edges.
-        ways: (N, 3) of the discs while the shutter is open, None of still ones.
+        motions: (N, 3) of the discs while the shutter is open, None of still ones.
         nearer_px: by how much the face is taken to be narrower on either side.
 
     Returns:
@@ -167,7 +167,7 @@ def background_shares(
         shapes[:, mine] = np.multiply.outer(edges_m, shape)[:, None]
     x = pixels.x_px - middles[:, :1].astype(np.float32)
     y = pixels.y_px - middles[:, 1:].astype(np.float32)
-    in_opening = 1 - blurred_share_outside(shapes[0], x, y, width_px, ways)
-    beyond_rim = blurred_share_outside(shapes[1], x, y, width_px, ways)
+    in_opening = 1 - blurred_share_outside(shapes[0], x, y, width_px, motions)
+    beyond_rim = blurred_share_outside(shapes[1], x, y, width_px, motions)
     shares: Array32 = np.stack([in_opening, beyond_rim], axis=1)
     return shares

@@ -52,20 +52,20 @@ class ImageMotion:
         x, y = (outlines.centers_px - self.middles_px[outlines.eyes]).T
         growth, turn = self.turns[outlines.eyes].T
         along_x, along_y = self.means_px[outlines.eyes].T
-        ways: Array = np.stack([along_x + growth * x - turn * y, along_y + turn * x + growth * y, growth], axis=1)
-        return ways
+        motions: Array = np.stack([along_x + growth * x - turn * y, along_y + turn * x + growth * y, growth], axis=1)
+        return motions
 
     def spread_px(self, outlines: Ellipses) -> float:
         """Largest distance by which the motion spreads an edge to either side. [px]"""
         return float(np.hypot(*self.of(outlines)[:, :2].T).max(initial=0.0)) / 2
 
 
-def motion_steps(ways: Array) -> tuple[Array, Array]:
+def motion_steps(motions: Array) -> tuple[Array, Array]:
     """(T, N, 3) steps of motions (N, 3) from mid-exposure, and (T,) their shares of the motion."""
-    longest_px = float(np.hypot(*ways[:, :2].T).max(initial=0.0))
+    longest_px = float(np.hypot(*motions[:, :2].T).max(initial=0.0))
     count = max(1, int(np.ceil(longest_px / _STEP_PX)))
     shares = (np.arange(count) + 0.5) / count - 0.5
-    return np.multiply.outer(shares, ways), shares
+    return np.multiply.outer(shares, motions), shares
 
 
 def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float) -> Array32:
@@ -75,12 +75,12 @@ def share_outside(shapes_px: Array, x_px: Array32, y_px: Array32, width_px: floa
 
 
 def blurred_share_outside(
-    shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float, ways: Array | None
+    shapes_px: Array, x_px: Array32, y_px: Array32, width_px: float, motions: Array | None
 ) -> Array32:
     """As `share_outside`, of ellipses that move by (N, 3), or stand still where that is None."""
-    if ways is None:
+    if motions is None:
         return share_outside(shapes_px, x_px, y_px, width_px)
-    steps = motion_steps(ways)[0].astype(np.float32)[..., None]
+    steps = motion_steps(motions)[0].astype(np.float32)[..., None]
     total = np.zeros_like(x_px)
     for along_x, along_y, growth in steps.transpose(0, 2, 1, 3):
         scale = 1 - growth
@@ -88,15 +88,15 @@ def blurred_share_outside(
     return total / np.float32(len(steps))
 
 
-def motion_blurred(model: Model, ways: Array, ellipses: tuple[int, ...]) -> Model:
+def motion_blurred(model: Model, motions: Array, ellipses: tuple[int, ...]) -> Model:
     """The model of moving outlines, from one of still outlines.
 
     Args:
         model: of still outlines.
-        ways: (N, 3) motions.
+        motions: (N, 3) motions.
         ellipses: indices at which the parameters of each outline's ellipses begin.
     """
-    steps = motion_steps(ways)[0]
+    steps = motion_steps(motions)[0]
 
     def moved(parameters: Array) -> tuple[Array32, Array32]:
         total, slopes = model(_moved_by(parameters, steps[0], ellipses))
@@ -190,17 +190,17 @@ def fit_motion(
     return motion
 
 
-def _evaluate_moving(model: Model, pixels: OutlinePixels, parameters: Array, ways: Array) -> tuple[Minimum, Array32]:
+def _evaluate_moving(model: Model, pixels: OutlinePixels, parameters: Array, motions: Array) -> tuple[Minimum, Array32]:
     """The fit of moving discs at given parameters, and (N, 2, K) derivatives by the displacements along x and y."""
     values, jacobian = np.zeros_like(pixels.values), None
     by_way = np.zeros((len(parameters), 2, pixels.values.shape[1]), np.float32)
-    for step, share in zip(*motion_steps(ways), strict=True):
+    for step, share in zip(*motion_steps(motions), strict=True):
         picture, slopes = model(_moved_by(parameters, step, (0,)))
         values += picture
         by_way += np.float32(share) * slopes[:, :2]
         jacobian = slopes if jacobian is None else jacobian + slopes
     assert jacobian is not None
-    scale = np.float32(1 / len(motion_steps(ways)[1]))
+    scale = np.float32(1 / len(motion_steps(motions)[1]))
     jacobian *= scale
     residuals = pixels.values - scale * values
     normal = NormalEquations(jacobian, residuals, pixels.present)
