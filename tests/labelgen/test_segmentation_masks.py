@@ -14,8 +14,7 @@ from labelgen.export.export_log import ExportLog
 from labelgen.export.mask_images import write_masks
 from labelgen.frame_labels import label_frame
 from labelgen.part_pixels import parts_mask
-from labelgen.segmentation_masks import OCCLUDERS, amodal_masks, named_parts, part_triangles, union_of_masks
-from labelgen.silhouettes import silhouette
+from labelgen.segmentation_masks import OCCLUDERS, amodal_masks, named_parts, part_triangles, silhouette, union_of_masks
 from render.analytic_engine.analytic_engine import AnalyticEngine
 from render.camera.sensor import expose
 from render.engine import load_engine
