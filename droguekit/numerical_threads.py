@@ -1,4 +1,4 @@
-"""Numerical libraries on one thread: with more, equal inputs differ in the last bits from call to call."""
+"""Restrict numerical libraries to one thread: with several, equal inputs give results that differ in the last bits."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Hold OpenCV and the linear algebra of numpy and scipy to one thread; what was set before returns at the end.
+    """Restrict OpenCV and the linear algebra of numpy and scipy to one thread, and restore the setting at the end.
 
-    Matrices and pictures are small here: libraries that spread them over threads take twice the time and more. Linear
-    algebra that is loaded only later is not held.
+    Matrices and pictures are small here, so that several threads would take at least twice the time. Libraries that
+    are loaded only inside the block are not restricted.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -30,7 +30,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def one_thread_in_new_processes() -> Iterator[None]:
-    """Let a process that starts meanwhile use one thread; libraries read these variables when they load."""
+    """Restrict processes that start meanwhile to one thread; libraries read these variables when they load."""
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:

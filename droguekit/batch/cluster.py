@@ -40,7 +40,7 @@ class LostWorkersError(RuntimeError):
     """Dask gave up a frame because too many workers that held it were lost."""
 
     def __init__(self, was_alone: bool) -> None:
-        """With whether the workers had no other frame at the time."""
+        """Take whether the workers held no other frame at the time."""
         lost, beside = (MAX_ATTEMPTS, "it alone") if was_alone else (ALLOWED_FAILURES + 1, "it and perhaps others")
         super().__init__(f"{lost} Dask workers died or ran out of time with {beside}")
 
@@ -157,7 +157,7 @@ def run_on_cluster(
 
 
 class _SubmissionWindow:
-    """The frames that wait, and the few that the scheduler holds."""
+    """Waiting frames, and the few frames that the scheduler holds."""
 
     def __init__(self, client: Client, task: ClusterTask, waiting: deque[int]) -> None:
         self._client, self._task, self._waiting = client, pickle.dumps(task), waiting
@@ -253,7 +253,7 @@ def _connect(address: str) -> Client:
         from distributed import Client
     except ImportError as error:
         raise ValueError("--scheduler: Dask is missing: pip install 'droguekit[cluster]'") from error
-    for name in ("distributed", "distributed.client"):  # Dask gives the second a level of its own
+    for name in ("distributed", "distributed.client"):  # Dask sets the level of the second separately
         logging.getLogger(name).setLevel(logging.CRITICAL)  # failures are reported by frame
     try:
         # Every message to the scheduler names the task, and by default a client remembers the last thousand.

@@ -128,7 +128,7 @@ def frame_timeout_s(recipe: Recipe) -> float:
 def _pairs_by_scene(recipe: Recipe) -> Counter[int]:
     count, scenes = recipe.frames.count, recipe.frames.scenes
     length = 1 if recipe.sequence is None else recipe.sequence.frames_per_sequence
-    # Every run of as many frames, or sequences, as there are scenes visits each scene once.
+    # As many consecutive frames, or sequences, as there are scenes visit each scene once.
     rounds = count // (scenes * length)
     by_scene = Counter(dict.fromkeys(range(scenes), rounds * length))
     by_scene.update(scene_of_frame(recipe, frame_index) for frame_index in range(rounds * scenes * length, count))
@@ -200,7 +200,7 @@ def _box(drogue: DrogueParameters, rig: StereoRig, pose: RigidTransform) -> tupl
 
 @dataclass(frozen=True, eq=False)
 class LawCheck:
-    """Counts against a law.
+    """Counts compared with a law.
 
     Attributes:
         counts, expected: by cell; (rows, columns) for places.
@@ -215,7 +215,7 @@ class LawCheck:
 
     @property
     def p_value(self) -> float:
-        """Chance of a statistic as large as this, or larger, if the law holds."""
+        """Probability of a statistic this large or larger if the law holds."""
         return float(chi2.sf(self.statistic, self.degrees)) if self.degrees else 1.0
 
 
@@ -233,7 +233,7 @@ def check_sizes(drawn: DrawnFrames, recipe: Recipe) -> tuple[LawCheck, Array] | 
         return None
     assert law.low_m is not None and law.high_m is not None
     sides_px = drawn.sides_px[shows]
-    # The mean of what attitude and lenses make of a drogue's size; it moves draws over an edge both ways alike.
+    # The mean effect of attitude and lenses on the size; it moves draws over a bin's edge equally in both directions.
     side_at_1_m = float(np.exp(np.log(sides_px * drawn.distances_m[shows]).mean()))
     edges = np.geomspace(side_at_1_m / law.high_m, side_at_1_m / law.low_m, SIZE_BINS + 1)
     shares = np.diff(1.0 - distance_share(law, side_at_1_m / edges))
@@ -284,7 +284,7 @@ def _cell(value: Array, edges: Array) -> Array:
 
 
 def chi_square(hits: Array, laws: Array) -> LawCheck:
-    """Pearson's test for draws that each have a law of their own.
+    """Pearson's chi-square test for draws that each follow a law of their own.
 
     With one law for all it is the textbook's sum of (count - expected)^2 / expected. Otherwise counts vary less than
     that sum takes them to, and their own covariance stands in its place. Cells in which few draws are expected count as
@@ -297,7 +297,7 @@ def chi_square(hits: Array, laws: Array) -> LawCheck:
     counts, expected = hits.sum(axis=0), laws.sum(axis=0)
     rare = expected < _FEWEST_EXPECTED
     if rare.any() and not rare.all() and expected[rare].sum() < _FEWEST_EXPECTED:
-        # Too few even together: with the smallest of the others.
+        # Still too few together, so the smallest of the others joins them.
         rare[np.argmin(np.where(rare, np.inf, expected))] = True
     if rare.any():
         hits = np.column_stack([hits[:, ~rare], hits[:, rare].sum(axis=1)])

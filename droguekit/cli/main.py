@@ -70,7 +70,7 @@ Exit codes: 0 done, 1 the work found a fault, 2 wrong usage or input, 130 interr
 
 
 def load_command(name: str) -> Any:
-    """The command `name`, its module imported now; None where there is none."""
+    """Import the module of a command and return the command; None where there is none."""
     if name not in COMMANDS:
         return None
     chosen = COMMANDS[name]
@@ -82,7 +82,7 @@ def load_command(name: str) -> Any:
         if not (error.name and f"{error.name}.".startswith(_STUDIES)):
             raise
         raise ValueError(f"{name}: is no part of the installed package; run it in a clone of the repository") from error
-    # Python keeps some words for itself, such as `import`.
+    # Some names are Python keywords, such as `import`.
     function = getattr(module, f"{name}_" if keyword.iskeyword(name) else name)
     examples: tuple[str, ...] = getattr(module, "EXAMPLES", ())
     # The backspace keeps the help's line breaks.
@@ -132,7 +132,7 @@ def droguekit(
 
 
 def explain(error: BaseException) -> str:
-    """An error as one line that names what it is about."""
+    """An error as one line that names its subject."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     text = " ".join(str(error).split()) or type(error).__name__
@@ -175,7 +175,7 @@ def main() -> None:
     with contextlib.suppress(BrokenPipeError):
         sys.stdout.flush()
         sys.exit(code)
-    # Whoever read our output has gone; Python would complain while closing it.
+    # The reader of our output has closed it; otherwise Python would report an error at exit.
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 

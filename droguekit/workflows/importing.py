@@ -1,4 +1,4 @@
-"""Real stereo images into a dataset without truth."""
+"""Make a dataset without truth from real stereo images."""
 
 from __future__ import annotations
 
