@@ -323,7 +323,7 @@ def _navigated(
     estimates = folder / f"{name}.jsonl"
     made_with = [*methods, *([f"tracker {how.tracker}"] if how.tracker else []), *(["filter"] if how.filtered else [])]
     if is_navigated(estimates, sha256, made_with):
-        report.say(f"{folder.name}: {estimates} is there already")
+        report.say(f"{folder.name}: {estimates} exists already")
         return estimates
     navigate_dataset(folder / "dataset", methods, estimates, report, how)
     mark_navigated(estimates, sha256, made_with)

@@ -158,7 +158,7 @@ def run_cells(cells: Sequence[Cell], out: Path, report: ProgressReport) -> dict[
     wanted = list(dict.fromkeys(cells))
     todo = [cell for cell in wanted if repr(cell) not in known]
     if len(todo) < len(wanted):
-        report.say(f"{len(wanted) - len(todo)} of {len(wanted)} cells are there already")
+        report.say(f"{len(wanted) - len(todo)} of {len(wanted)} cells are finished already")
     report.begin("cells", len(todo))
     try:
         for cell in todo:

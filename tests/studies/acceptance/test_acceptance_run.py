@@ -150,7 +150,7 @@ def test_what_is_there_is_kept(
     told = io.StringIO()
     again = measure_flight_tier(options(), [data], folder / "out", PlainProgress(told))
     assert again == rows
-    assert told.getvalue().count("is there already") == 3 and "40 of 40 pairs are there already" in told.getvalue()
+    assert told.getvalue().count("jsonl exists already") == 3 and "40 of 40 pairs exist already" in told.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_centroids_are_timed_on_pairs_that_are_made_once(tmp_path: Path, monkeyp
     tables = [
         measure_tier(AcceptanceOptions("speed", 3, draws=2, workers=0), tmp_path, PlainProgress(told)) for _ in range(2)
     ]
-    assert "9 of 9 pairs are there already" in told.getvalue()
+    assert "9 of 9 pairs exist already" in told.getvalue()
     for table in tables:
         measured = {row.quantity: row.measured for row in table.rows}
         near, far = (measured[f"centroids of both eyes, {z_m} m, median [ms]"] for z_m in (2, 10))

@@ -64,7 +64,7 @@ def test_a_stopped_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     listener = Listener()
     assert run_cells(cells, tmp_path / "parts", listener) == whole
     assert (listener.total, listener.done) == (1, 1)
-    assert listener.said == ["1 of 2 cells are there already"]
+    assert listener.said == ["1 of 2 cells are finished already"]
 
 
 def test_cells_of_other_code_are_made_again(tmp_path: Path) -> None:
