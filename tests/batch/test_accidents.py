@@ -199,7 +199,7 @@ def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
     with waiting_run() as process:
         assert process.stderr is not None
         process.send_signal(signal.SIGINT)
-        await_line(process.stderr, "stopping: ")
+        await_line(process.stderr, "stopping after ")
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()
     assert process.returncode == INTERRUPTED
