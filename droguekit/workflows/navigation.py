@@ -261,7 +261,7 @@ def _estimate_pairs(
 ) -> Generator[PairEstimates | SkippedPair]:
     """Estimates of all pairs, as fast as possible or in real time."""
     from nav.detector.detector_registry import DEFAULT_DETECTOR
-    from nav.realtime.pipeline import MonotonicClock, replay
+    from nav.realtime import MonotonicClock, replay
     from nav.runner import open_navigator, process_dataset
 
     navigator = open_navigator(settings, DEFAULT_DETECTOR if options.detector is None else options.detector)

@@ -33,9 +33,7 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import drogue_part_ids
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.part_pixels import FeaturePixels, parts_mask
-from labelgen.validation.bag_checks import bag_faults, bag_files
-from labelgen.validation.coco_checks import CocoFiles
-from labelgen.validation.exr_checks import passes_faults
+from labelgen.validation.file_checks import CocoFiles, bag_faults, bag_files, passes_faults
 from labelgen.validation.label_checks import (
     box_faults,
     check_boxes,

@@ -72,11 +72,11 @@ def open_tracker(name: str) -> Tracker:
 
         return StereoTracker(name, BernoulliEyeTracker)
     if name == FLOW:
-        from nav.tracking.median_flow import MedianFlowEyeTracker
+        from nav.tracking.opencv_trackers import MedianFlowEyeTracker
 
         return StereoTracker(name, MedianFlowEyeTracker)
     if name == MIL:
-        from nav.tracking.mil import MilEyeTracker
+        from nav.tracking.opencv_trackers import MilEyeTracker
 
         return StereoTracker(name, MilEyeTracker)
     if name == POSE_PREDICT:

@@ -1,4 +1,4 @@
-"""Ablations of our network: each variant changes one thing and is trained by `droguekit train` on the same budget."""
+"""`python -m studies.detector_comparison.ablation`: our network with one thing changed at a time, on equal budgets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset, read_blind_index
@@ -24,6 +26,17 @@ from nav.detector.input_image import input_image
 from nav.detector.onnx_cost import network_cost
 from nav.detector.onnx_detector import OnnxDetector
 from studies.detector_comparison.latency import measure_latency
+from studies.detector_comparison.options import (
+    CorpusOption,
+    DeviceOption,
+    PassesOption,
+    SeedOption,
+    SizeOption,
+    TestOption,
+    ThreadsOption,
+    input_size_px,
+    print_status,
+)
 
 
 class SingleViewDetector(OnnxDetector):
@@ -200,3 +213,41 @@ def _train(options: AblationOptions, folder: Path, changes: tuple[str, ...], say
     if ended.returncode != 0:
         said = (folder / "train.log").read_text(encoding="utf-8", errors="replace").strip().splitlines()
         raise OSError(f"{folder / 'train.log'}: {said[-1] if said else 'the training failed silently'}")
+
+
+_EXAMPLES = """Examples:
+
+  python -m studies.detector_comparison.ablation --corpus data/detector-small --image-passes 5000
+  python -m studies.detector_comparison.ablation --corpus data/detector-train --test data/detector-test"""
+
+
+def main(
+    corpus: CorpusOption,
+    out: Annotated[Path, typer.Option("--out", help="Folder; trainings that are found there are resumed.")] = Path(
+        "out/ablation"
+    ),
+    test: TestOption = None,
+    variant: Annotated[str, typer.Option("--variant", help="Of the network: l or s.")] = "s",
+    image_passes: PassesOption = 5_000,
+    size: SizeOption = "320x416",
+    threads: ThreadsOption = 2,
+    seed: SeedOption = 0,
+    device: DeviceOption = "cpu",
+    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Number of timing rounds.")] = 30,
+) -> None:
+    """Train variants of our network that differ in one thing, for the same image passes; measure scores and times."""
+    try:
+        options = AblationOptions(
+            corpus, test or corpus, variant, image_passes, input_size_px(size), threads, seed, device, rounds
+        )
+        lines = ablate(options, out, print_status)
+    except (ValueError, OSError) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+    typer.echo("\n".join(lines))
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False)
+    app.command(epilog=_EXAMPLES)(main)
+    app()

@@ -17,7 +17,7 @@ def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile():
 from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
 from nav.numerics import least_squares_loops
-from nav.realtime.warm_up import warm_up_jit
+from nav.realtime import warm_up_jit
 from nav.navigator import Navigator
 from nav.pose import adjustment_loops
 from render.engine import load_engine

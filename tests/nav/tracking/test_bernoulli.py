@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geometry.se3 import Array
-from nav.tracking.pixel_comparison_features import PixelComparisonFeatures
+from nav.tracking.bernoulli import PixelComparisonFeatures
 from nav.tracking.region import EyeImage, ImageRegion, box_center, image_region
 from tests.support.painted_sequences import Look, Place, film
 

@@ -11,7 +11,7 @@ from datasets_manifest.types.estimates import NoFix, PoseEstimate
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from nav.detector.color_blob import ColorBlobDetector
-from nav.realtime.pipeline import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
+from nav.realtime import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
 from nav.runner import LATE, add_smoothed, open_navigator
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings, SkippedPair
 

@@ -1,1 +1,0 @@
-"""Navigation at camera rate: threads, queues, and what is compiled beforehand."""
