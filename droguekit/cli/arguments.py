@@ -84,7 +84,7 @@ def parse_frames(text: str | None, count: int) -> range:
         raise ValueError(f"--frames: must be A:B with whole numbers, such as 0:100, got {text!r}")
     first, last = int(low or 0), int(high or count)
     if not first < last <= count:
-        raise ValueError(f"--frames: must name at least one of the recipe's {count} frames, got {text!r}")
+        raise ValueError(f"--frames: must name frames of the recipe's {count}, at least one, got {text!r}")
     return range(first, last)
 
 
