@@ -107,7 +107,7 @@ def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, S
     given = None if options.calibration is None else read_opencv_stereo(options.calibration, unit_m)
     if not _is_bag(source):
         if topics is not None:
-            raise ValueError(f"--topics: {source} is no bag")
+            raise ValueError(f"--topics: {source} is not a ROS bag")
         if given is None:
             raise ValueError("--calibration: images need one; see docs/how-to/calibrate.md for how to make it")
         rig = rig_of_calibration(given)
