@@ -41,23 +41,28 @@ def software_versions() -> dict[str, str]:
 
 
 def cpu_features() -> list[str]:
-    """Instruction sets that numpy found on this machine, and the processor's vendor where the system names it.
+    """Instruction sets that numpy found on this machine, and the processor's maker and model where the system tells.
 
-    Libraries choose their code by both, which decides the last bits of derived numbers.
+    They decide the last bits of derived numbers: libraries and compilers choose their code by all of them, and two
+    models of one maker with equal instruction sets render different pixels.
     """
     # numpy's stubs leave out the form with `mode`.
     report: dict[str, Any] = np.show_config(mode="dicts")  # type: ignore[call-arg, assignment, func-returns-value]
     extensions = report["SIMD Extensions"]
-    return [*extensions.get("baseline", ()), *extensions.get("found", ()), *_vendor(_CPU_INFO)]
+    return [*extensions.get("baseline", ()), *extensions.get("found", ()), *_processor(_CPU_INFO)]
 
 
-def _vendor(cpu_info: Path) -> list[str]:
-    """The vendor of a Linux machine's processor, such as `GenuineIntel`; empty where the file does not name one."""
+def _processor(cpu_info: Path) -> list[str]:
+    """Maker and model of a Linux machine's processor, such as `AuthenticAMD`, `family 25 model 17`, as far as known."""
     try:
-        found = re.search(r"^vendor_id\s*:\s*(\S+)", cpu_info.read_text(encoding="utf-8", errors="replace"), re.M)
+        text = cpu_info.read_text(encoding="utf-8", errors="replace")
     except OSError:
         return []
-    return [] if found is None else [found.group(1)]
+    maker, family, model = (
+        re.search(rf"^{key}\s*:\s*(\S+)", text, re.M) for key in ("vendor_id", "cpu family", "model")
+    )
+    found = [] if maker is None else [maker.group(1)]
+    return found if family is None or model is None else [*found, f"family {family.group(1)} model {model.group(1)}"]
 
 
 def differing_builds(

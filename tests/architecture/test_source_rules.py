@@ -125,6 +125,20 @@ def test_folders_stay_small() -> None:
     assert {str(folder): count for folder, count in counts.items() if count > MAX_MODULES} == {}
 
 
+def test_a_public_class_name_means_one_thing() -> None:
+    places: dict[str, list[str]] = {}
+    for path in source_files():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(str(path.relative_to(REPOSITORY)))
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}
+
+
+def test_a_module_name_means_one_thing() -> None:
+    counts = Counter(path.name for path in source_files() if not path.stem.startswith("__"))
+    assert {name: count for name, count in counts.items() if count > 1} == {}
+
+
 def test_no_module_without_a_meaning() -> None:
     assert [path for path in source_files() if path.stem in ("utils", "helpers", "common", "misc")] == []
 

@@ -131,6 +131,18 @@ def test_processors_of_two_makers_are_two(tmp_path, monkeypatch):
     assert len(told | {nobody}) == 3 and frozenset.intersection(*told) == nobody
 
 
+def test_two_models_of_one_maker_are_two_processors(tmp_path, monkeypatch):
+    found = set()
+    for family, model in ((25, 17), (26, 17), (25, 1)):
+        text = f"vendor_id\t: AuthenticAMD\ncpu family\t: {family}\nmodel\t\t: {model}\nmodel name\t: AMD EPYC\n"
+        (tmp_path / "cpuinfo").write_text(text)
+        monkeypatch.setattr(provenance, "_CPU_INFO", tmp_path / "cpuinfo")
+        features = cpu_features()
+        assert f"family {family} model {model}" in features
+        found.add(frozenset(features))
+    assert len(found) == 3
+
+
 def test_machine_description():
     features = cpu_features()
     assert features and all(isinstance(feature, str) for feature in features)
