@@ -206,5 +206,5 @@ def test_records_that_contradict_themselves_are_named(name, small_dataset, full_
 def test_part_ids_that_show_no_drogue_are_named(small_dataset, full_pairs, tmp_path):
     path = small_dataset / "frames" / f"{full_pairs[0].frame.frame_index:06d}" / "left_parts.png"
     path.write_bytes(encode_png(np.zeros((120, 160), np.uint8)))
-    with pytest.raises(ValueError, match=r"left_parts\.png: no pixel is the drogue's"):
+    with pytest.raises(ValueError, match=r"left_parts\.png: no pixel shows the drogue"):
         write_export("coco", small_dataset, tmp_path / "out", ExportLog())
