@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -43,6 +42,7 @@ from droguekit.benchmark.detection.detection_truth import DetectionTruth, ImageT
 from droguekit.benchmark.report.label_drawing import BOX_RGB, MARKER_RGB
 from droguekit.benchmark.results.detection_result import DetectedBox, DetectionResult, PairTimes
 from geometry.stereo import EYES
+from tests.support.parsed_page import ParsedPage
 
 FALSE_BOX = (700.0, 40.0, 60.0, 60.0)
 
@@ -262,19 +262,6 @@ def test_percentages_never_say_all_where_one_is_missing() -> None:
     ]
 
 
-class Page(HTMLParser):
-    """Collects references and the text of cells."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.references: list[str] = []
-        self.tags: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.references += [value or "" for name, value in attrs if name in ("src", "href", "action", "data")]
-
-
 def scored_dataset(folder: Path) -> ScoredDetections:
     truth = read_detection_truth(folder)
     good = [DetectedBox(image.image_id, image.box_xywh, 0.9) for image in truth.images if image.box_xywh is not None]
@@ -288,8 +275,7 @@ def test_the_page_needs_nothing_from_outside_and_names_the_published_rows(
     folder, _ = dataset
     write_detection_report(folder, timed(scored_dataset(folder)), tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    page = Page()
-    page.feed(text)
+    page = ParsedPage(text)
     assert all(reference.startswith(("#", "data:image/jpeg;base64,")) for reference in page.references)
     assert "script" not in page.tags and "<i>poor" not in text
     without_pictures = re.sub(r"data:image/jpeg;base64,[\w+/=]+", "", text)

@@ -1,6 +1,5 @@
 import re
 import xml.etree.ElementTree as ElementTree
-from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,43 +17,10 @@ from droguekit.benchmark.report.label_drawing import contact_tiles, label_pictur
 from droguekit.benchmark.report.number_text import distance_text, percent, plain_number, three_digits
 from droguekit.benchmark.report.pose_report import result_sentences, stage_times_table, write_report
 from droguekit.benchmark.results.benchmark_result import BenchmarkResult
+from tests.support.parsed_page import ParsedPage
 
 DatasetFixture = tuple[Path, list[PairRecord]]
 METHODS = {"joint": 1.0, "paper": 6.0, "circle-fit": 4.0}
-
-# Elements that HTML allows to stay open.
-VOID = {"meta", "img", "link", "br", "hr"}
-
-
-class Page(HTMLParser):
-    """Collects ids and references, and checks that elements nest."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.ids: list[str] = []
-        self.references: list[str] = []
-        self.tags: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        if tag not in VOID:
-            self.open.append(tag)
-        self._look(attrs)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self._look(attrs)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def _look(self, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if name == "id":
-                self.ids.append(value or "")
-            if name in ("src", "href", "action", "data", "poster"):
-                self.references.append(value or "")
 
 
 @pytest.fixture
@@ -70,9 +36,8 @@ def scored(
 def test_the_page_needs_nothing_from_outside(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
     write_report(*scored, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    page = Page()
-    page.feed(text)
-    assert page.open == []
+    page = ParsedPage(text)
+    assert page.open_tags == []
     assert all(reference.startswith(("#", "data:image/jpeg;base64,")) for reference in page.references)
     without_pictures = re.sub(r"data:image/jpeg;base64,[\w+/=]+", "", text)
     assert not re.search(r"https?:|//[a-z]|@import|url\((?!#)", without_pictures)
@@ -135,9 +100,8 @@ def test_names_from_files_cannot_break_the_page(
     estimates = tmp_path / "estimates.jsonl"
     write_estimates(estimates, build.estimates(records, {'<b>&"method': 1.0}, rng))
     write_report(folder, estimates, run_benchmark(folder, estimates), tmp_path / "report.html")
-    page = Page()
-    page.feed((tmp_path / "report.html").read_text(encoding="utf-8"))
-    assert page.open == []
+    page = ParsedPage((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert page.open_tags == []
     assert "b" not in page.tags
 
 

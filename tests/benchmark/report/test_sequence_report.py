@@ -6,7 +6,6 @@ import json
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,6 +28,7 @@ from droguekit.benchmark.results.sequence_result import SequencesResult
 from droguekit.benchmark.sequences.sequence_truth import true_sequences, true_state
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
+from tests.support.parsed_page import ParsedPage
 
 COUNT = 50
 HIDDEN = (20, 21, 22)
@@ -102,17 +102,9 @@ def scored(
     return flown[0], estimates, run_benchmark(flown[0], estimates)
 
 
-class Page(HTMLParser):
-    """Collects the ids."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.ids: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        # Keys of the legends are alike, and so are their ids.
-        self.ids += [value for name, value in attrs if name == "id" and value and not value.startswith("key-")]
+def ids_without_keys(text: str) -> list[str]:
+    """Ids of a page; keys of the legends are alike, and so are their ids."""
+    return [each for each in ParsedPage(text).ids if not each.startswith("key-")]
 
 
 def test_the_numbers_are_those_that_went_in(scored: tuple[Path, Path, BenchmarkResult]) -> None:
@@ -251,14 +243,14 @@ def test_nothing_is_told_of_plain_estimates_nor_of_single_pairs(
         result = run_benchmark(folder, file)
         assert "sequences" not in json.loads(result.to_json())
     write_report(folder, file, result, page)
-    assert "sequences" not in Page(page.read_text(encoding="utf-8")).ids
+    assert "sequences" not in ParsedPage(page.read_text(encoding="utf-8")).ids
 
 
 def test_the_page_shows_every_part(scored: tuple[Path, Path, BenchmarkResult], tmp_path: Path) -> None:
     folder, estimates, result = scored
     write_report(folder, estimates, result, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    ids = Page(text).ids
+    ids = ids_without_keys(text)
     assert len(ids) == len(set(ids))
     parts = {"sequences", "tracking", "hiding", "filter", "docking", "real-time"}
     tables = {"overlap", "sources", "losses", "hiding", "motion", "motion-nees", "lag", "raw", "mouth", "miss"}
@@ -320,11 +312,11 @@ def test_files_of_boxes_of_sequences_are_scored_as_trackers(
     assert part.sequences is not None and part.sequences.both.overlap is not None
     assert (part.sequences.both.overlap.n, part.sequences.both.hidden) == (2 * COUNT, 0)
     write_detection_report(folder, scored, tmp_path / "report.html")
-    ids = Page((tmp_path / "report.html").read_text(encoding="utf-8")).ids
+    ids = ids_without_keys((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert {"tracking", "table-overlap", "table-losses"} <= set(ids)
     assert len(ids) == len(set(ids))
 
     single = score_detections(read_detection_truth(dataset[0]), {"flow": DetectorOutput(boxes[:2])})
     assert "sequences" not in json.loads(single.result.to_json())["detectors"]["flow"]
     write_detection_report(dataset[0], single, tmp_path / "single.html")
-    assert "tracking" not in Page((tmp_path / "single.html").read_text(encoding="utf-8")).ids
+    assert "tracking" not in ParsedPage((tmp_path / "single.html").read_text(encoding="utf-8")).ids

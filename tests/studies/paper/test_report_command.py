@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from html import unescape
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Literal
 
@@ -20,35 +19,9 @@ from droguekit.benchmark.results.detection_result import (
 )
 from droguekit.cli.main import COMMANDS, DONE, WRONG_INPUT, load_command, run
 from studies.paper.paper_report import ReportInputs, missing_parts
+from tests.support.parsed_page import ParsedPage
 
 WriteEstimates = Callable[..., Path]
-VOID = {"meta", "img", "link", "br", "hr"}
-
-
-class Page(HTMLParser):
-    """Checks that elements nest, and collects ids and references."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.ids: list[str] = []
-        self.tags: set[str] = set()
-        self.references: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.handle_startendtag(tag, attrs)
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        self.ids += [value or "" for name, value in attrs if name == "id"]
-        self.references += [value or "" for name, value in attrs if name in ("src", "href")]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
 
 
 @pytest.fixture(scope="module")
@@ -75,9 +48,9 @@ def whole_page(
 
 
 def test_the_page_needs_nothing_from_outside_and_is_well_formed(whole_page: str) -> None:
-    page = Page(whole_page)
-    assert page.open == []
-    assert not page.tags & {"script", "link", "iframe", "object"}
+    page = ParsedPage(whole_page)
+    assert page.open_tags == []
+    assert not set(page.tags) & {"script", "link", "iframe", "object"}
     assert len(page.ids) == len(set(page.ids))
     assert all(reference.startswith(("#", "data:image/jpeg;base64,")) for reference in page.references)
     assert {reference[1:] for reference in page.references if reference.startswith("#")} <= set(page.ids)
@@ -133,8 +106,8 @@ def test_names_of_files_cannot_break_the_page(bench: Path, estimates_of: WriteEs
     hostile = tmp_path / "<b>&'x'.jsonl"
     estimates_of(bench, {"paper": (0, 0, 1e-4)}).rename(hostile)
     assert run(["report", "--semi-physical", f"{bench}:{hostile}", "--html", str(tmp_path / "r.html")]) == DONE
-    page = Page((tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert page.open == [] and "b" not in page.tags
+    page = ParsedPage((tmp_path / "r.html").read_text(encoding="utf-8"))
+    assert page.open_tags == [] and "b" not in page.tags
 
 
 def test_commands_that_are_told_exist() -> None:
