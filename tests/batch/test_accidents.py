@@ -10,9 +10,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO
 
 import pytest
 
@@ -161,9 +161,18 @@ def waiting_run(
     return start
 
 
-def await_line(stream: IO[str], beginning: str) -> None:
-    """Read until a line begins so; on a slow machine lines of progress come before it."""
-    assert any(line.startswith(beginning) for line in stream)
+def await_line(process: subprocess.Popen[str], beginning: str) -> None:
+    """Read errors until a line begins so; on a slow machine lines of progress come before it.
+
+    A run that never prints the line is killed after two minutes, and so fails instead of hanging.
+    """
+    assert process.stderr is not None
+    deadline = threading.Timer(120.0, process.kill)
+    deadline.start()
+    try:
+        assert any(line.startswith(beginning) for line in process.stderr)
+    finally:
+        deadline.cancel()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -178,7 +187,7 @@ def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
     with waiting_run() as process:
         assert process.stderr is not None
         process.send_signal(number)
-        await_line(process.stderr, "stopping after the running frames (1)")
+        await_line(process, "stopping after the running frames (1)")
         (tmp_path / "go-on").write_text("")
         told = process.stderr.read().splitlines()
     assert process.returncode == INTERRUPTED
@@ -199,7 +208,7 @@ def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
     with waiting_run() as process:
         assert process.stderr is not None
         process.send_signal(signal.SIGINT)
-        await_line(process.stderr, "stopping after ")
+        await_line(process, "stopping after ")
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()
     assert process.returncode == INTERRUPTED
