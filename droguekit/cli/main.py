@@ -74,7 +74,7 @@ def load_command(name: str) -> Any:
     if name not in COMMANDS:
         return None
     chosen = COMMANDS[name]
-    if chosen.module.startswith(_STUDIES):
+    if chosen.module.startswith(_STUDIES) and str(_REPOSITORY) not in sys.path:
         sys.path.append(str(_REPOSITORY))
     try:
         module = importlib.import_module(chosen.module)

@@ -118,3 +118,21 @@ def test_installed_clean_the_command_answers(installed: Path) -> None:
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert run_installed(installed, code, "--version").strip() == f"droguekit {project['version']}"
     assert "render" in run_installed(installed, code, "--help")
+
+
+def test_installed_clean_the_report_says_that_it_needs_a_clone(installed: Path) -> None:
+    code = "import sys; from droguekit.cli.main import run; print(run(['report', '--help']))"
+    paths = os.pathsep.join([str(installed), sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
+    result = subprocess.run(
+        [sys.executable, "-S", "-P", "-c", code],
+        cwd=installed.parent,
+        env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.stdout.strip() == "2"
+    assert (
+        result.stderr
+        == "droguekit: error: report: is no part of the installed package; run it in a clone of the repository\n"
+    )
