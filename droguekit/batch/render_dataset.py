@@ -28,7 +28,7 @@ from droguekit.batch.recipe_plan import frame_timeout_s
 from droguekit.batch.resume import check_frames, finish_frames, open_dataset
 from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerLimits, is_accident, run_tasks
-from labelgen.export.coco import write_annotations
+from labelgen.export.annotations.coco import write_annotations
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 

@@ -35,38 +35,43 @@ class ExportFormat:
 
 FORMATS: dict[str, ExportFormat] = {
     "coco": ExportFormat(
-        "drogue, markers and hub: boxes, run-length masks, keypoints; a file a split", "labelgen.export.coco:write_coco"
+        "drogue, markers and hub: boxes, run-length masks, keypoints; a file a split",
+        "labelgen.export.annotations.coco:write_coco",
     ),
     "yolo": ExportFormat(
-        "ultralytics pose: box and keypoints in the drogue's order", "labelgen.export.yolo:write_yolo"
+        "ultralytics pose: box and keypoints in the drogue's order", "labelgen.export.annotations.yolo:write_yolo"
     ),
     "yolo-image-order": ExportFormat(
         "ultralytics pose with keypoints as they stand in the image, for training on even rings",
-        "labelgen.export.yolo:write_yolo_image_order",
+        "labelgen.export.annotations.yolo:write_yolo_image_order",
     ),
     "yolo-detect": ExportFormat(
-        "ultralytics boxes of drogue, markers and hub", "labelgen.export.yolo:write_yolo_detect"
+        "ultralytics boxes of drogue, markers and hub", "labelgen.export.annotations.yolo:write_yolo_detect"
     ),
-    "speed": ExportFormat("SPEED+ pose lists and camera, a folder an eye", "labelgen.export.pose_lists:write_speed"),
-    "kitti": ExportFormat("KITTI calibration, boxes and images", "labelgen.export.kitti:write_kitti"),
+    "speed": ExportFormat(
+        "SPEED+ pose lists and camera, a folder an eye", "labelgen.export.poses.pose_lists:write_speed"
+    ),
+    "kitti": ExportFormat("KITTI calibration, boxes and images", "labelgen.export.poses.kitti:write_kitti"),
     "webdataset": ExportFormat(
-        "tar shards of images, part ids and records", "labelgen.export.tar_shards:write_webdataset"
+        "tar shards of images, part ids and records", "labelgen.export.packages.tar_shards:write_webdataset"
     ),
-    "parquet": ExportFormat("one table, a row a view", "labelgen.export.parquet:write_parquet", "exports"),
+    "parquet": ExportFormat("one table, a row a view", "labelgen.export.packages.parquet:write_parquet", "exports"),
     "rosbag": ExportFormat(
-        "ROS 2 bags (MCAP): images, CameraInfo, TF, true pose", "labelgen.export.rosbag:write_rosbag", "exports"
+        "ROS 2 bags (MCAP): images, CameraInfo, TF, true pose", "labelgen.export.poses.rosbag:write_rosbag", "exports"
     ),
-    "tum": ExportFormat("true trajectories as TUM text", "labelgen.export.pose_lists:write_tum"),
+    "tum": ExportFormat("true trajectories as TUM text", "labelgen.export.poses.pose_lists:write_tum"),
     "bop": ExportFormat(
-        "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.bop:write_bop"
+        "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.poses.bop:write_bop"
     ),
-    "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.mask_images:write_masks"),
-    "opencv": ExportFormat("the rig as OpenCV's stereo YAML", "labelgen.export.calibration_export:write_opencv"),
-    "kalibr": ExportFormat("the rig as Kalibr's camera chain", "labelgen.export.calibration_export:write_kalibr"),
+    "masks": ExportFormat("a PNG mask a part, seen and amodal", "labelgen.export.annotations.mask_images:write_masks"),
+    "opencv": ExportFormat("the rig as OpenCV's stereo YAML", "labelgen.export.poses.calibration_export:write_opencv"),
+    "kalibr": ExportFormat("the rig as Kalibr's camera chain", "labelgen.export.poses.calibration_export:write_kalibr"),
     "ros-camera-info": ExportFormat(
-        "the rig as ROS camera_info, a file an eye", "labelgen.export.calibration_export:write_camera_info"
+        "the rig as ROS camera_info, a file an eye", "labelgen.export.poses.calibration_export:write_camera_info"
     ),
-    "blind": ExportFormat("images, rig and drogue without any truth", "labelgen.export.blind_export:write_blind"),
+    "blind": ExportFormat(
+        "images, rig and drogue without any truth", "labelgen.export.packages.blind_export:write_blind"
+    ),
 }
 
 

@@ -23,7 +23,7 @@ from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part, drogue_part_ids
 from geometry.stereo import EYES, Eye
-from labelgen.export.coco import DROGUE, coco_image_id
+from labelgen.export.annotations.coco import DROGUE, coco_image_id
 from labelgen.export.keypoints import view_of
 from labelgen.part_pixels import FeaturePixels
 from labelgen.validation.label_checks import check_feature_pixels, named_features

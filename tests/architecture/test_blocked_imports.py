@@ -68,7 +68,7 @@ def test_modules_import_without_renderer_meshes_and_torch(module: str, tmp_path:
 
 
 @pytest.mark.parametrize(
-    "module", ["labelgen.frame_labels", "labelgen.validation.dataset_checks", "labelgen.export.coco"]
+    "module", ["labelgen.frame_labels", "labelgen.validation.dataset_checks", "labelgen.export.annotations.coco"]
 )
 def test_labels_import_without_renderer(module: str, tmp_path: Path) -> None:
     result = run_blocked(f"import {module}", [], tmp_path, RENDERERS)

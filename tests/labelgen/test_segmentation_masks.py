@@ -10,8 +10,8 @@ from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 from labelgen.disc_images import marker_discs
+from labelgen.export.annotations.mask_images import write_masks
 from labelgen.export.export_log import ExportLog
-from labelgen.export.mask_images import write_masks
 from labelgen.frame_labels import label_frame
 from labelgen.part_pixels import parts_mask
 from labelgen.segmentation_masks import OCCLUDERS, amodal_masks, named_parts, part_triangles, silhouette, union_of_masks

@@ -19,7 +19,7 @@ from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import Eye
-from labelgen.export.coco import write_annotations
+from labelgen.export.annotations.coco import write_annotations
 from labelgen.frame_labels import label_frame
 from render.camera.sensor import expose
 from render.engine import EyeRadiance, StereoRadiance

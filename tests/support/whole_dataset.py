@@ -9,7 +9,7 @@ from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import write_frame
 from droguekit.batch.frame_task import make_frame
-from labelgen.export.coco import write_annotations
+from labelgen.export.annotations.coco import write_annotations
 from render.engine import load_engine
 
 RECIPE = """

@@ -132,7 +132,7 @@ def test_unknown_formats_and_the_dataset_itself_are_refused(mixed_dataset, tmp_p
 def test_a_missing_package_is_named_with_its_extra(mixed_dataset, tmp_path, monkeypatch):
     # None in sys.modules makes an import fail as a package does that is not installed.
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.delitem(sys.modules, "labelgen.export.parquet", raising=False)
+    monkeypatch.delitem(sys.modules, "labelgen.export.packages.parquet", raising=False)
     with pytest.raises(ValueError, match=r"parquet: pyarrow is missing: pip install 'droguekit\[exports\]'"):
         write_export("parquet", mixed_dataset, tmp_path, ExportLog())
 

@@ -21,7 +21,7 @@ from datasets_manifest.storage.storage import Location
 from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox
 from geometry.stereo import EYES, Eye
-from labelgen.export.coco import coco_image_id
+from labelgen.export.annotations.coco import coco_image_id
 from labelgen.export.export_log import ExportLog
 from labelgen.export.keypoints import view_of
 

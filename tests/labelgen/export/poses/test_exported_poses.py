@@ -16,7 +16,7 @@ from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
-from labelgen.export.kitti import kitti_label
+from labelgen.export.poses.kitti import kitti_label
 from labelgen.part_pixels import drogue_hull_m
 
 

@@ -17,7 +17,7 @@ from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
-from labelgen.export.coco import HUB, MARKER, coco_annotation, coco_features, read_part_ids
+from labelgen.export.annotations.coco import HUB, MARKER, coco_annotation, coco_features, read_part_ids
 from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import export_image
 from labelgen.export.keypoints import (

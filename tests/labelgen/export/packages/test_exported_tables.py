@@ -16,7 +16,7 @@ from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
-from labelgen.export.tar_shards import write_webdataset
+from labelgen.export.packages.tar_shards import write_webdataset
 
 
 def read_shards(folder: Path) -> list[dict]:

@@ -19,7 +19,7 @@ from datasets_manifest.storage.writer import leftovers
 from geometry.se3 import RigidTransform
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
-from labelgen.export.rosbag import POSE_TOPIC, camera_info_topic, image_topic
+from labelgen.export.poses.rosbag import POSE_TOPIC, camera_info_topic, image_topic
 
 Messages = dict[str, list[tuple[int, Any]]]
 

@@ -9,7 +9,7 @@ from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
 from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
 from geometry.stereo import EYES
-from labelgen.export.coco import coco_annotation, coco_image_id, write_annotations
+from labelgen.export.annotations.coco import coco_annotation, coco_image_id, write_annotations
 from labelgen.export.keypoints import clockwise_order
 
 

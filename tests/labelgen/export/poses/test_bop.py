@@ -12,8 +12,8 @@ from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES
-from labelgen.export.bop import depth_numbers, write_bop
 from labelgen.export.export_log import ExportLog
+from labelgen.export.poses.bop import depth_numbers, write_bop
 from render.exr_writer import encode_passes
 
 SPLITS = ("train", "val", "test")

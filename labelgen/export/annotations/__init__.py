@@ -1,0 +1,1 @@
+"""Boxes, masks and keypoints for detectors and annotation tools."""

@@ -1,0 +1,1 @@
+"""True poses for pose estimators, robots and trajectories."""
