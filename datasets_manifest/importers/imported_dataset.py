@@ -123,12 +123,12 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
         ValueError: an image that cannot be read, or of another size, depth or colour than rig and first pair.
         OSError: it cannot be written; nothing is left behind.
     """
-    depth: _Depth | None = None
+    depth: PixelDepth | None = None
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     with new_folder(out) as folder:
         for frame_index, pair in enumerate(source):
-            depth = depth or _Depth(pair, settings.bits)
+            depth = depth or PixelDepth(pair, settings.bits)
             target = frame_folder(folder, frame_index)
             target.mkdir(parents=True)
             for eye, name, image in zip(EYES, pair.names, (pair.left, pair.right), strict=True):
@@ -155,7 +155,7 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
     return len(annotations)
 
 
-class _Depth:
+class PixelDepth:
     """Colour and depth of all images, taken from the first pair."""
 
     def __init__(self, pair: ImportedPair, bits: int | None) -> None:
@@ -167,6 +167,10 @@ class _Depth:
             raise ValueError(f"{pair.names[0]}: has 8 bits; leave the number of bits out")
         is_deep = max(int(pair.left.max()), int(pair.right.max())) >= 2**_KEPT_BITS
         self._bits = bits or (_DEEPEST_BITS if is_deep else _KEPT_BITS)
+
+    def encoding(self, given: Literal["linear", "gamma"] | None) -> Literal["linear", "gamma"]:
+        """The encoding of the pixel values; unless it is given, `gamma` for 8 bits and `linear` for more."""
+        return given or ("gamma" if self.output_bits == 8 else "linear")
 
     def kept_level_dn(self, level_dn: float) -> float:
         """A pixel value of the source as a pixel value of the stored images.
@@ -209,10 +213,10 @@ def _record(pair: ImportedPair, settings: ImportSettings, black_level_dn: float)
     }
 
 
-def _index(settings: ImportSettings, depth: _Depth, count: int) -> BlindIndex:
+def _index(settings: ImportSettings, depth: PixelDepth, count: int) -> BlindIndex:
     """The blind index; electrons and noise are those of a usual sensor, as the real ones are unknown."""
     usual = SENSORS["rgb-ideal"].model_dump()
-    encoding = settings.encoding or ("gamma" if depth.output_bits == 8 else "linear")
+    encoding = depth.encoding(settings.encoding)
     sensor = Sensor.model_validate(
         {**usual, "name": "imported", "color": depth.color, "output_bits": depth.output_bits, "encoding": encoding}
     )

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
@@ -16,20 +14,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from datasets_manifest.calibration.stereo_calibration import StereoCalibration
 from datasets_manifest.importers.imported_dataset import ImportedPair
-from datasets_manifest.types.images import Pixels
+from datasets_manifest.importers.ros_images import decode_image, message_stamp_ns
 from geometry.se3 import Array
 from geometry.stereo import EYES
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-# Bayer patterns by their first two pixels; OpenCV names them by the second row's second and third.
-_BAYER = {
-    "bayer_rggb": cv2.COLOR_BayerBG2RGB,
-    "bayer_bggr": cv2.COLOR_BayerRG2RGB,
-    "bayer_gbrg": cv2.COLOR_BayerGR2RGB,
-    "bayer_grbg": cv2.COLOR_BayerGB2RGB,
-}
-_CHANNELS = {"rgb": 3, "bgr": 3, "rgba": 4, "bgra": 4, "mono": 1}
 # Distortion models of sensor_msgs/CameraInfo that are Brown-Conrady's.
 _MODELS = ("plumb_bob", "")
 
@@ -60,7 +50,7 @@ class RosBag:
                     raise ValueError(f"{path}: has no images on {topic}; there are {_image_topics(reader)}")
             stamps: dict[str, set[int]] = {topic: set() for topic in self._topics}
             for connection, _, message in _messages(reader, self._topics, path):
-                stamp_ns = _stamp_ns(message)
+                stamp_ns = message_stamp_ns(message)
                 if stamp_ns in stamps[connection.topic]:
                     raise ValueError(
                         f"{path}: {connection.topic} has two images stamped {stamp_ns} ns, which cannot be paired"
@@ -82,7 +72,7 @@ class RosBag:
         waiting: dict[int, dict[str, Any]] = {}
         with self._open() as reader:
             for connection, _, message in _messages(reader, self._topics, self._path):
-                stamp_ns = _stamp_ns(message)
+                stamp_ns = message_stamp_ns(message)
                 if stamp_ns not in self._both:
                     continue
                 views = waiting.setdefault(stamp_ns, {})
@@ -131,44 +121,6 @@ class RosBag:
             reader.close()
 
 
-def decode_image(message: Any, name: str) -> Pixels:
-    """The pixels of an Image or CompressedImage: (H, W, 3) red, green, blue, or (H, W) grey.
-
-    Raises:
-        ValueError: an encoding that is not known, or data of another length; names the image.
-    """
-    if hasattr(message, "format"):
-        return _decompressed(message, name)
-    found = re.fullmatch(r"(bayer_[a-z]{4}|[a-z]+)(8|16)", message.encoding)
-    channels = None if found is None else 1 if found[1] in _BAYER else _CHANNELS.get(found[1])
-    if found is None or channels is None:
-        raise ValueError(
-            f"{name}: encoding {message.encoding!r} is not read; use rgb8, bgr8, mono8, bayer_rggb8 or the like"
-        )
-    kind, dtype = found[1], np.dtype(f"{'>' if message.is_bigendian else '<'}u{int(found[2]) // 8}")
-    row_bytes = message.width * channels * dtype.itemsize
-    if not row_bytes or message.step < row_bytes or len(message.data) != message.step * message.height:
-        raise ValueError(f"{name}: {len(message.data)} bytes are not an image of {message.width}x{message.height}")
-    rows = np.asarray(message.data).reshape(message.height, message.step)[:, :row_bytes]
-    values = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="))
-    image = values.reshape(message.height, message.width, channels)
-    if kind in _BAYER:
-        return np.asarray(cv2.cvtColor(image, _BAYER[kind]))
-    if channels == 1:
-        return np.ascontiguousarray(image[:, :, 0])
-    return np.ascontiguousarray(image[:, :, 2::-1] if kind.startswith("bgr") else image[:, :, :3])
-
-
-def _decompressed(message: Any, name: str) -> Pixels:
-    try:
-        image = cv2.imdecode(np.asarray(message.data), cv2.IMREAD_UNCHANGED) if len(message.data) else None
-    except cv2.error as error:
-        raise ValueError(f"{name}: {' '.join(str(error).split())[:200]}") from error
-    if image is None or image.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"{name}: is truncated, or not a compressed image of 8 or 16 bits")
-    return np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, 2::-1])
-
-
 def _messages(reader: AnyReader, topics: tuple[str, ...], path: Path) -> Iterator[tuple[Connection, int, Any]]:
     """Decoded messages of some topics; errors of the reader on damaged bags become a ValueError of one line."""
     connections = [connection for connection in reader.connections if connection.topic in topics]
@@ -181,11 +133,6 @@ def _messages(reader: AnyReader, topics: tuple[str, ...], path: Path) -> Iterato
         raise
     except Exception as error:
         raise ValueError(f"{path}: is damaged: {type(error).__name__}: {error}") from error
-
-
-def _stamp_ns(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def _image_topics(reader: AnyReader) -> str:
