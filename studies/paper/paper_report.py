@@ -20,8 +20,25 @@ from droguekit.benchmark.report.html_page import RowGroup, Table, page_template
 from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
 from droguekit.benchmark.results.detection_result import DetectionResult
 from droguekit.benchmark.sequences.sequence_latency import processing_time_s
-from studies.paper.corpus_figures import CorpusBoxes, place_panel, read_corpus, shape_panel, size_panel
 from studies.paper.docking_experiment import DockingData, DockingRun, read_docking
+from studies.paper.paper_figures import (
+    AXES,
+    PITCH,
+    YAW,
+    CorpusBoxes,
+    X,
+    Y,
+    Z,
+    error_series,
+    length_series,
+    measured_panel,
+    place_panel,
+    read_corpus,
+    shape_panel,
+    size_panel,
+    station_panel,
+    truth_series,
+)
 from studies.paper.paper_inputs import code_facts, dataset_facts, file_sha256
 from studies.paper.paper_tables import (
     Claim,
@@ -32,19 +49,6 @@ from studies.paper.paper_tables import (
     semi_physical_claims,
     table_1,
     table_2,
-)
-from studies.paper.pose_figures import (
-    AXES,
-    PITCH,
-    YAW,
-    X,
-    Y,
-    Z,
-    error_series,
-    length_series,
-    measured_panel,
-    station_panel,
-    truth_series,
 )
 from studies.paper.published_results import (
     CONTRADICTION,

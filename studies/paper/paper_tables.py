@@ -16,7 +16,7 @@ from droguekit.benchmark.results.benchmark_result import MethodResult, PoseRow
 from droguekit.benchmark.results.detection_result import DetectionResult, DetectorResult
 from geometry.se3 import Array
 from studies.paper.docking_experiment import LEAST_MARKERS, DockingData, frames_in_view, subset_scores
-from studies.paper.pose_figures import published_row
+from studies.paper.paper_figures import published_row
 from studies.paper.published_results import (
     ANGLE_LIMIT_DEG,
     DETECTION_FPS,

@@ -10,9 +10,18 @@ import numpy as np
 import pytest
 
 from datasets_manifest.storage.reader import Dataset
-from studies.paper.corpus_figures import CorpusBoxes, place_panel, shape_panel, size_panel
 from studies.paper.docking_experiment import DockingRun
-from studies.paper.pose_figures import PITCH, X, error_series, length_series, truth_series
+from studies.paper.paper_figures import (
+    PITCH,
+    CorpusBoxes,
+    X,
+    error_series,
+    length_series,
+    place_panel,
+    shape_panel,
+    size_panel,
+    truth_series,
+)
 from studies.paper.published_results import CONTENDERS, present, style_of
 
 METHODS = present(["joint-hub", "paper"])

@@ -25,6 +25,12 @@ from droguekit.cli.main import DONE, run
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.detector.onnx_detector import OnnxDetector
+from studies.detector_comparison.__main__ import (
+    PEERS,
+    ComparisonOptions,
+    compare_peers,
+    comparison_lines,
+)
 from studies.detector_comparison.ablation import (
     CHANGES,
     ONE_VIEW,
@@ -35,13 +41,7 @@ from studies.detector_comparison.ablation import (
     measured_networks,
 )
 from studies.detector_comparison.options import input_size_px
-from studies.detector_comparison.yolo_comparison import (
-    PEERS,
-    ComparisonOptions,
-    compare_peers,
-    comparison_lines,
-)
-from studies.detector_comparison.yolo_training import (
+from studies.detector_comparison.yolo import (
     check_corpus,
     export_corpus,
     run_script,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from studies.render_cost.comparison import CYCLES, MITSUBA, OWN, read_station, table_lines, write_station
+from studies.render_cost.__main__ import CYCLES, MITSUBA, OWN, read_station, table_lines, write_station
 from studies.render_cost.noise_search import MeasuredView, frame_at, recipe_at
 
 
