@@ -51,6 +51,13 @@ PEERS = ("yolov8s", "yolov8n")
 _TIMED_PAIRS = 4
 # Options that may change when a comparison is resumed, because they do not change what is trained.
 _FREE_TO_CHANGE = ("ours", "threads", "rounds", "device", "environment")
+_EXAMPLES = """Examples:
+
+  python -m studies.detector_comparison --corpus data/detector-small --ours out/detector/detector.onnx
+
+  python -m studies.detector_comparison --corpus data/detector-train --test data/detector-test --image-passes 8000
+
+  python -m studies.detector_comparison --corpus data/demo --image-passes 0"""
 
 Say = Callable[[str], None]
 
@@ -280,15 +287,6 @@ def comparison_lines(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 def _share(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.2f} %"
-
-
-_EXAMPLES = """Examples:
-
-  python -m studies.detector_comparison --corpus data/detector-small --ours out/detector/detector.onnx
-
-  python -m studies.detector_comparison --corpus data/detector-train --test data/detector-test --image-passes 8000
-
-  python -m studies.detector_comparison --corpus data/demo --image-passes 0"""
 
 
 def main(

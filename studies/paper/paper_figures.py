@@ -37,6 +37,17 @@ from studies.paper.semi_physical import SemiPhysicalRun, StationErrors
 _COLOR = "#1f78c8"
 _CELLS_ACROSS = 24
 _SIZE_BARS = 20
+# Size of a panel over the image number. [in]
+_SERIES_IN = (4.4, 2.7)
+
+# A few outliers would flatten the curves: where the largest error is that much larger than the 99th percentile, the
+# panel ends there and the errors beyond are counted.
+_NEARLY_ALL_PERCENTILE = 99.0
+_FAR_LARGER = 4.0
+
+# About how many poses of a line have its marker, and how many lines alternate their markers.
+_MARKS = 12
+_ORDERS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,18 +195,6 @@ def _draw_cells(axes: Axes, points: Array, edges: Sequence[Array]) -> None:
     axes.grid(True, color=INK, alpha=0.15, linewidth=0.6)
 
 
-_PANEL_IN = (4.4, 2.7)
-
-# A few outliers would flatten the curves: where the largest error is that much larger than the 99th percentile, the
-# panel ends there and the errors beyond are counted.
-_NEARLY_ALL_PERCENTILE = 99.0
-_FAR_LARGER = 4.0
-
-# About how many poses of a line have its marker, and how many lines alternate their markers.
-_MARKS = 12
-_ORDERS = 4
-
-
 class SeriesQuantity(NamedTuple):
     """A component of the pose.
 
@@ -236,7 +235,7 @@ def error_series(figure_name: str, run: DockingRun, contenders: Sequence[Contend
     Returns:
         An `<svg>` element.
     """
-    with drawing(_PANEL_IN) as (figure, axes):
+    with drawing(_SERIES_IN) as (figure, axes):
         shown = [run.errors[contender.method][:, quantity.column] * quantity.scale for contender in contenders]
         reach = _reach(shown)
         outside = sum(int(np.count_nonzero(np.abs(values) > reach)) for values in shown)
@@ -259,7 +258,7 @@ def truth_series(figure_name: str, run: DockingRun, contenders: Sequence[Contend
     Returns:
         An `<svg>` element.
     """
-    with drawing(_PANEL_IN) as (figure, axes):
+    with drawing(_SERIES_IN) as (figure, axes):
         truth = run.truth[:, quantity.column]
         axes.plot(run.numbers, truth, color=INK, linewidth=7, alpha=0.2, solid_capstyle="round")
         # By the truth: a mistaken pose may lie anywhere.
@@ -282,7 +281,7 @@ def length_series(figure_name: str, run: DockingRun, contenders: Sequence[Conten
     Returns:
         An `<svg>` element.
     """
-    with drawing(_PANEL_IN) as (figure, axes):
+    with drawing(_SERIES_IN) as (figure, axes):
         for order, contender in enumerate(contenders):
             lengths = 1e3 * np.linalg.norm(run.errors[contender.method][:, :3], axis=1)
             _draw_series(axes, run, np.where(lengths > 0, lengths, np.nan), style_of(contender.method), order)
@@ -336,9 +335,7 @@ def _finish(axes: Axes, run: DockingRun, title: str) -> None:
     axes.set_xlim(run.numbers[0] - 0.5, run.numbers[-1] + 0.5)
     if axes.get_yscale() == "linear":
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
-    axes.grid(True, color=INK, alpha=0.15, linewidth=0.6)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    _grid(axes)
 
 
 Axis = Literal["x", "y", "z"]

@@ -41,6 +41,11 @@ from studies.render_cost.plain_renderers import measure_plain_cycles, measure_pl
 
 _PICTURES_FOR_NOISE = 4
 OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
+_EXAMPLES = """Examples:
+
+  python -m studies.render_cost
+
+  python -m studies.render_cost --station 10 --station 40 --full-samples 4"""
 
 
 def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEstimate, RenderCost, MeasuredView]:
@@ -157,13 +162,6 @@ def _cost(row: dict[str, Any]) -> str:
 
 def _ratio(row: dict[str, Any], own: dict[str, Any]) -> str:
     return f"{'at least ' if row['is_least'] else ''}{row['cpu_s'] / own['cpu_s']:.0f}"
-
-
-_EXAMPLES = """Examples:
-
-  python -m studies.render_cost
-
-  python -m studies.render_cost --station 10 --station 40 --full-samples 4"""
 
 
 def main(
