@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from datasets_manifest.importers.imported_dataset import VIEW_FOLDERS, ImportedPair, image_key
+from datasets_manifest.importers.coco_boxes import VIEW_FOLDERS, image_key
+from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.types.images import Pixels
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")

@@ -70,7 +70,8 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
         ValueError: images, calibration or boxes that cannot be used, or options that do not go with the source.
         OSError: the dataset cannot be written.
     """
-    from datasets_manifest.importers.imported_dataset import ImportSettings, read_boxes, write_imported
+    from datasets_manifest.importers.coco_boxes import read_boxes
+    from datasets_manifest.importers.imported_dataset import ImportSettings, write_imported
     from drogue_models.presets import load_drogue
 
     if _is_bag(source) and (options.rate_hz is not None or options.boxes is not None):

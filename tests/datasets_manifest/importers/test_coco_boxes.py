@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.importers.imported_dataset import boxes_of_pair, read_boxes
+from datasets_manifest.importers.coco_boxes import boxes_of_pair, read_boxes
 
 WIDTH = 100
 
