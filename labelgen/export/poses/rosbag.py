@@ -23,7 +23,9 @@ from datasets_manifest.atomic import new_folder
 from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
+from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.pixel_values import PIXEL_VALUES_TOPIC, PixelValues
 from datasets_manifest.types.records import PairRecord
 from geometry.body_axes import FLU_FROM_FRD
 from geometry.se3 import RigidTransform
@@ -42,6 +44,7 @@ _TOPICS = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
     POSE_TOPIC: "geometry_msgs/msg/PoseStamped",
+    PIXEL_VALUES_TOPIC: "std_msgs/msg/String",
 }
 
 # Message definitions of the oldest ROS 2 release that is still maintained; later ones read them.
@@ -53,7 +56,7 @@ _NEVER = QosTime(2147483647, 4294967295)
 
 
 def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """Write a bag for each sequence: images, CameraInfo, transforms, and the true pose of the drogue.
+    """Write a bag for each sequence: images, their meaning, CameraInfo, transforms, and the drogue's true pose.
 
     Args:
         dataset: folder.
@@ -104,6 +107,8 @@ class _Bag:
         rig, images = record.frame.rig, source.images(record.frame_index)
         moving = moving_transforms(rig, record.frame.world_from_left, record.left_from_drogue)
         self.write("/tf", transforms_message(moving, stamp_ns), stamp_ns)
+        values = message("std_msgs/msg/String", pixel_values(images, record.frame.sensor, stamp_ns).as_text())
+        self.write(PIXEL_VALUES_TOPIC, values, stamp_ns)
         for eye in EYES:
             self.write(camera_info_topic(eye), camera_info_message(rig, eye, stamp_ns), stamp_ns)
             self.write(image_topic(eye), image_message(images, eye, stamp_ns), stamp_ns)
@@ -172,6 +177,22 @@ def image_message(images: StereoImages, eye: Eye, stamp_ns: int) -> Any:
         int(sys.byteorder == "big"),
         data.nbytes // height,
         data.reshape(-1).view(np.uint8),
+    )
+
+
+def pixel_values(images: StereoImages, sensor: Sensor, stamp_ns: int) -> PixelValues:
+    """Meaning of the pixel values of a pair's Image messages: of the raw mosaic where there is one."""
+    encoding, black_level_dn = images.encoding, images.black_level_dn
+    if images.left_mosaic is not None and encoding != "linear":
+        # The record has the black level of the image on the sRGB curve; the mosaic is linear.
+        encoding = "linear"
+        black_level_dn = float(round(sensor.black_level_dn * 2.0 ** (sensor.output_bits - sensor.adc_bits)))
+    return PixelValues(
+        stamp_ns=stamp_ns,
+        encoding=encoding,
+        black_level_dn=black_level_dn,
+        bits=images.bits,
+        exposure_s=images.exposure_s,
     )
 
 

@@ -61,6 +61,35 @@ def test_images_and_times_are_the_datasets(bag: Messages, small_dataset: Path) -
             assert stamp_ns == log_time == round(source.record(frame_index).time_s * 1e9)
 
 
+@pytest.mark.parametrize(
+    ("preset", "more", "encoding", "bits", "black_level_dn"),
+    [
+        # The sensors' black level is 64 of 4096.
+        ("rgb-ideal", "", "linear", 8, 4),
+        ("mono", "output_bits = 12", "linear", 12, 64),
+        # On the sRGB curve, which begins at the black level, nothing but light gives a number.
+        ("mono", 'encoding = "gamma"', "gamma", 8, 0),
+        # The bag has the mosaic, which is linear.
+        ("paper-colour", 'encoding = "gamma"', "linear", 8, 4),
+    ],
+)
+def test_what_the_numbers_mean_stands_beside_every_pair(
+    preset: str, more: str, encoding: str, bits: int, black_level_dn: int, dataset_by_preset: Any, tmp_path: Path
+) -> None:
+    source = Dataset(dataset_by_preset(preset, more))
+    (folder,) = write_export("rosbag", source.path, tmp_path / "bags", ExportLog())
+    found = [json.loads(message.data) for _, message in read_bag(folder)["/stereo/pixel_values"]]
+    for index, values in zip(source.frame_indices, found, strict=True):
+        record = source.record(index)
+        assert values == {
+            "stamp_ns": round(record.time_s * 1e9),
+            "encoding": encoding,
+            "bits": bits,
+            "black_level_dn": black_level_dn,
+            "exposure_s": record.frame.exposure.time_s,
+        }
+
+
 def test_calibration_gives_the_baseline_and_both_eyes_the_left_frame(bag: Messages) -> None:
     left, right = (bag[camera_info_topic(eye)][0][1] for eye in ("left", "right"))
     assert left.header.frame_id == right.header.frame_id == "stereo_left_optical"
