@@ -16,7 +16,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
+from droguekit.scoring.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
 
 _HUB_RGB = (255, 120, 220)
 _TEXT_RGB = (255, 255, 255)

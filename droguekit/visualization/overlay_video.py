@@ -14,8 +14,8 @@ from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, rea
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
 from drogue_models.parameters import DrogueParameters
-from droguekit.benchmark.poses.pose_errors import estimates_by_method, pose_error
-from droguekit.benchmark.report.label_drawing import (
+from droguekit.scoring.poses.pose_errors import estimates_by_method, pose_error
+from droguekit.scoring.report.label_drawing import (
     Picture,
     Rgb,
     display_picture,

@@ -19,7 +19,7 @@ from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
 from drogue_models.tanker import tanker_mesh
-from droguekit.benchmark.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
+from droguekit.scoring.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
 from droguekit.visualization.video_file import check_video, evenly, period_s, write_video
 from geometry.se3 import Array, RigidTransform
 

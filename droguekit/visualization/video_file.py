@@ -11,7 +11,7 @@ from PIL import Image
 
 from datasets_manifest.atomic import part_path
 from datasets_manifest.types.records import PairRecord
-from droguekit.benchmark.report.label_drawing import Picture, resized
+from droguekit.scoring.report.label_drawing import Picture, resized
 
 _SUFFIXES = (".gif", ".mp4")
 _MOST_PICTURES = 2000

@@ -12,11 +12,11 @@ from datasets_manifest.storage.storage import Location, open_storage
 
 if TYPE_CHECKING:
     from droguekit.batch.progress import ProgressReport
-    from droguekit.benchmark.blind_check import BlindCheck
-    from droguekit.benchmark.detection.detection_scores import DetectorOutput
-    from droguekit.benchmark.detection.detector_runner import DetectorRunner
-    from droguekit.benchmark.results.benchmark_result import BenchmarkResult
-    from droguekit.benchmark.results.detection_result import DetectionResult
+    from droguekit.scoring.blind_check import BlindCheck
+    from droguekit.scoring.detection.detection_scores import DetectorOutput
+    from droguekit.scoring.detection.detector_runner import DetectorRunner
+    from droguekit.scoring.results.benchmark_result import BenchmarkResult
+    from droguekit.scoring.results.detection_result import DetectionResult
     from nav.detector.onnx_cost import NetworkCost
 
 
@@ -62,7 +62,7 @@ def benchmark_lines(
     if (estimates is not None) == wants_detections:
         raise ValueError("--estimates: give either estimates, or detections (--detections, --detector)")
     if estimates is None:
-        from droguekit.benchmark.detection.detection_tables import detector_lines
+        from droguekit.scoring.detection.detection_tables import detector_lines
 
         return detector_lines(benchmark_detections(dataset, options, json_out, html_out, report))
     if options.split is not None or options.threshold is not None:
@@ -82,7 +82,7 @@ def _error_lines(result: BenchmarkResult) -> Iterator[str]:
 
 
 def _blind_lines(check: BlindCheck) -> Iterator[str]:
-    from droguekit.benchmark.blind_check import COLUMNS, row_cells
+    from droguekit.scoring.blind_check import COLUMNS, row_cells
 
     yield f"{check.dataset.name} has no true poses: estimates are compared with their own measurements and with boxes"
     yield " ".join([f"{'method':<16}", *(f"{column:>16}" for column in COLUMNS)])
@@ -100,9 +100,9 @@ def benchmark_dataset(
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.benchmark.pose_benchmark import run_benchmark
-    from droguekit.benchmark.report.pose_report import write_report
     from droguekit.numerical_threads import one_thread
+    from droguekit.scoring.pose_benchmark import run_benchmark
+    from droguekit.scoring.report.pose_report import write_report
 
     with one_thread():
         result = run_benchmark(dataset, estimates)
@@ -121,8 +121,8 @@ def check_blind_dataset(dataset: Location, estimates: Path, json_out: Path | Non
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.benchmark.blind_check import check_blind, write_blind_report
     from droguekit.numerical_threads import one_thread
+    from droguekit.scoring.blind_check import check_blind, write_blind_report
 
     with one_thread():
         check = check_blind(dataset, estimates)
@@ -143,9 +143,9 @@ def benchmark_detections(
         OSError: a result cannot be written.
     """
     from datasets_manifest.atomic import write_text_atomic
-    from droguekit.benchmark.detection.detection_report import write_detection_report
-    from droguekit.benchmark.detection.detection_scores import score_detections, split_to_score
-    from droguekit.benchmark.detection.detection_truth import read_detection_truth
+    from droguekit.scoring.detection.detection_report import write_detection_report
+    from droguekit.scoring.detection.detection_scores import score_detections, split_to_score
+    from droguekit.scoring.detection.detection_truth import read_detection_truth
 
     if options.threshold is not None and not 0 <= options.threshold <= 1:
         raise ValueError(f"--threshold: must be from 0 to 1, got {options.threshold:g}")
@@ -163,9 +163,9 @@ def benchmark_detections(
 def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) -> dict[str, DetectorOutput]:
     """Boxes by their name in the report; all files are opened before the first detector runs."""
     from datasets_manifest.storage.blind import read_blind_index
-    from droguekit.benchmark.detection.detection_scores import DetectorOutput
-    from droguekit.benchmark.detection.detector_runner import DetectorRunner
-    from droguekit.benchmark.results.detection_result import image_id_of, read_detections
+    from droguekit.scoring.detection.detection_scores import DetectorOutput
+    from droguekit.scoring.detection.detector_runner import DetectorRunner
+    from droguekit.scoring.results.detection_result import image_id_of, read_detections
     from geometry.stereo import EYES
     from nav.detector.detector_registry import detector_factory
 
@@ -183,8 +183,8 @@ def _runs(dataset: Location, options: DetectionOptions, report: ProgressReport) 
 
 def _detector_run(name_or_file: str, detecting: DetectorRunner, report: ProgressReport) -> DetectorOutput:
     """Run a detector on all images."""
-    from droguekit.benchmark.detection.detection_scores import DetectorOutput
-    from droguekit.benchmark.detection.detector_runner import LEAST_SCORE
+    from droguekit.scoring.detection.detection_scores import DetectorOutput
+    from droguekit.scoring.detection.detector_runner import LEAST_SCORE
 
     report.say(f"{detecting.name}: detecting the drogue, without the truth")
     report.begin("pairs", detecting.pairs)

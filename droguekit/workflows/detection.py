@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from datasets_manifest.storage.storage import Location
     from droguekit.batch.progress import ProgressReport
-    from droguekit.benchmark.results.detection_result import DetectedBox, PairTimes
+    from droguekit.scoring.results.detection_result import DetectedBox, PairTimes
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ def detect_dataset(
         ValueError: no such dataset, detector or tracker, a score outside 0 to 1, or an image that cannot be read.
         OSError: the file cannot be written; it stays as it was.
     """
-    from droguekit.benchmark.detection.detector_runner import DetectorRunner
-    from droguekit.benchmark.results.detection_result import write_detections
+    from droguekit.scoring.detection.detector_runner import DetectorRunner
+    from droguekit.scoring.results.detection_result import write_detections
     from nav.detector.detector_registry import DEFAULT_DETECTOR, detector_factory
 
     if not 0 <= least_score <= 1:

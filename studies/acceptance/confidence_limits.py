@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.stats import beta, binom, norm, t
 
 from datasets_manifest.random_streams import named_generator
-from droguekit.benchmark.confidence_intervals import CONFIDENCE, RESAMPLES, rms_upper_limit
+from droguekit.scoring.confidence_intervals import CONFIDENCE, RESAMPLES, rms_upper_limit
 from geometry.se3 import Array
 
 ValueWithLimit = tuple[float, float]

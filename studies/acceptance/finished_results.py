@@ -11,7 +11,7 @@ from pathlib import Path
 from datasets_manifest.atomic import write_text_atomic
 
 _MAKE_RESULTS = {".py", ".onnx"}
-_ROOMS = ("geometry", "drogue_models", "nav", "studies.acceptance", "droguekit.benchmark")
+_ROOMS = ("geometry", "drogue_models", "nav", "studies.acceptance", "droguekit.scoring")
 
 
 def code_fingerprint(rooms: Sequence[str] = _ROOMS) -> str:

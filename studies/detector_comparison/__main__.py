@@ -19,8 +19,8 @@ import typer
 from datasets_manifest.atomic import try_lock, write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
-from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorRunner
-from droguekit.benchmark.results.detection_result import write_detections
+from droguekit.scoring.detection.detector_runner import LEAST_SCORE, DetectorRunner
+from droguekit.scoring.results.detection_result import write_detections
 from nav.detector.detector import Detector
 from nav.detector.onnx_cost import network_cost
 from nav.detector.onnx_detector import OnnxDetector

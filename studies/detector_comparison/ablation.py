@@ -16,10 +16,10 @@ import typer
 from datasets_manifest.atomic import write_text_atomic
 from datasets_manifest.storage.blind import BlindDataset, read_blind_index
 from datasets_manifest.types.images import StereoImages
-from droguekit.benchmark.detection.detection_metrics import Evaluation
-from droguekit.benchmark.detection.detection_tables import percent_text
-from droguekit.benchmark.detection.detection_truth import ImageTruth, read_detection_truth
-from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorRunner
+from droguekit.scoring.detection.detection_metrics import Evaluation
+from droguekit.scoring.detection.detection_tables import percent_text
+from droguekit.scoring.detection.detection_truth import ImageTruth, read_detection_truth
+from droguekit.scoring.detection.detector_runner import LEAST_SCORE, DetectorRunner
 from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, Detector, StereoDetection
 from nav.detector.input_image import input_image

@@ -16,8 +16,8 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import PoseEstimate, write_estimates
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.confidence_intervals import CONFIDENCE, Interval, ratio_intervals
-from droguekit.benchmark.poses.pose_errors import COMPONENTS, pose_error
+from droguekit.scoring.confidence_intervals import CONFIDENCE, Interval, ratio_intervals
+from droguekit.scoring.poses.pose_errors import COMPONENTS, pose_error
 from geometry.se3 import Array
 from nav.runner import navigate
 

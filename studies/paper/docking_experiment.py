@@ -13,11 +13,11 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from datasets_manifest.types.records import PairRecord, ViewRecord
-from droguekit.benchmark.confidence_intervals import Interval, bootstrap_intervals
-from droguekit.benchmark.pose_benchmark import score_methods
-from droguekit.benchmark.poses.drogue_truth import VISIBLE_FRACTION, drogue_truth
-from droguekit.benchmark.poses.pose_errors import pose_error
-from droguekit.benchmark.results.benchmark_result import BenchmarkResult, DatasetFacts
+from droguekit.scoring.confidence_intervals import Interval, bootstrap_intervals
+from droguekit.scoring.pose_benchmark import score_methods
+from droguekit.scoring.poses.drogue_truth import VISIBLE_FRACTION, drogue_truth
+from droguekit.scoring.poses.pose_errors import pose_error
+from droguekit.scoring.results.benchmark_result import BenchmarkResult, DatasetFacts
 from geometry.se3 import Array, RigidTransform
 from studies.paper.paper_inputs import ExperimentData, read_estimates_file
 

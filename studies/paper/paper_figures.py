@@ -18,8 +18,8 @@ from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.records import PixelBox
-from droguekit.benchmark.report.figures import INK, PANEL_IN, MethodStyle, drawing, svg_element
-from droguekit.benchmark.report.number_text import plain_number
+from droguekit.scoring.report.figures import INK, PANEL_IN, MethodStyle, drawing, svg_element
+from droguekit.scoring.report.number_text import plain_number
 from geometry.se3 import Array
 from studies.paper.docking_experiment import DockingRun
 from studies.paper.paper_inputs import source_text

@@ -12,7 +12,7 @@ from pathlib import Path
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, read_estimates
-from droguekit.benchmark.poses.pose_errors import estimates_by_method
+from droguekit.scoring.poses.pose_errors import estimates_by_method
 from studies.paper.published_results import CONTENDERS, Contender, present
 
 _PACKAGES = ("datasets_manifest", "drogue_models", "droguekit", "geometry", "labelgen", "nav", "render", "scenes")

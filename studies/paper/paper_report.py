@@ -14,12 +14,12 @@ from markupsafe import Markup
 from pydantic import ValidationError
 
 from datasets_manifest.storage.storage import Location
-from droguekit.benchmark.detection.detection_figures import is_timed, speed_panel
-from droguekit.benchmark.report.figures import MethodStyle, legend_key, method_styles
-from droguekit.benchmark.report.html_page import RowGroup, Table, page_template
-from droguekit.benchmark.report.number_text import ABSENT, plain_number, three_digits
-from droguekit.benchmark.results.detection_result import DetectionResult
-from droguekit.benchmark.sequences.sequence_latency import processing_time_s
+from droguekit.scoring.detection.detection_figures import is_timed, speed_panel
+from droguekit.scoring.report.figures import MethodStyle, legend_key, method_styles
+from droguekit.scoring.report.html_page import RowGroup, Table, page_template
+from droguekit.scoring.report.number_text import ABSENT, plain_number, three_digits
+from droguekit.scoring.results.detection_result import DetectionResult
+from droguekit.scoring.sequences.sequence_latency import processing_time_s
 from studies.paper.docking_experiment import DockingData, DockingRun, read_docking
 from studies.paper.paper_figures import (
     AXES,

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from droguekit.benchmark.detection.detection_figures import published_name
-from droguekit.benchmark.detection.detection_report import best_detector
-from droguekit.benchmark.detection.detection_tables import PUBLISHED_DETECTORS, percent_text
-from droguekit.benchmark.report.html_page import RowGroup, Table
-from droguekit.benchmark.report.number_text import ABSENT, interval_text, millimetres, percent, three_digits
-from droguekit.benchmark.results.benchmark_result import MethodResult, PoseRow
-from droguekit.benchmark.results.detection_result import DetectionResult, DetectorResult
+from droguekit.scoring.detection.detection_figures import published_name
+from droguekit.scoring.detection.detection_report import best_detector
+from droguekit.scoring.detection.detection_tables import PUBLISHED_DETECTORS, percent_text
+from droguekit.scoring.report.html_page import RowGroup, Table
+from droguekit.scoring.report.number_text import ABSENT, interval_text, millimetres, percent, three_digits
+from droguekit.scoring.results.benchmark_result import MethodResult, PoseRow
+from droguekit.scoring.results.detection_result import DetectionResult, DetectorResult
 from geometry.se3 import Array
 from studies.paper.docking_experiment import LEAST_MARKERS, DockingData, frames_in_view, subset_scores
 from studies.paper.paper_figures import published_row

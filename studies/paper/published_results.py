@@ -1,7 +1,7 @@
 """What the seed paper prints of its experiments, digit for digit; all of it is of data that are not public.
 
 Source: "Research of an Unmanned Aerial Vehicle Autonomous Aerial Refueling Docking Method Based on Binocular Vision"
-(docs/explanation/paper.md). Its table of detectors is in `droguekit.benchmark.detection.detection_tables`.
+(docs/explanation/paper.md). Its table of detectors is in `droguekit.scoring.detection.detection_tables`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from droguekit.benchmark.report.figures import MethodStyle, method_styles
+from droguekit.scoring.report.figures import MethodStyle, method_styles
 
 TITLE = "Research of an Unmanned Aerial Vehicle Autonomous Aerial Refueling Docking Method Based on Binocular Vision"
 

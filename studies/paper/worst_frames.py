@@ -15,8 +15,8 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import NoFix, PoseEstimate
 from datasets_manifest.types.records import PairRecord, PixelBox
 from drogue_models.marker_layout import MarkerLayout, marker_layout
-from droguekit.benchmark.report.label_drawing import Picture, display_picture, jpeg_uri
-from droguekit.benchmark.report.number_text import plain_number, three_digits
+from droguekit.scoring.report.label_drawing import Picture, display_picture, jpeg_uri
+from droguekit.scoring.report.number_text import plain_number, three_digits
 from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig

@@ -57,8 +57,8 @@ def test_the_block_holds(package: str, tmp_path: Path) -> None:
     "module",
     [
         "nav.runner",
-        "droguekit.benchmark.pose_benchmark",
-        "droguekit.benchmark.report.pose_report",
+        "droguekit.scoring.pose_benchmark",
+        "droguekit.scoring.report.pose_report",
         "droguekit.cli.main",
     ],
 )

@@ -14,9 +14,9 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate, Region, write_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.detection.detection_figures import published_name, speed_panel
-from droguekit.benchmark.detection.detection_tables import PUBLISHED_DETECTORS
 from droguekit.cli.main import DONE, run
+from droguekit.scoring.detection.detection_figures import published_name, speed_panel
+from droguekit.scoring.detection.detection_tables import PUBLISHED_DETECTORS
 from droguekit.workflows.rendering import open_recipe
 from geometry.se3 import RigidTransform
 from studies.paper.paper_report import read_detection

@@ -14,8 +14,8 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import PoseEstimate, write_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.report.html_page import MOST_OPEN_ROWS
 from droguekit.cli.main import DONE, run
+from droguekit.scoring.report.html_page import MOST_OPEN_ROWS
 from droguekit.workflows.rendering import open_recipe
 from geometry.se3 import RigidTransform
 

@@ -15,8 +15,8 @@ from pycocotools.cocoeval import COCOeval
 from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER
 from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.types.estimates import PoseEstimate, read_estimates
-from droguekit.benchmark.detection.detection_truth import read_detection_truth
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.scoring.detection.detection_truth import read_detection_truth
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from droguekit.benchmark.detection.detection_truth import read_detection_truth
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.scoring.detection.detection_truth import read_detection_truth
 from nav.tracking.tracker import tracker_names
 
 FRAMES = 8

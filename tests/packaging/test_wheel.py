@@ -67,7 +67,7 @@ def test_holds_every_module_and_data_file(wheel: Path) -> None:
     assert sorted(wanted - names) == []
     assert any(name.startswith("datasets_manifest/recipes/") for name in names)
     assert any(name.startswith("drogue_models/examples/") for name in names)
-    assert any(name.startswith("droguekit/benchmark/report/templates/") for name in names)
+    assert any(name.startswith("droguekit/scoring/report/templates/") for name in names)
 
 
 def test_holds_only_our_packages_and_the_licence(wheel: Path) -> None:

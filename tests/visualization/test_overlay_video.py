@@ -12,8 +12,8 @@ from PIL import Image
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, Feature, NoFix, PoseEstimate, write_estimates
-from droguekit.benchmark.report.label_drawing import Rgb
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from droguekit.scoring.report.label_drawing import Rgb
 from droguekit.visualization.overlay_video import ESTIMATE_RGB, TRUE_RGB, draw_overlay, write_overlay_video
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform

@@ -44,7 +44,7 @@ def view(
         raise ValueError("view: rerun is not installed; pip install 'droguekit[viz]'") from error
     from datasets_manifest.types.estimates import read_estimates
     from droguekit.batch.progress import progress_report
-    from droguekit.benchmark.poses.pose_errors import estimates_by_method
+    from droguekit.scoring.poses.pose_errors import estimates_by_method
     from droguekit.visualization.rerun_viewer.recording import open_pairs
     from droguekit.visualization.rerun_viewer.session import view_pairs
 

@@ -23,7 +23,7 @@ from datasets_manifest.storage.storage import Location, absolute
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
 from droguekit.batch.progress import ProgressReport
 from droguekit.batch.worker_pool import is_accident, run_tasks
-from droguekit.benchmark.poses.pose_errors import estimates_by_method
+from droguekit.scoring.poses.pose_errors import estimates_by_method
 from droguekit.visualization.browse.pairs import (
     LIGHTS,
     BrowsedPairs,

@@ -24,9 +24,9 @@ from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, ViewRecord
 from drogue_models.parameters import DrogueParameters
-from droguekit.benchmark.poses.pose_errors import pose_error
-from droguekit.benchmark.report.label_drawing import Picture, display_picture, resized
-from droguekit.benchmark.report.number_text import plain_number
+from droguekit.scoring.poses.pose_errors import pose_error
+from droguekit.scoring.report.label_drawing import Picture, display_picture, resized
+from droguekit.scoring.report.number_text import plain_number
 from droguekit.visualization.drogue_outlines import Ring, drogue_rings
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, StereoRig

@@ -28,8 +28,8 @@ from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.tanker import tanker_mesh
-from droguekit.benchmark.poses.pose_errors import pose_error
-from droguekit.benchmark.report.label_drawing import BOX_RGB, MARKER_RGB, Rgb, display_picture
+from droguekit.scoring.poses.pose_errors import pose_error
+from droguekit.scoring.report.label_drawing import BOX_RGB, MARKER_RGB, Rgb, display_picture
 from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig

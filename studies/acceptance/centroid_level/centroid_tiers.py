@@ -11,8 +11,8 @@ from scipy.stats import norm
 
 from drogue_models.presets import RING_RADIUS_M
 from droguekit.batch.progress import ProgressReport
-from droguekit.benchmark.confidence_intervals import CONFIDENCE, rms_upper_limit
-from droguekit.benchmark.poses.cramer_rao import FacingRing
+from droguekit.scoring.confidence_intervals import CONFIDENCE, rms_upper_limit
+from droguekit.scoring.poses.cramer_rao import FacingRing
 from geometry.stereo import paper_rig
 from studies.acceptance.acceptance_table import AcceptanceRow, at_most, between, worst
 from studies.acceptance.centroid_level.drawn_frames import (

@@ -17,8 +17,8 @@ from datasets_manifest.random_streams import seeded_generator
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import load_drogue
 from droguekit.batch.progress import ProgressReport
-from droguekit.benchmark.poses.cramer_rao import FacingRing, feature_points
 from droguekit.numerical_threads import one_thread
+from droguekit.scoring.poses.cramer_rao import FacingRing, feature_points
 from geometry.se3 import Array, angles_from_axis, skew
 from geometry.stereo import StereoRig, paper_rig
 from nav.pose.pose_method import EXACT, StatedTolerances

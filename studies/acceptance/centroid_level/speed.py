@@ -15,8 +15,8 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
 from droguekit.batch.progress import ProgressReport
-from droguekit.benchmark.poses.cramer_rao import feature_points
 from droguekit.numerical_threads import one_thread
+from droguekit.scoring.poses.cramer_rao import feature_points
 from geometry.stereo import paper_rig
 from nav.navigator import Navigator
 from nav.pair_measurement import PairMeasurement

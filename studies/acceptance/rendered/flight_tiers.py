@@ -13,9 +13,9 @@ from itertools import groupby
 import numpy as np
 
 from datasets_manifest.recipe.recipe import FrameCounts, Recipe
-from droguekit.benchmark.poses.pose_errors import COMPONENTS
-from droguekit.benchmark.results.benchmark_result import BenchmarkResult
-from droguekit.benchmark.sequences.tracking_scores import REACQUISITION_LIMIT_FRAMES, reacquisition
+from droguekit.scoring.poses.pose_errors import COMPONENTS
+from droguekit.scoring.results.benchmark_result import BenchmarkResult
+from droguekit.scoring.sequences.tracking_scores import REACQUISITION_LIMIT_FRAMES, reacquisition
 from studies.acceptance.acceptance_table import COMPARISON, GOAL, AcceptanceRow, at_most, between, not_measured, worst
 from studies.acceptance.confidence_limits import (
     ValueWithLimit,

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from droguekit.benchmark.confidence_intervals import ratio_intervals, rms_upper_limit
-from droguekit.benchmark.poses.pose_errors import COMPONENTS
-from droguekit.benchmark.results.benchmark_result import BenchmarkResult, PoseBin
+from droguekit.scoring.confidence_intervals import ratio_intervals, rms_upper_limit
+from droguekit.scoring.poses.pose_errors import COMPONENTS
+from droguekit.scoring.results.benchmark_result import BenchmarkResult, PoseBin
 from geometry.se3 import Array
 from studies.acceptance.acceptance_table import AcceptanceRow, at_most, between, not_measured, worst
 from studies.acceptance.confidence_limits import (

@@ -10,9 +10,9 @@ import numpy as np
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import PoseEstimate, read_estimates
-from droguekit.benchmark.poses.centroid_errors import centroid_errors
-from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
-from droguekit.benchmark.poses.pose_errors import estimates_by_method, pose_error
+from droguekit.scoring.poses.centroid_errors import centroid_errors
+from droguekit.scoring.poses.drogue_truth import DrogueTruth, drogue_truth
+from droguekit.scoring.poses.pose_errors import estimates_by_method, pose_error
 from geometry.se3 import Array
 from studies.acceptance.rendered.centroid_bounds import center_bounds_px
 

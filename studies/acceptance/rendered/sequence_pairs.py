@@ -10,13 +10,13 @@ import numpy as np
 
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estimates
-from droguekit.benchmark.poses.centroid_errors import centroid_errors
-from droguekit.benchmark.poses.cramer_rao import component_deviations
-from droguekit.benchmark.poses.drogue_truth import DrogueTruth, drogue_truth
-from droguekit.benchmark.poses.pose_errors import estimates_by_method, pose_error
-from droguekit.benchmark.poses.reference import build_reference
-from droguekit.benchmark.sequences.sequence_latency import processing_time_s
-from droguekit.benchmark.sequences.sequence_truth import Visibility, true_state
+from droguekit.scoring.poses.centroid_errors import centroid_errors
+from droguekit.scoring.poses.cramer_rao import component_deviations
+from droguekit.scoring.poses.drogue_truth import DrogueTruth, drogue_truth
+from droguekit.scoring.poses.pose_errors import estimates_by_method, pose_error
+from droguekit.scoring.poses.reference import build_reference
+from droguekit.scoring.sequences.sequence_latency import processing_time_s
+from droguekit.scoring.sequences.sequence_truth import Visibility, true_state
 from geometry.se3 import Array
 from studies.acceptance.rendered.scored_frames import BEST
 

@@ -8,14 +8,14 @@ import pytest
 from datasets_manifest.random_streams import seeded_generator
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
-from droguekit.benchmark.poses.cramer_rao import (
+from droguekit.scoring.poses.cramer_rao import (
     FeatureNoise,
     angles_jacobian,
     feature_points,
     features_seen,
     pose_bound,
 )
-from droguekit.benchmark.poses.pose_errors import pose_error
+from droguekit.scoring.poses.pose_errors import pose_error
 from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig

@@ -10,7 +10,7 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
-from droguekit.benchmark.poses.drogue_truth import DrogueTruth
+from droguekit.scoring.poses.drogue_truth import DrogueTruth
 from geometry.se3 import RigidTransform
 from geometry.stereo import paper_rig
 from scenes.drogue_appearance import drogue_of_scene

@@ -18,10 +18,10 @@ from datasets_manifest.recipe.recipe import RecipeSource, load_recipe, parse_rec
 from datasets_manifest.storage.reader import Dataset
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.detection.detection_scores import DetectorOutput, score_detections
-from droguekit.benchmark.detection.detection_truth import read_detection_truth
-from droguekit.benchmark.detection.detector_runner import LEAST_SCORE, DetectorRunner
 from droguekit.cli.main import DONE, run
+from droguekit.scoring.detection.detection_scores import DetectorOutput, score_detections
+from droguekit.scoring.detection.detection_truth import read_detection_truth
+from droguekit.scoring.detection.detector_runner import LEAST_SCORE, DetectorRunner
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.detector.onnx_detector import OnnxDetector

@@ -14,8 +14,8 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
-from droguekit.benchmark.report.html_page import Table
-from droguekit.benchmark.report.number_text import ABSENT
+from droguekit.scoring.report.html_page import Table
+from droguekit.scoring.report.number_text import ABSENT
 from studies.paper.docking_experiment import read_docking
 from studies.paper.paper_report import failure_table, time_table
 from studies.paper.paper_tables import docking_claims, docking_table

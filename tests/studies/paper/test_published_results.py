@@ -7,8 +7,8 @@ import pytest
 
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import load_drogue
-from droguekit.benchmark.detection.detection_tables import PUBLISHED_DETECTORS
-from droguekit.benchmark.poses.pose_errors import pose_error
+from droguekit.scoring.detection.detection_tables import PUBLISHED_DETECTORS
+from droguekit.scoring.poses.pose_errors import pose_error
 from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, paper_rig

@@ -10,14 +10,14 @@ from typing import Literal
 
 import pytest
 
-from droguekit.benchmark.results.detection_result import (
+from droguekit.cli.main import COMMANDS, DONE, WRONG_INPUT, load_command, run
+from droguekit.scoring.results.detection_result import (
     DetectionDataset,
     DetectionResult,
     DetectionRow,
     DetectorResult,
     PairTimes,
 )
-from droguekit.cli.main import COMMANDS, DONE, WRONG_INPUT, load_command, run
 from studies.paper.paper_report import ReportInputs, missing_parts
 from tests.support.parsed_page import ParsedPage
 

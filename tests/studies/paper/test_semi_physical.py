@@ -11,7 +11,7 @@ import pytest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Feature, read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
-from droguekit.benchmark.report.number_text import ABSENT
+from droguekit.scoring.report.number_text import ABSENT
 from studies.paper.paper_tables import semi_physical_claims, table_2, worst_station
 from studies.paper.semi_physical import read_semi_physical
 

@@ -21,8 +21,8 @@ from datasets_manifest.types.estimates import NoFix, PoseEstimate, write_estimat
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from droguekit.benchmark.report.label_drawing import display_picture
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
+from droguekit.scoring.report.label_drawing import display_picture
 from droguekit.visualization.browse.page import write_browse
 from geometry.se3 import RigidTransform
 from tests.support.small_datasets import rendered, single_pairs_recipe

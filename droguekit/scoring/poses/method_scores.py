@@ -1,0 +1,259 @@
+"""The scores of one method: pair by pair, and summarized over the pairs of a bin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datasets_manifest.types.estimates import Estimate, PoseEstimate
+from droguekit.scoring.confidence_intervals import (
+    Interval,
+    bootstrap_intervals,
+    fraction_interval,
+    rms_interval,
+    root_mean_square,
+)
+from droguekit.scoring.poses.centroid_errors import CentroidErrors, centroid_statistics, position_error_from_centroids
+from droguekit.scoring.poses.cramer_rao import FeatureNoise, component_deviations
+from droguekit.scoring.poses.drogue_truth import DrogueTruth
+from droguekit.scoring.poses.pose_errors import (
+    COMPONENTS,
+    FlipTrials,
+    PoseError,
+    RangefinderSample,
+    flip_statistics,
+    flip_trials,
+    nees,
+    normalized_errors,
+    pose_error,
+    rangefinder_errors,
+    ring_tilt_scale,
+    squared_errors,
+)
+from droguekit.scoring.poses.reference import Reference, bound_covariance, feature_noise, mean_bound
+from droguekit.scoring.results.benchmark_result import PoseRow
+from droguekit.scoring.results.pose_result import Bound, ComponentErrors, ComponentRatios
+from geometry.se3 import Array
+
+UNITS = {"x": "m", "y": "m", "z": "m", "pitch": "deg", "yaw": "deg"}
+_PERCENTILES = (95.0, 99.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseScore:
+    """Scores of one pose.
+
+    Attributes:
+        error: estimate minus truth.
+        common_bound: (5,) bound of all visible features, markers and hub each at its own noise, or None. [m, deg]
+        own_bound: (5,) bound of the features that the method used, at its own noise, or None. [m, deg]
+        has_covariance: whether the estimate carries one.
+        squared_errors: (3,) see `consistency.squared_errors`.
+        flips: None where no bound is known.
+        depth: with the rangefinder's reading, or None without one.
+    """
+
+    error: PoseError
+    common_bound: Array | None
+    own_bound: Array | None
+    has_covariance: bool
+    squared_errors: Array | None
+    flips: FlipTrials | None
+    depth: RangefinderSample | None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameScore:
+    """Scores of one method in one pair that shows a drogue.
+
+    Attributes:
+        pose: scores of its pose, or None without one.
+        bound: (5,) Cramer-Rao bound at the noise of the pair's bin [m, deg], or None where there is none.
+        centroids: errors of its features.
+        from_centroids_m: (3,) position error that its centroids alone would make, or None. [m]
+    """
+
+    pose: PoseScore | None
+    bound: Array | None
+    centroids: CentroidErrors
+    from_centroids_m: Array | None
+
+
+def frame_scores(
+    drogues: Mapping[int, DrogueTruth],
+    estimates: Mapping[int, Estimate],
+    centroids: Mapping[int, CentroidErrors],
+    reference: Reference,
+) -> dict[int, FrameScore]:
+    """Score a method on every pair that shows a drogue.
+
+    Args:
+        drogues: the truth by frame.
+        estimates: of the method, by frame; one may be missing.
+        centroids: of the method, for every frame of `drogues`.
+        reference: of the file.
+    """
+    noise = [
+        _used_noise([centroids[i] for i in drogues if reference.bin_of_frame[i] == k])
+        for k in range(len(reference.bins))
+    ]
+    scores = {}
+    for index, truth in drogues.items():
+        estimate, found = estimates.get(index), centroids[index]
+        pose = None
+        if isinstance(estimate, PoseEstimate):
+            own_noise = noise[reference.bin_of_frame[index]]
+            pose = _pose_score(estimate, truth, found, own_noise, reference.covariances[index])
+        scores[index] = FrameScore(
+            pose=pose,
+            bound=reference.bounds[index],
+            centroids=found,
+            from_centroids_m=position_error_from_centroids(truth, found),
+        )
+    return scores
+
+
+def summarize(scores: Sequence[FrameScore], truth_spread: Array, key: str) -> PoseRow:
+    """The row of some pairs, of which there is at least one.
+
+    Args:
+        scores: one for each pair; their order does not matter.
+        truth_spread: (5,) what a pair without a pose counts with in `rmse_with_failures`. [m, deg]
+        key: of the bootstrap's random stream.
+    """
+    fixed = [score for score in scores if score.pose is not None]
+    poses = [score.pose for score in scores if score.pose is not None]
+    numbers: dict[str, float] = {}
+    intervals: dict[str, Interval] = {"fix_fraction": fraction_interval(len(fixed), len(scores))}
+    bound = mean_bound([score.bound for score in fixed])
+    bounded = [score.pose.error for score in fixed if score.pose is not None and score.bound is not None]
+    if poses:
+        numbers, error_intervals = _error_numbers([pose.error for pose in poses], key)
+        intervals |= error_intervals
+    return PoseRow.model_validate(
+        {
+            "n": len(scores),
+            "fixes": len(fixed),
+            "fix_fraction": len(fixed) / len(scores),
+            **numbers,
+            "intervals": intervals,
+            "bound": bound,
+            "bound_ratio": _ratios(bounded, bound),
+            "centroids": centroid_statistics([score.centroids for score in scores]),
+            **_centroid_share(fixed),
+            **_checks(poses),
+            "failures": len(scores) - len(poses),
+            "rmse_with_failures": _with_failures(poses, len(scores), truth_spread),
+            "rangefinder": rangefinder_errors([pose.depth for pose in poses if pose.depth is not None]),
+        }
+    )
+
+
+def _pose_score(
+    estimate: PoseEstimate,
+    truth: DrogueTruth,
+    centroids: CentroidErrors,
+    noise: FeatureNoise | None,
+    common: Array | None,
+) -> PoseScore:
+    pose = estimate.left_from_drogue
+    error = pose_error(pose, truth.left_from_drogue)
+    own = bound_covariance(truth, _used(truth, centroids), noise)
+    covariance = common if own is None else own
+    reading_m = truth.rangefinder_reading_m
+    scale_rad = None if noise is None else ring_tilt_scale(truth, centroids, noise.marker_px)
+    return PoseScore(
+        error=error,
+        common_bound=None if common is None else component_deviations(truth.left_from_drogue, common),
+        own_bound=None if own is None else component_deviations(truth.left_from_drogue, own),
+        has_covariance=estimate.covariance is not None,
+        squared_errors=squared_errors(estimate, error),
+        flips=None if covariance is None else flip_trials(pose, truth, covariance, scale_rad),
+        depth=None
+        if reading_m is None
+        else RangefinderSample(float(pose.translation_m[2]), truth.distance_m, reading_m),
+    )
+
+
+def _used(truth: DrogueTruth, centroids: CentroidErrors) -> NDArray[np.bool_]:
+    used = np.zeros_like(truth.visible)
+    used[centroids.eye[centroids.used], centroids.feature[centroids.used]] = True
+    return used
+
+
+def _used_noise(errors: Sequence[CentroidErrors]) -> FeatureNoise | None:
+    """Noise of the centroids on which a method's poses rest."""
+    offsets = np.concatenate([e.offset_px[e.used] for e in errors])
+    hub = np.concatenate([e.is_hub[e.used] for e in errors])
+    marker_px, hub_px = (root_mean_square(part) if len(part) else None for part in (offsets[~hub], offsets[hub]))
+    return feature_noise(marker_px, hub_px)
+
+
+def _error_numbers(errors: Sequence[PoseError], key: str) -> tuple[dict[str, float], dict[str, Interval]]:
+    position = np.array([error.position_m for error in errors])
+    columns = np.column_stack([position, np.stack([error.components for error in errors])])
+    names = [("position", "m"), *UNITS.items()]
+    mean_ends, rank_ends = bootstrap_intervals(columns, _PERCENTILES, key)
+    numbers: dict[str, float] = {}
+    intervals: dict[str, Interval] = {}
+    for k, (name, unit) in enumerate(names):
+        column = columns[:, k]
+        average = f"{name}_mean_{unit}" if name == "position" else f"{name}_bias_{unit}"
+        numbers[average] = float(column.mean())
+        intervals[average] = tuple(mean_ends[k].tolist())
+        numbers[f"{name}_rmse_{unit}"] = root_mean_square(column)
+        intervals[f"{name}_rmse_{unit}"] = rms_interval(column)
+        for p, percent in enumerate(_PERCENTILES):
+            rank = f"{name}_p{percent:.0f}_{unit}"
+            numbers[rank] = float(np.percentile(np.abs(column), percent))
+            intervals[rank] = tuple(rank_ends[k, p].tolist())
+        numbers[f"{name}_max_{unit}"] = float(np.abs(column).max())
+    transverse = np.array([error.transverse_m for error in errors])
+    numbers["transverse_rmse_m"] = root_mean_square(transverse)
+    intervals["transverse_rmse_m"] = rms_interval(transverse)
+    return numbers, intervals
+
+
+def _ratios(errors: Sequence[PoseError], bound: Bound | None) -> ComponentRatios | None:
+    if bound is None:
+        return None
+    limits = np.array([getattr(bound, f"{name}_{UNITS[name]}") for name in COMPONENTS])
+    rms = np.sqrt(np.mean(np.square([error.components for error in errors]), axis=0))
+    return ComponentRatios(**dict(zip(COMPONENTS, (rms / limits).tolist(), strict=True)))
+
+
+def _checks(poses: Sequence[PoseScore]) -> dict[str, object]:
+    """Errors against bounds and covariances, pose by pose, and mirrored tilts."""
+    optical = [pose.flips.optical for pose in poses if pose.flips is not None]
+    sight = [pose.flips.sight for pose in poses if pose.flips is not None]
+    return {
+        "normalized": normalized_errors([(p.error, p.common_bound) for p in poses if p.common_bound is not None]),
+        "normalized_own": normalized_errors([(p.error, p.own_bound) for p in poses if p.own_bound is not None]),
+        "nees": nees([pose.squared_errors for pose in poses if pose.has_covariance]),
+        "flips": flip_statistics([trial for trial in optical if trial is not None]),
+        "sight_flips": flip_statistics([trial for trial in sight if trial is not None]),
+    }
+
+
+def _with_failures(poses: Sequence[PoseScore], count: int, truth_spread: Array) -> ComponentErrors:
+    squares = (count - len(poses)) * truth_spread**2
+    for pose in poses:
+        squares = squares + pose.error.components**2
+    x, y, z, pitch, yaw = np.sqrt(squares / count).tolist()
+    return ComponentErrors(x_m=x, y_m=y, z_m=z, pitch_deg=pitch, yaw_deg=yaw)
+
+
+def _centroid_share(fixed: Sequence[FrameScore]) -> dict[str, float | None]:
+    """Share of the position error that centroid errors explain, over the frames where they determine a pose."""
+    pairs = [(s.pose.error.components[:3], s.from_centroids_m) for s in fixed if s.pose is not None]
+    known = [(error, predicted) for error, predicted in pairs if predicted is not None]
+    if not known:
+        return {"position_from_centroids_rmse_m": None, "centroid_share": None}
+    errors, predicted = np.array([k[0] for k in known]), np.array([k[1] for k in known])
+    total, rest = float(np.square(errors).sum()), float(np.square(errors - predicted).sum())
+    share = None if total == 0 else max(0.0, 1 - rest / total)
+    from_centroids = float(np.sqrt(np.square(predicted).sum(axis=1).mean()))
+    return {"position_from_centroids_rmse_m": from_centroids, "centroid_share": share}
