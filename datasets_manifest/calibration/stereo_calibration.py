@@ -1,16 +1,18 @@
-"""A rig from a user's stereo calibration.
+"""The stereo rig of calibrated cameras, and the checks of the numbers that other programs give for them.
 
-Images are not resampled. The rectified cameras of OpenCV's `stereoRectify` become the rig's ideal eyes, and the
-calibrated cameras its lenses, so that navigation measures in the original images and rectifies its measurements.
+Images are not resampled. The rectified cameras become the rig's ideal eyes, and the calibrated cameras its lenses, so
+that navigation measures in the original images and rectifies its measurements. A rectification that comes with the
+calibration is kept: its rectified left camera is the frame of all poses. Without one it is that of OpenCV's
+`stereoRectify`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from geometry.distortion import BrownConrady, Lens
 from geometry.pinhole import PinholeCamera
@@ -19,33 +21,199 @@ from geometry.stereo import StereoRig
 
 # A baseline outside this range is taken to be in another unit. [m]
 _BASELINES_M = (1e-3, 10.0)
-# Radial k1, k2, tangential p1, p2, radial k3; OpenCV's longer models go on from there.
-_COEFFICIENTS = 5
-_SHAPES = {"M1": (3, 3), "D1": None, "M2": (3, 3), "D2": None, "R": (3, 3), "T": (3, 1)}
+# In widths of the image, with a field of view of 157 degrees; shorter ones are in millimetres, or in image widths.
+_SHORTEST_FOCAL_LENGTH = 0.1
+# Numbers of coefficients of OpenCV's lens models; the first five are Brown-Conrady's.
+_COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
+_BROWN_CONRADY_COUNT = 5
+# Six printed decimals move the entries of a rotation by 5e-7, five by 5e-6; a typing error moves them by more.
+_ROTATION_TOLERANCE = 1e-4
+_EXACT = 1e-12
+# Rows of two rectified cameras that differ by less agree but for printed decimals. [px]
+_SAME_PX = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class StereoCalibration:
-    """The result of `cv2.stereoCalibrate`.
+def camera_of_matrix(matrix: ArrayLike, size_px: tuple[int, int], name: str) -> PinholeCamera:
+    """A camera from its matrix, the principal point of which lies in the image.
 
-    Attributes:
-        size_px: (width, height) of both images.
-        M1, M2: (3, 3) intrinsics of the left and the right camera. [px]
-        D1, D2: (K,) distortion coefficients, OpenCV's order.
-        R, T: (3, 3) and (3,) right camera's axes from the left one's. [m]
+    Args:
+        matrix: (3, 3) or its nine entries row by row: fx 0 cx, 0 fy cy, 0 0 1. [px]
+        size_px: (width, height) of its images.
+        name: of the matrix, with its file; begins the errors.
+
+    Raises:
+        ValueError: not such a matrix.
     """
+    m = _finite(matrix, (3, 3), name)
+    if _is_camera_matrix(m.T) and not _is_camera_matrix(m):
+        raise ValueError(
+            f"{name}: is transposed, as MATLAB's IntrinsicMatrix is; give fx 0 cx, 0 fy cy, 0 0 1 (MATLAB also counts "
+            "pixels from 1: subtract 1 from its cx and cy)"
+        )
+    if not _is_camera_matrix(m):
+        raise ValueError(f"{name}: must be fx 0 cx, 0 fy cy, 0 0 1 with positive fx and fy, got {m.tolist()}")
+    if m[0, 1] != 0:
+        raise ValueError(f"{name}: has a skew of {m[0, 1]:g} px, which is not supported; calibrate without skew")
+    camera = PinholeCamera(*size_px, *(float(m[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))))
+    if camera.fx_px < _SHORTEST_FOCAL_LENGTH * camera.width_px:
+        raise ValueError(
+            f"{name}: has focal lengths of ({camera.fx_px:g}, {camera.fy_px:g}) px, far too short for images of "
+            f"{size_px[0]}x{size_px[1]} px; they must be in pixels of these images"
+        )
+    if not camera.contains([camera.cx_px, camera.cy_px]):
+        raise ValueError(
+            f"{name}: the principal point ({camera.cx_px:g}, {camera.cy_px:g}) lies outside the image of "
+            f"{size_px[0]}x{size_px[1]} px; matrix and image size do not belong together"
+        )
+    return camera
 
-    size_px: tuple[int, int]
-    M1: Array
-    D1: Array
-    M2: Array
-    D2: Array
-    R: Array
-    T: Array
+
+def _is_camera_matrix(m: Array) -> bool:
+    """Whether a matrix has the zeros and the one of a camera's, whatever its skew."""
+    return bool(m[0, 0] > 0 < m[1, 1] and m[1, 0] == 0 and np.array_equal(m[2], [0, 0, 1]))
 
 
-def read_opencv_stereo(path: Path, unit_m: float = 1.0) -> StereoCalibration:
-    """A calibration from OpenCV's YAML, XML or JSON storage, with the names that OpenCV's own samples use.
+def nearest_rotation(matrix: ArrayLike, name: str) -> Array:
+    """The rotation nearest to a matrix with printed decimals.
+
+    Args:
+        matrix: (3, 3) or its nine entries row by row.
+        name: of the matrix, with its file; begins the errors.
+
+    Raises:
+        ValueError: an entry is more than 1e-4 away from the rotation's.
+
+    Source: Higham 1986, "Computing the polar decomposition".
+    """
+    m = _finite(matrix, (3, 3), name)
+    u, _, v = np.linalg.svd(m)
+    rotation: Array = u @ v
+    error = float(np.abs(rotation - m).max())
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise ValueError(f"{name}: is not a rotation matrix, got {m.tolist()}")
+    return m if error < _EXACT else rotation
+
+
+def distortion_of_coefficients(coefficients: ArrayLike, name: str) -> BrownConrady:
+    """The lens model of OpenCV's coefficients k1, k2, p1, p2, k3 ...
+
+    Args:
+        coefficients: 4, 5, 8, 12 or 14 of them, or none for an ideal lens.
+        name: of the coefficients, with their file; begins the errors.
+
+    Raises:
+        ValueError: another number of coefficients, or a model that the rig cannot have.
+    """
+    values = np.asarray(coefficients, dtype=np.float64).reshape(-1)
+    if len(values) not in (0, *_COEFFICIENT_COUNTS):
+        raise ValueError(f"{name}: must have 4, 5, 8, 12 or 14 coefficients, got {len(values)}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name}: must be finite, got {values.tolist()}")
+    if np.any(values[_BROWN_CONRADY_COUNT:]):
+        raise ValueError(
+            f"{name}: must be k1, k2, p1, p2, k3; calibrate without the rational, thin-prism and tilted models, "
+            f"got {values.tolist()}"
+        )
+    return BrownConrady(*values[:_BROWN_CONRADY_COUNT].tolist())
+
+
+def calibrated_lens(camera: PinholeCamera, distortion: BrownConrady, ideal_from_real: Array, name: str) -> Lens:
+    """A camera with its lens; `name` is that of the coefficients, with their file, and begins the error.
+
+    Raises:
+        ValueError: the distortion folds the image.
+    """
+    try:
+        return Lens(camera, distortion, ideal_from_real)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def rig_of_cameras(left: Lens, right: Lens, right_from_left: RigidTransform) -> StereoRig:
+    """The rig of two calibrated cameras; its left frame is the left camera that OpenCV's `stereoRectify` makes.
+
+    Args:
+        left, right: cameras and lenses; their rotations are not used.
+        right_from_left: from the left camera's axes to the right one's. [m]
+
+    Raises:
+        ValueError: an arrangement or a baseline that a rig cannot have.
+    """
+    baseline_m = float(np.linalg.norm(right_from_left.translation_m))
+    _check_baseline(baseline_m, "T")
+    if _is_ideal(left, right, right_from_left):
+        return StereoRig(left.camera, baseline_m)
+    size_px = left.camera.width_px, left.camera.height_px
+    R1, R2, P1, P2, *_ = cv2.stereoRectify(
+        left.camera.matrix(),
+        left.distortion.coefficients(),
+        right.camera.matrix(),
+        right.distortion.coefficients(),
+        size_px,
+        right_from_left.rotation,
+        right_from_left.translation_m,
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=-1,
+    )
+    if not P2[0, 3] < 0 or P2[1, 3] != 0:
+        raise ValueError(
+            "T: the right camera must stand to the right of the left one, got "
+            f"{right_from_left.translation_m.tolist()} m as its axes from the left one's (negative x); are the two "
+            "swapped?"
+        )
+    lenses = Lens(left.camera, left.distortion, R1), Lens(right.camera, right.distortion, R2)
+    return StereoRig(_rectified_camera(P1, size_px), baseline_m, lenses=lenses)
+
+
+def rig_of_rectification(
+    left: Lens, right: Lens, P1: ArrayLike, P2: ArrayLike, names: tuple[str, str], unit_m: float = 1.0
+) -> StereoRig:
+    """The rig of two calibrated cameras with a given rectification, the left camera of which is the rig's left frame.
+
+    Args:
+        left, right: cameras and lenses; `ideal_from_real` are the rectifying rotations R1 and R2.
+        P1, P2: (3, 4) projections of the rectified images; the right one's last column begins with -fx B.
+        names: of P1 and P2, with their files; begin the errors.
+        unit_m: the unit of B. [m]
+
+    Raises:
+        ValueError: projections that do not rectify the pair, or a baseline that a rig cannot have.
+
+    Source: the definition of `sensor_msgs/CameraInfo`; OpenCV's documentation of `stereoRectify`.
+    """
+    first, second = (_finite(matrix, (3, 4), name) for matrix, name in zip((P1, P2), names, strict=True))
+    for matrix, name in zip((first, second), names, strict=True):
+        if not _is_camera_matrix(matrix[:, :3]) or matrix[0, 1] != 0 or matrix[2, 3] != 0:
+            raise ValueError(f"{name}: must be fx 0 cx tx, 0 fy cy ty, 0 0 1 0, got {matrix.tolist()}")
+    if first[0, 3] < 0 and second[0, 3] == 0:
+        raise ValueError(f"{names[0]}: is that of a right camera, and {names[1]} of a left one; swap the two")
+    if first[1, 3] != 0 or second[1, 3] != 0:
+        raise ValueError(f"{names[1]}: rectifies cameras that stand above each other, which are not supported")
+    if first[0, 3] != 0 or not second[0, 3] < 0:
+        raise ValueError(
+            f"{names[1]}: entry (0, 3) must be -fx times the baseline, and that of {names[0]} 0, got "
+            f"{second[0, 3]:g} and {first[0, 3]:g}"
+        )
+    # The principal points may differ along a row, where disparity is not 0 at infinity.
+    differ = [entry for entry in ((0, 0), (1, 1), (1, 2)) if abs(first[entry] - second[entry]) > _SAME_PX]
+    if differ:
+        raise ValueError(
+            f"{names[1]}: fx, fy and cy must be those of {names[0]}, got {second[:, :3].tolist()} and "
+            f"{first[:, :3].tolist()}"
+        )
+    size_px = left.camera.width_px, left.camera.height_px
+    if (right.camera.width_px, right.camera.height_px) != size_px:
+        raise ValueError(f"{names[1]}: the images of both cameras must have the same size")
+    baseline_m = float(-second[0, 3] / second[0, 0]) * unit_m
+    _check_baseline(baseline_m, names[1])
+    camera = _rectified_camera(first, size_px)
+    if all(_is_rectified(lens, camera) for lens in (left, right)):
+        return StereoRig(camera, baseline_m)
+    return StereoRig(camera, baseline_m, lenses=(left, right))
+
+
+def read_opencv_stereo(path: Path, unit_m: float = 1.0) -> StereoRig:
+    """A rig from OpenCV's YAML, XML or JSON storage, with the names that OpenCV's own samples use.
 
     Args:
         path: the file, with M1, D1, M2, D2, R, T, image_width and image_height.
@@ -56,9 +224,10 @@ def read_opencv_stereo(path: Path, unit_m: float = 1.0) -> StereoCalibration:
     """
     if not path.is_file():
         raise ValueError(f"{path}: there is no such calibration file")
+    names = ("M1", "D1", "M2", "D2", "R", "T")
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        found = {name: storage.getNode(name).mat() for name in _SHAPES}
+        found = {name: storage.getNode(name).mat() for name in names}
         sizes = [storage.getNode(name) for name in ("image_width", "image_height")]
         width, height = (int(node.real()) if node.isInt() or node.isReal() else 0 for node in sizes)
     except (cv2.error, SystemError, OverflowError, ValueError) as error:
@@ -67,75 +236,60 @@ def read_opencv_stereo(path: Path, unit_m: float = 1.0) -> StereoCalibration:
     missing += [name for name, value in (("image_width", width), ("image_height", height)) if value < 1]
     if missing:
         raise ValueError(f"{path}: lacks {', '.join(missing)}, as cv2.stereoCalibrate names them")
-    matrices = {}
-    for name, shape in _SHAPES.items():
-        matrix = np.asarray(found[name], dtype=np.float64)
-        if not np.isfinite(matrix).all() or (shape is not None and matrix.size != np.prod(shape)):
-            raise ValueError(f"{path}: {name}: must be finite{f' and {shape}' if shape else ''}, got {matrix.tolist()}")
-        matrices[name] = matrix.reshape(3, 3) if shape == (3, 3) else matrix.reshape(-1)
-    matrices["T"] = matrices["T"] * unit_m
-    return StereoCalibration((width, height), **matrices)
-
-
-def rig_of_calibration(calibration: StereoCalibration) -> StereoRig:
-    """The rig that a calibration describes; its left frame is the rectified left camera's.
-
-    Raises:
-        ValueError: a distortion model, an arrangement or a baseline that the rig cannot have.
-    """
-    left = Lens(_camera(calibration.M1, calibration.size_px, "M1"), _distortion(calibration.D1, "D1"))
-    right = Lens(_camera(calibration.M2, calibration.size_px, "M2"), _distortion(calibration.D2, "D2"))
-    RigidTransform(calibration.R, calibration.T)  # raises where R is no rotation
-    baseline_m = float(np.linalg.norm(calibration.T))
-    if not _BASELINES_M[0] <= baseline_m <= _BASELINES_M[1]:
-        raise ValueError(f"T: must be in metres, and {baseline_m:g} m is not a plausible baseline; give its unit")
-    if _is_ideal(calibration, left, right):
-        return StereoRig(left.camera, baseline_m)
-    R1, R2, P1, P2, *_ = cv2.stereoRectify(
-        calibration.M1,
-        left.distortion.coefficients(),
-        calibration.M2,
-        right.distortion.coefficients(),
-        calibration.size_px,
-        calibration.R,
-        calibration.T,
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=-1,
+    left, right = (
+        calibrated_lens(
+            camera_of_matrix(found[f"M{number}"], (width, height), f"{path}: M{number}"),
+            distortion_of_coefficients(found[f"D{number}"], f"{path}: D{number}"),
+            np.eye(3),
+            f"{path}: D{number}",
+        )
+        for number in (1, 2)
     )
-    if not P2[0, 3] < 0 or P2[1, 3] != 0:
-        raise ValueError(
-            f"T: the right camera must stand to the right of the left one, got {calibration.T.tolist()} m as its "
-            "axes from the left one's (negative x); are the two swapped?"
-        )
-    lenses = Lens(left.camera, left.distortion, R1), Lens(right.camera, right.distortion, R2)
-    return StereoRig(_camera(P1, calibration.size_px, "P1"), baseline_m, lenses=lenses)
-
-
-def _camera(matrix: Array, size_px: tuple[int, int], name: str) -> PinholeCamera:
+    shift = _finite(found["T"], (3, 1), f"{path}: T").reshape(3) * unit_m
+    right_from_left = RigidTransform(nearest_rotation(found["R"], f"{path}: R"), shift)
     try:
-        return PinholeCamera(*size_px, *(float(matrix[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))))
+        return rig_of_cameras(left, right, right_from_left)
     except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
+        raise ValueError(f"{path}: {error}") from error
 
 
-def _distortion(coefficients: Array, name: str) -> BrownConrady:
-    if np.any(coefficients[_COEFFICIENTS:]):
-        raise ValueError(
-            f"{name}: must be k1, k2, p1, p2, k3; calibrate without the rational, thin-prism and tilted models, "
-            f"got {coefficients.tolist()}"
-        )
-    given = np.zeros(_COEFFICIENTS)
-    given[: len(coefficients)] = coefficients[:_COEFFICIENTS]
-    return BrownConrady(*given.tolist())
+def _rectified_camera(projection: Array, size_px: tuple[int, int]) -> PinholeCamera:
+    """The ideal camera of a projection; its principal point may lie outside the image."""
+    return PinholeCamera(*size_px, *(float(projection[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))))
 
 
-def _is_ideal(calibration: StereoCalibration, left: Lens, right: Lens) -> bool:
+def _check_baseline(baseline_m: float, name: str) -> None:
+    if not _BASELINES_M[0] <= baseline_m <= _BASELINES_M[1]:
+        raise ValueError(f"{name}: must be in metres, and {baseline_m:g} m is not a plausible baseline; give its unit")
+
+
+def _is_rectified(lens: Lens, camera: PinholeCamera) -> bool:
+    """Whether an eye's images are rectified ones, which need no lens."""
+    return (
+        lens.camera == camera
+        and not lens.distortion.coefficients().any()
+        and np.array_equal(lens.ideal_from_real, np.eye(3))
+    )
+
+
+def _is_ideal(left: Lens, right: Lens, right_from_left: RigidTransform) -> bool:
     """Whether the images are rectified already, in which case rectification would only add rounding errors."""
+    shift = right_from_left.translation_m
     return (
         not left.distortion.coefficients().any()
         and not right.distortion.coefficients().any()
         and left.camera == right.camera
-        and np.array_equal(calibration.R, np.eye(3))
-        and bool(calibration.T[0] < 0)
-        and not calibration.T[1:].any()
+        and np.array_equal(right_from_left.rotation, np.eye(3))
+        and bool(shift[0] < 0)
+        and not shift[1:].any()
     )
+
+
+def _finite(values: ArrayLike, shape: tuple[int, int], name: str) -> Array:
+    """A matrix of a shape from its rows or its entries row by row."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.size != shape[0] * shape[1]:
+        raise ValueError(f"{name}: must have {shape[0]}x{shape[1]} entries, got {array.size}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: must be finite, got {array.tolist()}")
+    return array.reshape(shape)

@@ -12,16 +12,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
-from datasets_manifest.calibration.stereo_calibration import StereoCalibration
+from datasets_manifest.calibration.camera_info import CameraInfo, rig_of_camera_info
 from datasets_manifest.importers.imported_dataset import ImportedPair
 from datasets_manifest.importers.ros_images import decode_image, message_stamp_ns
 from geometry.se3 import Array
-from geometry.stereo import EYES
+from geometry.stereo import EYES, StereoRig
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-# Distortion models of sensor_msgs/CameraInfo that are Brown-Conrady's.
-_MODELS = ("plumb_bob", "")
 
 
 class RosBag:
@@ -83,8 +81,8 @@ class RosBag:
                     del waiting[stamp_ns]
                     yield ImportedPair(self._topics, 1e-9 * stamp_ns, left, right)
 
-    def calibration(self) -> StereoCalibration:
-        """The calibration in the bag, from the CameraInfo of both image topics.
+    def rig(self) -> StereoRig:
+        """The cameras, from the CameraInfo of both image topics; their rectified left one is the left frame.
 
         Raises:
             ValueError: there is none, or it does not describe a stereo pair.
@@ -104,8 +102,8 @@ class RosBag:
                     break
         if len(found) < len(EYES):
             raise ValueError(f"{self._path}: has no CameraInfo on {' and '.join(topics)}; give --calibration")
-        left, right = (found[topic] for topic in topics)
-        return _calibration(left, right, self._path)
+        left, right = (_camera_info(found[topic], f"{self._path}: {topic}") for topic in topics)
+        return rig_of_camera_info(left, right)
 
     @contextmanager
     def _open(self) -> Iterator[AnyReader]:
@@ -152,34 +150,9 @@ def _stereo_topics(reader: AnyReader) -> tuple[str, str]:
     return pairs[0]
 
 
-def _calibration(left: Any, right: Any, path: Path) -> StereoCalibration:
-    """Calibration from both CameraInfo: R and P of each eye rectify it, and P[0, 3] of the right one is -f B."""
-    for info in (left, right):
-        if info.distortion_model not in _MODELS:
-            raise ValueError(
-                f"{path}: distortion model {info.distortion_model!r} is not read; calibrate with plumb_bob"
-            )
-    if (left.width, left.height) != (right.width, right.height):
-        raise ValueError(f"{path}: the eyes' CameraInfo give images of different size")
-    rotations = [_numbers(info, "r").reshape(3, 3) for info in (left, right)]
-    projection = _numbers(right, "p").reshape(3, 4)
-    if not projection[0, 0] > 0 or not projection[0, 3] < 0:
-        raise ValueError(
-            f"{path}: the right CameraInfo's P[0, 3] must be -f times the baseline, got {projection[0, 3]:g}"
-        )
-    right_from_left = rotations[1].T @ rotations[0]
-    shift = rotations[1].T @ np.array([projection[0, 3] / projection[0, 0], 0.0, 0.0])
-    intrinsics = [_numbers(info, "k").reshape(3, 3) for info in (left, right)]
-    distortion = [_numbers(info, "d") for info in (left, right)]
-    return StereoCalibration(
-        (int(left.width), int(left.height)),
-        M1=intrinsics[0],
-        D1=distortion[0],
-        M2=intrinsics[1],
-        D2=distortion[1],
-        R=right_from_left,
-        T=shift,
-    )
+def _camera_info(message: Any, topic: str) -> CameraInfo:
+    size_px, model = (int(message.width), int(message.height)), str(message.distortion_model)
+    return CameraInfo(topic, size_px, model, *(_numbers(message, name) for name in ("d", "k", "r", "p")))
 
 
 def _numbers(info: Any, name: str) -> Array:

@@ -101,7 +101,7 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
 
 def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, StereoRig]:
     """The pairs and the rig that took them."""
-    from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo, rig_of_calibration
+    from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo
     from datasets_manifest.importers.image_folder import ImageFolder
 
     unit_m, topics = _UNITS_M[options.calibration_unit], options.topics
@@ -111,8 +111,7 @@ def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, S
             raise ValueError(f"--topics: {source} is not a ROS bag")
         if given is None:
             raise ValueError("--calibration: images need one; see docs/how-to/calibrate.md for how to make it")
-        rig = rig_of_calibration(given)
-        return ImageFolder(source, rig.camera.width_px, options.rate_hz or _RATE_HZ), rig
+        return ImageFolder(source, given.camera.width_px, options.rate_hz or _RATE_HZ), given
     names = None if topics is None else tuple(topics.split(","))
     if names is not None and len(names) != 2:
         raise ValueError(f"--topics: must be LEFT,RIGHT, got {topics!r}")
@@ -121,7 +120,7 @@ def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, S
     except ModuleNotFoundError as error:
         raise ValueError(f"{source}: {error.name} is missing: pip install 'droguekit[exports]'") from error
     bag = RosBag(source, names)
-    return bag, rig_of_calibration(given or bag.calibration())
+    return bag, given or bag.rig()
 
 
 def _is_bag(source: Path) -> bool:

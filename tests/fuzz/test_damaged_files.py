@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from datasets_manifest.calibration.calibration_files import opencv_stereo
-from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo, rig_of_calibration
+from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo
 from datasets_manifest.importers.ros_bag import RosBag
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
 from datasets_manifest.recipe.rigs import resolve_rig
@@ -99,7 +99,7 @@ def test_damaged_bags(bag, edit, other, name):
         def use():
             source = RosBag(copy)
             assert len(list(source)) == source.count
-            rig_of_calibration(source.calibration())
+            source.rig()
 
         quietly(use)
 
@@ -128,4 +128,4 @@ def test_damaged_calibrations(edit, other):
     with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
         path = Path(place) / "calibration.yaml"
         path.write_bytes(edit(other(text.encode())))
-        quietly(lambda: rig_of_calibration(read_opencv_stereo(path)))
+        quietly(lambda: read_opencv_stereo(path))

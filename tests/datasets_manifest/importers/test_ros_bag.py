@@ -13,7 +13,6 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from datasets_manifest.calibration.stereo_calibration import rig_of_calibration
 from datasets_manifest.importers.ros_bag import RosBag
 
 HUMBLE, NOETIC = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
@@ -71,7 +70,7 @@ def test_pairs_and_calibration_of_a_ros_2_bag(encoding: str, tmp_path: Path) -> 
         np.testing.assert_array_equal(pair.left, picture(10 * place))
         np.testing.assert_array_equal(pair.right, picture(10 * place + 50))
         assert pair.time_s == place + 1
-    rig = rig_of_calibration(bag.calibration())
+    rig = bag.rig()
     assert rig.baseline_m == pytest.approx(BASELINE_M) and rig.camera.fx_px == FOCAL_PX and rig.lenses is None
 
 
@@ -86,7 +85,7 @@ def test_a_ros_1_bag_has_matrices_with_capital_names(tmp_path: Path) -> None:
                 writer.write(connection, 10**9, NOETIC.serialize_ros1(message, kind))
     bag = RosBag(path)
     assert [pair.left[0, 0, 0] for pair in bag] == [7]
-    assert rig_of_calibration(bag.calibration()).baseline_m == pytest.approx(BASELINE_M)
+    assert bag.rig().baseline_m == pytest.approx(BASELINE_M)
 
 
 def test_compressed_images_have_their_calibration_beside_the_raw_topic(tmp_path: Path) -> None:
@@ -98,7 +97,7 @@ def test_compressed_images_have_their_calibration_beside_the_raw_topic(tmp_path:
     bag = RosBag(write_bag2(tmp_path / "bag", messages))
     (pair,) = bag
     np.testing.assert_array_equal(pair.left, picture(9))
-    assert bag.calibration().size_px == (WIDTH, HEIGHT)
+    assert bag.rig().camera.width_px == WIDTH
 
 
 def test_images_without_a_partner_are_told(tmp_path: Path) -> None:
@@ -115,7 +114,7 @@ def test_what_cannot_be_paired_or_rectified_is_refused(tmp_path: Path) -> None:
         RosBag(write_bag2(tmp_path / "unstamped", stereo((0, 0))))
     rectified = [(topic.replace("image_raw", "image_rect"), kind, message) for topic, kind, message in stereo((1,))]
     with pytest.raises(ValueError, match="is rectified"):
-        RosBag(write_bag2(tmp_path / "rectified", rectified)).calibration()
+        RosBag(write_bag2(tmp_path / "rectified", rectified)).rig()
     with pytest.raises(ValueError, match="no images on /a"):
         RosBag(tmp_path / "rectified", ("/a", "/b"))
     with pytest.raises(ValueError, match="is not a ROS bag"):
