@@ -1,0 +1,89 @@
+"""Masks of the drogue and its features from part ids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+
+from datasets_manifest.types.records import PixelBox
+from labelgen.part_pixels import FeaturePixels, drogue_mask
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class MaskPixels:
+    """The pixels of one mask, column by column as in COCO.
+
+    Attributes:
+        columns, rows: (N,) of each pixel. [px]
+        size_px: (width, height) of the image. [px]
+    """
+
+    columns: Indices
+    rows: Indices
+    size_px: tuple[int, int]
+
+    def segmentation(self) -> dict[str, Any]:
+        """COCO's compressed run lengths, the first of them outside the set.
+
+        Source: the mask format of the COCO API (runs of the column-major image, beginning with zeros).
+        """
+        width, height = self.size_px
+        flat = self.columns * height + self.rows
+        breaks = np.flatnonzero(np.diff(flat) != 1)
+        starts, ends = flat[np.r_[0, breaks + 1]], flat[np.r_[breaks, len(flat) - 1]] + 1
+        edges = np.stack([starts, ends], axis=1).ravel()
+        counts = np.diff(np.concatenate([[0], edges, [width * height]]))
+        runs = counts[:-1] if counts[-1] == 0 else counts
+        packed = coco_mask.frPyObjects({"size": [height, width], "counts": runs.tolist()}, height, width)
+        return {"size": [height, width], "counts": packed["counts"].decode("ascii")}
+
+    def corner_box(self) -> list[float]:
+        """x, y, width and height of the box around the pixels' areas, counted from the image's corner. [px]"""
+        low_u, low_v = int(self.columns.min()), int(self.rows.min())
+        return [
+            float(low_u),
+            float(low_v),
+            float(int(self.columns.max()) - low_u + 1),
+            float(int(self.rows.max()) - low_v + 1),
+        ]
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+
+class DroguePixels:
+    """Masks of the drogue and its features in one eye's image, computed within the drogue's visible box."""
+
+    def __init__(self, part_id: NDArray[np.uint8], box: PixelBox, marker_count: int) -> None:
+        """Crop the part ids.
+
+        Args:
+            part_id: (H, W) of the whole image.
+            box: `box_visible_xywh_px` of the view.
+            marker_count: of the drogue.
+        """
+        u, v = round(box[0] + 0.5), round(box[1] + 0.5)
+        crop = part_id[v : v + round(box[3]), u : u + round(box[2])]
+        # Transposed, rows come in the order of the image's columns, which is COCO's.
+        self._turned = np.ascontiguousarray(crop.T)
+        self._low = u, v
+        self._size_px = part_id.shape[1], part_id.shape[0]
+        self._marker_count = marker_count
+        self._features = FeaturePixels(self._turned)
+
+    def drogue(self) -> MaskPixels:
+        """The whole drogue."""
+        return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count)))
+
+    def feature(self, part: int) -> MaskPixels:
+        """One marker, or the hub."""
+        return self._set(*self._features.indices(part))
+
+    def _set(self, columns: Indices, rows: Indices) -> MaskPixels:
+        return MaskPixels(columns + self._low[0], rows + self._low[1], self._size_px)
