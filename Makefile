@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup), which is quick the second time. Paths are relative, so the folder may
 # lie anywhere.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo docs test test-slow torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
+.PHONY: help setup demo docs test test-slow test-readers torture fuzz lint bench bench-engines bench-peers bench-scaling bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -33,6 +33,9 @@ test: setup lint ## linters, types and the fast tests
 test-slow: setup ## the tests that render for longer
 	@echo "test-slow: pytest, the slow tests"
 	@$(BIN)/python -m pytest -m "slow and not torture"
+
+test-readers: setup ## read the exports with datumaro, evo, FiftyOne, Label Studio's SDK and ultralytics (installs them under out/readers)
+	@scripts/readers
 
 torture: setup ## kill a run of 200 pairs 50 times, and compare the result with an undisturbed run (minutes)
 	@$(BIN)/python -m pytest tests/batch -m torture --capture=no

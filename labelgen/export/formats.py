@@ -1,8 +1,9 @@
 """The export formats; a format's module is imported when it is used.
 
-A writer takes the dataset's location, the folder to write into and a log. It iterates over `log.records(...)`, holds
-one pair at a time, logs what its format cannot hold, and makes files appear whole or not at all: single files by
-`open_text_atomic`, folders by `new_folder`, both of `datasets_manifest.atomic`. The same dataset gives the same bytes.
+A writer takes the dataset's location, the folder to write into, a log and, where images are optional, their bits. It
+iterates over `log.records(...)`, holds one pair at a time, logs what its format cannot hold, and makes files appear
+whole or not at all: single files by `open_text_atomic`, folders by `new_folder`, both of `datasets_manifest.atomic`.
+The same dataset gives the same bytes.
 """
 
 from __future__ import annotations
@@ -11,11 +12,15 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from datasets_manifest.storage.storage import Location, open_storage
 from labelgen.export.export_log import ExportLog
 
-Writer = Callable[[Location, Path, ExportLog], list[Path]]
+if TYPE_CHECKING:
+    from labelgen.export.frame_files import ImageBits
+
+Writer = Callable[..., list[Path]]
 
 
 @dataclass(frozen=True)
@@ -26,17 +31,20 @@ class ExportFormat:
         description: one line for the command's help.
         writer: `module:function` of its `Writer`, which returns the main files or folders that it wrote.
         extra: the extra of pyproject.toml with its dependencies, or None.
+        images_are_optional: whether the writer takes `image_bits`, and writes images where it is given.
     """
 
     description: str
     writer: str
     extra: str | None = None
+    images_are_optional: bool = False
 
 
 FORMATS: dict[str, ExportFormat] = {
     "coco": ExportFormat(
         "drogue, markers and hub: boxes, run-length masks, keypoints; a file a split",
         "labelgen.export.annotations.coco:write_coco",
+        images_are_optional=True,
     ),
     "yolo": ExportFormat(
         "ultralytics pose: box and keypoints in the drogue's order", "labelgen.export.annotations.yolo:write_yolo"
@@ -75,7 +83,9 @@ FORMATS: dict[str, ExportFormat] = {
 }
 
 
-def write_export(name: str, dataset: Location, out: Path, log: ExportLog) -> list[Path]:
+def write_export(
+    name: str, dataset: Location, out: Path, log: ExportLog, image_bits: ImageBits | None = None
+) -> list[Path]:
     """Write a dataset in a format.
 
     Args:
@@ -83,6 +93,7 @@ def write_export(name: str, dataset: Location, out: Path, log: ExportLog) -> lis
         dataset: the dataset's folder.
         out: folder to write into.
         log: receives the progress and what the format cannot hold.
+        image_bits: copies images too, of at most so many bits, in a format that otherwise names the dataset's.
 
     Returns:
         The main files or folders that were written.
@@ -95,6 +106,9 @@ def write_export(name: str, dataset: Location, out: Path, log: ExportLog) -> lis
     if name not in FORMATS:
         raise ValueError(f"--format: no format named {name!r}; there are {', '.join(FORMATS)}")
     chosen = FORMATS[name]
+    if image_bits is not None and not chosen.images_are_optional:
+        names = ", ".join(other for other, format_ in FORMATS.items() if format_.images_are_optional)
+        raise ValueError(f"--images: is for {names}; {name} has images without it, or cannot have any")
     module, function = chosen.writer.split(":")
     try:
         writer: Writer = getattr(importlib.import_module(module), function)
@@ -111,6 +125,6 @@ def write_export(name: str, dataset: Location, out: Path, log: ExportLog) -> lis
     if not read_manifest(dataset).frames:
         raise ValueError(f"{dataset}: its manifest lists no pairs yet; let `render` finish first")
     try:
-        return writer(dataset, out, log)
+        return writer(dataset, out, log) if image_bits is None else writer(dataset, out, log, image_bits)
     finally:
         log.end()

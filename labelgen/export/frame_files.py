@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
+import zlib
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +16,8 @@ from datasets_manifest.storage.layout import image_file
 from datasets_manifest.storage.reader import Dataset
 from geometry.stereo import Eye
 from labelgen.export.export_log import ExportLog
+
+ImageBits = Literal[8, 16]
 
 
 def export_file(source: Dataset, frame_index: int, name: str, target: Path) -> None:
@@ -47,26 +52,50 @@ def link_or_copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def export_image(source: Dataset, frame_index: int, eye: Eye, target: Path, log: ExportLog) -> None:
-    """Write one eye's image for programs that take 8 bits a sample.
+def export_image(
+    source: Dataset, frame_index: int, eye: Eye, target: Path, log: ExportLog, bits: ImageBits = 8
+) -> None:
+    """Write one eye's image as a PNG whose values use the whole range of its samples, as most programs expect.
 
     Args:
         source: the dataset.
         frame_index: which pair.
         eye: which image.
-        target: the PNG to make: a link or a copy, or the upper 8 of 12 bits.
+        target: the PNG to make. An image of 8 bits is linked or copied. Of 12 bits, the upper 8 are written, or all of
+            them in 16: moved to the top, with an sBIT chunk that says how many are significant.
         log: counts the images that lose bits.
+        bits: of a sample, at most.
 
     Raises:
         ValueError: the image is missing or damaged; names the file.
         OSError: it cannot be written.
     """
-    name, bits = image_file(eye), source.manifest.recipe.sensor.output_bits
-    if bits == 8:
+    name, stored_bits = image_file(eye), source.manifest.recipe.sensor.output_bits
+    if stored_bits == 8:
         export_file(source, frame_index, name, target)
         return
     where = source.frames.where(frame_index, name)
-    pixels = decode_png(source.frames.read(frame_index, name), where) >> (bits - 8)
+    pixels = decode_png(source.frames.read(frame_index, name), where)
+    if bits == 8:
+        data = encode_png((pixels >> (stored_bits - 8)).astype(np.uint8))
+        log.lost(f"images of {stored_bits} bits: written with their upper 8")
+    else:
+        # The upper bits again below, so that the largest number stays the largest.
+        low = 16 - stored_bits
+        whole = (pixels << low | pixels >> (stored_bits - low)).astype(np.uint16)
+        data = with_significant_bits(encode_png(whole), stored_bits, channels=1 if pixels.ndim == 2 else 3)
     target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_bytes(encode_png(pixels.astype(np.uint8)))
-    log.lost(f"images of {bits} bits: written with their upper 8")
+    target.write_bytes(data)
+
+
+def with_significant_bits(png: bytes, bits: int, channels: int) -> bytes:
+    """The PNG with an sBIT chunk: the upper `bits` of every channel are the camera's.
+
+    Source: PNG specification (ISO/IEC 15948), sections 11.3.2.4 (sBIT) and 13.12 (scaling by replication of bits).
+    """
+    # The signature and the header, which is always first and of one length.
+    header_end = 8 + 25
+    body = b"sBIT" + bytes([bits] * channels)
+    return (
+        png[:header_end] + struct.pack(">I", channels) + body + struct.pack(">I", zlib.crc32(body)) + png[header_end:]
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, cast
 
 import typer
 
@@ -15,6 +15,7 @@ from labelgen.export.formats import FORMATS, write_export
 
 EXAMPLES = (
     "droguekit export data/demo --format coco --out data/demo-coco",
+    "droguekit export data/demo --format coco --images --out data/demo-coco   (annotations/ and images/)",
     "droguekit export data/demo --format blind --out data/demo-blind",
 )
 
@@ -23,13 +24,27 @@ def export(
     dataset: DatasetArgument,
     format_: Annotated[str, typer.Option("--format", metavar="NAME", help="One of the formats below.")],
     out: Annotated[Path, output_option("--out", "DIR2", "Folder for the files; made if missing.")],
+    images: Annotated[
+        bool, typer.Option("--images", help="With coco: copy the images too, so that the folder can be moved.")
+    ] = False,
+    image_bits: Annotated[
+        int | None,
+        typer.Option(
+            metavar="8|16", help="With --images: bits of copies of 12-bit images; 8 by default.", show_default=False
+        ),
+    ] = None,
 ) -> None:
     """Write a dataset's labels in another format, with the images where the format has them.
 
     The command counts and prints what the format cannot represent.
     """
+    if image_bits is not None and not images:
+        raise ValueError("--image-bits: is for copies; add --images")
+    if image_bits not in (None, 8, 16):
+        raise ValueError(f"--image-bits: must be 8 or 16, got {image_bits}")
     log = ExportLog(progress_report())
-    for path in write_export(format_, dataset, out, log):
+    bits = cast(Literal[8, 16], image_bits or 8) if images else None
+    for path in write_export(format_, dataset, out, log, bits):
         typer.echo(f"wrote {path}")
     for what, count in log.losses.items():
         typer.echo(f"{format_}: {count} x {what}")

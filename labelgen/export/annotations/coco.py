@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools.coco import COCO
 
-from datasets_manifest.storage.layout import FRAMES_FOLDER, image_file, parts_file
+from datasets_manifest.atomic import new_folder
+from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, FRAMES_FOLDER, image_file, parts_file
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, Storage, join, open_storage
@@ -27,6 +29,7 @@ from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.part_masks import DroguePixels
 from labelgen.export.export_log import ExportLog
+from labelgen.export.frame_files import ImageBits, export_image
 from labelgen.export.keypoints import (
     CORNER_FROM_CENTER_PX,
     clockwise_order,
@@ -43,8 +46,11 @@ DROGUE, MARKER, HUB = 1, 2, 3
 
 NAMESPACE = "droguekit"
 
-# Ids of markers and hubs: the feature's number in the upper bits, the image's id in the lower ones.
-_FEATURE_ID_STEP = 2**32
+# Ids of markers and hubs: the feature's number in the upper bits, the image's id in the lower ones. Many programs keep
+# ids in signed integers of 32 bits; with at most 33 features these are below 34 * 2^25 < 2^31.
+_FEATURE_ID_STEP = 2**25
+
+IMAGES_FOLDER = "images"
 
 # COCO's OKS is exp(-d^2 / (2 area (2 sigma)^2)). Ours falls to exp(-1/2) where d is half a marker's radius, 0.025 m,
 # of a disc of the drogue's radius, whose area is pi (0.33 m)^2: sigma = 0.025 / (sqrt(pi) 0.33) / 2.
@@ -60,22 +66,42 @@ def write_annotations(dataset: Location, out: Location) -> list[Location]:
     return [join(out, name) for name in _write(dataset, out, ExportLog(), with_features=False)]
 
 
-def write_coco(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """Write `all.json` and one file for each split that has pairs: drogues, markers and hubs.
+def write_coco(dataset: Location, out: Path, log: ExportLog, image_bits: ImageBits | None = None) -> list[Path]:
+    """Write one file for all pairs and one for each split that has pairs: drogues, markers and hubs.
+
+    With images the folder has COCO's own layout, which datumaro, CVAT and torchvision read: `annotations/all.json` and
+    `annotations/person_keypoints_SPLIT.json`, and `images/SPLIT/000123_left.png`. Names of images count from `images`
+    in the file of all pairs, and from `images/SPLIT` in that of a split. Without, `all.json` and `SPLIT.json` name the
+    dataset's own files.
 
     Args:
         dataset: the dataset's folder.
-        out: folder to write into; files of these names are replaced.
+        out: with images a new folder; else a folder in which files of these names are replaced.
         log: counts what the format cannot hold.
+        image_bits: writes images of at most so many bits; None writes none.
 
     Returns:
-        The files, `all.json` first.
+        The file of all pairs, then those of the splits; with images the folder alone.
 
     Raises:
         ValueError: the dataset cannot be read; names the file.
         OSError: a file cannot be written; an existing one stays as it was.
     """
-    return [out / name for name in _write(dataset, out, log, with_features=True)]
+    if image_bits is None:
+        return [out / name for name in _write(dataset, out, log, with_features=True)]
+    with new_folder(out) as folder:
+        place = folder / ANNOTATIONS_FOLDER
+        place.mkdir()
+        _write(dataset, place, log, with_features=True, images=ImageCopies(folder / IMAGES_FOLDER, image_bits))
+    return [out]
+
+
+@dataclass(frozen=True)
+class ImageCopies:
+    """Where images are copied to, and with how many bits at most."""
+
+    folder: Path
+    bits: ImageBits
 
 
 def read_part_ids(source: Dataset, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
@@ -87,15 +113,20 @@ def read_part_ids(source: Dataset, record: PairRecord, eye: Eye) -> NDArray[np.u
     return source.part_ids(record.frame_index, eye) if parts_file(eye) in record.file_sha256 else None
 
 
-def _write(dataset: Location, out: Location, log: ExportLog, with_features: bool) -> list[str]:
+def _write(
+    dataset: Location, out: Location, log: ExportLog, with_features: bool, images: ImageCopies | None = None
+) -> list[str]:
     """Write the files, and return their names in `out`."""
     source, target = Dataset(dataset), open_storage(out)
     splits = source.manifest.split_of_frame()
-    names = ["all", *(split for split in ("train", "val", "test") if split in splits.values())]
+    own = "" if images is None else "person_keypoints_"
+    files = {"all": "all.json"}
+    files |= {split: f"{own}{split}.json" for split in ("train", "val", "test") if split in splits.values()}
     header = canonical_json(coco_header(source.manifest, with_features))
     count = keypoint_count(source.manifest)
+    bits = source.manifest.recipe.sensor.output_bits
     with ExitStack() as stack:
-        writers = {name: _CocoFile(stack, target, f"{name}.json", header) for name in names}
+        writers = {name: _CocoFile(stack, target, file, header) for name, file in files.items()}
         for record in log.records(source):
             split = splits[record.frame_index]
             for eye in EYES:
@@ -106,11 +137,23 @@ def _write(dataset: Location, out: Location, log: ExportLog, with_features: bool
                     annotations += coco_features(record, eye, part_id, count)
                 image = coco_image(record, eye, split)
                 for name in ("all", split):
-                    writers[name].add(image, annotations)
+                    own_name = image if images is None else {**image, "file_name": _copy_name(record, eye, split, name)}
+                    writers[name].add(own_name, annotations)
+                if images is not None:
+                    copy = images.folder / _copy_name(record, eye, split, "all")
+                    export_image(source, record.frame_index, eye, copy, log, images.bits)
+                elif bits > 8:
+                    log.lost(f"images of {bits} bits in 16, nearly black to programs for 8: add --images for copies")
                 _log_missing_labels(log, record, eye, annotations)
         for writer in writers.values():
             writer.finish()
-    return [f"{name}.json" for name in names]
+    return list(files.values())
+
+
+def _copy_name(record: PairRecord, eye: Eye, split: str, file: str) -> str:
+    """Name of a copied image, in the file of all pairs from the folder of all images."""
+    name = f"{record.frame_index:06d}_{eye}.png"
+    return f"{split}/{name}" if file == "all" else name
 
 
 def _log_missing_labels(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[str, Any]]) -> None:
@@ -166,16 +209,18 @@ def coco_header(manifest: Manifest, with_features: bool) -> dict[str, Any]:
         with_features: markers and hub are annotated too.
     """
     count = keypoint_count(manifest)
+    names = [f"marker_{index}" for index in range(count)]
     drogue = {
         "id": DROGUE,
         "name": "drogue",
         "supercategory": "refuelling",
-        "keypoints": [f"marker_{index}" for index in range(count)],
+        "keypoints": names,
         "skeleton": [[index + 1, (index + 1) % count + 1] for index in range(count)],
     }
+    # Readers of keypoints want both lists of every category, and all annotations have absent keypoints of these names.
     features = [
-        {"id": MARKER, "name": "marker", "supercategory": "refuelling"},
-        {"id": HUB, "name": "hub", "supercategory": "refuelling"},
+        {"id": id_, "name": name, "supercategory": "refuelling", "keypoints": names, "skeleton": []}
+        for id_, name in ((MARKER, "marker"), (HUB, "hub"))
     ]
     return {
         "info": {
@@ -274,6 +319,9 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
 
     Arguments as those of `coco_annotation`. The entries have `count` absent keypoints, so that COCO's evaluation of
     keypoints, which asks every annotation for them, passes them over.
+
+    Raises:
+        ValueError: the frame's index is too large for ids of 32 bits.
     """
     view = view_of(record, eye)
     if view.box_visible_xywh_px is None:
@@ -282,6 +330,8 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
     hub = [] if view.hub is None else [(HUB, int(Part.HUB), 1, view.hub)]
     markers = [(MARKER, marker_id(index), 2 + index, marker) for index, marker in enumerate(view.markers)]
     image_id = coco_image_id(record.frame_index, eye)
+    if image_id >= _FEATURE_ID_STEP:
+        raise ValueError(f"frame {record.frame_index}: must be below {_FEATURE_ID_STEP // 2 - 1} for COCO's ids")
     entries = []
     feature: FeatureView
     for category, part, number, feature in [*hub, *markers]:

@@ -103,7 +103,7 @@ def test_ids_are_unique_and_stable(truth, mixed_dataset):
     assert len(set(ids)) == len(ids) and min(ids) >= 1
     for annotation in truth.dataset["annotations"]:
         # What docs/reference/dataset-format.md promises.
-        upper, image_id = divmod(annotation["id"], 2**32)
+        upper, image_id = divmod(annotation["id"], 2**25)
         assert image_id == annotation["image_id"]
         index = annotation["droguekit"].get("marker_index")
         assert upper == {DROGUE: 0, HUB: 1, MARKER: None if index is None else 2 + index}[annotation["category_id"]]

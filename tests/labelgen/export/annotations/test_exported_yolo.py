@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 from pathlib import Path
 
 import cv2
@@ -18,8 +15,8 @@ from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
+from tests.support.other_python import read_by
 
-ULTRALYTICS = "DROGUEKIT_ULTRALYTICS_PYTHON"
 NAMES = ("yolo", "yolo-image-order", "yolo-detect")
 
 # Runs in the other environment, which has nothing of ours.
@@ -175,19 +172,9 @@ def test_twelve_bits_become_eight_and_are_told(dataset_by_preset, tmp_path):
         np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), whole // 16)
 
 
-@pytest.mark.skipif(ULTRALYTICS not in os.environ, reason=f"{ULTRALYTICS} names no Python that has ultralytics")
 @pytest.mark.parametrize("name", NAMES)
 def test_ultralytics_reads_it_without_a_corrupt_file(name, exports, mixed_dataset, tmp_path):
-    done = subprocess.run(
-        [os.environ[ULTRALYTICS], "-c", READ_BY_ULTRALYTICS, str(exports[name] / "data.yaml")],
-        cwd=tmp_path,
-        env={**os.environ, "YOLO_CONFIG_DIR": str(tmp_path), "PYTHONPATH": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout.splitlines()[-1])
+    told = read_by("ultralytics", READ_BY_ULTRALYTICS, exports[name] / "data.yaml", folder=tmp_path)
     empty = sum(view.box_visible_xywh_px is None for _, _, view, _ in views(mixed_dataset))
     assert sum(split["corrupt"] + split["missing"] for split in told.values()) == 0
     assert sum(split["found"] for split in told.values()) == 18

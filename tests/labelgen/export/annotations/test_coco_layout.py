@@ -1,0 +1,157 @@
+"""Copies of images, and COCO files as other people's readers take them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets_manifest.storage.reader import Dataset
+from geometry.stereo import EYES
+from labelgen.export.export_log import ExportLog
+from labelgen.export.formats import write_export
+from labelgen.export.keypoints import view_of
+from tests.support.other_python import read_by
+
+READ_BY_DATUMARO = """
+import json, sys
+import datumaro
+read = datumaro.Dataset.import_from(sys.argv[1], "coco_person_keypoints")
+print(json.dumps([
+    {"subset": item.subset, "id": item.id, "shape": list(item.media.data.shape), "annotations": [
+        {"type": one.type.name, "id": one.id, "label": read.categories()[datumaro.AnnotationType.label][one.label].name,
+         "box": list(map(float, one.get_bbox())), "area": float(one.get_area()),
+         "points": list(map(float, one.points)) if one.type.name == "points" else [],
+         "flags": [int(flag) for flag in one.visibility] if one.type.name == "points" else []}
+        for one in item.annotations]}
+    for item in read]))
+"""
+
+
+@pytest.fixture(scope="module")
+def with_images(mixed_dataset, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("coco") / "out"
+    assert write_export("coco", mixed_dataset, out, ExportLog(), image_bits=8) == [out]
+    return out
+
+
+def annotations_of(path: Path) -> list[dict]:
+    return json.loads(path.read_text())["annotations"]
+
+
+def test_every_category_names_the_keypoints_of_its_annotations(with_images):
+    table = json.loads((with_images / "annotations" / "all.json").read_text())
+    categories = {category["id"]: category for category in table["categories"]}
+    assert [category["name"] for category in categories.values()] == ["drogue", "marker", "hub"]
+    assert {annotation["category_id"] for annotation in table["annotations"]} == set(categories)
+    for annotation in table["annotations"]:
+        category = categories[annotation["category_id"]]
+        assert len(annotation["keypoints"]) == 3 * len(category["keypoints"])
+        assert all(1 <= end <= len(category["keypoints"]) for bone in category["skeleton"] for end in bone)
+    ids = [annotation["id"] for annotation in table["annotations"]]
+    assert len(ids) == len(set(ids)) and min(ids) > 0 and max(ids) < 2**31
+
+
+def test_every_named_image_lies_in_the_moved_folder(with_images, mixed_dataset, tmp_path):
+    source = Dataset(mixed_dataset)
+    moved = with_images.rename(tmp_path / "moved")
+    files = sorted(path.name for path in (moved / "annotations").iterdir())
+    assert files == ["all.json", *(f"person_keypoints_{split}.json" for split in ("test", "train", "val"))]
+    for file in files:
+        split = file.removesuffix(".json").rpartition("_")[2]
+        folder = moved / "images" if split == "all" else moved / "images" / split
+        table = json.loads((moved / "annotations" / file).read_text())
+        assert table["images"]
+        for image in table["images"]:
+            own = image["droguekit"]
+            pixels = cv2.imread(str(folder / image["file_name"]))
+            stored = getattr(source.images(own["frame_index"]), own["view"])
+            np.testing.assert_array_equal(pixels[:, :, ::-1], stored)
+    moved.rename(with_images)
+
+
+def test_deep_images_are_told_of_and_copied_with_eight_bits(dataset_by_preset, tmp_path):
+    dataset = dataset_by_preset("mono", "output_bits = 12")
+    log = ExportLog()
+    write_export("coco", dataset, tmp_path / "without", log)
+    assert log.losses["images of 12 bits in 16, nearly black to programs for 8: add --images for copies"] == 6
+    log = ExportLog()
+    write_export("coco", dataset, tmp_path / "with", log, image_bits=8)
+    assert log.losses["images of 12 bits: written with their upper 8"] == 6
+    source = Dataset(dataset)
+    for image in json.loads((tmp_path / "with" / "annotations" / "all.json").read_text())["images"]:
+        copy = cv2.imread(str(tmp_path / "with" / "images" / image["file_name"]), cv2.IMREAD_UNCHANGED)
+        own = image["droguekit"]
+        np.testing.assert_array_equal(copy, getattr(source.images(own["frame_index"]), own["view"]) // 16)
+        assert copy.dtype == np.uint8
+
+
+def chunks(png: bytes) -> dict[bytes, bytes]:
+    """The data of a PNG's chunks by type."""
+    found, place = {}, 8
+    while place < len(png):
+        (length,) = struct.unpack_from(">I", png, place)
+        found[png[place + 4 : place + 8]] = png[place + 8 : place + 8 + length]
+        place += 12 + length
+    return found
+
+
+@pytest.mark.parametrize(("preset", "channels"), [("mono", 1), ("rgb-ideal", 3)])
+def test_copies_of_sixteen_bits_lose_nothing_and_say_how_many_bits_count(preset, channels, dataset_by_preset, tmp_path):
+    dataset = dataset_by_preset(preset, "output_bits = 12")
+    log = ExportLog()
+    write_export("coco", dataset, tmp_path / "out", log, image_bits=16)
+    assert not any("bits" in what for what in log.losses)
+    source = Dataset(dataset)
+    for image in json.loads((tmp_path / "out" / "annotations" / "all.json").read_text())["images"]:
+        path = tmp_path / "out" / "images" / image["file_name"]
+        found = chunks(path.read_bytes())
+        assert list(found)[:2] == [b"IHDR", b"sBIT"] and found[b"sBIT"] == bytes([12] * channels)
+        copy = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        stored = getattr(source.images(image["droguekit"]["frame_index"]), image["droguekit"]["view"])
+        np.testing.assert_array_equal((copy if channels == 1 else copy[:, :, ::-1]) >> 4, stored)
+        # A reader of 8 bits sees what the copies of 8 bits show.
+        np.testing.assert_array_equal(cv2.imread(str(path))[:, :, 0], (copy if channels == 1 else copy[:, :, 0]) >> 8)
+
+
+def test_other_formats_refuse_the_option(mixed_dataset, tmp_path):
+    with pytest.raises(ValueError, match="--images: is for coco; kitti has images without it"):
+        write_export("kitti", mixed_dataset, tmp_path / "out", ExportLog(), image_bits=8)
+    assert not (tmp_path / "out").exists()
+
+
+def test_datumaro_reads_every_annotation(with_images, mixed_dataset, tmp_path):
+    told = read_by("datumaro", READ_BY_DATUMARO, with_images, folder=tmp_path)
+    assert len(told) == 18 and {item["subset"] for item in told} == {"train", "val", "test"}
+    assert all(item["shape"] == [120, 160, 3] for item in told)
+    read = {(one["id"], one["type"]): one for item in told for one in item["annotations"]}
+    wanted = annotations_of(with_images / "annotations" / "all.json")
+    names = {1: "drogue", 2: "marker", 3: "hub"}
+    # A box, a mask and the keypoints of each.
+    assert len(read) == sum(len(item["annotations"]) for item in told) == 3 * len(wanted)
+    for annotation in wanted:
+        box, mask, points = (read[annotation["id"], kind] for kind in ("bbox", "mask", "points"))
+        assert {one["label"] for one in (box, mask, points)} == {names[annotation["category_id"]]}
+        np.testing.assert_allclose(box["box"], annotation["bbox"])
+        assert mask["area"] == annotation["area"]
+        keypoints = np.array(annotation["keypoints"]).reshape(-1, 3)
+        # datumaro rounds points to hundredths of a pixel.
+        np.testing.assert_allclose(np.reshape(points["points"], (-1, 2)), keypoints[:, :2], atol=0.0051)
+        assert points["flags"] == keypoints[:, 2].tolist()
+
+
+def test_the_views_of_the_datasets_own_images_are_named_without_copies(mixed_dataset, tmp_path):
+    (whole, *_) = write_export("coco", mixed_dataset, tmp_path / "out", ExportLog())
+    source = Dataset(mixed_dataset)
+    named = [image["file_name"] for image in json.loads(whole.read_text())["images"]]
+    assert named == [f"frames/{index:06d}/{eye}.png" for index in source.frame_indices for eye in EYES]
+    assert all((mixed_dataset / name).is_file() for name in named)
+    assert len(annotations_of(whole)) > sum(
+        view_of(source.record(index), eye).box_visible_xywh_px is not None
+        for index in source.frame_indices
+        for eye in EYES
+    )
