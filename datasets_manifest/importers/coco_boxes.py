@@ -1,11 +1,20 @@
-"""Hand-drawn boxes around the drogue, from COCO files."""
+"""Hand-drawn boxes around the drogue, from COCO files of annotation tools.
+
+Names of images are matched by whole parts of their paths, from the end: `flight/left/1.png` in the file is `left/1.png`
+of a folder. Backslashes are slashes. Label Studio puts eight hexadecimal digits and a hyphen before the names of files
+that were uploaded.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from pathlib import Path, PurePath, PurePosixPath
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
 from typing import Any
+from urllib.parse import unquote
 
 from datasets_manifest.types.records import PixelBox
 
@@ -19,51 +28,191 @@ def image_key(path: PurePath) -> str:
     return f"{path.parent.name}/{path.name}" if is_view else path.name
 
 
-def read_boxes(path: Path) -> Mapping[str, list[PixelBox]]:
-    """Hand-drawn boxes from a COCO file, by `image_key`, in pixel-centre coordinates.
+_DROGUE = "drogue"
+
+_UPLOADED = re.compile(r"[0-9a-f]{8}-(.+)")
+
+
+@dataclass(frozen=True)
+class DrawnBox:
+    """One box of a file.
+
+    Attributes:
+        image_name: `file_name` of its image.
+        size_px: (width, height) that the file gives for the image, or None. [px]
+        box: x, y, width, height in pixel-centre coordinates. [px]
+    """
+
+    image_name: str
+    size_px: tuple[int, int] | None
+    box: PixelBox
+
+
+@dataclass(frozen=True)
+class DrawnBoxes:
+    """The boxes of a file, around the drogue alone.
+
+    Attributes:
+        path: of the file.
+        boxes: in the file's order.
+    """
+
+    path: Path
+    boxes: tuple[DrawnBox, ...]
+
+    def of_views(
+        self, names: Sequence[tuple[str, str]], view_size_px: tuple[int, int]
+    ) -> dict[tuple[int, int], PixelBox]:
+        """The boxes by pair and view (0 left, 1 right).
+
+        Args:
+            names: of the left and the right image of every pair; equal where one image holds both views side by side.
+            view_size_px: (width, height) of one view. [px]
+
+        Raises:
+            ValueError: an image that fits several views or has another size, two boxes in a view, or none of the boxes
+                belongs to these images.
+        """
+        index = _NameIndex(names)
+        found: dict[tuple[int, int], PixelBox] = {}
+        for drawn in self.boxes:
+            place = index.find(drawn.image_name, self.path)
+            if place is None:
+                continue
+            pair, view = place
+            width_px, height_px = view_size_px
+            x, y, width, height = drawn.box
+            is_side_by_side = names[pair][0] == names[pair][1]
+            size_px = (2 * width_px, height_px) if is_side_by_side else view_size_px
+            if drawn.size_px not in (None, size_px):
+                raise ValueError(
+                    f"{self.path}: {drawn.image_name} was {_size(drawn.size_px)} px when its box was drawn, and the "
+                    f"image is {_size(size_px)} px; draw on images of the calibrated size"
+                )
+            if is_side_by_side:
+                view = int(x + width / 2 >= width_px - 0.5)
+                x -= view * width_px
+            if (pair, view) in found:
+                raise ValueError(
+                    f"{self.path}: {drawn.image_name} has two boxes in one view, and one drogue is looked for"
+                )
+            found[pair, view] = (x, y, width, height)
+        if self.boxes and not found:
+            raise ValueError(
+                f"{self.path}: none of its {len(self.boxes)} boxes belongs to these images: it names "
+                f"{self.boxes[0].image_name}, and the images are {names[0][0]} and so on"
+            )
+        return found
+
+
+class _NameIndex:
+    """Finds the view that a file name of a COCO file means."""
+
+    def __init__(self, names: Sequence[tuple[str, str]]) -> None:
+        self._by_file: dict[str, list[tuple[tuple[str, ...], tuple[int, int]]]] = {}
+        self._by_upload: dict[str, list[tuple[tuple[str, ...], tuple[int, int]]]] = {}
+        for pair, (left, right) in enumerate(names):
+            for view, name in enumerate((left,) if left == right else (left, right)):
+                parts = _parts(name)
+                entry = parts, (pair, view)
+                self._by_file.setdefault(parts[-1], []).append(entry)
+                self._by_upload.setdefault(_as_uploaded(parts[-1]), []).append(entry)
+
+    def find(self, name: str, path: Path) -> tuple[int, int] | None:
+        """Pair and view, or None where no image fits.
+
+        Raises:
+            ValueError: several fit.
+        """
+        asked = _parts(name)
+        fitting = [entry for entry in self._by_file.get(asked[-1], []) if _is_end_of_either(entry[0], asked)]
+        uploaded = _UPLOADED.fullmatch(asked[-1])
+        if not fitting and uploaded is not None:
+            fitting = self._by_upload.get(uploaded[1], [])
+        if len(fitting) > 1:
+            first, second = ("/".join(parts) for parts, _ in fitting[:2])
+            raise ValueError(
+                f"{path}: {name} may be {first} or {second}; give each file_name its folder, as in {first}"
+            )
+        return fitting[0][1] if fitting else None
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """The parts of a path; those of Windows and of Label Studio's local files (`...?d=left/1.png`) too."""
+    path = unquote(name.partition("?d=")[2]) if "?d=" in name else name
+    return tuple(part for part in path.replace("\\", "/").split("/") if part not in ("", ".", "..")) or (name,)
+
+
+def _is_end_of_either(one: tuple[str, ...], other: tuple[str, ...]) -> bool:
+    shared = min(len(one), len(other))
+    return one[-shared:] == other[-shared:]
+
+
+def _as_uploaded(file: str) -> str:
+    """A file's name as Label Studio stores it (Django's `get_valid_name`)."""
+    return re.sub(r"[^-\w.]", "", file.strip().replace(" ", "_"))
+
+
+def _size(size_px: tuple[int, int] | None) -> str:
+    return "unknown" if size_px is None else f"{size_px[0]}x{size_px[1]}"
+
+
+def read_boxes(path: Path, category: str | None = None) -> DrawnBoxes:
+    """Hand-drawn boxes of one category of a COCO file.
+
+    Args:
+        path: of the file.
+        category: its name; None for the one named drogue. A file without categories has boxes of the drogue alone.
 
     Raises:
-        ValueError: it cannot be read or is not a COCO file; names it.
+        ValueError: it cannot be read, is not a COCO file, has no such category, or an annotation is no upright box;
+            names the file, and the annotation.
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-        names = {_number(image["id"]): image_key(PurePosixPath(str(image["file_name"]))) for image in table["images"]}
-        boxes: dict[str, list[PixelBox]] = {}
-        for annotation in table["annotations"]:
-            boxes.setdefault(names[_number(annotation["image_id"])], []).append(_box(annotation["bbox"]))
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: is truncated or not JSON: {error}") from error
+    try:
+        return DrawnBoxes(path, tuple(_drawn_boxes(table, category)))
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: is not a COCO file of boxes: {type(error).__name__} {error}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _drawn_boxes(table: dict[str, Any], category: str | None) -> list[DrawnBox]:
+    images = {_number(image["id"]): image for image in table["images"]}
+    if len(images) < len(table["images"]):
+        raise ValueError("images: two have the same id")
+    wanted = _category_id(table.get("categories", []), category)
+    boxes: list[DrawnBox] = []
+    for annotation in table["annotations"]:
+        name = f"annotation {annotation.get('id', len(boxes))}"
+        if wanted is not None and annotation.get("category_id") != wanted:
+            continue
+        image = images.get(_number(annotation.get("image_id")))
+        if image is None:
+            raise ValueError(f"{name}: no image has its image_id {annotation['image_id']}")
+        size = image.get("width"), image.get("height")
+        size_px = size if all(type(number) is int and number > 0 for number in size) else None
+        file = str(image["file_name"])
+        boxes.append(DrawnBox(file, size_px, _box(annotation, f"{name} on {file}")))
     return boxes
 
 
-def boxes_of_pair(
-    boxes: Mapping[str, list[PixelBox]], names: tuple[str, str], width_px: int
-) -> tuple[PixelBox | None, PixelBox | None]:
-    """The boxes of the left and the right view.
-
-    Args:
-        boxes: as `read_boxes` gives them.
-        names: of the left and the right image; equal where one image holds both views side by side.
-        width_px: of one view.
-
-    Raises:
-        ValueError: a view with two boxes, though one drogue is looked for.
-    """
-    if names[0] == names[1]:
-        both = boxes.get(names[0], [])
-        left = [box for box in both if box[0] + box[2] / 2 < width_px - 0.5]
-        views = [left, [(x - width_px, y, w, h) for x, y, w, h in both if (x, y, w, h) not in left]]
-    else:
-        views = [boxes.get(name, []) for name in names]
-    for name, found in zip(names, views, strict=True):
-        if len(found) > 1:
-            raise ValueError(f"boxes: {name} has {len(found)} in one view, and one drogue is looked for")
-    first, second = (found[0] if found else None for found in views)
-    return first, second
+def _category_id(categories: list[dict[str, Any]], asked: str | None) -> int | None:
+    """Id of the category with the drogue's boxes; None for a file without categories."""
+    if not categories and asked is None:
+        return None
+    ids = [_number(one["id"]) for one in categories if str(one["name"]).strip().lower() == (asked or _DROGUE).lower()]
+    if len(ids) != 1:
+        names = ", ".join(str(one["name"]) for one in categories) or "none"
+        raise ValueError(
+            f"categories: {len(ids) or 'none'} named {asked or _DROGUE}; choose by --box-category from {names}"
+        )
+    return ids[0]
 
 
 def _number(value: Any) -> int:
@@ -72,9 +221,18 @@ def _number(value: Any) -> int:
     return value
 
 
-def _box(value: Any) -> PixelBox:
+def _box(annotation: dict[str, Any], name: str) -> PixelBox:
     """A COCO box in pixel-centre coordinates; COCO's origin is half a pixel before the first pixel's centre."""
-    x, y, width, height = (float(number) for number in value)
-    if not (abs(x) < 1e6 and abs(y) < 1e6 and 0 < width < 1e6 and 0 < height < 1e6):
-        raise ValueError(f"a bbox must be x, y, width, height in pixels, got {value}")
+    value = annotation.get("bbox")
+    try:
+        x, y, width, height = (float(number) for number in value)  # type: ignore[union-attr]
+        is_box = abs(x) < 1e6 and abs(y) < 1e6 and 0 < width < 1e6 and 0 < height < 1e6
+    except (TypeError, ValueError):
+        is_box = False
+    if not is_box:
+        raise ValueError(f"{name}: its bbox must be x, y, width, height in pixels, got {value}")
+    attributes = annotation.get("attributes")
+    turn_deg = attributes.get("rotation", 0) if isinstance(attributes, dict) else 0
+    if not isinstance(turn_deg, (int, float)) or not math.isclose(turn_deg % 360, 0, abs_tol=1e-9):
+        raise ValueError(f"{name}: its box is turned by {turn_deg} degrees; draw it upright")
     return (x - 0.5, y - 0.5, width, height)

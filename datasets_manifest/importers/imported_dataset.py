@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
@@ -11,7 +11,7 @@ import numpy as np
 
 from datasets_manifest.atomic import new_folder
 from datasets_manifest.calibration.calibration_files import calibration_files
-from datasets_manifest.importers.coco_boxes import boxes_of_pair
+from datasets_manifest.importers.coco_boxes import DrawnBoxes
 from datasets_manifest.recipe.rigs import SENSORS
 from datasets_manifest.storage.blind import BlindIndex
 from datasets_manifest.storage.image_codecs import encode_png
@@ -85,7 +85,7 @@ class ImportSettings:
         black_level_dn: pixel value without light, in the source. [DN]
         bits: significant bits of images with more than 8; by default as many as the first pair needs.
         exposure_s: exposure time; 0 where it is unknown. [s]
-        boxes: around the drogue, by image name.
+        boxes: around the drogue.
     """
 
     name: str
@@ -95,7 +95,7 @@ class ImportSettings:
     black_level_dn: float = 0.0
     bits: int | None = None
     exposure_s: float = 0.0
-    boxes: Mapping[str, list[PixelBox]] | None = None
+    boxes: DrawnBoxes | None = None
 
 
 def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, advance: Callable[[], None]) -> int:
@@ -115,8 +115,8 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
         OSError: it cannot be written; nothing is left behind.
     """
     depth: PixelDepth | None = None
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
+    names: list[tuple[str, str]] = []
+    box_count = 0
     with new_folder(out) as folder:
         for frame_index, pair in enumerate(source):
             depth = depth or PixelDepth(pair, settings.bits)
@@ -126,12 +126,7 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
                 pixels = depth.checked(image, name, settings.rig)
                 (target / image_file(eye)).write_bytes(encode_png(pixels))
             _write(target / RECORD_FILE, _record(pair, settings, depth.kept_level_dn(settings.black_level_dn)))
-            boxes = boxes_of_pair(settings.boxes or {}, pair.names, settings.rig.camera.width_px)
-            for view, box in enumerate(boxes):
-                image_id = 2 * frame_index + view + 1
-                images.append(_coco_image(image_id, frame_index, view, settings.rig))
-                if box is not None:
-                    annotations.append(_coco_box(image_id, box))
+            names.append(pair.names)
             advance()
         assert depth is not None  # a source without pairs was refused
         _write(folder / BLIND_FILE, _index(settings, depth, source.count).model_dump(mode="json"))
@@ -139,11 +134,11 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
             (folder / CALIBRATION_FOLDER).mkdir(exist_ok=True)
             (folder / CALIBRATION_FOLDER / name).write_text(text, encoding="utf-8")
         if settings.boxes is not None:
-            categories = [{"id": 1, "name": "drogue", "supercategory": "target"}]
-            table = {"images": images, "annotations": annotations, "categories": categories}
+            table = _coco_table(settings.boxes, names, settings.rig)
+            box_count = len(table["annotations"])
             (folder / ANNOTATIONS_FOLDER).mkdir()
             _write(folder / ANNOTATIONS_FOLDER / "all.json", table)
-    return len(annotations)
+    return box_count
 
 
 class PixelDepth:
@@ -219,6 +214,19 @@ def _index(settings: ImportSettings, depth: PixelDepth, count: int) -> BlindInde
         drogues_differ=False,
         frames=tuple(range(count)),
     )
+
+
+def _coco_table(drawn: DrawnBoxes, names: list[tuple[str, str]], rig: StereoRig) -> dict[str, Any]:
+    """All views of the dataset, and the boxes of those that have one."""
+    boxes = drawn.of_views(names, (rig.camera.width_px, rig.camera.height_px))
+    places = [(pair, view) for pair in range(len(names)) for view in range(len(EYES))]
+    return {
+        "images": [_coco_image(2 * pair + view + 1, pair, view, rig) for pair, view in places],
+        "annotations": [
+            _coco_box(2 * pair + view + 1, boxes[pair, view]) for pair, view in places if (pair, view) in boxes
+        ],
+        "categories": [{"id": 1, "name": "drogue", "supercategory": "target"}],
+    }
 
 
 def _coco_image(image_id: int, frame_index: int, view: int, rig: StereoRig) -> dict[str, Any]:

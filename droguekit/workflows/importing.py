@@ -23,7 +23,8 @@ class ImportOptions:
         calibration: file of OpenCV's stereo calibration; a bag's own when None.
         calibration_unit: `m`, `cm` or `mm`, of its translation.
         drogue: preset or TOML file.
-        boxes: COCO boxes of the drogue by image name, or None.
+        boxes: COCO file of boxes of the drogue by image name, or None.
+        box_category: name of their category; the one named drogue when None.
         topics: `LEFT,RIGHT` of a bag, or None where it has one pair of them.
         rate_hz: pairs a second in a folder; 25 when None. [Hz]
         encoding: `linear` or `gamma`; by depth when None.
@@ -35,6 +36,7 @@ class ImportOptions:
     calibration_unit: str = "m"
     drogue: str = "red-8"
     boxes: Path | None = None
+    box_category: str | None = None
     topics: str | None = None
     rate_hz: float | None = None
     encoding: str | None = None
@@ -76,8 +78,10 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
 
     if _is_bag(source) and (options.rate_hz is not None or options.boxes is not None):
         raise ValueError("--rate, --boxes: are for folders of images; a bag has stamps, and no names for its images")
+    if options.box_category is not None and options.boxes is None:
+        raise ValueError("--box-category: names the category of --boxes, which is missing")
     pairs, rig = _open_source(source, options)
-    given = None if options.boxes is None else read_boxes(options.boxes)
+    given = None if options.boxes is None else read_boxes(options.boxes, options.box_category)
     settings = ImportSettings(
         name=out.resolve().name,
         rig=rig,
@@ -95,7 +99,7 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
     for line in pairs.left_out:
         report.say(f"left out: {line}")
     if given is not None:
-        report.say(f"boxes: {used} of {sum(map(len, given.values()))} belong to these images")
+        report.say(f"boxes: {used} of {len(given.boxes)} belong to these images")
     return pairs.count
 
 

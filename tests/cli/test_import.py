@@ -123,6 +123,19 @@ def test_boxes_come_along(smoke_dataset: Path, pictures: Path, tmp_path: Path) -
         assert got.imgToAnns[annotation["image_id"]][0]["bbox"] == annotation["bbox"]
 
 
+def test_boxes_that_fit_no_image_leave_no_dataset(
+    smoke_dataset: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = drogue_boxes(smoke_dataset)
+    for image in table["images"]:
+        image["file_name"] = f"other_{image['file_name']}"
+    (tmp_path / "boxes.json").write_text(json.dumps(table))
+    order = [*arguments(pictures, smoke_dataset, tmp_path / "imported"), "--boxes", str(tmp_path / "boxes.json")]
+    assert run(order) == WRONG_INPUT
+    assert "belongs to these images" in capsys.readouterr().err
+    assert not (tmp_path / "imported").exists()
+
+
 def test_the_benchmark_checks_poses_without_truth(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps(drogue_boxes(smoke_dataset)))
@@ -159,6 +172,7 @@ def test_the_preview_shows_imported_pairs(smoke_dataset: Path, pictures: Path, t
         (("--calibration-unit", "ft"), "--calibration-unit"),
         (("--topics", "a,b"), "is not a ROS bag"),
         (("--boxes", "none.json"), "none.json"),
+        (("--box-category", "basket"), "--box-category"),
     ],
 )
 def test_wrong_options_are_one_line(

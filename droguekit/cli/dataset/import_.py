@@ -34,6 +34,9 @@ def import_(
     boxes: Annotated[
         Path | None, typer.Option("--boxes", metavar="FILE", help="COCO boxes of the drogue, by image name.")
     ] = None,
+    box_category: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Category of the boxes; by default the one named drogue.")
+    ] = None,
     topics: Annotated[
         str | None, typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics, where a bag has several.")
     ] = None,
@@ -55,6 +58,8 @@ def import_(
     Pixels stay as they are: the rig stores the calibration's distortion and rotation, and navigation rectifies the
     points that it measures.
     """
-    options = ImportOptions(calibration, calibration_unit, drogue, boxes, topics, rate, encoding, black_level, bits)
+    options = ImportOptions(
+        calibration, calibration_unit, drogue, boxes, box_category, topics, rate, encoding, black_level, bits
+    )
     count = import_images(source, out, options, progress_report())
     typer.echo(f"wrote {out}: {count} pairs")
