@@ -92,12 +92,12 @@ def write_overlay_video(
         which = "" if sequence_id is None else f" of sequence {sequence_id}"
         raise ValueError(f"{dataset.path}: holds no pairs{which} to show")
     records = [dataset.record(index) for index in evenly(fitting, count)]
-    method, answers = estimates
+    method, of_method = estimates
 
     def draw(record: PairRecord) -> Picture:
         drogue = dataset.sought_drogue(record)
         index = record.frame_index
-        return draw_overlay(record, dataset.images(index), drogue, method, answers.get(index))
+        return draw_overlay(record, dataset.images(index), drogue, method, of_method.get(index))
 
     length_s = period_s(records)
     write_video(path, map(draw, records), length_s)

@@ -85,7 +85,7 @@ def _with_frames(recipe: Recipe, count: int, scenes: int) -> Recipe:
 
 
 def _stations_table(recipe: Recipe, reports: tuple[FrameReport, ...]) -> Iterator[str]:
-    """CPU time of a pair at each distance, and the share of each stage."""
+    """CPU time of a pair at each distance, and the share of each stage; dashes where no pair was measured."""
     stages = list(dict.fromkeys(stage for report in reports for stage in report.stage_s))
     yield f"{'distance':>9} {'CPU s/pair':>11}  share of each stage [%]"
     yield f"{'':>21}  {' '.join(f'{stage:>9}' for stage in stages)}"
@@ -96,8 +96,9 @@ def _stations_table(recipe: Recipe, reports: tuple[FrameReport, ...]) -> Iterato
                 total.update(report.stage_s)
                 count += 1
         cpu_s = sum(total.values())
-        shares = " ".join(f"{100 * total[stage] / cpu_s:9.1f}" for stage in stages)
-        yield f"{station_m:7g} m {cpu_s / count:11.2f}  {shares}"
+        mean = f"{cpu_s / count:.2f}" if count else "-"
+        shares = " ".join(f"{f'{100 * total[stage] / cpu_s:.1f}' if cpu_s else '-':>9}" for stage in stages)
+        yield f"{station_m:7g} m {mean:>11}  {shares}"
 
 
 def _mean_row(quality: str, frames: tuple[MeasuredFrame, ...]) -> str:

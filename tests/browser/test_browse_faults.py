@@ -51,7 +51,7 @@ def test_without_labels_a_pair_is_shown_alone(
     assert f"data/{labels.name} {fault}" in page.inner_text("#fault")
     picture = page.get_attribute("#left image", "href")
     assert picture is not None and picture.startswith("pictures/000001-")
-    assert page.locator("#left rect, #left path, #conditions td, #features td, #answers td").count() == 0
+    assert page.locator("#left rect, #left path, #conditions td, #features td, #estimates td").count() == 0
     assert page.is_disabled("#zoom")
     show(page, 2)
     assert not page.is_visible("#fault")

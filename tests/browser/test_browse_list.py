@@ -42,7 +42,7 @@ def test_a_method_may_be_called_as_a_script_calls_its_own_things(
     page = opened.page
     fixes = [i for i, estimate in browsed.estimates[method].items() if isinstance(estimate, PoseEstimate)]
     page.select_option("#filters [name=method]", method)
-    page.select_option("#filters [name=answer]", "fix")
+    page.select_option("#filters [name=result]", "fix")
     assert shown_frames(page) == fixes
     page.select_option("#filters [name=order]", "error")
     assert shown_frames(page) == sorted(fixes, reverse=True)
@@ -74,8 +74,8 @@ def test_filters_count_as_numpy_does(browsed: BrowsedDataset, open_page: OpenPag
         ({"drogue": "seen"}, box),
         ({"light": "1 to 100 cd/m²"}, (luminance >= 1) & (luminance < 100)),
         ({"light": "from 3000 cd/m²"}, luminance >= 3000),
-        ({"method": OTHER, "answer": "fix"}, fix),
-        ({"answer": "none"}, ~fix),
+        ({"method": OTHER, "result": "fix"}, fix),
+        ({"result": "none"}, ~fix),
         ({"text": "LOW-LIGHT val"}, (family == "low-light") & (split == "val")),
         ({"text": "nothing like that"}, index < 0),
     ]

@@ -55,8 +55,8 @@ def test_names_are_shown_as_they_are(browsed: BrowsedDataset, open_page: OpenPag
     opened = open_page(browsed.page)
     opened.page.on("dialog", lambda dialog: opened.faults.append("a foreign script ran"))
     show(opened.page, 4)
-    answers = opened.page.inner_text("#answers")
-    assert OTHER in answers and "<i>nothing</i> seen" in answers
+    estimates = opened.page.inner_text("#estimates")
+    assert OTHER in estimates and "<i>nothing</i> seen" in estimates
     assert opened.page.locator("img[src=x]").count() == 0 and opened.faults == []
 
 
@@ -167,13 +167,13 @@ def test_pairs_without_truth_show_estimates_alone(browsed: BrowsedDataset, open_
     opened = open_page(tmp_path / "page" / "index.html")
     page = opened.page
     fixes = [i for i, estimate in browsed.estimates["own"].items() if isinstance(estimate, PoseEstimate)]
-    page.select_option("#filters [name=answer]", "fix")
+    page.select_option("#filters [name=result]", "fix")
     assert shown_frames(page) == fixes
     assert not page.is_visible("#filters [name=near]")
     show(page, fixes[0])
     assert not page.is_visible("#layers [name=markers]") and page.is_visible("#layers [name=estimate]")
     pose = browsed.estimates["own"][fixes[0]].left_from_drogue
-    assert f"a fix at {pose.translation_m[2]:.2f}" in page.inner_text("#answers")
+    assert f"a fix at {pose.translation_m[2]:.2f}" in page.inner_text("#estimates")
     page.keyboard.press("z")
     # The estimate's rim fills most of what is shown.
     x, _, width, _ = (float(part) for part in page.get_attribute("#left", "viewBox").split())

@@ -8,28 +8,18 @@ from pycocotools.coco import COCO
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
 from labelgen.validation.dataset_checks import validate_dataset
-from tests.support.small_datasets import RIG_320_PX, rendered
+from tests.support.recipe_builder import RIG_320_PX, recipe_text, stations
+from tests.support.small_datasets import rendered
 
-TABLE = f"""
-name = "variants"
-seed = 2
-{RIG_320_PX}
-[frames]
-count = 10
-scenes = 10
-empty_fraction = 0.2
-[distance]
-law = "stations"
-stations_m = [2.0, 4.0]
-[target]
-missing_marker_fraction = 0.2
-[[target.variants]]
-drogue = "red-8"
-[[target.variants]]
-drogue = "white-5"
-[render]
-engine = "analytic"
-"""
+TABLE = recipe_text(
+    name="variants",
+    seed=2,
+    rig=RIG_320_PX,
+    frames={"count": 10, "scenes": 10, "empty_fraction": 0.2},
+    distance=stations(2.0, 4.0),
+    target={"missing_marker_fraction": 0.2, "variants": [{"drogue": "red-8"}, {"drogue": "white-5"}]},
+    render={"engine": "analytic"},
+)
 
 
 @pytest.fixture(scope="module")

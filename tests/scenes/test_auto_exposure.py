@@ -2,80 +2,80 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.types.frame import Exposure
 from drogue_models.parameters import WHITE_PAINT
 from scenes.auto_exposure import automatic_exposure
 from scenes.environment_radiance import environment_radiance
 from scenes.environment_sampling import environment_of_scene
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
+from tests.support.recipe_builder import RecipeTable, build_recipe, stations
 
-TABLE = """
-name = "meter-test"
-rig = { preset = "rgb-ideal", width_px = 64, height_px = 48, focal_px = 107.0 }
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [5.0]
-[exposure]
-%s
-"""
+BASE: RecipeTable = {
+    "name": "meter-test",
+    "rig": {"preset": "rgb-ideal", "width_px": 64, "height_px": 48, "focal_px": 107.0},
+    "frames": {"count": 1},
+    "distance": stations(5.0),
+}
 
 
-def recipe(exposure: str = "") -> Recipe:
-    return parse_recipe(TABLE % exposure)
+def recipe(**exposure: Any) -> Recipe:
+    """With these keys in its section `exposure`."""
+    return build_recipe(BASE, exposure=exposure)
 
 
-def exposure_of(text: str):
-    return sample_frame(recipe(text), 0).exposure
+def exposure_of(**exposure: Any) -> Exposure:
+    return sample_frame(recipe(**exposure), 0).exposure
 
 
-FREE = exposure_of("")
+FREE = exposure_of()
 
 
 def test_time_alone_when_its_limits_suffice():
-    with_gain = exposure_of("auto_gain = [1, 16]")
+    with_gain = exposure_of(auto_gain=[1, 16])
     assert with_gain == FREE
     assert FREE.gain == 1
 
 
 def test_gain_makes_up_for_a_time_at_its_limit():
     longest_s = FREE.time_s / 5
-    got = exposure_of(f"auto_time_s = [1e-6, {longest_s!r}]\nauto_gain = [1, 16]")
+    got = exposure_of(auto_time_s=[1e-6, longest_s], auto_gain=[1, 16])
     assert got.time_s == longest_s
     assert got.gain == pytest.approx(5, rel=1e-12)
 
 
 def test_gain_stays_within_its_limits():
-    got = exposure_of(f"auto_time_s = [1e-6, {FREE.time_s / 5!r}]\nauto_gain = [1, 3]")
+    got = exposure_of(auto_time_s=[1e-6, FREE.time_s / 5], auto_gain=[1, 3])
     assert got.gain == 3
 
 
 def test_a_gain_that_must_be_high_shortens_the_time():
-    got = exposure_of("auto_gain = [4, 16]")
+    got = exposure_of(auto_gain=[4, 16])
     assert got.gain == 4
     assert got.time_s == pytest.approx(FREE.time_s / 4, rel=1e-12)
 
 
 def test_a_low_gain_takes_a_shortest_time_that_is_too_long():
-    got = exposure_of(f"auto_time_s = [{2 * FREE.time_s!r}, 1]\nauto_gain = [0.1, 1]")
+    got = exposure_of(auto_time_s=[2 * FREE.time_s, 1], auto_gain=[0.1, 1])
     assert got.time_s == 2 * FREE.time_s
     assert got.gain == pytest.approx(0.5, rel=1e-12)
 
 
 def test_a_fixed_time_keeps_its_gain_or_meters_it():
     time_s = FREE.time_s / 8
-    assert exposure_of(f"time_s = {time_s!r}").gain == 1
-    assert exposure_of(f"time_s = {time_s!r}\nauto_gain = 6").gain == 6
-    assert exposure_of(f"time_s = {time_s!r}\nauto_gain = [1, 64]").gain == pytest.approx(8, rel=1e-12)
+    assert exposure_of(time_s=time_s).gain == 1
+    assert exposure_of(time_s=time_s, auto_gain=6).gain == 6
+    assert exposure_of(time_s=time_s, auto_gain=[1, 64]).gain == pytest.approx(8, rel=1e-12)
 
 
 def test_product_of_time_and_gain_answers_the_aperture():
-    wide, narrow = (exposure_of(f"f_number = {f}\nauto_time_s = [1e-6, 1]\nauto_gain = [1, 64]") for f in (2.0, 4.0))
+    wide, narrow = (exposure_of(f_number=f, auto_time_s=[1e-6, 1], auto_gain=[1, 64]) for f in (2.0, 4.0))
     assert narrow.time_s * narrow.gain == pytest.approx(4 * wide.time_s * wide.gain, rel=1e-12)
 
 
@@ -87,7 +87,7 @@ def test_the_meter_alone_with_a_scene():
 
 
 def test_a_meter_on_the_plate_minds_no_sky_behind_it():
-    made = recipe('auto_meter = "plate"\nauto_level_fraction = 0.5\nauto_time_s = [1e-6, 1]')
+    made = recipe(auto_meter="plate", auto_level_fraction=0.5, auto_time_s=[1e-6, 1])
     environment = environment_of_scene(made.seed, 0, made.environment)
     pose = sample_frame(made, 0).world_from_left
     longer = []
@@ -104,7 +104,7 @@ def test_a_meter_on_the_plate_minds_no_sky_behind_it():
     assert longer[1] == 1
 
 
-@pytest.mark.parametrize("text", ["auto_gain = [0.01, 1]", "auto_gain = [1, 100]", "auto_gain = [4, 2]"])
-def test_impossible_gains_are_refused(text):
+@pytest.mark.parametrize("auto_gain", [[0.01, 1], [1, 100], [4, 2]])
+def test_impossible_gains_are_refused(auto_gain: list[float]) -> None:
     with pytest.raises(ValueError, match="gain"):
-        recipe(text)
+        recipe(auto_gain=auto_gain)

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from render.surfaces import DIRT_MAP_PX, dirt_map
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import RecipeTable, between, build_recipe
 
-BASE = """
-name = "target-test"
-seed = 4
-rig = { preset = "rgb-ideal", probe_tip_body_m = [2.6, 0.5, 0.35] }
-[frames]
-count = 300
-scenes = 300
-empty_fraction = %f
-[distance]
-law = "uniform"
-low_m = 3
-high_m = 20
-[target]
-%s
-"""
+BASE: RecipeTable = {
+    "name": "target-test",
+    "seed": 4,
+    "rig": {"preset": "rgb-ideal", "probe_tip_body_m": [2.6, 0.5, 0.35]},
+    "frames": {"count": 300, "scenes": 300},
+    "distance": between(3, 20),
+}
 
 
-def recipe(target="", empty=0.0):
-    return parse_recipe(BASE % (empty, target))
+def recipe(empty_fraction: float = 0.0, **target: Any) -> Recipe:
+    """With these keys in its section `target`."""
+    return build_recipe(BASE, frames={"empty_fraction": empty_fraction}, target=target)
 
 
 def within_chance(share, expected, count):
@@ -42,21 +38,21 @@ def test_without_the_section_the_drogue_is_as_new_and_alone():
 
 
 def test_variants_come_in_their_shares():
-    drawn = recipe('variants = [{ drogue = "red-8", weight = 3 }, { drogue = "white-5" }]')
+    drawn = recipe(variants=[{"drogue": "red-8", "weight": 3}, {"drogue": "white-5"}])
     names = [drogue_of_scene(drawn, scene).name for scene in range(300)]
     assert set(names) == {"red-8", "white-5"}
     assert within_chance(names.count("white-5") / 300, 0.25, 300)
 
 
 def test_an_empty_frame_says_what_is_sought_where_there_are_several():
-    drawn = recipe('variants = [{ drogue = "red-7" }]', empty=1.0)
+    drawn = recipe(1.0, variants=[{"drogue": "red-7"}])
     frame = sample_frame(drawn, 0)
     assert frame.drogue is None and frame.condition is None
     assert frame.sought is not None and frame.sought.name == "red-7"
 
 
 def test_faults_come_in_their_shares_and_three_markers_stay():
-    drawn = recipe("missing_marker_fraction = 0.9\ndirty_marker_fraction = 0.3\nfailed_lamp_fraction = 0.2")
+    drawn = recipe(missing_marker_fraction=0.9, dirty_marker_fraction=0.3, failed_lamp_fraction=0.2)
     states = [condition_of_scene(drawn, scene, drawn.drogue) for scene in range(300)]
     assert all(sum(not marker.missing for marker in state.markers) >= 3 for state in states)
     # Of eight markers three are spared, the others go with a chance of 0.9.
@@ -68,13 +64,13 @@ def test_faults_come_in_their_shares_and_three_markers_stay():
 
 def test_bystanders_do_not_change_the_rest_of_a_frame():
     alone = sample_frame(recipe(), 5)
-    among = sample_frame(recipe("probe = true\nobstacle_frame_fraction = 1\ndistractor_frame_fraction = 1"), 5)
+    among = sample_frame(recipe(probe=True, obstacle_frame_fraction=1, distractor_frame_fraction=1), 5)
     assert among.model_copy(update={"bystanders": ()}).model_dump_json() == alone.model_dump_json()
     assert [bystander.kind for bystander in among.bystanders[:2]] == ["probe", "obstacle"]
 
 
 def test_the_probe_ends_where_the_rig_has_its_tip():
-    frame = sample_frame(recipe("probe = true"), 0)
+    frame = sample_frame(recipe(probe=True), 0)
     (probe,) = frame.bystanders
     tip_m = frame.rig.body_from_left.inverse().apply(frame.rig.probe_tip_body_m)
     assert probe.left_from_object.translation_m == pytest.approx(tip_m, abs=1e-12)
@@ -85,7 +81,7 @@ def test_the_probe_ends_where_the_rig_has_its_tip():
 
 
 def test_distractors_stay_behind_the_drogue():
-    drawn = recipe("distractor_frame_fraction = 1")
+    drawn = recipe(distractor_frame_fraction=1)
     for index in range(50):
         frame = sample_frame(drawn, index)
         depths_m = [bystander.left_from_object.translation_m[2] for bystander in frame.bystanders]
@@ -93,12 +89,12 @@ def test_distractors_stay_behind_the_drogue():
 
 
 def test_distractors_have_the_forms_that_are_named_as_often_as_they_are():
-    lines = 'distractor_frame_fraction = 1\ndistractor_forms = ["ring", "ring", "ring", "disc"]'
-    forms = [each.shape.form for index in range(150) for each in sample_frame(recipe(lines, 1.0), index).bystanders]
+    drawn = recipe(1.0, distractor_frame_fraction=1, distractor_forms=["ring", "ring", "ring", "disc"])
+    forms = [each.shape.form for index in range(150) for each in sample_frame(drawn, index).bystanders]
     assert set(forms) == {"ring", "disc"}
     assert within_chance(forms.count("ring") / len(forms), 0.75, len(forms))
     # Recipes that name none are written as they were before there were names.
-    assert "distractor_forms" not in recipe("distractor_frame_fraction = 1").model_dump_json()
+    assert "distractor_forms" not in recipe(distractor_frame_fraction=1).model_dump_json()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
@@ -110,17 +106,17 @@ def test_dirt_covers_the_share_that_is_asked_for(share):
 
 
 @pytest.mark.parametrize(
-    ("line", "fault"),
+    ("target", "fault"),
     [
-        ("missing_marker_fraction = 1.5", "target.missing_marker_fraction"),
-        ("dirt_fraction = [0, 2]", "dirt_fraction: must lie in"),
-        ('variants = [{ drogue = "red-9" }]', "red-9"),
-        ("variants = [{ weight = 1 }]", "target.variants.0.drogue"),
-        ("probe_radius_m = 0", "target.probe_radius_m"),
-        ("distractor_forms = []", "target.distractor_forms"),
-        ('distractor_forms = ["cube"]', "target.distractor_forms.0"),
+        ({"missing_marker_fraction": 1.5}, "target.missing_marker_fraction"),
+        ({"dirt_fraction": [0, 2]}, "dirt_fraction: must lie in"),
+        ({"variants": [{"drogue": "red-9"}]}, "red-9"),
+        ({"variants": [{"weight": 1}]}, "target.variants.0.drogue"),
+        ({"probe_radius_m": 0}, "target.probe_radius_m"),
+        ({"distractor_forms": []}, "target.distractor_forms"),
+        ({"distractor_forms": ["cube"]}, "target.distractor_forms.0"),
     ],
 )
-def test_a_wrong_section_is_named(line, fault):
+def test_a_wrong_section_is_named(target: dict[str, Any], fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
-        recipe(line)
+        recipe(**target)

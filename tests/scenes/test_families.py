@@ -6,57 +6,38 @@ from collections import Counter
 
 import pytest
 
-from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from droguekit.batch.recipe_plan import plan_recipe
 from scenes.sampler import family_of_scene, recipe_of_scene, sample_frame, scenes_per_family, split_of_scenes
+from tests.support.recipe_builder import RecipeTable, Section, build_recipe, stations
 
-BASE = """
-name = "families-test"
-family = "own"
-seed = %d
-[frames]
-count = 40
-scenes = 10
-[distance]
-law = "stations"
-stations_m = [10.0]
-[environment]
-ground = "forest"
-sun_elevation_deg = [20, 50]
-[exposure]
-time_s = 1e-3
-[split]
-train = 0.7
-test = 0.3
-"""
-FAMILIES = """
-[[families]]
-name = "day"
-weight = 2
-[[families]]
-name = "sea"
-weight = 1
-[families.environment]
-ground = "sea"
-[families.exposure]
-time_s = 2e-3
-"""
+BASE: RecipeTable = {
+    "name": "families-test",
+    "family": "own",
+    "frames": {"count": 40, "scenes": 10},
+    "distance": stations(10.0),
+    "environment": {"ground": "forest", "sun_elevation_deg": [20, 50]},
+    "exposure": {"time_s": 1e-3},
+    "split": {"train": 0.7, "test": 0.3},
+}
+DAY = {"name": "day", "weight": 2}
+SEA = {"name": "sea", "weight": 1, "environment": {"ground": "sea"}, "exposure": {"time_s": 2e-3}}
 
 
-def recipe(more=FAMILIES, seed=1):
-    return parse_recipe(BASE % seed + more)
+def recipe(*families: Section, seed: int = 1) -> Recipe:
+    return build_recipe(BASE, families=families, seed=seed)
 
 
 def test_scenes_are_shared_out_by_largest_remainder():
-    assert scenes_per_family(recipe()) == [7, 3]
-    assert scenes_per_family(recipe(FAMILIES.replace("weight = 1", "weight = 6"))) == [3, 7]
-    names = [family_of_scene(recipe(), scene).name for scene in range(10)]
+    assert scenes_per_family(recipe(DAY, SEA)) == [7, 3]
+    assert scenes_per_family(recipe(DAY, SEA | {"weight": 6})) == [3, 7]
+    names = [family_of_scene(recipe(DAY, SEA), scene).name for scene in range(10)]
     assert Counter(names) == {"day": 7, "sea": 3}
-    assert names != [family_of_scene(recipe(seed=2), scene).name for scene in range(10)]
+    assert names != [family_of_scene(recipe(DAY, SEA, seed=2), scene).name for scene in range(10)]
 
 
 def test_a_family_changes_what_it_names_and_no_more():
-    drawn = recipe()
+    drawn = recipe(DAY, SEA)
     for index in range(10):
         frame = sample_frame(drawn, index)
         family = family_of_scene(drawn, frame.scene_id)
@@ -67,7 +48,7 @@ def test_a_family_changes_what_it_names_and_no_more():
 
 
 def test_splits_and_poses_stay_as_without_families():
-    with_families, without = recipe(), recipe("")
+    with_families, without = recipe(DAY, SEA), recipe()
     for index in range(10):
         assert split_of_scenes(with_families)[index] == split_of_scenes(without)[index]
         one, other = sample_frame(with_families, index), sample_frame(without, index)
@@ -76,27 +57,27 @@ def test_splits_and_poses_stay_as_without_families():
 
 
 def test_a_recipe_without_families_is_its_own_for_every_scene():
-    drawn = recipe("")
+    drawn = recipe()
     assert recipe_of_scene(drawn, 3) is drawn
 
 
 def test_the_plan_counts_them():
-    assert plan_recipe(recipe()).by_family == {"day": (7, 28), "sea": (3, 12)}
-    assert plan_recipe(recipe("")).by_family == {}
+    assert plan_recipe(recipe(DAY, SEA)).by_family == {"day": (7, 28), "sea": (3, 12)}
+    assert plan_recipe(recipe()).by_family == {}
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("families", "message"),
     [
-        ('[[families]]\nname = "a"\n[[families]]\nname = "a"', "each needs a name of its own"),
-        ('[families]\nname = "a"', r"each begun by \[\[families\]\]"),
-        ('[[families]]\nname = "a"\nweight = 0', r"families\.0\.weight"),
-        ('[[families]]\nname = "a"\n[families.environment]\nfog = 1', r"families\.0\.environment\.fog"),
+        ([{"name": "a"}, {"name": "a"}], "each needs a name of its own"),
+        ({"name": "a"}, r"each begun by \[\[families\]\]"),
+        ([{"name": "a", "weight": 0}], r"families\.0\.weight"),
+        ([{"name": "a", "environment": {"fog": 1}}], r"families\.0\.environment\.fog"),
     ],
 )
-def test_wrong_families_are_named(more, message):
+def test_wrong_families_are_named(families: Section | list[Section], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        recipe(more)
+        build_recipe(BASE, families=families)
 
 
 def test_the_paper_count_ships():

@@ -4,18 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.recipe.rigs import Rangefinder
 from scenes.sampler import sample_frame, sample_rangefinder_m
+from tests.support.recipe_builder import RecipeTable, build_recipe, stations
 
-RECIPE = """
-name = "bench"
-[frames]
-count = 4
-[distance]
-law = "stations"
-stations_m = [2.0, 3.0]
-"""
+BASE: RecipeTable = {"name": "bench", "frames": {"count": 4}, "distance": stations(2.0, 3.0)}
 
 
 def errors_m(rangefinder: Rangefinder, seed: int, count: int) -> np.ndarray:
@@ -50,7 +43,7 @@ def test_readings_are_whole_steps_of_the_last_digit() -> None:
 
 
 def test_a_rangefinder_changes_nothing_else_of_a_frame() -> None:
-    plain, read = (sample_frame(parse_recipe(RECIPE + more), 1) for more in ("", "[rangefinder]\n"))
+    plain, read = (sample_frame(recipe, 1) for recipe in (build_recipe(BASE), build_recipe(BASE, rangefinder={})))
     assert "rangefinder_reading_m" not in plain.model_dump(mode="json")
     table = read.model_dump(mode="json")
     reading_m = table.pop("rangefinder_reading_m")
@@ -60,9 +53,9 @@ def test_a_rangefinder_changes_nothing_else_of_a_frame() -> None:
 
 
 def test_a_recipe_without_one_does_not_know_of_it() -> None:
-    assert "rangefinder" not in parse_recipe(RECIPE).model_dump(mode="json")
+    assert "rangefinder" not in build_recipe(BASE).model_dump(mode="json")
 
 
 def test_a_frame_without_a_drogue_has_no_reading() -> None:
-    recipe = parse_recipe(RECIPE.replace("count = 4", "count = 4\nempty_fraction = 1.0") + "[rangefinder]\n")
+    recipe = build_recipe(BASE, frames={"empty_fraction": 1.0}, rangefinder={})
     assert sample_frame(recipe, 0).rangefinder_reading_m is None

@@ -1,35 +1,29 @@
 from __future__ import annotations
 
+from typing import Unpack
+
 import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import bulk_frame_generator, frame_generator
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.stereo import EYES
 from scenes.framing import sample_distance_m
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
+from tests.support.recipe_builder import RecipeTable, between, build_recipe, stations
 
-BASE = """
-name = "sampler-test"
-seed = %d
-[frames]
-count = 400
-scenes = 10
-empty_fraction = %f
-[distance]
-%s
-[split]
-train = 0.7
-val = 0.2
-test = 0.1
-"""
-STATIONS = 'law = "stations"\nstations_m = [1.7, 3.0, 10.0, 40.0]'
+BASE: RecipeTable = {
+    "name": "sampler-test",
+    "frames": {"count": 400, "scenes": 10},
+    "distance": stations(1.7, 3.0, 10.0, 40.0),
+    "split": {"train": 0.7, "val": 0.2, "test": 0.1},
+}
 
 
-def recipe(distance=STATIONS, seed=1, empty=0.0, more=""):
-    return parse_recipe(BASE % (seed, empty, distance) + more)
+def recipe(**changes: Unpack[RecipeTable]) -> Recipe:
+    return build_recipe(BASE, **changes)
 
 
 def test_frames_depend_on_seed_and_index_alone():
@@ -66,7 +60,7 @@ def test_negative_seed_is_refused():
 
 @pytest.mark.parametrize("distance_m", [1.7, 3.0, 10.0, 40.0])
 def test_the_whole_drogue_is_in_both_views(distance_m):
-    drawn = recipe(f'law = "stations"\nstations_m = [{distance_m}]')
+    drawn = recipe(distance=stations(distance_m))
     for index in range(40):
         frame = sample_frame(drawn, index)
         assert frame.left_from_drogue.translation_m[2] == pytest.approx(distance_m)
@@ -76,7 +70,7 @@ def test_the_whole_drogue_is_in_both_views(distance_m):
 
 
 def test_places_fill_the_common_field():
-    drawn = recipe('law = "stations"\nstations_m = [10.0]')
+    drawn = recipe(distance=stations(10.0))
     places = np.array([sample_left_from_drogue(drawn, index).translation_m[:2] for index in range(200)])
     x_low, x_high, y_low, y_high = drawn.rig.common_field_m(10.0, 0.33)
     # Uniform: of 200 draws the extremes lie within 4 % of the ends (0.96^200 = 3e-4).
@@ -87,13 +81,13 @@ def test_places_fill_the_common_field():
 
 
 def test_on_axis_stays_on_the_rig_axis():
-    drawn = recipe(more="[pose]\non_axis = true\n")
+    drawn = recipe(pose={"on_axis": True})
     for index in range(8):
         np.testing.assert_allclose(sample_frame(drawn, index).left_from_drogue.translation_m[:2], [0.06, 0.0])
 
 
 def test_an_attitude_that_never_fits_is_one_clear_error():
-    drawn = recipe('law = "stations"\nstations_m = [1.47]', more="[pose]\npitch_deg = 0\nyaw_deg = [40, 45]\n")
+    drawn = recipe(distance=stations(1.47), pose={"pitch_deg": 0, "yaw_deg": [40, 45]})
     with pytest.raises(ValueError, match="no attitude within the recipe's ranges"):
         sample_frame(drawn, 0)
 
@@ -111,7 +105,7 @@ def quantile_error(law, transform):
 )
 def test_distance_laws(name, transform):
     """Kolmogorov-Smirnov distance to the intended law; 1.95/sqrt(n) is its 0.1 % point."""
-    law = recipe(f'law = "{name}"\nlow_m = 2.0\nhigh_m = 40.0').distance
+    law = recipe(distance=between(2.0, 40.0, name)).distance
     assert quantile_error(law, transform) < 1.95 / np.sqrt(4000)
 
 
@@ -130,14 +124,14 @@ def test_scenes_are_visited_evenly_and_split_whole():
 
 
 def test_empty_frames_have_no_drogue():
-    drawn = recipe(empty=0.25)
+    drawn = recipe(frames={"empty_fraction": 0.25})
     empty = sum(sample_left_from_drogue(drawn, index) is None for index in range(400))
     # Binomial of 400 draws: standard deviation 8.7; four of them.
     assert abs(empty - 100) < 35
 
 
 def test_a_pose_drawn_alone_is_that_of_the_frame():
-    drawn = recipe(empty=0.25)
+    drawn = recipe(frames={"empty_fraction": 0.25})
     for index in range(12):
         alone, frame = sample_left_from_drogue(drawn, index), sample_frame(drawn, index)
         assert (alone is None) == (frame.drogue is None)

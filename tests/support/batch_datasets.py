@@ -16,27 +16,17 @@ from datasets_manifest.storage.layout import EVENTS_FILE
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import RunSummary, render_dataset
-from tests.support.small_datasets import RIG_160_PX, RIG_320_PX
+from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, between, recipe_text
 
-TINY_RECIPE = f"""
-name = "tiny"
-seed = 5
-{RIG_320_PX}
-[frames]
-count = 4
-scenes = 2
-[distance]
-law = "log-uniform"
-low_m = 3.0
-high_m = 12.0
-[render]
-samples_per_px = 1
-surround_samples_per_px = 1
-max_depth = 2
-[split]
-train = 0.5
-test = 0.5
-"""
+TINY_RECIPE = recipe_text(
+    name="tiny",
+    seed=5,
+    rig=RIG_320_PX,
+    frames={"count": 4, "scenes": 2},
+    distance=between(3.0, 12.0, "log-uniform"),
+    render={"samples_per_px": 1, "surround_samples_per_px": 1, "max_depth": 2},
+    split={"train": 0.5, "test": 0.5},
+)
 
 # A real engine that other packages could bring: the analytic one, with accidents on frames that the environment names.
 TROUBLED_ENGINE = """
@@ -87,23 +77,15 @@ class TroubledEngine(AnalyticEngine):
 """
 
 # Pairs of 160 x 120 pixels without a renderer.
-QUICK_RECIPE = f"""
-name = "quick"
-seed = 5
-{RIG_160_PX}
-[frames]
-count = 8
-scenes = 2
-[distance]
-law = "log-uniform"
-low_m = 3.0
-high_m = 12.0
-[render]
-engine = "troubled"
-[split]
-train = 0.5
-test = 0.5
-"""
+QUICK_RECIPE = recipe_text(
+    name="quick",
+    seed=5,
+    rig=RIG_160_PX,
+    frames={"count": 8, "scenes": 2},
+    distance=between(3.0, 12.0, "log-uniform"),
+    render={"engine": "troubled"},
+    split={"train": 0.5, "test": 0.5},
+)
 
 ANALYTIC_RECIPE = QUICK_RECIPE.replace('"troubled"', '"analytic"')
 

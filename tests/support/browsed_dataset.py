@@ -14,40 +14,23 @@ from datasets_manifest.types.records import PairRecord
 from droguekit.batch.progress import PlainProgress
 from droguekit.visualization.browse.page import write_browse
 from geometry.se3 import RigidTransform
+from tests.support.recipe_builder import between, recipe_text
 from tests.support.small_datasets import rendered
 
 # Real lenses: an overlay that knew only the ideal camera would be off by pixels.
-RECIPE = """
-name = "page"
-seed = 4
-[rig]
-preset = "paper-real"
-width_px = 320
-height_px = 240
-focal_px = 533.0
-[frames]
-count = 12
-scenes = 4
-empty_fraction = 0.2
-[distance]
-law = "log-uniform"
-low_m = 1.9
-high_m = 9.0
-[split]
-train = 0.5
-val = 0.25
-test = 0.25
-[render]
-engine = "analytic"
-[[families]]
-name = "clear"
-weight = 1
-environment = {sun_elevation_deg = [20, 60]}
-[[families]]
-name = "low-light"
-weight = 1
-environment = {sun_elevation_deg = [-8, -2]}
-"""
+RECIPE = recipe_text(
+    name="page",
+    seed=4,
+    rig={"preset": "paper-real", "width_px": 320, "height_px": 240, "focal_px": 533.0},
+    frames={"count": 12, "scenes": 4, "empty_fraction": 0.2},
+    distance=between(1.9, 9.0, "log-uniform"),
+    split={"train": 0.5, "val": 0.25, "test": 0.25},
+    render={"engine": "analytic"},
+    families=[
+        {"name": "clear", "weight": 1, "environment": {"sun_elevation_deg": [20, 60]}},
+        {"name": "low-light", "weight": 1, "environment": {"sun_elevation_deg": [-8, -2]}},
+    ],
+)
 PAIRS = 12
 OTHER = "</script><img src=x onerror=alert(1)>"
 ERRORS_M = 1e-3 * np.array([0.0, 1.0, 0.5])

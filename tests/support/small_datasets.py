@@ -1,4 +1,4 @@
-"""Recipes of small pairs, and datasets rendered from such recipes, for tests of several packages.
+"""Recipes of small pairs and short sequences, and datasets rendered from recipes, for tests of several packages.
 
 A dataset that many tests read is a fixture of its own, see the `conftest.py` beside this file.
 """
@@ -12,59 +12,58 @@ from pathlib import Path
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
+from tests.support.recipe_builder import RIG_160_PX, RecipeTable, between, recipe_text
 
-# The ideal eyes with an eighth and a quarter of their pixels a side, at the same field of view.
-RIG_160_PX = """[rig]
-preset = "rgb-ideal"
-width_px = 160
-height_px = 120
-focal_px = 266.0"""
-RIG_320_PX = """[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.0"""
+# Single pairs between 2 and 5 m, some of them without a drogue.
+SINGLE_PAIRS: RecipeTable = {
+    "name": "single-pairs",
+    "seed": 2,
+    "rig": RIG_160_PX,
+    "frames": {"count": 4, "scenes": 2, "empty_fraction": 0.3},
+    "distance": between(2.0, 5.0),
+    "render": {"engine": "analytic"},
+}
 
+# Three sequences of 20 pairs, in which a receiver keeps its station 4 m behind the drogue.
+STATION_KEEPING: RecipeTable = {
+    "name": "sequence-test",
+    "seed": 2,
+    "frames": {"count": 60, "scenes": 2},
+    "exposure": {"time_s": 0.002},
+    "sequence": {"frames_per_sequence": 20, "receiver": {"manoeuvres": ["station"], "start_m": 4.0}},
+}
 
-def single_pairs_recipe(seed: int, count: int = 4, scenes: int = 2, empty_fraction: float = 0.3) -> str:
-    """Pairs that follow no sequence, between 2 and 5 m, some of them without a drogue."""
-    return f"""
-name = "single-pairs"
-seed = {seed}
-{RIG_160_PX}
-[frames]
-count = {count}
-scenes = {scenes}
-empty_fraction = {empty_fraction}
-[distance]
-law = "uniform"
-low_m = 2.0
-high_m = 5.0
-[render]
-engine = "analytic"
-"""
+# A receiver keeps its station behind a drogue that is let go above the wind: it swings, and shows its side to the
+# receiver once or twice, so that some pairs cannot be made.
+SWINGING: RecipeTable = {
+    "name": "swinging",
+    "frames": {"count": 20},
+    "exposure": {"time_s": 0.002},
+    "sequence": {
+        "frames_per_sequence": 20,
+        "frame_rate_hz": 5,
+        "hose": {"preset": "small-uav", "airspeed_m_s": 4},
+        "turbulence": "none",
+        "release_m": [3.0, 0.0, 1.0],
+        "receiver": {"manoeuvres": ["station"], "start_m": 4.0, "follower": {"bandwidth_hz": 0}},
+    },
+}
 
 
 def docking_recipe(sequences: int) -> str:
     """Docking runs of six pairs each, two a second, from 2.4 to 1.7 m, each in a scene of its own."""
-    return f"""
-name = "tiny-docking"
-seed = 3
-{RIG_160_PX}
-[frames]
-count = {6 * sequences}
-scenes = {sequences}
-[sequence]
-frames_per_sequence = 6
-frame_rate_hz = 2
-[sequence.receiver]
-start_m = 2.4
-end_m = 1.7
-closure_m_s = 1.0
-hold_s = 0.0
-[render]
-engine = "analytic"
-"""
+    return recipe_text(
+        name="tiny-docking",
+        seed=3,
+        rig=RIG_160_PX,
+        frames={"count": 6 * sequences, "scenes": sequences},
+        sequence={
+            "frames_per_sequence": 6,
+            "frame_rate_hz": 2,
+            "receiver": {"start_m": 2.4, "end_m": 1.7, "closure_m_s": 1.0, "hold_s": 0.0},
+        },
+        render={"engine": "analytic"},
+    )
 
 
 def rendered(text: str, out: Path, frames: Iterable[int] | None = None) -> Path:

@@ -17,23 +17,17 @@ from droguekit.scoring.report.label_drawing import Rgb
 from droguekit.visualization.overlay_video import ESTIMATE_RGB, TRUE_RGB, draw_overlay, write_overlay_video
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform
-from tests.support.small_datasets import RIG_320_PX, rendered
+from tests.support.recipe_builder import RIG_320_PX, between, recipe_text
+from tests.support.small_datasets import rendered
 
-RECIPE = f"""
-name = "flight"
-seed = 5
-{RIG_320_PX}
-[frames]
-count = 6
-scenes = 2
-empty_fraction = 0.5
-[distance]
-law = "uniform"
-low_m = 3.0
-high_m = 6.0
-[render]
-engine = "analytic"
-"""
+RECIPE = recipe_text(
+    name="flight",
+    seed=5,
+    rig=RIG_320_PX,
+    frames={"count": 6, "scenes": 2, "empty_fraction": 0.5},
+    distance=between(3.0, 6.0),
+    render={"engine": "analytic"},
+)
 # The bar above, and the whole image beside which the close-up stands.
 BAR_PX, WHOLE_PX = 64, (600, 800)
 OFFSET_M = np.array([0.4, 0.0, 0.0])

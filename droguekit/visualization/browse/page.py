@@ -226,15 +226,19 @@ def write_browse(
     indices = source.frame_indices()
     if not indices:
         raise ValueError(f"{dataset}: holds no pairs yet")
-    answers = (
+    by_method = (
         {} if estimates is None else estimates_by_method(_without_unused_parts(estimates), indices, str(estimates))
     )
     with lock_page_folder(out):
-        return _write(source, out, answers, workers, report)
+        return _write(source, out, by_method, workers, report)
 
 
 def _write(
-    source: BrowsedPairs, out: Path, answers: Mapping[str, Mapping[int, Estimate]], workers: int, report: ProgressReport
+    source: BrowsedPairs,
+    out: Path,
+    by_method: Mapping[str, Mapping[int, Estimate]],
+    workers: int,
+    report: ProgressReport,
 ) -> BrowseSummary:
     indices = source.frame_indices()
     make = _PictureTask(source, out.resolve())
@@ -249,7 +253,7 @@ def _write(
                 index = attempt.index
                 if attempt.value is not None:
                     entry, was_there = attempt.value
-                    entry = with_estimates(entry, [frames.get(index) for frames in answers.values()])
+                    entry = with_estimates(entry, [frames.get(index) for frames in by_method.values()])
                     rows[index] = entry.row | {"labels": write_labels(out, index, entry.labels)}
                     kept += was_there
                     drogues.add(entry.rings)
@@ -261,7 +265,7 @@ def _write(
     finally:
         report.end()
     left_out = tuple(skipped[index] for index in sorted(skipped))
-    write_page(out, source.facts(), [rows[index] for index in sorted(rows)], drogues, list(answers), left_out)
+    write_page(out, source.facts(), [rows[index] for index in sorted(rows)], drogues, list(by_method), left_out)
     return BrowseSummary(len(rows), kept, left_out)
 
 

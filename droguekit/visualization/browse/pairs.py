@@ -179,19 +179,19 @@ def page_entry_without_truth(frame_index: int, time_s: float, rings: tuple[Ring,
 def with_estimates(entry: PageEntry, estimates: Sequence[Estimate | None]) -> PageEntry:
     """The entry with estimates of the pair: one for each method, None where a method has none."""
     truth = entry.left_from_drogue
-    answers = [None if estimate is None else _answer(estimate, truth) for estimate in estimates]
-    row = entry.row | {"answers": [_in_short(answer) for answer in answers]}
-    return replace(entry, row=row, labels=entry.labels | {"answers": [answer for answer in answers if answer]})
+    described = [None if estimate is None else _describe_estimate(estimate, truth) for estimate in estimates]
+    row = entry.row | {"estimates": [_in_short(one) for one in described]}
+    return replace(entry, row=row, labels=entry.labels | {"estimates": [one for one in described if one]})
 
 
-def _in_short(answer: dict[str, Any] | None) -> float | str | None:
+def _in_short(described: dict[str, Any] | None) -> float | str | None:
     """Position error [mm], or `fix` without truth, or `no fix`; None without an estimate."""
-    if answer is None:
+    if described is None:
         return None
-    if answer["pose"] is None:
+    if described["pose"] is None:
         return "no fix"
     # Without truth there is no error.
-    return "fix" if answer["error"] is None else float(answer["error"][0])
+    return "fix" if described["error"] is None else float(described["error"][0])
 
 
 def rings_name(rings: tuple[Ring, ...]) -> str:
@@ -229,7 +229,7 @@ def _jpeg(picture: Picture, quality: int) -> bytes:
     return data.tobytes()
 
 
-def _answer(estimate: Estimate, truth: RigidTransform | None) -> dict[str, Any]:
+def _describe_estimate(estimate: Estimate, truth: RigidTransform | None) -> dict[str, Any]:
     pose = estimate.left_from_drogue if isinstance(estimate, PoseEstimate) else None
     error = None if pose is None or truth is None else pose_error(pose, truth)
     return {

@@ -124,7 +124,7 @@ class PairRecorder:
             for name, color in self._methods.items():
                 self._log(_path("errors", curve, name), rr.SeriesLine(color=color, name=name), static=True)
 
-    def add(self, pair: ShownPair, answers: Mapping[str, Estimate]) -> None:
+    def add(self, pair: ShownPair, estimates: Mapping[str, Estimate]) -> None:
         """Log a pair and the methods' estimates of it."""
         rr.set_time_sequence(FRAMES, pair.frame_index, recording=self._to)
         rr.set_time_seconds(SECONDS, pair.images.time_s, recording=self._to)
@@ -132,7 +132,7 @@ class PairRecorder:
         if pair.record is not None:
             self._add_truth(pair)
         for method in self._methods:
-            self._add_answer(method, answers.get(method), pair)
+            self._add_estimate(method, estimates.get(method), pair)
 
     def _log(self, path: str, *what: rr.AsComponents, static: bool = False) -> None:
         rr.log(path, *what, static=static, recording=self._to)
@@ -189,7 +189,7 @@ class PairRecorder:
         hubs = [view.hub.center_ellipse_px] if view.hub is not None and view.hub.visible_fraction > 0 else []
         self._log(f"{path}/hub", rr.Points2D(_corner_px(hubs), colors=[_HUB_RGB], radii=_TRUE_POINTS))
 
-    def _add_answer(self, method: str, estimate: Estimate | None, pair: ShownPair) -> None:
+    def _add_estimate(self, method: str, estimate: Estimate | None, pair: ShownPair) -> None:
         pose = estimate.left_from_drogue if isinstance(estimate, PoseEstimate) else None
         color = self._methods[method]
         self._show(_path("rig", "estimates", method), pair.drogue, pose, partial(_wires, color=color))

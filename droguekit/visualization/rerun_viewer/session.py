@@ -37,7 +37,7 @@ class ViewSummary:
 def view_pairs(
     source: ShownPairs,
     frames: Sequence[int],
-    answers: Mapping[str, Mapping[int, Estimate]],
+    estimates: Mapping[str, Mapping[int, Estimate]],
     save: Path | None,
     report: ProgressReport,
 ) -> ViewSummary:
@@ -46,7 +46,7 @@ def view_pairs(
     Args:
         source: the dataset.
         frames: indices of the pairs, in order.
-        answers: estimates by method and frame.
+        estimates: by method and frame.
         save: an .rrd file, which appears when it is complete and is not written without pairs; None opens a viewer.
         report: is told of the progress.
 
@@ -57,14 +57,14 @@ def view_pairs(
     recording = rr.new_recording(APPLICATION)
     if save is None:
         _open_viewer(recording)
-        return _log_pairs(recording, source, frames, answers, report)
+        return _log_pairs(recording, source, frames, estimates, report)
     part = part_path(save)
     try:
         save.parent.mkdir(parents=True, exist_ok=True)
         # The library reports no failed writes; this one is ours.
         part.touch(exist_ok=False)
         rr.save(part, default_blueprint=blueprint(), recording=recording)
-        summary = _log_pairs(recording, source, frames, answers, report)
+        summary = _log_pairs(recording, source, frames, estimates, report)
         rr.disconnect(recording=recording)
         _check_recording(part, len(summary.shown))
         if summary.shown:
@@ -120,7 +120,7 @@ def _log_pairs(
     recording: rr.RecordingStream,
     source: ShownPairs,
     frames: Sequence[int],
-    answers: Mapping[str, Mapping[int, Estimate]],
+    estimates: Mapping[str, Mapping[int, Estimate]],
     report: ProgressReport,
 ) -> ViewSummary:
     recorder, shown, faults = None, [], []
@@ -132,8 +132,8 @@ def _log_pairs(
             except ValueError as error:
                 faults.append(f"frame {index} is left out: {error}")
             else:
-                recorder = recorder or PairRecorder(recording, pair.rig, list(answers))
-                recorder.add(pair, {name: found[index] for name, found in answers.items() if index in found})
+                recorder = recorder or PairRecorder(recording, pair.rig, list(estimates))
+                recorder.add(pair, {name: found[index] for name, found in estimates.items() if index in found})
                 shown.append(index)
             report.advance()
     finally:

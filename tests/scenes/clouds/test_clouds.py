@@ -3,38 +3,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.environment import CloudLayer, Environment, Mist
 from scenes.clouds.cloud_density import CloudDensity
 from scenes.clouds.cloud_layers import CloudLight, diffuse_transmission, opacity_towards, render_cloud_layer
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.environment_sampling import environment_of_scene
 from scenes.sky.photometry import direction_from_angles, luminance
+from tests.support.recipe_builder import RecipeTable, between, build_recipe
 
-RECIPE = """
-name = "weather-test"
-[frames]
-count = 10
-scenes = 10
-[distance]
-law = "uniform"
-low_m = 3.0
-high_m = 10.0
-%s
-"""
-ONE_LAYER = "[environment.clouds]\nscene_fraction = 1.0\n"
-TWO_LAYERS = """
-[[environment.clouds]]
-scene_fraction = 1.0
-[[environment.clouds]]
-kind = "cirrus"
-scene_fraction = 1.0
-optical_depth = 0.4
-[environment.mist]
-scene_fraction = 0.5
-[environment.moon]
-scene_fraction = 1.0
-"""
+ONE_LAYER = {"clouds": {"scene_fraction": 1.0}}
+TWO_LAYERS = {
+    "clouds": [{"scene_fraction": 1.0}, {"kind": "cirrus", "scene_fraction": 1.0, "optical_depth": 0.4}],
+    "mist": {"scene_fraction": 0.5},
+    "moon": {"scene_fraction": 1.0},
+}
 
 
 def environment(**changes):
@@ -180,7 +162,12 @@ def test_finite_everywhere_at_any_hour(kind, height_m):
 
 
 def test_recipes_with_one_layer_still_read_and_draw_the_same_sky():
-    one, two = (parse_recipe(RECIPE % text).environment for text in (ONE_LAYER, TWO_LAYERS))
+    base: RecipeTable = {
+        "name": "weather-test",
+        "frames": {"count": 10, "scenes": 10},
+        "distance": between(3.0, 10.0),
+    }
+    one, two = (build_recipe(base, environment=weather).environment for weather in (ONE_LAYER, TWO_LAYERS))
     assert len(one.clouds) == 1 and len(two.clouds) == 2
     for scene in range(6):
         first, second = environment_of_scene(1, scene, one), environment_of_scene(1, scene, two)

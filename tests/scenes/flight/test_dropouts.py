@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from datasets_manifest.recipe.sequence_ranges import DropoutRanges
 from drogue_models.parts import Part
 from geometry.se3 import log_twist
@@ -15,36 +17,28 @@ from labelgen.part_pixels import drogue_hull_m
 from scenes.flight.dropouts import DropoutEvent, formation_displacement_m, sample_dropout
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import direction_from_angles
+from tests.support.recipe_builder import RIG_160_PX, RecipeTable, Section, build_recipe, change_recipe
 
 FRAMES = 40
-BASE = """
-name = "loss-test"
-seed = %d
-%s
-[frames]
-count = 40
-[pose]
-camera_pitch_deg = 10
-[exposure]
-time_s = 0.002
-[sequence]
-frames_per_sequence = 40
-frame_rate_hz = 20
-release_m = [13.8, 0.5, -5]
-[sequence.receiver]
-manoeuvres = ["station"]
-start_m = %g
-[sequence.losses]
-kinds = ["%s"]
-begins_s = 0.6
-lasts_s = 0.5
-onset_s = 0.4
-%s
-"""
+BASE: RecipeTable = {
+    "name": "loss-test",
+    "seed": 2,
+    "frames": {"count": 40},
+    "pose": {"camera_pitch_deg": 10},
+    "exposure": {"time_s": 0.002},
+    "sequence": {
+        "frames_per_sequence": 40,
+        "frame_rate_hz": 20,
+        "release_m": [13.8, 0.5, -5],
+        "receiver": {"manoeuvres": ["station"], "start_m": 6.0},
+        "losses": {"begins_s": 0.6, "lasts_s": 0.5, "onset_s": 0.4},
+    },
+}
 
 
-def recipe(kind, seed=2, start_m=6.0, rig="", more=""):
-    return parse_recipe(BASE % (seed, rig, start_m, kind, more))
+def recipe(kind: str, **changes: Unpack[RecipeTable]) -> Recipe:
+    """With dropouts of this kind."""
+    return build_recipe(change_recipe(BASE, sequence={"losses": {"kinds": [kind]}}), **changes)
 
 
 def event(drawn):
@@ -75,7 +69,7 @@ def clearance_m(bar, origins, directions):
 
 @pytest.mark.parametrize("seed", [2, 3, 4, 5])
 def test_a_bar_hides_all_of_the_drogue_and_comes_from_outside_the_picture(seed):
-    drawn = recipe("occlusion", seed)
+    drawn = recipe("occlusion", seed=seed)
     frames = {k: sample_frame(drawn, k) for k in range(FRAMES)}
     for k in lost(drawn):
         (bar,) = frames[k].bystanders
@@ -113,7 +107,7 @@ def test_nothing_else_of_a_sequence_changes_with_a_bar():
 
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_turned_receiver_sees_nothing_of_the_drogue_from_the_same_place(seed):
-    drawn, plain = recipe("out-of-view", seed), recipe("none", seed)
+    drawn, plain = recipe("out-of-view", seed=seed), recipe("none", seed=seed)
     inside = lost(drawn)
     for k in range(0, FRAMES, 3):
         receiver_rotation, straight = sample_frame(drawn, k), sample_frame(plain, k)
@@ -132,11 +126,11 @@ def test_a_turned_receiver_sees_nothing_of_the_drogue_from_the_same_place(seed):
 
 
 def test_the_turn_is_in_the_twists():
-    drawn = parse_recipe(
-        (BASE % (2, "", 6.0, "out-of-view", ""))
-        .replace("frame_rate_hz = 20", "frame_rate_hz = 1000")
-        .replace("time_s = 0.002", "time_s = 0.0005")
-        .replace("= 40", "= 2000")
+    drawn = recipe(
+        "out-of-view",
+        frames={"count": 2000},
+        exposure={"time_s": 0.0005},
+        sequence={"frames_per_sequence": 2000, "frame_rate_hz": 1000},
     )
     happens = sample_dropout(frame_generator(2, 0, "loss"), drawn.sequence.losses, 0)
     middle = round(1000 * (happens.begin_s - happens.onset_s / 2))
@@ -153,7 +147,7 @@ def test_the_turn_is_in_the_twists():
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_the_sun_comes_beside_the_drogue_and_goes(seed):
-    drawn, plain = recipe("glare", seed), recipe("none", seed)
+    drawn, plain = recipe("glare", seed=seed), recipe("none", seed=seed)
     happens = event(drawn)
     beside = {}
     for k in range(FRAMES):
@@ -213,69 +207,74 @@ def test_kinds_come_in_turn_and_draws_do_not_depend_on_them():
 
 
 @pytest.mark.parametrize(
-    ("kind", "changes", "fault"),
+    ("kind", "losses", "fault"),
     [
-        ("occlusion", {"more": 'thickness_m = 2'}, r"sequence.losses.thickness_m"),
+        ("occlusion", {"thickness_m": 2}, r"sequence.losses.thickness_m"),
         ("hail", {}, r"sequence.losses.kinds"),
-        ("out-of-view", {"more": "turn_deg = 15"}, r"turn_deg: 15 degrees leave part of the drogue in view at 6 m"),
-        ("glare", {"more": "sun_offset_deg = [0, 9]"}, r"look up at the drogue by at least 10.4 degrees"),
-        ("occlusion", {"more": "[render]\nengine = 'analytic'"}, r"render.engine: analytic draws no obstacles"),
+        ("out-of-view", {"turn_deg": 15}, r"turn_deg: 15 degrees leave part of the drogue in view at 6 m"),
+        ("glare", {"sun_offset_deg": [0, 9]}, r"look up at the drogue by at least 10.4 degrees"),
     ],
-)  # fmt: skip
-def test_wrong_losses_are_named_on_one_line(kind, changes, fault):
+)
+def test_wrong_losses_are_named_on_one_line(kind: str, losses: Section, fault: str) -> None:
     with pytest.raises(ValueError, match=fault) as caught:
-        recipe(kind, **changes)
+        recipe(kind, sequence={"losses": losses})
+    assert "\n" not in str(caught.value)
+
+
+def test_an_engine_without_obstacles_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"render.engine: analytic draws no obstacles") as caught:
+        recipe("occlusion", render={"engine": "analytic"})
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "fault"),
+    ("changes", "fault"),
     [
-        ("begins_s = 0.6", "begins_s = 0.3", r"begins_s: must be at least onset_s, 0.4 s"),
-        ("lasts_s = 0.5", "lasts_s = 5", r"dropouts last until 6 s, which is 122 frames, got 40"),
-        (
-            "camera_pitch_deg = 10",
-            "camera_pitch_deg = 0",
-            r"pose.camera_pitch_deg: glare needs the receiver to look up",
-        ),
+        ({"sequence": {"losses": {"begins_s": 0.3}}}, r"begins_s: must be at least onset_s, 0.4 s"),
+        ({"sequence": {"losses": {"lasts_s": 5}}}, r"dropouts last until 6 s, which is 122 frames, got 40"),
+        ({"pose": {"camera_pitch_deg": 0}}, r"pose.camera_pitch_deg: glare needs the receiver to look up"),
     ],
 )
-def test_losses_that_do_not_fit_are_refused(before, after, fault):
+def test_losses_that_do_not_fit_are_refused(changes: RecipeTable, fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
-        parse_recipe((BASE % (2, "", 6.0, "glare", "")).replace(before, after))
+        recipe("glare", **changes)
+
+
+def bar_recipe(obstacle_distance_m: float, start_m: float) -> Recipe:
+    losses, receiver = {"obstacle_distance_m": obstacle_distance_m}, {"start_m": start_m}
+    return recipe("occlusion", sequence={"losses": losses, "receiver": receiver})
 
 
 def test_a_bar_as_thick_as_its_distance_is_refused():
-    drawn = recipe("occlusion", more="obstacle_distance_m = 0.4", start_m=2.0)
+    drawn = bar_recipe(0.4, start_m=2.0)
     with pytest.raises(ValueError, match=r"obstacle_distance_m: a bar that hides the drogue throughout"):
         sample_frame(drawn, 0)
 
 
 @pytest.mark.parametrize(("start_m", "obstacle_m"), [(4.0, 5.0), (4.0, 3.6)])
 def test_a_bar_that_does_not_stand_before_the_drogue_is_refused(start_m, obstacle_m):
-    drawn = recipe("occlusion", more=f"obstacle_distance_m = {obstacle_m}", start_m=start_m)
+    drawn = bar_recipe(obstacle_m, start_m)
     with pytest.raises(ValueError, match=r"sequence.losses.obstacle_distance_m: .* is not in front of all of"):
         sample_frame(drawn, 0)
 
 
 def test_a_sun_below_the_horizon_is_refused():
-    low = BASE % (2, "", 6.0, "glare", "")
-    low = low.replace("[sequence.losses]", "offset_down_m = 0.9\n[sequence.losses]")
-    low = low.replace("camera_pitch_deg = 10", "camera_pitch_deg = 5")
+    low = recipe("glare", pose={"camera_pitch_deg": 5}, sequence={"receiver": {"offset_down_m": 0.9}})
     # The drogue is seen 8.5 degrees below the axis, which is pitched up by 5, and the sun at most 2.8 above it.
     with pytest.raises(ValueError, match=r"sun_offset_deg: the sun beside .* below the horizon"):
-        sample_frame(parse_recipe(low), 0)
+        sample_frame(low, 0)
 
 
-@pytest.mark.parametrize("offset", ["[0, 0.8]", "[-0.8, 0]"])
-def test_a_turn_must_lose_a_drogue_that_is_beside_the_axis(offset):
-    text = (BASE % (2, "", 6.0, "out-of-view", "turn_deg = 28")).replace(
-        "[sequence.losses]", f"offset_right_m = {offset}\n[sequence.losses]"
-    )
+@pytest.mark.parametrize("offset_right_m", [[0, 0.8], [-0.8, 0]])
+def test_a_turn_must_lose_a_drogue_that_is_beside_the_axis(offset_right_m: list[float]) -> None:
+    def turned(turn_deg: float) -> Recipe:
+        losses, receiver = {"turn_deg": turn_deg}, {"offset_right_m": offset_right_m}
+        return recipe("out-of-view", sequence={"losses": losses, "receiver": receiver})
+
     # Half a field of 16.7 degrees, and rim, baseline and offset of 1.25 m in all at 6 m: 28.5 degrees.
     with pytest.raises(ValueError, match=r"turn_deg: 28 degrees leave part .* at 6 m; turn by at least"):
-        parse_recipe(text)
-    parse_recipe(text.replace("turn_deg = 28", "turn_deg = 40"))
+        turned(28)
+    turned(40)
 
 
 def test_recipes_without_losses_do_not_know_of_them():
@@ -292,8 +291,7 @@ def test_records_of_a_hidden_drogue_say_so():
     from render.camera.sensor import expose
     from render.engine import load_engine
 
-    rig = 'rig = { preset = "rgb-ideal", width_px = 160, height_px = 120, focal_px = 266.0 }'
-    drawn = recipe("occlusion", rig=rig, more="[render]\nsamples_per_px = 1\nedge_samples_per_px = 4")
+    drawn = recipe("occlusion", rig=RIG_160_PX, render={"samples_per_px": 1, "edge_samples_per_px": 4})
     for k, hidden in ((0, False), (lost(drawn)[0], True)):
         frame = sample_frame(drawn, k)
         radiance = load_engine("mitsuba").render(frame, drawn.render)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
 from geometry.se3 import exp_twist, log_twist
@@ -13,10 +15,16 @@ from geometry.stereo import EYES
 from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
 from scenes.flight.sequence import _flight
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
-from tests.support.sequence_recipe import BASE, recipe
+from tests.support.recipe_builder import build_recipe
+from tests.support.small_datasets import STATION_KEEPING
 
 # Where the drogue hangs, nearly: without the time in which the hose settles.
-RELEASED = "release_m = [13.8, 0.5, -5]\n"
+RELEASED = {"release_m": [13.8, 0.5, -5]}
+
+
+def recipe(**sequence: Any) -> Recipe:
+    """With these keys in its section `sequence`."""
+    return build_recipe(STATION_KEEPING, sequence=sequence)
 
 
 def frame_text(drawn, index):
@@ -24,16 +32,16 @@ def frame_text(drawn, index):
 
 
 def test_each_frame_is_the_same_alone_and_in_any_order():
-    drawn = recipe(RELEASED)
+    drawn = recipe(**RELEASED)
     in_order = [frame_text(drawn, index) for index in (3, 4, 25)]
     for index, text in reversed(list(zip((3, 4, 25), in_order, strict=True))):
         _flight.cache_clear()
         assert frame_text(drawn, index) == text
-    assert frame_text(recipe(RELEASED + 'turbulence = "moderate"'), 3) != in_order[0]
+    assert frame_text(recipe(**RELEASED, turbulence="moderate"), 3) != in_order[0]
 
 
 def test_sequences_scenes_and_times():
-    drawn = recipe(RELEASED + "frame_rate_hz = 50")
+    drawn = recipe(**RELEASED, frame_rate_hz=50)
     frames = [sample_frame(drawn, index) for index in range(60)]
     assert [frame.sequence_id for frame in frames] == [index // 20 for index in range(60)]
     assert all(frame.scene_id == scene_of_frame(drawn, 20 * (index // 20)) for index, frame in enumerate(frames))
@@ -46,7 +54,7 @@ def test_sequences_scenes_and_times():
 
 
 def test_hose_hangs_between_pod_and_coupling():
-    drawn = recipe('turbulence = "moderate"\ntanker_motion_m = 0.5')
+    drawn = recipe(turbulence="moderate", tanker_motion_m=0.5)
     for index in (0, 7, 19):
         frame = sample_frame(drawn, index)
         nodes, drogue = frame.hose_nodes_left_m, frame.drogue
@@ -65,8 +73,8 @@ def test_hose_hangs_between_pod_and_coupling():
 def test_twists_are_the_rates_of_the_poses():
     # So many pairs a second that poses beside each other give the rate in the middle to second order.
     # The pod stands still in the axes that its own motion turns.
-    text = BASE % ('frame_rate_hz = 1000\nturbulence = "moderate"\ntanker_motion_m = 0', "")
-    drawn = parse_recipe(text.replace("time_s = 0.002", "time_s = 0.0005"))
+    moving = {"frame_rate_hz": 1000, "turbulence": "moderate", "tanker_motion_m": 0}
+    drawn = build_recipe(STATION_KEEPING, exposure={"time_s": 0.0005}, sequence=moving)
     earlier, frame, later = (sample_frame(drawn, index) for index in (9, 10, 11))
     tanker_from_left = {f.frame_index: f.left_from_tanker.inverse() for f in (earlier, frame, later)}
     step = tanker_from_left[9].inverse() @ tanker_from_left[11]
@@ -83,7 +91,7 @@ def test_twists_are_the_rates_of_the_poses():
 
 
 def test_a_moving_pose_goes_where_its_twist_points():
-    frame = sample_frame(recipe(RELEASED + 'turbulence = "moderate"'), 5)
+    frame = sample_frame(recipe(**RELEASED, turbulence="moderate"), 5)
     moved = frame.left_from_drogue @ exp_twist(1e-3 * frame.drogue_twist_per_s)
     expected = exp_twist(1e-3 * frame.left_twist_per_s) @ frame.left_from_drogue_at(1e-3)
     np.testing.assert_allclose(moved.as_matrix(), expected.as_matrix(), atol=1e-12)
@@ -129,7 +137,9 @@ def test_guided_receivers_of_many_sequences_keep_the_drogue_in_view(turbulence):
 
 
 def test_guidance_makes_the_drogue_stand_stiller_in_the_picture():
-    guided, loose = (recipe('turbulence = "moderate"', f"follower.bandwidth_hz = {hertz}") for hertz in (0.8, 0))
+    guided, loose = (
+        recipe(turbulence="moderate", receiver={"follower": {"bandwidth_hz": hertz}}) for hertz in (0.8, 0)
+    )
     spread = [
         np.std([sample_left_from_drogue(drawn, index).translation_m[:2] for index in range(0, 60, 5)])
         for drawn in (guided, loose)
@@ -138,7 +148,7 @@ def test_guidance_makes_the_drogue_stand_stiller_in_the_picture():
 
 
 def test_a_small_pair_flies():
-    small = recipe('hose = "small-uav"\nturbulence = "light"', receiver="body_radius_m = 0.15")
+    small = recipe(hose="small-uav", turbulence="light", receiver={"body_radius_m": 0.15})
     assert sample_left_from_drogue(small, 0).translation_m[2] == pytest.approx(4.0, abs=0.2)
 
 

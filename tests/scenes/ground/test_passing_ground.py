@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import CloudLight, render_cloud_layer
 from scenes.environment_radiance import environment_radiance
@@ -15,26 +14,9 @@ from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.sea import GroundLight
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
+from tests.support.recipe_builder import between, build_recipe
 
 FOCAL_PX, SIZE_PX = 400.0, 192
-RECIPE = """
-name = "passing"
-[frames]
-count = 40
-scenes = 2
-[exposure]
-time_s = 0.002
-[sequence]
-frames_per_sequence = 20
-frame_rate_hz = 10
-tanker_motion_m = 0
-hose = { preset = "full-size", airspeed_m_s = 100 }
-turbulence = "none"
-release_m = [13.8, 0.0, -5]
-[sequence.receiver]
-manoeuvres = ["station"]
-start_m = 4.0
-"""
 
 
 def environment(kind="fields", **changes):
@@ -178,7 +160,20 @@ def test_sky_and_light_stay_as_they_are():
 
 
 def test_a_sequence_flies_with_its_airspeed_and_starts_again():
-    recipe = parse_recipe(RECIPE)
+    recipe = build_recipe(
+        name="passing",
+        frames={"count": 40, "scenes": 2},
+        exposure={"time_s": 0.002},
+        sequence={
+            "frames_per_sequence": 20,
+            "frame_rate_hz": 10,
+            "tanker_motion_m": 0,
+            "hose": {"preset": "full-size", "airspeed_m_s": 100},
+            "turbulence": "none",
+            "release_m": [13.8, 0.0, -5],
+            "receiver": {"manoeuvres": ["station"], "start_m": 4.0},
+        },
+    )
     frames = [sample_frame(recipe, index) for index in range(40)]
     places = np.array([frame.environment.camera_offset_m for frame in frames])
     # With a pod that keeps its place, the receiver's own motion is what the poses tell of it.
@@ -191,5 +186,5 @@ def test_a_sequence_flies_with_its_airspeed_and_starts_again():
 
 
 def test_single_pairs_do_not_know_of_flight():
-    recipe = parse_recipe('name = "single"\n[frames]\ncount = 1\n[distance]\nlaw = "uniform"\nlow_m = 3\nhigh_m = 9\n')
+    recipe = build_recipe(name="single", frames={"count": 1}, distance=between(3, 9))
     assert "camera_offset_m" not in sample_frame(recipe, 0).environment.model_dump()

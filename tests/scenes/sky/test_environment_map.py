@@ -4,33 +4,29 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import OpenEXR
 import pytest
 
-from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
+from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import FrameSpec
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.equirectangular_sky import load_map
 from scenes.sky.photometry import SUN_SOLID_ANGLE_SR, luminance
+from tests.support.recipe_builder import RecipeTable, recipe_text, stations
 
 HEIGHT = 128
-RECIPE = """
-name = "map-test"
-[frames]
-count = 4
-[distance]
-law = "stations"
-stations_m = [10.0]
-[exposure]
-time_s = 1e-3
-[environment.map]
-file = "%s"
-%s
-"""
+BASE: RecipeTable = {
+    "name": "map-test",
+    "frames": {"count": 4},
+    "distance": stations(10.0),
+    "exposure": {"time_s": 1e-3},
+}
 
 
 def picture(sun_row=40, sun_column=180, sun=50_000.0):
@@ -51,14 +47,17 @@ def write(path, values):
         OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(str(path))
 
 
-def recipe(folder, name="sky.exr", more="cd_m2_per_unit = 1000.0"):
+def recipe(folder: Path, name: str = "sky.exr", scenes: int = 1, **keys: float | list[float]) -> Recipe:
+    """A recipe in a file beside the map, with these keys for the map; 1000 cd/m2 a unit without any."""
     path = folder / "mine.toml"
-    path.write_text(RECIPE % (name, more), encoding="utf-8")
+    environment_map = {"file": name, **(keys or {"cd_m2_per_unit": 1000.0})}
+    text = recipe_text(BASE, frames={"scenes": scenes}, environment={"map": environment_map})
+    path.write_text(text, encoding="utf-8")
     return load_recipe(str(path)).recipe
 
 
-def environment(folder, name="sky.exr", more="cd_m2_per_unit = 1000.0"):
-    return sample_frame(recipe(folder, name, more), 0).environment
+def environment(folder: Path, name: str = "sky.exr", **keys: float | list[float]) -> Environment:
+    return sample_frame(recipe(folder, name, **keys), 0).environment
 
 
 def texel_direction(row, column, rotation_deg=0.0):
@@ -81,7 +80,7 @@ def test_levels_colours_and_sides_are_kept(tmp_path, name, tolerance):
 
 def test_the_sun_becomes_a_beam_of_the_same_light(tmp_path):
     write(tmp_path / "sky.exr", picture())
-    light = load_map(environment(tmp_path, more="cd_m2_per_unit = 1000.0\nrotation_deg = 30").map)
+    light = load_map(environment(tmp_path, cd_m2_per_unit=1000.0, rotation_deg=30).map)
     edges = np.cos(np.array([40, 41]) * np.pi / HEIGHT)
     solid_angle_sr = (edges[0] - edges[1]) * np.pi / HEIGHT
     np.testing.assert_allclose(light.sun_lux, (50e6 - np.array([2e3, 1e3, 1e3])) * solid_angle_sr, rtol=1e-5)
@@ -105,18 +104,14 @@ def test_an_even_sky_has_no_sun(tmp_path):
 
 def test_illuminance_is_as_asked_for(tmp_path):
     write(tmp_path / "sky.exr", picture())
-    around = environment_radiance(environment(tmp_path, more="horizontal_illuminance_lux = 70000"))
+    around = environment_radiance(environment(tmp_path, horizontal_illuminance_lux=70000))
     # The light map has 128 rows, as this picture: only the split of the sun's texel among cosines is left.
     assert float(luminance(around.ground_illuminance_lux)) == pytest.approx(70_000, rel=0.01)
 
 
 def test_rotations_are_drawn_by_scene(tmp_path):
     write(tmp_path / "sky.exr", picture())
-    text = (RECIPE % ("sky.exr", "cd_m2_per_unit = 1.0\nrotation_deg = [0, 360]")).replace(
-        "count = 4", "count = 4\nscenes = 4"
-    )
-    (tmp_path / "four.toml").write_text(text, encoding="utf-8")
-    drawn = load_recipe(str(tmp_path / "four.toml")).recipe
+    drawn = recipe(tmp_path, scenes=4, cd_m2_per_unit=1.0, rotation_deg=[0, 360])
     environments = [sample_frame(drawn, index).environment for index in range(4)]
     assert len({env.map.rotation_deg for env in environments}) == 4
     assert len({round(env.sun_azimuth_deg, 6) for env in environments}) == 4
@@ -177,15 +172,15 @@ def test_a_file_that_is_no_picture_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "more", "message"),
+    ("name", "keys", "message"),
     [
-        ("sky.png", "cd_m2_per_unit = 1.0", "must be the path of an .exr or .hdr file"),
-        ("sky.exr", "", "give one of the two"),
-        ("sky.exr", "cd_m2_per_unit = 1.0\nhorizontal_illuminance_lux = 1.0", "give one of the two"),
-        ("sky.exr", "cd_m2_per_unit = 1.0\nturn = 3", "turn: Extra inputs"),
+        ("sky.png", {"cd_m2_per_unit": 1.0}, "must be the path of an .exr or .hdr file"),
+        ("sky.exr", {"rotation_deg": 0}, "give one of the two"),
+        ("sky.exr", {"cd_m2_per_unit": 1.0, "horizontal_illuminance_lux": 1.0}, "give one of the two"),
+        ("sky.exr", {"cd_m2_per_unit": 1.0, "turn": 3}, "turn: Extra inputs"),
     ],
 )
-def test_wrong_keys_are_named(tmp_path, name, more, message):
+def test_wrong_keys_are_named(tmp_path: Path, name: str, keys: dict[str, float], message: str) -> None:
     write(tmp_path / "sky.exr", picture())
     with pytest.raises(ValueError, match=message):
-        recipe(tmp_path, name, more)
+        recipe(tmp_path, name, **keys)

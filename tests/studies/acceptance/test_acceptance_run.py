@@ -27,59 +27,40 @@ from studies.acceptance.acceptance_table import AcceptanceRow
 from studies.acceptance.rendered.flight_tiers import FLIGHT_TIERS, FlightData, approach_rows, lost_rows, part_length
 from studies.acceptance.rendered.scored_frames import BEST
 from studies.acceptance.rendered.sequence_pairs import FILTERED, score_pairs
-from tests.support.small_datasets import RIG_320_PX
+from tests.support.recipe_builder import RIG_320_PX, recipe_text
 
-RECIPE = f"""
-name = "small-flights"
-seed = 3
-{RIG_320_PX}
-[frames]
-count = 20
-scenes = 1
-[pose]
-camera_pitch_deg = 8
-[environment]
-sun_elevation_deg = [30, 60]
-sun_azimuth_deg = [120, 240]
-[environment.clouds]
-scene_fraction = 0.0
-[render]
-engine = "analytic"
-[sequence]
-frames_per_sequence = 20
-frame_rate_hz = 25
-release_m = [13.8, 0.5, -5]
-[sequence.receiver]
-manoeuvres = ["station"]
-start_m = 3.0
-[sequence.losses]
-kinds = ["out-of-view"]
-begins_s = 0.24
-lasts_s = 0.16
-onset_s = 0.16
-"""
+RECIPE = recipe_text(
+    name="small-flights",
+    seed=3,
+    rig=RIG_320_PX,
+    frames={"count": 20, "scenes": 1},
+    pose={"camera_pitch_deg": 8},
+    environment={"sun_elevation_deg": [30, 60], "sun_azimuth_deg": [120, 240], "clouds": {"scene_fraction": 0.0}},
+    render={"engine": "analytic"},
+    sequence={
+        "frames_per_sequence": 20,
+        "frame_rate_hz": 25,
+        "release_m": [13.8, 0.5, -5],
+        "receiver": {"manoeuvres": ["station"], "start_m": 3.0},
+        "losses": {"kinds": ["out-of-view"], "begins_s": 0.24, "lasts_s": 0.16, "onset_s": 0.16},
+    },
+)
 
 # A drogue that hangs steeply, and receivers of all attitudes: with seed 10 the second one does not look into the mouth.
-TURNED = f"""
-name = "turned"
-{RIG_320_PX}
-[frames]
-count = 2
-[pose]
-camera_pitch_deg = [-45, 45]
-[render]
-engine = "analytic"
-[sequence]
-frames_per_sequence = 2
-turbulence = "none"
-release_m = [0.5, 0, -1.5]
-hose.preset = "small-uav"
-hose.airspeed_m_s = 3
-[sequence.receiver]
-manoeuvres = ["station"]
-start_m = 3.0
-attitude_sd_deg = 10
-"""
+TURNED = recipe_text(
+    name="turned",
+    rig=RIG_320_PX,
+    frames={"count": 2},
+    pose={"camera_pitch_deg": [-45, 45]},
+    render={"engine": "analytic"},
+    sequence={
+        "frames_per_sequence": 2,
+        "turbulence": "none",
+        "release_m": [0.5, 0, -1.5],
+        "hose": {"preset": "small-uav", "airspeed_m_s": 3},
+        "receiver": {"manoeuvres": ["station"], "start_m": 3.0, "attitude_sd_deg": 10},
+    },
+)
 
 
 def options(engines: tuple[str, ...] = (), **changes: object) -> AcceptanceOptions:

@@ -25,9 +25,10 @@ from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from droguekit.scoring.report.label_drawing import display_picture
 from droguekit.visualization.browse.page import write_browse
 from geometry.se3 import RigidTransform
-from tests.support.small_datasets import rendered, single_pairs_recipe
+from tests.support.recipe_builder import recipe_text
+from tests.support.small_datasets import SINGLE_PAIRS, rendered
 
-RECIPE = single_pairs_recipe(2)
+RECIPE = recipe_text(SINGLE_PAIRS)
 
 
 def told() -> PlainProgress:
@@ -99,7 +100,7 @@ def test_a_second_run_keeps_pictures_and_makes_missing_ones(tiny: Path, tmp_path
 
 
 def test_pictures_of_other_pixels_are_replaced(tiny: Path, tmp_path: Path) -> None:
-    other = rendered(single_pairs_recipe(3), tmp_path / "other")
+    other = rendered(recipe_text(SINGLE_PAIRS, seed=3), tmp_path / "other")
     write_browse(tiny, tmp_path / "page", None, 0, told())
     assert write_browse(other, tmp_path / "page", None, 0, told()).kept == 0
     write_browse(other, tmp_path / "fresh", None, 0, told())
@@ -109,7 +110,7 @@ def test_pictures_of_other_pixels_are_replaced(tiny: Path, tmp_path: Path) -> No
 def test_a_run_that_is_stopped_leaves_the_page_as_it_was(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other, page = rendered(single_pairs_recipe(3), tmp_path / "other"), tmp_path / "page"
+    other, page = rendered(recipe_text(SINGLE_PAIRS, seed=3), tmp_path / "other"), tmp_path / "page"
     write_browse(tiny, page, None, 0, told())
     before = contents(page)
     steps = iter(range(2))
@@ -128,8 +129,8 @@ def test_a_run_that_is_stopped_leaves_the_page_as_it_was(
 
 
 def test_a_false_fix_is_drawn_as_the_drogue_that_was_looked_for(tmp_path: Path) -> None:
-    text = single_pairs_recipe(2, count=6, scenes=6, empty_fraction=0.5)
-    text += '[target]\nvariants = [{ drogue = "red-8" }, { drogue = "white-5" }]\n'
+    frames = {"count": 6, "scenes": 6, "empty_fraction": 0.5}
+    text = recipe_text(SINGLE_PAIRS, frames=frames, target={"variants": [{"drogue": "red-8"}, {"drogue": "white-5"}]})
     dataset = Dataset(rendered(text, tmp_path / "dataset"))
     write_browse(tmp_path / "dataset", tmp_path / "page", None, 0, told())
     drogues, empty, named = catalogue(tmp_path / "page")["drogues"], 0, set()
@@ -158,7 +159,7 @@ def test_what_methods_say_stands_in_their_order(tiny: Path, tmp_path: Path) -> N
     for row in table["rows"]:
         error = "fix" if row["distance_m"] is None else pytest.approx(5.0, abs=1e-3)  # rounded to a micrometre
         silent = row["frame"] == dataset.frame_indices[-1]
-        assert row["answers"] == ([None, None] if silent else ["no fix", error])
+        assert row["estimates"] == ([None, None] if silent else ["no fix", error])
 
 
 def test_an_image_that_was_changed_is_left_out(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -260,7 +261,7 @@ def test_pairs_without_truth_are_shown_too(tiny: Path, tmp_path: Path) -> None:
     assert run(["browse", *arguments, "--estimates", str(tmp_path / "e.jsonl")]) == DONE
     found = catalogue(tmp_path / "page")
     assert found["is_blind"] and [row["distance_m"] for row in found["rows"]] == [None] * 4
-    assert labels(tmp_path / "page", 1)["answers"][0]["reason"] == "nothing seen"
+    assert labels(tmp_path / "page", 1)["estimates"][0]["reason"] == "nothing seen"
     assert labels(tmp_path / "page", 1)["left"]["markers"] == []
 
 

@@ -17,9 +17,10 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import Estimate, NoFix, PoseEstimate, write_estimates
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.se3 import RigidTransform, rotation_from_angles
-from tests.support.small_datasets import docking_recipe, rendered, single_pairs_recipe
+from tests.support.recipe_builder import recipe_text
+from tests.support.small_datasets import SINGLE_PAIRS, docking_recipe, rendered
 
-SINGLE_PAIRS = single_pairs_recipe(3, count=8, empty_fraction=0.4)
+MANY_EMPTY = recipe_text(SINGLE_PAIRS, seed=3, frames={"count": 8, "empty_fraction": 0.4})
 METHOD = "joint+filter/2"
 LOST = 3
 OFFSET_M = np.array([0.003, 0.0, 0.004])
@@ -174,7 +175,7 @@ def test_without_a_pair_to_show_nothing_is_written(
 
 
 def test_the_distance_stops_where_there_is_no_drogue(tmp_path: Path) -> None:
-    rendered(SINGLE_PAIRS, tmp_path / "dataset")
+    rendered(MANY_EMPTY, tmp_path / "dataset")
     out = tmp_path / "a.rrd"
     assert run(["view", str(tmp_path / "dataset"), "--save", str(out)]) == DONE
     dataset = Dataset(tmp_path / "dataset")
@@ -192,7 +193,7 @@ def test_the_distance_stops_where_there_is_no_drogue(tmp_path: Path) -> None:
 
 
 def test_frames_that_the_dataset_lacks_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rendered(SINGLE_PAIRS, tmp_path / "dataset", (0, 7))
+    rendered(MANY_EMPTY, tmp_path / "dataset", (0, 7))
     assert run(["view", str(tmp_path / "dataset"), "--frames", "2:5", "--save", str(tmp_path / "a.rrd")]) == WRONG_INPUT
     assert "--frames: the dataset holds none of these pairs, got 2:5" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["dataset"]

@@ -18,7 +18,7 @@
       const found = (word) => (/^\d+$/.test(word) ? words.includes(word) : text.includes(word));
       return value.toLowerCase().split(/\s+/).filter(Boolean).every(found);
     },
-    answer: (row, value, state) => kindOf(droguekit.answerOf(row, state)) === value,
+    result: (row, value, state) => kindOf(droguekit.resultOf(row, state)) === value,
   };
 
   const ORDERS = {
@@ -26,15 +26,15 @@
     far: (row) => -(row.distance_m ?? -Infinity),
     // A fix without a drogue counts as the largest error.
     error: (row, state) => {
-      const answer = droguekit.answerOf(row, state);
-      if (answer === "fix") return -Infinity;
-      return typeof answer === "number" ? -answer : Infinity;
+      const result = droguekit.resultOf(row, state);
+      if (result === "fix") return -Infinity;
+      return typeof result === "number" ? -result : Infinity;
     },
   };
 
-  function kindOf(answer) {
-    if (answer === null) return "nothing";
-    return answer === "no fix" ? "none" : "fix";
+  function kindOf(result) {
+    if (result === null) return "missing";
+    return result === "no fix" ? "none" : "fix";
   }
 
   function drogueOf(row) {
@@ -48,8 +48,8 @@
   };
 
   /** That method's result for a pair: its error [mm], "fix" without truth, "no fix", or null without an estimate. */
-  droguekit.answerOf = function (row, state) {
-    return row.answers[catalogue.methods.indexOf(droguekit.methodOf(state))];
+  droguekit.resultOf = function (row, state) {
+    return row.estimates[catalogue.methods.indexOf(droguekit.methodOf(state))];
   };
 
   /** Rows that pass the filters of a state, in its order. */

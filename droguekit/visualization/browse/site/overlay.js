@@ -45,7 +45,7 @@
   }
 
   /** Layers of an eye, by name. */
-  function layersOf(catalogue, labels, eye, answer, arm) {
+  function layersOf(catalogue, labels, eye, estimate, arm) {
     const view = labels[eye];
     const groups = {};
     for (const name of droguekit.LAYERS) groups[name] = layer(name);
@@ -60,20 +60,20 @@
     if (view.hub) groups.hub.append(cross(view.hub[0], view.hub[1], arm, view.hub[2] > 0 ? "seen" : "unseen", "hub"));
     const rings = catalogue.drogues[labels.drogue];
     if (labels.pose) groups.truth.append(...outline(catalogue.rig, eye, labels.pose, rings));
-    if (answer && answer.pose) groups.estimate.append(...outline(catalogue.rig, eye, answer.pose, rings));
-    for (const [of, name, x, y, used] of answer ? answer.centroids : []) {
+    if (estimate && estimate.pose) groups.estimate.append(...outline(catalogue.rig, eye, estimate.pose, rings));
+    for (const [of, name, x, y, used] of estimate ? estimate.centroids : []) {
       if (of === eye) groups.centroids.append(cross(x, y, arm, used ? "measured" : "measured unused", name));
     }
     return groups;
   }
 
   /** The box around the drogue in an eye's image, else around an estimate, else null. */
-  droguekit.surroundings = function (labels, eye, answer) {
+  droguekit.surroundings = function (labels, eye, estimate) {
     const view = labels[eye];
     if (view.box_visible_px || view.box_full_px) return view.box_visible_px || view.box_full_px;
-    if (!answer || !answer.pose) return null;
+    if (!estimate || !estimate.pose) return null;
     const { rig, drogues } = droguekit.catalogue;
-    const corners = droguekit.ringImage(rig, eye, answer.pose, drogues[labels.drogue][0]);
+    const corners = droguekit.ringImage(rig, eye, estimate.pose, drogues[labels.drogue][0]);
     if (!corners) return null;
     const [low, high] = [Math.min, Math.max].map((end) => [0, 1].map((axis) => end(...corners.map((xy) => xy[axis]))));
     return [low[0], low[1], high[0] - low[0], high[1] - low[1]];
@@ -93,13 +93,13 @@
   /**
    * Draw an eye's image and its overlay.
    * @param svg      the element to fill
-   * @param shown    {row, labels, eye, answer, zoomed, hidden: names of the layers that are not drawn, complain: hears
-   *                 of an image that cannot be shown}
+   * @param shown    {row, labels, eye, estimate, zoomed, hidden: names of the layers that are not drawn, complain: is
+   *                 told of an image that cannot be shown}
    */
   droguekit.drawEye = function (svg, shown) {
-    const { row, labels, eye, answer, zoomed, hidden, complain } = shown;
+    const { row, labels, eye, estimate, zoomed, hidden, complain } = shown;
     const catalogue = droguekit.catalogue;
-    const around = droguekit.surroundings(labels, eye, answer);
+    const around = droguekit.surroundings(labels, eye, estimate);
     const seen = viewBox(catalogue, zoomed ? around : null);
     svg.setAttribute("viewBox", seen.join(" "));
     svg.setAttribute("aria-label", `Frame ${row.frame}, ${eye} eye`);
@@ -114,7 +114,7 @@
       preserveAspectRatio: "none",
     });
     image.addEventListener("error", () => image.isConnected && complain(`${href} cannot be shown.`));
-    const groups = layersOf(catalogue, labels, eye, answer, ARM_SHARE * seen[2]);
+    const groups = layersOf(catalogue, labels, eye, estimate, ARM_SHARE * seen[2]);
     svg.replaceChildren(image, ...droguekit.LAYERS.filter((name) => !hidden.has(name)).map((name) => groups[name]));
   };
 })();

@@ -26,7 +26,7 @@
     const { methods } = catalogue;
     addOptions(form.elements.method, methods);
     form.elements.method.parentElement.hidden = methods.length < 2;
-    form.elements.answer.parentElement.hidden = methods.length === 0;
+    form.elements.result.parentElement.hidden = methods.length === 0;
     form.elements.order.querySelector("[value=error]").hidden = methods.length === 0 || catalogue.is_blind;
     const layers = byId("layers");
     addOptions(layers.elements.drawn, methods);
@@ -78,10 +78,10 @@
 
   function errorOf(row) {
     if (catalogue.methods.length === 0) return "";
-    const answer = droguekit.answerOf(row, state);
-    if (answer === null) return "";
-    if (typeof answer === "number") return `, ${droguekit.millimetres(answer)} off`;
-    return answer === "fix" && !catalogue.is_blind ? ", false fix" : `, ${answer}`;
+    const result = droguekit.resultOf(row, state);
+    if (result === null) return "";
+    if (typeof result === "number") return `, ${droguekit.millimetres(result)} off`;
+    return result === "fix" && !catalogue.is_blind ? ", false fix" : `, ${result}`;
   }
 
   /** The number of pages, and the state's page. */

@@ -11,7 +11,9 @@
   let wanted = null;
   const faults = new Set();
   const NOTHING_SEEN = { box_full_px: null, box_visible_px: null, markers: [], hub: null, board_corners_px: [] };
-  const NO_LABELS = { pose: null, drogue: null, left: NOTHING_SEEN, right: NOTHING_SEEN, conditions: [], answers: [] };
+  const NO_LABELS = {
+    pose: null, drogue: null, left: NOTHING_SEEN, right: NOTHING_SEEN, conditions: [], estimates: [],
+  };
 
   /** Called by a pair's own script with its labels. */
   droguekit.receive = function (name, labels) {
@@ -62,14 +64,14 @@
     byId(id).hidden = rows.length === 0;
   }
 
-  function answerCells(answer) {
-    const name = cell("th", answer.method);
-    if (!answer.pose) return [name, cell("td", `no fix: ${answer.reason}`, 3)];
-    if (!answer.error) {
+  function estimateCells(estimate) {
+    const name = cell("th", estimate.method);
+    if (!estimate.pose) return [name, cell("td", `no fix: ${estimate.reason}`, 3)];
+    if (!estimate.error) {
       const what = droguekit.catalogue.is_blind ? "a fix" : "a fix and no drogue there,";
-      return [name, cell("td", `${what} at ${answer.pose[11].toFixed(2)}\u00a0m`, 3)];
+      return [name, cell("td", `${what} at ${estimate.pose[11].toFixed(2)}\u00a0m`, 3)];
     }
-    const [position, pitch, yaw] = answer.error;
+    const [position, pitch, yaw] = estimate.error;
     const degrees = (value) => `${value.toFixed(3).replace("-", "\u2212")}°`;
     return [name, cell("td", droguekit.millimetres(position)), cell("td", degrees(pitch)), cell("td", degrees(yaw))];
   }
@@ -90,11 +92,11 @@
     if (current === null) return;
     const { row, labels } = current;
     const method = byId("layers").elements.drawn.value;
-    const answer = labels.answers.find((one) => one.method === method);
+    const estimate = labels.estimates.find((one) => one.method === method);
     for (const eye of ["left", "right"]) {
-      droguekit.drawEye(byId(eye), { row, labels, eye, answer, zoomed, hidden, complain });
+      droguekit.drawEye(byId(eye), { row, labels, eye, estimate, zoomed, hidden, complain });
     }
-    byId("zoom").disabled = !["left", "right"].some((eye) => droguekit.surroundings(labels, eye, answer));
+    byId("zoom").disabled = !["left", "right"].some((eye) => droguekit.surroundings(labels, eye, estimate));
     byId("zoom").setAttribute("aria-pressed", String(zoomed));
   }
 
@@ -116,7 +118,7 @@
     if (fault) complain(fault);
     current = { row, labels };
     fill("conditions", labels.conditions.map(([name, value]) => [cell("th", name), cell("td", value)]));
-    fill("answers", labels.answers.map(answerCells));
+    fill("estimates", labels.estimates.map(estimateCells));
     fill("features", featureRows(labels));
     draw();
   };
