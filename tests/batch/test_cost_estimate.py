@@ -26,24 +26,14 @@ from droguekit.batch.frame_task import FrameReport
 from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
 from droguekit.batch.worker_pool import WorkerLimits
 from droguekit.workflows.planning import cost_lines
+from tests.support.recipe_builder import RecipeTable, between, build_recipe
 
-RECIPE = """
-name = "spread"
-[frames]
-count = 200
-scenes = 10
-empty_fraction = 0.2
-[distance]
-law = "log-uniform"
-low_m = 2.0
-high_m = 40.0
-[[families]]
-name = "day"
-[[families]]
-name = "dusk"
-[families.environment]
-sun_elevation_deg = 0
-"""
+BASE: RecipeTable = {
+    "name": "spread",
+    "frames": {"count": 200, "scenes": 10, "empty_fraction": 0.2},
+    "distance": between(2.0, 40.0, "log-uniform"),
+    "families": [{"name": "day"}, {"name": "dusk", "environment": {"sun_elevation_deg": 0}}],
+}
 
 
 def test_the_fit_goes_through_what_follows_the_law() -> None:
@@ -68,7 +58,7 @@ def test_weighted_values_pull_the_fit() -> None:
 
 
 def test_probed_frames_are_spread_over_distances_families_and_scenes() -> None:
-    recipe = parse_recipe(RECIPE)
+    recipe = build_recipe(BASE)
     drawn = plan_recipe(recipe).drawn
     order = choose_probe_frames(drawn, 200)
     chosen = order.counted
@@ -85,7 +75,7 @@ def test_probed_frames_are_spread_over_distances_families_and_scenes() -> None:
 
 
 def test_as_many_other_frames_of_all_distances_and_families_come_first() -> None:
-    drawn = plan_recipe(parse_recipe(RECIPE)).drawn
+    drawn = plan_recipe(build_recipe(BASE)).drawn
     order = choose_probe_frames(drawn, 200)
     assert len(set(order.warm_up)) == 12
     assert not set(order.warm_up) & set(order.counted)
@@ -96,14 +86,14 @@ def test_as_many_other_frames_of_all_distances_and_families_come_first() -> None
 
 
 def test_few_frames_are_probed_where_there_are_few() -> None:
-    drawn = plan_recipe(parse_recipe(RECIPE.replace("count = 200", "count = 2").replace("= 0.2", "= 0.0"))).drawn
+    drawn = plan_recipe(build_recipe(BASE, frames={"count": 2, "empty_fraction": 0.0})).drawn
     order = choose_probe_frames(drawn, 2)
     assert sorted(order.counted) == [0, 1]
     assert len(order.warm_up) == 1
 
 
 def test_only_empty_frames_are_probed_where_there_are_no_others() -> None:
-    drawn = plan_recipe(parse_recipe(RECIPE.replace("empty_fraction = 0.2", "empty_fraction = 1.0"))).drawn
+    drawn = plan_recipe(build_recipe(BASE, frames={"empty_fraction": 1.0})).drawn
     assert len(choose_probe_frames(drawn, 200).counted) == 1
 
 
@@ -126,7 +116,7 @@ def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], 
 
 
 def test_drawing_a_frame_counts_for_every_pair_and_a_new_scene_once() -> None:
-    recipe = parse_recipe(RECIPE)
+    recipe = build_recipe(BASE)
     plan = plan_recipe(recipe)
     found = estimate_cost(recipe, plan, synthetic(recipe, plan, lambda _: 1.0, first_s=0.7))
     assert found.frames_s == pytest.approx(200 * (1.0 + 0.2), rel=1e-9)  # float64 least squares
@@ -138,10 +128,12 @@ def test_drawing_a_frame_counts_for_every_pair_and_a_new_scene_once() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_families_without_a_measured_frame_count_as_the_others(seed: int) -> None:
     # Three frames are measured of six families: the last ones may well have none.
-    families = "".join(f'[[families]]\nname = "f{number}"\n' for number in range(6))
-    recipe = parse_recipe(
-        f'name = "six"\nseed = {seed}\n[frames]\ncount = 12\nscenes = 6\n'
-        f'[distance]\nlaw = "uniform"\nlow_m = 2\nhigh_m = 20\n{families}'
+    recipe = build_recipe(
+        name="six",
+        seed=seed,
+        frames={"count": 12, "scenes": 6},
+        distance=between(2, 20),
+        families=[{"name": f"f{number}"} for number in range(6)],
     )
     plan = plan_recipe(recipe)
     found = estimate_cost(recipe, plan, synthetic(recipe, plan, lambda _: 1.0))
@@ -151,7 +143,7 @@ def test_families_without_a_measured_frame_count_as_the_others(seed: int) -> Non
 
 
 def test_the_standard_error_is_how_much_the_total_scatters() -> None:
-    recipe = parse_recipe(RECIPE)
+    recipe = build_recipe(BASE)
     plan = plan_recipe(recipe)
     rng = np.random.default_rng(5)
     distances = dict(zip(plan.drawn.indices, plan.drawn.distances_m, strict=True))
@@ -173,7 +165,7 @@ def test_the_standard_error_is_how_much_the_total_scatters() -> None:
 
 
 def test_as_many_frames_as_terms_say_nothing_of_scatter() -> None:
-    recipe = parse_recipe(RECIPE.replace("count = 200", "count = 9"))
+    recipe = build_recipe(BASE, frames={"count": 9})
     plan = plan_recipe(recipe)
     found = estimate_cost(recipe, plan, synthetic(recipe, plan, float))
     assert len([index for index, report in found.probed.items() if report.distance_m is not None]) == 3

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 import numpy as np
 import pytest
 from scipy.stats import chisquare, kstest
 
 from datasets_manifest.recipe.drogue_ranges import DistanceLaw
-from datasets_manifest.recipe.recipe import Recipe, load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from droguekit.batch.recipe_plan import check_places, check_sizes, chi_square, distance_share, draw_frames, plan_recipe
 from scenes.framing import sample_distance_m
-
-RECIPE = """
-name = "lawful"
-seed = {seed}
-[frames]
-count = {count}
-[distance]
-law = "{law}"
-low_m = 2.0
-high_m = 40.0
-"""
+from tests.support.recipe_builder import RecipeTable, between, build_recipe
 
 
-def lawful(law: str = "log-uniform", count: int = 1500, seed: int = 3) -> Recipe:
-    return parse_recipe(RECIPE.format(law=law, count=count, seed=seed))
+def lawful(law: str = "log-uniform", count: int = 1500, **changes: Unpack[RecipeTable]) -> Recipe:
+    base: RecipeTable = {"name": "lawful", "seed": 3, "frames": {"count": count}, "distance": between(2.0, 40.0, law)}
+    return build_recipe(base, **changes)
 
 
 def test_with_one_law_for_all_it_is_the_textbooks_statistic() -> None:
@@ -94,9 +87,9 @@ def test_places_that_keep_to_one_side_are_found_out() -> None:
 def test_what_is_not_drawn_is_not_judged() -> None:
     recipe = load_recipe("demo").recipe
     assert check_sizes(plan_recipe(recipe).drawn, recipe) is None
-    on_axis = parse_recipe(RECIPE.format(law="uniform", count=20, seed=1) + "[pose]\non_axis = true\n")
+    on_axis = lawful("uniform", count=20, seed=1, pose={"on_axis": True})
     assert check_places(plan_recipe(on_axis).drawn, on_axis.rig.camera) is None
-    empty = parse_recipe(RECIPE.format(law="uniform", count=20, seed=1).replace("= 20", "= 20\nempty_fraction = 1.0"))
+    empty = lawful("uniform", seed=1, frames={"count": 20, "empty_fraction": 1.0})
     assert check_sizes(plan_recipe(empty).drawn, empty) is None
 
 

@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Unpack
 
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from droguekit.batch.recipe_plan import draw_frames, plan_recipe
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 from labelgen.part_pixels import drogue_box
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
+from tests.support.recipe_builder import RecipeTable, between, build_recipe
+from tests.support.small_datasets import SWINGING
 
-RECIPE = """
-name = "planned"
-[frames]
-count = 23
-scenes = 5
-empty_fraction = 0.3
-[distance]
-law = "log-uniform"
-low_m = 2.0
-high_m = 30.0
-[split]
-train = 0.6
-val = 0.2
-test = 0.2
-"""
+BASE: RecipeTable = {
+    "name": "planned",
+    "frames": {"count": 23, "scenes": 5, "empty_fraction": 0.3},
+    "distance": between(2.0, 30.0, "log-uniform"),
+    "split": {"train": 0.6, "val": 0.2, "test": 0.2},
+}
 
 
-def planned(**changes: str) -> Recipe:
-    text = RECIPE
-    for old, new in changes.items():
-        text = text.replace(f"{old} = ", f"{old} = {new} # ")
-    return parse_recipe(text)
+def planned(**changes: Unpack[RecipeTable]) -> Recipe:
+    return build_recipe(BASE, **changes)
 
 
 def test_counts_are_those_of_the_frames() -> None:
@@ -70,9 +61,9 @@ def test_boxes_are_those_of_the_labels() -> None:
         np.testing.assert_allclose(side_px**2, width * height, rtol=1e-12)
 
 
-@pytest.mark.parametrize("rig", ['"rgb-ideal"', '"paper-real"'])
+@pytest.mark.parametrize("rig", ["rgb-ideal", "paper-real"])
 def test_a_box_at_the_end_of_its_room_touches_the_edge_of_an_image(rig: str) -> None:
-    recipe = parse_recipe(f"rig = {rig}\n" + RECIPE.replace("empty_fraction = 0.3", ""))
+    recipe = planned(rig=rig, frames={"empty_fraction": None})
     camera, drawn = recipe.rig.camera, draw_frames(recipe, tuple(range(12)))
     kept_px = recipe.rig.largest_shift_px()
     last_px = np.array([camera.width_px, camera.height_px]) - 0.5
@@ -93,34 +84,13 @@ def test_a_box_at_the_end_of_its_room_touches_the_edge_of_an_image(rig: str) -> 
 
 
 def test_places_that_are_not_drawn_have_no_room() -> None:
-    drawn = plan_recipe(parse_recipe(RECIPE + "[pose]\non_axis = true\n")).drawn
+    drawn = plan_recipe(planned(pose={"on_axis": True})).drawn
     assert np.isnan(drawn.rooms_px).all()
     assert np.isfinite(drawn.centers_px).any()
 
 
-SWINGING = """
-name = "swinging"
-[frames]
-count = 20
-[exposure]
-time_s = 0.002
-[sequence]
-frames_per_sequence = 20
-frame_rate_hz = 5
-hose = {{ preset = "small-uav", airspeed_m_s = {airspeed_m_s} }}
-turbulence = "none"
-release_m = [3.0, 0.0, 1.0]
-[sequence.receiver]
-manoeuvres = ["station"]
-start_m = 4.0
-[sequence.receiver.follower]
-bandwidth_hz = 0
-"""
-
-
 def test_a_pair_that_cannot_be_made_is_a_drop_with_its_reason_and_the_others_are_drawn() -> None:
-    # Let go above the wind, the drogue swings, and shows its side to the receiver once or twice.
-    recipe = parse_recipe(SWINGING.format(airspeed_m_s=4))
+    recipe = build_recipe(SWINGING)
     reasons = {}
     for index in range(20):
         try:
@@ -138,13 +108,13 @@ def test_a_pair_that_cannot_be_made_is_a_drop_with_its_reason_and_the_others_are
 
 def test_a_recipe_of_which_no_pair_can_be_made_is_refused() -> None:
     # In still air the hose hangs straight down, and so the receiver looks at the drogue from the side.
-    hanging = SWINGING.format(airspeed_m_s=0).replace("release_m", "# release_m")
+    hanging = build_recipe(SWINGING, sequence={"hose": {"airspeed_m_s": 0}, "release_m": None})
     with pytest.raises(ValueError, match=r"sequence 0: leaves the visible volume at 0\.40 s"):
-        plan_recipe(parse_recipe(hanging))
+        plan_recipe(hanging)
 
 
 def test_a_large_recipe_is_drawn_in_part_but_counted_in_full() -> None:
-    plan = plan_recipe(planned(count="1000003"), most_sampled=50)
+    plan = plan_recipe(planned(frames={"count": 1_000_003}), most_sampled=50)
     assert sum(plan.by_scene.values()) == 1_000_003
     assert len(plan.drawn.indices) == 50
     assert plan.drawn.indices[0] == 0

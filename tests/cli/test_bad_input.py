@@ -17,18 +17,9 @@ import pytest
 
 from datasets_manifest.storage import layout
 from droguekit.cli.main import FAULT, WRONG_INPUT, run
+from tests.support.recipe_builder import between, recipe_text
 
-RECIPE = """
-name = "mine"
-[frames]
-count = 2
-[distance]
-law = "uniform"
-low_m = 3.0
-high_m = 9.0
-[render]
-samples_per_px = 1
-"""
+RECIPE = recipe_text(name="mine", frames={"count": 2}, distance=between(3.0, 9.0), render={"samples_per_px": 1})
 
 
 def _run(*arguments: str | Path, before: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:

@@ -21,25 +21,16 @@ from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.types.estimates import read_estimates
 from droguekit.cli.main import DONE, run
 from nav.runner import method_names
+from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
 
 # The scalar variant takes its time with every pixel.
-SMALL_RECIPE = """
-name = "small"
-[rig]
-preset = "rgb-ideal"
-width_px = 160
-height_px = 120
-focal_px = 266.0
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [10.0]
-[render]
-samples_per_px = 1
-surround_samples_per_px = 1
-max_depth = 2
-"""
+SMALL_RECIPE = recipe_text(
+    name="small",
+    rig=RIG_160_PX,
+    frames={"count": 1},
+    distance=stations(10.0),
+    render={"samples_per_px": 1, "surround_samples_per_px": 1, "max_depth": 2},
+)
 
 
 def no_engines() -> Generator[str, None, bool]:

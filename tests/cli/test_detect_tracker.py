@@ -11,30 +11,27 @@ import pytest
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.scoring.detection.detection_truth import read_detection_truth
 from nav.tracking.tracker import tracker_names
+from tests.support.recipe_builder import recipe_text
 
 FRAMES = 8
 # It finds all of these flat pictures to a percent; what is tested here is what comes after.
 DETECTOR = ("--detector", "color-blob")
 # Two sequences of four pairs, 10 s apart.
-RECIPE = """
-name = "two-flights"
-family = "docking"
-seed = 3
-rig = "rgb-ideal"
-[frames]
-count = 8
-scenes = 2
-[sequence]
-frames_per_sequence = 4
-frame_rate_hz = 25
-hose = "full-size"
-turbulence = ["light"]
-[sequence.receiver]
-manoeuvres = ["station"]
-start_m = 6.0
-[render]
-engine = "analytic"
-"""
+RECIPE = recipe_text(
+    name="two-flights",
+    family="docking",
+    seed=3,
+    rig="rgb-ideal",
+    frames={"count": 8, "scenes": 2},
+    sequence={
+        "frames_per_sequence": 4,
+        "frame_rate_hz": 25,
+        "hose": "full-size",
+        "turbulence": ["light"],
+        "receiver": {"manoeuvres": ["station"], "start_m": 6.0},
+    },
+    render={"engine": "analytic"},
+)
 
 
 @pytest.fixture(scope="module")

@@ -7,35 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import Conditions, PairRecord, StereoViews, ViewRecord
 from geometry.se3 import RigidTransform, exp_twist
-
-RECIPE = """
-name = "tiny"
-seed = 0
-[rig]
-preset = "{preset}"
-width_px = 48
-height_px = 36
-focal_px = 80.0
-output_bits = {bits}
-[frames]
-count = 4
-scenes = 2
-[distance]
-law = "uniform"
-low_m = 2.0
-high_m = 3.0
-"""
+from tests.support.recipe_builder import between, build_recipe
 
 
 def make_recipe(preset: str = "rgb-ideal", bits: int = 8) -> Recipe:
-    return parse_recipe(RECIPE.format(preset=preset, bits=bits))
+    return build_recipe(
+        name="tiny",
+        seed=0,
+        rig={"preset": preset, "width_px": 48, "height_px": 36, "focal_px": 80.0, "output_bits": bits},
+        frames={"count": 4, "scenes": 2},
+        distance=between(2.0, 3.0),
+    )
 
 
 def make_images(recipe: Recipe, frame_index: int) -> StereoImages:

@@ -5,17 +5,18 @@ import numpy as np
 import pytest
 
 from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices, write_calibration
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.recipe.rigs import resolve_rig
 from datasets_manifest.types.field_types import write_rig
 from geometry.stereo import EYES
+from tests.support.recipe_builder import RecipeTable, Section, build_recipe, stations
 
-TABLE = """
-name = "rig-test"
-frames = { count = 1 }
-distance = { law = "stations", stations_m = [5.0] }
-render = { engine = "analytic" }
-"""
+BASE: RecipeTable = {
+    "name": "rig-test",
+    "frames": {"count": 1},
+    "distance": stations(5.0),
+    "render": {"engine": "analytic"},
+}
 
 
 def test_ideal_presets_have_no_lenses():
@@ -45,7 +46,7 @@ def test_ranges_of_a_table_hold():
 
 
 def test_json_gives_the_rig_back():
-    recipe = parse_recipe(TABLE + 'rig = "paper-real"', seed=4)
+    recipe = build_recipe(BASE, rig="paper-real", seed=4)
     again = Recipe.model_validate_json(recipe.model_dump_json())
     assert again.model_dump_json() == recipe.model_dump_json()
     pixels = np.array([[10.0, 20.0], [1200.0, 900.0]])
@@ -75,12 +76,10 @@ def test_calibration_rectifies_the_real_images(tmp_path):
 
 def test_engines_without_lenses_are_named():
     with pytest.raises(ValueError, match=r"render\.engine: foreign draws ideal eyes only"):
-        parse_recipe(TABLE.replace("analytic", "foreign") + 'rig = "paper-real"')
+        build_recipe(BASE, rig="paper-real", render={"engine": "foreign"})
 
 
-@pytest.mark.parametrize(
-    "eyes", ["{ k1 = 3.0 }", "{ k9 = 0.1 }", "{ k1 = -1.9, k2 = -2.0 }", "{ right_rotation_deg = -1 }"]
-)
-def test_wrong_eyes_are_refused(eyes):
+@pytest.mark.parametrize("eyes", [{"k1": 3.0}, {"k9": 0.1}, {"k1": -1.9, "k2": -2.0}, {"right_rotation_deg": -1}])
+def test_wrong_eyes_are_refused(eyes: Section) -> None:
     with pytest.raises(ValueError, match="rig: "):
-        parse_recipe(TABLE + f'rig = {{ preset = "mono", focal_px = 600.0, eyes = {eyes} }}')
+        build_recipe(BASE, rig={"preset": "mono", "focal_px": 600.0, "eyes": eyes})

@@ -75,7 +75,7 @@ def test_damaged_environment_maps(edit, other, suffix):
         else:
             OpenEXR.File({}, {name: picture[..., 0].copy() for name in "RGB"}).write(str(path))
         path.write_bytes(edit(other(path.read_bytes())))
-        text = RECIPE.replace("[environment.clouds]", f'[environment]\nmap = "{path.name}"\n[environment.clouds]')
+        text = RECIPE.replace("[environment]", f'[environment]\nmap = "{path.name}"')
         quietly(lambda: environment_radiance(sample_frame(parse_recipe(text, Path(place)), 0).environment))
 
 

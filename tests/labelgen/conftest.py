@@ -6,24 +6,22 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from scenes.sampler import sample_frame
 from tests.support.drawn_pairs import Pair, write_drawn_dataset
-from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
-
-RECIPE = recipe_text(
-    name="small",
-    seed=3,
-    rig=RIG_160_PX,
-    frames={"count": 6, "scenes": 3, "empty_fraction": 0.3},
-    distance=stations(1.7, 2.5, 4.0),
-    split={"train": 0.34, "val": 0.33, "test": 0.33},
-)
+from tests.support.recipe_builder import RIG_160_PX, build_recipe, stations
 
 
 @pytest.fixture(scope="session")
 def small_recipe() -> Recipe:
-    return parse_recipe(RECIPE)
+    return build_recipe(
+        name="small",
+        seed=3,
+        rig=RIG_160_PX,
+        frames={"count": 6, "scenes": 3, "empty_fraction": 0.3},
+        distance=stations(1.7, 2.5, 4.0),
+        split={"train": 0.34, "val": 0.33, "test": 0.33},
+    )
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
@@ -17,28 +16,22 @@ from render.camera.optics import light_on_sensor
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import RIG_320_PX, RecipeTable, build_recipe, recipe_text, stations
 from tests.support.small_datasets import rendered
 
-TABLE = """
-name = "real-lenses"
-seed = 3
-[rig]
-preset = "paper-real"
-%s
-[frames]
-count = 4
-[distance]
-law = "stations"
-stations_m = [2.0, 5.0]
-[render]
-engine = "analytic"
-"""
-SMALL = "width_px = 320\nheight_px = 240\nfocal_px = 533.0"
+BASE: RecipeTable = {
+    "name": "real-lenses",
+    "seed": 3,
+    "rig": {"preset": "paper-real"},
+    "frames": {"count": 4},
+    "distance": stations(2.0, 5.0),
+    "render": {"engine": "analytic"},
+}
 
 
 @pytest.fixture(scope="module")
 def made():
-    recipe = parse_recipe(TABLE % "")
+    recipe = build_recipe(BASE)
     frame = sample_frame(recipe, 0)
     radiance = load_engine("analytic").render(frame, recipe.render)
     return frame, radiance, label_frame(frame, radiance, expose(frame, radiance))
@@ -94,5 +87,6 @@ def test_vignetting_of_real_eyes_is_centred_on_their_axes(made):
 
 
 def test_a_dataset_of_real_eyes_is_valid(tmp_path):
-    dataset = rendered(TABLE % SMALL, tmp_path / "set", range(2))
+    small = recipe_text(BASE, rig=RIG_320_PX | {"preset": "paper-real"})
+    dataset = rendered(small, tmp_path / "set", range(2))
     assert validate_dataset(dataset).faults == []

@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import Obstacle
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.marker_layout import marker_layout
 from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
@@ -19,31 +20,23 @@ from render.analytic_engine.analytic_engine import AnalyticEngine
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import RIG_160_PX, RecipeTable, Section, build_recipe, stations
 
-RECIPE = """
-name = "masks"
-seed = 4
-[rig]
-preset = "rgb-ideal"
-width_px = 40
-height_px = 30
-focal_px = {focal_px}
-{eyes}
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [{distance_m}]
-[render]
-engine = "analytic"
-"""
+BASE: RecipeTable = {
+    "name": "masks",
+    "seed": 4,
+    "rig": {"preset": "rgb-ideal", "width_px": 40, "height_px": 30, "focal_px": 66.0},
+    "frames": {"count": 1},
+    "distance": stations(2.5),
+    "render": {"engine": "analytic"},
+}
+LENSES = {"k1": -0.3, "k2": 0.05, "principal_point_px": 0.5, "right_rotation_deg": 0.3}
 
 
-LENSES = "eyes = { k1 = -0.3, k2 = 0.05, principal_point_px = 0.5, right_rotation_deg = 0.3 }"
-
-
-def small_frame(eyes="", focal_px=66.0, distance_m=2.5):
-    recipe = parse_recipe(RECIPE.format(eyes=eyes, focal_px=focal_px, distance_m=distance_m))
+def small_frame(
+    eyes: Section | None = None, focal_px: float = 66.0, distance_m: float = 2.5
+) -> tuple[Recipe, FrameSpec]:
+    recipe = build_recipe(BASE, rig={"focal_px": focal_px, "eyes": eyes}, distance=stations(distance_m))
     return recipe, sample_frame(recipe, 0)
 
 
@@ -63,7 +56,7 @@ def rays_that_meet(frame, eye, triangles):
 
 
 # The tanker leaves the image, and lenses bend its long edges by pixels.
-@pytest.mark.parametrize("eyes", ["", LENSES])
+@pytest.mark.parametrize("eyes", [None, LENSES])
 def test_silhouettes_are_what_rays_meet(eyes):
     _, frame = small_frame(eyes)
     parts = part_triangles(frame, "right")
@@ -99,7 +92,7 @@ def test_amodal_masks_have_the_records_pixels(full_pairs):
                 assert abs(np.count_nonzero(alone[part]) - count) <= 1
 
 
-@pytest.mark.parametrize("eyes", ["", LENSES])
+@pytest.mark.parametrize("eyes", [None, LENSES])
 def test_amodal_masks_of_flat_rings_have_the_engines_pixels(eyes):
     recipe, frame = small_frame(eyes)
     radiance = AnalyticEngine().render(frame, recipe.render)
@@ -163,12 +156,8 @@ def supersampled_px(frame, disc, eye):
 
 
 def test_pixel_centres_count_what_supersampling_counts():
-    recipe = parse_recipe(
-        RECIPE.format(eyes="", focal_px=2133.0, distance_m="4.0, 5.5, 7.0, 9.0")
-        .replace("width_px = 40", "width_px = 1280")
-        .replace("height_px = 30", "height_px = 960")
-        .replace("count = 1", "count = 8")
-    )
+    rig = {"width_px": 1280, "height_px": 960, "focal_px": 2133.0}
+    recipe = build_recipe(BASE, rig=rig, frames={"count": 8}, distance=stations(4.0, 5.5, 7.0, 9.0))
     ratios = []
     for index in range(8):
         frame = sample_frame(recipe, index)
@@ -186,11 +175,10 @@ def test_pixel_centres_count_what_supersampling_counts():
 
 
 @pytest.mark.mitsuba
-@pytest.mark.parametrize("eyes", ["", LENSES])
+@pytest.mark.parametrize("eyes", [None, LENSES])
 def test_silhouettes_are_the_path_tracer_s(eyes):
     """Another program's rays through the same pixel centres: part ids, and what it counts of features alone."""
-    text = RECIPE.format(eyes=eyes, focal_px=266.0, distance_m=2.5).replace("analytic", "mitsuba")
-    recipe = parse_recipe(text.replace("width_px = 40", "width_px = 160").replace("height_px = 30", "height_px = 120"))
+    recipe = build_recipe(BASE, rig={**RIG_160_PX, "eyes": eyes}, render={"engine": "mitsuba"})
     frame = sample_frame(recipe, 0)
     radiance = load_engine("mitsuba").render(frame, recipe.render.model_copy(update={"edge_samples_per_px": 1}))
     for eye in EYES:

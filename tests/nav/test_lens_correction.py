@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.recipe.rigs import resolve_rig
 from datasets_manifest.types.estimates import PoseEstimate
 from geometry.circles import disc_image_centers, disc_outline, project_disc_centers
@@ -18,22 +17,8 @@ from nav.navigator import Navigator
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import build_recipe, stations
 
-TABLE = """
-name = "real-eyes"
-seed = 3
-rig = "paper-real"
-[frames]
-count = 10
-[distance]
-law = "stations"
-stations_m = [2.0, 6.0]
-[environment]
-sun_elevation_deg = [30, 60]
-sun_azimuth_deg = [120, 240]
-[render]
-engine = "analytic"
-"""
 DISCS = 5.0 * np.stack([np.eye(2)] * 2)
 RIG, _ = resolve_rig("paper-real", 3)
 POSE = RigidTransform(rotation_from_angles(0.1, -0.1, 0.3), np.array([0.2, -0.15, 1.8]))
@@ -76,7 +61,15 @@ def test_ideal_eyes_change_nothing():
 
 
 def test_poses_through_real_lenses():
-    recipe = parse_recipe(TABLE)
+    recipe = build_recipe(
+        name="real-eyes",
+        seed=3,
+        rig="paper-real",
+        frames={"count": 10},
+        distance=stations(2.0, 6.0),
+        environment={"sun_elevation_deg": [30, 60], "sun_azimuth_deg": [120, 240]},
+        render={"engine": "analytic"},
+    )
     engine, navigator = load_engine("analytic"), Navigator(recipe.rig, recipe.drogue)
     for index in range(4):
         frame = sample_frame(recipe, index)

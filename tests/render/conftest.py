@@ -5,25 +5,9 @@ import importlib.util
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from render.engine import RenderEngine, load_engine
-
-TABLE = """
-name = "render-test"
-seed = 5
-drogue = "red-8"
-rig = { preset = "rgb-ideal", width_px = %d, height_px = %d, focal_px = %f }
-[frames]
-count = 50
-[distance]
-law = "stations"
-stations_m = %s
-[pose]
-speed_m_s = %f
-rate_deg_s = %f
-[render]
-samples_per_px = %d
-"""
+from tests.support.recipe_builder import build_recipe, stations
 
 
 @pytest.fixture(scope="session")
@@ -31,8 +15,16 @@ def make_recipe():
     """A recipe for the paper's rig scaled down by a factor."""
 
     def make(scale=1.0, stations_m=(3.0,), samples=16, speed_m_s=0.0, rate_deg_s=0.0) -> Recipe:
-        size = (round(1280 * scale), round(960 * scale), 2133.3333 * scale)
-        return parse_recipe(TABLE % (*size, list(stations_m), speed_m_s, rate_deg_s, samples))
+        width_px, height_px, focal_px = round(1280 * scale), round(960 * scale), round(2133.3333 * scale, 6)
+        return build_recipe(
+            name="render-test",
+            seed=5,
+            rig={"preset": "rgb-ideal", "width_px": width_px, "height_px": height_px, "focal_px": focal_px},
+            frames={"count": 50},
+            distance=stations(*stations_m),
+            pose={"speed_m_s": speed_m_s, "rate_deg_s": rate_deg_s},
+            render={"samples_per_px": samples},
+        )
 
     return make
 

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
+from tests.support.recipe_builder import build_recipe, stations
 
 GOLDEN = Path(__file__).parent / "golden_render.npz"
-_RECIPE = """
-name = "golden"
-seed = 8
-rig = { preset = "rgb-ideal", width_px = 96, height_px = 72, focal_px = 160.0 }
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [2.2]
-[environment]
-ground = "sea"
-sun_elevation_deg = { low = 40, high = 40 }
-[render]
-"""
 
 
-def golden_recipe(*render_lines: str) -> Recipe:
-    """The recipe of the frame, with lines for its section `render`."""
-    return parse_recipe(_RECIPE + "\n".join(render_lines))
+def golden_recipe(**render: object) -> Recipe:
+    """The recipe of the frame, with these keys in its section `render`."""
+    return build_recipe(
+        name="golden",
+        seed=8,
+        rig={"preset": "rgb-ideal", "width_px": 96, "height_px": 72, "focal_px": 160.0},
+        frames={"count": 1},
+        distance=stations(2.2),
+        environment={"ground": "sea", "sun_elevation_deg": {"low": 40, "high": 40}},
+        render=render,
+    )

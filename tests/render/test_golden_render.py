@@ -20,19 +20,19 @@ from tests.render.golden_frame import GOLDEN, golden_recipe
 pytestmark = pytest.mark.mitsuba
 
 RENDERS, MORE_RENDERS = 200, 60
-RENDER_LINES = "edge_samples_per_px = 64", "denoise = false"
+RENDER = {"edge_samples_per_px": 64, "denoise": False}
 
 
 def luminance(engine, index):
     """(2, H, W) luminance of both eyes by the samples of seed `index`."""
-    recipe = golden_recipe(*RENDER_LINES)
+    recipe = golden_recipe(**RENDER)
     frame = sample_frame(recipe, 0).model_copy(update={"seed": index})
     radiance = engine.render(frame, recipe.render)
     return np.stack([getattr(radiance, eye).radiance_cd_m2 @ REC709_LUMINANCE for eye in EYES])
 
 
 def stored_parts(engine):
-    recipe = golden_recipe(*RENDER_LINES)
+    recipe = golden_recipe(**RENDER)
     radiance = engine.render(sample_frame(recipe, 0), recipe.render)
     return np.stack([getattr(radiance, eye).part_id for eye in EYES])
 

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.recipe.rigs import SENSORS
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame
@@ -24,6 +23,7 @@ from drogue_models.parameters import DrogueParameters, HubParameters, even_ring
 from geometry.circles import disc_outline, project_disc_centers
 from geometry.se3 import RigidTransform, angles_from_rotation, exp_twist, log_twist, rotation_from_angles
 from geometry.stereo import EYES, Eye, paper_rig
+from tests.support.recipe_builder import between, build_recipe
 
 RIG = paper_rig()
 SIGMA_COVARIANCE = ((1e-4, 0.0), (0.0, 1e-4))
@@ -204,9 +204,11 @@ def make_dataset(folder: Path, records: Sequence[PairRecord], alike: bool = Fals
             images = StereoImages(left=left, right=right, time_s=0.0, exposure_s=1e-3)
             files = encode_files(images, parts)
         write_frame(folder, record, files)
-    recipe = parse_recipe(
-        f'name = "bench-test"\ndescription = "Flat pictures of a drogue."\nframes = {{count = {len(records)}}}\n'
-        'distance = {law = "uniform", low_m = 1.7, high_m = 40}'
+    recipe = build_recipe(
+        name="bench-test",
+        description="Flat pictures of a drogue.",
+        frames={"count": len(records)},
+        distance=between(1.7, 40),
     )
     write_manifest(folder, build_manifest(folder, recipe, "test", dict.fromkeys(range(recipe.frames.scenes), "train")))
     return folder

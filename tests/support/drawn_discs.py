@@ -20,8 +20,12 @@ def tilted_shape(radius_px, rng, ratio=0.97):
     return turn @ np.diag([radius_px, ratio * radius_px]) @ turn.T
 
 
-def coverage(shape, center, grid):
-    count = int(8 * 2 * np.pi * np.linalg.norm(shape)) + 64
+def coverage(shape: np.ndarray, center: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """(N, N) share of each pixel of a square window that an ellipse covers, blurred by 0.5 px.
+
+    More than two points per pixel of circumference are exact to 2e-14: the error is exp(-2 (pi 0.5 px / step)^2).
+    """
+    count = int(2 * 2 * np.pi * np.linalg.norm(shape)) + 64
     angle = 2 * np.pi * np.arange(count) / count
     arms = np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ shape
     tangents = np.stack([-np.sin(angle), np.cos(angle)], axis=-1) @ shape * (2 * np.pi / count)

@@ -11,32 +11,19 @@ from datasets_manifest.storage.writer import write_frame
 from droguekit.batch.frame_task import make_frame
 from labelgen.export.annotations.coco import write_annotations
 from render.engine import load_engine
+from tests.support.recipe_builder import recipe_text, stations
 
-RECIPE = """
-name = "fuzz"
-seed = 5
-[rig]
-preset = "rgb-ideal"
-width_px = 48
-height_px = 36
-focal_px = 80.0
-[frames]
-count = 3
-scenes = 2
-empty_fraction = 0.3
-[distance]
-law = "stations"
-stations_m = [2.5]
-[environment.clouds]
-scene_fraction = 0.0
-[render]
-engine = "analytic"
-[outputs]
-exr = true
-[split]
-train = 0.5
-test = 0.5
-"""
+RECIPE = recipe_text(
+    name="fuzz",
+    seed=5,
+    rig={"preset": "rgb-ideal", "width_px": 48, "height_px": 36, "focal_px": 80.0},
+    frames={"count": 3, "scenes": 2, "empty_fraction": 0.3},
+    distance=stations(2.5),
+    environment={"clouds": {"scene_fraction": 0.0}},
+    render={"engine": "analytic"},
+    outputs={"exr": True},
+    split={"train": 0.5, "test": 0.5},
+)
 
 
 def write_whole_dataset(folder: Path) -> None:

@@ -5,33 +5,27 @@ from __future__ import annotations
 import base64
 import re
 from pathlib import Path
+from typing import Unpack
 
 import cv2
 import numpy as np
 import pytest
 
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from tests.support.recipe_builder import RecipeTable, between, recipe_text, stations
+from tests.support.small_datasets import SWINGING
 
-RECIPE = """
-name = "{name}"
-description = "a < b & c"
-[frames]
-count = 40
-scenes = 4
-empty_fraction = {empty}
-[distance]
-law = "{law}"
-{distance}
-{families}
-"""
-LOG = {"law": "log-uniform", "distance": "low_m = 2.0\nhigh_m = 40.0"}
-STATIONS = {"law": "stations", "distance": "stations_m = [2.0, 5.0]"}
-FAMILIES = '[[families]]\nname = "day"\n[[families]]\nname = "dusk"\n'
+BASE: RecipeTable = {
+    "name": "own",
+    "description": "a < b & c",
+    "frames": {"count": 40, "scenes": 4},
+    "distance": between(2.0, 40.0, "log-uniform"),
+}
 
 
-def page_of(tmp_path: Path, empty: float = 0.0, families: str = "", **law: str) -> str:
+def page_of(tmp_path: Path, **changes: Unpack[RecipeTable]) -> str:
     recipe = tmp_path / "own.toml"
-    recipe.write_text(RECIPE.format(name="own", empty=empty, families=families, **law), encoding="utf-8")
+    recipe.write_text(recipe_text(BASE, **changes), encoding="utf-8")
     out = tmp_path / "new" / "plan.html"
     assert run(["plan", str(recipe), "--no-probe", "--html", str(out)]) == DONE
     return out.read_text(encoding="utf-8")
@@ -45,14 +39,14 @@ def pictures(page: str) -> list[np.ndarray]:
 
 
 def test_the_page_needs_nothing_from_outside(tmp_path: Path) -> None:
-    page = page_of(tmp_path, families=FAMILIES, **LOG)
+    page = page_of(tmp_path, families=[{"name": "day"}, {"name": "dusk"}])
     assert "http" not in page and "<script" not in page
     assert "a &lt; b &amp; c" in page
     assert len(pictures(page)) == 4
 
 
 def test_the_page_repeats_what_the_command_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = page_of(tmp_path, **LOG)
+    page = page_of(tmp_path)
     said = capsys.readouterr().out.splitlines()
     assert said[-1].startswith("wrote ")
     shown = page[page.index("<pre>") + 5 : page.index("</pre>")].splitlines()
@@ -60,7 +54,7 @@ def test_the_page_repeats_what_the_command_says(tmp_path: Path, capsys: pytest.C
 
 
 def test_stations_have_bars_and_no_law_of_sizes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(pictures(page_of(tmp_path, **STATIONS))) == 3
+    assert len(pictures(page_of(tmp_path, distance=stations(2.0, 5.0)))) == 3
     shown = capsys.readouterr().out
     assert "box sizes" not in shown
     assert "places of the box's middle" in shown
@@ -74,35 +68,14 @@ def test_the_law_is_printed_with_its_chi_square(capsys: pytest.CaptureFixture[st
 
 
 def test_without_drogues_there_are_no_boxes(tmp_path: Path) -> None:
-    assert pictures(page_of(tmp_path, empty=1.0, **LOG)) == []
+    assert pictures(page_of(tmp_path, frames={"empty_fraction": 1.0})) == []
 
 
 def test_pairs_that_cannot_be_made_are_listed_with_their_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe = tmp_path / "swinging.toml"
-    # Let go above the wind, the drogue swings, and shows its side to the receiver once or twice.
-    recipe.write_text(
-        """
-name = "swinging"
-[frames]
-count = 20
-[exposure]
-time_s = 0.002
-[sequence]
-frames_per_sequence = 20
-frame_rate_hz = 5
-hose = { preset = "small-uav", airspeed_m_s = 4 }
-turbulence = "none"
-release_m = [3.0, 0.0, 1.0]
-[sequence.receiver]
-manoeuvres = ["station"]
-start_m = 4.0
-[sequence.receiver.follower]
-bandwidth_hz = 0
-""",
-        encoding="utf-8",
-    )
+    recipe.write_text(recipe_text(SWINGING), encoding="utf-8")
     assert run(["plan", str(recipe), "--no-probe", "--html", str(tmp_path / "plan.html")]) == DONE
     shown = capsys.readouterr().out
     dropped = re.findall(r"^  frame (\d+): sequence 0: leaves the visible volume at", shown, re.MULTILINE)

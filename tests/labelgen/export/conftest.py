@@ -8,39 +8,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import Recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform
 from scenes.sampler import sample_frame
 from tests.support.drawn_pairs import Pair, write_drawn_dataset
-
-SMALL = """
-name = "mixed"
-seed = 918273645
-[rig]
-preset = "{preset}"
-width_px = 160
-height_px = 120
-focal_px = 266.0
-{more}
-[frames]
-count = 9
-scenes = 9
-empty_fraction = 0.25
-[distance]
-law = "stations"
-stations_m = [1.7, 2.5, 4.0]
-[split]
-train = 0.4
-val = 0.3
-test = 0.3
-"""
+from tests.support.recipe_builder import RIG_160_PX, Section, build_recipe, stations
 
 
-def small_recipe_of(preset: str, more: str = "") -> Recipe:
-    """A recipe of small frames by a rig of this preset."""
-    return parse_recipe(SMALL.format(preset=preset, more=more))
+def small_recipe_of(preset: str, rig: Section | None = None) -> Recipe:
+    """A recipe of small frames by a rig of this preset, with more keys of the rig."""
+    return build_recipe(
+        name="mixed",
+        seed=918273645,
+        rig={**RIG_160_PX, "preset": preset, **(rig or {})},
+        frames={"count": 9, "scenes": 9, "empty_fraction": 0.25},
+        distance=stations(1.7, 2.5, 4.0),
+        split={"train": 0.4, "val": 0.3, "test": 0.3},
+    )
 
 
 def mixed_recipe() -> Recipe:
@@ -82,11 +68,11 @@ def mixed_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def dataset_by_preset(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
+def dataset_by_preset(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     """A dataset of three pairs by a rig; to be read only."""
 
-    def make(preset: str, more: str = "") -> Path:
-        recipe = small_recipe_of(preset, more)
+    def make(preset: str, rig: Section | None = None) -> Path:
+        recipe = small_recipe_of(preset, rig)
         drawn = [Pair(sample_frame(recipe, index)) for index in range(3)]
         return write_drawn_dataset(tmp_path_factory.mktemp(preset) / "dataset", recipe, drawn)
 

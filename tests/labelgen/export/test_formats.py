@@ -112,7 +112,7 @@ sys.exit(run(["export", sys.argv[1], "--format", sys.argv[2], "--out", sys.argv[
 @pytest.mark.parametrize("name", ["coco", "speed", "webdataset", "parquet"])
 def test_a_full_disk_is_one_line_and_leaves_nothing(name, dataset_by_preset, tmp_path):
     # Images of 12 bits are written anew instead of linked.
-    dataset = dataset_by_preset("mono", "output_bits = 12")
+    dataset = dataset_by_preset("mono", {"output_bits": 12})
     command = [sys.executable, "-c", ON_A_FULL_DISK, str(dataset), name, str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     errors = [line for line in done.stderr.splitlines() if not line.startswith("pairs: ")]

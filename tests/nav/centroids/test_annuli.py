@@ -14,20 +14,11 @@ from nav.centroids.motion_blur import ImageMotion
 from nav.centroids.outline_pixels import annulus_pixels
 from render.analytic_engine.pixel_coverage import pixel_coverage
 from render.camera.optics import blur
-from studies.acceptance.rendered.centroid_bounds import PixelLight, outline_coverage
+from tests.support.drawn_discs import DAY, coverage
 
-DAY = PixelLight(2300, 4700, 4.8, 11_700 / 255, 0.5, 0.01)
 STEP_PX = np.array([0.03, -0.02])
 # Shot noise of the background, and its growth; what discs of the same light would have told.
 NOISE = NoiseModel(2300 / DAY.step_e**2 + 1 / 12, 1 / DAY.step_e * 2, 0.0)
-
-
-def coverage(shape, center, grid):
-    count = int(8 * 2 * np.pi * np.linalg.norm(shape)) + 64
-    angle = 2 * np.pi * np.arange(count) / count
-    arms = np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ shape
-    tangents = np.stack([-np.sin(angle), np.cos(angle)], axis=-1) @ shape * (2 * np.pi / count)
-    return outline_coverage(center + arms, tangents, grid, grid, DAY.psf_sigma_px)
 
 
 def draw_annuli(outer_px, rng, shadow=0.0, contrast_e=DAY.contrast_e, mouth_e=0.0, way=(0.0, 0.0)):

@@ -17,35 +17,20 @@ from labelgen.frame_labels import label_frame
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import RIG_320_PX, RecipeTable, between, build_recipe
 
 DOC = Path(__file__).resolve().parents[3] / "docs/how-to/calibrate.md"
-RECIPE = """
-name = "board"
-seed = 2
-[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.0
-{eyes}
-[board]
-columns = 7
-rows = 6
-square_m = 0.09
-[frames]
-count = 4
-empty_fraction = 1.0
-[distance]
-law = "uniform"
-low_m = 1.7
-high_m = 2.0
-[pose]
-pitch_deg = [-25, 25]
-yaw_deg = [-25, 25]
-[render]
-engine = "analytic"
-"""
-LENSES = "eyes = { k1 = -0.2, k2 = 0.1, p1 = 0.001, principal_point_px = 3.0, right_rotation_deg = 0.3 }"
+BASE: RecipeTable = {
+    "name": "board",
+    "seed": 2,
+    "rig": RIG_320_PX,
+    "board": {"columns": 7, "rows": 6, "square_m": 0.09},
+    "frames": {"count": 4, "empty_fraction": 1.0},
+    "distance": between(1.7, 2.0),
+    "pose": {"pitch_deg": [-25, 25], "yaw_deg": [-25, 25]},
+    "render": {"engine": "analytic"},
+}
+LENSES = {"k1": -0.2, "k2": 0.1, "p1": 0.001, "principal_point_px": 3.0, "right_rotation_deg": 0.3}
 
 
 def rendered(recipe, index):
@@ -53,10 +38,10 @@ def rendered(recipe, index):
     return frame, load_engine("analytic").render(frame, recipe.render)
 
 
-@pytest.mark.parametrize("eyes", ["", LENSES])
+@pytest.mark.parametrize("eyes", [None, LENSES])
 def test_every_pixel_has_the_mean_of_what_its_rays_see(eyes):
     """Against 16 x 16 rays a pixel, written apart from the engine."""
-    recipe = parse_recipe(RECIPE.format(eyes=eyes))
+    recipe = build_recipe(BASE, rig={"eyes": eyes})
     frame, radiance = rendered(recipe, 0)
     board, pose = recipe.board, frame.board.left_from_board
     sub = (np.arange(16) + 0.5) / 16 - 0.5
@@ -93,7 +78,7 @@ def test_every_pixel_has_the_mean_of_what_its_rays_see(eyes):
 
 
 def test_paper_and_ink_have_their_reflectance():
-    recipe = parse_recipe(RECIPE.format(eyes=""))
+    recipe = build_recipe(BASE)
     _, radiance = rendered(recipe, 1)
     plate = radiance.left.radiance_cd_m2[radiance.left.coverage == 1]
     # Air of 2 m adds light to black of 1e-4 of the sky's.
@@ -101,9 +86,9 @@ def test_paper_and_ink_have_their_reflectance():
     np.testing.assert_allclose(ratio, recipe.board.black_reflectance / recipe.board.white_reflectance, rtol=5e-3)
 
 
-@pytest.mark.parametrize("eyes", ["", LENSES])
+@pytest.mark.parametrize("eyes", [None, LENSES])
 def test_depth_and_labels_are_those_of_the_plate(eyes):
-    recipe = parse_recipe(RECIPE.format(eyes=eyes))
+    recipe = build_recipe(BASE, rig={"eyes": eyes})
     for index in range(recipe.frames.count):
         frame, radiance = rendered(recipe, index)
         record = label_frame(frame, radiance, expose(frame, radiance))
@@ -121,19 +106,19 @@ def test_depth_and_labels_are_those_of_the_plate(eyes):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("changes", "message"),
     [
-        (('engine = "analytic"', 'engine = "mitsuba"'), "board: is drawn by the engine analytic only"),
-        (("empty_fraction = 1.0", "empty_fraction = 0.5"), "board: takes the drogue's place"),
-        (("[pose]", "[pose]\nspeed_m_s = 1.0"), "board: stands still"),
-        (("low_m = 1.7", "low_m = 0.7"), "nearer than 1.38 m, where both views hold the board"),
-        (("columns = 7", "columns = 8"), "one must be even and the other odd"),
-        (("square_m = 0.09", "square_m = -1"), "board.square_m"),
+        ({"render": {"engine": "mitsuba"}}, "board: is drawn by the engine analytic only"),
+        ({"frames": {"empty_fraction": 0.5}}, "board: takes the drogue's place"),
+        ({"pose": {"speed_m_s": 1.0}}, "board: stands still"),
+        ({"distance": between(0.7, 2.0)}, "nearer than 1.38 m, where both views hold the board"),
+        ({"board": {"columns": 8}}, "one must be even and the other odd"),
+        ({"board": {"square_m": -1}}, "board.square_m"),
     ],
 )
-def test_boards_that_cannot_be_are_refused(change, message):
+def test_boards_that_cannot_be_are_refused(changes: RecipeTable, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
-        parse_recipe(RECIPE.format(eyes="").replace(*change))
+        build_recipe(BASE, **changes)
 
 
 def test_other_datasets_know_nothing_of_boards():

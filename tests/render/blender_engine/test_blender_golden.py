@@ -21,7 +21,7 @@ pytestmark = [
 ]
 
 RENDERS = 8
-RENDER_LINES = 'engine = "blender"', "samples_per_px = 16", "surround_samples_per_px = 16"
+RENDER = {"engine": "blender", "samples_per_px": 16, "surround_samples_per_px": 16}
 
 
 def test_renders_scatter_around_the_other_path_tracer_s_mean():
@@ -29,7 +29,7 @@ def test_renders_scatter_around_the_other_path_tracer_s_mean():
 
     with np.load(GOLDEN) as stored:
         mean, variance, parts = stored["mean"].astype(float), stored["variance"].astype(float), stored["parts"]
-    recipe = golden_recipe(*RENDER_LINES)
+    recipe = golden_recipe(**RENDER)
     frame = sample_frame(recipe, 0)
     blender = BlenderEngine()
     images = []

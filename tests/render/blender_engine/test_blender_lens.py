@@ -7,7 +7,6 @@ import importlib.util
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
@@ -15,6 +14,7 @@ from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import build_recipe, stations
 
 pytestmark = [
     pytest.mark.blender,
@@ -23,40 +23,34 @@ pytestmark = [
     ),
 ]
 
-RECIPE = """
-name = "real-lenses"
-seed = 3
-[rig]
-preset = "rgb-ideal"
-width_px = 320
-height_px = 240
-focal_px = 533.3
-[rig.eyes]
-k1 = -0.2
-k2 = 0.1
-p1 = 0.002
-p2 = -0.003
-principal_point_px = 6.0
-focal_fraction = 0.01
-right_rotation_deg = 0.5
-[frames]
-count = 2
-[distance]
-law = "stations"
-stations_m = [2.0]
-[pose]
-speed_m_s = 0.5
-[render]
-engine = "blender"
-samples_per_px = 16
-"""
-
 
 @pytest.fixture(scope="module")
 def made():
     from render.blender_engine.blender_engine import BlenderEngine
 
-    recipe = parse_recipe(RECIPE)
+    recipe = build_recipe(
+        name="real-lenses",
+        seed=3,
+        rig={
+            "preset": "rgb-ideal",
+            "width_px": 320,
+            "height_px": 240,
+            "focal_px": 533.3,
+            "eyes": {
+                "k1": -0.2,
+                "k2": 0.1,
+                "p1": 0.002,
+                "p2": -0.003,
+                "principal_point_px": 6.0,
+                "focal_fraction": 0.01,
+                "right_rotation_deg": 0.5,
+            },
+        },
+        frames={"count": 2},
+        distance=stations(2.0),
+        pose={"speed_m_s": 0.5},
+        render={"engine": "blender", "samples_per_px": 16},
+    )
     frame = sample_frame(recipe, 0)
     engine = BlenderEngine()
     radiance = engine.render(frame, recipe.render)

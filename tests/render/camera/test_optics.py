@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.frame import Exposure, Optics
 from geometry.pinhole import PinholeCamera
 from render.camera.optics import blur_circle_px, disc_kernel, light_on_sensor, transmission
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import build_recipe, stations
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 
@@ -131,15 +132,9 @@ def test_a_blur_without_end_is_refused(make_recipe):
 
 
 def test_recipe_keys_reach_the_sensor():
-    recipe = parse_recipe(
-        """
-        name = "lens"
-        frames = { count = 1 }
-        distance = { law = "stations", stations_m = [5.0] }
-        [rig]
-        preset = "mono"
-        optics = { natural_vignetting = true, mechanical_falloff_fraction = 0.2, focus_distance_m = 12.0 }
-        """
+    optics = {"natural_vignetting": True, "mechanical_falloff_fraction": 0.2, "focus_distance_m": 12.0}
+    recipe = build_recipe(
+        name="lens", rig={"preset": "mono", "optics": optics}, frames={"count": 1}, distance=stations(5.0)
     )
     assert recipe.sensor.optics == Optics(
         natural_vignetting=True, mechanical_falloff_fraction=0.2, focus_distance_m=12.0

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids
 from geometry.stereo import EYES
 from render.camera.optics import blur
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import build_recipe, stations
 
 pytestmark = pytest.mark.mitsuba
 
@@ -135,24 +135,23 @@ def test_smoothing_leaves_no_speckles_on_the_tanker(engine, below_the_wing):
     assert np.mean(errors[0]) == pytest.approx(0.0, abs=0.01 * settled.mean())
 
 
-PROBE_BESIDE = """
-name = "probe"
-seed = 3
-rig = { preset = "rgb-ideal", width_px = 427, height_px = 320, focal_px = 711.0, probe_tip_body_m = [2.6, 0.5, 0.35] }
-[frames]
-count = 2
-[distance]
-law = "stations"
-stations_m = [2.2, 2.6]
-[target]
-probe = true
-"""
-
-
 @pytest.mark.parametrize("index", [0, 1])
 def test_a_probe_beside_the_drogue_brings_no_noise(engine, index):
     """It stands close before markers and face, whose light from others is next to nothing elsewhere."""
-    recipe = parse_recipe(PROBE_BESIDE)
+    recipe = build_recipe(
+        name="probe",
+        seed=3,
+        rig={
+            "preset": "rgb-ideal",
+            "width_px": 427,
+            "height_px": 320,
+            "focal_px": 711.0,
+            "probe_tip_body_m": [2.6, 0.5, 0.35],
+        },
+        frames={"count": 2},
+        distance=stations(2.2, 2.6),
+        target={"probe": True},
+    )
     frame = sample_frame(recipe, index)
     first, second = (engine.render(reseeded(frame, seed), recipe.render) for seed in (1, 2))
     # Two pictures differ by both their noises. With two paths from each pixel it was two to three times the sensor's.

@@ -42,7 +42,7 @@ def test_white_face_shines_as_its_irradiance_says(engine, make_recipe, sun_azimu
 
 def test_nothing_shadows_the_markers(engine, make_recipe):
     """With the sun behind the receiver every marker is evenly lit: no shadow edge of rim or rib lies on it."""
-    recipe = make_recipe(scale=0.5, stations_m=(2.5,), samples=256)
+    recipe = make_recipe(scale=0.25, stations_m=(2.0,), samples=256)
     frame = sample_frame(recipe, 0)
     environment = frame.environment.model_copy(update={"sun_azimuth_deg": 170.0, "sun_elevation_deg": 20.0})
     level = RigidTransform(np.eye(3), frame.left_from_drogue.translation_m * [0, 0, 1])

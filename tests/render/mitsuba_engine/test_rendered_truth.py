@@ -44,7 +44,7 @@ def centroid_and_area(image, center_px, radius_px):
 
 
 def test_centroids_of_lit_markers_are_the_ellipse_centres(engine, make_recipe):
-    recipe = make_recipe(stations_m=(2.0, 5.0, 10.0, 20.0, 40.0), samples=64)
+    recipe = make_recipe(stations_m=(2.0, 5.0, 10.0, 20.0, 40.0), samples=1)
     errors, area_ratios = [], []
     for index in range(5):
         frame = sample_frame(recipe, index)

@@ -12,6 +12,7 @@ import pytest
 
 from geometry.stereo import EYES
 from render.compositing import inside_one_part
+from tests.support.recipe_builder import recipe_text, stations
 
 pytestmark = pytest.mark.mitsuba
 
@@ -31,19 +32,14 @@ for index in range(2):
     frames.append(engine.render(frame, recipe.render))
 pickle.dump((engine.version, frames), open(sys.argv[2], "wb"))
 """
-RECIPE = """
-name = "variants"
-seed = 3
-rig = { preset = "rgb-ideal", width_px = 160, height_px = 120, focal_px = 266.67 }
-[frames]
-count = 2
-[distance]
-law = "stations"
-stations_m = [2.5, 4.0]
-[render]
-samples_per_px = 64
-surround_samples_per_px = 16
-"""
+RECIPE = recipe_text(
+    name="variants",
+    seed=3,
+    rig={"preset": "rgb-ideal", "width_px": 160, "height_px": 120, "focal_px": 266.67},
+    frames={"count": 2},
+    distance=stations(2.5, 4.0),
+    render={"samples_per_px": 64, "surround_samples_per_px": 16},
+)
 
 # A disc smaller than a ray's step aside, right before the camera and seen from behind: as if a ray had slipped into a
 # part's inside. The second one stands before a wall that faces the camera.

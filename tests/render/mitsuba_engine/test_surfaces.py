@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.types.appearance import DrogueCondition, Obstacle, SurfaceCondition
 from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
@@ -13,24 +12,9 @@ from geometry.se3 import RigidTransform
 from render.engine import load_engine
 from render.surfaces import clean_reflectance_rgb, reflectance_map
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import build_recipe, stations
 
 NEW = SurfaceCondition()
-REAL = """
-name = "real-eyes"
-seed = 3
-[rig]
-preset = "paper-real"
-width_px = 640
-height_px = 480
-focal_px = 1066.7
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [3.0]
-[render]
-samples_per_px = 2
-"""
 
 
 def aged(frame, states, **more):
@@ -147,7 +131,14 @@ def test_a_frame_without_a_drogue_shows_its_bystanders(engine, recipe, frame):
 def test_rays_go_through_real_lenses_as_the_analytic_engine_projects(engine):
     if "scalar" in engine.version:
         pytest.skip("the scalar variant draws ideal eyes only")
-    recipe = parse_recipe(REAL)
+    recipe = build_recipe(
+        name="real-eyes",
+        seed=3,
+        rig={"preset": "paper-real", "width_px": 640, "height_px": 480, "focal_px": 1066.7},
+        frames={"count": 1},
+        distance=stations(3.0),
+        render={"samples_per_px": 2},
+    )
     frame = sample_frame(recipe, 0)
     traced, drawn = (renderer.render(frame, recipe.render) for renderer in (engine, load_engine("analytic")))
     for ours, theirs in ((traced.left, drawn.left), (traced.right, drawn.right)):

@@ -29,6 +29,7 @@ from studies.acceptance.rendered.flight_tiers import (
 )
 from studies.acceptance.rendered.scored_frames import BEST, CHAIN
 from studies.acceptance.rendered.sequence_pairs import FILTERED, ScoredPair, TruePair
+from tests.support.recipe_builder import RecipeTable, build_recipe, stations
 
 LAYOUT, RIG = marker_layout(load_drogue("red-8")), paper_rig()
 
@@ -234,27 +235,16 @@ def test_docking_conditions_has_every_combination_whatever_the_seed(seed: int) -
 
 
 def test_in_turn_needs_families_of_equal_weight() -> None:
-    from datasets_manifest.recipe.recipe import parse_recipe
 
-    text = """
-name = "turns"
-[frames]
-count = 4
-scenes = 4
-in_turn = true
-[distance]
-law = "stations"
-stations_m = [5]
-[[families]]
-name = "a"
-weight = %g
-[[families]]
-name = "b"
-"""
-    drawn = parse_recipe(text % 1)
+    base: RecipeTable = {
+        "name": "turns",
+        "frames": {"count": 4, "scenes": 4, "in_turn": True},
+        "distance": stations(5),
+    }
+    drawn = build_recipe(base, families=[{"name": "a"}, {"name": "b"}])
     assert [recipe_of_scene(drawn, scene_of_frame(drawn, k)).family for k in range(4)] == ["a", "b", "a", "b"]
     with pytest.raises(ValueError, match=r"families: have equal weights where frames.in_turn is true"):
-        parse_recipe(text % 2)
-    variants = '[target]\nvariants = [{ drogue = "red-8", weight = 4 }, { drogue = "red-5" }]\n[[families]]\nname = "a"'
+        build_recipe(base, families=[{"name": "a", "weight": 2}, {"name": "b"}])
+    variants = [{"drogue": "red-8", "weight": 4}, {"drogue": "red-5"}]
     with pytest.raises(ValueError, match=r"target.variants: have equal weights where frames.in_turn is true"):
-        parse_recipe((text % 1).replace('[[families]]\nname = "a"', variants))
+        build_recipe(base, families=[{"name": "a"}, {"name": "b"}], target={"variants": variants})

@@ -21,6 +21,7 @@ from studies.engine_agreement.navigation_agreement import (
     size_ratios,
     station_recipe,
 )
+from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
 from tests.support.small_datasets import rendered
 
 
@@ -98,23 +99,16 @@ def test_one_engine_against_itself_errs_alike_and_stays_when_run_again(tmp_path)
     assert 0 < np.abs(errors.one[:, :3]).max() < 0.1
 
 
-SMALL = """
-name = "small"
-seed = %d
-rig = { preset = "rgb-ideal", width_px = 160, height_px = 120, focal_px = 266.7 }
-[frames]
-count = 1
-[distance]
-law = "stations"
-stations_m = [3.0]
-[render]
-engine = "%s"
-samples_per_px = 4
-"""
-
-
 def small_dataset(folder, engine, seed=1):
-    return rendered(SMALL % (seed, engine), folder)
+    text = recipe_text(
+        name="small",
+        seed=seed,
+        rig=RIG_160_PX | {"focal_px": 266.7},
+        frames={"count": 1},
+        distance=stations(3.0),
+        render={"engine": engine, "samples_per_px": 4},
+    )
+    return rendered(text, folder)
 
 
 def test_datasets_of_other_frames_are_refused(tmp_path):

@@ -148,7 +148,7 @@ def test_several_drogues_have_no_common_flip(mixed_dataset, small_dataset, tmp_p
 
 
 def test_a_missing_split_is_replaced_and_told(dataset_by_preset, tmp_path):
-    dataset = dataset_by_preset("rgb-ideal", "")
+    dataset = dataset_by_preset("rgb-ideal")
     splits = set(Dataset(dataset).manifest.split_of_frame().values())
     log = ExportLog()
     write_export("yolo", dataset, tmp_path / "out", log)
@@ -162,7 +162,7 @@ def test_a_missing_split_is_replaced_and_told(dataset_by_preset, tmp_path):
 
 
 def test_twelve_bits_become_eight_and_are_told(dataset_by_preset, tmp_path):
-    dataset = dataset_by_preset("mono", "output_bits = 12")
+    dataset = dataset_by_preset("mono", {"output_bits": 12})
     log = ExportLog()
     write_export("yolo", dataset, tmp_path / "out", log)
     assert log.losses["images of 12 bits: written with their upper 8"] == 6

@@ -57,9 +57,9 @@ def test_navigation_sees_the_same(blind, mixed_dataset):
         assert got.drogue == want.drogue and got.rig.baseline_m == want.rig.baseline_m
 
 
-@pytest.mark.parametrize(("preset", "more"), [("paper-colour", ""), ("mono", "output_bits = 12")])
-def test_mosaics_and_twelve_bits_stay(preset, more, dataset_by_preset, tmp_path):
-    dataset = dataset_by_preset(preset, more)
+@pytest.mark.parametrize(("preset", "rig"), [("paper-colour", {}), ("mono", {"output_bits": 12})])
+def test_mosaics_and_twelve_bits_stay(preset, rig, dataset_by_preset, tmp_path):
+    dataset = dataset_by_preset(preset, rig)
     write_export("blind", dataset, tmp_path / "out", ExportLog())
     want, got = BlindDataset(dataset).pair(0).images, BlindDataset(tmp_path / "out").pair(0).images
     np.testing.assert_array_equal(got.left, want.left)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from datasets_manifest.recipe.recipe import parse_recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
@@ -15,6 +14,7 @@ from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.poses.bop import depth_numbers, write_bop
 from render.exr_writer import encode_passes
+from tests.support.recipe_builder import build_recipe, stations
 
 SPLITS = ("train", "val", "test")
 FOLDERS = {"train": "train_pbr", "val": "val", "test": "test"}
@@ -234,9 +234,7 @@ def test_without_depth_the_rest_is_there_and_the_loss_is_told(small_dataset, tmp
 
 
 def test_real_lenses_are_refused(tmp_path):
-    recipe = parse_recipe(
-        'name = "real"\nrig = "paper-real"\nframes = { count = 1 }\n[distance]\nlaw = "stations"\nstations_m = [5.0]'
-    )
+    recipe = build_recipe(name="real", rig="paper-real", frames={"count": 1}, distance=stations(5.0))
     write_manifest(
         tmp_path / "real",
         build_manifest(tmp_path / "real", recipe, "1", dict.fromkeys(range(recipe.frames.scenes), "train")),

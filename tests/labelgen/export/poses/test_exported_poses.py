@@ -33,14 +33,14 @@ def rotation_of_scalar_first(quaternion: list[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("preset", "more"),
+    ("preset", "rig"),
     [
-        ("rgb-ideal", ""),
-        ("paper-real", "eyes = { k1 = [-0.1, -0.1], right_rotation_deg = 0.5, principal_point_px = 3 }"),
+        ("rgb-ideal", {}),
+        ("paper-real", {"eyes": {"k1": [-0.1, -0.1], "right_rotation_deg": 0.5, "principal_point_px": 3}}),
     ],
 )
-def test_speed_poses_project_markers_where_the_labels_have_them(preset, more, dataset_by_preset, tmp_path):
-    dataset = dataset_by_preset(preset, more)
+def test_speed_poses_project_markers_where_the_labels_have_them(preset, rig, dataset_by_preset, tmp_path):
+    dataset = dataset_by_preset(preset, rig)
     write_export("speed", dataset, tmp_path / "out", ExportLog())
     source, seen = Dataset(dataset), 0
     for eye in EYES:
@@ -143,7 +143,7 @@ def sees_drogue(part_id: np.ndarray) -> np.ndarray:
 
 
 def test_kitti_refuses_eyes_that_are_not_rectified(dataset_by_preset, tmp_path):
-    dataset = dataset_by_preset("paper-real", "eyes = { k1 = [-0.1, -0.1] }")
+    dataset = dataset_by_preset("paper-real", {"eyes": {"k1": [-0.1, -0.1]}})
     with pytest.raises(ValueError, match="KITTI holds rectified ones only"):
         write_export("kitti", dataset, tmp_path / "out", ExportLog())
     assert not (tmp_path / "out").exists()
