@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import os
 import signal
 from pathlib import Path
 
@@ -13,6 +14,10 @@ from hypothesis import settings
 # The same draws on every machine, however busy it is; `make fuzz` draws anew.
 settings.register_profile("suite", deadline=None, derandomize=True, database=None)
 settings.load_profile("suite")
+
+# Libraries read this when they load. The suite runs several processes at a time, and in small problems threads of each
+# mostly wait for one another.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and every program that they start with them.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -53,7 +53,7 @@ def test_missing_truncated_and_changed_frames_are_made_again(
     image.write_bytes(image.read_bytes()[:1000])
     record = layout.frame_folder(out, 2) / layout.RECORD_FILE
     record.write_text(record.read_text().replace('"family":"clear"', '"family":"foggy"'))
-    summary = make(out, text=analytic_recipe)
+    summary = make(out, workers=0, text=analytic_recipe)
     assert set(summary.totals.made) == {0, 1, 2}
     assert summary.kept == 5
     assert hashes(out) == hashes(analytic_dataset)
@@ -65,7 +65,7 @@ def test_frames_that_no_manifest_vouches_for_are_made_again(
     out = tmp_path / "copy"
     shutil.copytree(analytic_dataset, out)
     (out / layout.MANIFEST_FILE).unlink()
-    assert make(out, text=analytic_recipe).kept == 0
+    assert make(out, workers=0, text=analytic_recipe).kept == 0
     assert hashes(out) == hashes(analytic_dataset)
 
 
@@ -73,16 +73,16 @@ def test_a_part_is_a_dataset_that_the_rest_completes(
     analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
 ) -> None:
     out = tmp_path / "parts"
-    first = make(out, range(1, 3), text=analytic_recipe)
+    first = make(out, range(1, 3), workers=0, text=analytic_recipe)
     assert (first.pairs, first.planned) == (2, 8)
     assert [entry.frame_index for entry in read_manifest(out).frames] == [1, 2]
-    second = make(out, text=analytic_recipe)
+    second = make(out, workers=0, text=analytic_recipe)
     assert (second.kept, second.pairs) == (2, 8)
     assert hashes(out) == hashes(analytic_dataset)
 
 
 def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
-    tiny_dataset: Path, tiny_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
 ) -> None:
     out = tmp_path / "killed"
     script = tmp_path / "run.py"
@@ -98,8 +98,8 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
         "    def say(self, text): pass\n"
         "    def end(self): pass\n"
         "if __name__ == '__main__':\n"
-        f"    text = {tiny_recipe!r}\n"
-        f"    render_dataset(RecipeSource(parse_recipe(text), text), Path({str(out)!r}), range(4), 1, Tell())\n"
+        f"    text = {analytic_recipe!r}\n"
+        f"    render_dataset(RecipeSource(parse_recipe(text), text), Path({str(out)!r}), range(8), 1, Tell())\n"
     )
     with subprocess.Popen(
         [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -108,23 +108,25 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
         assert run.stdout.readline() == "frame\n"
         run.kill()
     made_before = len(layout.frame_indices(out))
-    assert 1 <= made_before < 4
-    assert make(out).kept == made_before
+    assert 1 <= made_before < 8
+    assert make(out, workers=0, text=analytic_recipe).kept == made_before
     assert leftovers(out) == []
-    assert hashes(out) == hashes(tiny_dataset)
+    assert hashes(out) == hashes(analytic_dataset)
 
 
-def test_events_tell_of_every_frame_and_are_only_added_to(tiny_dataset: Path, make: Make, tmp_path: Path) -> None:
+def test_events_tell_of_every_frame_and_are_only_added_to(
+    analytic_dataset: Path, analytic_recipe: str, make: Make, tmp_path: Path
+) -> None:
     out = tmp_path / "copy"
-    shutil.copytree(tiny_dataset, out)
+    shutil.copytree(analytic_dataset, out)
     before = (out / layout.EVENTS_FILE).read_text()
     shutil.rmtree(layout.frame_folder(out, 3))
-    make(out)
+    make(out, text=analytic_recipe)
     text = (out / layout.EVENTS_FILE).read_text()
     assert text.startswith(before)
     first = [json.loads(line) for line in before.splitlines()]
-    assert [line["event"] for line in first] == ["start", *["frame"] * 4, "end"]
-    assert {line["frame"] for line in first if line["event"] == "frame"} == {0, 1, 2, 3}
+    assert [line["event"] for line in first] == ["start", *["frame"] * 8, "end"]
+    assert {line["frame"] for line in first if line["event"] == "frame"} == {*range(8)}
     new = [json.loads(line) for line in text[len(before) :].splitlines()]
     assert [(line["event"], line.get("frame")) for line in new] == [("start", None), ("frame", 3), ("end", None)]
     assert all(seconds >= 0 for seconds in new[1]["stage_s"].values())

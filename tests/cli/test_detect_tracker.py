@@ -21,7 +21,7 @@ RECIPE = recipe_text(
     name="two-flights",
     family="docking",
     seed=3,
-    rig="rgb-ideal",
+    rig={"preset": "rgb-ideal", "width_px": 640, "height_px": 480, "focal_px": 1067.0},
     frames={"count": 8, "scenes": 2},
     sequence={
         "frames_per_sequence": 4,
