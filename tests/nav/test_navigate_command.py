@@ -18,6 +18,7 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
 from geometry.se3 import RigidTransform, rotation_from_angles
+from tests.support.painted_pairs import fly_past
 
 PAIRS = 6
 
@@ -37,10 +38,10 @@ class Flight:
 
 
 @pytest.fixture(scope="module")
-def flight(fly, tmp_path_factory):
+def flight(tmp_path_factory):
     """A dataset without truth of a drogue that comes nearer."""
     turn = rotation_from_angles(*np.radians([4, -3, 5]))
-    pairs = fly([RigidTransform(turn, np.array([0.02 * k, -0.01 * k, 5.0 - 0.02 * k])) for k in range(PAIRS)])
+    pairs = fly_past([RigidTransform(turn, np.array([0.02 * k, -0.01 * k, 5.0 - 0.02 * k])) for k in range(PAIRS)])
     out = tmp_path_factory.mktemp("flight") / "data"
     settings = ImportSettings("flight", pairs[0].rig, pairs[0].drogue, encoding="linear")
     write_imported(Flight(pairs), settings, out, lambda: None)

@@ -26,6 +26,7 @@ from nav.runner import method_names, navigate
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
+from tests.support.painted_pairs import make_pose, paint_pair
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]
@@ -36,7 +37,7 @@ NAVIGATOR = Navigator(RIG, DROGUE)
 BOUND_SIGMAS = 1.5 * 5
 
 
-def draw_place(make_pose, rng, z_m):
+def draw_place(rng, z_m):
     x_low, x_high, y_low, y_high = RIG.common_field_m(z_m, DROGUE.rim_radius_m)
     # Within the seven tenths of the symmetry's range where noise cannot turn the roll that is nearest to zero.
     return make_pose(
@@ -46,11 +47,11 @@ def draw_place(make_pose, rng, z_m):
 
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
 @pytest.mark.parametrize("z_m", [1.7, 5.0, 10.0, 20.0, 40.0])
-def test_joint_error_stays_within_its_own_bound(draw, make_pose, z_m, kind):
+def test_joint_error_stays_within_its_own_bound(z_m, kind):
     for seed in range(2):
         rng = np.random.default_rng([seed, int(10 * z_m)])
-        place = draw_place(make_pose, rng, z_m)
-        images = draw(RIG, DROGUE, place, rng, kind=kind)
+        place = draw_place(rng, z_m)
+        images = paint_pair(RIG, DROGUE, place, rng, kind=kind)
         observation = NAVIGATOR.observe(images).observation
         assert not isinstance(observation, NoFixReason), observation.reason
         assert observation.paired.all()
@@ -72,10 +73,10 @@ def test_joint_error_stays_within_its_own_bound(draw, make_pose, z_m, kind):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 5.0])
-def test_attitude_near_by(draw, make_pose, z_m):
+def test_attitude_near_by(z_m):
     rng = np.random.default_rng(21)
     place = make_pose(0.06, 0.0, z_m, 6, -7, 12)
-    (estimate,) = NAVIGATOR.estimate(0, draw(RIG, DROGUE, place, rng), ["joint"])
+    (estimate,) = NAVIGATOR.estimate(0, paint_pair(RIG, DROGUE, place, rng), ["joint"])
     assert isinstance(estimate, PoseEstimate)
     deviation_deg = np.degrees(np.sqrt(np.diag(estimate.covariance)[3:].max()))
     error_deg = np.degrees(angles_from_rotation(estimate.left_from_drogue.rotation)) - (6, -7, 12)
@@ -83,17 +84,17 @@ def test_attitude_near_by(draw, make_pose, z_m):
 
 
 @pytest.mark.parametrize("name", ["red-5", "red-7"])
-def test_other_drogues(draw, make_pose, name):
+def test_other_drogues(name):
     drogue = PRESETS[name]
     place = make_pose(0.2, 0.1, 8, -5, 7, 12)
-    images = draw(RIG, drogue, place, np.random.default_rng(22))
+    images = paint_pair(RIG, drogue, place, np.random.default_rng(22))
     for estimate in Navigator(RIG, drogue).estimate(0, images, method_names()):
         assert isinstance(estimate, PoseEstimate)
         # The weakest of them, the paper's, misses by 40 mm on average at 10 m with five markers.
         assert np.linalg.norm(estimate.left_from_drogue.translation_m - place.translation_m) < 0.2
 
 
-def test_outlines_of_near_markers_are_those_of_opencv(make_pose):
+def test_outlines_of_near_markers_are_those_of_opencv():
     place = make_pose(0.06, -0.03, 1.7, 9, -8, 12)
     shapes = marker_shapes(RIG, LAYOUT, place)
     camera, turn = RIG.camera, np.linspace(0, 2 * np.pi, 720, endpoint=False)
@@ -113,15 +114,15 @@ def test_outlines_of_near_markers_are_those_of_opencv(make_pose):
 
 
 @pytest.mark.parametrize(("z_m", "pitch_deg"), [(0.2, 80), (1.7, 89), (1.7, 90), (40.0, 10)])
-def test_outlines_of_far_markers_and_of_impossible_poses_are_circles(make_pose, z_m, pitch_deg):
+def test_outlines_of_far_markers_and_of_impossible_poses_are_circles(z_m, pitch_deg):
     shapes = marker_shapes(RIG, LAYOUT, make_pose(0, 0, z_m, pitch_deg))
     np.testing.assert_allclose(shapes, np.broadcast_to(RIG.camera.fx_px * 0.05 / z_m * np.eye(2), shapes.shape))
 
 
-def test_hidden_markers_and_false_discs(draw, make_pose):
+def test_hidden_markers_and_false_discs():
     place = make_pose(0.1, 0.05, 6, 8, -6, 10)
     false_discs = ((0.45, 0.1, 0.0, 0.05), (-0.1, 0.1, 0.1, 0.05))
-    images = draw(RIG, DROGUE, place, np.random.default_rng(23), hidden=(3,), extra_discs=false_discs)
+    images = paint_pair(RIG, DROGUE, place, np.random.default_rng(23), hidden=(3,), extra_discs=false_discs)
     (estimate,) = NAVIGATOR.estimate(0, images, ["joint"])
     assert isinstance(estimate, PoseEstimate)
     assert len([feature for feature in estimate.features if feature.used]) == 14
@@ -129,8 +130,11 @@ def test_hidden_markers_and_false_discs(draw, make_pose):
     assert abs(estimate.left_from_drogue.translation_m[2] - 6) < BOUND_SIGMAS * 60e-3 * 0.04 * 0.36
 
 
-def test_estimates_survive_the_disk(draw, make_pose, tmp_path):
-    pairs = {3: draw(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None), 5: draw(RIG, None, make_pose(0, 0, 9), None)}
+def test_estimates_survive_the_disk(tmp_path):
+    pairs = {
+        3: paint_pair(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None),
+        5: paint_pair(RIG, None, make_pose(0, 0, 9), None),
+    }
     estimates = [e for frame, images in pairs.items() for e in NAVIGATOR.estimate(frame, images, method_names())]
     assert [(e.frame_index, e.method) for e in estimates] == [(i, m) for i in (3, 5) for m in method_names()]
     assert {e.status for e in estimates if e.frame_index == 3} == {"fix"}
@@ -146,8 +150,8 @@ def test_estimates_survive_the_disk(draw, make_pose, tmp_path):
         assert read.model_dump_json() == written.model_dump_json()
 
 
-def test_centroids_can_be_the_same_for_all_methods(draw, make_pose):
-    images = draw(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), np.random.default_rng(7))
+def test_centroids_can_be_the_same_for_all_methods():
+    images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), np.random.default_rng(7))
     places = {}
     for choice in CENTROID_CHOICES:
         estimates = Navigator(RIG, DROGUE, centroids=choice).estimate(0, images, ["paper", "joint"])
@@ -173,8 +177,8 @@ def test_runner_refuses_unknown_methods_before_it_reads(smoke_dataset):
         navigate(BlindDataset(smoke_dataset), ["joint", "magic"])
 
 
-def test_the_same_picture_gives_the_same_answer(draw, make_pose):
-    images = draw(RIG, DROGUE, make_pose(0.3, -0.2, 12, 6, 3, 5), np.random.default_rng(24))
+def test_the_same_picture_gives_the_same_answer():
+    images = paint_pair(RIG, DROGUE, make_pose(0.3, -0.2, 12, 6, 3, 5), np.random.default_rng(24))
     first, second = (NAVIGATOR.estimate(0, images, ["paper", "joint"]) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert isinstance(a, PoseEstimate)
@@ -185,8 +189,8 @@ def test_the_same_picture_gives_the_same_answer(draw, make_pose):
         np.testing.assert_allclose([f.center_px for f in a.features], [f.center_px for f in b.features], atol=1e-9)
 
 
-def test_what_is_stated_of_the_tolerances_reaches_the_method(draw, make_pose):
-    images = draw(RIG, DROGUE, make_pose(0.06, 0, 8, 6, 3, 5), np.random.default_rng(25))
+def test_what_is_stated_of_the_tolerances_reaches_the_method():
+    images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 8, 6, 3, 5), np.random.default_rng(25))
     stated = StatedTolerances(ring_radius_m=5e-4, disparity_px=0.2)
     built, loose = (
         Navigator(RIG, DROGUE, tolerances=tolerances).estimate(0, images, ["joint"])[0]
@@ -233,8 +237,8 @@ def test_haze_of_a_low_sun_is_not_taken_for_red_paint(frame_index):
     assert np.linalg.norm(estimate.left_from_drogue.translation_m - truth_m) < 0.002 * truth_m[2]
 
 
-def test_a_region_beside_the_image_shows_nothing(draw, make_pose):
-    images = draw(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None)
+def test_a_region_beside_the_image_shows_nothing():
+    images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None)
     beside = Region(eye="left", box_xywh_px=(1290.0, 100.0, 50.0, 50.0), source="tracker", score=1.0)
     before = Region(eye="right", box_xywh_px=(-90.0, 100.0, 50.0, 50.0), source="tracker", score=1.0)
     seen = NAVIGATOR.measure(images, (beside, before)).observation
@@ -261,9 +265,9 @@ class OneEyed:
 @pytest.mark.parametrize("box_xywh_px", [None, (3.0, 4.0, 60.0, 50.0)], ids=["nothing", "another place"])
 @pytest.mark.parametrize("blind", EYES)
 @pytest.mark.parametrize("z_m", [1.7, 10.0, 40.0])
-def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(draw, make_pose, z_m, blind, box_xywh_px):
+def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(z_m, blind, box_xywh_px):
     place = make_pose(0.05, -0.04, z_m, 4.0, -6.0, 3.0)
-    images = draw(RIG, DROGUE, place, np.random.default_rng(3))
+    images = paint_pair(RIG, DROGUE, place, np.random.default_rng(3))
     (known,) = NAVIGATOR.estimate(0, images, ["joint"])
     (estimate,) = Navigator(RIG, DROGUE, OneEyed(blind, box_xywh_px)).estimate(0, images, ["joint"])
     assert isinstance(known, PoseEstimate) and isinstance(estimate, PoseEstimate)
@@ -274,9 +278,9 @@ def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(draw, make_pos
     )
 
 
-def test_what_only_one_eye_can_see_is_not_made_up_in_the_other(draw, make_pose):
+def test_what_only_one_eye_can_see_is_not_made_up_in_the_other():
     place = make_pose(0.05, -0.04, 5.0, 4.0, -6.0, 3.0)
-    images = draw(RIG, DROGUE, place, np.random.default_rng(4))
+    images = paint_pair(RIG, DROGUE, place, np.random.default_rng(4))
     images = replace(images, right=np.full_like(images.right, int(np.median(images.right))))
     (estimate,) = NAVIGATOR.estimate(0, images, ["joint-hub"])
     assert not isinstance(estimate, PoseEstimate) and "one eye only" in estimate.reason

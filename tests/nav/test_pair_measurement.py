@@ -17,6 +17,7 @@ from nav.navigator import Navigator
 from nav.pair_measurement import PairMeasurement, estimate_pose
 from nav.pose.pose_method import NoFixReason, Observation
 from nav.pose.pose_methods import METHODS, pose_method
+from tests.support.painted_pairs import make_pose, paint_pair
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]
@@ -82,7 +83,7 @@ FAULTS = {
 }
 
 
-def broken(make_pose, corrupt) -> Observation:
+def broken(corrupt) -> Observation:
     place = make_pose(0.06, 0, 5, 7, 7)
     pixels = np.stack([project_disc_centers(RIG, place, LAYOUT.centers_m, LAYOUT.radius_m, eye) for eye in EYES])
     cov = np.tile(0.01 * np.eye(2), (2, 8, 1, 1))
@@ -96,22 +97,22 @@ STEREO_METHODS = [name for name in METHODS if not name.startswith("mono-")]
 
 @pytest.mark.parametrize("method", STEREO_METHODS)
 @pytest.mark.parametrize("corrupt", FAULTS, ids=lambda corrupt: corrupt.__name__)
-def test_every_method_gives_the_reason(make_pose, method, corrupt):
-    answer = METHODS[method](broken(make_pose, corrupt))
+def test_every_method_gives_the_reason(method, corrupt):
+    answer = METHODS[method](broken(corrupt))
     assert isinstance(answer, NoFixReason)
     assert FAULTS[corrupt] in answer.reason
 
 
-def test_joint_refuses_markers_in_a_wrong_order(make_pose):
-    answer = METHODS["joint"](broken(make_pose, wrong_order))
+def test_joint_refuses_markers_in_a_wrong_order():
+    answer = METHODS["joint"](broken(wrong_order))
     assert isinstance(answer, NoFixReason)
     assert "do not fit the drogue" in answer.reason
 
 
-def test_the_papers_method_needs_a_circle(make_pose):
+def test_the_papers_method_needs_a_circle():
     centers = LAYOUT.centers_m.copy()
     centers[0] *= 1.1
-    good = broken(make_pose, lambda pixels, cov: None)
+    good = broken(lambda pixels, cov: None)
     observation = Observation(RIG, MarkerLayout(centers, 0.05, None), good.pixels_px, good.cov_px2)
     answer = METHODS["paper"](observation)
     assert isinstance(answer, NoFixReason)
@@ -149,9 +150,9 @@ def test_flat_images(level):
 
 @pytest.mark.parametrize("blind", EYES)
 @pytest.mark.parametrize("z_m", [3.0, 12.0])
-def test_one_blind_eye(draw, make_pose, blind, z_m):
+def test_one_blind_eye(blind, z_m):
     place = make_pose(0.1, 0.05, z_m, 8, -7, 10)
-    images = draw(RIG, DROGUE, place, np.random.default_rng(8))
+    images = paint_pair(RIG, DROGUE, place, np.random.default_rng(8))
     images = replace(images, **{blind: np.zeros_like(images.left)})
     for estimate in Navigator(RIG, DROGUE).estimate(2, images, list(METHODS)):
         if estimate.method in STEREO_METHODS:
@@ -167,9 +168,9 @@ def test_one_blind_eye(draw, make_pose, blind, z_m):
         assert (error_m < limit_m).all(), estimate.method
 
 
-def test_a_single_eye_is_measured_by_the_edge_model_too(draw, make_pose):
+def test_a_single_eye_is_measured_by_the_edge_model_too():
     place = make_pose(0.1, 0.05, 5.0, 8, -7, 10)
-    images = draw(RIG, DROGUE, place, np.random.default_rng(9))
+    images = paint_pair(RIG, DROGUE, place, np.random.default_rng(9))
     navigator = Navigator(RIG, DROGUE)
     seen = navigator.refine(images, navigator.observe(images)).observation
     alone = replace(images, left=np.zeros_like(images.left))
@@ -182,13 +183,13 @@ def test_a_single_eye_is_measured_by_the_edge_model_too(draw, make_pose):
 
 
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
-def test_pictures_without_a_drogue(draw, make_pose, kind):
-    images = draw(RIG, None, make_pose(0, 0, 5), np.random.default_rng(7), kind=kind)
+def test_pictures_without_a_drogue(kind):
+    images = paint_pair(RIG, None, make_pose(0, 0, 5), np.random.default_rng(7), kind=kind)
     assert isinstance(Navigator(RIG, DROGUE).observe(images).observation, NoFixReason)
 
 
-def test_a_reason_of_the_method_keeps_the_features(make_pose):
-    measurement = PairMeasurement(broken(make_pose, on_one_line), {"detect": 0.01})
+def test_a_reason_of_the_method_keeps_the_features():
+    measurement = PairMeasurement(broken(on_one_line), {"detect": 0.01})
     estimate = estimate_pose(3, measurement, "joint")
     assert isinstance(estimate, NoFix)
     assert len(estimate.features) == 16

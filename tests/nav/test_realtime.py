@@ -14,6 +14,7 @@ from nav.detector.color_blob import ColorBlobDetector
 from nav.realtime import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
 from nav.runner import LATE, add_smoothed, open_navigator
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings, SkippedPair
+from tests.support.painted_pairs import fly_past
 
 RATE_HZ = 25.0
 PATIENCE_S = 60.0
@@ -74,8 +75,8 @@ def place(x_m, y_m, z_m):
 
 
 @pytest.fixture(scope="module")
-def pairs(fly):
-    return fly([place(0.02 * k, -0.01 * k, 5.0 - 0.02 * k) for k in range(7)])
+def pairs():
+    return fly_past([place(0.02 * k, -0.01 * k, 5.0 - 0.02 * k) for k in range(7)])
 
 
 @pytest.fixture(autouse=True)

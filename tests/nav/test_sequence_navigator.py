@@ -19,6 +19,7 @@ from nav.runner import add_smoothed, open_navigator
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings
 from nav.tracked_observer import TrackedObserver
 from nav.tracking.tracker import tracker_names
+from tests.support.painted_pairs import fly_past
 
 DETECTOR = "color-blob"
 STEP_M = (0.012, -0.006, -0.02)
@@ -47,9 +48,9 @@ def way(count, start=(0.0, 0.05, 5.0)):
 
 
 @pytest.fixture(scope="module")
-def steady(fly):
+def steady():
     """A drogue that is always in view."""
-    return fly(way(12))
+    return fly_past(way(12))
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +61,8 @@ def hidden_places():
 
 
 @pytest.fixture(scope="module")
-def hidden_flight(fly, hidden_places):
-    return fly(hidden_places)
+def hidden_flight(hidden_places):
+    return fly_past(hidden_places)
 
 
 def answers_by_method(pairs, settings, detector=None):
@@ -145,8 +146,8 @@ def test_where_boxes_at_the_right_place_show_no_markers_those_of_the_detector_co
         assert {region.source for region in followed.regions} == {"detector"}
 
 
-def test_a_pair_that_the_filter_does_not_believe_has_a_fix_and_no_filtered_pose(fly, steady):
-    (elsewhere,) = fly([place(0.8, 0.3, 6.0)], [steady[7].images.time_s])
+def test_a_pair_that_the_filter_does_not_believe_has_a_fix_and_no_filtered_pose(steady):
+    (elsewhere,) = fly_past([place(0.8, 0.3, 6.0)], [steady[7].images.time_s])
     pairs = [*steady[:7], replace(elsewhere, frame_index=7), *steady[8:10]]
     found, _ = answers_by_method(pairs, SequenceSettings(("joint-hub",), filtered=True))
     assert all(isinstance(estimate, PoseEstimate) for estimate in found["joint-hub"])

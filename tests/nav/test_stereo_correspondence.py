@@ -15,6 +15,7 @@ from nav.matching.blobs import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
 from nav.pose.pose_method import NoFixReason
 from nav.stereo_correspondence import correspond
+from tests.support.painted_pairs import make_pose
 
 RIG = paper_rig()
 
@@ -55,7 +56,7 @@ def matched(layout, place, rng, hidden=(), false_discs=()):
 
 @pytest.mark.parametrize("count", [5, 7, 8])
 @pytest.mark.parametrize("z_m", [1.7, 5, 40])
-def test_all_markers_at_every_roll(make_pose, count, z_m):
+def test_all_markers_at_every_roll(count, z_m):
     layout = marker_layout(PRESETS[f"red-{count}"])
     rng = np.random.default_rng([count, int(z_m)])
     for roll_deg in np.linspace(-180, 180, 17):
@@ -69,7 +70,7 @@ def test_all_markers_at_every_roll(make_pose, count, z_m):
 
 @pytest.mark.parametrize("z_m", [1.7, 5, 40])
 @pytest.mark.parametrize("blind", EYES)
-def test_four_markers_are_enough_where_the_other_image_says_where_they_are(make_pose, blind, z_m):
+def test_four_markers_are_enough_where_the_other_image_says_where_they_are(blind, z_m):
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng([EYES.index(blind), int(z_m)])
     for roll_deg in (-170, -25, 0, 40):
@@ -84,7 +85,7 @@ def test_four_markers_are_enough_where_the_other_image_says_where_they_are(make_
         assert worst_match_px(observation, layout, place) < 0.46
 
 
-def test_four_discs_elsewhere_are_no_ring_beside_the_other_images(make_pose):
+def test_four_discs_elsewhere_are_no_ring_beside_the_other_images():
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(1)
     left = centroids(layout, make_pose(0.06, 0, 5, 5, -5, 0), "left", rng)
@@ -98,7 +99,7 @@ def test_four_discs_elsewhere_are_no_ring_beside_the_other_images(make_pose):
 
 @pytest.mark.parametrize("count", [5, 7, 8])
 @pytest.mark.parametrize("missing", [0, 2, 4])
-def test_one_missing_marker_leaves_a_gap(make_pose, count, missing):
+def test_one_missing_marker_leaves_a_gap(count, missing):
     layout = marker_layout(PRESETS[f"red-{count}"])
     rng = np.random.default_rng(missing)
     place = make_pose(0.06, 0, 10, 8, -6, 10)
@@ -109,7 +110,7 @@ def test_one_missing_marker_leaves_a_gap(make_pose, count, missing):
 
 
 @pytest.mark.parametrize("count", [5, 7, 8])
-def test_false_blobs_are_left_out(make_pose, count):
+def test_false_blobs_are_left_out(count):
     layout = marker_layout(PRESETS[f"red-{count}"])
     # Beside the ring, inside it, and of the wrong size near a marker.
     false_discs = [(1.3, 0.4, 1.0), (-0.5, 0.3, 1.0), (0.1, -1.4, 1.2), (0.95, -0.6, 0.1), (-1.2, -1.2, 3.0)]
@@ -122,7 +123,7 @@ def test_false_blobs_are_left_out(make_pose, count):
         assert worst_match_px(observation, layout, place) < 0.46
 
 
-def test_a_marker_may_be_missing_in_one_eye_only(make_pose):
+def test_a_marker_may_be_missing_in_one_eye_only():
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(3)
     place = make_pose(0.06, 0, 5, 7, 7, 12)
@@ -134,7 +135,7 @@ def test_a_marker_may_be_missing_in_one_eye_only(make_pose):
     assert worst_match_px(observation, layout, place) < 0.46
 
 
-def test_markers_that_are_cut_or_off_their_row_are_dropped(make_pose):
+def test_markers_that_are_cut_or_off_their_row_are_dropped():
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(4)
     place = make_pose(0.06, 0, 5, 7, 7, 12)
@@ -148,7 +149,7 @@ def test_markers_that_are_cut_or_off_their_row_are_dropped(make_pose):
     assert observation.seen.sum(axis=1).tolist() == [6, 7]
 
 
-def test_rings_of_two_drogues_are_not_matched(make_pose):
+def test_rings_of_two_drogues_are_not_matched():
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(5)
     left = centroids(layout, make_pose(0.06, 0, 5), "left", rng)
@@ -159,7 +160,7 @@ def test_rings_of_two_drogues_are_not_matched(make_pose):
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_too_few_regions_in_one_eye_leave_the_other(make_pose, eye):
+def test_too_few_regions_in_one_eye_leave_the_other(eye):
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(6)
     place = make_pose(0.06, 0, 5)
@@ -172,7 +173,7 @@ def test_too_few_regions_in_one_eye_leave_the_other(make_pose, eye):
     assert worst_match_px(observation, layout, place) < 6 * 0.033
 
 
-def test_too_few_regions_in_both_eyes(make_pose):
+def test_too_few_regions_in_both_eyes():
     layout = marker_layout(PRESETS["red-8"])
     place, rng = make_pose(0.06, 0, 5), np.random.default_rng(8)
     left, right = (centroids(layout, place, eye, rng, hidden=range(4)) for eye in EYES)
@@ -182,7 +183,7 @@ def test_too_few_regions_in_both_eyes(make_pose):
     assert "regions of the right image" in answer.reason
 
 
-def test_an_uneven_layout_keeps_its_own_names(make_pose):
+def test_an_uneven_layout_keeps_its_own_names():
     centers = marker_layout(PRESETS["red-8"]).centers_m[[0, 1, 2, 4, 5, 7]]
     layout = MarkerLayout(centers, 0.05, np.array([0, 0, 0.25]), 0.05, 0.075)
     assert layout.symmetry_order == 1
@@ -218,7 +219,7 @@ def test_a_mirrored_ring_is_no_ring():
     assert mirrored is None or mirrored.count < 5
 
 
-def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leaves_whole(make_pose):
+def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leaves_whole():
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(9)
     told = {"whole": 0, "cut": 0}
     for _ in range(200):
@@ -246,7 +247,7 @@ def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leave
     assert min(told.values()) > 100
 
 
-def partly_beside(make_pose, rng, layout, whole_left, whole_right):
+def partly_beside(rng, layout, whole_left, whole_right):
     """A place near by where the edges of the images leave so many markers whole."""
     size_px = np.array([RIG.camera.width_px, RIG.camera.height_px])
     while True:
@@ -266,10 +267,10 @@ def partly_beside(make_pose, rng, layout, whole_left, whole_right):
 
 
 @pytest.mark.parametrize("whole", [(4, 4), (4, 3), (3, 4)])
-def test_what_the_edges_of_both_images_leave_of_a_ring_is_enough(make_pose, whole):
+def test_what_the_edges_of_both_images_leave_of_a_ring_is_enough(whole):
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(whole)
     for _ in range(40):
-        place, cut = partly_beside(make_pose, rng, layout, *whole)
+        place, cut = partly_beside(rng, layout, *whole)
         shown = [centroids(layout, place, eye, rng, cut[eye]) for eye in EYES]
         assert all(match_ring(one.blobs, layout) is None for one in shown)
         observation = correspond(*shown, RIG, layout)
@@ -279,17 +280,17 @@ def test_what_the_edges_of_both_images_leave_of_a_ring_is_enough(make_pose, whol
         assert worst_match_px(observation, layout, place) < 6 * 0.0203
 
 
-def test_four_markers_are_not_enough_where_the_images_show_the_places_of_the_others(make_pose):
+def test_four_markers_are_not_enough_where_the_images_show_the_places_of_the_others():
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(12)
     place = make_pose(0.06, 0, 1.8)
     shown = [centroids(layout, place, eye, rng, hidden=range(4)) for eye in EYES]
     assert isinstance(correspond(*shown, RIG, layout), NoFixReason)
 
 
-def test_parts_of_a_ring_at_other_distances_do_not_belong_together(make_pose):
+def test_parts_of_a_ring_at_other_distances_do_not_belong_together():
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(13)
     for _ in range(20):
-        place, cut = partly_beside(make_pose, rng, layout, 4, 4)
+        place, cut = partly_beside(rng, layout, 4, 4)
         left = centroids(layout, place, "left", rng, cut["left"])
         # As far off as a ring a fifth nearer.
         x_m, y_m, z_m = place.translation_m
@@ -298,9 +299,9 @@ def test_parts_of_a_ring_at_other_distances_do_not_belong_together(make_pose):
         assert isinstance(answer, NoFixReason)
 
 
-def test_three_markers_and_the_hub_are_no_four_markers(make_pose):
+def test_three_markers_and_the_hub_are_no_four_markers():
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(14)
     for _ in range(60):
-        place, cut = partly_beside(make_pose, rng, layout, 3, 3)
+        place, cut = partly_beside(rng, layout, 3, 3)
         shown = [centroids(layout, place, eye, rng, cut[eye]) for eye in EYES]
         assert isinstance(correspond(*shown, RIG, layout), NoFixReason)

@@ -9,6 +9,7 @@ from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.night import star_catalogue
 from scenes.sky.photometry import luminance
+from tests.support.recipe_builder import paper_view_recipe
 
 
 def exact_rays(frame):
@@ -18,9 +19,9 @@ def exact_rays(frame):
     return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def test_background_is_the_surroundings_by_pixel(make_recipe):
+def test_background_is_the_surroundings_by_pixel():
     """The coarse grid of the clear sky against the sky evaluated at every pixel."""
-    frame = sample_frame(make_recipe(scale=0.5), 0)
+    frame = sample_frame(paper_view_recipe(scale=0.5), 0)
     image = background(frame)
     around = environment_radiance(frame.environment)
     expected = around.radiance(exact_rays(frame))
@@ -29,8 +30,8 @@ def test_background_is_the_surroundings_by_pixel(make_recipe):
     assert np.abs(image / expected - 1).mean() < 0.001
 
 
-def test_turning_camera_blurs_the_sky(make_recipe):
-    frame = sample_frame(make_recipe(scale=0.25), 0)
+def test_turning_camera_blurs_the_sky():
+    frame = sample_frame(paper_view_recipe(scale=0.25), 0)
     frame = frame.model_copy(
         update={
             "left_twist_per_s": np.array([0, 0, 0, 0, 1.0, 0]),
@@ -44,8 +45,8 @@ def test_turning_camera_blurs_the_sky(make_recipe):
     assert abs(blurred.mean() / sharp.mean() - 1) < 0.02
 
 
-def test_the_sun_is_drawn_where_it_stands(make_recipe):
-    frame = sample_frame(make_recipe(scale=1.0), 0)
+def test_the_sun_is_drawn_where_it_stands():
+    frame = sample_frame(paper_view_recipe(scale=1.0), 0)
     environment = frame.environment.model_copy(
         update={"sun_elevation_deg": 6.0, "sun_azimuth_deg": 4.0, "visibility_m": 4e5, "clouds": ()}
     )
@@ -60,9 +61,9 @@ def test_the_sun_is_drawn_where_it_stands(make_recipe):
     assert abs(np.sqrt(4 * disc.sum() / np.pi) - 0.5332 * np.pi / 180 * 2133.33) < 1.0
 
 
-def test_stars_shine_with_all_their_light_and_stay_behind_clouds(make_recipe):
+def test_stars_shine_with_all_their_light_and_stay_behind_clouds():
     """Light of the picture with stars less that of the sky alone, over the pixels' solid angles, is theirs in lux."""
-    frame = sample_frame(make_recipe(scale=0.5), 0)
+    frame = sample_frame(paper_view_recipe(scale=0.5), 0)
     environment = frame.environment.model_copy(update={"sun_elevation_deg": -40.0, "clouds": ()})
     camera, rotation = frame.rig.camera, world_from_camera_up()
     stars = np.zeros((camera.height_px, camera.width_px, 3), dtype=np.float32)

@@ -13,15 +13,16 @@ from render.compositing import TracedEye
 from render.engine import load_engine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
+from tests.support.recipe_builder import paper_view_recipe
 
 BLACK = (0.0, 0.0, 0.0)
 VISIBILITY_M = 60.0
 DISTANCES_M = (5.0, 15.0, 30.0)
 
 
-def black_frame(make_recipe, distance_m):
+def black_frame(distance_m):
     """A black drogue in dense mist, in one corner of the view."""
-    recipe = make_recipe(scale=0.25, stations_m=(distance_m,), samples=4)
+    recipe = paper_view_recipe(scale=0.25, stations_m=(distance_m,), samples=4)
     frame = sample_frame(recipe, 0)
     drogue = DrogueParameters.model_validate(
         frame.drogue.model_dump() | {"face_reflectance_rgb": BLACK, "marker_reflectance_rgb": BLACK}
@@ -36,9 +37,9 @@ def black_frame(make_recipe, distance_m):
     )
 
 
-def check(make_recipe, engine):
+def check(engine):
     for distance_m in DISTANCES_M:
-        recipe, frame = black_frame(make_recipe, distance_m)
+        recipe, frame = black_frame(distance_m)
         seen = engine.render(frame, recipe.render).left
         light = luminance(seen.radiance_cd_m2)
         marker = (seen.part_id == int(Part.FACE)) & (seen.coverage > 0.9999)
@@ -52,20 +53,20 @@ def check(make_recipe, engine):
         assert contrast == pytest.approx(expected, rel=0.02)
 
 
-def test_contrast_falls_as_koschmieder_says_in_the_analytic_engine(make_recipe):
-    check(make_recipe, load_engine("analytic"))
+def test_contrast_falls_as_koschmieder_says_in_the_analytic_engine():
+    check(load_engine("analytic"))
 
 
 @pytest.mark.mitsuba
-def test_contrast_falls_as_koschmieder_says_in_mitsuba(make_recipe, engine):
-    check(make_recipe, engine)
+def test_contrast_falls_as_koschmieder_says_in_mitsuba(engine):
+    check(engine)
 
 
-def test_airlight_is_the_background_where_nothing_can_be_seen(make_recipe):
+def test_airlight_is_the_background_where_nothing_can_be_seen():
     """Endless air in front of things and the background behind them are one, in clear air and in mist."""
     from scenes.environment_radiance import EnvironmentRadiance
 
-    _, frame = black_frame(make_recipe, 10.0)
+    _, frame = black_frame(10.0)
     azimuth = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(90, -1e-4)], axis=-1)[None].astype(np.float32)
     for environment in (frame.environment, frame.environment.model_copy(update={"mist": None, "visibility_m": 3e4})):

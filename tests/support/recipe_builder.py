@@ -86,6 +86,33 @@ def build_recipe(base: RecipeTable | None = None, /, **changes: Unpack[RecipeTab
     return parse_recipe(recipe_text(base, **changes))
 
 
+def paper_view_recipe(
+    scale: float = 1.0,
+    stations_m: Sequence[float] = (3.0,),
+    samples: int = 16,
+    speed_m_s: float = 0.0,
+    rate_deg_s: float = 0.0,
+) -> Recipe:
+    """50 pairs by the paper's rig, with its pixels a side scaled at the same field of view.
+
+    Args:
+        scale: 1 for 1280 x 960 pixels.
+        stations_m: distances, in turn.
+        samples: paths through each pixel of the drogue.
+        speed_m_s, rate_deg_s: motion of the drogue.
+    """
+    size = {"width_px": round(1280 * scale), "height_px": round(960 * scale), "focal_px": round(2133.3333 * scale, 6)}
+    return build_recipe(
+        name="render-test",
+        seed=5,
+        rig={"preset": "rgb-ideal", **size},
+        frames={"count": 50},
+        distance=stations(*stations_m),
+        pose={"speed_m_s": speed_m_s, "rate_deg_s": rate_deg_s},
+        render={"samples_per_px": samples},
+    )
+
+
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in changes.items():

@@ -19,7 +19,7 @@ from nav.navigator import DETECTOR, Navigator
 from nav.pair_measurement import regions_of
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason
 from nav.tracking.rim_boxes import rim_boxes
-from tests.nav.conftest import FACE_RGB, background, expose, paint_disc
+from tests.support.painted_pairs import FACE_RGB, background, expose, make_pose, paint_disc
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]
@@ -72,7 +72,7 @@ def measured(images, place):
 
 @pytest.mark.parametrize("sensor", ["mono", "mosaic"])
 @pytest.mark.parametrize(("z_m", "face_behind_m"), [(2.0, 0.0), (5.0, 0.0), (5.0, 0.02), (10.0, 0.0)])
-def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(make_pose, sensor, z_m, face_behind_m):
+def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(sensor, z_m, face_behind_m):
     rng = np.random.default_rng([8, int(z_m)])
     place = make_pose(0.06, 0.01, z_m, 6, -5, 10)
     # From 20 mm behind the markers the face seems to end a pixel earlier than the layout says, at 5 m.
@@ -109,7 +109,7 @@ def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(make_pose, sensor,
 
 @pytest.mark.parametrize("sensor", ["mono", "mosaic"])
 @pytest.mark.parametrize("z_m", [2.0, 5.0, 10.0])
-def test_a_face_without_markers_shows_no_ring(make_pose, sensor, z_m):
+def test_a_face_without_markers_shows_no_ring(sensor, z_m):
     place = make_pose(0.06, 0.01, z_m, 6, -5, 10)
     images = seen_by(sensor, place, np.random.default_rng([9, int(z_m)]), markers=0)
     observation = measured(images, place).observation

@@ -17,6 +17,7 @@ from geometry.stereo import EYES, StereoRig, paper_rig
 from nav.centroids.binary_centroids import binary_centroids, quantisation_variance_px2
 from nav.detector.color_blob import ColorBlobDetector
 from nav.matching.marker_channel import marker_channel, marker_color
+from tests.support.painted_pairs import make_pose, paint_pair
 
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]
@@ -98,12 +99,12 @@ def test_mosaic_channel_lies_on_the_images_grid(color):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 5.0, 10.0, 20.0, 40.0])
-def test_centroids_are_as_good_as_their_declared_variance(draw, make_pose, z_m):
+def test_centroids_are_as_good_as_their_declared_variance(z_m):
     errors, variances = [], []
     for seed in range(4):
         rng = np.random.default_rng([seed, int(z_m)])
         place = make_pose(*rng.uniform([0.05, -0.01], [0.07, 0.01]), z_m, *rng.uniform(-9, 9, 2), rng.uniform(-22, 22))
-        images = draw(RIG, DROGUE, place, rng)
+        images = paint_pair(RIG, DROGUE, place, rng)
         for eye in EYES:
             box = rim_box(RIG, place, DROGUE, eye)
             found = binary_centroids(marker_channel(images, eye, 0), box, LAYOUT)
@@ -129,9 +130,9 @@ def test_quantisation_law():
     assert quantisation_variance_px2(np.array(radius)) == pytest.approx(variance, rel=1e-3)
 
 
-def test_discs_at_the_images_edge_are_dropped(draw, make_pose):
+def test_discs_at_the_images_edge_are_dropped():
     place = make_pose(0.06, 0.28, 1.7)
-    images = draw(RIG, DROGUE, place, None)
+    images = paint_pair(RIG, DROGUE, place, None)
     truth = project_disc_centers(RIG, place, LAYOUT.centers_m, LAYOUT.radius_m, "left")
     outside = truth[:, 1] + RIG.camera.fx_px * LAYOUT.radius_m / 1.7 > RIG.camera.height_px
     assert 0 < outside.sum() < 4
@@ -151,14 +152,14 @@ def test_boxes_beside_the_image_hold_nothing(box):
 @pytest.mark.parametrize("name", ["red-8", "red-7", "red-5", "white-8"])
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
 @pytest.mark.parametrize("z_m", [1.7, 6.0, 40.0])
-def test_detector_boxes_the_rim(draw, make_pose, name, kind, z_m):
+def test_detector_boxes_the_rim(name, kind, z_m):
     if name == "white-8" and kind == "cloud" and z_m == 40:
         pytest.skip("white markers of 5 px before a white cloud show no contrast")
     drogue = PRESETS[name]
     rng = np.random.default_rng(11)
     place = make_pose(0.06, 0.01, z_m, 8, -6, 17)
     colors = {"marker_rgb": WHITE_RGB} if name == "white-8" else {}
-    detection = ColorBlobDetector(drogue).detect(draw(RIG, drogue, place, rng, kind=kind, **colors))
+    detection = ColorBlobDetector(drogue).detect(paint_pair(RIG, drogue, place, rng, kind=kind, **colors))
     for eye in EYES:
         found = detection.of(eye)
         assert found is not None
@@ -167,20 +168,20 @@ def test_detector_boxes_the_rim(draw, make_pose, name, kind, z_m):
         assert overlap(found.box_xywh_px, rim_box(RIG, place, drogue, eye)) > 0.9
 
 
-def test_detector_on_a_small_rig(draw, make_pose):
+def test_detector_on_a_small_rig():
     rig = StereoRig(PinholeCamera(320, 240, 533.3, 533.3, 159.5, 119.5), 0.12)
     for z_m in (2.0, 5.0, 10.0):
         place = make_pose(0.06, 0, z_m, 5, 5, 10)
-        detection = ColorBlobDetector(DROGUE).detect(draw(rig, DROGUE, place, np.random.default_rng(12)))
+        detection = ColorBlobDetector(DROGUE).detect(paint_pair(rig, DROGUE, place, np.random.default_rng(12)))
         for eye in EYES:
             found = detection.of(eye)
             assert found is not None
             assert overlap(found.box_xywh_px, rim_box(rig, place, DROGUE, eye)) > 0.85
 
 
-def test_detector_is_not_misled_by_other_red_things(draw, make_pose):
+def test_detector_is_not_misled_by_other_red_things():
     place = make_pose(0.06, 0, 20, 5, 5, 10)
-    images = draw(RIG, DROGUE, place, np.random.default_rng(13))
+    images = paint_pair(RIG, DROGUE, place, np.random.default_rng(13))
     pictures = []
     for image in (images.left, images.right):
         painted = image.copy()

@@ -20,6 +20,7 @@ from nav.centroids.outline_pixels import disc_pixels
 from studies.acceptance.rendered.centroid_bounds import center_bound_px
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
 from tests.support.grey_centroid import grey_centroids
+from tests.support.painted_pairs import make_pose, paint_pair
 
 
 @pytest.mark.parametrize("light", [DAY, DUSK], ids=["day", "dusk"])
@@ -249,11 +250,11 @@ def test_mosaic_sites_keep_their_places(color, radius_px):
 
 @pytest.mark.parametrize("kind", ["sky", "cloud"])
 @pytest.mark.parametrize("z_m", [2.0, 10.0, 40.0])
-def test_drawn_drogue_is_measured_at_its_ellipse_centres(draw, make_pose, kind, z_m):
+def test_drawn_drogue_is_measured_at_its_ellipse_centres(kind, z_m):
     rig, drogue = paper_rig(), PRESETS["red-8"]
     layout, rng = marker_layout(drogue), np.random.default_rng([12, int(z_m)])
     place = make_pose(0.06, 0.002, z_m, 7, -6, 10)
-    images = draw(rig, drogue, place, rng, kind=kind)
+    images = paint_pair(rig, drogue, place, rng, kind=kind)
     truth = np.concatenate([project_disc_centers(rig, place, layout.centers_m, layout.radius_m, eye) for eye in EYES])
     radius = rig.camera.fx_px * layout.radius_m / z_m
     start = circles(np.repeat([0, 1], 8), truth + rng.normal(0, 0.1, truth.shape), np.full(16, radius))

@@ -21,6 +21,7 @@ from nav.detector.detector_registry import (
 )
 from nav.detector.model_metadata import ModelMetadata
 from nav.runner import navigate
+from tests.support.painted_pairs import make_pose, paint_pair
 
 DROGUE = PRESETS["red-8"]
 
@@ -57,12 +58,12 @@ def test_a_file_is_opened_once_and_called_by_its_name(red_squares):
     assert make(DROGUE) is make(PRESETS["white-8"])
 
 
-def test_color_blob_has_the_detection_as_its_only_candidate(draw, make_pose):
+def test_color_blob_has_the_detection_as_its_only_candidate():
     from geometry.pinhole import PinholeCamera
     from geometry.stereo import StereoRig
 
     rig = StereoRig(PinholeCamera(320, 240, 533.3, 533.3, 159.5, 119.5), 0.12)
-    images = draw(rig, DROGUE, make_pose(0.06, 0, 3.0, 5, 5, 10), np.random.default_rng(1))
+    images = paint_pair(rig, DROGUE, make_pose(0.06, 0, 3.0, 5, 5, 10), np.random.default_rng(1))
     detector = ColorBlobDetector(DROGUE)
     found = detector.detect(images)
     candidates = detector.candidates(images, 0.1)

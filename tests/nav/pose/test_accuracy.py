@@ -19,6 +19,7 @@ from nav.pose.joint import joint
 from nav.pose.paper import paper, triple_circles
 from nav.pose.pose_method import NoFixReason, Observation, Solution
 from nav.pose.pose_methods import METHODS
+from tests.support.painted_pairs import draw_poses, make_pose
 
 RIG = paper_rig()
 # The published bounds were worked out for this ring, not for the shipped one of 0.27 m.
@@ -63,7 +64,7 @@ def tangent_error(estimate, truth, layout) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [5, 7, 8])
 @pytest.mark.parametrize("z_m", [1.7, 5.0, 20.0])
-def test_methods_are_exact_without_noise(make_pose, count, z_m):
+def test_methods_are_exact_without_noise(count, z_m):
     place = make_pose(0.1, -0.02, z_m, 7, -5, 11)
     # Points instead of discs: triangulation then sees the markers' very centres.
     # Little noise is assumed, so that the tilt of 8.6 degrees counts as certain at 20 m and no prior draws it to zero.
@@ -78,7 +79,7 @@ def test_methods_are_exact_without_noise(make_pose, count, z_m):
 
 
 @pytest.mark.parametrize("name", [*MONOCULAR, "circle-fit", "disparity-plane"])
-def test_monocular_and_circle_methods_are_exact_without_noise(draw_poses, name):
+def test_monocular_and_circle_methods_are_exact_without_noise(name):
     draws = draw_poses(np.random.default_rng(53), 10, (1.7, 10.0), 0.01, tilt_deg=(6.0, 10.0))
     point_sized = MarkerLayout(draws.layout.centers_m, 1e-6, None)
     for index, place in enumerate(draws.places):
@@ -97,14 +98,14 @@ def test_monocular_and_circle_methods_are_exact_without_noise(draw_poses, name):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 2.0, 5.0])
-def test_joint_models_the_shift_of_ellipse_centres(make_pose, z_m):
+def test_joint_models_the_shift_of_ellipse_centres(z_m):
     place = make_pose(0.1, 0.02, z_m, 10, 10, 3)
     solution = solved(joint, observe(ring(8), place, 0.05))
     # Ignoring the shift costs 0.28 mm at 1.5 m and 0.1 mm at 5 m; with it only the convergence limit remains.
     np.testing.assert_allclose(solution.left_from_drogue.translation_m, place.translation_m, atol=1e-6)
 
 
-def test_golden_bound_of_the_joint_adjustment(make_pose):
+def test_golden_bound_of_the_joint_adjustment():
     place = make_pose(ON_AXIS_X_M, 0, 10)
     features = observed_features(observe(ring(8), place, 1.0), with_hub=False)
     information = adjust(features, place.rotation[None], place.translation_m[None]).information[0]
@@ -115,7 +116,7 @@ def test_golden_bound_of_the_joint_adjustment(make_pose):
     assert np.degrees(deviation[3]) == pytest.approx(16.4, abs=0.06)
 
 
-def test_golden_bound_of_mean_and_plane(make_pose):
+def test_golden_bound_of_mean_and_plane():
     observation = observe(ring(8, marker_radius_m=1e-6), make_pose(ON_AXIS_X_M, 0, 10), 1.0)
     step_px = 1e-3
     variance = np.zeros(2)
@@ -132,7 +133,7 @@ def test_golden_bound_of_mean_and_plane(make_pose):
     assert np.sqrt(variance[1]) == pytest.approx(56.5, abs=0.06)
 
 
-def test_golden_share_of_triples_without_a_real_root(make_pose):
+def test_golden_share_of_triples_without_a_real_root():
     layout = ring(8, marker_radius_m=1e-6)
     triples = list(combinations(range(8), 3))
     # The widest triples of eight: their gaps are 2, 3 and 3 places.
@@ -147,7 +148,7 @@ def test_golden_share_of_triples_without_a_real_root(make_pose):
     assert np.mean(negative) == pytest.approx(0.895, abs=0.025)
 
 
-def test_golden_flip_rate(make_pose):
+def test_golden_flip_rate():
     rng = np.random.default_rng(2)
     place = make_pose(ON_AXIS_X_M, 0, 20, 6, 0, 5)
     count = 600
@@ -162,7 +163,7 @@ def test_golden_flip_rate(make_pose):
     assert flips / count == pytest.approx(0.180, abs=0.067)
 
 
-def test_depth_error_of_the_joint_adjustment_grows_with_the_square_of_distance(make_pose):
+def test_depth_error_of_the_joint_adjustment_grows_with_the_square_of_distance():
     rng = np.random.default_rng(3)
     distances = np.array([2.5, 5.0, 10.0])
     rms = []
@@ -178,7 +179,7 @@ def test_depth_error_of_the_joint_adjustment_grows_with_the_square_of_distance(m
     assert slope == pytest.approx(2.0, abs=0.24)
 
 
-def test_covariance_of_the_joint_adjustment_is_that_of_its_errors(make_pose):
+def test_covariance_of_the_joint_adjustment_is_that_of_its_errors():
     rng = np.random.default_rng(4)
     layout = ring(8)
     count, scores = 200, []
@@ -191,7 +192,7 @@ def test_covariance_of_the_joint_adjustment_is_that_of_its_errors(make_pose):
     assert np.mean(scores) == pytest.approx(1.0, abs=0.164)
 
 
-def test_a_marker_that_one_eye_missed_still_counts(make_pose):
+def test_a_marker_that_one_eye_missed_still_counts():
     place = make_pose(ON_AXIS_X_M, 0, 5, 7, 7)
     whole = observe(ring(8), place, 0.05)
     pixels = whole.pixels_px.copy()
@@ -205,7 +206,7 @@ def test_a_marker_that_one_eye_missed_still_counts(make_pose):
     assert np.linalg.det(half.covariance) < np.linalg.det(without.covariance)
 
 
-def test_the_paper_withstands_one_wrong_marker_where_the_mean_does_not(make_pose):
+def test_the_paper_withstands_one_wrong_marker_where_the_mean_does_not():
     rng = np.random.default_rng(5)
     errors = {paper: [], mean_plane: []}
     for _ in range(60):
@@ -221,7 +222,7 @@ def test_the_paper_withstands_one_wrong_marker_where_the_mean_does_not(make_pose
     assert np.mean(errors[paper]) < 0.5 * np.mean(errors[mean_plane])
 
 
-def test_missing_markers_do_not_shift_the_mean(make_pose):
+def test_missing_markers_do_not_shift_the_mean():
     place = make_pose(0.1, 0.05, 5, 7, -3, 4)
     whole = observe(ring(8, marker_radius_m=1e-6), place, 0.05)
     pixels = whole.pixels_px.copy()
@@ -230,6 +231,6 @@ def test_missing_markers_do_not_shift_the_mean(make_pose):
     np.testing.assert_allclose(solution.left_from_drogue.translation_m, place.translation_m, atol=1e-7)
 
 
-def test_constant_never_tilts(make_pose):
+def test_constant_never_tilts():
     solution = solved(METHODS["constant"], observe(ring(8), make_pose(0, 0, 5, 7, -5, 4), 0.05))
     np.testing.assert_allclose(solution.left_from_drogue.rotation[:, 2], [0, 0, 1], atol=1e-12)

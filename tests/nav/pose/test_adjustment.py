@@ -16,6 +16,7 @@ from geometry.stereo import EYES
 from nav.pose.adjustment import AdjustmentState, Loss, adjust, linearise, project_features
 from nav.pose.features import stack_features
 from nav.pose.pose_method import StatedTolerances
+from tests.support.painted_pairs import draw_poses
 
 SIGMA_PX = 0.1
 STATED = StatedTolerances(
@@ -35,7 +36,7 @@ def poses_of(draws):
     return np.array([p.rotation for p in draws.places]), np.array([p.translation_m for p in draws.places])
 
 
-def test_residuals_are_those_of_opencv_whitened(draw_poses):
+def test_residuals_are_those_of_opencv_whitened():
     draws = draw_poses(np.random.default_rng(70), 6, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, radii_count=0.0)
     rotations, translations = poses_of(draws)
@@ -56,7 +57,7 @@ def test_residuals_are_those_of_opencv_whitened(draw_poses):
 
 @pytest.mark.parametrize("tolerances", [None, STATED])
 @pytest.mark.parametrize("loss", [Loss(), Loss(tilt_prior_rad=0.1)])
-def test_derivatives_by_the_pose_are_those_of_the_residuals(draw_poses, tolerances, loss):
+def test_derivatives_by_the_pose_are_those_of_the_residuals(tolerances, loss):
     draws = draw_poses(np.random.default_rng(71), 5, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 0.0, tolerances)
     rotations, translations = poses_of(draws)
@@ -77,7 +78,7 @@ def test_derivatives_by_the_pose_are_those_of_the_residuals(draw_poses, toleranc
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_costs_are_sums_over_residuals(draw_poses, loss):
+def test_costs_are_sums_over_residuals(loss):
     draws = draw_poses(np.random.default_rng(72), 8, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 1.0, STATED)
     rotations, translations = poses_of(draws)
@@ -98,7 +99,7 @@ def test_costs_are_sums_over_residuals(draw_poses, loss):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_adjusted_poses_are_minima(draw_poses, loss):
+def test_adjusted_poses_are_minima(loss):
     draws = draw_poses(np.random.default_rng(73), 12, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 1.0, STATED)
     found = adjust(features, *poses_of(draws), loss)
@@ -133,7 +134,7 @@ def minimum_by_scipy(draws, features, index: int) -> tuple[np.ndarray, np.ndarra
 # deviations of the minimum. Discs: the derivatives neglect the shift of the ellipse centres, of a relative size of
 # (0.075 m / 1.7 m)^2 = 2e-3; times the root of 40 residuals of one deviation this is 0.012 deviations.
 @pytest.mark.parametrize(("radii_count", "sigmas"), [(0.0, 1e-4), (1.0, 0.02)])
-def test_adjusted_poses_are_those_of_scipy(draw_poses, radii_count, sigmas):
+def test_adjusted_poses_are_those_of_scipy(radii_count, sigmas):
     draws = draw_poses(np.random.default_rng(76), 6, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, radii_count)
     found = adjust(features, *poses_of(draws))
@@ -146,7 +147,7 @@ def test_adjusted_poses_are_those_of_scipy(draw_poses, radii_count, sigmas):
         assert 0 <= found.costs[index] - cost + 1e-9 < sigmas**2 / 2 + 2e-9
 
 
-def test_a_pose_behind_the_cameras_has_infinite_cost_and_is_not_adjusted(draw_poses):
+def test_a_pose_behind_the_cameras_has_infinite_cost_and_is_not_adjusted():
     draws = draw_poses(np.random.default_rng(74), 2, 3.0, SIGMA_PX)
     features = features_of(draws)
     rotations, translations = poses_of(draws)
@@ -156,7 +157,7 @@ def test_a_pose_behind_the_cameras_has_infinite_cost_and_is_not_adjusted(draw_po
     np.testing.assert_array_equal(found.translations_m[0], translations[0])
 
 
-def test_an_unmeasured_feature_has_no_residuals(draw_poses):
+def test_an_unmeasured_feature_has_no_residuals():
     draws = draw_poses(np.random.default_rng(75), 3, 4.0, SIGMA_PX)
     whole = features_of(draws, 1.0, STATED)
     mask = np.arange(10) == 3

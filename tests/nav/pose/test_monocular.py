@@ -7,6 +7,7 @@ import pytest
 
 from nav.pose.monocular import circle_poses, conic_through
 from nav.pose.pose_methods import METHODS
+from tests.support.painted_pairs import draw_poses
 
 
 def circle_cone(center: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:
@@ -49,7 +50,7 @@ def test_conic_through_points_of_a_circle():
 
 @pytest.mark.parametrize("z_m", [2.0, 5.0])
 @pytest.mark.parametrize("name", ["mono-ippe", "mono-sqpnp", "mono-lm"])
-def test_monocular_methods_reach_the_bound_of_one_eye(draw_poses, name, z_m):
+def test_monocular_methods_reach_the_bound_of_one_eye(name, z_m):
     draws = draw_poses(np.random.default_rng(54), 250, z_m, 0.05, tilt_deg=(6.0, 10.0))
     left = type(draws)(draws.rig, draws.layout, 0.05, draws.places, draws.exact_px[:, :1], draws.pixels_px[:, :1])
     ratios = []
@@ -63,7 +64,7 @@ def test_monocular_methods_reach_the_bound_of_one_eye(draw_poses, name, z_m):
 
 
 @pytest.mark.parametrize(("z_m", "z_rmse_mm"), [(2.0, 0.41), (5.0, 2.5), (10.0, 10.0)])
-def test_depth_of_the_ellipse(draw_poses, z_m, z_rmse_mm):
+def test_depth_of_the_ellipse(z_m, z_rmse_mm):
     draws = draw_poses(np.random.default_rng(55), 200, z_m, 0.1)
     errors = [
         METHODS["mono-circle"](draws.observation(i)).left_from_drogue.translation_m[2] - place.translation_m[2]
@@ -73,7 +74,7 @@ def test_depth_of_the_ellipse(draw_poses, z_m, z_rmse_mm):
     assert 1e3 * np.sqrt(np.mean(np.square(errors))) < 1.15 * z_rmse_mm
 
 
-def test_the_hub_chooses_the_branch_of_the_ellipse(draw_poses):
+def test_the_hub_chooses_the_branch_of_the_ellipse():
     draws = draw_poses(np.random.default_rng(56), 60, 15.0, 0.1, tilt_deg=(5.0, 10.0))
     wrong = {True: 0, False: 0}
     for index, place in enumerate(draws.places):

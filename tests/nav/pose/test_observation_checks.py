@@ -14,13 +14,14 @@ from geometry.pinhole import PinholeCamera
 from nav.pose.joint_batch import solve_joint_batch
 from nav.pose.pose_method import NoFixReason, Observation, Solution, StatedTolerances
 from nav.pose.pose_methods import METHODS
+from tests.support.painted_pairs import draw_poses
 
 MONO = [name for name in METHODS if name.startswith("mono-")]
 HUB = ["joint-hub", "joint-robust"]
 
 
 @pytest.fixture
-def draws(draw_poses):
+def draws():
     return draw_poses(np.random.default_rng(71), 1, 5.0, 0.05, tilt_deg=(6.0, 8.0))
 
 
@@ -78,7 +79,7 @@ def test_the_right_eye_replaces_the_left_one(draws, method, left_over):
 
 
 @pytest.mark.parametrize("method", MONO)
-def test_the_right_eye_is_as_exact(draw_poses, method):
+def test_the_right_eye_is_as_exact(method):
     draws = draw_poses(np.random.default_rng(73), 6, (1.7, 10.0), 0.01, tilt_deg=(6.0, 10.0))
     for index, place in enumerate(draws.places):
         pixels = draws.exact_px[index].copy()
@@ -148,7 +149,7 @@ def test_reasons_of_monocular_methods(draws, method, change, reason):
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in MONO])
 @pytest.mark.parametrize("factor", [0.5, 0.67, 1.5, 2.0])
 @pytest.mark.parametrize("z_m", [3.0, 10.0])
-def test_another_rigs_baseline(draw_poses, method, factor, z_m):
+def test_another_rigs_baseline(method, factor, z_m):
     draws = draw_poses(np.random.default_rng(74), 1, z_m, 0.05, tilt_deg=(6.0, 8.0))
     good = draws.observation(0)
     assert isinstance(METHODS[method](good), Solution)

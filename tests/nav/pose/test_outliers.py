@@ -9,6 +9,7 @@ from nav.pose.baselines import mean_plane
 from nav.pose.joint import joint, joint_robust
 from nav.pose.paper import _row_differences, paper, paper_literal, paper_reading, three_sphere_candidates
 from nav.pose.pose_method import NoFixReason, Solution, StatedTolerances
+from tests.support.painted_pairs import draw_poses
 
 
 def corrupt(rng, draws, count: int, eyes: str = "one") -> np.ndarray:
@@ -39,7 +40,7 @@ def distances_m(method, draws, pixels, hub=True) -> np.ndarray:
 @pytest.mark.parametrize("hub", [True, False])
 @pytest.mark.parametrize("eyes", ["one", "both", "columns"])
 @pytest.mark.parametrize("markers", [7, 8])
-def test_one_outlier_hardly_matters(draw_poses, markers, eyes, hub):
+def test_one_outlier_hardly_matters(markers, eyes, hub):
     rng = np.random.default_rng(31)
     draws = draw_poses(rng, 40, (1.7, 10.0), 0.1, markers=markers)
     clean = distances_m(joint_robust, draws, draws.pixels_px, hub)
@@ -50,7 +51,7 @@ def test_one_outlier_hardly_matters(draw_poses, markers, eyes, hub):
 
 
 @pytest.mark.parametrize("markers", [7, 8])
-def test_two_outliers_are_found_and_nothing_else(draw_poses, markers):
+def test_two_outliers_are_found_and_nothing_else(markers):
     rng = np.random.default_rng(32)
     draws = draw_poses(rng, 30, (1.7, 10.0), 0.1, markers=markers)
     wrong = corrupt(rng, draws, 2)
@@ -65,7 +66,7 @@ def test_two_outliers_are_found_and_nothing_else(draw_poses, markers):
 @pytest.mark.parametrize("hub", [True, False])
 @pytest.mark.parametrize("wrong_markers", [1, 2])
 @pytest.mark.parametrize("markers", [7, 8])
-def test_acceptance_errors_with_outliers(draw_poses, markers, wrong_markers, hub):
+def test_acceptance_errors_with_outliers(markers, wrong_markers, hub):
     rng = np.random.default_rng(42)
     draws = draw_poses(rng, 1000, (1.7, 10.0), 0.1, markers=markers)
     clean = distances_m(joint_robust, draws, draws.pixels_px, hub)
@@ -74,7 +75,7 @@ def test_acceptance_errors_with_outliers(draw_poses, markers, wrong_markers, hub
     assert wrong.mean() < {1: 1.25, 2: 1.5}[wrong_markers] * clean.mean()
 
 
-def test_the_inlier_mask_excludes_the_outlier(draw_poses):
+def test_the_inlier_mask_excludes_the_outlier():
     rng = np.random.default_rng(33)
     draws = draw_poses(rng, 30, (1.7, 10.0), 0.05)
     for index in range(30):
@@ -87,7 +88,7 @@ def test_the_inlier_mask_excludes_the_outlier(draw_poses):
         assert solution.used_hub.all()
 
 
-def test_a_wrong_hub_is_an_outlier(draw_poses):
+def test_a_wrong_hub_is_an_outlier():
     draws = draw_poses(np.random.default_rng(34), 10, 5.0, 0.05, tilt_deg=(6.0, 10.0))
     for index in range(10):
         pixels = draws.pixels_px[index].copy()
@@ -103,7 +104,7 @@ def test_a_wrong_hub_is_an_outlier(draw_poses):
         )
 
 
-def test_four_good_markers_are_kept_with_one_large_residual(draw_poses):
+def test_four_good_markers_are_kept_with_one_large_residual():
     draws = draw_poses(np.random.default_rng(44), 12, 5.0, 0.1, markers=5)
     pixels = draws.exact_px.copy()
     # Up in one eye and down in the other, 4.7 deviations apart: no pose takes that up, and the marker's sum is 21.8.
@@ -117,7 +118,7 @@ def test_four_good_markers_are_kept_with_one_large_residual(draw_poses):
         assert np.linalg.norm(solution.left_from_drogue.translation_m - place.translation_m) < 5 * 2e-3
 
 
-def test_five_markers_cannot_identify_two_outliers(draw_poses):
+def test_five_markers_cannot_identify_two_outliers():
     rng = np.random.default_rng(35)
     draws = draw_poses(rng, 10, (1.7, 10.0), 0.05, markers=5)
     pixels = corrupt(rng, draws, 2)
@@ -127,7 +128,7 @@ def test_five_markers_cannot_identify_two_outliers(draw_poses):
         assert right, "a pose that claims to agree with wrong markers"
 
 
-def order_of_table_2(draw_poses, method, sigma_px, count, seed):
+def order_of_table_2(method, sigma_px, count, seed):
     """Mean position errors with 5, 7 and 8 markers, one of them wrong in one eye."""
     means = []
     for markers in (5, 7, 8):
@@ -137,8 +138,8 @@ def order_of_table_2(draw_poses, method, sigma_px, count, seed):
     return means
 
 
-def test_table_2_of_the_paper_has_its_order(draw_poses):
-    five, seven, eight = order_of_table_2(draw_poses, paper, 0.35, 300, 36)
+def test_table_2_of_the_paper_has_its_order():
+    five, seven, eight = order_of_table_2(paper, 0.35, 300, 36)
     assert eight < seven < five
 
 
@@ -146,12 +147,12 @@ def test_table_2_of_the_paper_has_its_order(draw_poses):
 @pytest.mark.parametrize("sigma_px", [0.1, 0.2, 0.35])
 # Errors of the paper's method have long tails: of 1,500 draws the ratio of means, 0.95, has a deviation of 0.03.
 @pytest.mark.parametrize(("method", "count"), [(paper, 15_000), (joint_robust, 1500)])
-def test_table_2_has_its_order_at_any_noise(draw_poses, method, count, sigma_px):
-    five, seven, eight = order_of_table_2(draw_poses, method, sigma_px, count, 37)
+def test_table_2_has_its_order_at_any_noise(method, count, sigma_px):
+    five, seven, eight = order_of_table_2(method, sigma_px, count, 37)
     assert eight < seven < five
 
 
-def test_the_literal_score_is_zero_for_every_candidate(draw_poses):
+def test_the_literal_score_is_zero_for_every_candidate():
     draws = draw_poses(np.random.default_rng(38), 20, (1.7, 10.0), 0.3)
     for index in range(20):
         observation = draws.observation(index)
@@ -161,7 +162,7 @@ def test_the_literal_score_is_zero_for_every_candidate(draw_poses):
         assert scores.max() == 0
 
 
-def test_the_literal_score_is_much_worse_than_full_reprojection(draw_poses):
+def test_the_literal_score_is_much_worse_than_full_reprojection():
     rng = np.random.default_rng(39)
     draws = draw_poses(rng, 150, (1.7, 10.0), 0.1)
     wrong = corrupt(rng, draws, 1)
@@ -176,7 +177,7 @@ def test_the_literal_score_is_much_worse_than_full_reprojection(draw_poses):
 @pytest.mark.parametrize(
     ("reading", "published_mm"), [("own_vdiff", 29.0), ("center_per_eye", 13.3), ("full_reproj", 12.8)]
 )
-def test_other_readings_choose_candidates(draw_poses, reading, published_mm):
+def test_other_readings_choose_candidates(reading, published_mm):
     rng = np.random.default_rng(40)
     draws = draw_poses(rng, 200, (1.7, 10.0), 0.1)
     mean_mm = 1e3 * distances_m(paper_reading(reading), draws, corrupt(rng, draws, 1)).mean()
@@ -185,7 +186,7 @@ def test_other_readings_choose_candidates(draw_poses, reading, published_mm):
     assert mean_mm == pytest.approx(published_mm, rel=0.35)
 
 
-def test_the_literal_method_is_deterministic(draw_poses):
+def test_the_literal_method_is_deterministic():
     draws = draw_poses(np.random.default_rng(41), 3, 5.0, 0.1)
     for index in range(3):
         first, second = (paper_literal(draws.observation(index)).left_from_drogue.as_matrix() for _ in range(2))
@@ -198,7 +199,7 @@ def test_unknown_reading():
         paper_reading("best")
 
 
-def test_a_wrong_ring_radius_makes_no_outliers(draw_poses):
+def test_a_wrong_ring_radius_makes_no_outliers():
     draws = draw_poses(np.random.default_rng(43), 20, 2.0, 0.02, ring_sigma_m=5e-4)
     for index in range(20):
         built = draws.observation(index)

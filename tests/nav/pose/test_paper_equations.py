@@ -13,6 +13,7 @@ from geometry.se3 import rotation_from_angles
 from geometry.stereo import EYES, paper_rig
 from nav.pose.paper import paper, paper_with_step, triple_circles
 from nav.pose.pose_method import Solution
+from tests.support.painted_pairs import draw_poses, make_pose
 
 RIG = paper_rig()
 # The ring for which the reference figures were worked out.
@@ -21,13 +22,13 @@ MARKERS = np.column_stack([np.array(even_ring(8, RING_M)), np.zeros(8)])
 WIDE = [i for i, t in enumerate(combinations(range(8), 3)) if sorted(np.diff([*t, t[0] + 8])) == [2, 3, 3]]
 
 
-def markers_m(make_pose, *pose) -> np.ndarray:
+def markers_m(*pose) -> np.ndarray:
     return make_pose(*pose).apply(MARKERS)
 
 
-def test_eq_4_as_printed_is_no_plane_through_the_origin(make_pose):
+def test_eq_4_as_printed_is_no_plane_through_the_origin():
     origin = np.array([0.06, 0.1, 5.0])
-    (x1, y1, z1), (x2, y2, z2) = markers_m(make_pose, *origin, 8, -6, 5)[:2]
+    (x1, y1, z1), (x2, y2, z2) = markers_m(*origin, 8, -6, 5)[:2]
     right_side = x2**2 + y2**2 + z2**2 - x1**2 - y1**2 - z1**2
     sideways = 2 * (x2 - x1) * origin[0] + 2 * (y2 - y1) * origin[1]
     # Squares of 5 m in float64.
@@ -36,8 +37,8 @@ def test_eq_4_as_printed_is_no_plane_through_the_origin(make_pose):
     assert sideways + 2 * (z2 + z1) * origin[2] - right_side == pytest.approx(4 * z1 * origin[2])
 
 
-def test_eq_5_has_rank_2(make_pose):
-    p1, p2, p3 = markers_m(make_pose, 0.06, 0.1, 5, 8, -6, 5)[[0, 3, 5]]
+def test_eq_5_has_rank_2():
+    p1, p2, p3 = markers_m(0.06, 0.1, 5, 8, -6, 5)[[0, 3, 5]]
     rows = np.stack([p2 - p1, p3 - p1, p3 - p2])
     np.testing.assert_allclose(rows[2], rows[1] - rows[0], atol=1e-15)
     assert np.linalg.matrix_rank(rows) == 2
@@ -59,8 +60,8 @@ def test_eqs_10_and_11_need_the_sign_of_the_normal():
     assert np.arcsin(normal[1]) == pytest.approx(-0.1)
 
 
-def test_eq_12_as_printed_has_no_disparity(make_pose):
-    points = markers_m(make_pose, 0.3, -0.2, 8, 8, -6, 5)
+def test_eq_12_as_printed_has_no_disparity():
+    points = markers_m(0.3, -0.2, 8, 8, -6, 5)
     left, right = (points @ RIG.camera.matrix().T / points[:, 2:] for _ in EYES)
     assert np.abs(left - right).max() == 0
     seen = [RIG.project(points, eye) for eye in EYES]
@@ -113,8 +114,8 @@ def test_eq_16_jumps_away_where_the_least_loss_is_not_zero():
     assert largest_after_arrival > 0.05
 
 
-def test_the_three_spheres_touch(make_pose):
-    circles = triple_circles(markers_m(make_pose, 0.3, -0.2, 8, 8, -6, 5))
+def test_the_three_spheres_touch():
+    circles = triple_circles(markers_m(0.3, -0.2, 8, 8, -6, 5))
     assert len(circles.radii2_m2) == 56
     # Squares of 8 m in float64, divided by the sine of the narrowest triple.
     np.testing.assert_allclose(circles.radii2_m2, RING_M**2, atol=1e-12)
@@ -122,11 +123,11 @@ def test_the_three_spheres_touch(make_pose):
 
 
 @pytest.mark.parametrize(("z_m", "share"), [(2.0, 0.51), (10.0, 0.90)])
-def test_noise_leaves_no_root_or_a_distant_one(make_pose, z_m, share):
+def test_noise_leaves_no_root_or_a_distant_one(z_m, share):
     rng = np.random.default_rng(1)
     missing, axial_mm = [], []
     for _ in range(500):
-        points = markers_m(make_pose, 0.06, 0, z_m, 0, 0, rng.uniform(-22.5, 22.5))
+        points = markers_m(0.06, 0, z_m, 0, 0, rng.uniform(-22.5, 22.5))
         seen = [RIG.project(points, eye) + 0.1 * rng.standard_normal((8, 2)) for eye in EYES]
         discriminant = RING_M**2 - triple_circles(RIG.triangulate(*seen)).radii2_m2[WIDE]
         missing.append((discriminant < 0).mean())
@@ -143,7 +144,7 @@ def test_markers_of_10_cm_radius_do_not_fit_inside_the_rim():
     assert np.linalg.norm(places[1] - places[0]) < 2 * marker_radius_m
 
 
-def mean_errors_mm(draw_poses, markers: int, bad: bool) -> tuple[float, float]:
+def mean_errors_mm(markers: int, bad: bool) -> tuple[float, float]:
     """Mean position errors of method `paper` with the step in depth, and as it is shipped, without."""
     rng = np.random.default_rng(100)
     draws = draw_poses(rng, 400, (1.7, 10.0), 0.1, markers=markers)
@@ -164,10 +165,10 @@ def mean_errors_mm(draw_poses, markers: int, bad: bool) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(("markers", "least_loss"), [(5, 1.5), (8, 1.0)])
-def test_the_step_in_depth_brings_little_and_costs_where_a_marker_is_wrong(draw_poses, markers, least_loss):
-    with_step, without = mean_errors_mm(draw_poses, markers, bad=False)
+def test_the_step_in_depth_brings_little_and_costs_where_a_marker_is_wrong(markers, least_loss):
+    with_step, without = mean_errors_mm(markers, bad=False)
     # Ratios of 1.17 and 0.92 over 1500 poses, of 5 and of 8 markers; 0.07 over these 400, by bootstrap, three of it.
     assert 0.92 - 0.21 < with_step / without < 1.17 + 0.21
-    with_step, without = mean_errors_mm(draw_poses, markers, bad=True)
+    with_step, without = mean_errors_mm(markers, bad=True)
     # Ratios of 2.3 and 1.23 over 1500 poses; 0.19 and 0.07 over these 400, three of it.
     assert with_step > least_loss * without

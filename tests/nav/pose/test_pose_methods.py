@@ -12,6 +12,7 @@ import pytest
 from nav.pose.pose_method import NoFixReason
 from nav.pose.pose_methods import METHODS, method_names, pose_method
 from nav.runner import method_names as names_of_runner
+from tests.support.painted_pairs import draw_poses
 
 NAMES = (
     "paper paper-literal circle-fit mono-circle mean-plane disparity-plane mono-ippe mono-sqpnp mono-lm "
@@ -55,7 +56,7 @@ def test_built_in_methods():
     assert method_names()[: len(METHODS)] == tuple(METHODS)
 
 
-def test_a_method_of_another_package(install, draw_poses):
+def test_a_method_of_another_package(install):
     install("never = other_estimators:never")
     assert method_names() == (*METHODS, "never")
     observation = draw_poses(np.random.default_rng(81), 1, 5.0, 0.1).observation(0)
@@ -93,7 +94,7 @@ def test_a_method_that_cannot_be_loaded(install, line, fault):
         pose_method("broken")
 
 
-def test_a_method_that_returns_another_type(install, draw_poses):
+def test_a_method_that_returns_another_type(install):
     install("nothing = other_estimators:nothing")
     observation = draw_poses(np.random.default_rng(82), 1, 5.0, 0.1).observation(0)
     with pytest.raises(ValueError, match="method: 'nothing' must answer Solution or NoFixReason, got NoneType"):

@@ -13,6 +13,7 @@ from nav.pose.joint import joint_hub, joint_robust
 from nav.pose.joint_batch import solve_joint_batch
 from nav.pose.pose_method import EXACT, StatedTolerances
 from nav.pose.pose_methods import METHODS
+from tests.support.painted_pairs import draw_poses
 
 STATED = StatedTolerances(
     ring_radius_m=5e-4, ellipticity=0.002, placement_m=3e-4, hub_lateral_m=1e-3, disparity_px=0.19
@@ -35,7 +36,7 @@ def state_of(draws, features, departures):
 
 
 @pytest.mark.parametrize("eyes", [1, 2])
-def test_a_displaced_feature_has_the_joint_covariance_of_both_eyes(draw_poses, eyes):
+def test_a_displaced_feature_has_the_joint_covariance_of_both_eyes(eyes):
     draws = draw_poses(np.random.default_rng(60), 4, (1.7, 10.0), 0.1)
     rng = np.random.default_rng(61)
     roots = rng.normal(0, 0.1, (4, eyes, 10, 2, 2))
@@ -62,7 +63,7 @@ def test_a_displaced_feature_has_the_joint_covariance_of_both_eyes(draw_poses, e
 
 
 @pytest.mark.parametrize("tolerances", [STATED, *EACH])
-def test_derivatives_are_those_of_the_residuals(draw_poses, tolerances):
+def test_derivatives_are_those_of_the_residuals(tolerances):
     draws = draw_poses(np.random.default_rng(62), 5, (1.7, 10.0), 0.1)
     features = features_of(draws, tolerances)
     step = 1e-4
@@ -75,7 +76,7 @@ def test_derivatives_are_those_of_the_residuals(draw_poses, tolerances):
         np.testing.assert_allclose(now, slope, atol=2e-3 * max(1.0, np.abs(slope).max()))
 
 
-def test_a_marker_in_one_eye_has_its_own_covariance(draw_poses):
+def test_a_marker_in_one_eye_has_its_own_covariance():
     draws = draw_poses(np.random.default_rng(63), 1, 3.0, 0.1)
     for lost in (0, 1):
         pixels = draws.pixels_px.copy()
@@ -102,7 +103,7 @@ def toleranced(draws, rng, tolerances):
 
 @pytest.mark.parametrize("tolerances", [STATED, *EACH])
 @pytest.mark.parametrize("features", [8, 10])
-def test_covariances_include_the_stated_tolerances(draw_poses, tolerances, features):
+def test_covariances_include_the_stated_tolerances(tolerances, features):
     rng = np.random.default_rng(64)
     draws = draw_poses(rng, 120, (1.7, 6.0), 0.03, tilt_deg=(6.0, 10.0))
     pixels = toleranced(draws, rng, tolerances)[:, :, :features]
@@ -118,7 +119,7 @@ def test_covariances_include_the_stated_tolerances(draw_poses, tolerances, featu
     assert np.mean(squares) == pytest.approx(1.0, abs=0.19)
 
 
-def test_one_eye_has_no_disparity_tolerance(draw_poses):
+def test_one_eye_has_no_disparity_tolerance():
     draws = draw_poses(np.random.default_rng(65), 3, 5.0, 0.1)
     for index in range(3):
         exact, told = (
@@ -129,7 +130,7 @@ def test_one_eye_has_no_disparity_tolerance(draw_poses):
         np.testing.assert_allclose(exact.covariance, told.covariance, rtol=1e-6, atol=1e-15)
 
 
-def test_a_displaced_marker_is_no_outlier(draw_poses):
+def test_a_displaced_marker_is_no_outlier():
     rng = np.random.default_rng(66)
     draws = draw_poses(rng, 5, 2.0, 0.02)
     pixels = toleranced(draws, rng, STATED)
@@ -143,7 +144,7 @@ def test_a_displaced_marker_is_no_outlier(draw_poses):
         assert np.flatnonzero(~wrong.used.all(axis=0)).tolist() == [3]
 
 
-def test_tiny_tolerances_change_nothing(draw_poses):
+def test_tiny_tolerances_change_nothing():
     draws = draw_poses(np.random.default_rng(67), 3, 5.0, 0.1)
     tiny = StatedTolerances(1e-9, 1e-9, 1e-9, 1e-9, 1e-9)
     for index in range(3):

@@ -30,6 +30,7 @@ from render.engine import load_engine
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
+from tests.support.recipe_builder import paper_view_recipe
 
 LAMP_CD_M2 = 1e6
 STATIONS_M = (2.0, 5.0, 10.0, 20.0, 40.0)
@@ -103,8 +104,8 @@ def area_and_centroid(coverage, disc, margin_px=2.5):
 
 
 @pytest.mark.parametrize("station", range(len(STATIONS_M)))
-def test_area_and_centroid_of_every_marker(analytic, make_recipe, station):
-    recipe = make_recipe(stations_m=STATIONS_M)
+def test_area_and_centroid_of_every_marker(analytic, station):
+    recipe = paper_view_recipe(stations_m=STATIONS_M)
     frame = sample_frame(recipe, station)
     layout = marker_layout(frame.drogue)
     coverage = lamp_coverage(analytic, recipe, frame)
@@ -123,8 +124,8 @@ def test_area_and_centroid_of_every_marker(analytic, make_recipe, station):
             assert np.abs(centroid - ellipse).max() <= LATTICE_LAW * disc.semi_axes_px()[1] ** -1.5
 
 
-def test_both_edges_of_the_hub_have_their_own_centres(analytic, make_recipe):
-    recipe = make_recipe(stations_m=(2.0,))
+def test_both_edges_of_the_hub_have_their_own_centres(analytic):
+    recipe = paper_view_recipe(stations_m=(2.0,))
     tilted = RigidTransform(rotation_from_angles(0.15, -0.12, 0.1), np.array([0.05, 0.01, 2.1]))
     frame = sample_frame(recipe, 0).model_copy(update={"left_from_drogue": tilted})
     hubs = [frame.drogue.hub.model_copy(update={"reflectance_rgb": (level,) * 3}) for level in (1.0, 0.0)]
@@ -171,8 +172,8 @@ def test_coverage_of_whole_pixels_and_of_nothing():
     assert pixel_coverage([shapely.box(-0.5, 1.0, -3.5, 2.0)], 8, 6) is None
 
 
-def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic, make_recipe):
-    recipe = make_recipe(stations_m=(2.5,))
+def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic):
+    recipe = paper_view_recipe(stations_m=(2.5,))
     frame = sample_frame(recipe, 0)
     seen = analytic.render(frame, recipe.render).left
     around = environment_radiance(frame.environment)
@@ -198,8 +199,8 @@ def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic, make_recipe
         np.testing.assert_allclose(values[0], want, rtol=1e-6)
 
 
-def test_coverage_and_surroundings_make_the_whole_image(analytic, make_recipe):
-    recipe = make_recipe(scale=0.5, stations_m=(3.0,))
+def test_coverage_and_surroundings_make_the_whole_image(analytic):
+    recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     drawn = analytic.render(frame, recipe.render).right
     empty = analytic.render(frame.model_copy(update={"drogue": None, "left_from_drogue": None}), recipe.render).right
@@ -216,8 +217,8 @@ def test_coverage_and_surroundings_make_the_whole_image(analytic, make_recipe):
 
 @pytest.mark.mitsuba
 @pytest.mark.parametrize("angles_rad", [(0.0, 0.0, 0.0), (0.15, -0.12, 0.3)])
-def test_part_ids_agree_with_the_path_traced_ones(analytic, engine, make_recipe, angles_rad):
-    recipe = make_recipe(scale=0.5, stations_m=(3.0,), samples=1)
+def test_part_ids_agree_with_the_path_traced_ones(analytic, engine, angles_rad):
+    recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,), samples=1)
     pose = RigidTransform(rotation_from_angles(*angles_rad), np.array([0.1, 0.05, 3.0]))
     frame = sample_frame(recipe, 0).model_copy(update={"left_from_drogue": pose})
     ours, theirs = (one.render(frame, recipe.render) for one in (analytic, engine))
@@ -239,10 +240,10 @@ def test_part_ids_agree_with_the_path_traced_ones(analytic, engine, make_recipe,
 
 
 @pytest.mark.parametrize("tilt_deg", [10.0, 40.0])
-def test_labels_stand_the_check(analytic, make_recipe, tilt_deg):
+def test_labels_stand_the_check(analytic, tilt_deg):
     """Random frames of all distances; at 40 degrees the opening's edge cuts the hub."""
     tilt = Range(low=-tilt_deg, high=tilt_deg)
-    recipe = make_recipe(scale=0.5, stations_m=(1.7, 2.5, 5.0, 10.0, 40.0))
+    recipe = paper_view_recipe(scale=0.5, stations_m=(1.7, 2.5, 5.0, 10.0, 40.0))
     recipe = recipe.model_copy(update={"pose": recipe.pose.model_copy(update={"pitch_deg": tilt, "yaw_deg": tilt})})
     hub_fractions = []
     for index in range(10):
@@ -256,8 +257,8 @@ def test_labels_stand_the_check(analytic, make_recipe, tilt_deg):
     assert (min(hub_fractions) < 1) == (tilt_deg > 28)
 
 
-def test_drogue_without_a_hub(analytic, make_recipe):
-    recipe = make_recipe(scale=0.5, stations_m=(3.0,))
+def test_drogue_without_a_hub(analytic):
+    recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,))
     frame = with_drogue(sample_frame(recipe, 0), hub=None)
     radiance = analytic.render(frame, recipe.render)
     assert Part.COUPLING in radiance.left.part_id and Part.HUB not in radiance.left.part_id
@@ -266,8 +267,8 @@ def test_drogue_without_a_hub(analytic, make_recipe):
     assert check_against_passes(record, radiance) == []
 
 
-def test_from_behind_a_flat_drogue_shows_its_back_only(analytic, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(3.0,))
+def test_from_behind_a_flat_drogue_shows_its_back_only(analytic):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,))
     turned = RigidTransform(rotation_from_angles(0.1, np.pi - 0.2, 0.0), np.array([0.0, 0.0, 3.0]))
     frame = sample_frame(recipe, 0).model_copy(update={"left_from_drogue": turned})
     radiance = analytic.render(frame, recipe.render)
@@ -278,8 +279,8 @@ def test_from_behind_a_flat_drogue_shows_its_back_only(analytic, make_recipe):
     assert check_against_passes(record, radiance) == []
 
 
-def test_drogue_beyond_the_image_and_behind_the_camera(analytic, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(3.0,))
+def test_drogue_beyond_the_image_and_behind_the_camera(analytic):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     cut, gone, back = (
         frame.model_copy(update={"left_from_drogue": RigidTransform(np.eye(3), np.array(place))})
@@ -295,8 +296,8 @@ def test_drogue_beyond_the_image_and_behind_the_camera(analytic, make_recipe):
         analytic.render(back, recipe.render)
 
 
-def test_same_frame_same_bits(analytic, make_recipe):
-    recipe = make_recipe(scale=0.5, stations_m=(3.0, 5.0), speed_m_s=2.0, rate_deg_s=20.0)
+def test_same_frame_same_bits(analytic):
+    recipe = paper_view_recipe(scale=0.5, stations_m=(3.0, 5.0), speed_m_s=2.0, rate_deg_s=20.0)
     first = analytic.render(sample_frame(recipe, 0), recipe.render)
     analytic.render(sample_frame(recipe, 1), recipe.render)
     again = load_engine("analytic").render(sample_frame(recipe, 0), recipe.render)
@@ -305,8 +306,8 @@ def test_same_frame_same_bits(analytic, make_recipe):
             assert np.array_equal(getattr(getattr(first, eye), name), getattr(getattr(again, eye), name)), name
 
 
-def test_moving_drogue_is_blurred_around_its_middle(analytic, make_recipe):
-    recipe = make_recipe(stations_m=(5.0,))
+def test_moving_drogue_is_blurred_around_its_middle(analytic):
+    recipe = paper_view_recipe(stations_m=(5.0,))
     still = sample_frame(recipe, 0)
     still = still.model_copy(update={"exposure": still.exposure.model_copy(update={"time_s": 0.005})})
     across = still.left_from_drogue.rotation.T @ np.array([1.0, 0.5, 0.0])

@@ -26,6 +26,7 @@ from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
+from tests.support.recipe_builder import paper_view_recipe
 
 pytestmark = [
     pytest.mark.blender,
@@ -72,8 +73,8 @@ def moments(image, near_px, reach_px):
 
 
 @pytest.mark.slow
-def test_lit_markers_are_where_and_as_large_as_the_labels_say(blender, make_recipe):
-    recipe = make_recipe(scale=0.5, stations_m=(4.0, 8.0), samples=36)
+def test_lit_markers_are_where_and_as_large_as_the_labels_say(blender):
+    recipe = paper_view_recipe(scale=0.5, stations_m=(4.0, 8.0), samples=36)
     errors, areas = [], []
     for index in range(2):
         frame = sample_frame(recipe, index)
@@ -98,8 +99,8 @@ def test_lit_markers_are_where_and_as_large_as_the_labels_say(blender, make_reci
     assert np.mean(areas) == pytest.approx(1.0, abs=0.006)
 
 
-def test_passes_of_pixel_centres(blender, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(2.0,), samples=1)
+def test_passes_of_pixel_centres(blender):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(2.0,), samples=1)
     frame = sample_frame(recipe, 0)
     radiance = blender.render(frame, recipe.render)
     layout = marker_layout(frame.drogue)
@@ -122,8 +123,8 @@ def test_passes_of_pixel_centres(blender, make_recipe):
 
 
 @pytest.mark.mitsuba
-def test_both_path_tracers_agree(blender, engine, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(2.0,), samples=36)
+def test_both_path_tracers_agree(blender, engine):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(2.0,), samples=36)
     settings = recipe.render.model_copy(update={"surround_samples_per_px": 36})
     frame = sample_frame(recipe, 0)
     theirs, ours = blender.render(frame, settings), engine.render(frame, settings)
@@ -143,8 +144,8 @@ def test_both_path_tracers_agree(blender, engine, make_recipe):
 
 
 @pytest.mark.mitsuba
-def test_rough_plastic_means_the_same_to_both(blender, engine, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(1.8,), samples=36)
+def test_rough_plastic_means_the_same_to_both(blender, engine):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(1.8,), samples=36)
     frame = sample_frame(recipe, 0)
     # The sun behind the cameras, so that the facets have something to mirror.
     environment = frame.environment.model_copy(update={"sun_azimuth_deg": 190.0, "sun_elevation_deg": 25.0})
@@ -166,8 +167,8 @@ def test_rough_plastic_means_the_same_to_both(blender, engine, make_recipe):
         assert got > 1.3 * without, part.name
 
 
-def test_noise_is_what_two_renderings_by_other_samples_differ_by(blender, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(3.0,), samples=16)
+def test_noise_is_what_two_renderings_by_other_samples_differ_by(blender):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,), samples=16)
     frame = sample_frame(recipe, 0)
     one, other = (blender.render(frame.model_copy(update={"seed": seed}), recipe.render) for seed in (1, 2))
     error, value = 0.0, 0.0
@@ -184,10 +185,10 @@ def test_noise_is_what_two_renderings_by_other_samples_differ_by(blender, make_r
 
 
 @pytest.mark.slow
-def test_same_frame_same_bits_whatever_came_before(blender, make_recipe):
+def test_same_frame_same_bits_whatever_came_before(blender):
     from render.blender_engine.blender_engine import BlenderEngine
 
-    recipe = make_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4, speed_m_s=2.0)
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4, speed_m_s=2.0)
     first = blender.render(sample_frame(recipe, 0), recipe.render)
     blender.render(lit(sample_frame(recipe, 1), LAMP_CD_M2), recipe.render)
     again = blender.render(sample_frame(recipe, 0), recipe.render)
@@ -203,8 +204,8 @@ def test_same_frame_same_bits_whatever_came_before(blender, make_recipe):
 
 
 @pytest.mark.slow
-def test_moving_drogue_is_blurred_around_its_middle(blender, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(3.0,), samples=36)
+def test_moving_drogue_is_blurred_around_its_middle(blender):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,), samples=36)
     frame = sample_frame(recipe, 0)
     still = frame.model_copy(update={"exposure": frame.exposure.model_copy(update={"time_s": 0.01})})
     across = still.left_from_drogue.rotation.T @ np.array([3.0, 0.0, 0.0])
@@ -226,8 +227,8 @@ def test_moving_drogue_is_blurred_around_its_middle(blender, make_recipe):
     assert width[1] - width[0] == pytest.approx(2 * travel_px, abs=4)
 
 
-def test_frames_without_a_drogue(blender, make_recipe):
-    recipe = make_recipe(scale=0.125, stations_m=(5.0,), samples=4)
+def test_frames_without_a_drogue(blender):
+    recipe = paper_view_recipe(scale=0.125, stations_m=(5.0,), samples=4)
     frame = sample_frame(recipe, 0).model_copy(
         update={"drogue": None, "left_from_drogue": None, "left_from_tanker": None, "hose_nodes_left_m": None}
     )
@@ -278,8 +279,8 @@ def _runs(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_a_killed_blender_costs_one_try(blender, make_recipe):
-    recipe = make_recipe(scale=0.125, stations_m=(5.0,), samples=2)
+def test_a_killed_blender_costs_one_try(blender):
+    recipe = paper_view_recipe(scale=0.125, stations_m=(5.0,), samples=2)
     frame = sample_frame(recipe, 0)
     before = blender.render(frame, recipe.render)
     os.kill(blender._process._process.pid, signal.SIGKILL)
@@ -287,9 +288,9 @@ def test_a_killed_blender_costs_one_try(blender, make_recipe):
     assert np.array_equal(before.left.radiance_cd_m2, after.left.radiance_cd_m2)
 
 
-def test_blender_rests_when_it_has_nothing_to_draw(blender, make_recipe):
+def test_blender_rests_when_it_has_nothing_to_draw(blender):
     """With one thread Cycles leaves one of TBB's awake, which takes a core for as long as the process lives."""
-    recipe = make_recipe(scale=0.125, stations_m=(5.0,), samples=2)
+    recipe = paper_view_recipe(scale=0.125, stations_m=(5.0,), samples=2)
     blender.render(sample_frame(recipe, 0), recipe.render)
     tasks = [*Path(f"/proc/{blender._process._process.pid}/task").iterdir()]
     assert len(tasks) > 1

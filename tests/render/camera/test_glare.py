@@ -10,10 +10,11 @@ from scenes.clouds.cloud_layers import opacity_towards
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
+from tests.support.recipe_builder import paper_view_recipe
 
 
-def with_sun(make_recipe, elevation_deg, azimuth_deg):
-    frame = sample_frame(make_recipe(scale=0.25), 0)
+def with_sun(elevation_deg, azimuth_deg):
+    frame = sample_frame(paper_view_recipe(scale=0.25), 0)
     environment = frame.environment.model_copy(
         update={"sun_elevation_deg": elevation_deg, "sun_azimuth_deg": azimuth_deg, "clouds": ()}
     )
@@ -43,16 +44,16 @@ def test_the_stated_share_of_the_light_is_scattered(fraction):
     assert total == pytest.approx(fraction, rel=0.01)  # quadrature in steps of 0.06 %, float32
 
 
-def test_a_fogged_lens_has_as_much_more_veil(make_recipe):
-    frame = with_sun(make_recipe, 14.0, 0.0)
+def test_a_fogged_lens_has_as_much_more_veil():
+    frame = with_sun(14.0, 0.0)
     optics = frame.sensor.optics.model_copy(update={"scattered_fraction": 0.1})
     fogged = frame.model_copy(update={"sensor": frame.sensor.model_copy(update={"optics": optics})})
     # Float32.
     np.testing.assert_allclose(sun_glare(fogged, eye(fogged)), 10 * sun_glare(frame, eye(frame)), rtol=1e-5)
 
 
-def test_veil_falls_with_the_square_of_the_angle(make_recipe):
-    frame = with_sun(make_recipe, 14.0, 0.0)
+def test_veil_falls_with_the_square_of_the_angle():
+    frame = with_sun(14.0, 0.0)
     veil = luminance(sun_glare(frame, eye(frame)))
     camera = frame.rig.camera
     v, u = np.unravel_index(np.arange(0, veil.size, 997), veil.shape)
@@ -67,18 +68,18 @@ def test_veil_falls_with_the_square_of_the_angle(make_recipe):
     assert 100 < np.median(veil) < 5000
 
 
-def test_no_veil_from_behind_at_night_or_from_a_hidden_sun(make_recipe):
-    behind = with_sun(make_recipe, 20.0, 180.0)
+def test_no_veil_from_behind_at_night_or_from_a_hidden_sun():
+    behind = with_sun(20.0, 180.0)
     assert sun_glare(behind, eye(behind)) is None
-    night = with_sun(make_recipe, -30.0, 0.0)
+    night = with_sun(-30.0, 0.0)
     assert sun_glare(night, eye(night)) is None
-    inside = with_sun(make_recipe, 3.0, 0.0)
+    inside = with_sun(3.0, 0.0)
     assert sun_glare(inside, eye(inside)) is not None
     assert sun_glare(inside, eye(inside, coverage=1.0)) is None
 
 
-def test_clouds_that_a_flying_camera_passes_take_the_glare(make_recipe):
-    frame = with_sun(make_recipe, 20.0, 0.0)
+def test_clouds_that_a_flying_camera_passes_take_the_glare():
+    frame = with_sun(20.0, 0.0)
     heap = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_size_m=900.0, optical_depth=3.0,
                       texture_seed=1, thickness_m=100.0)  # fmt: skip
     clear, beam = sun_glare(frame, eye(frame)), environment_radiance(frame.environment).beam_direction

@@ -12,7 +12,7 @@ from render.camera.optics import blur_circle_px, disc_kernel, light_on_sensor, t
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
-from tests.support.recipe_builder import build_recipe, stations
+from tests.support.recipe_builder import build_recipe, paper_view_recipe, stations
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 
@@ -28,8 +28,8 @@ def rendered(frame):
     return load_engine("analytic").render(frame, recipe.render).left
 
 
-def test_default_lens_is_perfect(make_recipe):
-    frame = with_optics(sample_frame(make_recipe(scale=0.25), 0))
+def test_default_lens_is_perfect():
+    frame = with_optics(sample_frame(paper_view_recipe(scale=0.25), 0))
     seen = rendered(frame)
     assert light_on_sensor(frame, seen, "left") is seen.radiance_cd_m2
 
@@ -50,9 +50,9 @@ def test_mechanical_falloff_takes_its_share_in_the_corner_only():
     assert share[12, 16] == pytest.approx(1 - 0.3 / 16, abs=3e-3)
 
 
-def test_vignetting_takes_electrons_and_their_noise(make_recipe):
+def test_vignetting_takes_electrons_and_their_noise():
     """Both ends of the chain: the corner's mean falls by the transmission."""
-    frame = with_optics(sample_frame(make_recipe(scale=0.25), 0), natural_vignetting=True)
+    frame = with_optics(sample_frame(paper_view_recipe(scale=0.25), 0), natural_vignetting=True)
     plain = with_optics(frame)
     seen = rendered(frame)
     ratio = light_on_sensor(frame, seen, "left") / light_on_sensor(plain, seen, "left")
@@ -81,9 +81,9 @@ def test_wide_disc_kernel_is_flat_with_a_hard_edge():
     assert middle.std() < 1e-6
 
 
-def test_blur_circle_follows_the_thin_lens(make_recipe):
+def test_blur_circle_follows_the_thin_lens():
     """Diameter against the image distances of the lens formula, worked out without the closed form."""
-    frame = with_optics(sample_frame(make_recipe(), 0), focus_distance_m=10.0)
+    frame = with_optics(sample_frame(paper_view_recipe(), 0), focus_distance_m=10.0)
     focal_px = frame.rig.camera.fx_px
     image_m = focal_px * 3.75e-6
     power = 1 / image_m + 1 / 10.0
@@ -98,8 +98,8 @@ def test_blur_circle_follows_the_thin_lens(make_recipe):
     assert blur_circle_px(closed, 2.0) == pytest.approx(blur_circle_px(frame, 2.0) / 2, rel=1e-12)
 
 
-def test_defocus_softens_the_target_and_keeps_its_light_and_place(make_recipe):
-    frame = sample_frame(make_recipe(scale=0.5, stations_m=(3.0,)), 0)
+def test_defocus_softens_the_target_and_keeps_its_light_and_place():
+    frame = sample_frame(paper_view_recipe(scale=0.5, stations_m=(3.0,)), 0)
     near = with_optics(frame, f_number=0.5, focus_distance_m=30.0)
     sharp = with_optics(frame, f_number=0.5)
     seen = rendered(sharp)
@@ -115,8 +115,8 @@ def test_defocus_softens_the_target_and_keeps_its_light_and_place(make_recipe):
     np.testing.assert_allclose(centers[0], centers[1], atol=0.3)
 
 
-def test_target_in_focus_before_a_soft_sky(make_recipe):
-    frame = sample_frame(make_recipe(scale=0.5, stations_m=(3.0,)), 0)
+def test_target_in_focus_before_a_soft_sky():
+    frame = sample_frame(paper_view_recipe(scale=0.5, stations_m=(3.0,)), 0)
     focused = with_optics(frame, f_number=1.0, focus_distance_m=3.0)
     seen = rendered(focused)
     image = light_on_sensor(focused, seen, "left")
@@ -125,8 +125,8 @@ def test_target_in_focus_before_a_soft_sky(make_recipe):
     np.testing.assert_allclose(image[inside], seen.radiance_cd_m2[inside], rtol=1e-5)
 
 
-def test_a_blur_without_end_is_refused(make_recipe):
-    frame = with_optics(sample_frame(make_recipe(), 0), f_number=0.5, focus_distance_m=0.06)
+def test_a_blur_without_end_is_refused():
+    frame = with_optics(sample_frame(paper_view_recipe(), 0), f_number=0.5, focus_distance_m=0.06)
     with pytest.raises(ValueError, match="focus_distance_m: gives a blur circle"):
         light_on_sensor(frame, rendered(with_optics(frame)), "left")
 

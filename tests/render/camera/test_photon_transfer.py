@@ -12,6 +12,7 @@ from render.camera.sensor import dn_per_electron, expose
 from render.engine import EyeRadiance, StereoRadiance, load_engine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
+from tests.support.recipe_builder import paper_view_recipe
 
 SHAPE = (96, 128)
 # 36864 samples an image give the variance within 0.74 % (one sigma); eight images within 0.26 %.
@@ -20,8 +21,8 @@ WITHIN = 0.03
 
 
 @pytest.fixture
-def frame(make_recipe):
-    return sample_frame(make_recipe(scale=0.1), 0)
+def frame():
+    return sample_frame(paper_view_recipe(scale=0.1), 0)
 
 
 def flat_numbers(frame: FrameSpec, electrons: float, gain: float, time_s: float, prnu_fraction=0.0):
@@ -109,9 +110,9 @@ def lit_electrons(frame, power=1.0, engine="analytic"):
     return (means[0] - means[1]) / dn_per_electron(frame.sensor, frame.exposure.gain)
 
 
-def lit_frame(make_recipe, time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0, scale=1.0):
+def lit_frame(time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0, scale=1.0):
     """A frame in thick dusk: what the sun lights is taken off again anyway."""
-    frame = sample_frame(make_recipe(scale=scale, stations_m=(distance_m,)), 0)
+    frame = sample_frame(paper_view_recipe(scale=scale, stations_m=(distance_m,)), 0)
     assert frame.drogue is not None and load_drogue("red-8").marker_count == 8
     changes = {
         "sensor": frame.sensor.model_copy(update={"output_bits": 12, "full_well_e": 1e6}),
@@ -132,17 +133,17 @@ def lit_frame(make_recipe, time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0, 
         (1.0, 2e-3, 2.8, 3.0, 4.0),
     ],
 )
-def test_electrons_of_a_lit_marker(make_recipe, power, time_s, f_number, distance_m, gain):
+def test_electrons_of_a_lit_marker(power, time_s, f_number, distance_m, gain):
     """L t q pi / (4 N^2) through the air of the distance; the luminance of an area does not fall with distance."""
-    frame = lit_frame(make_recipe, time_s, f_number, distance_m, gain, scale=0.5)
+    frame = lit_frame(time_s, f_number, distance_m, gain, scale=0.5)
     assert REC709_LUMINANCE.sum() == pytest.approx(1.0)
     assert lit_electrons(frame, power) == pytest.approx(expected_electrons(frame, power, distance_m), rel=WITHIN)
 
 
 @pytest.mark.mitsuba
 @pytest.mark.parametrize(("power", "f_number", "distance_m"), [(1.0, 2.8, 3.0), (3.0, 1.4, 1.7)])
-def test_electrons_of_a_lit_marker_by_path_tracing(make_recipe, engine, power, f_number, distance_m):
-    frame = lit_frame(make_recipe, f_number=f_number, distance_m=distance_m, scale=0.4)
+def test_electrons_of_a_lit_marker_by_path_tracing(engine, power, f_number, distance_m):
+    frame = lit_frame(f_number=f_number, distance_m=distance_m, scale=0.4)
     assert lit_electrons(frame, power, engine.name) == pytest.approx(
         expected_electrons(frame, power, distance_m), rel=WITHIN
     )
@@ -154,13 +155,13 @@ def expected_electrons(frame, power, distance_m):
     return lux_s * frame.sensor.responsivity_e_per_lux_s
 
 
-def test_light_of_a_whole_marker_falls_with_the_square_of_its_distance(make_recipe):
+def test_light_of_a_whole_marker_falls_with_the_square_of_its_distance():
     """Electrons summed over a marker and its blur, against its image's area."""
     from datasets_manifest.recipe.recipe import RenderSettings
 
     sums = []
     for distance_m in (5.0, 10.0, 20.0):
-        frame = lit_frame(make_recipe, distance_m=distance_m)
+        frame = lit_frame(distance_m=distance_m)
         pictures = []
         for luminance in (2000.0, 0.0):
             drogue = frame.drogue.model_copy(update={"marker_luminance_cd_m2": luminance})

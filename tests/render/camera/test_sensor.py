@@ -11,6 +11,7 @@ from datasets_manifest.types.frame import Exposure
 from render.camera.sensor import MONO_WEIGHTS, dn_per_electron, expose, normal_quantiles
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import paper_view_recipe
 
 SHAPE = (96, 128)
 
@@ -37,8 +38,8 @@ def flat_pair(level_cd_m2, rgb=(1.0, 1.0, 1.0)):
 
 
 @pytest.fixture
-def frame(make_recipe):
-    return sample_frame(make_recipe(scale=0.1), 0)
+def frame():
+    return sample_frame(paper_view_recipe(scale=0.1), 0)
 
 
 def with_sensor(frame, name="rgb-ideal", seed=5, time_s=1e-3, gain=1.0, **changes):

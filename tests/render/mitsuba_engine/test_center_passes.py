@@ -9,7 +9,7 @@ from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import EYES
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from tests.support.recipe_builder import RIG_320_PX, RecipeTable, build_recipe, stations
+from tests.support.recipe_builder import RIG_320_PX, RecipeTable, build_recipe, paper_view_recipe, stations
 
 pytestmark = pytest.mark.mitsuba
 
@@ -60,8 +60,8 @@ def test_nothing_is_seen_where_no_ray_is_sent(scene_of, changes, monkeypatch):
                 assert np.count_nonzero(distance_m != all_m) <= 3
 
 
-def test_depths_are_those_of_the_plane_that_is_seen(engine, make_recipe):
-    recipe = make_recipe(stations_m=(3.0, 11.0, 36.0), samples=1)
+def test_depths_are_those_of_the_plane_that_is_seen(engine):
+    recipe = paper_view_recipe(stations_m=(3.0, 11.0, 36.0), samples=1)
     # Depths are those of pixel centres, however few rays make the light.
     settings = recipe.render.model_copy(
         update={"open_samples_per_px": 1, "edge_samples_per_px": 1, "surround_samples_per_px": 1, "denoise": False}
@@ -78,7 +78,7 @@ def test_depths_are_those_of_the_plane_that_is_seen(engine, make_recipe):
         assert np.abs(seen.depth_m[rows, columns] - depth_m).max() < 4 * np.finfo(np.float32).eps * depth_m.max()
 
 
-def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of, make_recipe):
+def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of):
     """Seen from inside, a marker is black: one such ray of four takes a quarter of a pixel's light away."""
     import drjit as dr
     import mitsuba as mi
@@ -89,7 +89,7 @@ def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of, make_recipe):
 
     rays = 1_000_000
     rng = np.random.default_rng(4)
-    recipe = make_recipe(stations_m=(24.0,))
+    recipe = paper_view_recipe(stations_m=(24.0,))
     for frame in (sample_frame(recipe, index) for index in range(2)):
         scene = scene_of(frame)
         camera = CameraRays(frame, "left")

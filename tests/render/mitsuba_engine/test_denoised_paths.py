@@ -10,15 +10,15 @@ from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_
 from geometry.stereo import EYES
 from render.camera.optics import blur
 from scenes.sampler import sample_frame
-from tests.support.recipe_builder import build_recipe, stations
+from tests.support.recipe_builder import build_recipe, paper_view_recipe, stations
 
 pytestmark = pytest.mark.mitsuba
 
 
 @pytest.fixture(scope="module")
-def settled(engine, make_recipe):
+def settled(engine):
     """A frame at a third of the paper's scale, its recipe, and what many paths through every pixel make of it."""
-    recipe = make_recipe(scale=1 / 3, stations_m=(3.0,))
+    recipe = paper_view_recipe(scale=1 / 3, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     many = {"samples_per_px": 400, "open_samples_per_px": 36, "edge_samples_per_px": 2500, "denoise": False}
     return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
@@ -99,9 +99,9 @@ def redness_centroid(seen, marker):
 
 
 @pytest.fixture(scope="module")
-def below_the_wing(engine, make_recipe):
+def below_the_wing(engine):
     """A frame that shows pod and wing, its recipe, and what many paths through every pixel make of it."""
-    recipe = make_recipe(scale=1 / 3, stations_m=(12.0,))
+    recipe = paper_view_recipe(scale=1 / 3, stations_m=(12.0,))
     frame = next(frame for index in range(50) if shows_the_tanker(frame := sample_frame(recipe, index)))
     many = {"surround_samples_per_px": 1024, "denoise": False}
     return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))

@@ -8,6 +8,7 @@ import pytest
 from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from geometry.se3 import RigidTransform
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import paper_view_recipe
 
 
 @pytest.fixture
@@ -36,10 +37,10 @@ def without_marker(frame, missing, moved_m):
     return frame.model_copy(update={"condition": DrogueCondition(markers=markers), "left_from_drogue": pose})
 
 
-def test_new_scenes_and_other_pixels_take_the_same_kernels(kernels, make_recipe):
+def test_new_scenes_and_other_pixels_take_the_same_kernels(kernels):
     from render.mitsuba_engine.scene import KEPT_SCENES
 
-    recipe = make_recipe(scale=0.25, stations_m=(4.0,), samples=16)
+    recipe = paper_view_recipe(scale=0.25, stations_m=(4.0,), samples=16)
     frame = sample_frame(recipe, 0)
     known: set[str] = set()
     new = []

@@ -12,6 +12,7 @@ from geometry.se3 import RigidTransform
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
+from tests.support.recipe_builder import paper_view_recipe
 
 pytestmark = pytest.mark.mitsuba
 
@@ -19,9 +20,9 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize("sun_azimuth_deg", [0.0, 100.0, 180.0, 250.0])
-def test_white_face_shines_as_its_irradiance_says(engine, make_recipe, sun_azimuth_deg):
+def test_white_face_shines_as_its_irradiance_says(engine, sun_azimuth_deg):
     """A white face sends back E / pi, with E integrated over the surroundings in numpy; nothing shades the face."""
-    recipe = make_recipe(scale=0.25, stations_m=(4.0,), samples=256)
+    recipe = paper_view_recipe(scale=0.25, stations_m=(4.0,), samples=256)
     frame = sample_frame(recipe, 0)
     drogue = DrogueParameters.model_validate(
         frame.drogue.model_dump() | {"face_reflectance_rgb": WHITE, "marker_reflectance_rgb": WHITE}
@@ -40,9 +41,9 @@ def test_white_face_shines_as_its_irradiance_says(engine, make_recipe, sun_azimu
     assert got == pytest.approx(float(expected), rel=0.015)
 
 
-def test_nothing_shadows_the_markers(engine, make_recipe):
+def test_nothing_shadows_the_markers(engine):
     """With the sun behind the receiver every marker is evenly lit: no shadow edge of rim or rib lies on it."""
-    recipe = make_recipe(scale=0.25, stations_m=(2.0,), samples=256)
+    recipe = paper_view_recipe(scale=0.25, stations_m=(2.0,), samples=256)
     frame = sample_frame(recipe, 0)
     environment = frame.environment.model_copy(update={"sun_azimuth_deg": 170.0, "sun_elevation_deg": 20.0})
     level = RigidTransform(np.eye(3), frame.left_from_drogue.translation_m * [0, 0, 1])

@@ -9,6 +9,7 @@ from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from geometry.stereo import EYES
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
+from tests.support.recipe_builder import paper_view_recipe
 
 pytestmark = pytest.mark.mitsuba
 
@@ -16,8 +17,8 @@ UNREACHABLE = {"noise_over_sensor": 1e-3}
 """An aim for which all samples that are allowed are taken."""
 
 
-def test_stated_noise_is_the_difference_of_two_renders(engine, make_recipe):
-    recipe = make_recipe(scale=0.35, stations_m=(2.0,))
+def test_stated_noise_is_the_difference_of_two_renders(engine):
+    recipe = paper_view_recipe(scale=0.35, stations_m=(2.0,))
     frame = sample_frame(recipe, 0)
     first, second = (engine.render(frame.model_copy(update={"seed": seed}), recipe.render) for seed in (1, 2))
     error, total = [], []
@@ -32,8 +33,8 @@ def test_stated_noise_is_the_difference_of_two_renders(engine, make_recipe):
     assert stated == pytest.approx(measured, rel=0.25)
 
 
-def test_more_samples_leave_less_noise(engine, make_recipe):
-    frame_recipe = make_recipe(scale=0.25, stations_m=(2.5,))
+def test_more_samples_leave_less_noise(engine):
+    frame_recipe = paper_view_recipe(scale=0.25, stations_m=(2.5,))
     frame = sample_frame(frame_recipe, 0)
     few_samples, many_samples = (
         frame_recipe.render.model_copy(update={"samples_per_px": n, "edge_samples_per_px": 4 * n} | UNREACHABLE)
@@ -51,8 +52,8 @@ def test_more_samples_leave_less_noise(engine, make_recipe):
     )
 
 
-def test_edges_take_no_more_rays_than_the_aim_needs(engine, make_recipe):
-    recipe = make_recipe(scale=0.35, stations_m=(3.0,))
+def test_edges_take_no_more_rays_than_the_aim_needs(engine):
+    recipe = paper_view_recipe(scale=0.35, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     plenty = recipe.render.model_copy(update={"edge_samples_per_px": 2048})
     for aim in (0.35, 0.7):
@@ -63,8 +64,8 @@ def test_edges_take_no_more_rays_than_the_aim_needs(engine, make_recipe):
         assert stated == pytest.approx(aim, rel=0.25)
 
 
-def test_more_light_takes_more_rays(engine, make_recipe):
-    recipe = make_recipe(scale=0.35, stations_m=(3.0,))
+def test_more_light_takes_more_rays(engine):
+    recipe = paper_view_recipe(scale=0.35, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     plenty = recipe.render.model_copy(update={"edge_samples_per_px": 2048, "noise_over_sensor": 0.7})
     longer = frame.model_copy(

@@ -13,6 +13,7 @@ from geometry.stereo import EYES
 from labelgen.disc_images import marker_discs
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
+from tests.support.recipe_builder import paper_view_recipe
 
 pytestmark = pytest.mark.mitsuba
 
@@ -43,8 +44,8 @@ def centroid_and_area(image, center_px, radius_px):
     return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum(), weight.sum()
 
 
-def test_centroids_of_lit_markers_are_the_ellipse_centres(engine, make_recipe):
-    recipe = make_recipe(stations_m=(2.0, 5.0, 10.0, 20.0, 40.0), samples=1)
+def test_centroids_of_lit_markers_are_the_ellipse_centres(engine):
+    recipe = paper_view_recipe(stations_m=(2.0, 5.0, 10.0, 20.0, 40.0), samples=1)
     settings = recipe.render.model_copy(update={"edge_samples_per_px": 64})
     errors, area_ratios = [], []
     for index in range(5):
@@ -69,9 +70,9 @@ def test_centroids_of_lit_markers_are_the_ellipse_centres(engine, make_recipe):
     assert np.mean(area_ratios) == pytest.approx(1.0, abs=0.004)
 
 
-def test_opencv_predicts_the_same_places(make_recipe):
+def test_opencv_predicts_the_same_places():
     """The 3-D centres that labels project, projected by cv2.projectPoints, in both eyes."""
-    recipe = make_recipe(stations_m=(2.0, 10.0, 40.0))
+    recipe = paper_view_recipe(stations_m=(2.0, 10.0, 40.0))
     for index in range(3):
         frame = sample_frame(recipe, index)
         layout = marker_layout(frame.drogue)
@@ -86,8 +87,8 @@ def test_opencv_predicts_the_same_places(make_recipe):
             np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-9)
 
 
-def test_passes_of_pixel_centres(engine, make_recipe):
-    recipe = make_recipe(scale=0.5, stations_m=(3.0,), samples=1)
+def test_passes_of_pixel_centres(engine):
+    recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,), samples=1)
     frame = sample_frame(recipe, 0)
     radiance = engine.render(frame, recipe.render)
     layout = marker_layout(frame.drogue)
@@ -114,8 +115,8 @@ def test_passes_of_pixel_centres(engine, make_recipe):
             assert seen.amodal_px[32 + marker] == np.count_nonzero(seen.part_id == 32 + marker)
 
 
-def test_same_frame_same_bits(engine, make_recipe):
-    recipe = make_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4)
+def test_same_frame_same_bits(engine):
+    recipe = paper_view_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4)
     first = engine.render(sample_frame(recipe, 0), recipe.render)
     engine.render(sample_frame(recipe, 1), recipe.render)
     again = engine.render(sample_frame(recipe, 0), recipe.render)
@@ -124,9 +125,9 @@ def test_same_frame_same_bits(engine, make_recipe):
             assert np.array_equal(getattr(getattr(first, eye), name), getattr(getattr(again, eye), name)), name
 
 
-def test_moving_drogue_is_blurred_around_its_middle(engine, make_recipe):
+def test_moving_drogue_is_blurred_around_its_middle(engine):
     """The centroid of a streak is the mid-exposure place, and the streak is as long as speed times time says."""
-    recipe = make_recipe(scale=0.5, stations_m=(5.0,), samples=64)
+    recipe = paper_view_recipe(scale=0.5, stations_m=(5.0,), samples=64)
     settings = recipe.render.model_copy(update={"edge_samples_per_px": 64})
     still = sample_frame(recipe, 0).model_copy(
         update={"exposure": sample_frame(recipe, 0).exposure.model_copy(update={"time_s": 0.01})}

@@ -9,6 +9,7 @@ from datasets_manifest.random_streams import frame_generator
 from drogue_models.parts import Part
 from geometry.stereo import EYES
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import paper_view_recipe
 
 pytestmark = pytest.mark.mitsuba
 
@@ -121,12 +122,12 @@ def test_even_pixels_take_the_fewest_rays(counts_of):
     assert set(counts_of(np.zeros(9), np.ones(9, dtype=bool), 1.0, 100.0)) == {16}
 
 
-def test_rays_that_agree_do_not_prove_a_pixel_even(engine, make_recipe):
+def test_rays_that_agree_do_not_prove_a_pixel_even(engine):
     """Nine rays miss what fills a twentieth of a pixel three times in five."""
     from render.compositing import Compositor, TracedEye
     from render.mitsuba_engine.paths.sample_allocation import NoiseBudget
 
-    frame = sample_frame(make_recipe(scale=0.1), 0)
+    frame = sample_frame(paper_view_recipe(scale=0.1), 0)
     shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)
     face = np.full(shape, int(Part.FACE), dtype=np.uint8)
     depth = np.full(shape, 30.0, dtype=np.float32)

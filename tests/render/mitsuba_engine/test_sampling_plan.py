@@ -9,6 +9,7 @@ import pytest
 from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from scenes.sampler import sample_frame
+from tests.support.recipe_builder import paper_view_recipe
 
 pytestmark = pytest.mark.mitsuba
 
@@ -25,8 +26,8 @@ def test_dirt_on_a_marker_is_an_edge_everywhere(engine):
     assert len(set(clean) & set(plan.edges)) == len(clean) - 5 * 8
 
 
-def test_a_dirty_marker_has_little_noise(engine, make_recipe):
-    recipe = make_recipe(scale=0.5, stations_m=(6.0,))
+def test_a_dirty_marker_has_little_noise(engine):
+    recipe = paper_view_recipe(scale=0.5, stations_m=(6.0,))
     frame = sample_frame(recipe, 0)
     dirty = [SurfaceCondition(dirt_fraction=0.4, dirt_seed=index) for index in range(frame.drogue.marker_count)]
     frame = frame.model_copy(update={"condition": DrogueCondition(markers=tuple(dirty))})

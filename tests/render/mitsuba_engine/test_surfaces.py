@@ -12,7 +12,7 @@ from geometry.se3 import RigidTransform
 from render.engine import load_engine
 from render.surfaces import clean_reflectance_rgb, reflectance_map
 from scenes.sampler import sample_frame
-from tests.support.recipe_builder import build_recipe, stations
+from tests.support.recipe_builder import build_recipe, paper_view_recipe, stations
 
 NEW = SurfaceCondition()
 
@@ -23,8 +23,8 @@ def aged(frame, states, **more):
 
 
 @pytest.fixture
-def recipe(make_recipe):
-    return make_recipe(scale=0.25, stations_m=(2.5,), samples=16)
+def recipe():
+    return paper_view_recipe(scale=0.25, stations_m=(2.5,), samples=16)
 
 
 @pytest.fixture

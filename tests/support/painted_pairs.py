@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pytest
 
 from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.types.images import StereoImages
@@ -30,15 +29,11 @@ GREEN_RGB = (48.0, 66.0, 30.0)
 FACE_RGB = (7.0, 7.0, 7.0)
 
 
-def make_left_from_drogue(
+def make_pose(
     x_m: float, y_m: float, z_m: float, pitch_deg: float = 0, yaw_deg: float = 0, roll_deg: float = 0
-):
+) -> RigidTransform:
+    """left_from_drogue by its place and its angles."""
     return RigidTransform(rotation_from_angles(*np.radians([pitch_deg, yaw_deg, roll_deg])), np.array([x_m, y_m, z_m]))
-
-
-@pytest.fixture
-def make_pose() -> Callable[..., RigidTransform]:
-    return make_left_from_drogue
 
 
 def background(rig: StereoRig, kind: str) -> np.ndarray:
@@ -119,39 +114,27 @@ def draw_eye(
     return image
 
 
-def draw_pair(
+def paint_pair(
     rig: StereoRig, drogue: DrogueParameters | None, place: RigidTransform, rng: np.random.Generator | None, **kwargs
 ) -> StereoImages:
     images = [expose(draw_eye(rig, drogue, place, eye, **kwargs), rng) for eye in EYES]
     return StereoImages(images[0], images[1], time_s=0.0, exposure_s=1e-3)
 
 
-@pytest.fixture
-def draw() -> Callable[..., StereoImages]:
-    """`draw(rig, drogue, left_from_drogue, rng, kind=..., hidden=..., extra_discs=...)`."""
-    return draw_pair
-
-
 # A quarter of the seed paper's pixels behind half its focal length, so that whole flights are quick to draw.
 FLIGHT_RIG = StereoRig(PinholeCamera(640, 480, 3200 / 3, 3200 / 3, 319.5, 239.5), 0.12)
 
 
-def fly_by(places: Sequence[RigidTransform | None], times_s: Sequence[float] | None = None) -> list[BlindPair]:
+def fly_past(places: Sequence[RigidTransform | None], times_s: Sequence[float] | None = None) -> list[BlindPair]:
     """Pairs of one drogue at these places, None where it is hidden; 25 a second unless told otherwise."""
     pairs = []
     for index, place in enumerate(places):
         drogue = None if place is None else PRESETS["red-8"]
-        anywhere = make_left_from_drogue(0, 0, 5) if place is None else place
-        images = draw_pair(FLIGHT_RIG, drogue, anywhere, np.random.default_rng([77, index]))
+        anywhere = make_pose(0, 0, 5) if place is None else place
+        images = paint_pair(FLIGHT_RIG, drogue, anywhere, np.random.default_rng([77, index]))
         time_s = index / 25 if times_s is None else times_s[index]
         pairs.append(BlindPair(index, replace(images, time_s=time_s), FLIGHT_RIG, PRESETS["red-8"]))
     return pairs
-
-
-@pytest.fixture(scope="session")
-def fly() -> Callable[..., list[BlindPair]]:
-    """`fly(left_from_drogue of each pair, times_s=None)`."""
-    return fly_by
 
 
 @dataclass(frozen=True)
@@ -210,7 +193,7 @@ def drogue_features(layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
     return centers, np.append(radii, [layout.hub_inner_radius_m, layout.hub_outer_radius_m])
 
 
-def draw_measurements(
+def draw_poses(
     rng: np.random.Generator,
     count: int,
     z_m: float | tuple[float, float],
@@ -228,16 +211,10 @@ def draw_measurements(
         depth = z_m if isinstance(z_m, float) else rng.uniform(*z_m)
         tilts = rng.uniform(*tilt_deg, 2) * rng.choice([-1, 1], 2)
         x, y = rng.uniform(-0.03, 0.03, 2) * depth
-        places.append(make_left_from_drogue(0.06 + x, y, depth, *tilts, rng.uniform(-22.5, 22.5)))
+        places.append(make_pose(0.06 + x, y, depth, *tilts, rng.uniform(-22.5, 22.5)))
         points, radii = drogue_features(layout)
         points = points * np.append(np.full(markers, 1 + ring_sigma_m / 0.28 * rng.standard_normal()), [1, 1])[:, None]
         exact.append([project_disc_centers(rig, places[-1], points, radii, eye) for eye in EYES])
     exact_px = np.array(exact)
     noise = sigma_px * rng.standard_normal(exact_px.shape)
     return Draws(rig, layout, sigma_px, places, exact_px, exact_px + noise)
-
-
-@pytest.fixture
-def draw_poses() -> Callable[..., Draws]:
-    """`draw_poses(rng, count, z_m, sigma_px, markers=8, tilt_deg=(0, 10), ring_sigma_m=0)`."""
-    return draw_measurements
