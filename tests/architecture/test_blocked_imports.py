@@ -65,7 +65,10 @@ def test_the_block_holds(package: str, tmp_path: Path) -> None:
                 "droguekit.cli.main",
             ),
         ),
-        (RENDERERS, ("labelgen.frame_labels", "labelgen.validation.dataset_checks", "labelgen.export.annotations.coco")),
+        (
+            RENDERERS,
+            ("labelgen.frame_labels", "labelgen.validation.dataset_checks", "labelgen.export.annotations.coco"),
+        ),
     ],
     ids=["navigation and benchmark", "labels"],
 )
