@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,7 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import disc_area_px2, disc_outline
 from geometry.se3 import RigidTransform, rotation_from_angles
-from geometry.stereo import EYES, paper_rig
+from geometry.stereo import EYES, Eye, paper_rig
 from labelgen.disc_images import hub_discs, marker_discs, window_around
 
 LAYOUT = marker_layout(PRESETS["red-8"])
@@ -15,7 +17,7 @@ RIG = paper_rig()
 
 
 @st.composite
-def poses(draw):
+def poses(draw: st.DrawFn) -> RigidTransform:
     angles = [draw(st.floats(-0.5, 0.5)), draw(st.floats(-0.5, 0.5)), draw(st.floats(-3, 3))]
     distance_m = draw(st.floats(1.7, 40))
     place = [draw(st.floats(-0.2, 0.2)) * distance_m, draw(st.floats(-0.15, 0.15)) * distance_m, distance_m]
@@ -23,7 +25,7 @@ def poses(draw):
 
 
 @given(poses(), st.sampled_from(EYES), st.integers(0, 7))
-def test_extent_holds_the_projected_outline_and_touches_it(pose, eye, index):
+def test_extent_holds_the_projected_outline_and_touches_it(pose: RigidTransform, eye: Eye, index: int) -> None:
     disc = marker_discs(LAYOUT, RIG, pose, eye)[index]
     outline = RIG.project(disc_outline(pose, LAYOUT.centers_m[index], LAYOUT.radius_m, 4096), eye)
     low, high = np.array(disc.extent_px()[:2]), np.array(disc.extent_px()[2:])
@@ -34,7 +36,7 @@ def test_extent_holds_the_projected_outline_and_touches_it(pose, eye, index):
 
 
 @given(poses(), st.sampled_from(EYES))
-def test_semi_axes_give_the_area(pose, eye):
+def test_semi_axes_give_the_area(pose: RigidTransform, eye: Eye) -> None:
     disc = marker_discs(LAYOUT, RIG, pose, eye)[3]
     longer, shorter = disc.semi_axes_px()
     assert longer >= shorter > 0
@@ -44,7 +46,7 @@ def test_semi_axes_give_the_area(pose, eye):
 
 
 @given(poses(), st.sampled_from(EYES))
-def test_rays_through_projected_points_meet_the_plane_in_them(pose, eye):
+def test_rays_through_projected_points_meet_the_plane_in_them(pose: RigidTransform, eye: Eye) -> None:
     outer, inner = hub_discs(LAYOUT, RIG, pose, eye)
     for disc in (outer, inner):
         edge_m = disc_outline(pose, LAYOUT.hub_center_m, disc.radius_m, 12)
@@ -53,7 +55,7 @@ def test_rays_through_projected_points_meet_the_plane_in_them(pose, eye):
         np.testing.assert_allclose(disc.plane_depth_m(pixels), edge_m[:, 2], rtol=1e-12)
 
 
-def test_windows_end_with_the_image():
+def test_windows_end_with_the_image() -> None:
     facing = RigidTransform(np.eye(3), np.array([0.06, 0.0, 3.0]))
     disc = marker_discs(LAYOUT, RIG, facing, "left")[0]
     window = window_around(disc, 1.0)

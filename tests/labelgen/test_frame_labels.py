@@ -1,8 +1,11 @@
+from __future__ import annotations
+
 import cv2
 import numpy as np
 import pytest
 
 from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.records import ViewRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parts import drogue_part_ids
@@ -10,16 +13,18 @@ from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
 from labelgen.part_pixels import drogue_box, drogue_hull_m, mask_box
+from render.engine import EyeRadiance
+from tests.support.drawn_pairs import Pair
 
 
-def views_of(pair):
+def views_of(pair: Pair) -> tuple[tuple[str, ViewRecord, EyeRadiance], tuple[str, ViewRecord, EyeRadiance]]:
     return (
         ("left", pair.record.views.left, pair.radiance.left),
         ("right", pair.record.views.right, pair.radiance.right),
     )
 
 
-def test_centers_are_what_opencv_projects(full_pairs):
+def test_centers_are_what_opencv_projects(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         layout, rig, pose = marker_layout(pair.frame.drogue), pair.frame.rig, pair.frame.left_from_drogue
         points = np.vstack([layout.centers_m, layout.hub_center_m])
@@ -36,7 +41,7 @@ def test_centers_are_what_opencv_projects(full_pairs):
             np.testing.assert_allclose(got, want[:, 0], atol=1e-9)
 
 
-def test_ellipse_centers_are_those_of_drawn_ellipses(full_pairs):
+def test_ellipse_centers_are_those_of_drawn_ellipses(full_pairs: list[Pair]) -> None:
     # OpenCV fits an ellipse through projected points of each circle, knowing nothing of dual conics.
     angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(90)], axis=-1)
@@ -56,7 +61,7 @@ def test_ellipse_centers_are_those_of_drawn_ellipses(full_pairs):
                 np.testing.assert_allclose(label, (u, v), atol=2e-3)
 
 
-def test_stereo_rows_agree_and_disparity_gives_the_depth(full_pairs):
+def test_stereo_rows_agree_and_disparity_gives_the_depth(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         rig, layout = pair.frame.rig, marker_layout(pair.frame.drogue)
         left = np.array([marker.center_proj_px for marker in pair.record.views.left.markers])
@@ -66,7 +71,7 @@ def test_stereo_rows_agree_and_disparity_gives_the_depth(full_pairs):
         np.testing.assert_allclose(rig.camera.fx_px * rig.baseline_m / (left - right)[:, 0], depth, rtol=1e-12)
 
 
-def test_unoccluded_markers_are_wholly_visible(full_pairs):
+def test_unoccluded_markers_are_wholly_visible(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         for _, view, _ in views_of(pair):
             assert [marker.visible_fraction for marker in view.markers] == [1.0] * 8
@@ -75,7 +80,7 @@ def test_unoccluded_markers_are_wholly_visible(full_pairs):
             assert view.hub.visible_fraction == 1.0
 
 
-def test_a_hidden_marker_is_counted(full_pairs):
+def test_a_hidden_marker_is_counted(full_pairs: list[Pair]) -> None:
     pair = full_pairs[0]
     frame, radiance = pair.frame, pair.radiance
     hidden = radiance.left.part_id.copy()
@@ -89,7 +94,7 @@ def test_a_hidden_marker_is_counted(full_pairs):
     assert record.views.right.markers[2].visible_fraction == 1.0
 
 
-def test_boxes(full_pairs):
+def test_boxes(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         for eye, view, seen in views_of(pair):
             vertices = np.concatenate([mesh.vertices for mesh in drogue_meshes(pair.frame.drogue).values()])
@@ -106,24 +111,24 @@ def test_boxes(full_pairs):
             assert not view.truncated
 
 
-def test_full_mask_has_the_full_frame_as_its_box():
+def test_full_mask_has_the_full_frame_as_its_box() -> None:
     assert mask_box(np.ones((960, 1280), dtype=bool)) == (-0.5, -0.5, 1280.0, 960.0)
     assert mask_box(np.zeros((960, 1280), dtype=bool)) is None
 
 
-def test_hull_is_made_once_for_each_drogue(full_pairs):
+def test_hull_is_made_once_for_each_drogue(full_pairs: list[Pair]) -> None:
     first = drogue_hull_m(full_pairs[0].frame.drogue)
     assert drogue_hull_m(full_pairs[1].frame.drogue) is first
     assert not first.flags.writeable
 
 
-def test_a_drogue_behind_the_camera_is_refused(full_pairs):
+def test_a_drogue_behind_the_camera_is_refused(full_pairs: list[Pair]) -> None:
     frame = full_pairs[0].frame
     with pytest.raises(ValueError, match="in front of the camera"):
         drogue_box(frame.drogue, frame.rig, RigidTransform(np.eye(3), np.array([0.0, 0.0, -0.2])), "left")
 
 
-def test_poses_follow_the_motion(full_pairs):
+def test_poses_follow_the_motion(full_pairs: list[Pair]) -> None:
     pair = full_pairs[0]
     velocity = np.array([0.3, -0.2, 0.1, 0.0, 0.0, 0.5])
     moving = pair.frame.model_copy(update={"drogue_twist_per_s": velocity})
@@ -137,7 +142,7 @@ def test_poses_follow_the_motion(full_pairs):
 
 
 @pytest.mark.parametrize("roll_deg", [-100.0, -22.5, -1e-300, 0.0, 10.0, 44.999, 45.0, 170.0])
-def test_roll_modulo_the_symmetry(full_pairs, roll_deg):
+def test_roll_modulo_the_symmetry(full_pairs: list[Pair], roll_deg: float) -> None:
     pair = full_pairs[0]
     turned = RigidTransform(
         rotation_from_angles(0.02, -0.03, np.radians(roll_deg)), pair.frame.left_from_drogue.translation_m
@@ -150,7 +155,7 @@ def test_roll_modulo_the_symmetry(full_pairs, roll_deg):
     assert record.roll_deg == pytest.approx(roll_deg, abs=1e-9)
 
 
-def test_empty_frames_have_no_labels(pairs):
+def test_empty_frames_have_no_labels(pairs: list[Pair]) -> None:
     for pair in pairs:
         if pair.frame.drogue is not None:
             continue
@@ -162,7 +167,7 @@ def test_empty_frames_have_no_labels(pairs):
             assert view.box_full_xywh_px is None and view.box_visible_xywh_px is None
 
 
-def test_conditions(full_pairs):
+def test_conditions(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         conditions = pair.record.conditions
         assert conditions.distance_m == pair.frame.left_from_drogue.translation_m[2]
@@ -170,7 +175,7 @@ def test_conditions(full_pairs):
         assert conditions.background_luminance_cd_m2 == pytest.approx(2000.0, rel=1e-6)
 
 
-def test_signal_to_noise_follows_shot_and_read_noise(full_pairs):
+def test_signal_to_noise_follows_shot_and_read_noise(full_pairs: list[Pair]) -> None:
     pair = full_pairs[-1]
     sensor = pair.frame.sensor
     per_level = sensor.electrons_per_cd_m2(pair.frame.exposure)
@@ -181,14 +186,14 @@ def test_signal_to_noise_follows_shot_and_read_noise(full_pairs):
         assert marker.signal_to_noise == pytest.approx(want, rel=1e-5)
 
 
-def test_other_images_are_refused(full_pairs):
+def test_other_images_are_refused(full_pairs: list[Pair]) -> None:
     pair = full_pairs[0]
     small = np.zeros((10, 10, 3), dtype=np.uint8)
     with pytest.raises(ValueError, match="images: must be"):
         label_frame(pair.frame, pair.radiance, StereoImages(small, small, pair.frame.time_s, 1e-3))
 
 
-def test_eyes_are_not_swapped(full_pairs):
+def test_eyes_are_not_swapped(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         for left, right in zip(*(getattr(pair.record.views, eye).markers for eye in EYES), strict=True):
             assert left.center_proj_px[0] > right.center_proj_px[0]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.types.frame import FrameSpec
+from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
@@ -14,7 +18,7 @@ from labelgen.validation.dataset_checks import validate_dataset
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.optics import light_on_sensor
 from render.camera.sensor import expose
-from render.engine import load_engine
+from render.engine import StereoRadiance, load_engine
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import RIG_320_PX, RecipeTable, build_recipe, recipe_text, stations
 from tests.support.small_datasets import rendered
@@ -30,19 +34,19 @@ BASE: RecipeTable = {
 
 
 @pytest.fixture(scope="module")
-def made():
+def made() -> tuple[FrameSpec, StereoRadiance, PairRecord]:
     recipe = build_recipe(BASE)
     frame = sample_frame(recipe, 0)
     radiance = load_engine("analytic").render(frame, recipe.render)
     return frame, radiance, label_frame(frame, radiance, expose(frame, radiance))
 
 
-def test_labels_and_passes_agree(made):
+def test_labels_and_passes_agree(made: tuple[FrameSpec, StereoRadiance, PairRecord]) -> None:
     _, radiance, record = made
     assert check_against_passes(record, radiance) == []
 
 
-def test_marker_centres_are_opencv_s(made):
+def test_marker_centres_are_opencv_s(made: tuple[FrameSpec, StereoRadiance, PairRecord]) -> None:
     frame, _, record = made
     layout = marker_layout(frame.drogue)
     for eye, view in zip(EYES, (record.views.left, record.views.right), strict=True):
@@ -58,7 +62,7 @@ def test_marker_centres_are_opencv_s(made):
         assert np.abs(got - frame.rig.project(frame.left_from_drogue.apply(layout.centers_m), eye)).max() > 1
 
 
-def test_light_stands_where_labels_say(made):
+def test_light_stands_where_labels_say(made: tuple[FrameSpec, StereoRadiance, PairRecord]) -> None:
     """Centre of gravity of each marker's light over the even face against `center_ellipse_px`."""
     _, radiance, record = made
     for seen, view in ((radiance.left, record.views.left), (radiance.right, record.views.right)):
@@ -73,7 +77,7 @@ def test_light_stands_where_labels_say(made):
             np.testing.assert_allclose(found, marker.center_ellipse_px, atol=1e-3)
 
 
-def test_vignetting_of_real_eyes_is_centred_on_their_axes(made):
+def test_vignetting_of_real_eyes_is_centred_on_their_axes(made: tuple[FrameSpec, StereoRadiance, PairRecord]) -> None:
     frame, radiance, _ = made
     plain = frame.model_copy(update={"sensor": frame.sensor.model_copy(update={"optics": type(frame.sensor.optics)()})})
     for eye, seen in zip(EYES, (radiance.left, radiance.right), strict=True):
@@ -86,7 +90,7 @@ def test_vignetting_of_real_eyes_is_centred_on_their_axes(made):
         assert abs(column - camera.cx_px) < 3 and abs(row - camera.cy_px) < 3
 
 
-def test_a_dataset_of_real_eyes_is_valid(tmp_path):
+def test_a_dataset_of_real_eyes_is_valid(tmp_path: Path) -> None:
     small = recipe_text(BASE, rig=RIG_320_PX | {"preset": "paper-real"})
     dataset = rendered(small, tmp_path / "set", range(2))
     assert validate_dataset(dataset).faults == []

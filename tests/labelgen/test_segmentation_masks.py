@@ -1,3 +1,7 @@
+from __future__ import annotations
+
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +13,8 @@ from drogue_models.marker_layout import marker_layout
 from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
-from geometry.stereo import EYES
-from labelgen.disc_images import marker_discs
+from geometry.stereo import EYES, Eye
+from labelgen.disc_images import DiscInEye, marker_discs
 from labelgen.export.annotations.mask_images import write_masks
 from labelgen.export.export_log import ExportLog
 from labelgen.frame_labels import label_frame
@@ -20,6 +24,7 @@ from render.analytic_engine.analytic_engine import AnalyticEngine
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
+from tests.support.drawn_pairs import Pair
 from tests.support.recipe_builder import RIG_160_PX, RecipeTable, Section, build_recipe, stations
 
 BASE: RecipeTable = {
@@ -40,7 +45,7 @@ def small_frame(
     return recipe, sample_frame(recipe, 0)
 
 
-def rays_that_meet(frame, eye, triangles):
+def rays_that_meet(frame: FrameSpec, eye: Eye, triangles: np.ndarray) -> np.ndarray:
     """(H, W) whether rays through pixel centres meet triangles, by Moeller and Trumbore's test of each with each."""
     camera = frame.rig.camera
     pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), -1)
@@ -57,7 +62,7 @@ def rays_that_meet(frame, eye, triangles):
 
 # The tanker leaves the image, and lenses bend its long edges by pixels.
 @pytest.mark.parametrize("eyes", [None, LENSES])
-def test_silhouettes_are_what_rays_meet(eyes):
+def test_silhouettes_are_what_rays_meet(eyes: dict[str, float] | None) -> None:
     _, frame = small_frame(eyes)
     parts = part_triangles(frame, "right")
     for part in (Part.CANOPY, Part.TANKER, FIRST_MARKER_ID):
@@ -67,7 +72,7 @@ def test_silhouettes_are_what_rays_meet(eyes):
         assert np.count_nonzero(found != want) <= 1
 
 
-def test_what_reaches_behind_the_camera_is_cut():
+def test_what_reaches_behind_the_camera_is_cut() -> None:
     _, frame = small_frame(LENSES)
     probe = Obstacle(
         kind="probe",
@@ -82,7 +87,7 @@ def test_what_reaches_behind_the_camera_is_cut():
     assert want.any() and np.count_nonzero(found != want) <= 1
 
 
-def test_amodal_masks_have_the_records_pixels(full_pairs):
+def test_amodal_masks_have_the_records_pixels(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         for eye in EYES:
             seen = getattr(pair.radiance, eye)
@@ -93,7 +98,7 @@ def test_amodal_masks_have_the_records_pixels(full_pairs):
 
 
 @pytest.mark.parametrize("eyes", [None, LENSES])
-def test_amodal_masks_of_flat_rings_have_the_engines_pixels(eyes):
+def test_amodal_masks_of_flat_rings_have_the_engines_pixels(eyes: dict[str, float] | None) -> None:
     recipe, frame = small_frame(eyes)
     radiance = AnalyticEngine().render(frame, recipe.render)
     record = label_frame(frame, radiance, expose(frame, radiance))
@@ -104,7 +109,7 @@ def test_amodal_masks_of_flat_rings_have_the_engines_pixels(eyes):
         assert counts | seen.amodal_px == counts and len(seen.amodal_px) == 9
 
 
-def test_masks_divide_the_image(full_pairs):
+def test_masks_divide_the_image(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         part_id = pair.radiance.left.part_id
         alone = amodal_masks(pair.record, "left", part_id)
@@ -119,7 +124,7 @@ def test_masks_divide_the_image(full_pairs):
         assert named["occluder"] == OCCLUDERS and {"rim", "canopy", "hub", "hose", "tanker", "marker_7"} <= set(named)
 
 
-def test_mask_files_are_read_by_opencv(small_dataset, full_pairs, tmp_path):
+def test_mask_files_are_read_by_opencv(small_dataset: Path, full_pairs: list[Pair], tmp_path: Path) -> None:
     write_masks(small_dataset, tmp_path / "masks", ExportLog())
     for pair in full_pairs:
         folder = tmp_path / "masks" / f"{pair.frame.frame_index:06d}"
@@ -130,7 +135,7 @@ def test_mask_files_are_read_by_opencv(small_dataset, full_pairs, tmp_path):
         assert not (folder / "left_occluder_visible.png").exists()
 
 
-def lattice_sd_px(disc):
+def lattice_sd_px(disc: DiscInEye) -> float:
     """Standard deviation of the number of pixel centres in an ellipse.
 
     Source: variance 0.0728 times the perimeter for an outline that lies anyhow on the lattice (Kendall 1948, "On the
@@ -141,7 +146,7 @@ def lattice_sd_px(disc):
     return np.sqrt(0.4577 / (2 * np.pi) * np.pi * (a + b) * (1 + 3 * h / (10 + np.sqrt(4 - 3 * h))))
 
 
-def supersampled_px(frame, disc, eye):
+def supersampled_px(frame: FrameSpec, disc: DiscInEye, eye: Eye) -> float:
     """Area of a marker's image by 16 x 16 rays a pixel, written apart from engines and labels. [px]"""
     camera = frame.rig.camera
     u_low, v_low, u_high, v_high = disc.extent_px()
@@ -155,7 +160,7 @@ def supersampled_px(frame, disc, eye):
     return np.count_nonzero(inside) / 256
 
 
-def test_pixel_centres_count_what_supersampling_counts():
+def test_pixel_centres_count_what_supersampling_counts() -> None:
     rig = {"width_px": 1280, "height_px": 960, "focal_px": 2133.0}
     recipe = build_recipe(BASE, rig=rig, frames={"count": 8}, distance=stations(4.0, 5.5, 7.0, 9.0))
     ratios = []
@@ -176,7 +181,7 @@ def test_pixel_centres_count_what_supersampling_counts():
 
 @pytest.mark.mitsuba
 @pytest.mark.parametrize("eyes", [None, LENSES])
-def test_silhouettes_are_the_path_tracer_s(eyes):
+def test_silhouettes_are_the_path_tracer_s(eyes: dict[str, float] | None) -> None:
     """Another program's rays through the same pixel centres: part ids, and what it counts of features alone."""
     recipe = build_recipe(BASE, rig={**RIG_160_PX, "eyes": eyes}, render={"engine": "mitsuba"})
     frame = sample_frame(recipe, 0)

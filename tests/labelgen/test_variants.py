@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from pycocotools.coco import COCO
 
@@ -23,15 +25,15 @@ TABLE = recipe_text(
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return rendered(TABLE, tmp_path_factory.mktemp("variants") / "set")
 
 
-def test_it_is_valid(dataset):
+def test_it_is_valid(dataset: Path) -> None:
     assert validate_dataset(dataset).faults == []
 
 
-def test_navigation_is_told_which_drogue_and_not_whether_it_is_there(dataset):
+def test_navigation_is_told_which_drogue_and_not_whether_it_is_there(dataset: Path) -> None:
     truth, blind = Dataset(dataset), BlindDataset(dataset)
     names = set()
     for index in truth.frame_indices:
@@ -42,7 +44,7 @@ def test_navigation_is_told_which_drogue_and_not_whether_it_is_there(dataset):
     assert any(truth.record(index).frame.drogue is None for index in truth.frame_indices)
 
 
-def test_other_software_reads_keypoints_of_all(dataset, capsys):
+def test_other_software_reads_keypoints_of_all(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     coco = COCO(str(dataset / "annotations" / "all.json"))
     capsys.readouterr()
     (category,) = coco.loadCats(coco.getCatIds())
@@ -54,7 +56,7 @@ def test_other_software_reads_keypoints_of_all(dataset, capsys):
     assert shown == {5, 8}
 
 
-def test_missing_markers_are_labelled_as_hidden(dataset):
+def test_missing_markers_are_labelled_as_hidden(dataset: Path) -> None:
     truth = Dataset(dataset)
     for index in truth.frame_indices:
         record = truth.record(index)

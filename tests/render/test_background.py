@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.types.environment import CloudLayer
+from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import RigidTransform
 from render.background import add_stars, background
 from scenes.environment_radiance import environment_radiance
@@ -12,14 +13,14 @@ from scenes.sky.photometry import luminance
 from tests.support.recipe_builder import paper_view_recipe
 
 
-def exact_rays(frame):
+def exact_rays(frame: FrameSpec) -> np.ndarray:
     camera = frame.rig.camera
     u, v = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     rays = frame.world_from_left.rotate(camera.rays(np.stack([u, v], axis=-1)))
     return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def test_background_is_the_surroundings_by_pixel():
+def test_background_is_the_surroundings_by_pixel() -> None:
     """The coarse grid of the clear sky against the sky evaluated at every pixel."""
     frame = sample_frame(paper_view_recipe(scale=0.5), 0)
     image = background(frame)
@@ -30,7 +31,7 @@ def test_background_is_the_surroundings_by_pixel():
     assert np.abs(image / expected - 1).mean() < 0.001
 
 
-def test_turning_camera_blurs_the_sky():
+def test_turning_camera_blurs_the_sky() -> None:
     frame = sample_frame(paper_view_recipe(scale=0.25), 0)
     frame = frame.model_copy(
         update={
@@ -45,7 +46,7 @@ def test_turning_camera_blurs_the_sky():
     assert abs(blurred.mean() / sharp.mean() - 1) < 0.02
 
 
-def test_the_sun_is_drawn_where_it_stands():
+def test_the_sun_is_drawn_where_it_stands() -> None:
     frame = sample_frame(paper_view_recipe(scale=1.0), 0)
     environment = frame.environment.model_copy(
         update={"sun_elevation_deg": 6.0, "sun_azimuth_deg": 4.0, "visibility_m": 4e5, "clouds": ()}
@@ -61,7 +62,7 @@ def test_the_sun_is_drawn_where_it_stands():
     assert abs(np.sqrt(4 * disc.sum() / np.pi) - 0.5332 * np.pi / 180 * 2133.33) < 1.0
 
 
-def test_stars_shine_with_all_their_light_and_stay_behind_clouds():
+def test_stars_shine_with_all_their_light_and_stay_behind_clouds() -> None:
     """Light of the picture with stars less that of the sky alone, over the pixels' solid angles, is theirs in lux."""
     frame = sample_frame(paper_view_recipe(scale=0.5), 0)
     environment = frame.environment.model_copy(update={"sun_elevation_deg": -40.0, "clouds": ()})
@@ -96,6 +97,6 @@ def test_stars_shine_with_all_their_light_and_stay_behind_clouds():
     assert covered.max() < 3 * np.median(covered) < luminance(stars).max()
 
 
-def world_from_camera_up():
+def world_from_camera_up() -> np.ndarray:
     """Camera axes that look at the zenith."""
     return np.eye(3)

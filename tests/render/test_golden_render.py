@@ -7,12 +7,14 @@ After a change that is meant to change radiance, make the stored file anew and l
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from geometry.stereo import EYES
-from render.engine import load_engine
+from render.engine import RenderEngine, load_engine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.render.golden_frame import GOLDEN, golden_recipe
@@ -23,7 +25,7 @@ RENDERS, MORE_RENDERS = 200, 60
 RENDER = {"edge_samples_per_px": 64, "denoise": False}
 
 
-def luminance(engine, index):
+def luminance(engine: RenderEngine, index: int) -> np.ndarray:
     """(2, H, W) luminance of both eyes by the samples of seed `index`."""
     recipe = golden_recipe(**RENDER)
     frame = sample_frame(recipe, 0).model_copy(update={"seed": index})
@@ -31,13 +33,13 @@ def luminance(engine, index):
     return np.stack([getattr(radiance, eye).radiance_cd_m2 @ REC709_LUMINANCE for eye in EYES])
 
 
-def stored_parts(engine):
+def stored_parts(engine: RenderEngine) -> np.ndarray:
     recipe = golden_recipe(**RENDER)
     radiance = engine.render(sample_frame(recipe, 0), recipe.render)
     return np.stack([getattr(radiance, eye).part_id for eye in EYES])
 
 
-def write_failure(folder, image, mean, z):
+def write_failure(folder: Path, image: np.ndarray, mean: np.ndarray, z: np.ndarray) -> Path:
     """The render, what was expected and z from -5 to 5, side by side for each eye."""
     peak = mean.max()
     rows = [np.hstack([image[i] / peak, mean[i] / peak, z[i] / 10 + 0.5]) for i in range(2)]
@@ -46,7 +48,7 @@ def write_failure(folder, image, mean, z):
     return path
 
 
-def test_render_is_a_draw_from_the_stored_distribution(engine, tmp_path):
+def test_render_is_a_draw_from_the_stored_distribution(engine: RenderEngine, tmp_path: Path) -> None:
     with np.load(GOLDEN) as stored:
         mean, variance, parts = stored["mean"].astype(float), stored["variance"].astype(float), stored["parts"]
         usual, scatter = stored["mean_square"]
@@ -72,13 +74,13 @@ def test_render_is_a_draw_from_the_stored_distribution(engine, tmp_path):
         assert abs(total) < 4, f"part {part}: {total:.1f} standard errors; {failed}"
 
 
-def mean_square(image, mean, variance):
+def mean_square(image: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
     """Mean square of z over the pixels that have noise worth the name, and how many those are."""
     noisy = variance > (1e-3 * mean) ** 2
     return np.mean((image - mean)[noisy] ** 2 / variance[noisy]), noisy.sum()
 
 
-def make_golden():
+def make_golden() -> None:
     """Mean and variance of many renders, each by other samples, and what mean square of z others have against them."""
     engine = load_engine("mitsuba")
     images = np.stack([luminance(engine, index) for index in range(RENDERS + MORE_RENDERS)])

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.environment import Environment, Mist
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
 from render.compositing import TracedEye
-from render.engine import load_engine
+from render.engine import RenderEngine, load_engine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
 from tests.support.recipe_builder import paper_view_recipe
@@ -20,7 +22,7 @@ VISIBILITY_M = 60.0
 DISTANCES_M = (5.0, 15.0, 30.0)
 
 
-def black_frame(distance_m):
+def black_frame(distance_m: float) -> tuple[Recipe, FrameSpec]:
     """A black drogue in dense mist, in one corner of the view."""
     recipe = paper_view_recipe(scale=0.25, stations_m=(distance_m,), samples=4)
     frame = sample_frame(recipe, 0)
@@ -37,7 +39,7 @@ def black_frame(distance_m):
     )
 
 
-def check(engine):
+def check(engine: RenderEngine) -> None:
     for distance_m in DISTANCES_M:
         recipe, frame = black_frame(distance_m)
         seen = engine.render(frame, recipe.render).left
@@ -53,16 +55,16 @@ def check(engine):
         assert contrast == pytest.approx(expected, rel=0.02)
 
 
-def test_contrast_falls_as_koschmieder_says_in_the_analytic_engine():
+def test_contrast_falls_as_koschmieder_says_in_the_analytic_engine() -> None:
     check(load_engine("analytic"))
 
 
 @pytest.mark.mitsuba
-def test_contrast_falls_as_koschmieder_says_in_mitsuba(engine):
+def test_contrast_falls_as_koschmieder_says_in_mitsuba(engine: RenderEngine) -> None:
     check(engine)
 
 
-def test_airlight_is_the_background_where_nothing_can_be_seen():
+def test_airlight_is_the_background_where_nothing_can_be_seen() -> None:
     """Endless air in front of things and the background behind them are one, in clear air and in mist."""
     from scenes.environment_radiance import EnvironmentRadiance
 
@@ -75,7 +77,7 @@ def test_airlight_is_the_background_where_nothing_can_be_seen():
         np.testing.assert_allclose(around.radiance(rays), around.airlight(rays), rtol=0.02)
 
 
-def test_a_pixel_is_as_hazy_alone_as_among_others():
+def test_a_pixel_is_as_hazy_alone_as_among_others() -> None:
     rng = np.random.default_rng(8)
     depth_m = np.where(rng.random((12, 9)) < 0.6, np.inf, rng.uniform(5, 40, (12, 9))).astype(np.float32)
     seen = TracedEye.untraced(part_id=depth_m > 0, depth_m=depth_m, normal=np.zeros((12, 9, 3)), amodal_px={})

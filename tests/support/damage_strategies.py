@@ -27,7 +27,7 @@ def fuzz(examples):
     )
 
 
-def quietly(action):
+def quietly(action) -> None:
     """Run what may fail by a clear error only."""
     try:
         action()
@@ -42,7 +42,7 @@ HOSTILE = st.sampled_from([None, *_NUMBERS, *_TEXTS, [], {}, [[]], [None] * 40, 
 
 
 @st.composite
-def byte_edits(draw):
+def byte_edits(draw: st.DrawFn):
     """A change of a file's bytes: cut, turn over, double, insert."""
     kind = draw(st.sampled_from(["cut", "flip", "insert", "double", "empty"]))
     place, length = draw(st.floats(0, 1, exclude_max=True)), draw(st.integers(1, 40))
@@ -63,7 +63,7 @@ def byte_edits(draw):
 
 
 @st.composite
-def json_edits(draw):
+def json_edits(draw: st.DrawFn):
     """A change of one value, deep in a JSON file, or of a key."""
     steps, value = draw(st.lists(st.integers(0, 10**6), min_size=1, max_size=9)), draw(HOSTILE)
     kind = draw(st.sampled_from(["replace", "delete", "add"]))

@@ -14,7 +14,7 @@ DUSK = PixelLight(60, 240, 4.8, 11_700 / 255 / 16, 0.5, 0.01)
 COUNT = 8
 
 
-def tilted_shape(radius_px, rng, ratio=0.97):
+def tilted_shape(radius_px: float, rng: np.random.Generator, ratio=0.97):
     angle = rng.uniform(0, np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return turn @ np.diag([radius_px, ratio * radius_px]) @ turn.T
@@ -32,7 +32,7 @@ def coverage(shape: np.ndarray, center: np.ndarray, grid: np.ndarray) -> np.ndar
     return outline_coverage(center + arms, tangents, grid, grid, 0.5)
 
 
-def expose(light, mean_e, rng):
+def expose(light, mean_e: float, rng: np.random.Generator):
     if rng is None:
         return (mean_e / light.step_e).astype(np.float32)
     gains = 1 + light.prnu_fraction * rng.standard_normal(mean_e.shape)
@@ -40,7 +40,7 @@ def expose(light, mean_e, rng):
     return np.round(electrons / light.step_e).astype(np.float32)
 
 
-def draw_discs(radius_px, light, rng, shading=0.0, noisy=True, spoil=None, difference=True):
+def draw_discs(radius_px: float, light, rng: np.random.Generator, shading=0.0, noisy=True, spoil=None, difference=True):
     """Signals of COUNT discs in each eye, and their true outlines; `spoil(light of one disc, x, y, number)`."""
     cell = int(2 * radius_px + 18)
     grid = np.arange(cell, dtype=np.float64)
@@ -62,12 +62,12 @@ def draw_discs(radius_px, light, rng, shading=0.0, noisy=True, spoil=None, diffe
     return signals, Ellipses(np.repeat([0, 1], COUNT), np.array(centers), np.array(shapes))
 
 
-def rough_start(truth, rng):
+def rough_start(truth, rng: np.random.Generator):
     """Circles of the right area, as far off as binary centroids are."""
     return circles(truth.eyes, truth.centers_px + rng.normal(0, 0.1, (len(truth), 2)), 1.02 * truth.radii_px)
 
 
-def fit_many(radius_px, light, rng, draws=8):
+def fit_many(radius_px: float, light, rng: np.random.Generator, draws=8):
     """Errors of the centres, their covariances, and errors of the radii, of all discs of some draws. [px]"""
     errors, covariances, radial = [], [], []
     for _ in range(draws):

@@ -8,15 +8,19 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
+from tests.support.drawn_pairs import Pair
 
 NAMES = ("coco", "yolo", "yolo-image-order", "yolo-detect", "speed", "kitti", "webdataset", "parquet", "blind")
 # Those that fill a folder of their own; the others replace single files.
@@ -49,14 +53,16 @@ def tree(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_has_a_writer_and_a_line(name):
+def test_every_format_has_a_writer_and_a_line(name: str) -> None:
     module, function = FORMATS[name].writer.split(":")
     assert callable(getattr(importlib.import_module(module), function))
     assert FORMATS[name].description and "\n" not in FORMATS[name].description
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_same_dataset_gives_the_same_bytes_and_stays_as_it_is(name, mixed_dataset, tmp_path):
+def test_the_same_dataset_gives_the_same_bytes_and_stays_as_it_is(
+    name: str, mixed_dataset: Path, tmp_path: Path
+) -> None:
     before = tree(mixed_dataset)
     for out in ("a", "b"):
         write_export(name, mixed_dataset, tmp_path / out, ExportLog())
@@ -66,7 +72,7 @@ def test_the_same_dataset_gives_the_same_bytes_and_stays_as_it_is(name, mixed_da
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_damaged_dataset_leaves_nothing_half_written(name, mixed_dataset, tmp_path):
+def test_a_damaged_dataset_leaves_nothing_half_written(name: str, mixed_dataset: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(mixed_dataset, tmp_path / "copy")
     last = max((copy / "frames").iterdir())
     (last / "record.json").write_bytes((last / "record.json").read_bytes()[:-100])
@@ -80,7 +86,7 @@ def test_a_damaged_dataset_leaves_nothing_half_written(name, mixed_dataset, tmp_
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_nothing_is_overwritten(name, mixed_dataset, tmp_path):
+def test_nothing_is_overwritten(name: str, mixed_dataset: Path, tmp_path: Path) -> None:
     kept = tmp_path / "kept.txt"
     kept.write_text("mine")
     with pytest.raises(ValueError, match="is not empty; name a new folder"):
@@ -89,7 +95,7 @@ def test_nothing_is_overwritten(name, mixed_dataset, tmp_path):
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_images_behind_links_are_refused(name, mixed_dataset, tmp_path):
+def test_images_behind_links_are_refused(name: str, mixed_dataset: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(mixed_dataset, tmp_path / "copy")
     secret = tmp_path / "secret.png"
     image = min((copy / "frames").iterdir()) / "left.png"
@@ -110,7 +116,9 @@ sys.exit(run(["export", sys.argv[1], "--format", sys.argv[2], "--out", sys.argv[
 
 
 @pytest.mark.parametrize("name", ["coco", "speed", "webdataset", "parquet"])
-def test_a_full_disk_is_one_line_and_leaves_nothing(name, dataset_by_preset, tmp_path):
+def test_a_full_disk_is_one_line_and_leaves_nothing(
+    name: str, dataset_by_preset: Callable[..., Any], tmp_path: Path
+) -> None:
     # Images of 12 bits are written anew instead of linked.
     dataset = dataset_by_preset("mono", {"output_bits": 12})
     command = [sys.executable, "-c", ON_A_FULL_DISK, str(dataset), name, str(tmp_path / "out")]
@@ -121,7 +129,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(name, dataset_by_preset, tmp
     assert [path for path in tmp_path.rglob("*") if path.is_file() or path.name.endswith(".part")] == []
 
 
-def test_unknown_formats_and_the_dataset_itself_are_refused(mixed_dataset, tmp_path):
+def test_unknown_formats_and_the_dataset_itself_are_refused(mixed_dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no format named 'voc'; there are coco"):
         write_export("voc", mixed_dataset, tmp_path, ExportLog())
     for inside in (mixed_dataset / "frames" / "..", mixed_dataset / "annotations"):
@@ -129,7 +137,9 @@ def test_unknown_formats_and_the_dataset_itself_are_refused(mixed_dataset, tmp_p
             write_export("coco", mixed_dataset, inside, ExportLog())
 
 
-def test_a_missing_package_is_named_with_its_extra(mixed_dataset, tmp_path, monkeypatch):
+def test_a_missing_package_is_named_with_its_extra(
+    mixed_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # None in sys.modules makes an import fail as a package does that is not installed.
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.delitem(sys.modules, "labelgen.export.packages.parquet", raising=False)
@@ -138,7 +148,7 @@ def test_a_missing_package_is_named_with_its_extra(mixed_dataset, tmp_path, monk
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_dataset_that_is_still_being_rendered_is_refused(name, small_recipe, tmp_path):
+def test_a_dataset_that_is_still_being_rendered_is_refused(name: str, small_recipe: Recipe, tmp_path: Path) -> None:
     dataset = tmp_path / "dataset"
     dataset.mkdir()
     write_manifest(
@@ -149,14 +159,14 @@ def test_a_dataset_that_is_still_being_rendered_is_refused(name, small_recipe, t
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_pair_is_counted(name, mixed_dataset, tmp_path):
+def test_every_pair_is_counted(name: str, mixed_dataset: Path, tmp_path: Path) -> None:
     steps = Steps()
     write_export(name, mixed_dataset, tmp_path / "out", ExportLog(steps))
     assert steps.told == [("pairs", 9), *[1] * 9, "end"]
 
 
 @pytest.mark.parametrize("name", ["coco", "yolo", "yolo-detect", "kitti"])
-def test_what_is_cut_off_is_told(name, mixed_dataset, tmp_path):
+def test_what_is_cut_off_is_told(name: str, mixed_dataset: Path, tmp_path: Path) -> None:
     log = ExportLog()
     write_export(name, mixed_dataset, tmp_path / "out", log)
     # One drogue is outside both images, one is cut off by either.
@@ -184,7 +194,9 @@ def contradict(table: dict, what: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_records_that_contradict_themselves_are_named(name, small_dataset, full_pairs, tmp_path):
+def test_records_that_contradict_themselves_are_named(
+    name: str, small_dataset: Path, full_pairs: list[Pair], tmp_path: Path
+) -> None:
     path = small_dataset / "frames" / f"{full_pairs[0].frame.frame_index:06d}" / "record.json"
     whole = path.read_text()
     for what in (
@@ -203,7 +215,7 @@ def test_records_that_contradict_themselves_are_named(name, small_dataset, full_
             write_export(name, small_dataset, tmp_path / "out", ExportLog())
 
 
-def test_part_ids_that_show_no_drogue_are_named(small_dataset, full_pairs, tmp_path):
+def test_part_ids_that_show_no_drogue_are_named(small_dataset: Path, full_pairs: list[Pair], tmp_path: Path) -> None:
     path = small_dataset / "frames" / f"{full_pairs[0].frame.frame_index:06d}" / "left_parts.png"
     path.write_bytes(encode_png(np.zeros((120, 160), np.uint8)))
     with pytest.raises(ValueError, match=r"left_parts\.png: no pixel shows the drogue"):

@@ -1,27 +1,34 @@
+from __future__ import annotations
+
 import json
 import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.manifest import build_manifest, read_manifest, with_build, write_manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import canonical_json
 from labelgen.validation.dataset_checks import validate_dataset
+from tests.support.drawn_pairs import Pair
 
 
-def folder_of(dataset, pair):
+def folder_of(dataset: Path, pair: Pair) -> Path:
     return frame_folder(dataset, pair.frame.frame_index)
 
 
-def faults_of(dataset):
+def faults_of(dataset: Path) -> list[str]:
     report = validate_dataset(dataset)
     assert not report.passed
     assert all("\n" not in fault for fault in report.faults)
     return report.faults
 
 
-def edit_record(dataset, pair, edit):
+def edit_record(dataset: Path, pair: Pair, edit: Callable[..., Any]) -> None:
     """Change a record's JSON and describe the dataset anew, so that only its contents are wrong."""
     path = folder_of(dataset, pair) / "record.json"
     table = json.loads(path.read_text())
@@ -32,7 +39,7 @@ def edit_record(dataset, pair, edit):
     write_manifest(dataset, build_manifest(dataset, manifest.recipe, "1", splits))
 
 
-def test_a_whole_dataset_passes(small_dataset, pairs, capfd):
+def test_a_whole_dataset_passes(small_dataset: Path, pairs: list[Pair], capfd: pytest.CaptureFixture[str]) -> None:
     report = validate_dataset(small_dataset)
     assert report.faults == [] and report.passed and report.pairs == len(pairs)
     counts = {check.name: check.count for check in report.checks}
@@ -41,12 +48,12 @@ def test_a_whole_dataset_passes(small_dataset, pairs, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_no_folder_is_an_error(tmp_path):
+def test_no_folder_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is no such dataset folder"):
         validate_dataset(tmp_path / "none")
 
 
-def test_a_truncated_manifest_is_a_fault(small_dataset):
+def test_a_truncated_manifest_is_a_fault(small_dataset: Path) -> None:
     path = small_dataset / "manifest.json"
     path.write_text(path.read_text()[:500])
     (fault,) = faults_of(small_dataset)
@@ -54,7 +61,9 @@ def test_a_truncated_manifest_is_a_fault(small_dataset):
 
 
 @pytest.mark.parametrize("name", ["left.png", "right_parts.png"])
-def test_truncated_images_are_faults(small_dataset, full_pairs, name, capfd):
+def test_truncated_images_are_faults(
+    small_dataset: Path, full_pairs: list[Pair], name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = folder_of(small_dataset, full_pairs[0]) / name
     path.write_bytes(path.read_bytes()[:-20])
     faults = faults_of(small_dataset)
@@ -63,7 +72,7 @@ def test_truncated_images_are_faults(small_dataset, full_pairs, name, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_changed_pixel_is_a_fault(small_dataset, full_pairs):
+def test_a_changed_pixel_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
     one, other = (folder_of(small_dataset, pair) / "left.png" for pair in full_pairs[:2])
     shutil.copy(other, one)
     (fault,) = faults_of(small_dataset)
@@ -71,14 +80,14 @@ def test_a_changed_pixel_is_a_fault(small_dataset, full_pairs):
 
 
 @pytest.mark.parametrize("damage", [lambda text: text[: len(text) // 2], lambda text: "[]", lambda text: "[" * 100_000])
-def test_a_damaged_record_is_a_fault(small_dataset, full_pairs, damage):
+def test_a_damaged_record_is_a_fault(small_dataset: Path, full_pairs: list[Pair], damage: Callable[..., Any]) -> None:
     path = folder_of(small_dataset, full_pairs[0]) / "record.json"
     path.write_text(damage(path.read_text()))
     (fault,) = faults_of(small_dataset)
     assert fault.startswith(f"{path}: ")
 
 
-def test_missing_and_stray_files_are_faults(small_dataset, full_pairs):
+def test_missing_and_stray_files_are_faults(small_dataset: Path, full_pairs: list[Pair]) -> None:
     shutil.rmtree(folder_of(small_dataset, full_pairs[0]))
     missing = folder_of(small_dataset, full_pairs[1]) / "right.png"
     missing.unlink()
@@ -98,8 +107,8 @@ def test_missing_and_stray_files_are_faults(small_dataset, full_pairs):
         assert wanted in faults
 
 
-def test_shifted_labels_are_faults(small_dataset, full_pairs):
-    def shift(table):
+def test_shifted_labels_are_faults(small_dataset: Path, full_pairs: list[Pair]) -> None:
+    def shift(table: dict[str, Any]) -> None:
         # As a renderer with its origin at the pixel corner would have it.
         for view in table["views"].values():
             for marker in view["markers"]:
@@ -113,16 +122,16 @@ def test_shifted_labels_are_faults(small_dataset, full_pairs):
     assert sum("keypoints: differ" in fault for fault in faults) == 2
 
 
-def test_rows_that_differ_between_the_eyes_are_a_fault(small_dataset, full_pairs):
-    def lower(table):
+def test_rows_that_differ_between_the_eyes_are_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
+    def lower(table: dict[str, Any]) -> None:
         table["views"]["right"]["markers"][0]["center_proj_px"][1] += 1e-7
 
     edit_record(small_dataset, full_pairs[0], lower)
     assert any("rows of left and right differ by 1e-07 px" in fault for fault in faults_of(small_dataset))
 
 
-def test_a_wrong_box_is_a_fault(small_dataset, full_pairs):
-    def widen(table):
+def test_a_wrong_box_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
+    def widen(table: dict[str, Any]) -> None:
         table["views"]["left"]["box_visible_xywh_px"][2] += 1
 
     edit_record(small_dataset, full_pairs[0], widen)
@@ -131,7 +140,7 @@ def test_a_wrong_box_is_a_fault(small_dataset, full_pairs):
     assert any("bbox: is" in fault for fault in faults)
 
 
-def test_a_scene_in_two_splits_is_a_fault(small_dataset, small_recipe):
+def test_a_scene_in_two_splits_is_a_fault(small_dataset: Path, small_recipe: Recipe) -> None:
     manifest = read_manifest(small_dataset)
     first = manifest.frames[0]
     moved = first.model_copy(update={"split": "val" if first.split == "train" else "train"})
@@ -141,7 +150,7 @@ def test_a_scene_in_two_splits_is_a_fault(small_dataset, small_recipe):
     assert any("is in more than one split" in fault for fault in faults_of(small_dataset))
 
 
-def test_annotations_that_disagree_are_faults(small_dataset):
+def test_annotations_that_disagree_are_faults(small_dataset: Path) -> None:
     annotations = small_dataset / "annotations"
     table = json.loads((annotations / "all.json").read_text())
     table["annotations"][0]["area"] += 1
@@ -164,7 +173,7 @@ def test_annotations_that_disagree_are_faults(small_dataset):
     assert f"{parts[1]}: is missing" in faults
 
 
-def test_a_path_out_of_the_frame_is_a_fault(small_dataset, full_pairs):
+def test_a_path_out_of_the_frame_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
     edit_record(
         small_dataset, full_pairs[0], lambda table: table["file_sha256"].update({"../../recipe.toml": "0" * 64})
     )

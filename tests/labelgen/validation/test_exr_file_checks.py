@@ -1,4 +1,9 @@
+from __future__ import annotations
+
 import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,17 +15,19 @@ from datasets_manifest.storage.manifest import Drop, build_manifest, read_manife
 from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
-from labelgen.validation.dataset_checks import validate_dataset
+from labelgen.validation.dataset_checks import ValidationReport, validate_dataset
+from render.engine import EyeRadiance
 from render.exr_writer import encode_passes
+from tests.support.drawn_pairs import Pair
 
 SPLITS = ("train", "val", "test")
 
 
 @pytest.fixture
-def with_passes(small_dataset, full_pairs):
+def with_passes(small_dataset: Path, full_pairs: list[Pair]) -> Callable[..., Any]:
     """Writes one pair again with EXR files that a test may have changed before, whole by all hashes."""
 
-    def write(change=lambda passes: passes):
+    def write(change: Callable[[Any], Any] = lambda passes: passes) -> Path:
         pair = full_pairs[0]
         seen = {eye: getattr(pair.radiance, eye) for eye in EYES}
         files = encode_files(pair.images, {eye: passes.part_id for eye, passes in seen.items()})
@@ -33,21 +40,21 @@ def with_passes(small_dataset, full_pairs):
     return write
 
 
-def describe(dataset, drops=()):
+def describe(dataset: Path, drops: Sequence[Drop] = ()) -> None:
     manifest = read_manifest(dataset)
     splits = {entry.scene_id: entry.split for entry in manifest.frames}
     write_manifest(dataset, build_manifest(dataset, manifest.recipe, "1", splits, drops))
 
 
-def changed(passes, **planes):
+def changed(passes: EyeRadiance, **planes: np.ndarray) -> EyeRadiance:
     return type(passes)(**{**vars(passes), **planes})
 
 
-def counts(report):
+def counts(report: ValidationReport) -> dict[str, int]:
     return {check.name: check.count for check in report.checks}
 
 
-def test_passes_that_agree_pass(with_passes):
+def test_passes_that_agree_pass(with_passes: Callable[..., Any]) -> None:
     report = validate_dataset(with_passes())
     assert report.faults == [] and counts(report)["depth and normals"] == 2
 
@@ -68,7 +75,9 @@ def test_passes_that_agree_pass(with_passes):
         ("radiance_cd_m2", lambda light: light * np.float32(np.nan), "must be finite"),
     ],
 )
-def test_passes_that_contradict_are_faults(with_passes, full_pairs, plane, change, message):
+def test_passes_that_contradict_are_faults(
+    with_passes: Callable[..., Any], full_pairs: list[Pair], plane: str, change: Callable[..., Any], message: str
+) -> None:
     dataset = with_passes(
         lambda passes: changed(passes, **{plane: change(getattr(passes, plane)).astype(getattr(passes, plane).dtype)})
     )
@@ -77,7 +86,7 @@ def test_passes_that_contradict_are_faults(with_passes, full_pairs, plane, chang
     assert any(message in fault for fault in faults)
 
 
-def test_a_damaged_pass_does_not_reach_the_decoder(with_passes, full_pairs):
+def test_a_damaged_pass_does_not_reach_the_decoder(with_passes: Callable[..., Any], full_pairs: list[Pair]) -> None:
     dataset = with_passes()
     path = frame_folder(dataset, full_pairs[0].frame.frame_index) / "left.exr"
     path.write_bytes(path.read_bytes()[:-50])
@@ -85,7 +94,7 @@ def test_a_damaged_pass_does_not_reach_the_decoder(with_passes, full_pairs):
     assert fault == f"{path}: was changed: its hash differs from the recorded one"
 
 
-def test_a_pass_of_another_size_is_refused(full_pairs):
+def test_a_pass_of_another_size_is_refused(full_pairs: list[Pair]) -> None:
     pair = full_pairs[0]
     data = encode_passes(pair.radiance.left)
     camera = pair.frame.rig.camera
@@ -98,7 +107,7 @@ def test_a_pass_of_another_size_is_refused(full_pairs):
             read_passes(wrong, "x", camera)
 
 
-def test_calibration_files_are_compared_with_the_rig(small_dataset):
+def test_calibration_files_are_compared_with_the_rig(small_dataset: Path) -> None:
     folder = small_dataset / "calibration"
     path = folder / "ros_right.yaml"
     path.write_text(path.read_text().replace("cols: 4", "cols: 3"))
@@ -113,7 +122,7 @@ def test_calibration_files_are_compared_with_the_rig(small_dataset):
     assert f"{folder / 'opencv_stereo.yaml'}: is missing" in validate_dataset(small_dataset).faults
 
 
-def test_drops_are_compared_with_the_frames(small_dataset):
+def test_drops_are_compared_with_the_frames(small_dataset: Path) -> None:
     describe(small_dataset, [Drop(frame_index=2, reason="tried"), Drop(frame_index=77, reason="tried")])
     faults = validate_dataset(small_dataset).faults
     assert faults == [
@@ -122,7 +131,7 @@ def test_drops_are_compared_with_the_frames(small_dataset):
     ]
 
 
-def test_a_center_outside_its_box_is_a_fault(small_dataset, full_pairs):
+def test_a_center_outside_its_box_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
     path = frame_folder(small_dataset, full_pairs[0].frame.frame_index) / "record.json"
     table = json.loads(path.read_text())
     table["views"]["left"]["box_full_xywh_px"][0] += table["views"]["left"]["box_full_xywh_px"][2] / 2
@@ -132,7 +141,7 @@ def test_a_center_outside_its_box_is_a_fault(small_dataset, full_pairs):
     assert sum("lies outside box_full_xywh_px" in fault for fault in faults) >= 3
 
 
-def test_a_record_of_another_rig_is_a_fault(small_dataset, full_pairs):
+def test_a_record_of_another_rig_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
     path = frame_folder(small_dataset, full_pairs[0].frame.frame_index) / "record.json"
     table = json.loads(path.read_text())
     table["frame"]["rig"]["baseline_m"] = 0.13

@@ -5,28 +5,32 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
 from scipy.special import j1
 
-from datasets_manifest.recipe.recipe import RecipeSource, load_recipe
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource, load_recipe
 from datasets_manifest.types.field_types import Range
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.marker_layout import marker_layout
+from drogue_models.parameters import HubParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
 from geometry.circles import disc_area_px2
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
-from labelgen.disc_images import hub_discs, marker_discs
+from labelgen.disc_images import DiscInEye, hub_discs, marker_discs
 from labelgen.frame_labels import label_frame
 from labelgen.validation.dataset_checks import validate_dataset
 from labelgen.validation.label_checks import check_against_passes
+from render.analytic_engine.analytic_engine import AnalyticEngine
 from render.analytic_engine.pixel_coverage import pixel_coverage
 from render.camera.sensor import expose
-from render.engine import load_engine
+from render.engine import RenderEngine, load_engine
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
@@ -40,22 +44,22 @@ PASSES = ("radiance_cd_m2", "coverage", "part_id", "depth_m", "normal")
 
 
 @pytest.fixture(scope="module")
-def analytic():
+def analytic() -> RenderEngine:
     return load_engine("analytic")
 
 
-def with_drogue(frame, **changes):
+def with_drogue(frame: FrameSpec, **changes: HubParameters | float | None) -> FrameSpec:
     return frame.model_copy(update={"drogue": frame.drogue.model_copy(update=changes)})
 
 
-def clear_fraction(frame, center_m):
+def clear_fraction(frame: FrameSpec, center_m: np.ndarray) -> float:
     """What the air lets through from a place of the drogue."""
     drogue_m = frame.left_from_drogue.translation_m
     slant = np.linalg.norm(drogue_m) / drogue_m[2]
     return np.exp(-frame.environment.extinction_per_m * slant * frame.left_from_drogue.apply(center_m)[2])
 
 
-def difference(analytic, recipe, bright, dark):
+def difference(analytic: AnalyticEngine, recipe: Recipe, bright: FrameSpec, dark: FrameSpec) -> dict[str, np.ndarray]:
     """Luminance of one frame less another's, by eye."""
     on, off = (analytic.render(frame, recipe.render) for frame in (bright, dark))
     return {
@@ -64,13 +68,13 @@ def difference(analytic, recipe, bright, dark):
     }
 
 
-def lamp_coverage(analytic, recipe, frame):
+def lamp_coverage(analytic: AnalyticEngine, recipe: Recipe, frame: FrameSpec) -> dict[str, np.ndarray]:
     """Coverage by all markers: the light of lamps alone over their luminance."""
     images = difference(analytic, recipe, with_drogue(frame, marker_luminance_cd_m2=LAMP_CD_M2), frame)
     return {eye: image / LAMP_CD_M2 for eye, image in images.items()}
 
 
-def lattice_centroid(disc):
+def lattice_centroid(disc: DiscInEye) -> tuple[np.ndarray, np.ndarray]:
     """Centroid of the box-averaged image of a disc on the pixel lattice; not quite the centre of its ellipse.
 
     Within a pixel on the edge the light does not lie in the middle. By Poisson's summation formula, along each axis
@@ -86,14 +90,14 @@ def lattice_centroid(disc):
     return center, center + terms.sum(axis=0)
 
 
-def window(disc, margin_px):
+def window(disc: DiscInEye, margin_px: float) -> tuple[slice, slice]:
     """Rows and columns of the pixels around a disc's image."""
     u_low, v_low, u_high, v_high = disc.extent_px()
     rows = slice(int(v_low - margin_px), int(v_high + margin_px) + 2)
     return rows, slice(int(u_low - margin_px), int(u_high + margin_px) + 2)
 
 
-def area_and_centroid(coverage, disc, margin_px=2.5):
+def area_and_centroid(coverage: np.ndarray, disc: DiscInEye, margin_px: float = 2.5) -> tuple[float, np.ndarray]:
     """Of what lies within `margin_px` of a disc's ellipse."""
     rows, columns = window(disc, margin_px)
     v, u = np.mgrid[rows, columns]
@@ -104,7 +108,7 @@ def area_and_centroid(coverage, disc, margin_px=2.5):
 
 
 @pytest.mark.parametrize("station", range(len(STATIONS_M)))
-def test_area_and_centroid_of_every_marker(analytic, station):
+def test_area_and_centroid_of_every_marker(analytic: AnalyticEngine, station: int) -> None:
     recipe = paper_view_recipe(stations_m=STATIONS_M)
     frame = sample_frame(recipe, station)
     layout = marker_layout(frame.drogue)
@@ -124,7 +128,7 @@ def test_area_and_centroid_of_every_marker(analytic, station):
             assert np.abs(centroid - ellipse).max() <= LATTICE_LAW * disc.semi_axes_px()[1] ** -1.5
 
 
-def test_both_edges_of_the_hub_have_their_own_centres(analytic):
+def test_both_edges_of_the_hub_have_their_own_centres(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(stations_m=(2.0,))
     tilted = RigidTransform(rotation_from_angles(0.15, -0.12, 0.1), np.array([0.05, 0.01, 2.1]))
     frame = sample_frame(recipe, 0).model_copy(update={"left_from_drogue": tilted})
@@ -146,7 +150,7 @@ def test_both_edges_of_the_hub_have_their_own_centres(analytic):
         assert np.hypot(*apart) > 0.1
 
 
-def test_coverage_is_the_area_cut_by_each_pixel():
+def test_coverage_is_the_area_cut_by_each_pixel() -> None:
     """Random polygons with a hole, partly beyond the image, against shapely's intersection with every pixel's box."""
     rng = np.random.default_rng(7)
     for _ in range(6):
@@ -164,7 +168,7 @@ def test_coverage_is_the_area_cut_by_each_pixel():
         np.testing.assert_allclose(got, want, atol=2e-9)
 
 
-def test_coverage_of_whole_pixels_and_of_nothing():
+def test_coverage_of_whole_pixels_and_of_nothing() -> None:
     covered = pixel_coverage([shapely.box(1.5, 0.5, 3.5, 2.5)], 8, 6)
     assert (covered.rows, covered.columns) == (slice(1, 3), slice(2, 4))
     assert np.array_equal(covered.share, np.ones((2, 2)))
@@ -172,7 +176,7 @@ def test_coverage_of_whole_pixels_and_of_nothing():
     assert pixel_coverage([shapely.box(-0.5, 1.0, -3.5, 2.0)], 8, 6) is None
 
 
-def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic):
+def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(stations_m=(2.5,))
     frame = sample_frame(recipe, 0)
     seen = analytic.render(frame, recipe.render).left
@@ -199,7 +203,7 @@ def test_parts_are_flat_and_shine_as_their_irradiance_says(analytic):
         np.testing.assert_allclose(values[0], want, rtol=1e-6)
 
 
-def test_coverage_and_surroundings_make_the_whole_image(analytic):
+def test_coverage_and_surroundings_make_the_whole_image(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     drawn = analytic.render(frame, recipe.render).right
@@ -217,7 +221,9 @@ def test_coverage_and_surroundings_make_the_whole_image(analytic):
 
 @pytest.mark.mitsuba
 @pytest.mark.parametrize("angles_rad", [(0.0, 0.0, 0.0), (0.15, -0.12, 0.3)])
-def test_part_ids_agree_with_the_path_traced_ones(analytic, engine, angles_rad):
+def test_part_ids_agree_with_the_path_traced_ones(
+    analytic: AnalyticEngine, engine: RenderEngine, angles_rad: tuple[float, ...]
+) -> None:
     recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,), samples=1)
     pose = RigidTransform(rotation_from_angles(*angles_rad), np.array([0.1, 0.05, 3.0]))
     frame = sample_frame(recipe, 0).model_copy(update={"left_from_drogue": pose})
@@ -240,7 +246,7 @@ def test_part_ids_agree_with_the_path_traced_ones(analytic, engine, angles_rad):
 
 
 @pytest.mark.parametrize("tilt_deg", [10.0, 40.0])
-def test_labels_stand_the_check(analytic, tilt_deg):
+def test_labels_stand_the_check(analytic: AnalyticEngine, tilt_deg: float) -> None:
     """Random frames of all distances; at 40 degrees the opening's edge cuts the hub."""
     tilt = Range(low=-tilt_deg, high=tilt_deg)
     recipe = paper_view_recipe(scale=0.5, stations_m=(1.7, 2.5, 5.0, 10.0, 40.0))
@@ -257,7 +263,7 @@ def test_labels_stand_the_check(analytic, tilt_deg):
     assert (min(hub_fractions) < 1) == (tilt_deg > 28)
 
 
-def test_drogue_without_a_hub(analytic):
+def test_drogue_without_a_hub(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,))
     frame = with_drogue(sample_frame(recipe, 0), hub=None)
     radiance = analytic.render(frame, recipe.render)
@@ -267,7 +273,7 @@ def test_drogue_without_a_hub(analytic):
     assert check_against_passes(record, radiance) == []
 
 
-def test_from_behind_a_flat_drogue_shows_its_back_only(analytic):
+def test_from_behind_a_flat_drogue_shows_its_back_only(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,))
     turned = RigidTransform(rotation_from_angles(0.1, np.pi - 0.2, 0.0), np.array([0.0, 0.0, 3.0]))
     frame = sample_frame(recipe, 0).model_copy(update={"left_from_drogue": turned})
@@ -279,7 +285,7 @@ def test_from_behind_a_flat_drogue_shows_its_back_only(analytic):
     assert check_against_passes(record, radiance) == []
 
 
-def test_drogue_beyond_the_image_and_behind_the_camera(analytic):
+def test_drogue_beyond_the_image_and_behind_the_camera(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     cut, gone, back = (
@@ -296,7 +302,7 @@ def test_drogue_beyond_the_image_and_behind_the_camera(analytic):
         analytic.render(back, recipe.render)
 
 
-def test_same_frame_same_bits(analytic):
+def test_same_frame_same_bits(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(scale=0.5, stations_m=(3.0, 5.0), speed_m_s=2.0, rate_deg_s=20.0)
     first = analytic.render(sample_frame(recipe, 0), recipe.render)
     analytic.render(sample_frame(recipe, 1), recipe.render)
@@ -306,7 +312,7 @@ def test_same_frame_same_bits(analytic):
             assert np.array_equal(getattr(getattr(first, eye), name), getattr(getattr(again, eye), name)), name
 
 
-def test_moving_drogue_is_blurred_around_its_middle(analytic):
+def test_moving_drogue_is_blurred_around_its_middle(analytic: AnalyticEngine) -> None:
     recipe = paper_view_recipe(stations_m=(5.0,))
     still = sample_frame(recipe, 0)
     still = still.model_copy(update={"exposure": still.exposure.model_copy(update={"time_s": 0.005})})
@@ -328,7 +334,7 @@ def test_moving_drogue_is_blurred_around_its_middle(analytic):
             assert widths[1] - widths[0] == pytest.approx(travel, abs=1.5)
 
 
-def test_dataset_is_made_and_valid(tmp_path):
+def test_dataset_is_made_and_valid(tmp_path: Path) -> None:
     source = load_recipe("smoke")
     recipe = source.recipe
     recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"engine": "analytic"})})
@@ -339,7 +345,7 @@ def test_dataset_is_made_and_valid(tmp_path):
     assert report.faults == []
 
 
-def test_works_without_mitsuba():
+def test_works_without_mitsuba() -> None:
     code = (
         "import sys; sys.modules['mitsuba'] = sys.modules['drjit'] = None\n"
         "from render.engine import load_engine\nprint(load_engine('analytic').name)"

@@ -1,21 +1,26 @@
 """Calibration boards: exact coverage, and calibrations with OpenCV that find the rig again."""
 
+from __future__ import annotations
+
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
-from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
+from datasets_manifest.recipe.recipe import Recipe, load_recipe, parse_recipe
 from datasets_manifest.storage.image_codecs import encode_png
 from datasets_manifest.types.appearance import CalibrationBoard
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
 from render.camera.sensor import expose
-from render.engine import load_engine
+from render.engine import StereoRadiance, load_engine
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import RIG_320_PX, RecipeTable, between, build_recipe
 
@@ -33,13 +38,13 @@ BASE: RecipeTable = {
 LENSES = {"k1": -0.2, "k2": 0.1, "p1": 0.001, "principal_point_px": 3.0, "right_rotation_deg": 0.3}
 
 
-def rendered(recipe, index):
+def rendered(recipe: Recipe, index: int) -> tuple[FrameSpec, StereoRadiance]:
     frame = sample_frame(recipe, index)
     return frame, load_engine("analytic").render(frame, recipe.render)
 
 
 @pytest.mark.parametrize("eyes", [None, LENSES])
-def test_every_pixel_has_the_mean_of_what_its_rays_see(eyes):
+def test_every_pixel_has_the_mean_of_what_its_rays_see(eyes: dict[str, float] | None) -> None:
     """Against 16 x 16 rays a pixel, written apart from the engine."""
     recipe = build_recipe(BASE, rig={"eyes": eyes})
     frame, radiance = rendered(recipe, 0)
@@ -61,7 +66,7 @@ def test_every_pixel_has_the_mean_of_what_its_rays_see(eyes):
             black = on_squares & ((column + row) % 2 == 0)
             on_plate = (np.abs(places[..., :2]) <= np.array(board.size_m) / 2).all(axis=-1)
 
-            def mean(mask):
+            def mean(mask: np.ndarray) -> np.ndarray:
                 return mask.reshape(17, 16, 17, 16).mean(axis=(1, 3))
 
             window = np.ix_(rows, columns)
@@ -77,7 +82,7 @@ def test_every_pixel_has_the_mean_of_what_its_rays_see(eyes):
             assert np.abs(centers - mean(on_plate)).max() <= 0.6
 
 
-def test_paper_and_ink_have_their_reflectance():
+def test_paper_and_ink_have_their_reflectance() -> None:
     recipe = build_recipe(BASE)
     _, radiance = rendered(recipe, 1)
     plate = radiance.left.radiance_cd_m2[radiance.left.coverage == 1]
@@ -87,7 +92,7 @@ def test_paper_and_ink_have_their_reflectance():
 
 
 @pytest.mark.parametrize("eyes", [None, LENSES])
-def test_depth_and_labels_are_those_of_the_plate(eyes):
+def test_depth_and_labels_are_those_of_the_plate(eyes: dict[str, float] | None) -> None:
     recipe = build_recipe(BASE, rig={"eyes": eyes})
     for index in range(recipe.frames.count):
         frame, radiance = rendered(recipe, index)
@@ -121,19 +126,19 @@ def test_boards_that_cannot_be_are_refused(changes: RecipeTable, message: str) -
         build_recipe(BASE, **changes)
 
 
-def test_other_datasets_know_nothing_of_boards():
+def test_other_datasets_know_nothing_of_boards() -> None:
     recipe = load_recipe("smoke").recipe
     assert "board" not in recipe.model_dump(mode="json")
     assert "board" not in sample_frame(recipe, 0).model_dump(mode="json")
 
 
-def test_a_board_looks_different_after_half_a_turn():
+def test_a_board_looks_different_after_half_a_turn() -> None:
     board = CalibrationBoard()
     assert board.corners_m().shape == ((board.columns - 1) * (board.rows - 1), 3)
     np.testing.assert_allclose(board.grid_m().mean(axis=(0, 1)), 0, atol=1e-12)
 
 
-def documented_calibration():
+def documented_calibration() -> Callable[..., Any]:
     (code,) = re.findall(r"^```python\n(.*?)^```$", DOC.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     namespace = {}
     exec(compile(code, DOC.name, "exec", dont_inherit=True), namespace)
@@ -142,7 +147,7 @@ def documented_calibration():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", ["paper-real", "rgb-ideal"])
-def test_a_calibration_finds_the_rig_again(rig, tmp_path):
+def test_a_calibration_finds_the_rig_again(rig: str, tmp_path: Path) -> None:
     """The documented code on the shipped recipe's pictures: OpenCV's finder, calibrations and rectification."""
     text = load_recipe("calibration-board").text
     recipe = parse_recipe(text.replace('rig = "paper-real"', f'rig = "{rig}"'))
@@ -172,7 +177,12 @@ def test_a_calibration_finds_the_rig_again(rig, tmp_path):
     assert np.abs(left[:, 0, 1] - right[:, 0, 1]).max() < 0.05
 
 
-def undistorted_rms_px(truth, number, found, exact):
+def undistorted_rms_px(
+    truth: dict[str, list[np.ndarray]],
+    number: str,
+    found: tuple[np.ndarray, np.ndarray],
+    exact: tuple[np.ndarray, np.ndarray],
+) -> float:
     """Root mean square distance of true corners undistorted by a calibration and by the truth, each its way."""
     points = np.concatenate(truth[EYES[int(number) - 1]])[:, None]
     ours, theirs = (cv2.undistortPoints(points, matrix, distortion, P=matrix) for matrix, distortion in (found, exact))

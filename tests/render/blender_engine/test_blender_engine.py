@@ -8,12 +8,16 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.appearance import Obstacle
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.marker_layout import marker_layout
 from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import SatinPaint
@@ -24,9 +28,13 @@ from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
+from render.engine import RenderEngine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.support.recipe_builder import paper_view_recipe
+
+if TYPE_CHECKING:
+    from render.blender_engine.blender_engine import BlenderEngine
 
 pytestmark = [
     pytest.mark.blender,
@@ -40,7 +48,7 @@ PASSES = ("radiance_cd_m2", "coverage", "part_id", "depth_m", "normal")
 
 
 @pytest.fixture(scope="module")
-def blender():
+def blender() -> Iterator[BlenderEngine]:
     # Not at the top: the test is collected where Blender is missing, too.
     from render.blender_engine.blender_engine import BlenderEngine
 
@@ -49,12 +57,12 @@ def blender():
     engine.close()
 
 
-def lit(frame, luminance_cd_m2):
+def lit(frame: FrameSpec, luminance_cd_m2: float) -> FrameSpec:
     drogue = frame.drogue.model_copy(update={"marker_luminance_cd_m2": luminance_cd_m2})
     return frame.model_copy(update={"drogue": drogue})
 
 
-def lamp_coverage(engine, frame, settings):
+def lamp_coverage(engine: RenderEngine, frame: FrameSpec, settings: RenderSettings) -> dict[str, np.ndarray]:
     """Coverage by the markers: light of the lamps alone over their luminance, by eye."""
     on, off = engine.render(lit(frame, LAMP_CD_M2), settings), engine.render(frame, settings)
     return {
@@ -63,7 +71,7 @@ def lamp_coverage(engine, frame, settings):
     }
 
 
-def moments(image, near_px, reach_px):
+def moments(image: np.ndarray, near_px: np.ndarray, reach_px: float) -> tuple[np.ndarray, float]:
     """Centroid, and area, of what lies within reach of a place."""
     u0, v0 = np.floor(near_px - reach_px).astype(int)
     u1, v1 = np.ceil(near_px + reach_px).astype(int) + 1
@@ -73,7 +81,7 @@ def moments(image, near_px, reach_px):
 
 
 @pytest.mark.slow
-def test_lit_markers_are_where_and_as_large_as_the_labels_say(blender):
+def test_lit_markers_are_where_and_as_large_as_the_labels_say(blender: BlenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.5, stations_m=(4.0, 8.0), samples=36)
     errors, areas = [], []
     for index in range(2):
@@ -99,7 +107,7 @@ def test_lit_markers_are_where_and_as_large_as_the_labels_say(blender):
     assert np.mean(areas) == pytest.approx(1.0, abs=0.006)
 
 
-def test_passes_of_pixel_centres(blender):
+def test_passes_of_pixel_centres(blender: BlenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(2.0,), samples=1)
     frame = sample_frame(recipe, 0)
     radiance = blender.render(frame, recipe.render)
@@ -123,7 +131,7 @@ def test_passes_of_pixel_centres(blender):
 
 
 @pytest.mark.mitsuba
-def test_both_path_tracers_agree(blender, engine):
+def test_both_path_tracers_agree(blender: BlenderEngine, engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(2.0,), samples=36)
     settings = recipe.render.model_copy(update={"surround_samples_per_px": 36})
     frame = sample_frame(recipe, 0)
@@ -144,7 +152,7 @@ def test_both_path_tracers_agree(blender, engine):
 
 
 @pytest.mark.mitsuba
-def test_rough_plastic_means_the_same_to_both(blender, engine):
+def test_rough_plastic_means_the_same_to_both(blender: BlenderEngine, engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(1.8,), samples=36)
     frame = sample_frame(recipe, 0)
     # The sun behind the cameras, so that the facets have something to mirror.
@@ -167,7 +175,7 @@ def test_rough_plastic_means_the_same_to_both(blender, engine):
         assert got > 1.3 * without, part.name
 
 
-def test_noise_is_what_two_renderings_by_other_samples_differ_by(blender):
+def test_noise_is_what_two_renderings_by_other_samples_differ_by(blender: BlenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,), samples=16)
     frame = sample_frame(recipe, 0)
     one, other = (blender.render(frame.model_copy(update={"seed": seed}), recipe.render) for seed in (1, 2))
@@ -185,7 +193,7 @@ def test_noise_is_what_two_renderings_by_other_samples_differ_by(blender):
 
 
 @pytest.mark.slow
-def test_same_frame_same_bits_whatever_came_before(blender):
+def test_same_frame_same_bits_whatever_came_before(blender: BlenderEngine) -> None:
     from render.blender_engine.blender_engine import BlenderEngine
 
     recipe = paper_view_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4, speed_m_s=2.0)
@@ -204,7 +212,7 @@ def test_same_frame_same_bits_whatever_came_before(blender):
 
 
 @pytest.mark.slow
-def test_moving_drogue_is_blurred_around_its_middle(blender):
+def test_moving_drogue_is_blurred_around_its_middle(blender: BlenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(3.0,), samples=36)
     frame = sample_frame(recipe, 0)
     still = frame.model_copy(update={"exposure": frame.exposure.model_copy(update={"time_s": 0.01})})
@@ -227,7 +235,7 @@ def test_moving_drogue_is_blurred_around_its_middle(blender):
     assert width[1] - width[0] == pytest.approx(2 * travel_px, abs=4)
 
 
-def test_frames_without_a_drogue(blender):
+def test_frames_without_a_drogue(blender: BlenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.125, stations_m=(5.0,), samples=4)
     frame = sample_frame(recipe, 0).model_copy(
         update={"drogue": None, "left_from_drogue": None, "left_from_tanker": None, "hose_nodes_left_m": None}
@@ -279,7 +287,7 @@ def _runs(pid: int) -> bool:
 
 
 @pytest.mark.slow
-def test_a_killed_blender_costs_one_try(blender):
+def test_a_killed_blender_costs_one_try(blender: BlenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.125, stations_m=(5.0,), samples=2)
     frame = sample_frame(recipe, 0)
     before = blender.render(frame, recipe.render)
@@ -288,14 +296,14 @@ def test_a_killed_blender_costs_one_try(blender):
     assert np.array_equal(before.left.radiance_cd_m2, after.left.radiance_cd_m2)
 
 
-def test_blender_rests_when_it_has_nothing_to_draw(blender):
+def test_blender_rests_when_it_has_nothing_to_draw(blender: BlenderEngine) -> None:
     """With one thread Cycles leaves one of TBB's awake, which takes a core for as long as the process lives."""
     recipe = paper_view_recipe(scale=0.125, stations_m=(5.0,), samples=2)
     blender.render(sample_frame(recipe, 0), recipe.render)
     tasks = [*Path(f"/proc/{blender._process._process.pid}/task").iterdir()]
     assert len(tasks) > 1
 
-    def awake():
+    def awake() -> bool:
         # State after the name, which stands in brackets and may hold anything.
         return any((task / "stat").read_text().rpartition(")")[2].split()[0] == "R" for task in tasks)
 

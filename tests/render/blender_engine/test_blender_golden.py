@@ -24,7 +24,7 @@ RENDERS = 8
 RENDER = {"engine": "blender", "samples_per_px": 16, "surround_samples_per_px": 16}
 
 
-def test_renders_scatter_around_the_other_path_tracer_s_mean():
+def test_renders_scatter_around_the_other_path_tracer_s_mean() -> None:
     from render.blender_engine.blender_engine import BlenderEngine
 
     with np.load(GOLDEN) as stored:

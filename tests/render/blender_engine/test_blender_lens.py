@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
+from typing import Any
 
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
 from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
+from render.engine import RenderEngine, StereoRadiance
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import build_recipe, stations
 
@@ -25,7 +29,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def made():
+def made() -> tuple[Recipe, FrameSpec, StereoRadiance]:
     from render.blender_engine.blender_engine import BlenderEngine
 
     recipe = build_recipe(
@@ -58,12 +62,12 @@ def made():
     return recipe, frame, radiance
 
 
-def test_labels_and_passes_agree(made):
+def test_labels_and_passes_agree(made: tuple[Recipe, FrameSpec, StereoRadiance]) -> None:
     _, frame, radiance = made
     assert check_against_passes(label_frame(frame, radiance, expose(frame, radiance)), radiance) == []
 
 
-def test_markers_are_where_the_lens_shows_them(made):
+def test_markers_are_where_the_lens_shows_them(made: tuple[Recipe, FrameSpec, StereoRadiance]) -> None:
     _, frame, radiance = made
     layout = marker_layout(frame.drogue)
     for eye in EYES:
@@ -79,7 +83,7 @@ def test_markers_are_where_the_lens_shows_them(made):
 
 
 @pytest.mark.mitsuba
-def test_both_path_tracers_agree(made, engine):
+def test_both_path_tracers_agree(made: Any, engine: RenderEngine) -> None:
     if engine.version.find("llvm") < 0:
         pytest.skip("the scalar variant draws ideal eyes only")
     recipe, frame, theirs = made

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.types.environment import CloudLayer
+from datasets_manifest.types.frame import FrameSpec
 from render.camera.optics import glare_spread_per_sr, sun_glare
 from render.engine import EyeRadiance
 from scenes.clouds.cloud_layers import opacity_towards
@@ -13,7 +14,7 @@ from scenes.sky.photometry import luminance
 from tests.support.recipe_builder import paper_view_recipe
 
 
-def with_sun(elevation_deg, azimuth_deg):
+def with_sun(elevation_deg: float, azimuth_deg: float) -> FrameSpec:
     frame = sample_frame(paper_view_recipe(scale=0.25), 0)
     environment = frame.environment.model_copy(
         update={"sun_elevation_deg": elevation_deg, "sun_azimuth_deg": azimuth_deg, "clouds": ()}
@@ -21,7 +22,7 @@ def with_sun(elevation_deg, azimuth_deg):
     return frame.model_copy(update={"environment": environment})
 
 
-def eye(frame, coverage=0.0):
+def eye(frame: FrameSpec, coverage: float = 0.0) -> EyeRadiance:
     shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)
     nothing = np.zeros((*shape, 3), dtype=np.float32)
     full = np.full(shape, coverage, dtype=np.float32)
@@ -36,7 +37,7 @@ def eye(frame, coverage=0.0):
 
 
 @pytest.mark.parametrize("fraction", [0.01, 0.1])
-def test_the_stated_share_of_the_light_is_scattered(fraction):
+def test_the_stated_share_of_the_light_is_scattered(fraction: float) -> None:
     """Integral of the spread over small angles up to a right angle, in closed form and by quadrature."""
     angle = np.geomspace(1e-5, np.pi / 2, 20_000)
     integrand = 2 * np.pi * angle * glare_spread_per_sr(angle.astype(np.float32), fraction)
@@ -44,7 +45,7 @@ def test_the_stated_share_of_the_light_is_scattered(fraction):
     assert total == pytest.approx(fraction, rel=0.01)  # quadrature in steps of 0.06 %, float32
 
 
-def test_a_fogged_lens_has_as_much_more_veil():
+def test_a_fogged_lens_has_as_much_more_veil() -> None:
     frame = with_sun(14.0, 0.0)
     optics = frame.sensor.optics.model_copy(update={"scattered_fraction": 0.1})
     fogged = frame.model_copy(update={"sensor": frame.sensor.model_copy(update={"optics": optics})})
@@ -52,7 +53,7 @@ def test_a_fogged_lens_has_as_much_more_veil():
     np.testing.assert_allclose(sun_glare(fogged, eye(fogged)), 10 * sun_glare(frame, eye(frame)), rtol=1e-5)
 
 
-def test_veil_falls_with_the_square_of_the_angle():
+def test_veil_falls_with_the_square_of_the_angle() -> None:
     frame = with_sun(14.0, 0.0)
     veil = luminance(sun_glare(frame, eye(frame)))
     camera = frame.rig.camera
@@ -68,7 +69,7 @@ def test_veil_falls_with_the_square_of_the_angle():
     assert 100 < np.median(veil) < 5000
 
 
-def test_no_veil_from_behind_at_night_or_from_a_hidden_sun():
+def test_no_veil_from_behind_at_night_or_from_a_hidden_sun() -> None:
     behind = with_sun(20.0, 180.0)
     assert sun_glare(behind, eye(behind)) is None
     night = with_sun(-30.0, 0.0)
@@ -78,7 +79,7 @@ def test_no_veil_from_behind_at_night_or_from_a_hidden_sun():
     assert sun_glare(inside, eye(inside, coverage=1.0)) is None
 
 
-def test_clouds_that_a_flying_camera_passes_take_the_glare():
+def test_clouds_that_a_flying_camera_passes_take_the_glare() -> None:
     frame = with_sun(20.0, 0.0)
     heap = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_size_m=900.0, optical_depth=3.0,
                       texture_seed=1, thickness_m=100.0)  # fmt: skip

@@ -6,35 +6,37 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import load_recipe
-from datasets_manifest.types.frame import Exposure, Optics
+from datasets_manifest.types.frame import Exposure, FrameSpec, Optics
 from geometry.pinhole import PinholeCamera
 from render.camera.optics import blur_circle_px, disc_kernel, light_on_sensor, transmission
 from render.camera.sensor import expose
-from render.engine import load_engine
+from render.engine import EyeRadiance, load_engine
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import build_recipe, paper_view_recipe, stations
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 
 
-def with_optics(frame, f_number=2.8, psf_sigma_px=0.0, **optics):
+def with_optics(
+    frame: FrameSpec, f_number: float = 2.8, psf_sigma_px: float = 0.0, **optics: bool | float
+) -> FrameSpec:
     sensor = frame.sensor.model_copy(update={"optics": Optics(**optics), "psf_sigma_px": psf_sigma_px})
     exposure = Exposure(time_s=1e-4, f_number=f_number)
     return frame.model_copy(update={"sensor": sensor, "exposure": exposure})
 
 
-def rendered(frame):
+def rendered(frame: FrameSpec) -> EyeRadiance:
     recipe = load_recipe("pose-tier-a").recipe
     return load_engine("analytic").render(frame, recipe.render).left
 
 
-def test_default_lens_is_perfect():
+def test_default_lens_is_perfect() -> None:
     frame = with_optics(sample_frame(paper_view_recipe(scale=0.25), 0))
     seen = rendered(frame)
     assert light_on_sensor(frame, seen, "left") is seen.radiance_cd_m2
 
 
-def test_natural_vignetting_is_cos4_of_the_ray():
+def test_natural_vignetting_is_cos4_of_the_ray() -> None:
     share = transmission(CAMERA, Optics(natural_vignetting=True))
     v, u = np.mgrid[:48, :64]
     rays = CAMERA.rays(np.stack([u, v], axis=-1))
@@ -42,7 +44,7 @@ def test_natural_vignetting_is_cos4_of_the_ray():
     np.testing.assert_allclose(share, cosine**4, rtol=1e-6)  # float32
 
 
-def test_mechanical_falloff_takes_its_share_in_the_corner_only():
+def test_mechanical_falloff_takes_its_share_in_the_corner_only() -> None:
     share = transmission(CAMERA, Optics(mechanical_falloff_fraction=0.3))
     assert share[0, 0] == pytest.approx(0.7, rel=1e-6)
     # Half a pixel from the axis; half way to the corner it takes a sixteenth.
@@ -50,7 +52,7 @@ def test_mechanical_falloff_takes_its_share_in_the_corner_only():
     assert share[12, 16] == pytest.approx(1 - 0.3 / 16, abs=3e-3)
 
 
-def test_vignetting_takes_electrons_and_their_noise():
+def test_vignetting_takes_electrons_and_their_noise() -> None:
     """Both ends of the chain: the corner's mean falls by the transmission."""
     frame = with_optics(sample_frame(paper_view_recipe(scale=0.25), 0), natural_vignetting=True)
     plain = with_optics(frame)
@@ -60,7 +62,7 @@ def test_vignetting_takes_electrons_and_their_noise():
 
 
 @pytest.mark.parametrize("diameter_px", [0.1, 0.4, 1.0, 2.44, 7.3, 31.0])
-def test_disc_kernel_has_the_disc_s_moments(diameter_px):
+def test_disc_kernel_has_the_disc_s_moments(diameter_px: float) -> None:
     kernel = disc_kernel(diameter_px)
     reach = kernel.shape[0] // 2
     x = np.arange(-reach, reach + 1)
@@ -71,7 +73,7 @@ def test_disc_kernel_has_the_disc_s_moments(diameter_px):
     np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
 
 
-def test_wide_disc_kernel_is_flat_with_a_hard_edge():
+def test_wide_disc_kernel_is_flat_with_a_hard_edge() -> None:
     kernel = disc_kernel(31.0)
     middle = kernel[
         kernel.shape[0] // 2 - 8 : kernel.shape[0] // 2 + 9, kernel.shape[0] // 2 - 8 : kernel.shape[0] // 2 + 9
@@ -81,7 +83,7 @@ def test_wide_disc_kernel_is_flat_with_a_hard_edge():
     assert middle.std() < 1e-6
 
 
-def test_blur_circle_follows_the_thin_lens():
+def test_blur_circle_follows_the_thin_lens() -> None:
     """Diameter against the image distances of the lens formula, worked out without the closed form."""
     frame = with_optics(sample_frame(paper_view_recipe(), 0), focus_distance_m=10.0)
     focal_px = frame.rig.camera.fx_px
@@ -98,7 +100,7 @@ def test_blur_circle_follows_the_thin_lens():
     assert blur_circle_px(closed, 2.0) == pytest.approx(blur_circle_px(frame, 2.0) / 2, rel=1e-12)
 
 
-def test_defocus_softens_the_target_and_keeps_its_light_and_place():
+def test_defocus_softens_the_target_and_keeps_its_light_and_place() -> None:
     frame = sample_frame(paper_view_recipe(scale=0.5, stations_m=(3.0,)), 0)
     near = with_optics(frame, f_number=0.5, focus_distance_m=30.0)
     sharp = with_optics(frame, f_number=0.5)
@@ -115,7 +117,7 @@ def test_defocus_softens_the_target_and_keeps_its_light_and_place():
     np.testing.assert_allclose(centers[0], centers[1], atol=0.3)
 
 
-def test_target_in_focus_before_a_soft_sky():
+def test_target_in_focus_before_a_soft_sky() -> None:
     frame = sample_frame(paper_view_recipe(scale=0.5, stations_m=(3.0,)), 0)
     focused = with_optics(frame, f_number=1.0, focus_distance_m=3.0)
     seen = rendered(focused)
@@ -125,13 +127,13 @@ def test_target_in_focus_before_a_soft_sky():
     np.testing.assert_allclose(image[inside], seen.radiance_cd_m2[inside], rtol=1e-5)
 
 
-def test_a_blur_without_end_is_refused():
+def test_a_blur_without_end_is_refused() -> None:
     frame = with_optics(sample_frame(paper_view_recipe(), 0), f_number=0.5, focus_distance_m=0.06)
     with pytest.raises(ValueError, match="focus_distance_m: gives a blur circle"):
         light_on_sensor(frame, rendered(with_optics(frame)), "left")
 
 
-def test_recipe_keys_reach_the_sensor():
+def test_recipe_keys_reach_the_sensor() -> None:
     optics = {"natural_vignetting": True, "mechanical_falloff_fraction": 0.2, "focus_distance_m": 12.0}
     recipe = build_recipe(
         name="lens", rig={"preset": "mono", "optics": optics}, frames={"count": 1}, distance=stations(5.0)

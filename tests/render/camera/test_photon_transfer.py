@@ -9,7 +9,7 @@ from datasets_manifest.types.frame import Exposure, FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID
 from drogue_models.presets import load_drogue
 from render.camera.sensor import dn_per_electron, expose
-from render.engine import EyeRadiance, StereoRadiance, load_engine
+from render.engine import EyeRadiance, RenderEngine, StereoRadiance, load_engine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.support.recipe_builder import paper_view_recipe
@@ -21,11 +21,13 @@ WITHIN = 0.03
 
 
 @pytest.fixture
-def frame():
+def frame() -> FrameSpec:
     return sample_frame(paper_view_recipe(scale=0.1), 0)
 
 
-def flat_numbers(frame: FrameSpec, electrons: float, gain: float, time_s: float, prnu_fraction=0.0):
+def flat_numbers(
+    frame: FrameSpec, electrons: float, gain: float, time_s: float, prnu_fraction: float = 0.0
+) -> np.ndarray:
     """(N, H, W, 3) signals above black of a flat field. [DN]"""
     exposure = Exposure(time_s=time_s, f_number=2.8, gain=gain)
     sensor = frame.sensor.model_copy(update={"output_bits": 12, "prnu_fraction": prnu_fraction})
@@ -58,7 +60,9 @@ def flat_numbers(frame: FrameSpec, electrons: float, gain: float, time_s: float,
 
 @pytest.mark.parametrize("gain", [1.0, 4.0, 16.0])
 @pytest.mark.parametrize("time_s", [5e-5, 1e-2])
-def test_slope_of_the_curve_is_the_gain_and_its_intercept_the_read_noise(frame, gain, time_s):
+def test_slope_of_the_curve_is_the_gain_and_its_intercept_the_read_noise(
+    frame: FrameSpec, gain: float, time_s: float
+) -> None:
     """Variance = K mean + (K read)^2 + 1/12: K by a line through several levels, read noise from the dark."""
     levels_e = np.array([30.0, 100.0, 300.0, 0.06 * 11_700]) / (1 if gain < 16 else 2)
     shots = [flat_numbers(frame, level, gain, time_s) for level in levels_e]
@@ -76,7 +80,7 @@ def test_slope_of_the_curve_is_the_gain_and_its_intercept_the_read_noise(frame, 
 
 
 @pytest.mark.parametrize("prnu_fraction", [0.01, 0.03])
-def test_gains_of_pixels_are_what_stays_in_the_mean_of_many_shots(frame, prnu_fraction):
+def test_gains_of_pixels_are_what_stays_in_the_mean_of_many_shots(frame: FrameSpec, prnu_fraction: float) -> None:
     electrons = 8000.0
     shots = flat_numbers(frame, electrons, 1.0, 1e-3, prnu_fraction)
     fixed = shots.mean(axis=0).var() - shots.var(axis=0, ddof=1).mean() / IMAGES
@@ -84,7 +88,7 @@ def test_gains_of_pixels_are_what_stays_in_the_mean_of_many_shots(frame, prnu_fr
     assert np.sqrt(fixed) / shots.mean() == pytest.approx(prnu_fraction, rel=WITHIN)
 
 
-def lit_electrons(frame, power=1.0, engine="analytic"):
+def lit_electrons(frame: FrameSpec, power: float = 1.0, engine: str = "analytic") -> float:
     """Mean electrons of the red channel in the cores of the lit markers, read off the images, and their luminance."""
     drogue = frame.drogue.model_copy(
         update={"marker_luminance_cd_m2": 2000.0 * power, "marker_emission_rgb": (1.0, 1.0, 1.0)}
@@ -110,7 +114,9 @@ def lit_electrons(frame, power=1.0, engine="analytic"):
     return (means[0] - means[1]) / dn_per_electron(frame.sensor, frame.exposure.gain)
 
 
-def lit_frame(time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0, scale=1.0):
+def lit_frame(
+    time_s: float = 2e-3, f_number: float = 2.8, distance_m: float = 3.0, gain: float = 1.0, scale: float = 1.0
+) -> FrameSpec:
     """A frame in thick dusk: what the sun lights is taken off again anyway."""
     frame = sample_frame(paper_view_recipe(scale=scale, stations_m=(distance_m,)), 0)
     assert frame.drogue is not None and load_drogue("red-8").marker_count == 8
@@ -133,7 +139,9 @@ def lit_frame(time_s=2e-3, f_number=2.8, distance_m=3.0, gain=1.0, scale=1.0):
         (1.0, 2e-3, 2.8, 3.0, 4.0),
     ],
 )
-def test_electrons_of_a_lit_marker(power, time_s, f_number, distance_m, gain):
+def test_electrons_of_a_lit_marker(
+    power: float, time_s: float, f_number: float, distance_m: float, gain: float
+) -> None:
     """L t q pi / (4 N^2) through the air of the distance; the luminance of an area does not fall with distance."""
     frame = lit_frame(time_s, f_number, distance_m, gain, scale=0.5)
     assert REC709_LUMINANCE.sum() == pytest.approx(1.0)
@@ -142,20 +150,22 @@ def test_electrons_of_a_lit_marker(power, time_s, f_number, distance_m, gain):
 
 @pytest.mark.mitsuba
 @pytest.mark.parametrize(("power", "f_number", "distance_m"), [(1.0, 2.8, 3.0), (3.0, 1.4, 1.7)])
-def test_electrons_of_a_lit_marker_by_path_tracing(engine, power, f_number, distance_m):
+def test_electrons_of_a_lit_marker_by_path_tracing(
+    engine: RenderEngine, power: float, f_number: float, distance_m: float
+) -> None:
     frame = lit_frame(f_number=f_number, distance_m=distance_m, scale=0.4)
     assert lit_electrons(frame, power, engine.name) == pytest.approx(
         expected_electrons(frame, power, distance_m), rel=WITHIN
     )
 
 
-def expected_electrons(frame, power, distance_m):
+def expected_electrons(frame: FrameSpec, power: float, distance_m: float) -> float:
     air, exposure = np.exp(-frame.environment.extinction_per_m * distance_m), frame.exposure
     lux_s = 2000.0 * power * air * np.pi / (4 * exposure.f_number**2) * exposure.time_s
     return lux_s * frame.sensor.responsivity_e_per_lux_s
 
 
-def test_light_of_a_whole_marker_falls_with_the_square_of_its_distance():
+def test_light_of_a_whole_marker_falls_with_the_square_of_its_distance() -> None:
     """Electrons summed over a marker and its blur, against its image's area."""
     from datasets_manifest.recipe.recipe import RenderSettings
 

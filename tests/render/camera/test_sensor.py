@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 from datasets_manifest.recipe.rigs import SENSORS
-from datasets_manifest.types.frame import Exposure
+from datasets_manifest.types.frame import Exposure, FrameSpec
 from render.camera.sensor import MONO_WEIGHTS, dn_per_electron, expose, normal_quantiles
 from render.engine import EyeRadiance, StereoRadiance
 from scenes.sampler import sample_frame
@@ -16,7 +16,7 @@ from tests.support.recipe_builder import paper_view_recipe
 SHAPE = (96, 128)
 
 
-def flat_pair(level_cd_m2, rgb=(1.0, 1.0, 1.0)):
+def flat_pair(level_cd_m2: float, rgb: tuple[float, ...] = (1.0, 1.0, 1.0)) -> StereoRadiance:
     radiance = np.full((*SHAPE, 3), level_cd_m2, dtype=np.float32) * np.array(rgb, dtype=np.float32)
     nothing = np.zeros(SHAPE, dtype=np.float32)
     eye = EyeRadiance(
@@ -38,21 +38,28 @@ def flat_pair(level_cd_m2, rgb=(1.0, 1.0, 1.0)):
 
 
 @pytest.fixture
-def frame():
+def frame() -> FrameSpec:
     return sample_frame(paper_view_recipe(scale=0.1), 0)
 
 
-def with_sensor(frame, name="rgb-ideal", seed=5, time_s=1e-3, gain=1.0, **changes):
+def with_sensor(
+    frame: FrameSpec,
+    name: str = "rgb-ideal",
+    seed: int = 5,
+    time_s: float = 1e-3,
+    gain: float = 1.0,
+    **changes: float | str,
+) -> FrameSpec:
     sensor = SENSORS[name].model_copy(update={"output_bits": 12, **changes})
     exposure = Exposure(time_s=time_s, f_number=2.8, gain=gain)
     return frame.model_copy(update={"sensor": sensor, "exposure": exposure, "seed": seed})
 
 
-def level_for(frame, electrons):
+def level_for(frame: FrameSpec, electrons: float) -> float:
     return electrons / frame.sensor.electrons_per_cd_m2(frame.exposure)
 
 
-def test_white_marker_at_50_klux_fills_7000_electrons_in_0_13_ms():
+def test_white_marker_at_50_klux_fills_7000_electrons_in_0_13_ms() -> None:
     """The specification's own example: white at 50 klux, f/2.8, 0.13 ms."""
     sensor = SENSORS["rgb-ideal"]
     luminance = 50_000 * 0.8 / np.pi
@@ -60,7 +67,7 @@ def test_white_marker_at_50_klux_fills_7000_electrons_in_0_13_ms():
     assert electrons == pytest.approx(7000, rel=0.01)
 
 
-def test_noise_is_normal_far_into_its_tails():
+def test_noise_is_normal_far_into_its_tails() -> None:
     """All sums of two quantiles together, so that nothing but the table is tested."""
     quantiles = np.sort(normal_quantiles().astype(np.float64))
     places = np.linspace(-4.5, 4.5, 91)
@@ -72,7 +79,7 @@ def test_noise_is_normal_far_into_its_tails():
     np.testing.assert_allclose(got[places <= -3.0], ndtr(places[places <= -3.0]), rtol=0.07)
 
 
-def test_noise_differs_from_site_to_site_and_does_not_hang_together(frame):
+def test_noise_differs_from_site_to_site_and_does_not_hang_together(frame: FrameSpec) -> None:
     """Each site has bits of its own: neighbours, and the halves of one draw of the generator, are uncorrelated."""
     frame = with_sensor(frame, prnu_fraction=0.0)
     numbers = expose(frame, flat_pair(level_for(frame, 2000))).left.astype(float).ravel()
@@ -82,7 +89,7 @@ def test_noise_differs_from_site_to_site_and_does_not_hang_together(frame):
 
 
 @pytest.mark.parametrize("electrons", [3.0, 20.0, 200.0, 2000.0, 8000.0])
-def test_photon_transfer_curve(frame, electrons):
+def test_photon_transfer_curve(frame: FrameSpec, electrons: float) -> None:
     """Variance = shot + read^2 + (PRNU mean)^2 + quantisation, in electrons; mean = light."""
     frame = with_sensor(frame)
     images = expose(frame, flat_pair(level_for(frame, electrons)))
@@ -100,20 +107,20 @@ def test_photon_transfer_curve(frame, electrons):
     assert got.var() == pytest.approx(expected, rel=4 * np.sqrt(2 / count) + 0.01)
 
 
-def test_read_noise_alone_in_the_dark(frame):
+def test_read_noise_alone_in_the_dark(frame: FrameSpec) -> None:
     frame = with_sensor(frame)
     images = expose(frame, flat_pair(0.0))
     assert images.left.mean() == pytest.approx(frame.sensor.black_level_dn, abs=0.1)
     assert images.left.min() > 0  # the black level keeps the noise from being cut off
 
 
-def test_full_well_clips(frame):
+def test_full_well_clips(frame: FrameSpec) -> None:
     frame = with_sensor(frame)
     images = expose(frame, flat_pair(level_for(frame, 3 * frame.sensor.full_well_e)))
     assert np.all(images.left == 4095)
 
 
-def test_gain_scales_numbers_not_electrons(frame):
+def test_gain_scales_numbers_not_electrons(frame: FrameSpec) -> None:
     one, two = with_sensor(frame, read_noise_e=0.0), with_sensor(frame, gain=2.0, read_noise_e=0.0)
     level = level_for(one, 2000)
     low, high = (expose(f, flat_pair(level)).left.astype(float) - 64 for f in (one, two))
@@ -121,7 +128,7 @@ def test_gain_scales_numbers_not_electrons(frame):
     assert np.abs(high - 2 * low).max() <= 1.5
 
 
-def test_gains_of_pixels_stay_from_frame_to_frame(frame):
+def test_gains_of_pixels_stay_from_frame_to_frame(frame: FrameSpec) -> None:
     frame = with_sensor(frame, read_noise_e=0.0)
     other = frame.model_copy(update={"frame_index": 1})
     pictures = [expose(f, flat_pair(level_for(f, 8000))).left.astype(float) for f in (frame, other)]
@@ -130,13 +137,13 @@ def test_gains_of_pixels_stay_from_frame_to_frame(frame):
     assert correlation == pytest.approx(0.444, abs=0.03)
 
 
-def test_eyes_have_their_own_noise(frame):
+def test_eyes_have_their_own_noise(frame: FrameSpec) -> None:
     images = expose(with_sensor(frame), flat_pair(1000.0))
     left, right = images.left.astype(float).ravel(), images.right.astype(float).ravel()
     assert abs(np.corrcoef(left, right)[0, 1]) < 4 / np.sqrt(left.size)
 
 
-def test_mosaic_takes_one_colour_a_site(frame):
+def test_mosaic_takes_one_colour_a_site(frame: FrameSpec) -> None:
     frame = with_sensor(frame, "paper-colour", read_noise_e=0.0, prnu_fraction=0.0)
     images = expose(frame, flat_pair(level_for(frame, 4000), rgb=(1.0, 0.5, 0.25)))
     mosaic = images.left_mosaic.astype(float) - 64
@@ -148,7 +155,7 @@ def test_mosaic_takes_one_colour_a_site(frame):
     np.testing.assert_allclose(means, np.array([4000, 2000, 1000]) * per_electron, rtol=0.02)
 
 
-def test_mono_weighs_the_bands(frame):
+def test_mono_weighs_the_bands(frame: FrameSpec) -> None:
     frame = with_sensor(frame, "mono", read_noise_e=0.0)
     images = expose(frame, flat_pair(level_for(frame, 4000), rgb=(1.0, 0.0, 0.0)))
     assert images.left.ndim == 2
@@ -157,7 +164,7 @@ def test_mono_weighs_the_bands(frame):
 
 
 @pytest.mark.parametrize("bits", [8, 12])
-def test_bits_and_gamma(frame, bits):
+def test_bits_and_gamma(frame: FrameSpec, bits: int) -> None:
     frame = with_sensor(frame, output_bits=bits, encoding="gamma", read_noise_e=0.0, prnu_fraction=0.0)
     signal = 0.18
     images = expose(frame, flat_pair(level_for(frame, signal * frame.sensor.full_well_e)))
@@ -166,7 +173,7 @@ def test_bits_and_gamma(frame, bits):
     assert images.left.mean() / (2**bits - 1) == pytest.approx(0.4614, rel=0.005)
 
 
-def test_same_frame_same_image(frame):
+def test_same_frame_same_image(frame: FrameSpec) -> None:
     frame = with_sensor(frame)
     first, again = (expose(frame, flat_pair(1000.0)) for _ in range(2))
     assert np.array_equal(first.left, again.left) and np.array_equal(first.right, again.right)
@@ -174,7 +181,7 @@ def test_same_frame_same_image(frame):
     assert not np.array_equal(first.left, other.left)
 
 
-def test_blur_keeps_light_and_place(frame):
+def test_blur_keeps_light_and_place(frame: FrameSpec) -> None:
     """A point of light keeps its sum and centroid and spreads by the stated variance."""
     from render.camera.optics import blur
 

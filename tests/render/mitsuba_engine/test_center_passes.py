@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import EYES
+from render.engine import RenderEngine
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import RIG_320_PX, RecipeTable, build_recipe, paper_view_recipe, stations
@@ -15,7 +20,7 @@ pytestmark = pytest.mark.mitsuba
 
 
 @pytest.fixture(scope="module")
-def scene_of(engine):
+def scene_of(engine: RenderEngine) -> Callable[[FrameSpec], Any]:
     from render.mitsuba_engine.scene import SceneCache
 
     scenes = SceneCache()
@@ -40,7 +45,9 @@ BYSTANDERS = {"probe": True, "obstacle_frame_fraction": 1, "distractor_frame_fra
     [{}, {"rig": {"eyes": LENSES}}, {"pose": MOVING}, {"target": BYSTANDERS}],
     ids=["ideal", "real lenses", "moving", "bystanders"],
 )
-def test_nothing_is_seen_where_no_ray_is_sent(scene_of, changes, monkeypatch):
+def test_nothing_is_seen_where_no_ray_is_sent(
+    scene_of: Callable[[FrameSpec], Any], changes: RecipeTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from render.mitsuba_engine.paths.center_passes import CenterPasses
 
     recipe = build_recipe(BASE, **changes)
@@ -60,7 +67,7 @@ def test_nothing_is_seen_where_no_ray_is_sent(scene_of, changes, monkeypatch):
                 assert np.count_nonzero(distance_m != all_m) <= 3
 
 
-def test_depths_are_those_of_the_plane_that_is_seen(engine):
+def test_depths_are_those_of_the_plane_that_is_seen(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(stations_m=(3.0, 11.0, 36.0), samples=1)
     # Depths are those of pixel centres, however few rays make the light.
     settings = recipe.render.model_copy(
@@ -78,7 +85,7 @@ def test_depths_are_those_of_the_plane_that_is_seen(engine):
         assert np.abs(seen.depth_m[rows, columns] - depth_m).max() < 4 * np.finfo(np.float32).eps * depth_m.max()
 
 
-def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of):
+def test_no_ray_passes_between_the_triangles_of_a_marker(scene_of: Callable[[FrameSpec], Any]) -> None:
     """Seen from inside, a marker is black: one such ray of four takes a quarter of a pixel's light away."""
     import drjit as dr
     import mitsuba as mi

@@ -6,9 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids
 from geometry.stereo import EYES
 from render.camera.optics import blur
+from render.engine import EyeRadiance, RenderEngine, StereoRadiance
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import build_recipe, paper_view_recipe, stations
 
@@ -16,7 +19,7 @@ pytestmark = pytest.mark.mitsuba
 
 
 @pytest.fixture(scope="module")
-def settled(engine):
+def settled(engine: RenderEngine) -> tuple[Recipe, FrameSpec, StereoRadiance]:
     """A frame at a third of the paper's scale, its recipe, and what many paths through every pixel make of it."""
     recipe = paper_view_recipe(scale=1 / 3, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
@@ -24,15 +27,15 @@ def settled(engine):
     return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
 
 
-def reseeded(frame, seed):
+def reseeded(frame: FrameSpec, seed: int) -> FrameSpec:
     return frame.model_copy(update={"seed": seed})
 
 
-def of_drogue(seen):
+def of_drogue(seen: EyeRadiance) -> np.ndarray:
     return np.isin(seen.part_id, drogue_part_ids(MAX_MARKERS))
 
 
-def over_sensor(frame, first, second):
+def over_sensor(frame: FrameSpec, first: StereoRadiance, second: StereoRadiance) -> float:
     """Rms difference of two renders over the sensor's noise on the drogue, both behind the lens."""
     sensor, per_cd_m2 = frame.sensor, frame.sensor.electrons_per_cd_m2(frame.exposure)
     squares, electrons = [], []
@@ -44,7 +47,9 @@ def over_sensor(frame, first, second):
     return np.sqrt(np.mean(np.concatenate(squares)) / (np.mean(np.concatenate(electrons)) + sensor.read_noise_e**2))
 
 
-def test_smoothing_brings_pictures_nearer_to_the_settled_one(engine, settled):
+def test_smoothing_brings_pictures_nearer_to_the_settled_one(
+    engine: RenderEngine, settled: tuple[Recipe, FrameSpec, StereoRadiance]
+) -> None:
     recipe, frame, truth = settled
     smoothed = engine.render(frame, recipe.render)
     # Edges take fewer rays than their number for a drogue that is all edges: here some 100.
@@ -54,7 +59,9 @@ def test_smoothing_brings_pictures_nearer_to_the_settled_one(engine, settled):
     assert error < over_sensor(frame, alone, truth)
 
 
-def test_stated_noise_is_that_of_two_pictures(engine, settled):
+def test_stated_noise_is_that_of_two_pictures(
+    engine: RenderEngine, settled: tuple[Recipe, FrameSpec, StereoRadiance]
+) -> None:
     recipe, frame, _ = settled
     first, second = (engine.render(reseeded(frame, seed), recipe.render) for seed in (1, 2))
     stated = np.mean([first.monte_carlo_over_sensor_noise, second.monte_carlo_over_sensor_noise])
@@ -64,7 +71,9 @@ def test_stated_noise_is_that_of_two_pictures(engine, settled):
 
 
 @pytest.mark.parametrize("part", [Part.FACE, Part.RIBS, Part.COUPLING, Part.HUB, FIRST_MARKER_ID])
-def test_smoothing_keeps_the_mean_light_of_parts(engine, settled, part):
+def test_smoothing_keeps_the_mean_light_of_parts(
+    engine: RenderEngine, settled: tuple[Recipe, FrameSpec, StereoRadiance], part: Part
+) -> None:
     recipe, frame, truth = settled
     smoothed = [engine.render(reseeded(frame, seed), recipe.render) for seed in (3, 4)]
     means = [
@@ -75,7 +84,7 @@ def test_smoothing_keeps_the_mean_light_of_parts(engine, settled, part):
     assert np.mean(means[:2]) == pytest.approx(means[2], rel=0.01 if part != Part.RIBS else 0.03)
 
 
-def test_smoothing_moves_no_marker(engine, settled):
+def test_smoothing_moves_no_marker(engine: RenderEngine, settled: tuple[Recipe, FrameSpec, StereoRadiance]) -> None:
     recipe, frame, truth = settled
     smoothed = engine.render(frame, recipe.render)
     shifts = [
@@ -86,7 +95,7 @@ def test_smoothing_moves_no_marker(engine, settled):
     assert np.mean(shifts) < 0.005
 
 
-def redness_centroid(seen, marker):
+def redness_centroid(seen: EyeRadiance, marker: int) -> np.ndarray:
     """Centroid of red over blue around a marker. [px]"""
     rows, columns = np.nonzero(seen.part_id == marker)
     window = np.s_[rows.min() - 3 : rows.max() + 4, columns.min() - 3 : columns.max() + 4]
@@ -99,7 +108,7 @@ def redness_centroid(seen, marker):
 
 
 @pytest.fixture(scope="module")
-def below_the_wing(engine):
+def below_the_wing(engine: RenderEngine) -> tuple[Recipe, FrameSpec, StereoRadiance]:
     """A frame that shows pod and wing, its recipe, and what many paths through every pixel make of it."""
     recipe = paper_view_recipe(scale=1 / 3, stations_m=(12.0,))
     frame = next(frame for index in range(50) if shows_the_tanker(frame := sample_frame(recipe, index)))
@@ -107,20 +116,22 @@ def below_the_wing(engine):
     return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
 
 
-def shows_the_tanker(frame):
+def shows_the_tanker(frame: FrameSpec) -> bool:
     """Whether the hose leaves the pod well within the left image."""
     camera, origin = frame.rig.camera, frame.left_from_tanker.translation_m
     u, v = origin[:2] / origin[2] * camera.fx_px + (camera.cx_px, camera.cy_px)
     return 60 < u < camera.width_px - 60 and 60 < v < camera.height_px - 60
 
 
-def on_the_tanker(seen):
+def on_the_tanker(seen: EyeRadiance) -> np.ndarray:
     """(P, 3) light of pixels on pod and wing away from their outlines. [cd/m2]"""
     inside = cv2.erode((seen.part_id == Part.TANKER).astype(np.uint8), np.ones((3, 3), dtype=np.uint8)) > 0
     return seen.radiance_cd_m2[inside]
 
 
-def test_smoothing_leaves_no_speckles_on_the_tanker(engine, below_the_wing):
+def test_smoothing_leaves_no_speckles_on_the_tanker(
+    engine: RenderEngine, below_the_wing: tuple[Recipe, FrameSpec, StereoRadiance]
+) -> None:
     recipe, frame, truth = below_the_wing
     settled = on_the_tanker(truth.left)
     assert len(settled) > 2000
@@ -136,7 +147,7 @@ def test_smoothing_leaves_no_speckles_on_the_tanker(engine, below_the_wing):
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_a_probe_beside_the_drogue_brings_no_noise(engine, index):
+def test_a_probe_beside_the_drogue_brings_no_noise(engine: RenderEngine, index: int) -> None:
     """It stands close before markers and face, whose light from others is next to nothing elsewhere."""
     recipe = build_recipe(
         name="probe",

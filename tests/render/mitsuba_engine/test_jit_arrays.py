@@ -42,7 +42,7 @@ assert tensor.shape == (count, 1) and (tensor[:, 0] == array).all()
 
 
 @pytest.mark.parametrize("count", [1, 17, 1000])
-def test_kernels_do_not_read_beyond_what_numpy_owns(count):
+def test_kernels_do_not_read_beyond_what_numpy_owns(count: int) -> None:
     command = [sys.executable, "-c", SCRIPT, str(count)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     if done.returncode == 77:

@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
+from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import RigidTransform
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import paper_view_recipe
 
+if TYPE_CHECKING:
+    from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
+
 
 @pytest.fixture
-def kernels(engine):
+def kernels(engine: MitsubaEngine) -> Iterator[Callable[[FrameSpec, RenderSettings], set[str]]]:
     """A function that renders a frame and returns the hashes of the kernels that it took."""
     import drjit as dr
 
     if engine.variant.variant == "scalar_rgb":
         pytest.skip("the scalar variant compiles nothing")
 
-    def of(frame, settings) -> set[str]:
+    def of(frame: FrameSpec, settings: RenderSettings) -> set[str]:
         dr.kernel_history_clear()
         engine.render(frame, settings)
         return {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
@@ -31,13 +39,15 @@ def kernels(engine):
     dr.kernel_history_clear()
 
 
-def without_marker(frame, missing, moved_m):
+def without_marker(frame: FrameSpec, missing: int, moved_m: np.ndarray) -> FrameSpec:
     markers = tuple(SurfaceCondition(missing=index == missing) for index in range(frame.drogue.marker_count))
     pose = RigidTransform(frame.left_from_drogue.rotation, frame.left_from_drogue.translation_m + moved_m)
     return frame.model_copy(update={"condition": DrogueCondition(markers=markers), "left_from_drogue": pose})
 
 
-def test_new_scenes_and_other_pixels_take_the_same_kernels(kernels):
+def test_new_scenes_and_other_pixels_take_the_same_kernels(
+    kernels: Callable[[FrameSpec, RenderSettings], set[str]],
+) -> None:
     from render.mitsuba_engine.scene import KEPT_SCENES
 
     recipe = paper_view_recipe(scale=0.25, stations_m=(4.0,), samples=16)

@@ -9,6 +9,7 @@ import pytest
 from drogue_models.parameters import DrogueParameters, HubParameters
 from drogue_models.parts import Part
 from geometry.se3 import RigidTransform
+from render.engine import RenderEngine
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import luminance
@@ -20,7 +21,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize("sun_azimuth_deg", [0.0, 100.0, 180.0, 250.0])
-def test_white_face_shines_as_its_irradiance_says(engine, sun_azimuth_deg):
+def test_white_face_shines_as_its_irradiance_says(engine: RenderEngine, sun_azimuth_deg: float) -> None:
     """A white face sends back E / pi, with E integrated over the surroundings in numpy; nothing shades the face."""
     recipe = paper_view_recipe(scale=0.25, stations_m=(4.0,), samples=256)
     frame = sample_frame(recipe, 0)
@@ -41,7 +42,7 @@ def test_white_face_shines_as_its_irradiance_says(engine, sun_azimuth_deg):
     assert got == pytest.approx(float(expected), rel=0.015)
 
 
-def test_nothing_shadows_the_markers(engine):
+def test_nothing_shadows_the_markers(engine: RenderEngine) -> None:
     """With the sun behind the receiver every marker is evenly lit: no shadow edge of rim or rib lies on it."""
     recipe = paper_view_recipe(scale=0.25, stations_m=(2.0,), samples=256)
     frame = sample_frame(recipe, 0)

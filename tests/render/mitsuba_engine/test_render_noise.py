@@ -7,6 +7,7 @@ import pytest
 
 from drogue_models.parts import MAX_MARKERS, drogue_part_ids
 from geometry.stereo import EYES
+from render.engine import RenderEngine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.support.recipe_builder import paper_view_recipe
@@ -17,7 +18,7 @@ UNREACHABLE = {"noise_over_sensor": 1e-3}
 """An aim for which all samples that are allowed are taken."""
 
 
-def test_stated_noise_is_the_difference_of_two_renders(engine):
+def test_stated_noise_is_the_difference_of_two_renders(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.35, stations_m=(2.0,))
     frame = sample_frame(recipe, 0)
     first, second = (engine.render(frame.model_copy(update={"seed": seed}), recipe.render) for seed in (1, 2))
@@ -33,7 +34,7 @@ def test_stated_noise_is_the_difference_of_two_renders(engine):
     assert stated == pytest.approx(measured, rel=0.25)
 
 
-def test_more_samples_leave_less_noise(engine):
+def test_more_samples_leave_less_noise(engine: RenderEngine) -> None:
     frame_recipe = paper_view_recipe(scale=0.25, stations_m=(2.5,))
     frame = sample_frame(frame_recipe, 0)
     few_samples, many_samples = (
@@ -52,7 +53,7 @@ def test_more_samples_leave_less_noise(engine):
     )
 
 
-def test_edges_take_no_more_rays_than_the_aim_needs(engine):
+def test_edges_take_no_more_rays_than_the_aim_needs(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.35, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     plenty = recipe.render.model_copy(update={"edge_samples_per_px": 2048})
@@ -64,7 +65,7 @@ def test_edges_take_no_more_rays_than_the_aim_needs(engine):
         assert stated == pytest.approx(aim, rel=0.25)
 
 
-def test_more_light_takes_more_rays(engine):
+def test_more_light_takes_more_rays(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.35, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
     plenty = recipe.render.model_copy(update={"edge_samples_per_px": 2048, "noise_over_sensor": 0.7})

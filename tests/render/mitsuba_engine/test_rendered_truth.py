@@ -6,11 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import load_recipe
+from datasets_manifest.recipe.recipe import RenderSettings, load_recipe
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.stereo import EYES
 from labelgen.disc_images import marker_discs
+from render.engine import RenderEngine
 from scenes.sampler import sample_frame
 from scenes.sky.photometry import REC709_LUMINANCE
 from tests.support.recipe_builder import paper_view_recipe
@@ -21,12 +23,12 @@ pytestmark = pytest.mark.mitsuba
 LAMP_CD_M2 = 1e6
 
 
-def lit(frame, luminance_cd_m2):
+def lit(frame: FrameSpec, luminance_cd_m2: float) -> FrameSpec:
     drogue = frame.drogue.model_copy(update={"marker_luminance_cd_m2": luminance_cd_m2})
     return frame.model_copy(update={"drogue": drogue})
 
 
-def emission_images(engine, frame, settings):
+def emission_images(engine: RenderEngine, frame: FrameSpec, settings: RenderSettings) -> dict[str, np.ndarray]:
     """Light of the lamps alone: the same frame with lamps minus without."""
     on, off = engine.render(lit(frame, LAMP_CD_M2), settings), engine.render(frame, settings)
     return {
@@ -34,7 +36,7 @@ def emission_images(engine, frame, settings):
     }
 
 
-def centroid_and_area(image, center_px, radius_px):
+def centroid_and_area(image: np.ndarray, center_px: np.ndarray, radius_px: float) -> tuple[np.ndarray, float]:
     """Weighted centroid and area within a window that reaches 2.5 px beyond the disc."""
     reach = radius_px + 2.5
     u0, v0 = np.floor(center_px - reach).astype(int)
@@ -44,7 +46,7 @@ def centroid_and_area(image, center_px, radius_px):
     return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum(), weight.sum()
 
 
-def test_centroids_of_lit_markers_are_the_ellipse_centres(engine):
+def test_centroids_of_lit_markers_are_the_ellipse_centres(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(stations_m=(2.0, 5.0, 10.0, 20.0, 40.0), samples=1)
     settings = recipe.render.model_copy(update={"edge_samples_per_px": 64})
     errors, area_ratios = [], []
@@ -70,7 +72,7 @@ def test_centroids_of_lit_markers_are_the_ellipse_centres(engine):
     assert np.mean(area_ratios) == pytest.approx(1.0, abs=0.004)
 
 
-def test_opencv_predicts_the_same_places():
+def test_opencv_predicts_the_same_places() -> None:
     """The 3-D centres that labels project, projected by cv2.projectPoints, in both eyes."""
     recipe = paper_view_recipe(stations_m=(2.0, 10.0, 40.0))
     for index in range(3):
@@ -87,7 +89,7 @@ def test_opencv_predicts_the_same_places():
             np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-9)
 
 
-def test_passes_of_pixel_centres(engine):
+def test_passes_of_pixel_centres(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.5, stations_m=(3.0,), samples=1)
     frame = sample_frame(recipe, 0)
     radiance = engine.render(frame, recipe.render)
@@ -115,7 +117,7 @@ def test_passes_of_pixel_centres(engine):
             assert seen.amodal_px[32 + marker] == np.count_nonzero(seen.part_id == 32 + marker)
 
 
-def test_same_frame_same_bits(engine):
+def test_same_frame_same_bits(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.25, stations_m=(3.0, 5.0), samples=4)
     first = engine.render(sample_frame(recipe, 0), recipe.render)
     engine.render(sample_frame(recipe, 1), recipe.render)
@@ -125,7 +127,7 @@ def test_same_frame_same_bits(engine):
             assert np.array_equal(getattr(getattr(first, eye), name), getattr(getattr(again, eye), name)), name
 
 
-def test_moving_drogue_is_blurred_around_its_middle(engine):
+def test_moving_drogue_is_blurred_around_its_middle(engine: RenderEngine) -> None:
     """The centroid of a streak is the mid-exposure place, and the streak is as long as speed times time says."""
     recipe = paper_view_recipe(scale=0.5, stations_m=(5.0,), samples=64)
     settings = recipe.render.model_copy(update={"edge_samples_per_px": 64})
@@ -153,7 +155,7 @@ def test_moving_drogue_is_blurred_around_its_middle(engine):
     assert width[1] - width[0] == pytest.approx(2 * travel_px, abs=4)
 
 
-def test_rays_through_seams_are_sent_again(engine):
+def test_rays_through_seams_are_sent_again(engine: RenderEngine) -> None:
     """At this place a pixel centre's ray slips between two triangles of a marker's front and ends on its back."""
     recipe = load_recipe("demo", seed=11).recipe
     settings = recipe.render.model_copy(update={"samples_per_px": 1, "surround_samples_per_px": 1})
@@ -168,7 +170,7 @@ def test_rays_through_seams_are_sent_again(engine):
 
 
 @pytest.mark.parametrize("index", [341, 594])
-def test_rays_that_slip_into_a_markers_pocket_are_sent_again(engine, index):
+def test_rays_that_slip_into_a_markers_pocket_are_sent_again(engine: RenderEngine, index: int) -> None:
     """In these frames a ray just beyond a marker slips through the face's front and ends on the marker's wall."""
     recipe = load_recipe("detector-small", seed=1).recipe
     settings = recipe.render.model_copy(

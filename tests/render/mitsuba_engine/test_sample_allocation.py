@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import frame_generator
 from drogue_models.parts import Part
 from geometry.stereo import EYES
+from render.engine import RenderEngine
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import paper_view_recipe
+
+if TYPE_CHECKING:
+    from render.mitsuba_engine.paths.sample_allocation import StratifiedSamples
 
 pytestmark = pytest.mark.mitsuba
 
@@ -17,34 +24,34 @@ pytestmark = pytest.mark.mitsuba
 class Bits:
     """Random bits as `FrameRays` gives them."""
 
-    def __init__(self, seed):
+    def __init__(self, seed: int) -> None:
         self._seeds = frame_generator(seed, 0, "test")
 
-    def random_bits(self, kinds, pixels):
+    def random_bits(self, kinds: int, pixels: int) -> np.ndarray:
         return self._seeds.integers(2**32, size=(kinds, pixels), dtype=np.uint32)
 
 
 @pytest.fixture
-def place(engine):
+def place(engine: RenderEngine) -> type[StratifiedSamples]:
     from render.mitsuba_engine.paths.sample_allocation import StratifiedSamples
 
     return StratifiedSamples
 
 
 @pytest.fixture
-def counts_of(engine):
+def counts_of(engine: RenderEngine) -> Callable[..., Any]:
     from render.mitsuba_engine.paths.sample_allocation import counts_by_variance
 
     return counts_by_variance
 
 
-def of_pixel(samples, pixel):
+def of_pixel(samples: StratifiedSamples, pixel: int) -> tuple[np.ndarray, np.ndarray]:
     rows = np.array(samples.pixel) == pixel
     return np.array(samples.place).T[rows], np.array(samples.moment)[rows]
 
 
 @pytest.mark.parametrize("count", [16, 64, 1024])
-def test_every_rectangle_of_a_samples_size_has_one(place, count):
+def test_every_rectangle_of_a_samples_size_has_one(place: type[StratifiedSamples], count: int) -> None:
     samples = place(Bits(1), np.array([7, 30]), np.array([32, count]))
     places, _ = of_pixel(samples, 30)
     for power in range(count.bit_length()):
@@ -53,7 +60,7 @@ def test_every_rectangle_of_a_samples_size_has_one(place, count):
         assert len(np.unique(cell @ (1, columns))) == count
 
 
-def test_moments_are_even_in_every_part_of_a_pixel(place):
+def test_moments_are_even_in_every_part_of_a_pixel(place: type[StratifiedSamples]) -> None:
     places, moments = of_pixel(place(Bits(2), np.array([3]), np.array([256])), 3)
     assert len(np.unique(np.floor(moments * 256))) == 256
     # The first three numbers of the sequence put two samples into each box of two samples' size.
@@ -61,7 +68,7 @@ def test_moments_are_even_in_every_part_of_a_pixel(place):
     assert set(np.bincount(box, minlength=128)) == {2}
 
 
-def test_numbers_are_those_of_sobol(engine):
+def test_numbers_are_those_of_sobol(engine: RenderEngine) -> None:
     import drjit as dr
     import mitsuba as mi
     from scipy.stats.qmc import Sobol
@@ -75,7 +82,7 @@ def test_numbers_are_those_of_sobol(engine):
     assert np.array_equal(ours[gray] / 2**32, Sobol(3, scramble=False).random(64))
 
 
-def test_means_are_those_of_each_pixel(place):
+def test_means_are_those_of_each_pixel(place: type[StratifiedSamples]) -> None:
     counts = np.array([16, 64, 16, 512])
     samples = place(Bits(3), np.array([5, 9, 2, 40]), counts)
     means = samples.means([samples.place.x * 1.0, samples.place.y * 1.0])
@@ -83,7 +90,7 @@ def test_means_are_those_of_each_pixel(place):
         assert means[row] == pytest.approx(of_pixel(samples, pixel)[0].mean(axis=0), rel=1e-5)
 
 
-def test_error_on_an_edge_goes_with_the_count_to_the_power_of_three_quarters(place):
+def test_error_on_an_edge_goes_with_the_count_to_the_power_of_three_quarters(place: type[StratifiedSamples]) -> None:
     rng = np.random.default_rng(4)
     direction = rng.uniform(0, 2 * np.pi, 2000)
     normal, through = np.stack([np.cos(direction), np.sin(direction)], axis=1), rng.uniform(0.2, 0.8, (2000, 2))
@@ -103,7 +110,7 @@ def test_error_on_an_edge_goes_with_the_count_to_the_power_of_three_quarters(pla
     assert np.mean(errors[0] - truth) == pytest.approx(0.0, abs=4 * rms[0] / np.sqrt(2000))
 
 
-def test_counts_bring_the_error_that_is_allowed(counts_of):
+def test_counts_bring_the_error_that_is_allowed(counts_of: Callable[..., Any]) -> None:
     variance = np.random.default_rng(7).lognormal(0.0, 2.0, 5000)
     judged = np.arange(5000) % 2 == 0
     counts = counts_of(variance, judged, 5.0, 1e9)
@@ -112,17 +119,17 @@ def test_counts_bring_the_error_that_is_allowed(counts_of):
     assert np.sum(0.7 * variance[judged] * counts[judged] ** -1.5) == pytest.approx(5.0, rel=0.3)
 
 
-def test_counts_stay_within_what_may_be_taken(counts_of):
+def test_counts_stay_within_what_may_be_taken(counts_of: Callable[..., Any]) -> None:
     variance = np.random.default_rng(8).lognormal(0.0, 1.0, 5000)
     counts = counts_of(variance, np.ones(5000, dtype=bool), 1e-9, 100.0)
     assert np.mean(counts) == pytest.approx(100.0, rel=0.1)
 
 
-def test_even_pixels_take_the_fewest_rays(counts_of):
+def test_even_pixels_take_the_fewest_rays(counts_of: Callable[..., Any]) -> None:
     assert set(counts_of(np.zeros(9), np.ones(9, dtype=bool), 1.0, 100.0)) == {16}
 
 
-def test_rays_that_agree_do_not_prove_a_pixel_even(engine):
+def test_rays_that_agree_do_not_prove_a_pixel_even(engine: RenderEngine) -> None:
     """Nine rays miss what fills a twentieth of a pixel three times in five."""
     from render.compositing import Compositor, TracedEye
     from render.mitsuba_engine.paths.sample_allocation import NoiseBudget

@@ -8,13 +8,14 @@ import pytest
 
 from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from drogue_models.parts import FIRST_MARKER_ID, Part
+from render.engine import RenderEngine
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import paper_view_recipe
 
 pytestmark = pytest.mark.mitsuba
 
 
-def test_dirt_on_a_marker_is_an_edge_everywhere(engine):
+def test_dirt_on_a_marker_is_an_edge_everywhere(engine: RenderEngine) -> None:
     from render.mitsuba_engine.trace_request import plan_pixels
 
     ids = np.full((20, 30), int(Part.FACE), dtype=np.uint8)
@@ -26,7 +27,7 @@ def test_dirt_on_a_marker_is_an_edge_everywhere(engine):
     assert len(set(clean) & set(plan.edges)) == len(clean) - 5 * 8
 
 
-def test_a_dirty_marker_has_little_noise(engine):
+def test_a_dirty_marker_has_little_noise(engine: RenderEngine) -> None:
     recipe = paper_view_recipe(scale=0.5, stations_m=(6.0,))
     frame = sample_frame(recipe, 0)
     dirty = [SurfaceCondition(dirt_fraction=0.4, dirt_seed=index) for index in range(frame.drogue.marker_count)]

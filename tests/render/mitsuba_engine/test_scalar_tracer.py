@@ -6,12 +6,14 @@ import os
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from geometry.stereo import EYES
 from render.compositing import inside_one_part
+from render.engine import StereoRadiance
 from tests.support.recipe_builder import recipe_text, stations
 
 pytestmark = pytest.mark.mitsuba
@@ -72,7 +74,7 @@ np.savez(sys.argv[2], part_id=part_id, depth=depth, normal=normal)
 """
 
 
-def test_where_a_ray_slipped_through_what_stands_beside_is_seen(tmp_path):
+def test_where_a_ray_slipped_through_what_stands_beside_is_seen(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="mitsuba is not installed")
     (tmp_path / "recipe.toml").write_text(RECIPE)
     command = [sys.executable, "-c", LEAKS, str(tmp_path / "recipe.toml"), str(tmp_path / "passes.npz")]
@@ -86,7 +88,7 @@ def test_where_a_ray_slipped_through_what_stands_beside_is_seen(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory):
+def both(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, list[StereoRadiance]]]:
     pytest.importorskip("mitsuba", reason="mitsuba is not installed")
     folder = tmp_path_factory.mktemp("variants")
     (folder / "recipe.toml").write_text(RECIPE)
@@ -102,7 +104,7 @@ def both(tmp_path_factory):
     return results
 
 
-def test_passes_agree(both):
+def test_passes_agree(both: dict[str, tuple[str, list[StereoRadiance]]]) -> None:
     for scalar, fast in zip(both["scalar"][1], both["default"][1], strict=True):
         for eye in EYES:
             a, b = getattr(scalar, eye), getattr(fast, eye)
@@ -116,7 +118,7 @@ def test_passes_agree(both):
                 assert abs(a.amodal_px[part] - count) <= 2
 
 
-def test_radiance_agrees(both):
+def test_radiance_agrees(both: dict[str, tuple[str, list[StereoRadiance]]]) -> None:
     for index, (scalar, fast) in enumerate(zip(both["scalar"][1], both["default"][1], strict=True)):
         for eye in EYES:
             a, b = getattr(scalar, eye), getattr(fast, eye)

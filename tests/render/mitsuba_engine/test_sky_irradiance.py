@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
+
+from render.engine import RenderEngine
 
 pytestmark = pytest.mark.mitsuba
 
 
 @pytest.fixture(scope="module")
-def irradiance_map(engine):
+def irradiance_map(engine: RenderEngine) -> Callable[..., Any]:
     """Imported only after the engine has chosen Mitsuba's variant."""
     from render.mitsuba_engine.paths.sun_sky_integrator import irradiance_map
 
@@ -17,20 +22,20 @@ def irradiance_map(engine):
 
 
 @pytest.fixture(scope="module")
-def as_mitsuba_reads(engine):
+def as_mitsuba_reads(engine: RenderEngine) -> Callable[..., Any]:
     """Imported only after the engine has chosen Mitsuba's variant."""
     from render.mitsuba_engine.scene import as_mitsuba_reads
 
     return as_mitsuba_reads
 
 
-def test_even_sky_gives_its_own_radiance(irradiance_map):
+def test_even_sky_gives_its_own_radiance(irradiance_map: Callable[..., Any]) -> None:
     light = np.full((128, 256, 3), 7.0, dtype=np.float32)
     # Sums of 2048 float32.
     np.testing.assert_allclose(irradiance_map(light), 7.0, rtol=1e-5)
 
 
-def test_bright_half_gives_the_view_factor(irradiance_map):
+def test_bright_half_gives_the_view_factor(irradiance_map: Callable[..., Any]) -> None:
     """A plate whose normal is an angle a from the zenith sees (1 + cos a) / 2 of a bright upper half."""
     light = np.zeros((128, 256, 3), dtype=np.float32)
     light[:64] = 1.0
@@ -40,7 +45,7 @@ def test_bright_half_gives_the_view_factor(irradiance_map):
     np.testing.assert_allclose(irradiance_map(light), expected, atol=2e-3)
 
 
-def test_map_is_stretched_as_mitsuba_reads_it(as_mitsuba_reads):
+def test_map_is_stretched_as_mitsuba_reads_it(as_mitsuba_reads: Callable[..., Any]) -> None:
     height = 128
     polar = (np.arange(height) + 0.5) * np.pi / height
     light = np.broadcast_to(polar[:, None, None], (height, 2 * height, 3)).astype(np.float32)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import DrogueCondition, Obstacle, SurfaceCondition
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
-from render.engine import load_engine
+from render.engine import EyeRadiance, RenderEngine, load_engine
 from render.surfaces import clean_reflectance_rgb, reflectance_map
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import build_recipe, paper_view_recipe, stations
@@ -17,27 +21,27 @@ from tests.support.recipe_builder import build_recipe, paper_view_recipe, statio
 NEW = SurfaceCondition()
 
 
-def aged(frame, states, **more):
+def aged(frame: FrameSpec, states: dict[int, SurfaceCondition], **more: Any) -> FrameSpec:
     markers = tuple(states.get(index, NEW) for index in range(frame.drogue.marker_count))
     return frame.model_copy(update={"condition": DrogueCondition(markers=markers, **more)})
 
 
 @pytest.fixture
-def recipe():
+def recipe() -> Recipe:
     return paper_view_recipe(scale=0.25, stations_m=(2.5,), samples=16)
 
 
 @pytest.fixture
-def frame(recipe):
+def frame(recipe: Recipe) -> FrameSpec:
     return sample_frame(recipe, 0)
 
 
-def marker_light(seen, index):
+def marker_light(seen: EyeRadiance, index: int) -> float:
     mask = seen.part_id == FIRST_MARKER_ID + index
     return float(seen.radiance_cd_m2[mask].mean())
 
 
-def test_faded_paint_reflects_less_in_its_share(engine, recipe, frame):
+def test_faded_paint_reflects_less_in_its_share(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
     plain = engine.render(frame, recipe.render).left
     faded = engine.render(aged(frame, {2: SurfaceCondition(reflectance_fraction=0.5)}), recipe.render).left
     # Light from the marker itself and from its neighbours' reflexes: the paths' noise is 1 % over some 200 pixels.
@@ -45,13 +49,13 @@ def test_faded_paint_reflects_less_in_its_share(engine, recipe, frame):
     assert marker_light(faded, 5) == pytest.approx(marker_light(plain, 5), rel=0.02)
 
 
-def test_a_frame_as_new_after_an_aged_one_is_as_new(engine, recipe, frame):
+def test_a_frame_as_new_after_an_aged_one_is_as_new(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
     plain = engine.render(frame, recipe.render).left.radiance_cd_m2
     engine.render(aged(frame, {0: SurfaceCondition(reflectance_fraction=0.2)}), recipe.render)
     assert np.array_equal(engine.render(frame, recipe.render).left.radiance_cd_m2, plain)
 
 
-def test_a_missing_marker_is_gone(engine, recipe, frame):
+def test_a_missing_marker_is_gone(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
     seen = engine.render(aged(frame, {3: SurfaceCondition(missing=True)}), recipe.render)
     for eye in (seen.left, seen.right):
         assert FIRST_MARKER_ID + 3 not in eye.part_id
@@ -59,7 +63,7 @@ def test_a_missing_marker_is_gone(engine, recipe, frame):
         assert FIRST_MARKER_ID + 4 in eye.part_id
 
 
-def test_dirt_lies_where_its_map_has_it(engine, recipe, frame):
+def test_dirt_lies_where_its_map_has_it(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
     dirty = SurfaceCondition(dirt_fraction=0.4, dirt_seed=11)
     soiled = aged(frame, {1: dirty})
     plain = engine.render(aged(frame, {}), recipe.render).left
@@ -77,7 +81,7 @@ def test_dirt_lies_where_its_map_has_it(engine, recipe, frame):
     assert np.corrcoef(ratio, expected)[0, 1] > 0.85
 
 
-def test_lamps_shine_in_their_share(engine, recipe, frame):
+def test_lamps_shine_in_their_share(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
     lit = frame.model_copy(update={"drogue": frame.drogue.model_copy(update={"marker_luminance_cd_m2": 1e6})})
     states = {0: SurfaceCondition(lamp_fraction=0.5), 1: SurfaceCondition(lamp_fraction=0.0)}
     seen = engine.render(aged(lit, states), recipe.render).left
@@ -88,7 +92,7 @@ def test_lamps_shine_in_their_share(engine, recipe, frame):
     assert own[1] / own[2] == pytest.approx(0.0, abs=0.02)
 
 
-def test_bystanders_hide_what_is_behind_them(engine, recipe, frame):
+def test_bystanders_hide_what_is_behind_them(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
     center = frame.left_from_drogue.translation_m
     ball = Obstacle(
         kind="distractor",
@@ -104,7 +108,7 @@ def test_bystanders_hide_what_is_behind_them(engine, recipe, frame):
     assert seen.amodal_px[int(Part.HUB)] > np.count_nonzero(seen.part_id == Part.HUB)
 
 
-def test_a_frame_without_a_drogue_shows_its_bystanders(engine, recipe, frame):
+def test_a_frame_without_a_drogue_shows_its_bystanders(engine: RenderEngine, recipe: Recipe, frame: FrameSpec) -> None:
     ball = Obstacle(
         kind="distractor",
         shape=ObstacleShape(form="ball", radius_m=0.3),
@@ -128,7 +132,7 @@ def test_a_frame_without_a_drogue_shows_its_bystanders(engine, recipe, frame):
     assert seen.amodal_px == {}
 
 
-def test_rays_go_through_real_lenses_as_the_analytic_engine_projects(engine):
+def test_rays_go_through_real_lenses_as_the_analytic_engine_projects(engine: RenderEngine) -> None:
     if "scalar" in engine.version:
         pytest.skip("the scalar variant draws ideal eyes only")
     recipe = build_recipe(

@@ -1,4 +1,7 @@
+from __future__ import annotations
+
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +14,14 @@ from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
 from geometry.stereo import EYES
 from labelgen.export.annotations.coco import coco_annotation, coco_image_id, write_annotations
 from labelgen.export.keypoints import clockwise_order
+from tests.support.drawn_pairs import Pair
 
 
-def test_image_ids_are_those_that_are_promised():
+def test_image_ids_are_those_that_are_promised() -> None:
     assert [coco_image_id(0, "left"), coco_image_id(0, "right"), coco_image_id(7, "left")] == [1, 2, 15]
 
 
-def test_files_load_and_agree_with_the_frames(small_dataset, pairs):
+def test_files_load_and_agree_with_the_frames(small_dataset: Path, pairs: list[Pair]) -> None:
     coco = COCO(str(small_dataset / "annotations" / "all.json"))
     assert sorted(coco.imgs) == list(range(1, 2 * len(pairs) + 1))
     for pair in pairs:
@@ -44,7 +48,7 @@ def test_files_load_and_agree_with_the_frames(small_dataset, pairs):
                 assert part_id[int(y), int(x)] == FIRST_MARKER_ID + index
 
 
-def test_truth_against_itself_scores_one(small_dataset):
+def test_truth_against_itself_scores_one(small_dataset: Path) -> None:
     truth = COCO(str(small_dataset / "annotations" / "all.json"))
     results = [
         {key: annotation[key] for key in ("image_id", "category_id", "bbox")} | {"score": 0.9}
@@ -57,7 +61,7 @@ def test_truth_against_itself_scores_one(small_dataset):
     assert score.stats[0] == 1.0
 
 
-def test_splits_hold_what_the_manifest_says(small_dataset):
+def test_splits_hold_what_the_manifest_says(small_dataset: Path) -> None:
     manifest = read_manifest(small_dataset)
     whole = json.loads((small_dataset / "annotations" / "all.json").read_text())
     images, annotations = [], []
@@ -71,13 +75,13 @@ def test_splits_hold_what_the_manifest_says(small_dataset):
     assert sorted(images, **by_id) == whole["images"] and sorted(annotations, **by_id) == whole["annotations"]
 
 
-def test_the_same_dataset_gives_the_same_bytes(small_dataset, tmp_path):
+def test_the_same_dataset_gives_the_same_bytes(small_dataset: Path, tmp_path: Path) -> None:
     again = write_annotations(small_dataset, tmp_path / "again")
     for first, second in zip(sorted((small_dataset / "annotations").iterdir()), sorted(again), strict=True):
         assert first.name == second.name and first.read_bytes() == second.read_bytes()
 
 
-def test_an_unreadable_frame_leaves_the_old_files(small_dataset, full_pairs):
+def test_an_unreadable_frame_leaves_the_old_files(small_dataset: Path, full_pairs: list[Pair]) -> None:
     before = {path: path.read_bytes() for path in (small_dataset / "annotations").iterdir()}
     path = small_dataset / "frames" / f"{full_pairs[-1].frame.frame_index:06d}" / "right_parts.png"
     path.write_bytes(path.read_bytes()[:100])
@@ -87,7 +91,7 @@ def test_an_unreadable_frame_leaves_the_old_files(small_dataset, full_pairs):
     assert leftovers(small_dataset) == []
 
 
-def test_hidden_and_absent_keypoints(full_pairs):
+def test_hidden_and_absent_keypoints(full_pairs: list[Pair]) -> None:
     pair = full_pairs[0]
     markers = list(pair.record.views.left.markers)
     markers[0] = markers[0].model_copy(update={"visible_fraction": 0.2})
@@ -103,7 +107,7 @@ def test_hidden_and_absent_keypoints(full_pairs):
     assert annotation["num_keypoints"] == 7
 
 
-def test_order_in_the_image_starts_at_the_top_and_goes_clockwise(full_pairs):
+def test_order_in_the_image_starts_at_the_top_and_goes_clockwise(full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         view = pair.record.views.left
         order = clockwise_order(view)

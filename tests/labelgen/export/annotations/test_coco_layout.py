@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -33,7 +34,7 @@ print(json.dumps([
 
 
 @pytest.fixture(scope="module")
-def with_images(mixed_dataset, tmp_path_factory) -> Path:
+def with_images(mixed_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("coco") / "out"
     assert write_export("coco", mixed_dataset, out, ExportLog(), image_bits=8) == [out]
     return out
@@ -43,7 +44,7 @@ def annotations_of(path: Path) -> list[dict]:
     return json.loads(path.read_text())["annotations"]
 
 
-def test_every_category_names_the_keypoints_of_its_annotations(with_images):
+def test_every_category_names_the_keypoints_of_its_annotations(with_images: Path) -> None:
     table = json.loads((with_images / "annotations" / "all.json").read_text())
     categories = {category["id"]: category for category in table["categories"]}
     assert [category["name"] for category in categories.values()] == ["drogue", "marker", "hub"]
@@ -56,7 +57,7 @@ def test_every_category_names_the_keypoints_of_its_annotations(with_images):
     assert len(ids) == len(set(ids)) and min(ids) > 0 and max(ids) < 2**31
 
 
-def test_every_named_image_lies_in_the_moved_folder(with_images, mixed_dataset, tmp_path):
+def test_every_named_image_lies_in_the_moved_folder(with_images: Path, mixed_dataset: Path, tmp_path: Path) -> None:
     source = Dataset(mixed_dataset)
     moved = with_images.rename(tmp_path / "moved")
     files = sorted(path.name for path in (moved / "annotations").iterdir())
@@ -74,7 +75,9 @@ def test_every_named_image_lies_in_the_moved_folder(with_images, mixed_dataset, 
     moved.rename(with_images)
 
 
-def test_deep_images_are_told_of_and_copied_with_eight_bits(dataset_by_preset, tmp_path):
+def test_deep_images_are_told_of_and_copied_with_eight_bits(
+    dataset_by_preset: Callable[..., Path], tmp_path: Path
+) -> None:
     dataset = dataset_by_preset("mono", "output_bits = 12")
     log = ExportLog()
     write_export("coco", dataset, tmp_path / "without", log)
@@ -101,7 +104,9 @@ def chunks(png: bytes) -> dict[bytes, bytes]:
 
 
 @pytest.mark.parametrize(("preset", "channels"), [("mono", 1), ("rgb-ideal", 3)])
-def test_copies_of_sixteen_bits_lose_nothing_and_say_how_many_bits_count(preset, channels, dataset_by_preset, tmp_path):
+def test_copies_of_sixteen_bits_lose_nothing_and_say_how_many_bits_count(
+    preset: str, channels: int, dataset_by_preset: Callable[..., Path], tmp_path: Path
+) -> None:
     dataset = dataset_by_preset(preset, "output_bits = 12")
     log = ExportLog()
     write_export("coco", dataset, tmp_path / "out", log, image_bits=16)
@@ -118,13 +123,13 @@ def test_copies_of_sixteen_bits_lose_nothing_and_say_how_many_bits_count(preset,
         np.testing.assert_array_equal(cv2.imread(str(path))[:, :, 0], (copy if channels == 1 else copy[:, :, 0]) >> 8)
 
 
-def test_other_formats_refuse_the_option(mixed_dataset, tmp_path):
+def test_other_formats_refuse_the_option(mixed_dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="--images: is for coco; kitti has images without it"):
         write_export("kitti", mixed_dataset, tmp_path / "out", ExportLog(), image_bits=8)
     assert not (tmp_path / "out").exists()
 
 
-def test_datumaro_reads_every_annotation(with_images, mixed_dataset, tmp_path):
+def test_datumaro_reads_every_annotation(with_images: Path, mixed_dataset: Path, tmp_path: Path) -> None:
     told = read_by("datumaro", READ_BY_DATUMARO, with_images, folder=tmp_path)
     assert len(told) == 18 and {item["subset"] for item in told} == {"train", "val", "test"}
     assert all(item["shape"] == [120, 160, 3] for item in told)
@@ -144,7 +149,7 @@ def test_datumaro_reads_every_annotation(with_images, mixed_dataset, tmp_path):
         assert points["flags"] == keypoints[:, 2].tolist()
 
 
-def test_the_views_of_the_datasets_own_images_are_named_without_copies(mixed_dataset, tmp_path):
+def test_the_views_of_the_datasets_own_images_are_named_without_copies(mixed_dataset: Path, tmp_path: Path) -> None:
     (whole, *_) = write_export("coco", mixed_dataset, tmp_path / "out", ExportLog())
     source = Dataset(mixed_dataset)
     named = [image["file_name"] for image in json.loads(whole.read_text())["images"]]

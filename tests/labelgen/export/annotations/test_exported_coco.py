@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,13 +22,13 @@ from labelgen.export.keypoints import symmetric_orders
 
 
 @pytest.fixture(scope="module")
-def whole_file(mixed_dataset, tmp_path_factory) -> Path:
+def whole_file(mixed_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("coco")
     return write_coco(mixed_dataset, folder, ExportLog())[0]
 
 
 @pytest.fixture
-def truth(whole_file) -> COCO:
+def truth(whole_file: Path) -> COCO:
     """Anew for each test, because COCO's evaluation writes into it."""
     return COCO(str(whole_file))
 
@@ -47,7 +49,7 @@ def results_of(truth: COCO, *keys: str) -> list[dict]:
     return [{key: annotation[key] for key in ("image_id", "category_id", *keys)} for annotation in truth.anns.values()]
 
 
-def keypoint_results(truth: COCO, order_of) -> list[dict]:
+def keypoint_results(truth: COCO, order_of: Callable[..., Any]) -> list[dict]:
     """The truth's keypoints, each drogue's own ones in another order."""
     results = []
     for result in results_of(truth, "keypoints"):
@@ -64,7 +66,7 @@ def image_order(extra: dict) -> list[int]:
     return extra["keypoint_order_in_image"]
 
 
-def test_truth_against_itself_is_perfect(truth):
+def test_truth_against_itself_is_perfect(truth: Any) -> None:
     # 1 but for the rounding of precision = tp / (tp + fp + 2e-16).
     assert average_precision(truth, results_of(truth, "bbox"), "bbox") == pytest.approx(1, abs=1e-12)
     assert average_precision(truth, results_of(truth, "segmentation"), "segm") == pytest.approx(1, abs=1e-12)
@@ -72,24 +74,24 @@ def test_truth_against_itself_is_perfect(truth):
     assert average_precision(truth, own, "keypoints") == pytest.approx(1, abs=1e-12)
 
 
-def test_keypoints_in_the_image_order_are_perfect_up_to_a_turn(truth):
+def test_keypoints_in_the_image_order_are_perfect_up_to_a_turn(truth: Any) -> None:
     results = keypoint_results(truth, image_order)
     assert average_precision(truth, results, "keypoints") < 0.6
     assert average_precision(truth, align_keypoint_orders(truth, results), "keypoints") == pytest.approx(1, abs=1e-12)
 
 
-def test_a_mirrored_order_is_no_turn(truth):
+def test_a_mirrored_order_is_no_turn(truth: Any) -> None:
     results = keypoint_results(truth, lambda extra: image_order(extra)[::-1])
     assert average_precision(truth, align_keypoint_orders(truth, results), "keypoints") < 0.2
 
 
-def test_another_number_of_keypoints_is_refused(truth):
+def test_another_number_of_keypoints_is_refused(truth: Any) -> None:
     (result, *_) = keypoint_results(truth, image_order)
     with pytest.raises(ValueError, match="keypoints: must be 8 in every result, got 7"):
         align_keypoint_orders(truth, [{**result, "keypoints": result["keypoints"][:21]}])
 
 
-def test_a_ring_turns_onto_itself_as_often_as_it_has_markers():
+def test_a_ring_turns_onto_itself_as_often_as_it_has_markers() -> None:
     assert symmetric_orders(PRESETS["red-5"]) == tuple(tuple((i + step) % 5 for i in range(5)) for step in range(5))
     places = list(PRESETS["red-8"].marker_positions_m)
     places[0] = (places[0][0] + 0.002, places[0][1])
@@ -98,7 +100,7 @@ def test_a_ring_turns_onto_itself_as_often_as_it_has_markers():
     )
 
 
-def test_ids_are_unique_and_stable(truth, mixed_dataset):
+def test_ids_are_unique_and_stable(truth: Any, mixed_dataset: Path) -> None:
     ids = [annotation["id"] for annotation in truth.dataset["annotations"]]
     assert len(set(ids)) == len(ids) and min(ids) >= 1
     for annotation in truth.dataset["annotations"]:
@@ -109,7 +111,7 @@ def test_ids_are_unique_and_stable(truth, mixed_dataset):
         assert upper == {DROGUE: 0, HUB: 1, MARKER: None if index is None else 2 + index}[annotation["category_id"]]
 
 
-def test_drogues_are_those_of_the_dataset(truth, mixed_dataset):
+def test_drogues_are_those_of_the_dataset(truth: Any, mixed_dataset: Path) -> None:
     stored = json.loads((mixed_dataset / "annotations" / "all.json").read_text())
     assert stored["images"] == truth.dataset["images"]
     assert [c["name"] for c in stored["categories"]] == ["drogue"]
@@ -117,7 +119,7 @@ def test_drogues_are_those_of_the_dataset(truth, mixed_dataset):
     assert stored["annotations"] == [a for a in truth.dataset["annotations"] if a["category_id"] == DROGUE]
 
 
-def test_masks_are_the_part_ids(truth, mixed_dataset):
+def test_masks_are_the_part_ids(truth: Any, mixed_dataset: Path) -> None:
     source, seen = Dataset(mixed_dataset), set()
     for index in source.frame_indices:
         drogue = source.record(index).frame.drogue
@@ -139,7 +141,7 @@ def test_masks_are_the_part_ids(truth, mixed_dataset):
     assert seen == {("red-8", True), ("white-5", True), ("bare-7", False)}
 
 
-def test_all_drogues_have_eight_keypoints(truth):
+def test_all_drogues_have_eight_keypoints(truth: Any) -> None:
     assert len(truth.cats[DROGUE]["keypoints"]) == 8 == len(truth.dataset["info"]["droguekit"]["kpt_oks_sigmas"])
     for annotation in truth.anns.values():
         flags = annotation["keypoints"][2::3]
@@ -148,7 +150,7 @@ def test_all_drogues_have_eight_keypoints(truth):
             assert not any(annotation["keypoints"][3 * len(annotation["droguekit"]["visible_fraction"]) :])
 
 
-def test_splits_share_nothing_and_make_up_the_whole(mixed_dataset, tmp_path):
+def test_splits_share_nothing_and_make_up_the_whole(mixed_dataset: Path, tmp_path: Path) -> None:
     whole, *parts = (json.loads(path.read_text()) for path in write_coco(mixed_dataset, tmp_path, ExportLog()))
     assert len(parts) == 3
     for key in ("images", "annotations"):

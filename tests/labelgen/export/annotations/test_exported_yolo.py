@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 import yaml
 
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.records import PairRecord
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
@@ -46,21 +49,21 @@ print(json.dumps(told))
 
 
 @pytest.fixture(scope="module")
-def exports(mixed_dataset, tmp_path_factory) -> dict[str, Path]:
+def exports(mixed_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("yolo")
     for name in NAMES:
         write_export(name, mixed_dataset, folder / name, ExportLog())
     return {name: folder / name for name in NAMES}
 
 
-def label_rows(folder: Path, record, eye: str) -> np.ndarray:
+def label_rows(folder: Path, record: PairRecord, eye: str) -> np.ndarray:
     """Numbers of one label file, whatever its split."""
     (path,) = folder.glob(f"labels/*/{record.frame_index:06d}_{eye}.txt")
     rows = [list(map(float, line.split())) for line in path.read_text().splitlines()]
     return np.array(rows) if rows else np.zeros((0, 5))
 
 
-def views(dataset: Path):
+def views(dataset: Path) -> Iterator[Any]:
     source = Dataset(dataset)
     for index in source.frame_indices:
         record = source.record(index)
@@ -74,7 +77,7 @@ def in_pixels(shares: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_images_and_labels_go_together(name, exports, mixed_dataset):
+def test_images_and_labels_go_together(name: str, exports: dict[str, Path], mixed_dataset: Path) -> None:
     splits = Dataset(mixed_dataset).manifest.split_of_frame()
     for record, eye, _, _ in views(mixed_dataset):
         place = f"{splits[record.frame_index]}/{record.frame_index:06d}_{eye}"
@@ -84,7 +87,7 @@ def test_images_and_labels_go_together(name, exports, mixed_dataset):
     assert len(list(exports[name].rglob("*.txt"))) == len(list(exports[name].rglob("*.png"))) == 18
 
 
-def test_poses_are_the_records_in_the_drogues_order(exports, mixed_dataset):
+def test_poses_are_the_records_in_the_drogues_order(exports: dict[str, Path], mixed_dataset: Path) -> None:
     for record, eye, view, _ in views(mixed_dataset):
         rows = label_rows(exports["yolo"], record, eye)
         if view.box_visible_xywh_px is None:
@@ -104,7 +107,7 @@ def test_poses_are_the_records_in_the_drogues_order(exports, mixed_dataset):
         np.testing.assert_allclose(in_pixels(points[shown, :2]), centers[inside] + 0.5, atol=1e-9)
 
 
-def test_the_image_order_survives_a_mirror(exports, mixed_dataset):
+def test_the_image_order_survives_a_mirror(exports: dict[str, Path], mixed_dataset: Path) -> None:
     flip = yaml.safe_load((exports["yolo-image-order"] / "data.yaml").read_text())["flip_idx"]
     assert flip == [0, 7, 6, 5, 4, 3, 2, 1]
     seen = 0
@@ -123,7 +126,7 @@ def test_the_image_order_survives_a_mirror(exports, mixed_dataset):
     assert seen
 
 
-def test_boxes_of_all_classes_are_the_part_ids(exports, mixed_dataset):
+def test_boxes_of_all_classes_are_the_part_ids(exports: dict[str, Path], mixed_dataset: Path) -> None:
     for record, eye, view, part_id in views(mixed_dataset):
         rows = label_rows(exports["yolo-detect"], record, eye)
         wanted = [] if view.box_visible_xywh_px is None else [(0, view.box_visible_xywh_px)]
@@ -139,7 +142,7 @@ def test_boxes_of_all_classes_are_the_part_ids(exports, mixed_dataset):
             np.testing.assert_allclose(in_pixels(row[1:].reshape(2, 2)), [middle, box[2:]], atol=1e-9)
 
 
-def test_several_drogues_have_no_common_flip(mixed_dataset, small_dataset, tmp_path):
+def test_several_drogues_have_no_common_flip(mixed_dataset: Path, small_dataset: Path, tmp_path: Path) -> None:
     told = "values of flip_idx that do not fit all drogues: train with fliplr=0"
     for dataset, count in ((mixed_dataset, 1), (small_dataset, 0)):
         log = ExportLog()
@@ -147,7 +150,7 @@ def test_several_drogues_have_no_common_flip(mixed_dataset, small_dataset, tmp_p
         assert log.losses.get(told, 0) == count
 
 
-def test_a_missing_split_is_replaced_and_told(dataset_by_preset, tmp_path):
+def test_a_missing_split_is_replaced_and_told(dataset_by_preset: Callable[..., Any], tmp_path: Path) -> None:
     dataset = dataset_by_preset("rgb-ideal")
     splits = set(Dataset(dataset).manifest.split_of_frame().values())
     log = ExportLog()
@@ -161,7 +164,7 @@ def test_a_missing_split_is_replaced_and_told(dataset_by_preset, tmp_path):
     ]
 
 
-def test_twelve_bits_become_eight_and_are_told(dataset_by_preset, tmp_path):
+def test_twelve_bits_become_eight_and_are_told(dataset_by_preset: Callable[..., Any], tmp_path: Path) -> None:
     dataset = dataset_by_preset("mono", {"output_bits": 12})
     log = ExportLog()
     write_export("yolo", dataset, tmp_path / "out", log)
@@ -173,7 +176,9 @@ def test_twelve_bits_become_eight_and_are_told(dataset_by_preset, tmp_path):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_ultralytics_reads_it_without_a_corrupt_file(name, exports, mixed_dataset, tmp_path):
+def test_ultralytics_reads_it_without_a_corrupt_file(
+    name: str, exports: dict[str, Path], mixed_dataset: Path, tmp_path: Path
+) -> None:
     told = read_by("ultralytics", READ_BY_ULTRALYTICS, exports[name] / "data.yaml", folder=tmp_path)
     empty = sum(view.box_visible_xywh_px is None for _, _, view, _ in views(mixed_dataset))
     assert sum(split["corrupt"] + split["missing"] for split in told.values()) == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ LONG = 9
 
 
 @pytest.fixture(scope="module")
-def blind(mixed_dataset, tmp_path_factory) -> Path:
+def blind(mixed_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("blind") / "out"
     write_export("blind", mixed_dataset, out, ExportLog())
     return out
@@ -45,7 +46,7 @@ def numbers_of(value: Any) -> set[float]:
     return {float(value)} if isinstance(value, int | float) and not isinstance(value, bool) else set()
 
 
-def test_navigation_sees_the_same(blind, mixed_dataset):
+def test_navigation_sees_the_same(blind: Path, mixed_dataset: Path) -> None:
     whole, given = BlindDataset(mixed_dataset), BlindDataset(blind)
     assert given.frame_indices == whole.frame_indices
     for index in whole.frame_indices:
@@ -58,7 +59,9 @@ def test_navigation_sees_the_same(blind, mixed_dataset):
 
 
 @pytest.mark.parametrize(("preset", "rig"), [("paper-colour", {}), ("mono", {"output_bits": 12})])
-def test_mosaics_and_twelve_bits_stay(preset, rig, dataset_by_preset, tmp_path):
+def test_mosaics_and_twelve_bits_stay(
+    preset: str, rig: dict[str, int], dataset_by_preset: Callable[..., Any], tmp_path: Path
+) -> None:
     dataset = dataset_by_preset(preset, rig)
     write_export("blind", dataset, tmp_path / "out", ExportLog())
     want, got = BlindDataset(dataset).pair(0).images, BlindDataset(tmp_path / "out").pair(0).images
@@ -66,7 +69,9 @@ def test_mosaics_and_twelve_bits_stay(preset, rig, dataset_by_preset, tmp_path):
     assert (got.left_mosaic is None) == (preset != "paper-colour") and got.bits == want.bits
 
 
-def test_navigate_runs_on_it_and_what_needs_the_truth_says_so(blind, mixed_dataset, tmp_path, capsys):
+def test_navigate_runs_on_it_and_what_needs_the_truth_says_so(
+    blind: Path, mixed_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name, folder in (("blind", blind), ("whole", mixed_dataset)):
         assert run(["navigate", str(folder), "--method", "paper", "--out", str(tmp_path / f"{name}.jsonl")]) == DONE
     got, want = (list(read_estimates(tmp_path / f"{name}.jsonl")) for name in ("blind", "whole"))
@@ -76,7 +81,7 @@ def test_navigate_runs_on_it_and_what_needs_the_truth_says_so(blind, mixed_datas
     assert "is a blind dataset, which has no truth" in capsys.readouterr().err
 
 
-def test_only_what_is_needed_is_there(blind):
+def test_only_what_is_needed_is_there(blind: Path) -> None:
     names = {re.sub(r"\d{6}", "N", str(path.relative_to(blind))) for path in blind.rglob("*") if path.is_file()}
     calibration = {name for name in names if name.startswith("calibration/")}
     assert "calibration/opencv_stereo.yaml" in calibration
@@ -86,7 +91,7 @@ def test_only_what_is_needed_is_there(blind):
     }
 
 
-def test_no_key_of_the_truth_is_there(blind, mixed_dataset):
+def test_no_key_of_the_truth_is_there(blind: Path, mixed_dataset: Path) -> None:
     index = json.loads((blind / "blind.json").read_text())
     known = keys_of(index["rig"]) | keys_of(index["sensor"]) | keys_of(index["drogue"]) | ALLOWED
     assert set(index) == {"schema_version", "name", "rig", "sensor", "drogue", "drogues_differ", "frames"}
@@ -106,7 +111,7 @@ def test_no_key_of_the_truth_is_there(blind, mixed_dataset):
                 assert secret not in text
 
 
-def test_no_number_of_the_truth_is_there(blind, mixed_dataset):
+def test_no_number_of_the_truth_is_there(blind: Path, mixed_dataset: Path) -> None:
     source, index = Dataset(mixed_dataset), json.loads((blind / "blind.json").read_text())
     told = numbers_of(index["rig"]) | numbers_of(index["sensor"]) | numbers_of(index["drogue"])
     truth: set[float] = set()
@@ -123,7 +128,7 @@ def test_no_number_of_the_truth_is_there(blind, mixed_dataset):
             assert secrets.isdisjoint(map(float, NUMBER.findall(path.read_text()))), path
 
 
-def test_whether_there_is_a_drogue_is_not_told(blind, mixed_dataset):
+def test_whether_there_is_a_drogue_is_not_told(blind: Path, mixed_dataset: Path) -> None:
     source = Dataset(mixed_dataset)
     shapes = set()
     for index in source.frame_indices:
@@ -132,7 +137,7 @@ def test_whether_there_is_a_drogue_is_not_told(blind, mixed_dataset):
     assert len(shapes) == 1 and source.manifest.counts.empty > 0
 
 
-def test_a_damaged_index_is_one_line(blind, tmp_path):
+def test_a_damaged_index_is_one_line(blind: Path, tmp_path: Path) -> None:
     for text, fault in (("{", "is truncated or not JSON"), ("{}", "name: Field required"), ("[]", "valid dictionary")):
         (tmp_path / "blind.json").write_text(text)
         with pytest.raises(ValueError, match=fault):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tarfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -25,7 +26,7 @@ def read_shards(folder: Path) -> list[dict]:
     return list(webdataset.WebDataset(shards, shardshuffle=False, empty_check=False))
 
 
-def test_shards_hold_every_file_of_every_pair(mixed_dataset, tmp_path):
+def test_shards_hold_every_file_of_every_pair(mixed_dataset: Path, tmp_path: Path) -> None:
     source = Dataset(mixed_dataset)
     splits = source.manifest.split_of_frame()
     write_export("webdataset", mixed_dataset, tmp_path / "out", ExportLog())
@@ -42,7 +43,7 @@ def test_shards_hold_every_file_of_every_pair(mixed_dataset, tmp_path):
             assert sample[path.name] == path.read_bytes()
 
 
-def test_webdataset_decodes_images(mixed_dataset, tmp_path):
+def test_webdataset_decodes_images(mixed_dataset: Path, tmp_path: Path) -> None:
     write_export("webdataset", mixed_dataset, tmp_path / "out", ExportLog())
     shard = str(next((tmp_path / "out").glob("*.tar")))
     source = Dataset(mixed_dataset)
@@ -50,7 +51,7 @@ def test_webdataset_decodes_images(mixed_dataset, tmp_path):
         np.testing.assert_array_equal(sample["left.png"], source.images(int(sample["__key__"])).left)
 
 
-def test_shards_end_at_the_limit_and_belong_to_nobody(mixed_dataset, tmp_path):
+def test_shards_end_at_the_limit_and_belong_to_nobody(mixed_dataset: Path, tmp_path: Path) -> None:
     limit = 60_000
     paths = write_webdataset(mixed_dataset, tmp_path / "out", ExportLog(), limit)
     assert len(paths) > 4 and paths == sorted((tmp_path / "out").iterdir())
@@ -66,13 +67,13 @@ def test_shards_end_at_the_limit_and_belong_to_nobody(mixed_dataset, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def table(mixed_dataset, tmp_path_factory):
+def table(mixed_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("parquet")
     write_export("parquet", mixed_dataset, folder, ExportLog())
     return pq.read_table(folder / "views.parquet")
 
 
-def test_the_table_has_a_row_a_view(table, mixed_dataset):
+def test_the_table_has_a_row_a_view(table: Any, mixed_dataset: Path) -> None:
     source = Dataset(mixed_dataset)
     rows = table.to_pylist()
     assert [(row["frame_index"], row["view"]) for row in rows] == [
@@ -99,7 +100,7 @@ def test_the_table_has_a_row_a_view(table, mixed_dataset):
             np.testing.assert_allclose(axis, pose.rotation[:, 2], atol=1e-12)
 
 
-def test_every_column_is_filled_and_described(table, mixed_dataset):
+def test_every_column_is_filled_and_described(table: Any, mixed_dataset: Path) -> None:
     unfilled = [name for name in table.column_names if table[name].null_count == table.num_rows]
     # Single frames belong to no sequence, and this engine does not measure its sampling against the sensor.
     assert set(unfilled) <= {"sequence_id", "monte_carlo_over_sensor_noise"}

@@ -1,19 +1,25 @@
+from __future__ import annotations
+
 import json
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
 
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
-from geometry.stereo import EYES
+from geometry.stereo import EYES, Eye
 from labelgen.export.export_log import ExportLog
 from labelgen.export.poses.bop import depth_numbers, write_bop
 from render.exr_writer import encode_passes
+from tests.support.drawn_pairs import Pair
 from tests.support.recipe_builder import build_recipe, stations
 
 SPLITS = ("train", "val", "test")
@@ -21,7 +27,7 @@ FOLDERS = {"train": "train_pbr", "val": "val", "test": "test"}
 
 
 @pytest.fixture(scope="module")
-def deep_dataset(tmp_path_factory, small_recipe, pairs):
+def deep_dataset(tmp_path_factory: pytest.TempPathFactory, small_recipe: Recipe, pairs: list[Pair]) -> Path:
     """A dataset with EXR files."""
     folder = tmp_path_factory.mktemp("deep") / "dataset"
     recipe = small_recipe.model_copy(update={"outputs": small_recipe.outputs.model_copy(update={"exr": True})})
@@ -39,21 +45,21 @@ def deep_dataset(tmp_path_factory, small_recipe, pairs):
 
 
 @pytest.fixture(scope="module")
-def bop(deep_dataset):
+def bop(deep_dataset: Path) -> Path:
     """Its export, which no test may change."""
     write_bop(deep_dataset, deep_dataset.with_name("bop"), ExportLog())
     return deep_dataset.with_name("bop")
 
 
-def scene_of(bop, pair):
+def scene_of(bop: Path, pair: Pair) -> Path:
     return bop / FOLDERS[SPLITS[pair.frame.scene_id % 3]] / f"{pair.frame.scene_id:06d}"
 
 
-def table_of(bop, pair, name, eye):
+def table_of(bop: Path, pair: Pair, name: str, eye: Eye) -> Any:
     return json.loads((scene_of(bop, pair) / f"{name}_{eye}.json").read_text())[str(pair.frame.frame_index)]
 
 
-def mssd_mm(estimate, truth, points_mm, symmetries):
+def mssd_mm(estimate: np.ndarray, truth: np.ndarray, points_mm: np.ndarray, symmetries: list[np.ndarray]) -> float:
     """Maximum symmetry-aware surface distance. [mm]
 
     Source: Hodan et al. 2020, "BOP Challenge 2020 on 6D Object Localization", eq. 1: the least over the symmetries of
@@ -66,10 +72,12 @@ def mssd_mm(estimate, truth, points_mm, symmetries):
     )
 
 
-def mspd_px(estimate, truth, points_mm, symmetries, matrix):
+def mspd_px(
+    estimate: np.ndarray, truth: np.ndarray, points_mm: np.ndarray, symmetries: list[np.ndarray], matrix: np.ndarray
+) -> float:
     """Maximum symmetry-aware projection distance, eq. 2 of the same. [px]"""
 
-    def project(pose):
+    def project(pose: np.ndarray) -> np.ndarray:
         image = (points_mm @ pose[:3, :3].T + pose[:3, 3]) @ matrix.T
         return image[:, :2] / image[:, 2:]
 
@@ -77,13 +85,13 @@ def mspd_px(estimate, truth, points_mm, symmetries, matrix):
     return min(np.linalg.norm(seen - project(truth @ symmetry), axis=1).max() for symmetry in symmetries)
 
 
-def roll(degrees):
+def roll(degrees: float) -> np.ndarray:
     turn = np.eye(4)
     turn[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.0, np.radians(degrees)]))[0]
     return turn
 
 
-def test_poses_score_nothing_on_truth_and_under_a_roll_by_a_marker(bop, full_pairs):
+def test_poses_score_nothing_on_truth_and_under_a_roll_by_a_marker(bop: Path, full_pairs: list[Pair]) -> None:
     points_mm = np.asarray(trimesh.load(bop / "models" / "obj_000001.ply", process=False).vertices)
     info = json.loads((bop / "models" / "models_info.json").read_text())["1"]
     symmetries = [np.eye(4), *(np.array(entry).reshape(4, 4) for entry in info["symmetries_discrete"])]
@@ -109,7 +117,7 @@ def test_poses_score_nothing_on_truth_and_under_a_roll_by_a_marker(bop, full_pai
             np.testing.assert_allclose(image[:2] / image[2], view.markers[0].center_proj_px, atol=1e-9)
 
 
-def test_models_are_measured_in_millimetres(bop):
+def test_models_are_measured_in_millimetres(bop: Path) -> None:
     mesh = trimesh.load(bop / "models" / "obj_000001.ply", process=False)
     for name in ("models", "models_eval"):
         info = json.loads((bop / name / "models_info.json").read_text())["1"]
@@ -121,7 +129,7 @@ def test_models_are_measured_in_millimetres(bop):
         assert info["diameter"] == pytest.approx(660, abs=0.1)
 
 
-def test_masks_boxes_and_counts_agree(bop, full_pairs):
+def test_masks_boxes_and_counts_agree(bop: Path, full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         for eye in EYES:
             scene, index = scene_of(bop, pair), pair.frame.frame_index
@@ -142,7 +150,9 @@ def test_masks_boxes_and_counts_agree(bop, full_pairs):
                 assert info[key] == [columns.min(), rows.min(), np.ptp(columns), np.ptp(rows)]
 
 
-def test_what_leaves_the_image_counts_for_the_whole(full_pairs, small_recipe, tmp_path):
+def test_what_leaves_the_image_counts_for_the_whole(
+    full_pairs: list[Pair], small_recipe: Recipe, tmp_path: Path
+) -> None:
     frame, make = full_pairs[0].frame, type(full_pairs[0])
     camera, pose = frame.rig.camera, frame.left_from_drogue
     # The drogue's middle on the left border.
@@ -170,7 +180,7 @@ def test_what_leaves_the_image_counts_for_the_whole(full_pairs, small_recipe, tm
     assert info["px_count_valid"] < 0.7 * count and 0.4 < info["visib_fract"] < 0.7
 
 
-def test_depth_images_are_the_dataset_s_depth(bop, pairs):
+def test_depth_images_are_the_dataset_s_depth(bop: Path, pairs: list[Pair]) -> None:
     for pair in pairs:
         for eye in EYES:
             seen = getattr(pair.radiance, eye)
@@ -183,7 +193,7 @@ def test_depth_images_are_the_dataset_s_depth(bop, pairs):
             np.testing.assert_allclose(numbers[~sky] * scale, seen.depth_m[~sky] * 1e3, atol=0.5 * scale + 1e-3)
 
 
-def test_far_depth_takes_a_coarser_scale_and_what_is_beyond_is_unknown():
+def test_far_depth_takes_a_coarser_scale_and_what_is_beyond_is_unknown() -> None:
     near, scale = depth_numbers(np.array([[6.5, np.inf]], np.float32))
     assert scale == 0.1 and near.tolist() == [[65000, 0]]
     far, scale = depth_numbers(np.array([[6.5, 600.0]], np.float32))
@@ -192,7 +202,7 @@ def test_far_depth_takes_a_coarser_scale_and_what_is_beyond_is_unknown():
     assert scale == 100.0 and lost.tolist() == [[100, 0]]
 
 
-def test_both_eyes_stand_apart_by_the_baseline(bop, full_pairs):
+def test_both_eyes_stand_apart_by_the_baseline(bop: Path, full_pairs: list[Pair]) -> None:
     for pair in full_pairs:
         centers = []
         for eye in EYES:
@@ -202,7 +212,7 @@ def test_both_eyes_stand_apart_by_the_baseline(bop, full_pairs):
         assert np.linalg.norm(centers[1] - centers[0]) == pytest.approx(pair.frame.rig.baseline_m * 1e3, rel=1e-12)
 
 
-def test_images_empty_frames_and_targets(bop, pairs, deep_dataset):
+def test_images_empty_frames_and_targets(bop: Path, pairs: list[Pair], deep_dataset: Path) -> None:
     targets = json.loads((bop / "test_targets_bop19.json").read_text())
     want = set()
     for pair in pairs:
@@ -218,22 +228,22 @@ def test_images_empty_frames_and_targets(bop, pairs, deep_dataset):
     assert all(target["obj_id"] == target["inst_count"] == 1 for target in targets)
 
 
-def test_the_same_dataset_gives_the_same_bytes(bop, deep_dataset, tmp_path):
-    def contents(folder):
+def test_the_same_dataset_gives_the_same_bytes(bop: Path, deep_dataset: Path, tmp_path: Path) -> None:
+    def contents(folder: Path) -> dict[Path, bytes]:
         return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     write_bop(deep_dataset, tmp_path / "again", ExportLog())
     assert contents(tmp_path / "again") == contents(bop)
 
 
-def test_without_depth_the_rest_is_there_and_the_loss_is_told(small_dataset, tmp_path):
+def test_without_depth_the_rest_is_there_and_the_loss_is_told(small_dataset: Path, tmp_path: Path) -> None:
     log = ExportLog()
     write_bop(small_dataset, tmp_path / "bop", log)
     assert log.losses == {"depth images left out, for the dataset has no EXR files": 12}
     assert not list((tmp_path / "bop").rglob("depth_*")) and list((tmp_path / "bop").rglob("mask_visib_left"))
 
 
-def test_real_lenses_are_refused(tmp_path):
+def test_real_lenses_are_refused(tmp_path: Path) -> None:
     recipe = build_recipe(name="real", rig="paper-real", frames={"count": 1}, distance=stations(5.0))
     write_manifest(
         tmp_path / "real",

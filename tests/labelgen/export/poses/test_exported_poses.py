@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +21,7 @@ from labelgen.export.formats import write_export
 from labelgen.export.keypoints import view_of
 from labelgen.export.poses.kitti import kitti_label
 from labelgen.part_pixels import drogue_hull_m
+from tests.support.drawn_pairs import Pair
 
 
 def rotation_of_scalar_first(quaternion: list[float]) -> np.ndarray:
@@ -39,7 +43,9 @@ def rotation_of_scalar_first(quaternion: list[float]) -> np.ndarray:
         ("paper-real", {"eyes": {"k1": [-0.1, -0.1], "right_rotation_deg": 0.5, "principal_point_px": 3}}),
     ],
 )
-def test_speed_poses_project_markers_where_the_labels_have_them(preset, rig, dataset_by_preset, tmp_path):
+def test_speed_poses_project_markers_where_the_labels_have_them(
+    preset: str, rig: dict[str, dict[str, Any]], dataset_by_preset: Callable[..., Any], tmp_path: Path
+) -> None:
     dataset = dataset_by_preset(preset, rig)
     write_export("speed", dataset, tmp_path / "out", ExportLog())
     source, seen = Dataset(dataset), 0
@@ -69,7 +75,7 @@ def test_speed_poses_project_markers_where_the_labels_have_them(preset, rig, dat
     assert seen == 2 * with_drogue > 0
 
 
-def test_speed_tells_of_images_without_a_pose(mixed_dataset, tmp_path):
+def test_speed_tells_of_images_without_a_pose(mixed_dataset: Path, tmp_path: Path) -> None:
     log = ExportLog()
     write_export("speed", mixed_dataset, tmp_path / "out", log)
     empty = Dataset(mixed_dataset).manifest.counts.empty
@@ -88,7 +94,7 @@ def kitti_corners(numbers: list[float]) -> np.ndarray:
     return (turn @ np.stack([x, y, z])).T + numbers[11:14]
 
 
-def test_kitti_box_of_a_drogue_that_only_yaws_is_exact(full_pairs):
+def test_kitti_box_of_a_drogue_that_only_yaws_is_exact(full_pairs: list[Pair]) -> None:
     pair = full_pairs[0]
     pose = RigidTransform(rotation_from_angles(0.0, np.radians(25.0), 0.0), pair.record.left_from_drogue.translation_m)
     draw = type(pair)
@@ -105,7 +111,7 @@ def test_kitti_box_of_a_drogue_that_only_yaws_is_exact(full_pairs):
         np.testing.assert_allclose(numbers[3], numbers[14] - np.arctan2(middle[0], middle[2]), atol=1e-12)
 
 
-def test_kitti_boxes_and_calibration(mixed_dataset, tmp_path):
+def test_kitti_boxes_and_calibration(mixed_dataset: Path, tmp_path: Path) -> None:
     write_export("kitti", mixed_dataset, tmp_path / "out", ExportLog())
     training, source = tmp_path / "out" / "training", Dataset(mixed_dataset)
     truncated = []
@@ -142,7 +148,7 @@ def sees_drogue(part_id: np.ndarray) -> np.ndarray:
     return mask
 
 
-def test_kitti_refuses_eyes_that_are_not_rectified(dataset_by_preset, tmp_path):
+def test_kitti_refuses_eyes_that_are_not_rectified(dataset_by_preset: Callable[..., Any], tmp_path: Path) -> None:
     dataset = dataset_by_preset("paper-real", {"eyes": {"k1": [-0.1, -0.1]}})
     with pytest.raises(ValueError, match="KITTI holds rectified ones only"):
         write_export("kitti", dataset, tmp_path / "out", ExportLog())

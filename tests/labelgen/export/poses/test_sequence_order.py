@@ -12,13 +12,14 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.records import PairRecord
 from labelgen.export.export_log import ExportLog, SequenceOrder
 from labelgen.export.formats import write_export
+from tests.support.drawn_pairs import Pair
 
 
 def stamped(record: PairRecord, sequence_id: int | None, time_s: float) -> PairRecord:
     return record.model_copy(update={"sequence_id": sequence_id, "time_s": time_s})
 
 
-def test_sequences_begin_where_their_number_changes(pairs):
+def test_sequences_begin_where_their_number_changes(pairs: list[Pair]) -> None:
     order = SequenceOrder()
     record = pairs[0].record
     firsts = []
@@ -38,7 +39,9 @@ def test_sequences_begin_where_their_number_changes(pairs):
         (((0, float("nan")),), "must be in"),
     ],
 )
-def test_pairs_out_of_order_are_refused(pairs, steps, fault):
+def test_pairs_out_of_order_are_refused(
+    pairs: list[Pair], steps: tuple[tuple[int | None, float], ...], fault: str
+) -> None:
     order = SequenceOrder()
     with pytest.raises(ValueError, match=fault):
         for sequence_id, time_s in steps:
