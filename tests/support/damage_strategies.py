@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from datetime import timedelta
 
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 
+Edit = Callable[[bytes], bytes]
+
 # The suite's share of 500; `make fuzz` sets the variable.
 TIMES = int(os.environ.get("DROGUEKIT_FUZZ_TIMES", "1"))
 
 
-def fuzz(examples):
+def fuzz(examples: int) -> settings:
     """Settings of one test; the suite's draws are always the same, those of `make fuzz` are new each time."""
     return settings(
         max_examples=examples * TIMES,
@@ -27,7 +30,7 @@ def fuzz(examples):
     )
 
 
-def quietly(action) -> None:
+def quietly(action: Callable[[], object]) -> None:
     """Run what may fail by a clear error only."""
     try:
         action()
@@ -42,13 +45,13 @@ HOSTILE = st.sampled_from([None, *_NUMBERS, *_TEXTS, [], {}, [[]], [None] * 40, 
 
 
 @st.composite
-def byte_edits(draw: st.DrawFn):
+def byte_edits(draw: st.DrawFn) -> Edit:
     """A change of a file's bytes: cut, turn over, double, insert."""
     kind = draw(st.sampled_from(["cut", "flip", "insert", "double", "empty"]))
     place, length = draw(st.floats(0, 1, exclude_max=True)), draw(st.integers(1, 40))
     junk = draw(st.binary(min_size=1, max_size=40))
 
-    def edit(data):
+    def edit(data: bytes) -> bytes:
         at = int(place * len(data))
         if kind == "cut":
             return data[:at]
@@ -63,12 +66,12 @@ def byte_edits(draw: st.DrawFn):
 
 
 @st.composite
-def json_edits(draw: st.DrawFn):
+def json_edits(draw: st.DrawFn) -> Edit:
     """A change of one value, deep in a JSON file, or of a key."""
     steps, value = draw(st.lists(st.integers(0, 10**6), min_size=1, max_size=9)), draw(HOSTILE)
     kind = draw(st.sampled_from(["replace", "delete", "add"]))
 
-    def edit(data):
+    def edit(data: bytes) -> bytes:
         table = node = json.loads(data)
         for number, step in enumerate(steps):
             keys = list(node) if isinstance(node, dict) else list(range(len(node)))

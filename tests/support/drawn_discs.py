@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from nav.centroids.disc_fit import fit_discs
@@ -14,7 +16,7 @@ DUSK = PixelLight(60, 240, 4.8, 11_700 / 255 / 16, 0.5, 0.01)
 COUNT = 8
 
 
-def tilted_shape(radius_px: float, rng: np.random.Generator, ratio=0.97):
+def tilted_shape(radius_px: float, rng: np.random.Generator, ratio: float = 0.97) -> np.ndarray:
     angle = rng.uniform(0, np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return turn @ np.diag([radius_px, ratio * radius_px]) @ turn.T
@@ -32,7 +34,7 @@ def coverage(shape: np.ndarray, center: np.ndarray, grid: np.ndarray) -> np.ndar
     return outline_coverage(center + arms, tangents, grid, grid, 0.5)
 
 
-def expose(light, mean_e: float, rng: np.random.Generator):
+def expose(light: PixelLight, mean_e: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
     if rng is None:
         return (mean_e / light.step_e).astype(np.float32)
     gains = 1 + light.prnu_fraction * rng.standard_normal(mean_e.shape)
@@ -40,7 +42,15 @@ def expose(light, mean_e: float, rng: np.random.Generator):
     return np.round(electrons / light.step_e).astype(np.float32)
 
 
-def draw_discs(radius_px: float, light, rng: np.random.Generator, shading=0.0, noisy=True, spoil=None, difference=True):
+def draw_discs(
+    radius_px: float,
+    light: PixelLight,
+    rng: np.random.Generator,
+    shading: float = 0.0,
+    noisy: bool = True,
+    spoil: Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray] | None = None,
+    difference: bool = True,
+) -> tuple[list[MarkerSignal], Ellipses]:
     """Signals of COUNT discs in each eye, and their true outlines; `spoil(light of one disc, x, y, number)`."""
     cell = int(2 * radius_px + 18)
     grid = np.arange(cell, dtype=np.float64)
@@ -62,12 +72,14 @@ def draw_discs(radius_px: float, light, rng: np.random.Generator, shading=0.0, n
     return signals, Ellipses(np.repeat([0, 1], COUNT), np.array(centers), np.array(shapes))
 
 
-def rough_start(truth, rng: np.random.Generator):
+def rough_start(truth: Ellipses, rng: np.random.Generator) -> Ellipses:
     """Circles of the right area, as far off as binary centroids are."""
     return circles(truth.eyes, truth.centers_px + rng.normal(0, 0.1, (len(truth), 2)), 1.02 * truth.radii_px)
 
 
-def fit_many(radius_px: float, light, rng: np.random.Generator, draws=8):
+def fit_many(
+    radius_px: float, light: PixelLight, rng: np.random.Generator, draws: int = 8
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors of the centres, their covariances, and errors of the radii, of all discs of some draws. [px]"""
     errors, covariances, radial = [], [], []
     for _ in range(draws):

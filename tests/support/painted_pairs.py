@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,13 @@ def background(rig: StereoRig, kind: str) -> np.ndarray:
 
 
 def paint_disc(
-    image: np.ndarray, rig: StereoRig, eye: str, place: RigidTransform, center: Sequence[float], edges, rgb
+    image: np.ndarray,
+    rig: StereoRig,
+    eye: str,
+    place: RigidTransform,
+    center: Sequence[float],
+    edges: tuple[float, float],
+    rgb: Sequence[float],
 ) -> None:
     """Paint an annulus (inner and outer radius `edges`) across the drogue's axis by every pixel's share."""
     camera = rig.camera
@@ -115,7 +122,11 @@ def draw_eye(
 
 
 def paint_pair(
-    rig: StereoRig, drogue: DrogueParameters | None, place: RigidTransform, rng: np.random.Generator | None, **kwargs
+    rig: StereoRig,
+    drogue: DrogueParameters | None,
+    place: RigidTransform,
+    rng: np.random.Generator | None,
+    **kwargs: Any,
 ) -> StereoImages:
     images = [expose(draw_eye(rig, drogue, place, eye, **kwargs), rng) for eye in EYES]
     return StereoImages(images[0], images[1], time_s=0.0, exposure_s=1e-3)
