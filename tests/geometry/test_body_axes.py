@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import numpy as np
 
 from geometry.body_axes import FLU_FROM_FRD, FRD_FROM_OPTICAL, NED_FROM_ENU

@@ -1,5 +1,7 @@
 """Docking quantities against closed forms and drawn motions."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,7 +10,7 @@ from datasets_manifest.types.estimates import PoseEstimate
 from drogue_models.presets import load_drogue
 from geometry.body_axes import FRD_FROM_OPTICAL
 from geometry.pinhole import PinholeCamera
-from geometry.se3 import Array, RigidTransform
+from geometry.se3 import RigidTransform
 from geometry.stereo import StereoRig
 from nav.docking import capture_radius_m, docking_quantities
 from nav.filtering.pose_filter import FilterState
@@ -19,21 +21,23 @@ DROGUE = load_drogue("red-8")
 TIP_LEFT_M = FRD_FROM_OPTICAL.inverse().apply(TIP_M)
 
 
-def _ahead_of_tip(offset: list[float]) -> Array:
+def _ahead_of_tip(offset: list[float]) -> np.ndarray:
     """A place in the left camera's axes, from the probe's tip. [m]"""
-    place: Array = TIP_LEFT_M + np.array(offset)
+    place: np.ndarray = TIP_LEFT_M + np.array(offset)
     return place
 
 
-def _state(place: Array, velocity: Array, tilt: Array | None = None, spread: Array | None = None) -> FilterState:
+def _state(
+    place: np.ndarray, velocity: np.ndarray, tilt: np.ndarray | None = None, spread: np.ndarray | None = None
+) -> FilterState:
     turn = np.eye(3) if tilt is None else Rotation.from_rotvec(tilt).as_matrix()
     covariance = np.eye(12) * 1e-8 if spread is None else spread
     return FilterState(0.0, RigidTransform(turn, place), velocity, np.array([0.3, 0.2, 0.1]), covariance)
 
 
-def _spread(scale: float) -> Array:
+def _spread(scale: float) -> np.ndarray:
     root = np.random.default_rng(3).normal(size=(12, 12)) * np.repeat([1.0, 1.0, 0.3, 1.0], 3)[:, None]
-    matrix: Array = root @ root.T * scale**2
+    matrix: np.ndarray = root @ root.T * scale**2
     return matrix
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from geometry.se3 import Array
 from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.outline_pixels import disc_pixels, edge_distances
@@ -15,7 +14,7 @@ from nav.centroids.outline_pixels import disc_pixels, edge_distances
 _CLEAR_PX = 1.5
 
 
-def grey_centroids(signals: Sequence[MarkerSignal], discs: Ellipses) -> Array:
+def grey_centroids(signals: Sequence[MarkerSignal], discs: Ellipses) -> np.ndarray:
     """Centres of mass in windows about the discs, the window's mean background subtracted.
 
     Shading shifts it by a share of the radius, and a window cut off unevenly does too: it is here to be compared with.
@@ -36,6 +35,6 @@ def grey_centroids(signals: Sequence[MarkerSignal], discs: Ellipses) -> Array:
     total = light.sum(axis=1, dtype=np.float64)
     good = ~pixels.truncated & (total > 0)
     shift = np.stack([(light * pixels.x_px).sum(axis=1), (light * pixels.y_px).sum(axis=1)], axis=-1)
-    centers: Array = np.full((len(discs), 2), np.nan)
+    centers: np.ndarray = np.full((len(discs), 2), np.nan)
     centers[good] = discs.centers_px[good] + shift[good] / total[good, None]
     return centers

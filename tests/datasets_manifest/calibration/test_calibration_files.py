@@ -1,5 +1,7 @@
 """The files for OpenCV, Kalibr and ROS, read as those programs read them: by OpenCV and PyYAML."""
 
+from __future__ import annotations
+
 import cv2
 import numpy as np
 import pytest

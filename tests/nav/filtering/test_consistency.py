@@ -1,5 +1,7 @@
 """Gains against a Riccati solver, errors against their covariance."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from datasets_manifest.types.estimates import PoseEstimate
-from geometry.se3 import Array, RigidTransform
+from geometry.se3 import RigidTransform
 from nav.filtering.measurement_update import pose_difference
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FilterState, PoseFilter
@@ -41,7 +43,9 @@ def test_the_steady_state_is_that_of_the_riccati_equation(measure: Measure) -> N
     np.testing.assert_allclose(predicted.covariance[along_axis], expected, rtol=1e-8)
 
 
-def _flown(rng: np.random.Generator, settings: FilterSettings, runs: int, pairs: int) -> tuple[Array, Array, Array]:
+def _flown(
+    rng: np.random.Generator, settings: FilterSettings, runs: int, pairs: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses (runs, pairs, 4, 4) as seen, and smooth velocities and rates, of white accelerations in small steps."""
     sub, h = 10, PERIOD_S / 10
     t = np.tile([0.3, -0.2, 6.0], (runs, 1)) + rng.normal(size=(runs, 3)) * 0.2
@@ -63,7 +67,7 @@ def _flown(rng: np.random.Generator, settings: FilterSettings, runs: int, pairs:
     return seen, speeds[..., :3], speeds[..., 3:]
 
 
-def _error(state: FilterState, pose: RigidTransform, velocity: Array, rate: Array) -> Array:
+def _error(state: FilterState, pose: RigidTransform, velocity: np.ndarray, rate: np.ndarray) -> np.ndarray:
     return np.concatenate(
         [pose_difference(state.left_from_drogue, pose), velocity - state.velocity_m_s, rate - state.rate_rad_s]
     )
@@ -77,7 +81,7 @@ def _within(values: list[float], degrees: int) -> None:
 
 @pytest.mark.parametrize("learns", [False, True])
 def test_errors_and_innovations_match_their_covariances(
-    rng: np.random.Generator, measure: Measure, covariance: Array, learns: bool
+    rng: np.random.Generator, measure: Measure, covariance: np.ndarray, learns: bool
 ) -> None:
     settings = FilterSettings(long_term_excess=0, start_speed_m_s=0.5, noise_scale_variance_per_s=0.05 if learns else 0)
     runs, pairs = 20, 30
@@ -103,7 +107,7 @@ def test_errors_and_innovations_match_their_covariances(
 
 @pytest.mark.parametrize("factor", [0.1, 8.0])
 def test_the_process_noise_scale_adapts_to_rough_and_calm_air(
-    rng: np.random.Generator, measure: Measure, covariance: Array, factor: float
+    rng: np.random.Generator, measure: Measure, covariance: np.ndarray, factor: float
 ) -> None:
     assumed = FilterSettings(long_term_excess=0, start_speed_m_s=0.5)
     flown = FilterSettings(
@@ -136,7 +140,7 @@ def test_the_process_noise_scale_adapts_to_rough_and_calm_air(
     assert abs(fixed - 1) > 2 * abs(learned - 1)
 
 
-def test_constant_velocity_has_no_lag(measure: Measure, covariance: Array) -> None:
+def test_constant_velocity_has_no_lag(measure: Measure, covariance: np.ndarray) -> None:
     velocity, rate = np.array([0.1, -0.2, -0.8]), np.array([0.05, 0.02, 0.1])
     fixes = PoseFilter(STEADY_AIR, 1)
     for index in range(200):

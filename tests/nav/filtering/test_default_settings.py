@@ -1,12 +1,13 @@
 """Default settings with the motion that recipes make: a docking run in moderate air, with drawn noise."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np
 
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.types.estimates import PoseEstimate
-from geometry.se3 import Array
 from nav.filtering.measurement_update import pose_difference
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
@@ -17,7 +18,7 @@ PERIOD_S = 0.04
 AHEAD = 10
 
 
-def test_a_docking_run_in_moderate_air(rng: np.random.Generator, measure: Measure, covariance: Array) -> None:
+def test_a_docking_run_in_moderate_air(rng: np.random.Generator, measure: Measure, covariance: np.ndarray) -> None:
     recipe = load_recipe("docking-10m", 1).recipe
     poses = [sample_left_from_drogue(recipe, index) for index in range(450, 750)]
     fine, fixes = covariance * 0.01, PoseFilter(FilterSettings(), 8)

@@ -1,12 +1,14 @@
 """The motion model against finite differences, geometry and a simulation in small steps."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geometry.se3 import Array, RigidTransform, exp_rotation, exp_twist, left_jacobian, log_rotation
+from geometry.se3 import RigidTransform, exp_rotation, exp_twist, left_jacobian, log_rotation
 from nav.filtering.measurement_update import compute_innovation, initial_state, pose_difference
 from nav.filtering.motion_model import SIZE, FilterSettings, MotionState, propagate, vibration_covariance
 
@@ -49,7 +51,7 @@ def test_the_transition_is_the_derivative_of_the_step(
 
 
 def test_the_measurement_jacobian_is_the_derivative_of_the_apparent_pose(
-    rng: np.random.Generator, covariance: Array
+    rng: np.random.Generator, covariance: np.ndarray
 ) -> None:
     state = _state(rng)
     columns = []
@@ -124,7 +126,7 @@ def test_a_turn_adds_camera_noise_that_does_not_scale_with_the_air(rng: np.rando
     np.testing.assert_allclose(rough.noise - calm.noise, 2 * calm.air_noise, atol=1e-18)
 
 
-def test_the_initial_covariance_allows_for_a_turning_camera(covariance: Array) -> None:
+def test_the_initial_covariance_allows_for_a_turning_camera(covariance: np.ndarray) -> None:
     position, turn = np.array([0.2, 0.1, 6.0]), np.array([0.3, -0.5, 0.2])
     settings = FilterSettings(start_speed_m_s=1e-6, start_rate_rad_s=1e-6, start_turn_rad_s=0.7)
     speeds = initial_state(RigidTransform(np.eye(3), position), covariance, settings).reported_covariance[6:, 6:]
@@ -133,7 +135,7 @@ def test_the_initial_covariance_allows_for_a_turning_camera(covariance: Array) -
     assert seen @ np.linalg.solve(speeds, seen) == pytest.approx(turn @ turn / 0.7**2, rel=1e-6)
 
 
-def test_the_initial_pose_covariance_is_that_of_the_measurement(covariance: Array) -> None:
+def test_the_initial_pose_covariance_is_that_of_the_measurement(covariance: np.ndarray) -> None:
     pose = RigidTransform(Rotation.random(random_state=2).as_matrix(), np.array([0.2, 0.1, 6.0]))
     state = initial_state(pose, covariance, FilterSettings())
     np.testing.assert_allclose(state.reported_covariance[:6, :6], covariance, atol=1e-15)

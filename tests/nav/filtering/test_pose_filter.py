@@ -1,5 +1,7 @@
 """The filter with late, missing, ambiguous and wrong fixes."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.estimates import Mode, NoFix, PoseEstimate
-from geometry.se3 import Array, RigidTransform
+from geometry.se3 import RigidTransform
 from nav.filtering.measurement_update import PoseMeasurement, measurement_from_estimate, pose_difference
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FilterState, PoseFilter
@@ -24,7 +26,7 @@ def _pose(time_s: float, tilt_rad: float = 0.1) -> RigidTransform:
     return RigidTransform(attitude, np.array([0.1, -0.2 + 0.1 * time_s, 8.0 - 0.8 * time_s]))
 
 
-def _flown(measure: Measure, covariance: Array, pairs: int = 40) -> PoseFilter:
+def _flown(measure: Measure, covariance: np.ndarray, pairs: int = 40) -> PoseFilter:
     fixes = PoseFilter(SETTINGS, ORDER)
     for index in range(pairs):
         fixes.update(index * PERIOD_S, measure(_pose(index * PERIOD_S), covariance))
@@ -37,7 +39,7 @@ def _same(one: FilterState | None, other: FilterState | None, atol: float = 0.0)
     return bool(np.abs(away).max() <= atol and np.allclose(one.covariance, other.covariance, rtol=1e-12, atol=atol))
 
 
-def test_there_is_no_state_before_the_first_fix_and_after_coasting(measure: Measure, covariance: Array) -> None:
+def test_there_is_no_state_before_the_first_fix_and_after_coasting(measure: Measure, covariance: np.ndarray) -> None:
     fixes = PoseFilter(SETTINGS, ORDER)
     assert fixes.predict(0.0) is None
     first = fixes.update(3.0, measure(_pose(0), covariance))
@@ -51,7 +53,9 @@ def test_there_is_no_state_before_the_first_fix_and_after_coasting(measure: Meas
     assert fixes.predict(60.0) is None
 
 
-def test_prediction_does_not_change_the_filter_and_its_covariance_grows(measure: Measure, covariance: Array) -> None:
+def test_prediction_does_not_change_the_filter_and_its_covariance_grows(
+    measure: Measure, covariance: np.ndarray
+) -> None:
     fixes = _flown(measure, covariance)
     end_s = 39 * PERIOD_S
     before = fixes.predict(end_s)
@@ -65,7 +69,7 @@ def test_prediction_does_not_change_the_filter_and_its_covariance_grows(measure:
     assert np.abs(away).max() < 0.002
 
 
-def test_dropped_frames_and_uneven_times(measure: Measure, covariance: Array, rng: np.random.Generator) -> None:
+def test_dropped_frames_and_uneven_times(measure: Measure, covariance: np.ndarray, rng: np.random.Generator) -> None:
     fixes = PoseFilter(SETTINGS, ORDER)
     times = np.cumsum(rng.choice([0.01, 0.04, 0.08, 0.33], 80))
     updates = [fixes.update(float(time), measure(_pose(float(time)), covariance, rng)) for time in times]
@@ -78,7 +82,7 @@ def test_dropped_frames_and_uneven_times(measure: Measure, covariance: Array, rn
 
 @pytest.mark.parametrize("late", [5, 12])
 def test_a_late_fix_is_as_good_as_one_in_time(
-    measure: Measure, covariance: Array, rng: np.random.Generator, late: int
+    measure: Measure, covariance: np.ndarray, rng: np.random.Generator, late: int
 ) -> None:
     estimates = [measure(_pose(index * PERIOD_S), covariance, rng) for index in range(20)]
     in_time, delayed = PoseFilter(SETTINGS, ORDER), PoseFilter(SETTINGS, ORDER)
@@ -96,7 +100,7 @@ def test_a_late_fix_is_as_good_as_one_in_time(
 
 
 @pytest.mark.parametrize("age", [0, 3])
-def test_a_repeated_estimate_is_refused(measure: Measure, covariance: Array, age: int) -> None:
+def test_a_repeated_estimate_is_refused(measure: Measure, covariance: np.ndarray, age: int) -> None:
     fixes = _flown(measure, covariance)
     before, time_s = fixes.predict(1.6), (39 - age) * PERIOD_S
     again = fixes.update(time_s, measure(_pose(time_s), covariance))
@@ -104,7 +108,7 @@ def test_a_repeated_estimate_is_refused(measure: Measure, covariance: Array, age
     assert _same(fixes.predict(1.6), before)
 
 
-def test_a_clock_that_is_set_back_restarts_the_filter(measure: Measure, covariance: Array) -> None:
+def test_a_clock_that_is_set_back_restarts_the_filter(measure: Measure, covariance: np.ndarray) -> None:
     fixes = _flown(measure, covariance)
     assert fixes.update(1e9, measure(_pose(0), covariance)).accepted
     answers = [
@@ -116,7 +120,7 @@ def test_a_clock_that_is_set_back_restarts_the_filter(measure: Measure, covarian
     assert "too late" in answers[0].reason and answers[refused].reason == "first fix"
 
 
-def test_an_outlier_is_rejected_and_a_persistent_jump_accepted(measure: Measure, covariance: Array) -> None:
+def test_an_outlier_is_rejected_and_a_persistent_jump_accepted(measure: Measure, covariance: np.ndarray) -> None:
     fixes = _flown(measure, covariance)
     time_s = 40 * PERIOD_S
     jump = RigidTransform(np.eye(3), np.array([0.5, 0.0, 0.0]))
@@ -135,7 +139,7 @@ def test_an_outlier_is_rejected_and_a_persistent_jump_accepted(measure: Measure,
 
 
 def test_outliers_that_disagree_do_not_restart_the_filter(
-    measure: Measure, covariance: Array, rng: np.random.Generator
+    measure: Measure, covariance: np.ndarray, rng: np.random.Generator
 ) -> None:
     fixes = _flown(measure, covariance)
     for index in range(40, 50):
@@ -144,7 +148,7 @@ def test_outliers_that_disagree_do_not_restart_the_filter(
     assert fixes.update(50 * PERIOD_S, measure(_pose(50 * PERIOD_S), covariance)).accepted
 
 
-def test_equivalent_rolls_are_one(measure: Measure, covariance: Array, rng: np.random.Generator) -> None:
+def test_equivalent_rolls_are_one(measure: Measure, covariance: np.ndarray, rng: np.random.Generator) -> None:
     plain, turned = PoseFilter(SETTINGS, ORDER), PoseFilter(SETTINGS, ORDER)
     for index in range(40):
         pose = _pose(index * PERIOD_S)
@@ -158,7 +162,7 @@ def test_equivalent_rolls_are_one(measure: Measure, covariance: Array, rng: np.r
         assert _same(one.state, other.state, atol=1e-9)
 
 
-def test_roll_is_continuous_beyond_one_markers_turn(measure: Measure, covariance: Array) -> None:
+def test_roll_is_continuous_beyond_one_markers_turn(measure: Measure, covariance: np.ndarray) -> None:
     fixes, rate = PoseFilter(SETTINGS, ORDER), 2.0
     for index in range(100):
         roll = rate * index * PERIOD_S % (2 * np.pi / ORDER)
@@ -170,7 +174,7 @@ def test_roll_is_continuous_beyond_one_markers_turn(measure: Measure, covariance
     assert abs(update.state.rate_rad_s[2] - rate) < 0.01
 
 
-def _ambiguous(time_s: float, share: float, covariance: Array) -> PoseEstimate:
+def _ambiguous(time_s: float, share: float, covariance: np.ndarray) -> PoseEstimate:
     """The mixture of a tilt of 0.1 rad and its mirror image, as method `joint` reports one."""
     true, false = _pose(time_s), _pose(time_s, -0.1 + 0.4 * np.sin(3 * time_s))
     apart = pose_difference(true, false)
@@ -189,14 +193,14 @@ def _ambiguous(time_s: float, share: float, covariance: Array) -> PoseEstimate:
     )
 
 
-def test_mode_covariances_are_recovered_from_the_mixture(covariance: Array) -> None:
+def test_mode_covariances_are_recovered_from_the_mixture(covariance: np.ndarray) -> None:
     fix = measurement_from_estimate(_ambiguous(0.0, 0.4, covariance), ORDER, 1e-3)
     assert isinstance(fix, PoseMeasurement) and fix.weights == pytest.approx((0.6, 0.4))
     # Rounding of a spread that is 1000 times the covariance.
     np.testing.assert_allclose(fix.covariance, covariance, atol=1e-12)
 
 
-def test_both_hypotheses_are_kept_until_one_is_refuted(covariance: Array) -> None:
+def test_both_hypotheses_are_kept_until_one_is_refuted(covariance: np.ndarray) -> None:
     fixes = PoseFilter(SETTINGS, ORDER)
     first = fixes.update(0.0, _ambiguous(0.0, 0.45, covariance)).state
     assert first is not None and len(first.modes) == 2
@@ -214,7 +218,7 @@ def test_both_hypotheses_are_kept_until_one_is_refuted(covariance: Array) -> Non
     assert sure is not None and len(sure.modes) == 1
 
 
-def test_a_wrong_first_mode_is_dropped(measure: Measure, covariance: Array) -> None:
+def test_a_wrong_first_mode_is_dropped(measure: Measure, covariance: np.ndarray) -> None:
     fixes = PoseFilter(SETTINGS, ORDER)
     for index in range(10):
         fixes.update(index * PERIOD_S, _ambiguous(index * PERIOD_S, 0.47, covariance))
@@ -237,7 +241,7 @@ def test_a_wrong_first_mode_is_dropped(measure: Measure, covariance: Array) -> N
     ],
 )
 def test_invalid_estimates_are_refused(
-    measure: Measure, covariance: Array, change: dict[str, object], reason: str
+    measure: Measure, covariance: np.ndarray, change: dict[str, object], reason: str
 ) -> None:
     fixes = _flown(measure, covariance)
     before = fixes.predict(1.6)
@@ -246,7 +250,7 @@ def test_invalid_estimates_are_refused(
     assert _same(update.state, before) and _same(fixes.predict(1.6), before)
 
 
-def test_invalid_numbers_are_errors(measure: Measure, covariance: Array) -> None:
+def test_invalid_numbers_are_errors(measure: Measure, covariance: np.ndarray) -> None:
     fixes = _flown(measure, covariance)
     for time_s in (np.nan, np.inf):
         with pytest.raises(ValueError, match="time_s: must be finite"):
@@ -269,7 +273,7 @@ def test_invalid_numbers_are_errors(measure: Measure, covariance: Array) -> None
 
 @pytest.mark.slow
 def test_covariances_stay_valid_over_ten_thousand_fixes(
-    measure: Measure, covariance: Array, rng: np.random.Generator
+    measure: Measure, covariance: np.ndarray, rng: np.random.Generator
 ) -> None:
     settings = FilterSettings(vibration_m=0, vibration_rad=0, max_delay_s=0)
     fixes = PoseFilter(settings, ORDER)
@@ -285,7 +289,7 @@ def test_covariances_stay_valid_over_ten_thousand_fixes(
             np.testing.assert_allclose(update.state.covariance, update.state.covariance.T)
 
 
-def test_a_state_becomes_an_estimate(measure: Measure, covariance: Array) -> None:
+def test_a_state_becomes_an_estimate(measure: Measure, covariance: np.ndarray) -> None:
     state = _flown(measure, covariance).predict(1.6)
     assert state is not None
     seen = NoFix(frame_index=40, method="joint", reason="no drogue detected", stage_s={"detect": 0.1}, latency_s=0.2)

@@ -1,5 +1,7 @@
 """A receiver that turns by 30 degrees within 0.85 s, and back."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
-from geometry.se3 import Array, RigidTransform
+from geometry.se3 import RigidTransform
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FilterUpdate, PoseFilter
 from nav.filtering.smoother import smooth
@@ -32,10 +34,10 @@ def _pose(time_s: float) -> RigidTransform:
     return RigidTransform(attitude.as_matrix(), back.apply([0.1, -0.2, 8.0 - 0.8 * time_s]))
 
 
-def _velocity(time_s: float) -> Array:
+def _velocity(time_s: float) -> np.ndarray:
     step_s = 1e-5  # an error of the square of it
     ends = [_pose(time_s + sign * step_s).translation_m for sign in (1, -1)]
-    velocity: Array = (ends[0] - ends[1]) / (2 * step_s)
+    velocity: np.ndarray = (ends[0] - ends[1]) / (2 * step_s)
     return velocity
 
 
@@ -45,7 +47,7 @@ def _answers(estimates: list[PoseEstimate], settings: FilterSettings) -> list[Fi
 
 
 @pytest.fixture
-def estimates(rng: np.random.Generator, measure: Measure, covariance: Array) -> list[PoseEstimate]:
+def estimates(rng: np.random.Generator, measure: Measure, covariance: np.ndarray) -> list[PoseEstimate]:
     """Fixes of half a millimetre along the sight and less across."""
     return [measure(_pose(time_s), covariance / 400, rng, index) for index, time_s in enumerate(TIMES)]
 
@@ -77,7 +79,7 @@ def test_without_turns_in_the_model_fixes_are_rejected(estimates: list[PoseEstim
 @pytest.mark.parametrize("offset_m", [[0.5, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 1.0]])
 @pytest.mark.parametrize("wrong", [20, 35, 45])
 def test_outliers_are_not_taken_for_turns(
-    estimates: list[PoseEstimate], wrong: int, offset_m: list[float], covariance: Array, measure: Measure
+    estimates: list[PoseEstimate], wrong: int, offset_m: list[float], covariance: np.ndarray, measure: Measure
 ) -> None:
     jump = RigidTransform(np.eye(3), np.array(offset_m))
     estimates[wrong] = measure(jump @ _pose(TIMES[wrong]), covariance / 400, None, wrong)

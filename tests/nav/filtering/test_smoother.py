@@ -1,5 +1,7 @@
 """The smoother against batch least squares, and with gaps, outliers and ambiguity."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +11,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.estimates import Estimate, Mode, NoFix, PoseEstimate
-from geometry.se3 import Array, RigidTransform
+from geometry.se3 import RigidTransform
 from nav.filtering.measurement_update import pose_difference
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
@@ -32,7 +34,9 @@ def _rms_m(estimates: list[Estimate], truth: list[RigidTransform]) -> float:
     return float(np.sqrt((np.array(away) ** 2).sum(axis=1).mean()))
 
 
-def _batch(times: Array, depths: Array, sd_m: float, settings: FilterSettings) -> tuple[Array, Array]:
+def _batch(
+    times: np.ndarray, depths: np.ndarray, sd_m: float, settings: FilterSettings
+) -> tuple[np.ndarray, np.ndarray]:
     """Depth as seen, and speed, with their covariance, of all times at once by scipy.
 
     Unknowns are depth, speed and vibration at each time; nan is a depth that was not measured.
@@ -40,7 +44,7 @@ def _batch(times: Array, depths: Array, sd_m: float, settings: FilterSettings) -
     count = len(times)
     rows, values = [], []
 
-    def add(places: list[int], factors: Array, value: float, covariance: Array) -> None:
+    def add(places: list[int], factors: np.ndarray, value: float, covariance: np.ndarray) -> None:
         row = np.zeros((len(factors), 3 * count))
         row[:, places] = factors
         white = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -96,7 +100,7 @@ def _swinging(time_s: float) -> RigidTransform:
 
 
 def test_the_smoother_beats_the_filter_which_beats_the_fixes(
-    rng: np.random.Generator, measure: Measure, covariance: Array
+    rng: np.random.Generator, measure: Measure, covariance: np.ndarray
 ) -> None:
     settings = FilterSettings(vibration_m=0, vibration_rad=0)
     times = [index * 0.04 for index in range(150)]
@@ -116,7 +120,7 @@ def test_the_smoother_beats_the_filter_which_beats_the_fixes(
     assert errors[1] < 0.6 * errors[0] and errors[2] < 0.8 * errors[1]
 
 
-def test_gaps_outliers_and_pauses(measure: Measure, covariance: Array) -> None:
+def test_gaps_outliers_and_pauses(measure: Measure, covariance: np.ndarray) -> None:
     settings = FilterSettings()
     times = [index * 0.04 for index in range(60)]
     times[40:] = [time + 10 for time in times[40:]]
@@ -145,7 +149,7 @@ def test_gaps_outliers_and_pauses(measure: Measure, covariance: Array) -> None:
 
 
 def test_pairs_without_a_fix_change_nothing_elsewhere(
-    rng: np.random.Generator, measure: Measure, covariance: Array
+    rng: np.random.Generator, measure: Measure, covariance: np.ndarray
 ) -> None:
     times = [index * 0.04 for index in range(30)]
     estimates: list[Estimate] = [
@@ -164,7 +168,7 @@ def test_pairs_without_a_fix_change_nothing_elsewhere(
         assert np.abs(pose_difference(one.left_from_drogue, other.left_from_drogue)).max() < 1e-4
 
 
-def test_accelerations_are_correlated_over_a_gap(measure: Measure, covariance: Array) -> None:
+def test_accelerations_are_correlated_over_a_gap(measure: Measure, covariance: np.ndarray) -> None:
     times = [index * 0.04 for index in range(30)]
     estimates: list[Estimate] = [
         _no_fix(index) if 10 <= index < 18 else measure(_swinging(time), covariance, None, index)
@@ -182,7 +186,7 @@ def test_accelerations_are_correlated_over_a_gap(measure: Measure, covariance: A
     assert variances[1] > 2.5 * variances[0]
 
 
-def test_later_fixes_decide_between_hypotheses(measure: Measure, covariance: Array) -> None:
+def test_later_fixes_decide_between_hypotheses(measure: Measure, covariance: np.ndarray) -> None:
     times = [index * 0.04 for index in range(20)]
 
     def pose(time_s: float, tilt_rad: float) -> RigidTransform:
@@ -204,7 +208,7 @@ def test_later_fixes_decide_between_hypotheses(measure: Measure, covariance: Arr
         assert np.abs(pose_difference(estimate.left_from_drogue, pose(time, 0.1))[3:]).max() < 0.002
 
 
-def test_invalid_times_and_empty_sequences(measure: Measure, covariance: Array) -> None:
+def test_invalid_times_and_empty_sequences(measure: Measure, covariance: np.ndarray) -> None:
     two = [measure(_swinging(0), covariance)] * 2
     for times in ([0.0], [1.0, 0.0], [1.0, 1.0], [0.0, np.nan]):
         with pytest.raises(ValueError, match="times_s"):

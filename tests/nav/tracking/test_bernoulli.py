@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from geometry.se3 import Array
 from nav.tracking.bernoulli import PixelComparisonFeatures
 from nav.tracking.region import EyeImage, ImageRegion, box_center, image_region
 from tests.support.painted_sequences import Look, Place, film
@@ -26,7 +25,7 @@ def learned_at(place: Place, look: Look) -> PixelComparisonFeatures:
     return PixelComparisonFeatures(whole(place, look), place.box("left"), 256, np.random.default_rng(1))
 
 
-def at(*offsets_px: tuple[float, float]) -> Array:
+def at(*offsets_px: tuple[float, float]) -> np.ndarray:
     """Candidates of the box's own size."""
     return np.array([[*(box_center(BOX) + offset), 0.0] for offset in offsets_px])
 

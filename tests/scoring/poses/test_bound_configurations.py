@@ -1,5 +1,7 @@
 """Bounds of parts of what there is to see: one eye, some markers, a noisier hub, a drogue not as built."""
 
+from __future__ import annotations
+
 from itertools import pairwise
 from types import SimpleNamespace
 

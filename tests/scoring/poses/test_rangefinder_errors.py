@@ -1,5 +1,7 @@
 """Depths against a rangefinder's readings."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,3 +1,5 @@
+from __future__ import annotations
+
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path

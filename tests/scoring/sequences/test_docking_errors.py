@@ -1,5 +1,7 @@
 """Where the tip truly comes to the rim, and what answers about that err."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from types import SimpleNamespace
 

@@ -1,5 +1,7 @@
 """The lag of estimates that are late by a known time."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from types import SimpleNamespace
 

@@ -1,5 +1,7 @@
 """True velocity and rate of motions with a closed form, and what covariances of them are worth."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,5 +1,7 @@
 """Overlaps against pycocotools, and the plots in cases with a closed form."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from pycocotools import mask

@@ -1,5 +1,7 @@
 """Boxes through sequences: what counts as lost, as found again, and whose box it was."""
 
+from __future__ import annotations
+
 from types import SimpleNamespace
 
 import numpy as np
