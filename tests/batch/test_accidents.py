@@ -1,4 +1,4 @@
-"""Engines that abort, hang and refuse: each costs its own frame, and everything else is as without them."""
+"""Engines that abort, hang and refuse: each loses its own frame, and all other files are as without it."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_full_disk_ends_the_run_and_the_rest_goes_on_later(
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Callable[[str], object]]:
-    """A file system of its own in `tmp_path/disk`; the function that it is gives it other options."""
+    """Mounts a small file system at `tmp_path/disk`; call it to mount it anew with other options."""
     disk = tmp_path / "disk"
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", disk], capture_output=True).returncode:
@@ -143,7 +143,7 @@ def test_a_disk_that_is_full_and_one_that_is_read_only(
 def waiting_run(
     troubled: Troubled, quick_recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[], subprocess.Popen[str]]:
-    """Starts `render` with one worker in a process of its own, and returns when it is within frame 2."""
+    """Starts `render` with one worker in a process of its own, and returns when it works on frame 2."""
     troubled(wait=[2])
     for name in ("begun", "go-on"):
         os.mkfifo(tmp_path / name)

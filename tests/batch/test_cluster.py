@@ -63,7 +63,7 @@ def worker(start: Start, address: str, nanny: str = "--no-nanny") -> subprocess.
 
 
 class OnFrame:
-    """Hears how a run goes, and does something when a number of frames is finished."""
+    """A progress report that runs an action once a number of frames is finished."""
 
     def __init__(self, number: int, action: Callable[[], object]) -> None:
         self._left, self._action = number, action

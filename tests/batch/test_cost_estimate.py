@@ -1,4 +1,4 @@
-"""The cost that a plan reckons from a few frames."""
+"""The cost that a plan estimates from a few frames."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_only_empty_frames_are_probed_where_there_are_no_others() -> None:
 
 
 def synthetic(recipe: Recipe, plan: RecipePlan, rest_s: Callable[[int], float], first_s: float = 0.0) -> ProbeResult:
-    """A probe whose frames take `rest_s`, 0.2 s of their own to be drawn, and `first_s` where a scene is new."""
+    """A probe in which a frame takes `rest_s` and 0.2 s of sampling, and `first_s` more in a new scene."""
     drawn, met = plan.drawn, set[int]()
 
     def report(index: int) -> FrameReport:

@@ -37,7 +37,7 @@ class KilledRun:
         self.kills = 0
 
     def go_on_until(self, is_reached: Callable[[], bool], longest_s: float) -> bool:
-        """Let it run until something is so, and a random moment of up to so long after that.
+        """Let it run until a condition holds, and then for a random time of up to `longest_s`.
 
         Returns:
             Whether it is still at work.
@@ -52,11 +52,11 @@ class KilledRun:
         return not self._ends_within(float(self._rng.uniform(0, longest_s)))
 
     def frames(self) -> int:
-        """How many are there."""
+        """Number of finished frames."""
         return len(layout.frame_indices(self._out))
 
     def begins(self) -> int:
-        """How often it has looked at what is there, and begun with the rest."""
+        """How often it has started."""
         events = self._out / layout.EVENTS_FILE
         return events.read_text().count('"event": "start"') if events.exists() else 0
 
@@ -91,7 +91,7 @@ class KilledRun:
 
 
 def torture(recipe_text: str, kills: int, make: Make, hashes: Hashes, folder: Path) -> None:
-    """Kill a run so often on its way through a recipe, and compare with an undisturbed one."""
+    """Kill a run so many times while it renders a recipe, and compare with an undisturbed one."""
     calm, out, recipe, scratch = folder / "calm", folder / "out", folder / "recipe.toml", folder / "scratch"
     recipe.write_text(recipe_text)
     scratch.mkdir()

@@ -42,7 +42,7 @@ def made_shards(tmp_path_factory: pytest.TempPathFactory, recipe_file: Path) -> 
 
 @pytest.fixture
 def shards(made_shards: tuple[Path, ...], tmp_path: Path) -> tuple[Path, ...]:
-    """Copies that a test may spoil."""
+    """Copies that a test may damage."""
     for shard in made_shards:
         shutil.copytree(shard, tmp_path / shard.name)
     return tuple(tmp_path / shard.name for shard in made_shards)

@@ -278,7 +278,7 @@ def test_dask_workers_write_there_themselves(place: str, text: str, local: Path,
 
 
 class Ends:
-    """Hears how a run goes, and ends the server once two frames are finished."""
+    """A progress report that stops the server once two frames are finished."""
 
     def __init__(self, server: ThreadedMotoServer) -> None:
         self._server, self._left = server, 2

@@ -1,4 +1,4 @@
-"""What a plan says, against the frames themselves."""
+"""The numbers of a plan against the frames themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worker processes: what a death costs, what an error costs, and that nobody outlives the run."""
+"""Worker processes: what a crash and an error cost, and that no process outlives the run."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ _OVERFLOW = """
 
 
 class TextContrast(NamedTuple):
-    """How a piece of text stands out from what is behind it, as WCAG counts."""
+    """The contrast of a piece of text with its background by WCAG."""
 
     text: str
     ratio: float
@@ -196,7 +196,7 @@ class OpenedPage:
         return found
 
     def resize(self, width_px: int, media: Literal["screen", "print"] = "screen") -> None:
-        """Give the page another width, or the looks it has on paper."""
+        """Set the page's width, or the style that it has on paper."""
         self.page.emulate_media(media=media)
         self.page.set_viewport_size({"width": width_px, "height": 800})
 

@@ -1,4 +1,4 @@
-"""The instrument itself: what it must find on pages that are known to be wrong, or right."""
+"""`OpenedPage` itself: the faults it must find on pages that are known to be wrong, and none on right ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A folder and an object store, through the same interface, keep and lose the same things."""
+"""A folder and an object store behave alike through the same interface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What cannot carry a pose is answered with a reason, by every method, and never with a pose or an exception."""
+"""Measurements that do not determine a pose: every method gives a reason, never a pose or an exception."""
 
 from __future__ import annotations
 

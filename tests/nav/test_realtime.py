@@ -1,4 +1,4 @@
-"""Replay at a rate: which pairs are processed, which are late, and that threads change no answer and always end."""
+"""Replay at a rate: which pairs are processed, which are late, and that threads change no estimate and always end."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def no_thread_stays():
 
 
 def stepped(pairs, settings, read_s=None):
-    """All answers to pairs that arrive by a stepped clock."""
+    """Estimates of all pairs that arrive by a stepped clock."""
     clock = SteppedClock()
     answers = []
     navigator = open_navigator(settings, "color-blob")

@@ -1,4 +1,4 @@
-"""Where the hub is looked for, when the markers do not tell which way the drogue is tilted."""
+"""Where the hub is searched for when the markers leave the sign of the tilt ambiguous."""
 
 from __future__ import annotations
 

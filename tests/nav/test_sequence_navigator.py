@@ -117,7 +117,7 @@ def test_a_hidden_drogue_has_no_pose_and_is_found_again(hidden_flight, hidden_pl
 
 
 class TightTracker:
-    """Answers with boxes at the right place, so tight that they cut the markers off."""
+    """Returns boxes at the right place, so tight that they cut the markers off."""
 
     name = "tight"
 

@@ -1,4 +1,4 @@
-"""Matching drawn-up centres: rolls, missing markers, false blobs, rings that do not belong together."""
+"""Matching simulated centres: rolls, missing markers, false blobs, rings that do not belong together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a laser rangefinder reads."""
+"""Readings of a laser rangefinder."""
 
 from __future__ import annotations
 

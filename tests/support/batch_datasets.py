@@ -113,7 +113,7 @@ def tiny_recipe() -> str:
 
 @pytest.fixture(scope="session")
 def make() -> Make:
-    """Renders frames of a recipe, without a word: `make(out, frames, workers, text, told)`."""
+    """Renders frames of a recipe silently: `make(out, frames, workers, text, told)`."""
     return _make
 
 

@@ -1,4 +1,4 @@
-"""How a file is damaged, how often, and what counts as a clear answer to it."""
+"""How a file is damaged, how often, and which errors count as clear."""
 
 from __future__ import annotations
 

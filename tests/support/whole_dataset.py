@@ -1,4 +1,4 @@
-"""The dataset that is damaged."""
+"""The dataset that the fuzz tests damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Printing by a browser: none, one that says no, one that hangs, and a real one."""
+"""Printing by a browser: none, one that fails, one that hangs, and a real one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recipes by which the speed of rendering is measured."""
+"""The recipes and the table by which the speed of rendering is measured."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ FOLDERS = tuple(name for name in NAMES if name not in ("coco", "parquet"))
 
 
 class Steps:
-    """Remembers what a progress report is told."""
+    """Records what a progress report is told."""
 
     def __init__(self) -> None:
         self.told: list[object] = []

@@ -25,7 +25,7 @@ SPLITS = ("train", "val", "test")
 
 @pytest.fixture
 def with_passes(small_dataset: Path, full_pairs: list[Pair]) -> Callable[..., Any]:
-    """Writes one pair again with EXR files that a test may have changed before, whole by all hashes."""
+    """Writes one pair again with EXR files that a test may change first; all hashes match."""
 
     def write(change: Callable[[Any], Any] = lambda passes: passes) -> Path:
         pair = full_pairs[0]

@@ -56,7 +56,7 @@ def off(edges, shift):
 
 
 def fit_many(outer_px, shadow, draws=30):
-    """Squared errors over their covariances, and as they are, and variances."""
+    """Means of normalized squared errors, of squared errors [px^2] and of stated variances [px^2]."""
     rng = np.random.default_rng([3, int(outer_px)])
     normalized, errors, told = [], [], []
     for _ in range(draws):

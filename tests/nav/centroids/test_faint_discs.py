@@ -1,4 +1,4 @@
-"""Discs in little light are fitted as long as all their pixels together tell their place, and refused beyond."""
+"""Faint discs are fitted while all their pixels together determine their centre, and refused below that."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Discs that move while the shutter is open: their ways, and where they were at mid-exposure."""
+"""Discs that move while the shutter is open: their displacements, and their centres at mid-exposure."""
 
 from __future__ import annotations
 

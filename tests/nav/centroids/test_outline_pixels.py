@@ -22,7 +22,7 @@ def outlines(rng, count, radius_px, side_px):
 
 
 def inwards(outline, index, x, y):
-    """Distances inwards of all pixels from one outline; for circles docs/explanation/centroids.md has it."""
+    """Inward distances of all pixels from one outline; docs/explanation/centroids.md has the formula for circles."""
     arms = np.linalg.solve(
         outline.shapes_px[index], np.stack([x, y]).reshape(2, -1) - outline.centers_px[index][:, None]
     )

@@ -26,7 +26,7 @@ def red_square_model(
     strides: Sequence[int] = SQUARE_STRIDES,
     half_side_strides: float = 1.0,
 ) -> onnx.ModelProto:
-    """Mean colour of each cell -> how much red leads, and a square box of a fixed size around the cell's centre."""
+    """Scores of cells by their mean red above the other colours, and a square box of fixed size around each centre."""
     weights = np.zeros((channels, 3, 1, 1), np.float32)
     weights[0, :, 0, 0] = (RED_LOGIT - GREY_LOGIT) * np.array([1, -0.5, -0.5])
     bias = np.full(channels, np.log(half_side_strides), np.float32)

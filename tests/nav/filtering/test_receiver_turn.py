@@ -22,7 +22,7 @@ AFTER_ONSET = slice(27, 70)
 
 
 def _turned(time_s: float) -> Rotation:
-    """Of the camera: aside and back, with jumps of the angular acceleration to 7 rad/s^2."""
+    """The camera turns aside and back, with jumps of the angular acceleration to 7 rad/s^2."""
     share = np.clip((time_s - BEGINS_S) / LASTS_S, 0, 1)
     return Rotation.from_rotvec([0.0, ANGLE_RAD * (1 - np.cos(2 * np.pi * share)) / 2, 0.0])
 

@@ -1,4 +1,4 @@
-"""The weight of the other colours that takes the step of light from the rim."""
+"""The weight of the other colours that cancels the brightness step at the rim."""
 
 from __future__ import annotations
 

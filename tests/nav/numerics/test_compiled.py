@@ -47,7 +47,7 @@ def package(tmp_path: Path) -> Path:
 
 
 def call(package: Path) -> tuple[int, int, str]:
-    """What a new process gets from the caller, how often it found it in a cache, and where that cache is."""
+    """The caller's result in a new process, its number of cache hits, and its cache folder."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_")}
     home = str(package / "home")
     environment |= {"PYTHONPATH": str(package), "HOME": home, "XDG_CACHE_HOME": home, "PYTHONDONTWRITEBYTECODE": "1"}

@@ -1,4 +1,4 @@
-"""Golden numbers and error laws of the pose methods on drawn-up measurements (no images)."""
+"""Golden numbers and error laws of the pose methods on simulated measurements (no images)."""
 
 from __future__ import annotations
 

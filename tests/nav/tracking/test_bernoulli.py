@@ -64,7 +64,7 @@ def test_a_candidate_beyond_the_image_has_no_score() -> None:
 
 
 def test_pass_rates_stay_within_their_bounds() -> None:
-    """Beta posteriors with forgetting: two hundred equal answers are no certainty, and a new look is accepted."""
+    """Beta posteriors with forgetting: equal outcomes never give certainty, and a new appearance is accepted."""
     tests, dark = learned_at(PLACE, Look()), whole(PLACE, Look(light=0.2))
     before = tests.scores(dark, BOX, at((0, 0)))[0]
     for _ in range(200):

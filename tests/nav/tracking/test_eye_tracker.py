@@ -16,7 +16,7 @@ NOWHERE = StereoDetection(None, None)
 
 
 def boxes(place: Place) -> StereoDetection:
-    """The true ones."""
+    """The true boxes."""
     return StereoDetection(*(Detection(place.box(eye), 1.0) for eye in EYES))
 
 

@@ -12,7 +12,7 @@ NOWHERE = StereoDetection(None, None)
 
 
 def left_box(place: Place) -> StereoDetection:
-    """The true one of the left eye alone."""
+    """The true box of the left eye alone."""
     return StereoDetection(Detection(place.box("left"), 1.0), None)
 
 

@@ -18,7 +18,7 @@ from tests.support.painted_sequences import RATE_HZ, Look, Place, film, overlap
 
 
 class CountingDetector(ColorBlobDetector):
-    """The detector, and how often it was asked."""
+    """A detector that counts its calls."""
 
     asked = 0
 
@@ -28,7 +28,7 @@ class CountingDetector(ColorBlobDetector):
 
 
 def tracked(name: str = "bernoulli") -> tuple[TrackedDetector, CountingDetector]:
-    """Both, following nothing."""
+    """A tracked detector that has nothing to track yet."""
     detector = CountingDetector(load_drogue("red-8"))
     return TrackedDetector(detector, open_tracker(name)), detector
 
@@ -126,7 +126,7 @@ def test_a_false_first_box_is_corrected_by_a_later_detection() -> None:
     wrong = StereoDetection(*(Detection(false.box(eye), 1.0) for eye in EYES))
 
     class WrongAtFirst(CountingDetector):
-        """The detector, but for its first answer."""
+        """A detector whose first result is wrong."""
 
         def detect(self, images: StereoImages) -> StereoDetection:
             found = super().detect(images)

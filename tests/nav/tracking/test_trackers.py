@@ -22,7 +22,7 @@ SKY_AND_DARK = [Look(), Look(light=0.12, noise_dn=1.5), Look(bits=12, light=0.05
 
 
 def boxes(place: Place) -> StereoDetection:
-    """The true ones."""
+    """The true boxes."""
     return StereoDetection(*(Detection(place.box(eye), 1.0) for eye in EYES))
 
 

@@ -122,7 +122,7 @@ def test_a_training_stops_when_told_and_other_settings_are_refused(split_dataset
 
 
 class Calls:
-    """True from the n-th time that it is asked."""
+    """Returns True from the n-th call on."""
 
     def __init__(self, count: int) -> None:
         self.left = count

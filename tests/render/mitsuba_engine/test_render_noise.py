@@ -1,4 +1,4 @@
-"""The noise that frames say the renderer left in them, against what it is."""
+"""The renderer's noise as frames state it, against the noise that is measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A receiver's runs and manoeuvres, and the follower that guides it after the drogue."""
+"""A receiver's approaches and manoeuvres, and the follower that guides it to the drogue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sequences that cannot be flown or seen: what is said of them."""
+"""Sequences that cannot be flown or seen are refused with a clear error."""
 
 from __future__ import annotations
 

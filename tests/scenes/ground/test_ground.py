@@ -109,7 +109,7 @@ def test_far_ground_does_not_shimmer():
 
 
 def test_no_seam_between_bands_of_rows():
-    """Rows are worked out in bands; a flat tone must not change from one to the next."""
+    """Rows are computed in bands; a flat tone must not change from one to the next."""
     ground = Ground(environment("sea", altitude_m=6000.0, wind_speed_m_s=1.0), light(beam_lux=0.0))
     rows = luminance(ground.radiance(rays(25.0, 6.0, rows=120))).mean(axis=1)
     steps = np.abs(np.diff(rows)) / rows[:-1]

@@ -1,4 +1,4 @@
-"""What is to be found, and the files in which boxes are exchanged."""
+"""The ground truth of detection, and the files in which boxes are exchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of parts of what there is to see: one eye, some markers, a noisier hub, a drogue not as built."""
+"""Bounds from a subset of the features: one eye, some markers, a noisier hub, a drogue that departs from nominal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the tip truly comes to the rim, and what answers about that err."""
+"""The true place at which the probe's tip reaches the rim, and the errors of its estimates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""True velocity and rate of motions with a closed form, and what covariances of them are worth."""
+"""True velocity and rate of motions with a closed form, and the consistency of their covariances."""
 
 from __future__ import annotations
 

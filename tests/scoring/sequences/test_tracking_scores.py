@@ -1,4 +1,4 @@
-"""Boxes through sequences: what counts as lost, as found again, and whose box it was."""
+"""Boxes in sequences: losses, recoveries, and whether detector or tracker made a box."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The hash of what results rest on."""
+"""The hash of the inputs of results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What single answers to a dataset's pairs are worth, and the time that went into them."""
+"""Errors and processing times of the estimates of a dataset's pairs."""
 
 from __future__ import annotations
 

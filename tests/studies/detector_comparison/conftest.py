@@ -1,4 +1,4 @@
-"""Networks in files that answer what a test wants."""
+"""Networks in files whose outputs a test chooses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nav.detector.output_maps import MAP_CHANNELS, STRIDES
 
 
 def _rows_network(path: Path, rows: np.ndarray, size_px: tuple[int, int] = (64, 64)) -> Path:
-    """A network that answers the same rows whatever it sees, but for a share of the picture's mean that is zero."""
+    """A network with constant output rows, to which it adds zero times the mean of its input."""
     path.parent.mkdir(parents=True, exist_ok=True)
     nodes = [
         helper.make_node("ReduceMean", ["images"], ["mean"], keepdims=0),
@@ -68,7 +68,7 @@ def _maps_network(path: Path, is_countable: bool = True) -> Path:
 
 @pytest.fixture
 def rows_network() -> Callable[..., Path]:
-    """Writes a network of others to a file."""
+    """Writes a network with the output rows of other projects to a file."""
     return _rows_network
 
 

@@ -1,4 +1,4 @@
-"""What is asked of the peers, without their environment: their corpus, the length of their training, and faults."""
+"""The other projects' detectors without their environment: corpus, length of the training, and wrong input."""
 
 from __future__ import annotations
 

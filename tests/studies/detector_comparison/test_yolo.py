@@ -1,4 +1,4 @@
-"""Networks of others: their rows become boxes in our pixels, and their cost is counted as anybody would by hand."""
+"""Networks of other projects: their output rows become boxes in image pixels, and their cost is that by hand."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_network_with_operations_of_somebody_else_has_no_cost(tmp_path: Path) 
 
 
 class Tallying:
-    """Finds nothing, and remembers in which order it was asked."""
+    """Finds nothing, and records the order of its calls."""
 
     def __init__(self, name: str, asked: list[str]) -> None:
         self.name = name

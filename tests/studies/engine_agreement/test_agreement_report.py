@@ -1,4 +1,4 @@
-"""The report as a whole by an engine that needs no renderer, and that a second run goes on where the first was."""
+"""The whole report by an engine that needs no renderer, and a second run that resumes the first."""
 
 from __future__ import annotations
 

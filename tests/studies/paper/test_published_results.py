@@ -1,4 +1,4 @@
-"""What is said of the paper's numbers."""
+"""Claims about the paper's numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is kept of a distance, and the table."""
+"""The stored measurements of a distance, and the table."""
 
 from __future__ import annotations
 

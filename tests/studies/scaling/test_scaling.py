@@ -1,4 +1,4 @@
-"""The benchmark of spreading measures what it says and remembers it; the page on scaling shows a Job that works."""
+"""The scaling benchmark measures and stores its figures; the Job on the page about scaling works."""
 
 from __future__ import annotations
 
