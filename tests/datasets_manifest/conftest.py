@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,7 +121,7 @@ SPLIT_OF_SCENE = {scene_id: ("train", "test")[scene_id % 2] for scene_id in rang
 
 
 @pytest.fixture
-def maker():
+def maker() -> tuple[Callable[..., Any], ...]:
     """The functions above, for tests that choose sensor and frames."""
     return make_recipe, make_images, make_parts, make_record, add_frame
 

@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import json
 import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,7 +16,7 @@ from datasets_manifest.storage.provenance import cpu_features, software_versions
 SPLIT_OF_SCENE = {scene_id: ("train", "test")[scene_id % 2] for scene_id in range(4)}
 
 
-def test_counts_splits_and_engines(tiny):
+def test_counts_splits_and_engines(tiny: Path) -> None:
     manifest = read_manifest(tiny)
     assert (manifest.counts.pairs, manifest.counts.empty) == (3, 1)
     assert manifest.counts.by_split == {"train": 1, "val": 0, "test": 2}
@@ -24,14 +27,14 @@ def test_counts_splits_and_engines(tiny):
     assert {"camera_axes", "units", "pixel_centre", "quaternion_order", "coco_pixels"} <= set(manifest.conventions)
 
 
-def test_reading_gives_what_was_written(tiny, tmp_path):
+def test_reading_gives_what_was_written(tiny: Path, tmp_path: Path) -> None:
     manifest = read_manifest(tiny)
     write_manifest(tmp_path, manifest)
     assert (tmp_path / "manifest.json").read_bytes() == (tiny / "manifest.json").read_bytes()
     assert read_manifest(tmp_path).dataset_sha256 == manifest.dataset_sha256
 
 
-def test_the_dataset_hash_ignores_order_and_place(maker, tmp_path):
+def test_the_dataset_hash_ignores_order_and_place(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> None:
     make_recipe, _, _, _, add_frame = maker
     recipe = make_recipe()
     digests = set()
@@ -45,7 +48,7 @@ def test_the_dataset_hash_ignores_order_and_place(maker, tmp_path):
     assert len(digests) == 1
 
 
-def test_the_dataset_hash_follows_records_and_recipe(tiny):
+def test_the_dataset_hash_follows_records_and_recipe(tiny: Path) -> None:
     manifest = read_manifest(tiny)
     hashes = [entry.record_sha256 for entry in manifest.frames]
     other = manifest.recipe.model_copy(update={"seed": 5})
@@ -58,7 +61,7 @@ def test_the_dataset_hash_follows_records_and_recipe(tiny):
     assert len(digests) == 4
 
 
-def test_drops_are_kept_with_their_reasons(tiny, maker):
+def test_drops_are_kept_with_their_reasons(tiny: Path, maker: tuple[Callable[..., Any], ...]) -> None:
     make_recipe, *_ = maker
     drops = [Drop(frame_index=2, reason="the engine stopped"), Drop(frame_index=1, reason="no room")]
     write_manifest(tiny, build_manifest(tiny, make_recipe(), "1", SPLIT_OF_SCENE, drops))
@@ -78,7 +81,7 @@ def test_drops_are_kept_with_their_reasons(tiny, maker):
         (lambda table: table.pop("engines"), "engines"),
     ],
 )
-def test_edited_manifests_are_refused(tiny, edit, message):
+def test_edited_manifests_are_refused(tiny: Path, edit: Callable[..., Any], message: str) -> None:
     path = tiny / "manifest.json"
     table = json.loads(path.read_text())
     edit(table)
@@ -88,7 +91,7 @@ def test_edited_manifests_are_refused(tiny, edit, message):
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_missing_and_truncated_manifests_are_refused(tiny, tmp_path):
+def test_missing_and_truncated_manifests_are_refused(tiny: Path, tmp_path: Path) -> None:
     path = tiny / "manifest.json"
     text = path.read_text()
     for damaged in ("", text[:300], "[]", "null"):
@@ -107,7 +110,7 @@ def test_missing_and_truncated_manifests_are_refused(tiny, tmp_path):
 
 
 @pytest.mark.parametrize("contents", ["{", "{}", "[]", '{"frame_index": 1}'])
-def test_a_damaged_record_cannot_be_described(tiny, maker, contents):
+def test_a_damaged_record_cannot_be_described(tiny: Path, maker: tuple[Callable[..., Any], ...], contents: str) -> None:
     make_recipe, *_ = maker
     path = frame_folder(tiny, 1) / "record.json"
     path.write_text(contents)
@@ -115,14 +118,14 @@ def test_a_damaged_record_cannot_be_described(tiny, maker, contents):
         build_manifest(tiny, make_recipe(), "1", SPLIT_OF_SCENE)
 
 
-def test_a_record_in_the_wrong_folder_cannot_be_described(tiny, maker):
+def test_a_record_in_the_wrong_folder_cannot_be_described(tiny: Path, maker: tuple[Callable[..., Any], ...]) -> None:
     make_recipe, *_ = maker
     frame_folder(tiny, 1).rename(frame_folder(tiny, 2))
     with pytest.raises(ValueError, match=r"000002/record\.json: belongs to frame 1"):
         build_manifest(tiny, make_recipe(), "1", SPLIT_OF_SCENE)
 
 
-def test_processors_of_two_makers_are_two(tmp_path, monkeypatch):
+def test_processors_of_two_makers_are_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = set()
     for maker in ("GenuineIntel", "AuthenticAMD"):
         (tmp_path / maker).write_text(f"processor\t: 0\nvendor_id\t: {maker}\nmodel name\t: any\n")
@@ -133,7 +136,7 @@ def test_processors_of_two_makers_are_two(tmp_path, monkeypatch):
     assert len(told | {nobody}) == 3 and frozenset.intersection(*told) == nobody
 
 
-def test_two_models_of_one_maker_are_two_processors(tmp_path, monkeypatch):
+def test_two_models_of_one_maker_are_two_processors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = set()
     for family, model in ((25, 17), (26, 17), (25, 1)):
         text = f"vendor_id\t: AuthenticAMD\ncpu family\t: {family}\nmodel\t\t: {model}\nmodel name\t: AMD EPYC\n"
@@ -145,7 +148,7 @@ def test_two_models_of_one_maker_are_two_processors(tmp_path, monkeypatch):
     assert len(found) == 3
 
 
-def test_machine_description():
+def test_machine_description() -> None:
     features = cpu_features()
     assert features and all(isinstance(feature, str) for feature in features)
     assert {"python", "numpy", "scipy", "opencv-python-headless"} <= set(software_versions())

@@ -8,8 +8,10 @@ import shutil
 import signal
 import tarfile
 import uuid
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 import webdataset
@@ -27,7 +29,7 @@ FRAMES = (0, 1, 2, 3, 4, 6)
 
 
 @pytest.fixture
-def staged(maker, tmp_path):
+def staged(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> Path:
     """Six frames in folders of their own, which are to come into tar files of three, and the manifest."""
     make_recipe, _, _, _, add_frame = maker
     recipe, dataset = make_recipe(), tmp_path / "dataset"
@@ -38,17 +40,17 @@ def staged(maker, tmp_path):
     return dataset
 
 
-def contents(dataset):
+def contents(dataset: Path | str) -> dict[tuple[int, str], bytes]:
     """Every file of every frame."""
     store = FrameStore(dataset)
     return {(index, name): store.read(index, name) for index in store.indices() for name in store.names(index)}
 
 
-def shards(dataset):
+def shards(dataset: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((dataset / "shards").iterdir())}
 
 
-def test_packing_changes_where_frames_lie_and_nothing_else(staged):
+def test_packing_changes_where_frames_lie_and_nothing_else(staged: Path) -> None:
     before, manifest = contents(staged), read_manifest(staged)
     seen = [Dataset(staged).images(index).left for index in FRAMES]
     pack_all(staged)
@@ -64,7 +66,7 @@ def test_packing_changes_where_frames_lie_and_nothing_else(staged):
     assert dataset.frames.where(4, "left.png") == str(staged / "shards/000001.tar/000004.left.png")
 
 
-def test_the_list_says_where_bytes_lie_and_what_they_hash_to(staged):
+def test_the_list_says_where_bytes_lie_and_what_they_hash_to(staged: Path) -> None:
     pack_all(staged)
     for number, frames in ((0, [0, 1, 2]), (1, [3, 4]), (2, [6])):
         data = (staged / f"shards/{number:06d}.tar").read_bytes()
@@ -82,7 +84,7 @@ def test_the_list_says_where_bytes_lie_and_what_they_hash_to(staged):
             assert file.sha256 == hashlib.sha256(data[file.offset : file.end]).hexdigest()
 
 
-def test_the_webdataset_package_reads_the_tar_files(staged):
+def test_the_webdataset_package_reads_the_tar_files(staged: Path) -> None:
     wanted = contents(staged)
     pack_all(staged)
     samples = list(webdataset.WebDataset(str(staged / "shards/000000.tar"), shardshuffle=False))
@@ -92,7 +94,7 @@ def test_the_webdataset_package_reads_the_tar_files(staged):
         assert sample["record.json"] == wanted[index, "record.json"]
 
 
-def test_tar_files_depend_on_their_frames_alone(staged, tmp_path):
+def test_tar_files_depend_on_their_frames_alone(staged: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(staged, other)
     pack_all(staged)
@@ -104,7 +106,7 @@ def test_tar_files_depend_on_their_frames_alone(staged, tmp_path):
     assert shards(other) == shards(staged)
 
 
-def test_a_tar_file_is_complete_with_the_frames_that_are_made(staged):
+def test_a_tar_file_is_complete_with_the_frames_that_are_made(staged: Path) -> None:
     packing = Packing(3, range(0, 7, 2))
     assert [packing.members(number) for number in range(3)] == [{0, 2}, {4}, {6}]
     pack_if_complete(staged, 4, packing)
@@ -112,7 +114,9 @@ def test_a_tar_file_is_complete_with_the_frames_that_are_made(staged):
     assert list_frames(staged) == list(FRAMES)
 
 
-def test_a_frame_that_is_made_again_replaces_the_packed_one(staged, maker):
+def test_a_frame_that_is_made_again_replaces_the_packed_one(
+    staged: Path, maker: tuple[Callable[..., Any], ...]
+) -> None:
     before = contents(staged)
     pack_all(staged)
     whole = shards(staged)
@@ -129,7 +133,7 @@ def test_a_frame_that_is_made_again_replaces_the_packed_one(staged, maker):
     assert shards(staged) == whole and list((staged / "frames").iterdir()) == []
 
 
-def test_a_damaged_folder_is_not_packed(staged):
+def test_a_damaged_folder_is_not_packed(staged: Path) -> None:
     (frame_folder(staged, 1) / "left.png").write_bytes(b"")
     pack_if_complete(staged, 1, Packing(3, range(7)))
     assert not (staged / "shards/000000.tar").exists()
@@ -141,8 +145,8 @@ def _die_at(step: int) -> None:
     """Let this process be killed before its `step`-th change of the disk."""
     count = 0
 
-    def counted(function):
-        def change(*arguments, **options):
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def change(*arguments: Any, **options: Any) -> Any:
             nonlocal count
             count += 1
             if count == step:
@@ -169,7 +173,7 @@ def _packs_until_killed(dataset: Path, step: int) -> bool:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
 
 
-def test_a_kill_at_any_change_of_the_disk_loses_no_frame(staged, tmp_path):
+def test_a_kill_at_any_change_of_the_disk_loses_no_frame(staged: Path, tmp_path: Path) -> None:
     wanted, calm = contents(staged), tmp_path / "calm"
     shutil.copytree(staged, calm)
     pack_all(calm)
@@ -191,7 +195,7 @@ def test_a_kill_at_any_change_of_the_disk_loses_no_frame(staged, tmp_path):
     assert kills > 20
 
 
-def test_the_size_of_tar_files_stays(staged):
+def test_the_size_of_tar_files_stays(staged: Path) -> None:
     configure_packing(staged, None)
     configure_packing(staged, 3)
     with pytest.raises(ValueError, match=r"--tar: .* has tar files of 3 pairs, got 4; leave it out"):
@@ -209,7 +213,7 @@ def test_the_size_of_tar_files_stays(staged):
         (lambda text: text.replace('"size":', '"size":1'), "but that has"),
     ],
 )
-def test_a_spoilt_list_is_one_clear_line(staged, spoil, message):
+def test_a_spoilt_list_is_one_clear_line(staged: Path, spoil: Callable[..., Any], message: str) -> None:
     pack_all(staged)
     path = staged / "shards/000000.json"
     path.write_text(spoil(path.read_text()))
@@ -220,7 +224,7 @@ def test_a_spoilt_list_is_one_clear_line(staged, spoil, message):
 
 
 @pytest.fixture(params=["folder", "memory"])
-def place(request, tmp_path):
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
     """A place of each kind where frames come into tar files of two."""
     place = tmp_path / "place" if request.param == "folder" else f"memory://{uuid.uuid4().hex}"
     configure_packing(place, 2)
@@ -236,7 +240,9 @@ def place(request, tmp_path):
         (lambda data: data.replace(b"000000.", b"xxxxxx."), ""),
     ],
 )
-def test_an_archive_that_is_none_is_named(place, maker, spoil, message):
+def test_an_archive_that_is_none_is_named(
+    place: Path, maker: tuple[Callable[..., Any], ...], spoil: Callable[..., Any], message: str
+) -> None:
     make_recipe, _, _, _, add_frame = maker
     add_frame(place, make_recipe(), 0)
     pack_all(place)
@@ -248,7 +254,9 @@ def test_an_archive_that_is_none_is_named(place, maker, spoil, message):
     assert "\n" not in str(caught.value)
 
 
-def test_archives_of_a_store_are_packed_listed_and_mended_as_on_disk(place, maker):
+def test_archives_of_a_store_are_packed_listed_and_mended_as_on_disk(
+    place: Path | str, maker: tuple[Callable[..., Any], ...]
+) -> None:
     make_recipe, _, _, _, add_frame = maker
     for index in range(3):
         add_frame(place, make_recipe(), index)
@@ -272,7 +280,7 @@ def test_archives_of_a_store_are_packed_listed_and_mended_as_on_disk(place, make
     assert contents(place) == before
 
 
-def test_a_list_is_made_again_from_its_archive(staged):
+def test_a_list_is_made_again_from_its_archive(staged: Path) -> None:
     pack_all(staged)
     before = shards(staged)
     (staged / "shards/000000.json").unlink()
@@ -282,7 +290,7 @@ def test_a_list_is_made_again_from_its_archive(staged):
     assert shards(staged) == before
 
 
-def test_threads_read_one_store_while_lists_come_and_go(staged, monkeypatch):
+def test_threads_read_one_store_while_lists_come_and_go(staged: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = contents(staged)
     pack_all(staged)
     monkeypatch.setattr("datasets_manifest.storage.frame_store._MAX_CACHED_INDICES", 1)
@@ -293,7 +301,7 @@ def test_threads_read_one_store_while_lists_come_and_go(staged, monkeypatch):
     assert len(store._shards) == 1
 
 
-def test_reads_stay_within_the_list(staged):
+def test_reads_stay_within_the_list(staged: Path) -> None:
     pack_all(staged)
     store = FrameStore(staged)
     for name in ("../layout.json", "none.png"):

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ from datasets_manifest.storage.reader import Dataset
 
 @pytest.mark.parametrize("preset", ["rgb-ideal", "paper-colour", "mono"])
 @pytest.mark.parametrize("bits", [8, 12])
-def test_images_and_parts_come_back(maker, tmp_path, preset, bits):
+def test_images_and_parts_come_back(
+    maker: tuple[Callable[..., Any], ...], tmp_path: Path, preset: str, bits: int
+) -> None:
     make_recipe, make_images, make_parts, _, add_frame = maker
     recipe = make_recipe(preset, bits)
     add_frame(tmp_path, recipe, 1)
@@ -32,12 +36,12 @@ def test_images_and_parts_come_back(maker, tmp_path, preset, bits):
         np.testing.assert_array_equal(dataset.part_ids(1, eye), want)
 
 
-def test_indices_come_in_order(tiny):
+def test_indices_come_in_order(tiny: Path) -> None:
     assert Dataset(tiny).frame_indices == (0, 1, 3)
     assert BlindDataset(tiny).frame_indices == (0, 1, 3)
 
 
-def test_verify_finds_what_changed(tiny):
+def test_verify_finds_what_changed(tiny: Path) -> None:
     dataset = Dataset(tiny)
     assert [dataset.verify(index) for index in dataset.frame_indices] == [[], [], []]
     folder = frame_folder(tiny, 1)
@@ -53,7 +57,7 @@ def test_verify_finds_what_changed(tiny):
     assert dataset.verify(2) == [f"{frame_folder(tiny, 2)}: is not in the manifest"]
 
 
-def test_damaged_files_are_named(tiny):
+def test_damaged_files_are_named(tiny: Path) -> None:
     dataset, blind, folder = Dataset(tiny), BlindDataset(tiny), frame_folder(tiny, 1)
     whole = (folder / "left.png").read_bytes()
     (folder / "left.png").write_bytes(whole[:-10])
@@ -84,7 +88,7 @@ def test_damaged_files_are_named(tiny):
         dataset.record(77)
 
 
-def test_links_out_of_the_frame_are_refused(tiny, tmp_path):
+def test_links_out_of_the_frame_are_refused(tiny: Path, tmp_path: Path) -> None:
     path = frame_folder(tiny, 1) / "left.png"
     elsewhere = tmp_path / "secret.png"
     path.rename(elsewhere)
@@ -94,7 +98,7 @@ def test_links_out_of_the_frame_are_refused(tiny, tmp_path):
     assert "leads outside" in Dataset(tiny).verify(1)[0]
 
 
-def test_blind_pairs_hold_no_truth(tiny):
+def test_blind_pairs_hold_no_truth(tiny: Path) -> None:
     """An empty frame looks like any other but for its pixels, and no attribute leads to a record."""
     blind = BlindDataset(tiny)
     assert set(vars(BlindPair(0, None, None, None))) == {"frame_index", "images", "rig", "drogue"}
@@ -104,7 +108,7 @@ def test_blind_pairs_hold_no_truth(tiny):
     assert {name for name in dir(blind) if not name.startswith("_")} == {"frame_indices", "pair"}
 
 
-def test_blind_reading_does_not_need_valid_truth(tiny):
+def test_blind_reading_does_not_need_valid_truth(tiny: Path) -> None:
     """Labels may be cut out of a dataset before it is handed on; images stay readable."""
     path = frame_folder(tiny, 0) / "record.json"
     path.write_text('{"time_s": 0.5, "frame": {"exposure": {"time_s": 0.002}}, "image_black_level_dn": 1.0}')
@@ -115,7 +119,7 @@ def test_blind_reading_does_not_need_valid_truth(tiny):
         BlindDataset(tiny).pair(0)
 
 
-def test_missing_dataset():
+def test_missing_dataset() -> None:
     for reader in (Dataset, BlindDataset):
         with pytest.raises(ValueError, match="there is no such dataset folder"):
             reader(Path("/nonexistent/dataset"))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -19,13 +21,13 @@ BASE: RecipeTable = {
 }
 
 
-def test_ideal_presets_have_no_lenses():
+def test_ideal_presets_have_no_lenses() -> None:
     for name in ("rgb-ideal", "paper-colour", "mono"):
         rig, _ = resolve_rig(name, 3)
         assert rig.lenses is None and "lenses" not in write_rig(rig)
 
 
-def test_real_eyes_are_drawn_by_the_seed():
+def test_real_eyes_are_drawn_by_the_seed() -> None:
     one, again, other = (write_rig(resolve_rig("paper-real", seed)[0])["lenses"] for seed in (1, 1, 2))
     assert one == again != other
     left, right = one
@@ -34,7 +36,7 @@ def test_real_eyes_are_drawn_by_the_seed():
     assert left["distortion"] != right["distortion"]
 
 
-def test_ranges_of_a_table_hold():
+def test_ranges_of_a_table_hold() -> None:
     rig, _ = resolve_rig({"preset": "mono", "eyes": {"k1": [-0.1, -0.05], "k3": 0.01, "right_rotation_deg": 0.5}}, 9)
     for lens in rig.lenses:
         assert -0.1 <= lens.distortion.k1 <= -0.05
@@ -45,7 +47,7 @@ def test_ranges_of_a_table_hold():
     assert 0 < np.degrees(np.linalg.norm(turn)) <= 0.5 * np.sqrt(3)
 
 
-def test_json_gives_the_rig_back():
+def test_json_gives_the_rig_back() -> None:
     recipe = build_recipe(BASE, rig="paper-real", seed=4)
     again = Recipe.model_validate_json(recipe.model_dump_json())
     assert again.model_dump_json() == recipe.model_dump_json()
@@ -54,7 +56,7 @@ def test_json_gives_the_rig_back():
         assert np.array_equal(again.rig.real_px(pixels, eye), recipe.rig.real_px(pixels, eye))
 
 
-def test_calibration_rectifies_the_real_images(tmp_path):
+def test_calibration_rectifies_the_real_images(tmp_path: Path) -> None:
     """OpenCV, given the written file alone, takes real pixels to the ideal rig's."""
     rig, _ = resolve_rig("paper-real", 6)
     path = write_calibration(tmp_path, rig)[0]
@@ -74,7 +76,7 @@ def test_calibration_rectifies_the_real_images(tmp_path):
     np.testing.assert_allclose(rig.image(points, "right"), wanted[:, 0], atol=1e-8)
 
 
-def test_engines_without_lenses_are_named():
+def test_engines_without_lenses_are_named() -> None:
     with pytest.raises(ValueError, match=r"render\.engine: foreign draws ideal eyes only"):
         build_recipe(BASE, rig="paper-real", render={"engine": "foreign"})
 

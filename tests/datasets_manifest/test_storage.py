@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pickle
 import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,12 +25,12 @@ from datasets_manifest.storage.writer import (
 
 
 @pytest.fixture(params=["folder", "memory"])
-def place(request, tmp_path):
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Path | str:
     """An empty place of each kind; the memory is that of this process."""
     return tmp_path / "place" if request.param == "folder" else f"memory://{uuid.uuid4().hex}"
 
 
-def test_files_are_kept_replaced_and_removed(place):
+def test_files_are_kept_replaced_and_removed(place: Path | str) -> None:
     storage = open_storage(place)
     assert not storage.root_exists() and not storage.exists("a") and storage.names("") == []
     storage.write("a", b"first")
@@ -49,7 +52,7 @@ def test_files_are_kept_replaced_and_removed(place):
         storage.read("a")
 
 
-def test_streams_count_when_their_block_ends_without_an_error(place):
+def test_streams_count_when_their_block_ends_without_an_error(place: Path | str) -> None:
     storage = open_storage(place)
     storage.write("text", b"old")
     with pytest.raises(RuntimeError, match="stop"), storage.write_text("text") as stream:
@@ -68,7 +71,7 @@ def test_streams_count_when_their_block_ends_without_an_error(place):
     assert storage.names("") == ["deep", "text"]
 
 
-def test_a_folder_counts_with_its_last_file(place):
+def test_a_folder_counts_with_its_last_file(place: Path | str) -> None:
     storage = open_storage(place)
     storage.write_together("frames/000001", {"x": b"1", "record.json": b"{}"}, "record.json")
     storage.write_together("frames/000002", {"x": b"2", "record.json": b"{}"}, "record.json")
@@ -81,7 +84,7 @@ def test_a_folder_counts_with_its_last_file(place):
     assert storage.folders_with("frames", "record.json") == ["000002"] and storage.names("frames/000001") == []
 
 
-def test_objects_of_a_frame_without_its_record_are_leftovers(maker):
+def test_objects_of_a_frame_without_its_record_are_leftovers(maker: tuple[Callable[..., Any], ...]) -> None:
     make_recipe, _, _, _, add_frame = maker
     place = f"memory://{uuid.uuid4().hex}"
     add_frame(place, make_recipe(), 0)
@@ -96,7 +99,9 @@ def test_objects_of_a_frame_without_its_record_are_leftovers(maker):
     assert FrameStore(place).indices() == []
 
 
-def test_what_other_people_keep_in_a_dataset_is_no_leftover(place, maker):
+def test_what_other_people_keep_in_a_dataset_is_no_leftover(
+    place: Path | str, maker: tuple[Callable[..., Any], ...]
+) -> None:
     make_recipe, _, _, _, add_frame = maker
     add_frame(place, make_recipe(), 0)
     others = ["even/shards/000000.tar", "even/annotations/all.json", "bags/flight-0/x.mcap", "frames/notes.txt"]
@@ -106,7 +111,7 @@ def test_what_other_people_keep_in_a_dataset_is_no_leftover(place, maker):
     assert all(open_storage(place).read(name) == b"mine" for name in others)
 
 
-def test_what_a_caller_does_wrong_with_a_stream_stays_the_callers_error(place):
+def test_what_a_caller_does_wrong_with_a_stream_stays_the_callers_error(place: Path | str) -> None:
     storage = open_storage(place)
     storage.write("a", bytes(range(256)) * 4)
     with pytest.raises(ValueError, match="mine"), storage.open("a"):
@@ -118,7 +123,7 @@ def test_what_a_caller_does_wrong_with_a_stream_stays_the_callers_error(place):
         stream.read()
 
 
-def test_a_dataset_reads_the_same_from_both(place, maker):
+def test_a_dataset_reads_the_same_from_both(place: Path | str, maker: tuple[Callable[..., Any], ...]) -> None:
     make_recipe, make_images, make_parts, make_record, _ = maker
     recipe = make_recipe()
     for index in (0, 2):
@@ -138,7 +143,9 @@ def test_a_dataset_reads_the_same_from_both(place, maker):
         dataset.images(2)
 
 
-def test_a_frame_is_handed_on_as_it_is_on_record_or_not_at_all(place, maker):
+def test_a_frame_is_handed_on_as_it_is_on_record_or_not_at_all(
+    place: Path | str, maker: tuple[Callable[..., Any], ...]
+) -> None:
     make_recipe, make_images, make_parts, make_record, _ = maker
     recipe = make_recipe()
     files = encode_files(make_images(recipe, 0), make_parts(recipe, 0))
@@ -157,7 +164,7 @@ def test_a_frame_is_handed_on_as_it_is_on_record_or_not_at_all(place, maker):
         storage.write(f"frames/000000/{name}", whole)
 
 
-def test_a_link_that_leads_to_itself_is_one_clear_line(tmp_path, maker):
+def test_a_link_that_leads_to_itself_is_one_clear_line(tmp_path: Path, maker: tuple[Callable[..., Any], ...]) -> None:
     make_recipe, _, _, _, add_frame = maker
     add_frame(tmp_path, make_recipe(), 0)
     image = tmp_path / "frames/000000/left.png"
@@ -167,7 +174,7 @@ def test_a_link_that_leads_to_itself_is_one_clear_line(tmp_path, maker):
         FrameStore(tmp_path).read(0, "left.png")
 
 
-def test_places_by_their_names(tmp_path, monkeypatch):
+def test_places_by_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert as_location("s3://bucket/name/") == "s3://bucket/name"
     assert as_location("data/demo") == as_location("data/demo/") and join("s3://b/n", "x") == "s3://b/n/x"
     assert as_location(f"file://{tmp_path}") == tmp_path
@@ -178,7 +185,7 @@ def test_places_by_their_names(tmp_path, monkeypatch):
     assert absolute("data") == tmp_path / "data" and absolute("s3://b/n") == "s3://b/n"
 
 
-def test_a_place_may_be_called_as_what_lies_in_it():
+def test_a_place_may_be_called_as_what_lies_in_it() -> None:
     storage = open_storage(f"memory://{uuid.uuid4().hex}/frames")
     storage.write_together("frames/000001[2]*", {"x": b"", "record.json": b"{}"}, "record.json")
     assert storage.names("") == ["frames"] and storage.names("frames") == ["000001[2]*"]
@@ -187,13 +194,13 @@ def test_a_place_may_be_called_as_what_lies_in_it():
 
 
 @pytest.mark.parametrize("url", ["nonsense://x/y", "s3:///"])
-def test_urls_that_nobody_knows_are_refused(url):
+def test_urls_that_nobody_knows_are_refused(url: str) -> None:
     with pytest.raises((ValueError, OSError), match=url.split(":")[0]) as caught:
         read_manifest(url)
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_package_is_named_with_its_cure(monkeypatch):
+def test_a_missing_package_is_named_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     # What Python does for a package that is not installed.
     monkeypatch.setitem(__import__("sys").modules, "fsspec.core", None)
     with pytest.raises(ValueError, match=r'missing: pip install "droguekit\[remote\]"'):
@@ -201,7 +208,7 @@ def test_a_missing_package_is_named_with_its_cure(monkeypatch):
 
 
 @pytest.mark.parametrize("place", ["folder", "memory"], indirect=True)
-def test_work_comes_back_in_order_and_errors_in_their_turn(place):
+def test_work_comes_back_in_order_and_errors_in_their_turn(place: Path | str) -> None:
     storage = open_storage(place)
     assert list(map_in_order(lambda number: number**2, range(100), storage)) == [number**2 for number in range(100)]
     results = map_in_order(lambda number: 1 / (50 - number), range(100), storage)

@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +21,11 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import encode_files, encode_record, leftovers, remove_leftovers, write_frame
 
 
-def entries(folder):
+def entries(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-def test_a_frame_holds_its_files_and_their_hashes(maker, tmp_path):
+def test_a_frame_holds_its_files_and_their_hashes(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> None:
     make_recipe, _, _, _, add_frame = maker
     record = add_frame(tmp_path, make_recipe(), 123)
     folder = tmp_path / "frames" / "000123"
@@ -41,7 +43,7 @@ def test_a_frame_holds_its_files_and_their_hashes(maker, tmp_path):
     assert frame_indices(tmp_path) == [123] and leftovers(tmp_path) == []
 
 
-def test_records_come_back_bit_for_bit(tiny, maker):
+def test_records_come_back_bit_for_bit(tiny: Path, maker: tuple[Callable[..., Any], ...]) -> None:
     _, _, _, make_record, _ = maker
     dataset = Dataset(tiny)
     for index in dataset.frame_indices:
@@ -52,7 +54,7 @@ def test_records_come_back_bit_for_bit(tiny, maker):
         assert encode_record(wanted.model_copy(update={"file_sha256": record.file_sha256})) == data
 
 
-def test_record_schema(tiny):
+def test_record_schema(tiny: Path) -> None:
     table = json.loads((frame_folder(tiny, 0) / "record.json").read_text())
     assert np.array(table["left_from_drogue"]).shape == (4, 4)
     assert table["left_from_drogue"][3] == [0.0, 0.0, 0.0, 1.0]
@@ -62,7 +64,7 @@ def test_record_schema(tiny):
     assert table["pitch_deg"] == 1 / 3 and "0.3333333333333333" in (frame_folder(tiny, 0) / "record.json").read_text()
 
 
-def test_bytes_depend_on_nothing_else(maker, tmp_path):
+def test_bytes_depend_on_nothing_else(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> None:
     make_recipe, make_images, make_parts, make_record, _ = maker
     recipe = make_recipe()
     files = encode_files(make_images(recipe, 2), make_parts(recipe, 2))
@@ -74,7 +76,7 @@ def test_bytes_depend_on_nothing_else(maker, tmp_path):
         assert one.read_bytes() == other.read_bytes()
 
 
-def test_writing_again_replaces(maker, tmp_path):
+def test_writing_again_replaces(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> None:
     make_recipe, _, _, make_record, add_frame = maker
     recipe = make_recipe()
     add_frame(tmp_path, recipe, 5)
@@ -84,14 +86,14 @@ def test_writing_again_replaces(maker, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["../evil.png", "a/b.png", "record.json", "", "..", "a\\b", "c:x"])
-def test_names_that_are_not_plain_are_refused(maker, tmp_path, name):
+def test_names_that_are_not_plain_are_refused(maker: tuple[Callable[..., Any], ...], tmp_path: Path, name: str) -> None:
     make_recipe, _, _, make_record, _ = maker
     with pytest.raises(ValueError, match="files: must have plain names"):
         write_frame(tmp_path / "dataset", make_record(make_recipe(), 0), {name: b""})
     assert not (tmp_path / "dataset").exists()
 
 
-def test_part_ids_of_another_size_are_refused(maker):
+def test_part_ids_of_another_size_are_refused(maker: tuple[Callable[..., Any], ...]) -> None:
     make_recipe, make_images, make_parts, _, _ = maker
     recipe = make_recipe()
     parts = make_parts(recipe, 0)
@@ -100,7 +102,7 @@ def test_part_ids_of_another_size_are_refused(maker):
         encode_files(make_images(recipe, 0), parts)
 
 
-def run_apart(code, folder):
+def run_apart(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run code that may import this folder's conftest in a process of its own; `{folder!r}` in it is the argument."""
     here = Path(__file__).parent
     roots = os.pathsep.join([str(here), str(here.parents[1])])
@@ -126,7 +128,7 @@ except OSError as error:
 """
 
 
-def test_a_write_that_fails_leaves_nothing(maker, tmp_path):
+def test_a_write_that_fails_leaves_nothing(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> None:
     make_recipe, _, _, _, add_frame = maker
     add_frame(tmp_path / "dataset", make_recipe(), 0)
     before = entries(tmp_path)
@@ -136,7 +138,7 @@ def test_a_write_that_fails_leaves_nothing(maker, tmp_path):
 
 
 @pytest.fixture
-def full_disk(tmp_path):
+def full_disk(tmp_path: Path) -> Iterator[Path]:
     """A disk of 64 kB of its own."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -147,7 +149,7 @@ def full_disk(tmp_path):
     subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_a_full_disk_leaves_nothing_half_written(full_disk, maker):
+def test_a_full_disk_leaves_nothing_half_written(full_disk: Path, maker: tuple[Callable[..., Any], ...]) -> None:
     make_recipe, _, _, _, add_frame = maker
     recipe, dataset = make_recipe(), full_disk / "dataset"
     written = 0
@@ -165,7 +167,7 @@ def test_a_full_disk_leaves_nothing_half_written(full_disk, maker):
     assert not (dataset / "manifest.json").exists() and leftovers(dataset) == []
 
 
-def test_a_folder_that_cannot_be_made_is_one_clear_line(maker, tmp_path):
+def test_a_folder_that_cannot_be_made_is_one_clear_line(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> None:
     make_recipe, _, _, _, add_frame = maker
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="cannot be written: Not a directory") as caught:
@@ -188,7 +190,7 @@ except PermissionError as error:
 """
 
 
-def test_an_unwritable_folder_is_one_clear_line(tmp_path):
+def test_an_unwritable_folder_is_one_clear_line(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     said = run_apart(UNWRITABLE, tmp_path / "dataset").stdout.splitlines()
     tmp_path.chmod(0o700)
@@ -210,7 +212,7 @@ add_frame(Path({folder!r}), make_recipe(), 7)
 """
 
 
-def test_a_killed_run_leaves_only_leftovers(maker, tmp_path):
+def test_a_killed_run_leaves_only_leftovers(maker: tuple[Callable[..., Any], ...], tmp_path: Path) -> None:
     make_recipe, _, _, _, add_frame = maker
     done = run_apart(KILLED, tmp_path / "dataset")
     assert done.returncode == -signal.SIGKILL
@@ -226,7 +228,7 @@ def test_a_killed_run_leaves_only_leftovers(maker, tmp_path):
     assert remove_leftovers(tmp_path / "none") == []
 
 
-def test_text_is_replaced_at_the_end_or_not_at_all(tmp_path):
+def test_text_is_replaced_at_the_end_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "new" / "note.txt"
     write_text_atomic(path, "first\n")
     with pytest.raises(RuntimeError, match="stop"), open_text_atomic(path) as stream:

@@ -8,6 +8,7 @@ import json
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,7 +22,7 @@ from geometry.stereo import EYES
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 from labelgen.validation.dataset_checks import validate_dataset
-from tests.support.damage_strategies import byte_edits, fuzz, json_edits, quietly
+from tests.support.damage_strategies import Edit, byte_edits, fuzz, json_edits, quietly
 
 SECRET = "must not be read, changed or joined"
 FRAME_FILES = ["record.json", *(f"{eye}{rest}" for eye in EYES for rest in (".png", "_parts.png", ".exr"))]
@@ -29,8 +30,12 @@ OTHER_FILES = ["manifest.json", "recipe.toml", "calibration/opencv_stereo.yaml",
 OTHER_FILES += ["annotations/all.json", "annotations/train.json"]
 
 
+# Files with what is done to each, and whether the hashes are made to fit again.
+Damage = tuple[list[tuple[str, Edit | str]], bool]
+
+
 @st.composite
-def damages(draw):
+def damages(draw: st.DrawFn) -> Damage:
     """One or two files of a dataset, what to do with each, and whether the hashes are made to fit again."""
     found = []
     for _ in range(draw(st.integers(1, 2))):
@@ -43,7 +48,7 @@ def damages(draw):
     return found, draw(st.booleans())
 
 
-def apply(dataset, secret, found, is_repaired):
+def apply(dataset: Path, secret: Path, found: list[tuple[str, Edit | str]], is_repaired: bool) -> None:
     for name, edit in found:
         path = dataset / name
         if path.is_dir():
@@ -65,7 +70,7 @@ def apply(dataset, secret, found, is_repaired):
             repair(dataset)
 
 
-def repair(dataset):
+def repair(dataset: Path) -> None:
     """Make the hashes of records and manifest fit what lies there, so that damage gets past them."""
     table = json.loads((dataset / "manifest.json").read_bytes())
     for entry in table["frames"]:
@@ -83,11 +88,11 @@ def repair(dataset):
     (dataset / "manifest.json").write_bytes(json.dumps(table).encode("utf-8", "surrogatepass"))
 
 
-def content_sha256(table):
+def content_sha256(table: dict[str, Any]) -> str:
     return hashlib.sha256(canonical_json(table).encode("utf-8")).hexdigest()
 
 
-def listing(folder):
+def listing(folder: Path) -> dict[Path, Any]:
     """Every name below a folder with what it holds, links not followed."""
     return {
         path.relative_to(folder): path.read_bytes() if path.is_file() and not path.is_symlink() else None
@@ -97,7 +102,7 @@ def listing(folder):
 
 @fuzz(250)
 @given(damage=damages(), name=st.sampled_from([*FORMATS, "validate", "validate", "validate", "read", "blind"]))
-def test_damaged_datasets(whole, damage, name):
+def test_damaged_datasets(whole: Path, damage: Damage, name: str) -> None:
     with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
         base = Path(place)
         (base / "secret").write_text(SECRET)
@@ -121,7 +126,7 @@ def test_damaged_datasets(whole, damage, name):
         assert not [path for path, data in after.items() if path not in before and data and SECRET.encode() in data]
 
 
-def read_all(dataset):
+def read_all(dataset: Path) -> None:
     source = Dataset(dataset)
     for index in source.frame_indices:
         source.verify(index)

@@ -6,6 +6,7 @@ import json
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,13 +28,13 @@ from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from tests.support.damage_strategies import HOSTILE, byte_edits, fuzz, json_edits, quietly
+from tests.support.damage_strategies import HOSTILE, Edit, byte_edits, fuzz, json_edits, quietly
 from tests.support.whole_dataset import RECIPE
 
 
 @fuzz(60)
 @given(edits=st.lists(byte_edits(), min_size=1, max_size=3), swap=st.tuples(st.integers(0, 400), HOSTILE))
-def test_damaged_recipes(edits, swap):
+def test_damaged_recipes(edits: list[Edit], swap: tuple[int, Any]) -> None:
     text = load_recipe("smoke").text if swap[0] % 2 else RECIPE
     lines = text.splitlines()
     line = swap[0] % len(lines)
@@ -45,7 +46,7 @@ def test_damaged_recipes(edits, swap):
         data = edit(data)
     damaged = data.decode("utf-8", "replace")
 
-    def use():
+    def use() -> None:
         recipe = parse_recipe(damaged)
         sample_frame(recipe, 0)
 
@@ -54,7 +55,7 @@ def test_damaged_recipes(edits, swap):
 
 @fuzz(30)
 @given(edit=st.one_of(byte_edits(), json_edits()), other=byte_edits(), is_once=st.booleans())
-def test_damaged_estimates(edit, other, is_once):
+def test_damaged_estimates(edit: Edit, other: Edit, is_once: bool) -> None:
     pose = np.eye(4).tolist()
     line = json.dumps({"status": "fix", "frame_index": 0, "method": "mine", "left_from_drogue": pose}).encode()
     data = edit(line) + b"\n" + line
@@ -66,7 +67,7 @@ def test_damaged_estimates(edit, other, is_once):
 
 @fuzz(30)
 @given(edit=byte_edits(), other=byte_edits(), suffix=st.sampled_from([".exr", ".hdr"]))
-def test_damaged_environment_maps(edit, other, suffix):
+def test_damaged_environment_maps(edit: Edit, other: Edit, suffix: str) -> None:
     picture = np.full((8, 16, 3), 500.0, np.float32)
     with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
         path = Path(place) / f"map{suffix}"
@@ -80,7 +81,7 @@ def test_damaged_environment_maps(edit, other, suffix):
 
 
 @pytest.fixture(scope="module")
-def bag(whole):
+def bag(whole: Path) -> Path:
     """The dataset as a ROS 2 bag."""
     write_export("rosbag", whole, whole.with_name("bag"), ExportLog())
     (file,) = whole.with_name("bag").rglob("*.mcap")
@@ -89,14 +90,14 @@ def bag(whole):
 
 @fuzz(40)
 @given(edit=byte_edits(), other=byte_edits(), name=st.sampled_from([".mcap", ".mcap", "metadata.yaml"]))
-def test_damaged_bags(bag, edit, other, name):
+def test_damaged_bags(bag: Path, edit: Edit, other: Edit, name: str) -> None:
     with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
         copy = Path(place) / "bag"
         shutil.copytree(bag, copy)
         path = next(path for path in copy.iterdir() if path.name.endswith(name))
         path.write_bytes(edit(other(path.read_bytes())))
 
-        def use():
+        def use() -> None:
             source = RosBag(copy)
             assert len(list(source)) == source.count
             source.rig()
@@ -106,7 +107,7 @@ def test_damaged_bags(bag, edit, other, name):
 
 @fuzz(30)
 @given(edit=byte_edits(), other=byte_edits())
-def test_damaged_images(whole, edit, other):
+def test_damaged_images(whole: Path, edit: Edit, other: Edit) -> None:
     for name in ("left.png", "right_parts.png"):
         data = (frame_folder(whole, 0) / name).read_bytes()
         quietly(lambda data=data: decode_png(edit(other(data)), "image"))
@@ -114,7 +115,7 @@ def test_damaged_images(whole, edit, other):
 
 @fuzz(40)
 @given(edit=byte_edits(), other=byte_edits())
-def test_damaged_passes(whole, edit, other):
+def test_damaged_passes(whole: Path, edit: Edit, other: Edit) -> None:
     data = edit(other((frame_folder(whole, 0) / "left.exr").read_bytes()))
     camera = read_manifest(whole).recipe.rig.camera
     quietly(lambda: read_passes(data, "passes", camera))
@@ -123,7 +124,7 @@ def test_damaged_passes(whole, edit, other):
 
 @fuzz(20)
 @given(edit=byte_edits(), other=byte_edits())
-def test_damaged_calibrations(edit, other):
+def test_damaged_calibrations(edit: Edit, other: Edit) -> None:
     text = opencv_stereo(resolve_rig("paper-real", 3)[0])
     with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
         path = Path(place) / "calibration.yaml"

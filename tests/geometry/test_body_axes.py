@@ -5,7 +5,7 @@ import numpy as np
 from geometry.body_axes import FLU_FROM_FRD, FRD_FROM_OPTICAL, NED_FROM_ENU
 
 
-def test_directions_keep_their_meaning():
+def test_directions_keep_their_meaning() -> None:
     right, down, forward = np.eye(3)
     np.testing.assert_array_equal(FRD_FROM_OPTICAL.apply([forward, right, down]), np.eye(3))
     forward, right, down = np.eye(3)

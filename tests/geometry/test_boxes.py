@@ -18,7 +18,7 @@ from geometry.boxes import intersection_area, intersection_over_union
         ((9.0, 9.0, 0.0, 0.0), 0.0),
     ],
 )
-def test_what_two_boxes_share(other, want):
+def test_what_two_boxes_share(other: tuple[float, ...], want: float) -> None:
     assert intersection_over_union((0.0, 0.0, 4.0, 2.0), other) == pytest.approx(want)
     assert intersection_over_union(other, (0.0, 0.0, 4.0, 2.0)) == pytest.approx(want)
 

@@ -12,7 +12,7 @@ from geometry.circles import disc_image_centers, disc_outline, project_disc_cent
 from geometry.distortion import BrownConrady, Lens, border_px
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist, rotation_from_angles
-from geometry.stereo import EYES, StereoRig, paper_rig
+from geometry.stereo import EYES, Eye, StereoRig, paper_rig
 
 IDEAL = paper_rig()
 LEFT = Lens(PinholeCamera(1280, 960, 2140.0, 2136.0, 634.0, 484.5), BrownConrady(-0.08, 0.03, 2e-4, -1e-4, 0.01))
@@ -37,14 +37,14 @@ def sample_points_m(count: int) -> np.ndarray:
     st.floats(-0.35, 0.35),
     st.floats(-0.35, 0.35),
 )
-def test_undistort_inverts_distort(coefficients, x, y):
+def test_undistort_inverts_distort(coefficients: tuple[float, ...], x: float, y: float) -> None:
     model = BrownConrady(*coefficients)
     # Newton's method ends at rounding.
     np.testing.assert_allclose(model.undistort(model.distort([x, y])), [x, y], atol=1e-12)
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_images_are_opencv_s(eye):
+def test_images_are_opencv_s(eye: Eye) -> None:
     points, lens = sample_points_m(200), RIG.lens(eye)
     real_from_ideal = lens.ideal_from_real.T
     turn, _ = cv2.Rodrigues(real_from_ideal)
@@ -55,7 +55,7 @@ def test_images_are_opencv_s(eye):
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_real_and_ideal_pixels_go_back_and_forth(eye):
+def test_real_and_ideal_pixels_go_back_and_forth(eye: Eye) -> None:
     ideal = np.random.default_rng(3).uniform(-0.5, [1279.5, 959.5], (300, 2))
     real = RIG.real_px(ideal, eye)
     assert np.abs(real - ideal).max() > 3
@@ -63,7 +63,7 @@ def test_real_and_ideal_pixels_go_back_and_forth(eye):
     np.testing.assert_allclose(RIG.image(RIG.rays(real, eye) * 7.0 + RIG.eye_offset_m(eye), eye), real, atol=1e-9)
 
 
-def test_rectified_places_triangulate_to_the_point():
+def test_rectified_places_triangulate_to_the_point() -> None:
     points = sample_points_m(100)
     left, right = (RIG.ideal_px(RIG.image(points, eye), eye) for eye in EYES)
     np.testing.assert_allclose(left[:, 1], right[:, 1], atol=1e-9)
@@ -71,7 +71,7 @@ def test_rectified_places_triangulate_to_the_point():
     np.testing.assert_allclose(RIG.triangulate(left, right), points, rtol=1e-9)
 
 
-def test_ideal_rig_changes_nothing():
+def test_ideal_rig_changes_nothing() -> None:
     pixels = np.array([[3.25, 700.5], [1000.0, 12.0]])
     for eye in EYES:
         assert np.array_equal(IDEAL.real_px(pixels, eye), pixels)
@@ -79,7 +79,7 @@ def test_ideal_rig_changes_nothing():
     assert IDEAL.largest_shift_px() == 0.0
 
 
-def test_largest_shift_bounds_every_pixel_of_the_border():
+def test_largest_shift_bounds_every_pixel_of_the_border() -> None:
     u = np.linspace(-0.5, 1279.5, 500)
     edge = np.stack([u, np.full(500, -0.5)], axis=-1)
     shifts = [np.linalg.norm(RIG.real_px(edge, eye) - edge, axis=-1).max() for eye in EYES]
@@ -89,7 +89,7 @@ def test_largest_shift_bounds_every_pixel_of_the_border():
     assert border.min(axis=0).tolist() == [-0.5, -0.5] and border.max(axis=0).tolist() == [1279.5, 959.5]
 
 
-def test_disc_centres_are_the_ellipse_s_without_and_the_area_s_with_a_lens():
+def test_disc_centres_are_the_ellipse_s_without_and_the_area_s_with_a_lens() -> None:
     pose = RigidTransform(rotation_from_angles(0.2, -0.3, 0.4), np.array([0.3, -0.2, 1.9]))
     centers, radii = np.array([[0.27, 0, 0], [0, -0.27, 0]]), np.array([0.05, 0.05])
     bare = Lens(IDEAL.camera)
@@ -107,7 +107,7 @@ def test_disc_centres_are_the_ellipse_s_without_and_the_area_s_with_a_lens():
             assert abs(moments["m10"] / moments["m00"]) < 1e-4 and abs(moments["m01"] / moments["m00"]) < 1e-4
 
 
-def test_a_fold_and_a_foreign_size_are_refused():
+def test_a_fold_and_a_foreign_size_are_refused() -> None:
     with pytest.raises(ValueError, match="is not invertible over the whole image"):
         Lens(PinholeCamera(1280, 960, 500.0, 500.0, 639.5, 479.5), BrownConrady(k1=-0.6))
     with pytest.raises(ValueError, match="finite"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from nav.numerics import least_squares_loops
 from nav.pose import adjustment_loops
 
 
-def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile():
+def test_what_is_fitted_before_pairs_come_leaves_next_to_nothing_to_compile() -> None:
     code = """
 from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
@@ -50,6 +51,6 @@ print(len(before), *sorted({name for name, _ in compiled() - before}))
     "loops",
     [adjustment_loops, blurred_edges, centroid_uncertainty, least_squares_loops, outline_pixels],
 )
-def test_loops_can_be_cached_beside_their_file_or_at_home(loops):
+def test_loops_can_be_cached_beside_their_file_or_at_home(loops: Any) -> None:
     found = [loop for loop in vars(loops).values() if hasattr(loop, "signatures")]
     assert found and all(loop.stats.cache_path for loop in found)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +12,7 @@ from datasets_manifest.recipe.rigs import resolve_rig
 from datasets_manifest.types.estimates import PoseEstimate
 from geometry.circles import disc_image_centers, disc_outline, project_disc_centers
 from geometry.se3 import RigidTransform, rotation_from_angles
-from geometry.stereo import EYES, paper_rig
+from geometry.stereo import EYES, Eye, paper_rig
 from labelgen.frame_labels import label_frame
 from nav.centroids.ellipses import outline_shapes
 from nav.lens_correction import distort_points, undistort_points
@@ -24,13 +27,13 @@ RIG, _ = resolve_rig("paper-real", 3)
 POSE = RigidTransform(rotation_from_angles(0.1, -0.1, 0.3), np.array([0.2, -0.15, 1.8]))
 
 
-def shapes_of(project, centers_m, eye):
+def shapes_of(project: Callable[..., Any], centers_m: np.ndarray, eye: Eye) -> np.ndarray:
     outlines = np.stack([project(disc_outline(POSE, center, 0.05, 64), eye) for center in centers_m])
     return outline_shapes(outlines - outlines.mean(axis=1, keepdims=True))
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_centres_of_discs_go_back_and_forth(eye):
+def test_centres_of_discs_go_back_and_forth(eye: Eye) -> None:
     """Against polygons through the discs' true edges; a lens shifts a centre otherwise than a point."""
     centers_m = np.array([[0.27, 0.0, 0.0], [0.0, 0.27, 0.0], [-0.27, 0.0, 0.0]])
     radii_m = np.full(3, 0.05)
@@ -47,20 +50,20 @@ def test_centres_of_discs_go_back_and_forth(eye):
     np.testing.assert_allclose(np.sqrt(np.diagonal(moved[0])), growth, rtol=3e-3)
 
 
-def test_what_was_not_measured_stays_so():
+def test_what_was_not_measured_stays_so() -> None:
     centers = np.array([[np.nan, np.nan], [600.0, 300.0]])
     found, cov = undistort_points(RIG, "right", centers, DISCS, np.full((2, 2, 2), np.nan))
     assert np.isnan(found[0]).all() and np.isfinite(found[1]).all() and np.isnan(cov[0]).all()
     assert np.isnan(distort_points(RIG, "right", centers, DISCS)[0]).all()
 
 
-def test_ideal_eyes_change_nothing():
+def test_ideal_eyes_change_nothing() -> None:
     centers, cov = np.array([[10.0, 20.0]]), np.ones((1, 2, 2))
     assert undistort_points(paper_rig(), "left", centers, DISCS[:1], cov) == (centers, cov)
     assert distort_points(paper_rig(), "left", centers, DISCS[:1]) is centers
 
 
-def test_poses_through_real_lenses():
+def test_poses_through_real_lenses() -> None:
     recipe = build_recipe(
         name="real-eyes",
         seed=3,

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import signal
 import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +17,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from datasets_manifest.importers.imported_dataset import ImportedPair, ImportSettings, write_imported
+from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.types.estimates import NoFix, PoseEstimate, read_estimates
 from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, WRONG_INPUT, run
@@ -28,17 +33,17 @@ class Flight:
 
     left_out = ()
 
-    def __init__(self, pairs):
+    def __init__(self, pairs: list[BlindPair]) -> None:
         self._pairs, self.count = pairs, len(pairs)
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Any]:
         for pair in self._pairs:
             name = f"{pair.frame_index}.png"
             yield ImportedPair((name, name), pair.images.time_s, pair.images.left, pair.images.right)
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory):
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset without truth of a drogue that comes nearer."""
     turn = rotation_from_angles(*np.radians([4, -3, 5]))
     pairs = fly_past([RigidTransform(turn, np.array([0.02 * k, -0.01 * k, 5.0 - 0.02 * k])) for k in range(PAIRS)])
@@ -48,14 +53,14 @@ def flight(tmp_path_factory):
     return out
 
 
-def by_method(path):
+def by_method(path: Path) -> dict[str, Any]:
     found = {}
     for estimate in read_estimates(path):
         found.setdefault(estimate.method, []).append(estimate)
     return found
 
 
-def test_all_of_it_together(flight, tmp_path, capsys):
+def test_all_of_it_together(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "estimates.jsonl"
     options = ["--method", "joint-hub", "--tracker", "bernoulli", "--redetect-every", "3", "--filter", "--smooth"]
     assert run(["navigate", str(flight), *options, "--capture-radius", "0.2", "--out", str(out)]) == DONE
@@ -69,7 +74,7 @@ def test_all_of_it_together(flight, tmp_path, capsys):
     assert told == [*(f"{name:<18} {PAIRS} fixes in {PAIRS} pairs" for name in found), f"wrote {out}"]
 
 
-def test_without_options_the_detector_looks_at_every_pair_and_there_are_no_others(flight, tmp_path):
+def test_without_options_the_detector_looks_at_every_pair_and_there_are_no_others(flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "estimates.jsonl"
     assert run(["navigate", str(flight), "--method", "joint", "--out", str(out)]) == DONE
     (estimates,) = by_method(out).values()
@@ -77,7 +82,9 @@ def test_without_options_the_detector_looks_at_every_pair_and_there_are_no_other
     assert all(estimate.latency_s is None for estimate in estimates)
 
 
-def test_in_real_time_every_pair_is_worked_on_or_told_to_be_late(flight, tmp_path, capsys):
+def test_in_real_time_every_pair_is_worked_on_or_told_to_be_late(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, latency = tmp_path / "estimates.jsonl", tmp_path / "latency.json"
     # Faster than any machine works, so that pairs are late.
     options = ["--method", "joint", "--tracker", "flow", "--filter", "--rate", "10000", "--latency", str(latency)]
@@ -114,7 +121,9 @@ def test_in_real_time_every_pair_is_worked_on_or_told_to_be_late(flight, tmp_pat
         (["--centroids", "grey"], "--centroids: must be one of own, binary, edge"),
     ],
 )
-def test_what_makes_no_sense_is_refused_in_one_line(flight, tmp_path, capsys, options, message):
+def test_what_makes_no_sense_is_refused_in_one_line(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
     out = tmp_path / "estimates.jsonl"
     assert run(["navigate", str(flight), *options, "--out", str(out)]) == WRONG_INPUT
     told = capsys.readouterr().err
@@ -123,7 +132,9 @@ def test_what_makes_no_sense_is_refused_in_one_line(flight, tmp_path, capsys, op
     assert list(tmp_path.iterdir()) == []
 
 
-def test_places_that_cannot_take_results_are_refused_before_the_work(flight, tmp_path, capsys):
+def test_places_that_cannot_take_results_are_refused_before_the_work(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder, out = tmp_path / "folder", tmp_path / "estimates.jsonl"
     folder.mkdir()
     other_name = folder / ".." / out.name
@@ -142,7 +153,9 @@ def test_places_that_cannot_take_results_are_refused_before_the_work(flight, tmp
     assert list(folder.iterdir()) == []
 
 
-def test_a_damaged_pair_in_real_time_leaves_no_estimates(flight, tmp_path, capsys):
+def test_a_damaged_pair_in_real_time_leaves_no_estimates(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     data = tmp_path / "data"
     for file in flight.rglob("*"):
         if file.is_file():
@@ -155,7 +168,7 @@ def test_a_damaged_pair_in_real_time_leaves_no_estimates(flight, tmp_path, capsy
     assert not out.exists()
 
 
-def library_threads():
+def library_threads() -> list[int]:
     """How many threads OpenCV takes, and the linear algebra of each library that is loaded."""
     return [cv2.getNumThreads(), *(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")]
 
@@ -163,12 +176,12 @@ def library_threads():
 class InterruptedProgress(PlainProgress):
     """Ctrl-C after the second pair; remembers how many threads libraries took until then."""
 
-    def __init__(self, stream):
+    def __init__(self, stream: io.StringIO) -> None:
         super().__init__(stream)
         self._pairs = 0
         self.threads = []
 
-    def advance(self):
+    def advance(self) -> None:
         self._pairs += 1
         self.threads += library_threads()
         if self._pairs == 2:
@@ -176,7 +189,9 @@ class InterruptedProgress(PlainProgress):
 
 
 @pytest.mark.parametrize("rate_hz", [None, 500.0])
-def test_an_interrupt_leaves_the_old_file_no_thread_and_all_settings(flight, tmp_path, capsys, rate_hz):
+def test_an_interrupt_leaves_the_old_file_no_thread_and_all_settings(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rate_hz: float | None
+) -> None:
     out = tmp_path / "estimates.jsonl"
     out.write_text("old")
     threads, handler = set(threading.enumerate()), signal.signal(signal.SIGINT, signal.default_int_handler)

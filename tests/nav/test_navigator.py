@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,12 +15,13 @@ import pytest
 from datasets_manifest.recipe.recipe import load_recipe
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.types.estimates import PoseEstimate, Region, read_estimates, write_estimates
+from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
-from geometry.se3 import angles_from_rotation
+from geometry.se3 import RigidTransform, angles_from_rotation
 from geometry.stereo import EYES, paper_rig
-from nav.detector.detector import Detection
+from nav.detector.detector import Detection, StereoDetection
 from nav.navigator import CENTROID_CHOICES, Navigator
 from nav.pose.pose_method import EXACT, NoFixReason, StatedTolerances
 from nav.refinement import marker_shapes
@@ -37,7 +40,7 @@ NAVIGATOR = Navigator(RIG, DROGUE)
 BOUND_SIGMAS = 1.5 * 5
 
 
-def draw_place(rng, z_m):
+def draw_place(rng: np.random.Generator, z_m: float) -> RigidTransform:
     x_low, x_high, y_low, y_high = RIG.common_field_m(z_m, DROGUE.rim_radius_m)
     # Within the seven tenths of the symmetry's range where noise cannot turn the roll that is nearest to zero.
     return make_pose(
@@ -47,7 +50,7 @@ def draw_place(rng, z_m):
 
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
 @pytest.mark.parametrize("z_m", [1.7, 5.0, 10.0, 20.0, 40.0])
-def test_joint_error_stays_within_its_own_bound(z_m, kind):
+def test_joint_error_stays_within_its_own_bound(z_m: float, kind: str) -> None:
     for seed in range(2):
         rng = np.random.default_rng([seed, int(10 * z_m)])
         place = draw_place(rng, z_m)
@@ -73,7 +76,7 @@ def test_joint_error_stays_within_its_own_bound(z_m, kind):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 5.0])
-def test_attitude_near_by(z_m):
+def test_attitude_near_by(z_m: float) -> None:
     rng = np.random.default_rng(21)
     place = make_pose(0.06, 0.0, z_m, 6, -7, 12)
     (estimate,) = NAVIGATOR.estimate(0, paint_pair(RIG, DROGUE, place, rng), ["joint"])
@@ -84,7 +87,7 @@ def test_attitude_near_by(z_m):
 
 
 @pytest.mark.parametrize("name", ["red-5", "red-7"])
-def test_other_drogues(name):
+def test_other_drogues(name: str) -> None:
     drogue = PRESETS[name]
     place = make_pose(0.2, 0.1, 8, -5, 7, 12)
     images = paint_pair(RIG, drogue, place, np.random.default_rng(22))
@@ -94,7 +97,7 @@ def test_other_drogues(name):
         assert np.linalg.norm(estimate.left_from_drogue.translation_m - place.translation_m) < 0.2
 
 
-def test_outlines_of_near_markers_are_those_of_opencv():
+def test_outlines_of_near_markers_are_those_of_opencv() -> None:
     place = make_pose(0.06, -0.03, 1.7, 9, -8, 12)
     shapes = marker_shapes(RIG, LAYOUT, place)
     camera, turn = RIG.camera, np.linspace(0, 2 * np.pi, 720, endpoint=False)
@@ -114,12 +117,12 @@ def test_outlines_of_near_markers_are_those_of_opencv():
 
 
 @pytest.mark.parametrize(("z_m", "pitch_deg"), [(0.2, 80), (1.7, 89), (1.7, 90), (40.0, 10)])
-def test_outlines_of_far_markers_and_of_impossible_poses_are_circles(z_m, pitch_deg):
+def test_outlines_of_far_markers_and_of_impossible_poses_are_circles(z_m: float, pitch_deg: int) -> None:
     shapes = marker_shapes(RIG, LAYOUT, make_pose(0, 0, z_m, pitch_deg))
     np.testing.assert_allclose(shapes, np.broadcast_to(RIG.camera.fx_px * 0.05 / z_m * np.eye(2), shapes.shape))
 
 
-def test_hidden_markers_and_false_discs():
+def test_hidden_markers_and_false_discs() -> None:
     place = make_pose(0.1, 0.05, 6, 8, -6, 10)
     false_discs = ((0.45, 0.1, 0.0, 0.05), (-0.1, 0.1, 0.1, 0.05))
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(23), hidden=(3,), extra_discs=false_discs)
@@ -130,7 +133,7 @@ def test_hidden_markers_and_false_discs():
     assert abs(estimate.left_from_drogue.translation_m[2] - 6) < BOUND_SIGMAS * 60e-3 * 0.04 * 0.36
 
 
-def test_estimates_survive_the_disk(tmp_path):
+def test_estimates_survive_the_disk(tmp_path: Path) -> None:
     pairs = {
         3: paint_pair(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None),
         5: paint_pair(RIG, None, make_pose(0, 0, 9), None),
@@ -150,7 +153,7 @@ def test_estimates_survive_the_disk(tmp_path):
         assert read.model_dump_json() == written.model_dump_json()
 
 
-def test_centroids_can_be_the_same_for_all_methods():
+def test_centroids_can_be_the_same_for_all_methods() -> None:
     images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), np.random.default_rng(7))
     places = {}
     for choice in CENTROID_CHOICES:
@@ -164,7 +167,7 @@ def test_centroids_can_be_the_same_for_all_methods():
 
 
 @pytest.mark.mitsuba
-def test_runner_goes_through_a_dataset_on_disk(smoke_dataset):
+def test_runner_goes_through_a_dataset_on_disk(smoke_dataset: Path) -> None:
     blind = BlindDataset(smoke_dataset)
     estimates = list(navigate(blind, ["joint", "paper"]))
     assert [e.frame_index for e in estimates] == [i for i in blind.frame_indices for _ in range(2)]
@@ -172,12 +175,12 @@ def test_runner_goes_through_a_dataset_on_disk(smoke_dataset):
 
 
 @pytest.mark.mitsuba
-def test_runner_refuses_unknown_methods_before_it_reads(smoke_dataset):
+def test_runner_refuses_unknown_methods_before_it_reads(smoke_dataset: Path) -> None:
     with pytest.raises(ValueError, match="method: there is no pose method named 'magic'"):
         navigate(BlindDataset(smoke_dataset), ["joint", "magic"])
 
 
-def test_the_same_picture_gives_the_same_answer():
+def test_the_same_picture_gives_the_same_answer() -> None:
     images = paint_pair(RIG, DROGUE, make_pose(0.3, -0.2, 12, 6, 3, 5), np.random.default_rng(24))
     first, second = (NAVIGATOR.estimate(0, images, ["paper", "joint"]) for _ in range(2))
     for a, b in zip(first, second, strict=True):
@@ -189,7 +192,7 @@ def test_the_same_picture_gives_the_same_answer():
         np.testing.assert_allclose([f.center_px for f in a.features], [f.center_px for f in b.features], atol=1e-9)
 
 
-def test_what_is_stated_of_the_tolerances_reaches_the_method():
+def test_what_is_stated_of_the_tolerances_reaches_the_method() -> None:
     images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 8, 6, 3, 5), np.random.default_rng(25))
     stated = StatedTolerances(ring_radius_m=5e-4, disparity_px=0.2)
     built, loose = (
@@ -201,7 +204,7 @@ def test_what_is_stated_of_the_tolerances_reaches_the_method():
     assert built.covariance[2, 2] < loose.covariance[2, 2] / 25
 
 
-def test_navigation_runs_without_renderers_and_torch():
+def test_navigation_runs_without_renderers_and_torch() -> None:
     code = """
 import sys
 for name in ("mitsuba", "drjit", "bpy", "torch", "trimesh", "matplotlib", "scenes", "render", "labelgen"):
@@ -224,7 +227,7 @@ print(len(estimates), estimates[0].status)
 
 @pytest.mark.mitsuba
 @pytest.mark.parametrize("frame_index", [24, 125])
-def test_haze_of_a_low_sun_is_not_taken_for_red_paint(frame_index):
+def test_haze_of_a_low_sun_is_not_taken_for_red_paint(frame_index: int) -> None:
     """Frames against the sun at 20 and 40 m, whose orange haze has more red over the other colours than the markers."""
     recipe = load_recipe("pose-tier-b").recipe
     frame = sample_frame(recipe, frame_index)
@@ -237,7 +240,7 @@ def test_haze_of_a_low_sun_is_not_taken_for_red_paint(frame_index):
     assert np.linalg.norm(estimate.left_from_drogue.translation_m - truth_m) < 0.002 * truth_m[2]
 
 
-def test_a_region_beside_the_image_shows_nothing():
+def test_a_region_beside_the_image_shows_nothing() -> None:
     images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), None)
     beside = Region(eye="left", box_xywh_px=(1290.0, 100.0, 50.0, 50.0), source="tracker", score=1.0)
     before = Region(eye="right", box_xywh_px=(-90.0, 100.0, 50.0, 50.0), source="tracker", score=1.0)
@@ -251,21 +254,23 @@ class OneEyed:
 
     name = "one-eyed"
 
-    def __init__(self, blind, box_xywh_px=None):
+    def __init__(self, blind: str, box_xywh_px: float | None = None) -> None:
         self._inner, self._blind = NAVIGATOR.detector, blind
         self._instead = None if box_xywh_px is None else Detection(box_xywh_px, 0.9)
 
-    def detect(self, images):
+    def detect(self, images: StereoImages) -> StereoDetection:
         return replace(self._inner.detect(images), **{self._blind: self._instead})
 
-    def candidates(self, images, least_score):
+    def candidates(self, images: StereoImages, least_score: float) -> Any:
         return self._inner.candidates(images, least_score)
 
 
 @pytest.mark.parametrize("box_xywh_px", [None, (3.0, 4.0, 60.0, 50.0)], ids=["nothing", "another place"])
 @pytest.mark.parametrize("blind", EYES)
 @pytest.mark.parametrize("z_m", [1.7, 10.0, 40.0])
-def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(z_m, blind, box_xywh_px):
+def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(
+    z_m: float, blind: str, box_xywh_px: tuple[float, ...] | None
+) -> None:
     place = make_pose(0.05, -0.04, z_m, 4.0, -6.0, 3.0)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(3))
     (known,) = NAVIGATOR.estimate(0, images, ["joint"])
@@ -278,7 +283,7 @@ def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(z_m, blind, bo
     )
 
 
-def test_what_only_one_eye_can_see_is_not_made_up_in_the_other():
+def test_what_only_one_eye_can_see_is_not_made_up_in_the_other() -> None:
     place = make_pose(0.05, -0.04, 5.0, 4.0, -6.0, 3.0)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(4))
     images = replace(images, right=np.full_like(images.right, int(np.median(images.right))))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,48 +26,48 @@ DROGUE = PRESETS["red-8"]
 LAYOUT = marker_layout(DROGUE)
 
 
-def one_eye_only(pixels, cov):
+def one_eye_only(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[1] = np.nan
 
 
-def nothing_seen(pixels, cov):
+def nothing_seen(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[:] = np.nan
 
 
-def two_pairs(pixels, cov):
+def two_pairs(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[:, 2:] = np.nan
 
 
-def no_common_markers(pixels, cov):
+def no_common_markers(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[0, :4], pixels[1, 4:] = np.nan, np.nan
 
 
-def on_one_line(pixels, cov):
+def on_one_line(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[..., 1] = 480.0
 
 
-def huge(pixels, cov):
+def huge(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[0, 3, 0] = 1e12
 
 
-def infinite(pixels, cov):
+def infinite(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[1, 3, 1] = np.inf
 
 
-def wrong_order(pixels, cov):
+def wrong_order(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[0] = pixels[0, [0, 4, 1, 5, 2, 6, 3, 7]]
     pixels[1] = pixels[1, [0, 4, 1, 5, 2, 6, 3, 7]]
 
 
-def eyes_swapped(pixels, cov):
+def eyes_swapped(pixels: np.ndarray, cov: np.ndarray) -> None:
     pixels[:] = pixels[::-1].copy()
 
 
-def covariance_not_a_number(pixels, cov):
+def covariance_not_a_number(pixels: np.ndarray, cov: np.ndarray) -> None:
     cov[0, 2] = np.nan
 
 
-def covariance_zero(pixels, cov):
+def covariance_zero(pixels: np.ndarray, cov: np.ndarray) -> None:
     cov[0, 2] = 0
 
 
@@ -83,7 +85,7 @@ FAULTS = {
 }
 
 
-def broken(corrupt) -> Observation:
+def broken(corrupt: Callable[..., Any]) -> Observation:
     place = make_pose(0.06, 0, 5, 7, 7)
     pixels = np.stack([project_disc_centers(RIG, place, LAYOUT.centers_m, LAYOUT.radius_m, eye) for eye in EYES])
     cov = np.tile(0.01 * np.eye(2), (2, 8, 1, 1))
@@ -97,19 +99,19 @@ STEREO_METHODS = [name for name in METHODS if not name.startswith("mono-")]
 
 @pytest.mark.parametrize("method", STEREO_METHODS)
 @pytest.mark.parametrize("corrupt", FAULTS, ids=lambda corrupt: corrupt.__name__)
-def test_every_method_gives_the_reason(method, corrupt):
+def test_every_method_gives_the_reason(method: str, corrupt: Callable[..., Any]) -> None:
     answer = METHODS[method](broken(corrupt))
     assert isinstance(answer, NoFixReason)
     assert FAULTS[corrupt] in answer.reason
 
 
-def test_joint_refuses_markers_in_a_wrong_order():
+def test_joint_refuses_markers_in_a_wrong_order() -> None:
     answer = METHODS["joint"](broken(wrong_order))
     assert isinstance(answer, NoFixReason)
     assert "do not fit the drogue" in answer.reason
 
 
-def test_the_papers_method_needs_a_circle():
+def test_the_papers_method_needs_a_circle() -> None:
     centers = LAYOUT.centers_m.copy()
     centers[0] *= 1.1
     good = broken(lambda pixels, cov: None)
@@ -120,7 +122,7 @@ def test_the_papers_method_needs_a_circle():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_random_points_never_raise(method):
+def test_random_points_never_raise(method: str) -> None:
     rng = np.random.default_rng(6)
     for _ in range(60):
         pixels = rng.uniform(0, 1280, (2, 8, 2))
@@ -130,7 +132,7 @@ def test_random_points_never_raise(method):
 
 
 @pytest.mark.parametrize("size", [(480, 640), (961, 1280), (1, 1)])
-def test_images_of_another_size_than_the_rigs(size):
+def test_images_of_another_size_than_the_rigs(size: tuple[int, int]) -> None:
     image = np.zeros((*size, 3), np.uint8)
     estimates = Navigator(RIG, DROGUE).estimate(4, StereoImages(image, image, 0.0, 1e-3), list(METHODS))
     assert [estimate.method for estimate in estimates] == list(METHODS)
@@ -141,7 +143,7 @@ def test_images_of_another_size_than_the_rigs(size):
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])
-def test_flat_images(level):
+def test_flat_images(level: int) -> None:
     image = np.full((960, 1280, 3), level, np.uint8)
     measurement = Navigator(RIG, DROGUE).observe(StereoImages(image, image, 0.0, 1e-3))
     assert isinstance(measurement.observation, NoFixReason)
@@ -150,7 +152,7 @@ def test_flat_images(level):
 
 @pytest.mark.parametrize("blind", EYES)
 @pytest.mark.parametrize("z_m", [3.0, 12.0])
-def test_one_blind_eye(blind, z_m):
+def test_one_blind_eye(blind: str, z_m: float) -> None:
     place = make_pose(0.1, 0.05, z_m, 8, -7, 10)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(8))
     images = replace(images, **{blind: np.zeros_like(images.left)})
@@ -168,7 +170,7 @@ def test_one_blind_eye(blind, z_m):
         assert (error_m < limit_m).all(), estimate.method
 
 
-def test_a_single_eye_is_measured_by_the_edge_model_too():
+def test_a_single_eye_is_measured_by_the_edge_model_too() -> None:
     place = make_pose(0.1, 0.05, 5.0, 8, -7, 10)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(9))
     navigator = Navigator(RIG, DROGUE)
@@ -183,12 +185,12 @@ def test_a_single_eye_is_measured_by_the_edge_model_too():
 
 
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
-def test_pictures_without_a_drogue(kind):
+def test_pictures_without_a_drogue(kind: str) -> None:
     images = paint_pair(RIG, None, make_pose(0, 0, 5), np.random.default_rng(7), kind=kind)
     assert isinstance(Navigator(RIG, DROGUE).observe(images).observation, NoFixReason)
 
 
-def test_a_reason_of_the_method_keeps_the_features():
+def test_a_reason_of_the_method_keeps_the_features() -> None:
     measurement = PairMeasurement(broken(on_one_line), {"detect": 0.01})
     estimate = estimate_pose(3, measurement, "joint")
     assert isinstance(estimate, NoFix)
@@ -197,12 +199,12 @@ def test_a_reason_of_the_method_keeps_the_features():
     assert set(estimate.stage_s) == {"detect", "pose"}
 
 
-def test_unknown_method():
+def test_unknown_method() -> None:
     with pytest.raises(ValueError, match="method: there is no pose method named 'best'; there are paper, paper-lit"):
         pose_method("best")
 
 
-def test_observation_checks_its_shapes():
+def test_observation_checks_its_shapes() -> None:
     with pytest.raises(ValueError, match=r"pixels_px: must have shape \(2, 8, 2\)"):
         Observation(RIG, LAYOUT, np.zeros((2, 7, 2)), np.zeros((2, 8, 2, 2)))
     with pytest.raises(ValueError, match=r"cov_px2: must have shape \(2, 8, 2, 2\)"):

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.types.estimates import NoFix, PoseEstimate
+from datasets_manifest.types.images import StereoImages
+from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from nav.detector.color_blob import ColorBlobDetector
+from nav.detector.detector import StereoDetection
 from nav.realtime import LatestItemQueue, MonotonicClock, SingleItemQueue, replay
 from nav.runner import LATE, add_smoothed, open_navigator
-from nav.sequence_navigator import SequenceNavigator, SequenceSettings, SkippedPair
+from nav.sequence_navigator import PairEstimates, SequenceNavigator, SequenceSettings, SkippedPair
 from tests.support.painted_pairs import fly_past
 
 RATE_HZ = 25.0
@@ -23,11 +29,17 @@ PATIENCE_S = 60.0
 class DatasetInMemory:
     """Pairs as in a `BlindDataset`; reading one may take time on the test's clock, or fail."""
 
-    def __init__(self, pairs, clock=None, read_s=None, damaged=()):
+    def __init__(
+        self,
+        pairs: list[BlindPair],
+        clock: SteppedClock | None = None,
+        read_s: dict[int, float] | None = None,
+        damaged: Sequence[int] = (),
+    ) -> None:
         self._pairs, self._clock, self._read_s, self._damaged = pairs, clock, read_s or {}, damaged
         self.frame_indices = tuple(pair.frame_index for pair in pairs)
 
-    def pair(self, frame_index):
+    def pair(self, frame_index: int) -> BlindPair:
         if frame_index in self._damaged:
             raise ValueError(f"frames/{frame_index:06d}/left.png: the PNG is truncated")
         if self._clock is not None:
@@ -41,46 +53,46 @@ class SteppedClock:
     With `in_turn`, it advances only when all pairs that have arrived are answered.
     """
 
-    def __init__(self, in_turn=True):
+    def __init__(self, in_turn: bool = True) -> None:
         self._time_s, self._came, self._answered = 1000.0, 0, 0
         self._in_turn = in_turn
         self._changed = threading.Condition()
 
-    def now_s(self):
+    def now_s(self) -> float:
         with self._changed:
             return self._time_s
 
-    def advance(self, by_s):
+    def advance(self, by_s: float) -> None:
         with self._changed:
             self._changed.wait_for(self._may_go_on, PATIENCE_S)
             self._time_s += by_s
 
-    def _may_go_on(self):
+    def _may_go_on(self) -> bool:
         return self._answered == self._came or not self._in_turn
 
-    def answered(self):
+    def answered(self) -> None:
         with self._changed:
             self._answered += 1
             self._changed.notify_all()
 
-    def wait_until(self, time_s, stop):
+    def wait_until(self, time_s: float, stop: Any) -> None:
         with self._changed:
             self._changed.wait_for(lambda: self._may_go_on() or stop.is_set(), PATIENCE_S)
             self._came += 1
             self._time_s = max(self._time_s, time_s)
 
 
-def place(x_m, y_m, z_m):
+def place(x_m: float, y_m: float, z_m: float) -> RigidTransform:
     return RigidTransform(rotation_from_angles(*np.radians([4, -3, 5])), np.array([x_m, y_m, z_m]))
 
 
 @pytest.fixture(scope="module")
-def pairs():
+def pairs() -> list[BlindPair]:
     return fly_past([place(0.02 * k, -0.01 * k, 5.0 - 0.02 * k) for k in range(7)])
 
 
 @pytest.fixture(autouse=True)
-def no_thread_stays():
+def no_thread_stays() -> Iterator[None]:
     before = set(threading.enumerate())
     yield
     # The pool that works on the second eye stays, whoever made it.
@@ -88,7 +100,9 @@ def no_thread_stays():
     assert left == []
 
 
-def stepped(pairs, settings, read_s=None):
+def stepped(
+    pairs: list[BlindPair], settings: SequenceSettings, read_s: dict[int, float] | None = None
+) -> list[PairEstimates | SkippedPair]:
     """Estimates of all pairs that arrive by a stepped clock."""
     clock = SteppedClock()
     answers = []
@@ -101,7 +115,7 @@ def stepped(pairs, settings, read_s=None):
 
 
 @pytest.mark.parametrize("tracker", [None, "bernoulli"])
-def test_threads_do_not_change_estimates_of_pairs_in_order(pairs, tracker):
+def test_threads_do_not_change_estimates_of_pairs_in_order(pairs: list[BlindPair], tracker: str | None) -> None:
     settings = SequenceSettings(("joint-hub", "paper"), tracker=tracker, filtered=True)
     navigator = open_navigator(settings, "color-blob")
     alone = [navigator.process(pair) for pair in pairs]
@@ -116,14 +130,14 @@ def test_threads_do_not_change_estimates_of_pairs_in_order(pairs, tracker):
             np.testing.assert_allclose([f.center_px for f in a.features], [f.center_px for f in b.features], atol=1e-9)
 
 
-def test_after_a_slow_read_only_the_newest_pair_is_processed(pairs):
+def test_after_a_slow_read_only_the_newest_pair_is_processed(pairs: list[BlindPair]) -> None:
     # Pair 1 is read when pair 3 has come, which could not be read before pair 4 comes; pair 5 when the last one has.
     answers = stepped(pairs, SequenceSettings(("constant",)), {1: 3.2 / RATE_HZ, 5: 10 / RATE_HZ})
     assert [each.frame_index for each in answers] == list(range(7))
     assert [each.frame_index for each in answers if isinstance(each, SkippedPair)] == [2, 3]
 
 
-def test_latency_starts_at_the_arrival_of_a_pair(pairs):
+def test_latency_starts_at_the_arrival_of_a_pair(pairs: list[BlindPair]) -> None:
     answers = stepped(pairs[:3], SequenceSettings(("constant",), filtered=True), {0: 0.01, 1: 0.06, 2: 0.02})
     # Pair 1 came 0.04 s after pair 0, and was read 0.06 s after it; pair 2 was read before it came.
     assert [each.latency_s for each in answers] == pytest.approx([0.0, 0.02, 0.0])
@@ -134,7 +148,7 @@ def test_latency_starts_at_the_arrival_of_a_pair(pairs):
         assert all(estimate.stage_s["read"] == each.stage_s["read"] for estimate in each.estimates)
 
 
-def test_smoothed_estimates_have_no_latency(pairs):
+def test_smoothed_estimates_have_no_latency(pairs: list[BlindPair]) -> None:
     settings = SequenceSettings(("joint", "constant"), smoothed=True)
     estimates = list(add_smoothed(stepped(pairs[:3], settings), settings))
     assert sum(isinstance(e, PoseEstimate) for e in estimates if e.method == "joint+smoother") == 3
@@ -145,20 +159,20 @@ def test_smoothed_estimates_have_no_latency(pairs):
 class HeldDetector(ColorBlobDetector):
     """Takes as long with its first pair as it takes others to come."""
 
-    def __init__(self, drogue, others_came):
+    def __init__(self, drogue: DrogueParameters, others_came: threading.Event) -> None:
         super().__init__(drogue)
         self._others_came = others_came
 
-    def detect(self, images):
+    def detect(self, images: StereoImages) -> StereoDetection:
         assert self._others_came.wait(PATIENCE_S)
         return super().detect(images)
 
 
-def test_a_waiting_pair_is_late_when_a_newer_one_arrives(pairs):
+def test_a_waiting_pair_is_late_when_a_newer_one_arrives(pairs: list[BlindPair]) -> None:
     came = threading.Event()
 
     class Source(DatasetInMemory):
-        def pair(self, frame_index):
+        def pair(self, frame_index: int) -> BlindPair:
             if frame_index == 4:
                 came.set()
             return super().pair(frame_index)
@@ -179,7 +193,7 @@ def test_a_waiting_pair_is_late_when_a_newer_one_arrives(pairs):
         assert told_late == late
 
 
-def test_an_unreadable_pair_ends_the_replay_with_its_error(pairs):
+def test_an_unreadable_pair_ends_the_replay_with_its_error(pairs: list[BlindPair]) -> None:
     clock = SteppedClock()
     source = DatasetInMemory(pairs, damaged={2})
     answers = []
@@ -194,14 +208,14 @@ def test_an_unreadable_pair_ends_the_replay_with_its_error(pairs):
 class FaultyDetector(ColorBlobDetector):
     """Fails at its second pair."""
 
-    def detect(self, images):
+    def detect(self, images: StereoImages) -> StereoDetection:
         if images.time_s > 0:
             raise RuntimeError("the run time of the network failed")
         return super().detect(images)
 
 
 @pytest.mark.parametrize("tracker", [None, "flow"])
-def test_a_fault_in_a_stage_ends_the_replay_and_all_threads(pairs, tracker):
+def test_a_fault_in_a_stage_ends_the_replay_and_all_threads(pairs: list[BlindPair], tracker: str | None) -> None:
     clock = SteppedClock(in_turn=False)
     settings = SequenceSettings(("constant",), tracker=tracker, redetect_every=1)
     navigator = SequenceNavigator(settings, FaultyDetector)
@@ -209,7 +223,7 @@ def test_a_fault_in_a_stage_ends_the_replay_and_all_threads(pairs, tracker):
         list(replay(DatasetInMemory(pairs), navigator, RATE_HZ, clock))
 
 
-def test_closing_the_generator_stops_the_threads(pairs):
+def test_closing_the_generator_stops_the_threads(pairs: list[BlindPair]) -> None:
     clock = MonotonicClock()
     # The second pair would come after an hour.
     answers = replay(
@@ -219,19 +233,19 @@ def test_closing_the_generator_stops_the_threads(pairs):
     answers.close()
 
 
-def test_no_pairs_have_no_answers():
+def test_no_pairs_have_no_answers() -> None:
     navigator = open_navigator(SequenceSettings(("constant",)), "color-blob")
     assert list(replay(DatasetInMemory([]), navigator, RATE_HZ, SteppedClock())) == []
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -25.0, float("inf"), float("nan")])
-def test_an_invalid_rate_is_an_error(rate_hz):
+def test_an_invalid_rate_is_an_error(rate_hz: float) -> None:
     navigator = SequenceNavigator(SequenceSettings(("constant",)), lambda drogue: ColorBlobDetector(PRESETS["red-8"]))
     with pytest.raises(ValueError, match="rate_hz: must be positive and finite"):
         replay(DatasetInMemory([]), navigator, rate_hz, SteppedClock())
 
 
-def test_the_newest_item_replaces_older_ones():
+def test_the_newest_item_replaces_older_ones() -> None:
     queue = LatestItemQueue()
     queue.put(0, "item 0")
     queue.skip(1)
@@ -248,7 +262,7 @@ def test_the_newest_item_replaces_older_ones():
     assert queue.take() is None
 
 
-def test_a_closed_queue_returns_its_item_first():
+def test_a_closed_queue_returns_its_item_first() -> None:
     queue = SingleItemQueue()
     assert queue.wait_free()
     queue.put("last")
@@ -258,10 +272,10 @@ def test_a_closed_queue_returns_its_item_first():
     assert queue.take() is None
 
 
-def test_the_producer_waits_until_the_queue_is_empty():
+def test_the_producer_waits_until_the_queue_is_empty() -> None:
     queue, produced = SingleItemQueue(), []
 
-    def produce():
+    def produce() -> None:
         for number in range(20):
             if queue.wait_free():
                 produced.append(number)

@@ -5,18 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.recipe.recipe import load_recipe
+from geometry.se3 import RigidTransform
 from nav.navigator import Navigator
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
 
 
-def degrees_between(a, b) -> float:
+def degrees_between(a: RigidTransform, b: RigidTransform) -> float:
     """Angle between two drogues' axes."""
     return float(np.degrees(np.arccos(np.clip(a.rotation[:, 2] @ b.rotation[:, 2], -1, 1))))
 
 
-def test_a_faint_thing_where_the_mirrored_tilt_shows_the_hub_does_not_mirror_it():
+def test_a_faint_thing_where_the_mirrored_tilt_shows_the_hub_does_not_mirror_it() -> None:
     """At 40 m at dusk, with twice the weight on the mirrored tilt before the hub is seen."""
     recipe = load_recipe("pose-tier-a-dusk").recipe
     recipe = recipe.model_copy(update={"seed": 20270105})

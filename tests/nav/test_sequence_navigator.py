@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from datasets_manifest.storage.blind import BlindPair
 from datasets_manifest.types.estimates import NoFix, PoseEstimate
+from datasets_manifest.types.images import StereoImages
+from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import PRESETS
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES
@@ -29,43 +33,45 @@ HIDDEN = range(4, 8)
 class CountedDetector(ColorBlobDetector):
     """Remembers which time stamps it was shown."""
 
-    def __init__(self, drogue):
+    def __init__(self, drogue: DrogueParameters) -> None:
         super().__init__(drogue)
         self.shown_s = []
 
-    def detect(self, images):
+    def detect(self, images: StereoImages) -> StereoDetection:
         self.shown_s.append(images.time_s)
         return super().detect(images)
 
 
-def place(x_m, y_m, z_m):
+def place(x_m: float, y_m: float, z_m: float) -> RigidTransform:
     return RigidTransform(rotation_from_angles(*np.radians([4, -3, 5])), np.array([x_m, y_m, z_m]))
 
 
-def way(count, start=(0.0, 0.05, 5.0)):
+def way(count: int, start: tuple[float, ...] = (0.0, 0.05, 5.0)) -> list[RigidTransform]:
     """Places of a drogue that comes nearer and moves by some pixels from pair to pair."""
     return [place(*(np.array(start) + k * np.array(STEP_M))) for k in range(count)]
 
 
 @pytest.fixture(scope="module")
-def steady():
+def steady() -> list[BlindPair]:
     """A drogue that is always in view."""
     return fly_past(way(12))
 
 
 @pytest.fixture(scope="module")
-def hidden_places():
+def hidden_places() -> list[RigidTransform | None]:
     """Places of a drogue that hides in the pairs of `HIDDEN` and comes back a ring's width beside where it went."""
     before = HIDDEN.start
     return [*way(before), *(None for _ in HIDDEN), *way(5, start=(0.5, -0.3, 4.8))]
 
 
 @pytest.fixture(scope="module")
-def hidden_flight(hidden_places):
+def hidden_flight(hidden_places: list[RigidTransform | None]) -> list[BlindPair]:
     return fly_past(hidden_places)
 
 
-def answers_by_method(pairs, settings, detector=None):
+def answers_by_method(
+    pairs: list[BlindPair], settings: SequenceSettings, detector: Any = None
+) -> tuple[dict[str, Any], CountedDetector]:
     """{method: [estimate of each pair]} and the detector that was used."""
     shown = CountedDetector(PRESETS["red-8"])
     navigator = SequenceNavigator(settings, lambda drogue: shown)
@@ -75,12 +81,12 @@ def answers_by_method(pairs, settings, detector=None):
     return found, shown
 
 
-def sources(estimate):
+def sources(estimate: PoseEstimate) -> set[str]:
     return {region.source for region in estimate.regions}
 
 
 @pytest.mark.parametrize("tracker", tracker_names())
-def test_a_tracker_finds_the_same_poses_as_the_detector(steady, tracker):
+def test_a_tracker_finds_the_same_poses_as_the_detector(steady: list[BlindPair], tracker: str) -> None:
     alone, _ = answers_by_method(steady[:8], SequenceSettings(("joint-hub",)))
     followed, detector = answers_by_method(steady[:8], SequenceSettings(("joint-hub",), tracker=tracker))
     for one, other in zip(alone["joint-hub"], followed["joint-hub"], strict=True):
@@ -92,13 +98,15 @@ def test_a_tracker_finds_the_same_poses_as_the_detector(steady, tracker):
     assert detector.shown_s == [0.0]
 
 
-def test_the_detector_checks_at_every_nth_pair(steady):
+def test_the_detector_checks_at_every_nth_pair(steady: list[BlindPair]) -> None:
     _, detector = answers_by_method(steady[:10], SequenceSettings(("joint",), tracker="bernoulli", redetect_every=3))
     assert np.rint(25 * np.array(detector.shown_s)).tolist() == [0, 3, 6, 9]
 
 
 @pytest.mark.parametrize("tracker", [None, *tracker_names()])
-def test_a_hidden_drogue_has_no_pose_and_is_found_again(hidden_flight, hidden_places, tracker):
+def test_a_hidden_drogue_has_no_pose_and_is_found_again(
+    hidden_flight: list[BlindPair], hidden_places: list[RigidTransform | None], tracker: str | None
+) -> None:
     settings = SequenceSettings(("joint-hub", "paper"), tracker=tracker, filtered=True, smoothed=True)
     found, detector = answers_by_method(hidden_flight, settings)
     for name, estimates in found.items():
@@ -121,13 +129,13 @@ class TightTracker:
 
     name = "tight"
 
-    def start(self, images, found):
+    def start(self, images: StereoImages, found: StereoDetection) -> None:
         """Learn nothing."""
 
-    def correct(self, images, found):
+    def correct(self, images: StereoImages, found: StereoDetection) -> None:
         """Learn nothing."""
 
-    def follow(self, images, predicted):
+    def follow(self, images: StereoImages, predicted: StereoDetection) -> StereoDetection:
         tight = []
         for eye in EYES:
             x, y, width, height = predicted.of(eye).box_xywh_px
@@ -136,7 +144,7 @@ class TightTracker:
         return StereoDetection(*tight)
 
 
-def test_where_boxes_at_the_right_place_show_no_markers_those_of_the_detector_count(steady):
+def test_where_boxes_at_the_right_place_show_no_markers_those_of_the_detector_count(steady: list[BlindPair]) -> None:
     rig, drogue = steady[0].rig, steady[0].drogue
     navigator = Navigator(rig, drogue)
     observer = TrackedObserver(navigator, TightTracker(), rig, drogue, 25, FilterSettings())
@@ -146,7 +154,7 @@ def test_where_boxes_at_the_right_place_show_no_markers_those_of_the_detector_co
         assert {region.source for region in followed.regions} == {"detector"}
 
 
-def test_a_pair_that_the_filter_does_not_believe_has_a_fix_and_no_filtered_pose(steady):
+def test_a_pair_that_the_filter_does_not_believe_has_a_fix_and_no_filtered_pose(steady: list[BlindPair]) -> None:
     (elsewhere,) = fly_past([place(0.8, 0.3, 6.0)], [steady[7].images.time_s])
     pairs = [*steady[:7], replace(elsewhere, frame_index=7), *steady[8:10]]
     found, _ = answers_by_method(pairs, SequenceSettings(("joint-hub",), filtered=True))
@@ -158,7 +166,9 @@ def test_a_pair_that_the_filter_does_not_believe_has_a_fix_and_no_filtered_pose(
 
 
 @pytest.mark.parametrize(("radius_m", "captured"), [(50.0, True), (1e-6, False)])
-def test_filtered_and_smoothed_estimates_tell_of_motion_and_docking(steady, radius_m, captured):
+def test_filtered_and_smoothed_estimates_tell_of_motion_and_docking(
+    steady: list[BlindPair], radius_m: float, captured: bool
+) -> None:
     settings = SequenceSettings(("joint-hub",), filtered=True, smoothed=True, capture_radius_m=radius_m)
     found, _ = answers_by_method(steady, settings)
     assert all(e.motion is None and e.docking is None for e in found["joint-hub"])
@@ -170,26 +180,26 @@ def test_filtered_and_smoothed_estimates_tell_of_motion_and_docking(steady, radi
         assert last.docking.captured is captured
 
 
-def test_a_filter_of_a_method_without_covariance_says_so(steady):
+def test_a_filter_of_a_method_without_covariance_says_so(steady: list[BlindPair]) -> None:
     found, _ = answers_by_method(steady[:2], SequenceSettings(("mean-plane",), filtered=True))
     assert isinstance(found["mean-plane"][0], PoseEstimate)
     assert "no covariance" in found["mean-plane+filter"][0].reason
 
 
-def restamped(pairs, times_s):
+def restamped(pairs: list[BlindPair], times_s: list[float]) -> list[BlindPair]:
     return [
         replace(pair, images=replace(pair.images, time_s=time_s)) for pair, time_s in zip(pairs, times_s, strict=True)
     ]
 
 
-def test_sequences_begin_where_time_stamps_jump(steady):
+def test_sequences_begin_where_time_stamps_jump(steady: list[BlindPair]) -> None:
     pairs = restamped(steady[:8], [0.0, 0.04, 1.04, 2.05, 2.09, 2.09, 1.0, 1.04])
     navigator = open_navigator(SequenceSettings(("constant",)), DETECTOR)
     begins = [navigator.measure(pair).begins for pair in pairs]
     assert begins == [True, False, False, True, False, True, True, False]
 
 
-def test_a_new_sequence_knows_nothing_of_the_one_before(steady):
+def test_a_new_sequence_knows_nothing_of_the_one_before(steady: list[BlindPair]) -> None:
     settings = SequenceSettings(("joint-hub",), tracker="bernoulli", filtered=True, smoothed=True)
     times_s = [*(k / 25 for k in range(6)), *(10 + k / 25 for k in range(6))]
     pairs = restamped([*steady[6:], *steady[:6]], times_s)
@@ -201,7 +211,7 @@ def test_a_new_sequence_knows_nothing_of_the_one_before(steady):
             np.testing.assert_allclose(one.left_from_drogue.as_matrix(), other.left_from_drogue.as_matrix(), atol=1e-9)
 
 
-def test_another_drogue_begins_another_sequence(steady):
+def test_another_drogue_begins_another_sequence(steady: list[BlindPair]) -> None:
     smaller = PRESETS["red-8"].model_copy(update={"marker_radius_m": 0.049})
     pairs = [*steady[:2], replace(steady[2], drogue=smaller)]
     navigator = open_navigator(SequenceSettings(("constant",), tracker="bernoulli"), DETECTOR)
@@ -216,6 +226,6 @@ def test_another_drogue_begins_another_sequence(steady):
         ({"tracker": "mil", "redetect_every": 0}, "redetect_every: must be at least 1, got 0"),
     ],
 )
-def test_what_cannot_be_asked_for_is_refused_before_the_first_pair(settings, message):
+def test_what_cannot_be_asked_for_is_refused_before_the_first_pair(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         open_navigator(SequenceSettings(**{"methods": ("joint",), **settings}), DETECTOR)

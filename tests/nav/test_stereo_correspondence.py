@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -9,18 +11,25 @@ from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import disc_area_px2, project_disc_centers
 from geometry.se3 import RigidTransform
-from geometry.stereo import EYES, paper_rig
+from geometry.stereo import EYES, Eye, paper_rig
 from nav.centroids.binary_centroids import BinaryCentroids, quantisation_variance_px2
 from nav.matching.blobs import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
-from nav.pose.pose_method import NoFixReason
+from nav.pose.pose_method import NoFixReason, Observation
 from nav.stereo_correspondence import correspond
 from tests.support.painted_pairs import make_pose
 
 RIG = paper_rig()
 
 
-def centroids(layout, place, eye, rng, hidden=(), false_discs=()) -> BinaryCentroids:
+def centroids(
+    layout: MarkerLayout,
+    place: RigidTransform,
+    eye: Eye,
+    rng: np.random.Generator,
+    hidden: Sequence[int] = (),
+    false_discs: Sequence[tuple[float, ...]] = (),
+) -> BinaryCentroids:
     """Centres of the visible markers and the hub with their noise in a random order; false ones as (dx, dy, factor)."""
     kept = [i for i in range(layout.count) if i not in hidden]
     centers = project_disc_centers(RIG, place, layout.centers_m, layout.radius_m, eye)[kept]
@@ -38,7 +47,7 @@ def centroids(layout, place, eye, rng, hidden=(), false_discs=()) -> BinaryCentr
     return BinaryCentroids(Blobs(centers[order], areas[order]), variance[order, None, None] * np.eye(2))
 
 
-def worst_match_px(observation, layout, place) -> float:
+def worst_match_px(observation: Observation, layout: MarkerLayout, place: RigidTransform) -> float:
     """Largest distance of a matched centre from where its marker is, over the best turn of the layout."""
     worst = []
     for permutation in symmetry_permutations(layout):
@@ -49,14 +58,20 @@ def worst_match_px(observation, layout, place) -> float:
     return float(min(worst))
 
 
-def matched(layout, place, rng, hidden=(), false_discs=()):
+def matched(
+    layout: MarkerLayout,
+    place: RigidTransform,
+    rng: np.random.Generator,
+    hidden: Sequence[int] = (),
+    false_discs: Sequence[tuple[float, ...]] = (),
+) -> Observation:
     left, right = (centroids(layout, place, eye, rng, hidden, false_discs) for eye in EYES)
     return correspond(left, right, RIG, layout)
 
 
 @pytest.mark.parametrize("count", [5, 7, 8])
 @pytest.mark.parametrize("z_m", [1.7, 5, 40])
-def test_all_markers_at_every_roll(count, z_m):
+def test_all_markers_at_every_roll(count: int, z_m: float) -> None:
     layout = marker_layout(PRESETS[f"red-{count}"])
     rng = np.random.default_rng([count, int(z_m)])
     for roll_deg in np.linspace(-180, 180, 17):
@@ -70,7 +85,7 @@ def test_all_markers_at_every_roll(count, z_m):
 
 @pytest.mark.parametrize("z_m", [1.7, 5, 40])
 @pytest.mark.parametrize("blind", EYES)
-def test_four_markers_are_enough_where_the_other_image_says_where_they_are(blind, z_m):
+def test_four_markers_are_enough_where_the_other_image_says_where_they_are(blind: str, z_m: float) -> None:
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng([EYES.index(blind), int(z_m)])
     for roll_deg in (-170, -25, 0, 40):
@@ -85,7 +100,7 @@ def test_four_markers_are_enough_where_the_other_image_says_where_they_are(blind
         assert worst_match_px(observation, layout, place) < 0.46
 
 
-def test_four_discs_elsewhere_are_no_ring_beside_the_other_images():
+def test_four_discs_elsewhere_are_no_ring_beside_the_other_images() -> None:
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(1)
     left = centroids(layout, make_pose(0.06, 0, 5, 5, -5, 0), "left", rng)
@@ -99,7 +114,7 @@ def test_four_discs_elsewhere_are_no_ring_beside_the_other_images():
 
 @pytest.mark.parametrize("count", [5, 7, 8])
 @pytest.mark.parametrize("missing", [0, 2, 4])
-def test_one_missing_marker_leaves_a_gap(count, missing):
+def test_one_missing_marker_leaves_a_gap(count: int, missing: int) -> None:
     layout = marker_layout(PRESETS[f"red-{count}"])
     rng = np.random.default_rng(missing)
     place = make_pose(0.06, 0, 10, 8, -6, 10)
@@ -110,7 +125,7 @@ def test_one_missing_marker_leaves_a_gap(count, missing):
 
 
 @pytest.mark.parametrize("count", [5, 7, 8])
-def test_false_blobs_are_left_out(count):
+def test_false_blobs_are_left_out(count: int) -> None:
     layout = marker_layout(PRESETS[f"red-{count}"])
     # Beside the ring, inside it, and of the wrong size near a marker.
     false_discs = [(1.3, 0.4, 1.0), (-0.5, 0.3, 1.0), (0.1, -1.4, 1.2), (0.95, -0.6, 0.1), (-1.2, -1.2, 3.0)]
@@ -123,7 +138,7 @@ def test_false_blobs_are_left_out(count):
         assert worst_match_px(observation, layout, place) < 0.46
 
 
-def test_a_marker_may_be_missing_in_one_eye_only():
+def test_a_marker_may_be_missing_in_one_eye_only() -> None:
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(3)
     place = make_pose(0.06, 0, 5, 7, 7, 12)
@@ -135,7 +150,7 @@ def test_a_marker_may_be_missing_in_one_eye_only():
     assert worst_match_px(observation, layout, place) < 0.46
 
 
-def test_markers_that_are_cut_or_off_their_row_are_dropped():
+def test_markers_that_are_cut_or_off_their_row_are_dropped() -> None:
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(4)
     place = make_pose(0.06, 0, 5, 7, 7, 12)
@@ -149,7 +164,7 @@ def test_markers_that_are_cut_or_off_their_row_are_dropped():
     assert observation.seen.sum(axis=1).tolist() == [6, 7]
 
 
-def test_rings_of_two_drogues_are_not_matched():
+def test_rings_of_two_drogues_are_not_matched() -> None:
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(5)
     left = centroids(layout, make_pose(0.06, 0, 5), "left", rng)
@@ -160,7 +175,7 @@ def test_rings_of_two_drogues_are_not_matched():
 
 
 @pytest.mark.parametrize("eye", EYES)
-def test_too_few_regions_in_one_eye_leave_the_other(eye):
+def test_too_few_regions_in_one_eye_leave_the_other(eye: Eye) -> None:
     layout = marker_layout(PRESETS["red-8"])
     rng = np.random.default_rng(6)
     place = make_pose(0.06, 0, 5)
@@ -173,7 +188,7 @@ def test_too_few_regions_in_one_eye_leave_the_other(eye):
     assert worst_match_px(observation, layout, place) < 6 * 0.033
 
 
-def test_too_few_regions_in_both_eyes():
+def test_too_few_regions_in_both_eyes() -> None:
     layout = marker_layout(PRESETS["red-8"])
     place, rng = make_pose(0.06, 0, 5), np.random.default_rng(8)
     left, right = (centroids(layout, place, eye, rng, hidden=range(4)) for eye in EYES)
@@ -183,7 +198,7 @@ def test_too_few_regions_in_both_eyes():
     assert "regions of the right image" in answer.reason
 
 
-def test_an_uneven_layout_keeps_its_own_names():
+def test_an_uneven_layout_keeps_its_own_names() -> None:
     centers = marker_layout(PRESETS["red-8"]).centers_m[[0, 1, 2, 4, 5, 7]]
     layout = MarkerLayout(centers, 0.05, np.array([0, 0, 0.25]), 0.05, 0.075)
     assert layout.symmetry_order == 1
@@ -196,18 +211,18 @@ def test_an_uneven_layout_keeps_its_own_names():
 
 
 @pytest.mark.parametrize(("count", "least"), [(3, 3), (4, 4), (5, 4), (7, 5), (8, 5), (12, 8)])
-def test_least_markers(count, least):
+def test_least_markers(count: int, least: int) -> None:
     angles = 2 * np.pi * np.arange(count) / count
     centers = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
     assert least_markers(MarkerLayout(centers, 0.05, None)) == least
 
 
-def test_permutations_of_an_even_ring_are_its_turns():
+def test_permutations_of_an_even_ring_are_its_turns() -> None:
     permutations = symmetry_permutations(marker_layout(PRESETS["red-5"]))
     assert sorted(map(tuple, permutations)) == sorted(tuple(np.roll(np.arange(5), shift)) for shift in range(5))
 
 
-def test_a_mirrored_ring_is_no_ring():
+def test_a_mirrored_ring_is_no_ring() -> None:
     # Gaps of 1, 2, 1, 1 and 3 places have a handedness: no turn makes them 1, 1, 2, 1 and 3.
     centers = marker_layout(PRESETS["red-8"]).centers_m[[0, 1, 3, 4, 5]]
     layout = MarkerLayout(centers, 0.05, None)
@@ -219,7 +234,7 @@ def test_a_mirrored_ring_is_no_ring():
     assert mirrored is None or mirrored.count < 5
 
 
-def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leaves_whole():
+def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leaves_whole() -> None:
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(9)
     told = {"whole": 0, "cut": 0}
     for _ in range(200):
@@ -247,7 +262,9 @@ def test_markers_that_the_edge_of_a_picture_cuts_are_told_by_those_that_it_leave
     assert min(told.values()) > 100
 
 
-def partly_beside(rng, layout, whole_left, whole_right):
+def partly_beside(
+    rng: np.random.Generator, layout: MarkerLayout, whole_left: int, whole_right: int
+) -> tuple[RigidTransform, dict[str, np.ndarray]]:
     """A place near by where the edges of the images leave so many markers whole."""
     size_px = np.array([RIG.camera.width_px, RIG.camera.height_px])
     while True:
@@ -267,7 +284,7 @@ def partly_beside(rng, layout, whole_left, whole_right):
 
 
 @pytest.mark.parametrize("whole", [(4, 4), (4, 3), (3, 4)])
-def test_what_the_edges_of_both_images_leave_of_a_ring_is_enough(whole):
+def test_what_the_edges_of_both_images_leave_of_a_ring_is_enough(whole: tuple[int, int]) -> None:
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(whole)
     for _ in range(40):
         place, cut = partly_beside(rng, layout, *whole)
@@ -280,14 +297,14 @@ def test_what_the_edges_of_both_images_leave_of_a_ring_is_enough(whole):
         assert worst_match_px(observation, layout, place) < 6 * 0.0203
 
 
-def test_four_markers_are_not_enough_where_the_images_show_the_places_of_the_others():
+def test_four_markers_are_not_enough_where_the_images_show_the_places_of_the_others() -> None:
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(12)
     place = make_pose(0.06, 0, 1.8)
     shown = [centroids(layout, place, eye, rng, hidden=range(4)) for eye in EYES]
     assert isinstance(correspond(*shown, RIG, layout), NoFixReason)
 
 
-def test_parts_of_a_ring_at_other_distances_do_not_belong_together():
+def test_parts_of_a_ring_at_other_distances_do_not_belong_together() -> None:
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(13)
     for _ in range(20):
         place, cut = partly_beside(rng, layout, 4, 4)
@@ -299,7 +316,7 @@ def test_parts_of_a_ring_at_other_distances_do_not_belong_together():
         assert isinstance(answer, NoFixReason)
 
 
-def test_three_markers_and_the_hub_are_no_four_markers():
+def test_three_markers_and_the_hub_are_no_four_markers() -> None:
     layout, rng = marker_layout(PRESETS["red-8"]), np.random.default_rng(14)
     for _ in range(60):
         place, cut = partly_beside(rng, layout, 3, 3)

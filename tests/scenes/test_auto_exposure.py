@@ -37,56 +37,56 @@ def exposure_of(**exposure: Any) -> Exposure:
 FREE = exposure_of()
 
 
-def test_time_alone_when_its_limits_suffice():
+def test_time_alone_when_its_limits_suffice() -> None:
     with_gain = exposure_of(auto_gain=[1, 16])
     assert with_gain == FREE
     assert FREE.gain == 1
 
 
-def test_gain_makes_up_for_a_time_at_its_limit():
+def test_gain_makes_up_for_a_time_at_its_limit() -> None:
     longest_s = FREE.time_s / 5
     got = exposure_of(auto_time_s=[1e-6, longest_s], auto_gain=[1, 16])
     assert got.time_s == longest_s
     assert got.gain == pytest.approx(5, rel=1e-12)
 
 
-def test_gain_stays_within_its_limits():
+def test_gain_stays_within_its_limits() -> None:
     got = exposure_of(auto_time_s=[1e-6, FREE.time_s / 5], auto_gain=[1, 3])
     assert got.gain == 3
 
 
-def test_a_gain_that_must_be_high_shortens_the_time():
+def test_a_gain_that_must_be_high_shortens_the_time() -> None:
     got = exposure_of(auto_gain=[4, 16])
     assert got.gain == 4
     assert got.time_s == pytest.approx(FREE.time_s / 4, rel=1e-12)
 
 
-def test_a_low_gain_takes_a_shortest_time_that_is_too_long():
+def test_a_low_gain_takes_a_shortest_time_that_is_too_long() -> None:
     got = exposure_of(auto_time_s=[2 * FREE.time_s, 1], auto_gain=[0.1, 1])
     assert got.time_s == 2 * FREE.time_s
     assert got.gain == pytest.approx(0.5, rel=1e-12)
 
 
-def test_a_fixed_time_keeps_its_gain_or_meters_it():
+def test_a_fixed_time_keeps_its_gain_or_meters_it() -> None:
     time_s = FREE.time_s / 8
     assert exposure_of(time_s=time_s).gain == 1
     assert exposure_of(time_s=time_s, auto_gain=6).gain == 6
     assert exposure_of(time_s=time_s, auto_gain=[1, 64]).gain == pytest.approx(8, rel=1e-12)
 
 
-def test_product_of_time_and_gain_answers_the_aperture():
+def test_product_of_time_and_gain_answers_the_aperture() -> None:
     wide, narrow = (exposure_of(f_number=f, auto_time_s=[1e-6, 1], auto_gain=[1, 64]) for f in (2.0, 4.0))
     assert narrow.time_s * narrow.gain == pytest.approx(4 * wide.time_s * wide.gain, rel=1e-12)
 
 
-def test_the_meter_alone_with_a_scene():
+def test_the_meter_alone_with_a_scene() -> None:
     made = recipe()
     environment = environment_of_scene(made.seed, 0, made.environment)
     frame = sample_frame(made, 0)
     assert automatic_exposure(made.exposure, environment, made.rig.camera, frame.world_from_left, made.sensor) == FREE
 
 
-def test_a_meter_on_the_plate_minds_no_sky_behind_it():
+def test_a_meter_on_the_plate_minds_no_sky_behind_it() -> None:
     made = recipe(auto_meter="plate", auto_level_fraction=0.5, auto_time_s=[1e-6, 1])
     environment = environment_of_scene(made.seed, 0, made.environment)
     pose = sample_frame(made, 0).world_from_left

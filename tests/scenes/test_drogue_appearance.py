@@ -27,31 +27,31 @@ def recipe(empty_fraction: float = 0.0, **target: Any) -> Recipe:
     return build_recipe(BASE, frames={"empty_fraction": empty_fraction}, target=target)
 
 
-def within_chance(share, expected, count):
+def within_chance(share: float, expected: float, count: int) -> bool:
     # Four standard errors of a binomial share.
     return abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / count)
 
 
-def test_without_the_section_the_drogue_is_as_new_and_alone():
+def test_without_the_section_the_drogue_is_as_new_and_alone() -> None:
     frame = sample_frame(recipe(), 0)
     assert frame.condition is None and frame.bystanders == () and frame.sought is None
 
 
-def test_variants_come_in_their_shares():
+def test_variants_come_in_their_shares() -> None:
     drawn = recipe(variants=[{"drogue": "red-8", "weight": 3}, {"drogue": "white-5"}])
     names = [drogue_of_scene(drawn, scene).name for scene in range(300)]
     assert set(names) == {"red-8", "white-5"}
     assert within_chance(names.count("white-5") / 300, 0.25, 300)
 
 
-def test_an_empty_frame_says_what_is_sought_where_there_are_several():
+def test_an_empty_frame_says_what_is_sought_where_there_are_several() -> None:
     drawn = recipe(1.0, variants=[{"drogue": "red-7"}])
     frame = sample_frame(drawn, 0)
     assert frame.drogue is None and frame.condition is None
     assert frame.sought is not None and frame.sought.name == "red-7"
 
 
-def test_faults_come_in_their_shares_and_three_markers_stay():
+def test_faults_come_in_their_shares_and_three_markers_stay() -> None:
     drawn = recipe(missing_marker_fraction=0.9, dirty_marker_fraction=0.3, failed_lamp_fraction=0.2)
     states = [condition_of_scene(drawn, scene, drawn.drogue) for scene in range(300)]
     assert all(sum(not marker.missing for marker in state.markers) >= 3 for state in states)
@@ -62,14 +62,14 @@ def test_faults_come_in_their_shares_and_three_markers_stay():
     assert within_chance(np.mean([m.lamp_fraction == 0 for s in states for m in s.markers]), 0.2, 2400)
 
 
-def test_bystanders_do_not_change_the_rest_of_a_frame():
+def test_bystanders_do_not_change_the_rest_of_a_frame() -> None:
     alone = sample_frame(recipe(), 5)
     among = sample_frame(recipe(probe=True, obstacle_frame_fraction=1, distractor_frame_fraction=1), 5)
     assert among.model_copy(update={"bystanders": ()}).model_dump_json() == alone.model_dump_json()
     assert [bystander.kind for bystander in among.bystanders[:2]] == ["probe", "obstacle"]
 
 
-def test_the_probe_ends_where_the_rig_has_its_tip():
+def test_the_probe_ends_where_the_rig_has_its_tip() -> None:
     frame = sample_frame(recipe(probe=True), 0)
     (probe,) = frame.bystanders
     tip_m = frame.rig.body_from_left.inverse().apply(frame.rig.probe_tip_body_m)
@@ -80,7 +80,7 @@ def test_the_probe_ends_where_the_rig_has_its_tip():
     )
 
 
-def test_distractors_stay_behind_the_drogue():
+def test_distractors_stay_behind_the_drogue() -> None:
     drawn = recipe(distractor_frame_fraction=1)
     for index in range(50):
         frame = sample_frame(drawn, index)
@@ -88,7 +88,7 @@ def test_distractors_stay_behind_the_drogue():
         assert depths_m and min(depths_m) >= frame.left_from_drogue.translation_m[2] + 1.0
 
 
-def test_distractors_have_the_forms_that_are_named_as_often_as_they_are():
+def test_distractors_have_the_forms_that_are_named_as_often_as_they_are() -> None:
     drawn = recipe(1.0, distractor_frame_fraction=1, distractor_forms=["ring", "ring", "ring", "disc"])
     forms = [each.shape.form for index in range(150) for each in sample_frame(drawn, index).bystanders]
     assert set(forms) == {"ring", "disc"}
@@ -98,7 +98,7 @@ def test_distractors_have_the_forms_that_are_named_as_often_as_they_are():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
-def test_dirt_covers_the_share_that_is_asked_for(share):
+def test_dirt_covers_the_share_that_is_asked_for(share: float) -> None:
     dirt = dirt_map(7, share)
     assert dirt.shape == (DIRT_MAP_PX, DIRT_MAP_PX) and dirt.min() >= 0 and dirt.max() <= 1 + 1e-6
     # Softening keeps the mean; one texel is the resolution of the share.

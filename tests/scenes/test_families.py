@@ -28,7 +28,7 @@ def recipe(*families: Section, seed: int = 1) -> Recipe:
     return build_recipe(BASE, families=families, seed=seed)
 
 
-def test_scenes_are_shared_out_by_largest_remainder():
+def test_scenes_are_shared_out_by_largest_remainder() -> None:
     assert scenes_per_family(recipe(DAY, SEA)) == [7, 3]
     assert scenes_per_family(recipe(DAY, SEA | {"weight": 6})) == [3, 7]
     names = [family_of_scene(recipe(DAY, SEA), scene).name for scene in range(10)]
@@ -36,7 +36,7 @@ def test_scenes_are_shared_out_by_largest_remainder():
     assert names != [family_of_scene(recipe(DAY, SEA, seed=2), scene).name for scene in range(10)]
 
 
-def test_a_family_changes_what_it_names_and_no_more():
+def test_a_family_changes_what_it_names_and_no_more() -> None:
     drawn = recipe(DAY, SEA)
     for index in range(10):
         frame = sample_frame(drawn, index)
@@ -47,7 +47,7 @@ def test_a_family_changes_what_it_names_and_no_more():
         assert frame.exposure.time_s == (2e-3 if family.name == "sea" else 1e-3)
 
 
-def test_splits_and_poses_stay_as_without_families():
+def test_splits_and_poses_stay_as_without_families() -> None:
     with_families, without = recipe(DAY, SEA), recipe()
     for index in range(10):
         assert split_of_scenes(with_families)[index] == split_of_scenes(without)[index]
@@ -56,12 +56,12 @@ def test_splits_and_poses_stay_as_without_families():
         assert other.family == "own"
 
 
-def test_a_recipe_without_families_is_its_own_for_every_scene():
+def test_a_recipe_without_families_is_its_own_for_every_scene() -> None:
     drawn = recipe()
     assert recipe_of_scene(drawn, 3) is drawn
 
 
-def test_the_plan_counts_them():
+def test_the_plan_counts_them() -> None:
     assert plan_recipe(recipe(DAY, SEA)).by_family == {"day": (7, 28), "sea": (3, 12)}
     assert plan_recipe(recipe()).by_family == {}
 
@@ -80,7 +80,7 @@ def test_wrong_families_are_named(families: Section | list[Section], message: st
         build_recipe(BASE, families=families)
 
 
-def test_the_paper_count_ships():
+def test_the_paper_count_ships() -> None:
     """89 scenes and 14,298 images, as many as the paper trains on, over all families."""
     world = load_recipe("world-89").recipe
     assert world.frames.scenes == 89 and 2 * world.frames.count == 14_298

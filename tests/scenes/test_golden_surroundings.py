@@ -27,14 +27,14 @@ CLOUDS = {
 }
 
 
-def looking(up):
+def looking(up: float) -> np.ndarray:
     """(H, W, 3) directions of a pinhole that looks east, and so many metres up in each."""
     u, v = np.meshgrid(np.arange(WIDTH_PX) - WIDTH_PX / 2 + 0.5, np.arange(HEIGHT_PX) - HEIGHT_PX / 2 + 0.5)
     rays = np.stack([np.full_like(u, FOCAL_PX), -u, up * FOCAL_PX - v], axis=-1)
     return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def ground(kind):
+def ground(kind: str) -> np.ndarray:
     environment = Environment(
         sun_elevation_deg=53.13,
         sun_azimuth_deg=0.0,
@@ -50,7 +50,7 @@ def ground(kind):
     return Ground(environment, light).radiance(looking(-1.0))
 
 
-def cloud(kind):
+def cloud(kind: str) -> np.ndarray:
     """(H, W, 4) light times opacity, and opacity."""
     layer = CloudLayer.model_validate(
         {"kind": kind, "height_above_camera_m": 1200.0, "feature_size_m": 900.0, "texture_seed": 4} | CLOUDS[kind]
@@ -62,12 +62,12 @@ def cloud(kind):
     return np.concatenate([picture, towards_sun])
 
 
-def pictures():
+def pictures() -> dict[str, np.ndarray]:
     return {kind: ground(kind) for kind in MEAN_REFLECTANCE} | {kind: cloud(kind) for kind in CLOUDS}
 
 
 @pytest.mark.parametrize("kind", [*MEAN_REFLECTANCE, *CLOUDS])
-def test_they_look_as_they_did(kind):
+def test_they_look_as_they_did(kind: str) -> None:
     found = cloud(kind) if kind in CLOUDS else ground(kind)
     with np.load(GOLDEN) as stored:
         expected = stored[kind]

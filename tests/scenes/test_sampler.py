@@ -1,11 +1,13 @@
 from __future__ import annotations
 
-from typing import Unpack
+from collections.abc import Callable
+from typing import Any, Unpack
 
 import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import bulk_frame_generator, frame_generator
+from datasets_manifest.recipe.drogue_ranges import DistanceLaw
 from datasets_manifest.recipe.recipe import Recipe
 from drogue_models.marker_layout import marker_layout
 from geometry.circles import disc_outline
@@ -26,14 +28,14 @@ def recipe(**changes: Unpack[RecipeTable]) -> Recipe:
     return build_recipe(BASE, **changes)
 
 
-def test_frames_depend_on_seed_and_index_alone():
+def test_frames_depend_on_seed_and_index_alone() -> None:
     first = [sample_frame(recipe(), index).model_dump_json() for index in (3, 0, 7)]
     again = [sample_frame(recipe(), index).model_dump_json() for index in (7, 3, 0)]
     assert first == [again[1], again[2], again[0]]
     assert sample_frame(recipe(seed=2), 3).model_dump_json() != first[0]
 
 
-def test_seed_zero_is_a_seed():
+def test_seed_zero_is_a_seed() -> None:
     assert sample_frame(recipe(seed=0), 0).model_dump_json() == sample_frame(recipe(seed=0), 0).model_dump_json()
     assert sample_frame(recipe(seed=0), 0).left_from_drogue.as_matrix().tolist() != (
         sample_frame(recipe(seed=1), 0).left_from_drogue.as_matrix().tolist()
@@ -41,7 +43,7 @@ def test_seed_zero_is_a_seed():
 
 
 @pytest.mark.parametrize("make", [frame_generator, bulk_frame_generator])
-def test_streams_are_independent_of_each_other(make):
+def test_streams_are_independent_of_each_other(make: Callable[..., Any]) -> None:
     draws = {
         key: make(*key).standard_normal(2000)
         for key in [(1, 0, "a"), (1, 0, "b"), (1, 1, "a"), (2, 0, "a"), (2**40 + 1, 0, "a")]
@@ -53,13 +55,13 @@ def test_streams_are_independent_of_each_other(make):
             assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(2000)
 
 
-def test_negative_seed_is_refused():
+def test_negative_seed_is_refused() -> None:
     with pytest.raises(ValueError, match="must not be negative"):
         frame_generator(-1, 0, "a")
 
 
 @pytest.mark.parametrize("distance_m", [1.7, 3.0, 10.0, 40.0])
-def test_the_whole_drogue_is_in_both_views(distance_m):
+def test_the_whole_drogue_is_in_both_views(distance_m: float) -> None:
     drawn = recipe(distance=stations(distance_m))
     for index in range(40):
         frame = sample_frame(drawn, index)
@@ -69,7 +71,7 @@ def test_the_whole_drogue_is_in_both_views(distance_m):
             assert frame.rig.camera.contains(frame.rig.project(rim, eye), margin_px=0.5).all()
 
 
-def test_places_fill_the_common_field():
+def test_places_fill_the_common_field() -> None:
     drawn = recipe(distance=stations(10.0))
     places = np.array([sample_left_from_drogue(drawn, index).translation_m[:2] for index in range(200)])
     x_low, x_high, y_low, y_high = drawn.rig.common_field_m(10.0, 0.33)
@@ -80,19 +82,19 @@ def test_places_fill_the_common_field():
     assert places[:, 1].max() > y_high - 0.04 * (y_high - y_low) - 0.1
 
 
-def test_on_axis_stays_on_the_rig_axis():
+def test_on_axis_stays_on_the_rig_axis() -> None:
     drawn = recipe(pose={"on_axis": True})
     for index in range(8):
         np.testing.assert_allclose(sample_frame(drawn, index).left_from_drogue.translation_m[:2], [0.06, 0.0])
 
 
-def test_an_attitude_that_never_fits_is_one_clear_error():
+def test_an_attitude_that_never_fits_is_one_clear_error() -> None:
     drawn = recipe(distance=stations(1.47), pose={"pitch_deg": 0, "yaw_deg": [40, 45]})
     with pytest.raises(ValueError, match="no attitude within the recipe's ranges"):
         sample_frame(drawn, 0)
 
 
-def quantile_error(law, transform):
+def quantile_error(law: DistanceLaw, transform: Callable[..., Any]) -> float:
     rng = np.random.default_rng(1)
     draws = np.sort([transform(sample_distance_m(rng, law, 0)) for _ in range(4000)])
     ends = sorted([transform(2.0), transform(40.0)])
@@ -103,19 +105,19 @@ def quantile_error(law, transform):
     ("name", "transform"),
     [("uniform", lambda z: z), ("log-uniform", np.log), ("uniform-image-size", lambda z: 1 / z)],
 )
-def test_distance_laws(name, transform):
+def test_distance_laws(name: str, transform: Callable[..., Any]) -> None:
     """Kolmogorov-Smirnov distance to the intended law; 1.95/sqrt(n) is its 0.1 % point."""
     law = recipe(distance=between(2.0, 40.0, name)).distance
     assert quantile_error(law, transform) < 1.95 / np.sqrt(4000)
 
 
-def test_stations_cycle():
+def test_stations_cycle() -> None:
     drawn = recipe()
     distances = [sample_frame(drawn, index).left_from_drogue.translation_m[2] for index in range(8)]
     np.testing.assert_allclose(distances, [1.7, 3.0, 10.0, 40.0] * 2)
 
 
-def test_scenes_are_visited_evenly_and_split_whole():
+def test_scenes_are_visited_evenly_and_split_whole() -> None:
     drawn = recipe()
     scenes = [scene_of_frame(drawn, index) for index in range(400)]
     assert np.bincount(scenes).tolist() == [40] * 10
@@ -123,14 +125,14 @@ def test_scenes_are_visited_evenly_and_split_whole():
     assert sorted(splits) == ["test"] + ["train"] * 7 + ["val"] * 2
 
 
-def test_empty_frames_have_no_drogue():
+def test_empty_frames_have_no_drogue() -> None:
     drawn = recipe(frames={"empty_fraction": 0.25})
     empty = sum(sample_left_from_drogue(drawn, index) is None for index in range(400))
     # Binomial of 400 draws: standard deviation 8.7; four of them.
     assert abs(empty - 100) < 35
 
 
-def test_a_pose_drawn_alone_is_that_of_the_frame():
+def test_a_pose_drawn_alone_is_that_of_the_frame() -> None:
     drawn = recipe(frames={"empty_fraction": 0.25})
     for index in range(12):
         alone, frame = sample_left_from_drogue(drawn, index), sample_frame(drawn, index)
@@ -140,7 +142,7 @@ def test_a_pose_drawn_alone_is_that_of_the_frame():
             np.testing.assert_array_equal(alone.rotation, frame.left_from_drogue.rotation)
 
 
-def test_hose_runs_from_the_coupling_to_the_pod():
+def test_hose_runs_from_the_coupling_to_the_pod() -> None:
     frame = sample_frame(recipe(), 2)
     nodes = frame.hose_nodes_left_m
     tail = frame.left_from_drogue.apply([0, 0, frame.drogue.hub_depth_m + frame.drogue.coupling_length_m])
@@ -151,7 +153,7 @@ def test_hose_runs_from_the_coupling_to_the_pod():
     assert cosines.min() > 0.9  # no kinks
 
 
-def test_meter_lights_the_brighter_of_sky_and_plate():
+def test_meter_lights_the_brighter_of_sky_and_plate() -> None:
     drawn = recipe()
     for index in range(10):
         frame = sample_frame(drawn, index)

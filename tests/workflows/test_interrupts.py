@@ -17,7 +17,7 @@ def default_handler() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupt_that_somebody_would_swallow_comes_after_the_block():
+def test_an_interrupt_that_somebody_would_swallow_comes_after_the_block() -> None:
     swallowed = reached = False
     with pytest.raises(KeyboardInterrupt):
         with delay_interrupts(), suppress(BaseException):
@@ -28,7 +28,7 @@ def test_an_interrupt_that_somebody_would_swallow_comes_after_the_block():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_the_handler_of_before_hears_it_once_after_the_block():
+def test_the_handler_of_before_hears_it_once_after_the_block() -> None:
     heard: list[int] = []
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
     with delay_interrupts():
@@ -38,7 +38,7 @@ def test_the_handler_of_before_hears_it_once_after_the_block():
     assert heard == [signal.SIGINT]
 
 
-def test_without_an_interrupt_nothing_happens():
+def test_without_an_interrupt_nothing_happens() -> None:
     with delay_interrupts():
         pass
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -25,13 +28,13 @@ POINTS_M = np.random.default_rng(4).uniform([-0.2, -0.15, 1], [0.2, 0.15, 1], (3
 EXACT_PX = 1e-9
 
 
-def data_of(table, name):
+def data_of(table: dict[str, Any], name: str) -> np.ndarray:
     matrix = table[name]
     return np.array(matrix["data"], dtype=np.float64).reshape(matrix["rows"], matrix["cols"])
 
 
 @pytest.mark.parametrize("rig", RIGS, ids=["ideal", "real"])
-def test_kalibr_s_chain_projects_points_to_where_they_are_seen(rig):
+def test_kalibr_s_chain_projects_points_to_where_they_are_seen(rig: StereoRig) -> None:
     chain = yaml.safe_load(kalibr_camchain(rig))
     assert list(chain) == ["cam0", "cam1"]
     in_camera = POINTS_M
@@ -53,7 +56,7 @@ def test_kalibr_s_chain_projects_points_to_where_they_are_seen(rig):
 
 
 @pytest.mark.parametrize("rig", RIGS, ids=["ideal", "real"])
-def test_camera_info_rectifies_what_is_seen(rig):
+def test_camera_info_rectifies_what_is_seen(rig: StereoRig) -> None:
     for eye in EYES:
         table = yaml.safe_load(camera_info(rig, eye))
         assert (table["image_width"], table["image_height"], table["camera_name"]) == (1280, 960, eye)
@@ -74,7 +77,7 @@ def test_camera_info_rectifies_what_is_seen(rig):
         np.testing.assert_allclose(found[:, 0], homogeneous[:, :2] / homogeneous[:, 2:], atol=1e-8)
 
 
-def test_a_third_radial_coefficient_has_no_place_in_kalibr(tmp_path):
+def test_a_third_radial_coefficient_has_no_place_in_kalibr(tmp_path: Path) -> None:
     rig, _ = resolve_rig({"preset": "paper-real", "eyes": {"k3": {"low": 0.01, "high": 0.01}}})
     with pytest.raises(ValueError, match="no k3"):
         kalibr_camchain(rig)
@@ -87,7 +90,7 @@ def test_a_third_radial_coefficient_has_no_place_in_kalibr(tmp_path):
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-5, -2.5e-300, 3e22, 0.1, 1 / 3, 2133.3333333333335])
-def test_numbers_are_read_as_numbers(value):
+def test_numbers_are_read_as_numbers(value: float) -> None:
     # YAML 1.1 takes 1e-05 for a word.
     read = yaml.safe_load(yaml_number(value))
     assert isinstance(read, float) and read == value
@@ -96,7 +99,7 @@ def test_numbers_are_read_as_numbers(value):
 NAMES = ("M1", "D1", "M2", "D2", "R", "T", "R1", "R2", "P1", "P2", "Q")
 
 
-def test_opencv_reads_what_was_written(tmp_path):
+def test_opencv_reads_what_was_written(tmp_path: Path) -> None:
     rig = paper_rig()
     path = write_calibration(tmp_path, rig)[0]
     assert path.parent == tmp_path / "calibration"
@@ -111,7 +114,7 @@ def test_opencv_reads_what_was_written(tmp_path):
     assert storage.getNode("P2").mat()[0, 3] == -256.0
 
 
-def test_rectification_is_what_opencv_computes():
+def test_rectification_is_what_opencv_computes() -> None:
     rig = paper_rig()
     m = opencv_stereo_matrices(rig)
     r1, r2, p1, p2, q, _, _ = cv2.stereoRectify(
@@ -126,7 +129,7 @@ def test_rectification_is_what_opencv_computes():
     np.testing.assert_allclose(q[[2, 3], [3, 2]], m["Q"][[2, 3], [3, 2]], rtol=1e-12)
 
 
-def test_reprojection_matrix_inverts_the_projection():
+def test_reprojection_matrix_inverts_the_projection() -> None:
     rig = StereoRig(PinholeCamera(640, 480, 800.0, 810.0, 320.5, 239.0), 0.25)
     points = np.random.default_rng(5).uniform([-1, -1, 2], [1, 1, 20], (20, 3))
     left, right = rig.project(points, "left"), rig.project(points, "right")
@@ -135,6 +138,6 @@ def test_reprojection_matrix_inverts_the_projection():
     np.testing.assert_allclose(seen[:, :3] / seen[:, 3:], points, rtol=1e-11)
 
 
-def test_the_same_rig_gives_the_same_bytes(tmp_path):
+def test_the_same_rig_gives_the_same_bytes(tmp_path: Path) -> None:
     one, other = (write_calibration(tmp_path / name, paper_rig())[0] for name in ("a", "b"))
     assert one.read_bytes() == other.read_bytes()

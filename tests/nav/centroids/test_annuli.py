@@ -21,7 +21,14 @@ STEP_PX = np.array([0.03, -0.02])
 NOISE = NoiseModel(2300 / DAY.step_e**2 + 1 / 12, 1 / DAY.step_e * 2, 0.0)
 
 
-def draw_annuli(outer_px, rng, shadow=0.0, contrast_e=DAY.contrast_e, mouth_e=0.0, way=(0.0, 0.0)):
+def draw_annuli(
+    outer_px: float,
+    rng: np.random.Generator,
+    shadow: float = 0.0,
+    contrast_e: float = DAY.contrast_e,
+    mouth_e: float = 0.0,
+    way: tuple[float, float] = (0.0, 0.0),
+) -> tuple[list[MarkerSignal], Ellipses, Ellipses]:
     """Signals of an annulus in each eye with their true edges.
 
     `shadow` takes a share of the light beyond a line, `mouth_e` is the deviation of the light in the middle; all
@@ -50,12 +57,12 @@ def draw_annuli(outer_px, rng, shadow=0.0, contrast_e=DAY.contrast_e, mouth_e=0.
     return signals, outer, Ellipses(eyes, middle + STEP_PX, np.tile(shape * outer_px / 1.5, (2, 1, 1)))
 
 
-def off(edges, shift):
+def off(edges: Ellipses, shift: float | np.ndarray) -> Ellipses:
     """The edges as a markers-only pose predicts them."""
     return Ellipses(edges.eyes, edges.centers_px + shift, 1.004 * edges.shapes_px)
 
 
-def fit_many(outer_px, shadow, draws=30):
+def fit_many(outer_px: float, shadow: float, draws: int = 30) -> tuple[float, ...]:
     """Means of normalized squared errors, of squared errors [px^2] and of stated variances [px^2]."""
     rng = np.random.default_rng([3, int(outer_px)])
     normalized, errors, told = [], [], []
@@ -72,7 +79,7 @@ def fit_many(outer_px, shadow, draws=30):
 
 
 @pytest.mark.parametrize("outer_px", [30.0, 15.0, 8.0])
-def test_even_annuli_are_as_good_as_their_covariance(outer_px):
+def test_even_annuli_are_as_good_as_their_covariance(outer_px: float) -> None:
     normalized, variance, _ = fit_many(outer_px, 0.0)
     # 120 squared errors: standard deviation 0.13.
     assert 0.6 < normalized < 1.4
@@ -80,14 +87,14 @@ def test_even_annuli_are_as_good_as_their_covariance(outer_px):
     assert np.sqrt(variance) < 0.0045 * np.sqrt(16 / outer_px)
 
 
-def test_thin_annuli_keep_the_predicted_step():
+def test_thin_annuli_keep_the_predicted_step() -> None:
     normalized, variance, _ = fit_many(4.0, 0.0)
     assert 0.6 < normalized < 1.4
     # The bound of a disc of 4 px is 0.007 px.
     assert np.sqrt(variance) < 0.0085
 
 
-def test_covariances_are_right_beside_lighter_surroundings_than_a_marker_has():
+def test_covariances_are_right_beside_lighter_surroundings_than_a_marker_has() -> None:
     rng = np.random.default_rng(9)
     # What discs on a dark face would have told: a ninth of the variance beside the annuli.
     told = NoiseModel(NOISE.dark_dn2 / 9, NOISE.per_signal_dn, 0.0)
@@ -102,7 +109,7 @@ def test_covariances_are_right_beside_lighter_surroundings_than_a_marker_has():
 
 
 @pytest.mark.parametrize("outer_px", [30.0, 15.0])
-def test_what_lies_in_the_mouth_does_not_widen_covariances(outer_px):
+def test_what_lies_in_the_mouth_does_not_widen_covariances(outer_px: float) -> None:
     rng, normalized = np.random.default_rng([11, int(outer_px)]), []
     for _ in range(40):
         # Twelve times the noise of a pixel.
@@ -115,7 +122,7 @@ def test_what_lies_in_the_mouth_does_not_widen_covariances(outer_px):
 
 
 @pytest.mark.parametrize("outer_px", [53.0, 16.0, 5.3])
-def test_blur_of_whole_pixels_does_not_move_the_centre(outer_px):
+def test_blur_of_whole_pixels_does_not_move_the_centre(outer_px: float) -> None:
     rng = np.random.default_rng(5)
     cell, errors = int(2 * outer_px + 18), []
     angle = np.linspace(0, 2 * np.pi, int(64 * outer_px), endpoint=False)
@@ -139,7 +146,7 @@ def test_blur_of_whole_pixels_does_not_move_the_centre(outer_px):
 
 
 @pytest.mark.parametrize("outer_px", [30.0, 15.0])
-def test_shadow_edges_widen_the_covariance_more_than_they_move_the_centre(outer_px):
+def test_shadow_edges_widen_the_covariance_more_than_they_move_the_centre(outer_px: float) -> None:
     normalized, variance, told = fit_many(outer_px, 0.5)
     _, _, even = fit_many(outer_px, 0.0, 5)
     assert told > 3 * even
@@ -149,7 +156,7 @@ def test_shadow_edges_widen_the_covariance_more_than_they_move_the_centre(outer_
 
 
 @pytest.mark.parametrize("outer_px", [12.0, 5.0])
-def test_light_beyond_the_collar_does_not_move_the_centre(outer_px):
+def test_light_beyond_the_collar_does_not_move_the_centre(outer_px: float) -> None:
     rng = np.random.default_rng([7, int(outer_px)])
     factor, errors, unaware = 1 + 0.8 / outer_px, [], []
     for _ in range(20):
@@ -176,7 +183,7 @@ def test_light_beyond_the_collar_does_not_move_the_centre(outer_px):
 
 
 @pytest.mark.parametrize(("outer_px", "way"), [(30.0, (5.0, 3.0)), (15.0, (-4.0, 1.0)), (8.0, (1.0, 2.0))])
-def test_annuli_that_move_are_as_good_as_their_covariance(outer_px, way):
+def test_annuli_that_move_are_as_good_as_their_covariance(outer_px: float, way: tuple[float, float]) -> None:
     rng, normalized = np.random.default_rng([17, int(outer_px)]), []
     for _ in range(30):
         signals, outer, inner = draw_annuli(outer_px, rng, way=way)
@@ -189,7 +196,7 @@ def test_annuli_that_move_are_as_good_as_their_covariance(outer_px, way):
     assert 0.6 < np.mean(normalized) < 1.4
 
 
-def test_annuli_that_are_not_there_or_dark_give_reasons():
+def test_annuli_that_are_not_there_or_dark_give_reasons() -> None:
     rng = np.random.default_rng(4)
     signals, outer, inner = draw_annuli(15.0, rng, contrast_e=0.0)
     fits = fit_annuli(signals, outer, inner, NOISE)
@@ -200,7 +207,7 @@ def test_annuli_that_are_not_there_or_dark_give_reasons():
     assert not fits.accepted.any()
 
 
-def test_derivatives_are_those_of_the_picture():
+def test_derivatives_are_those_of_the_picture() -> None:
     rng = np.random.default_rng(5)
     signals, outer, inner = draw_annuli(12.0, rng)
     pixels = annulus_pixels(signals, outer, inner)
@@ -218,7 +225,7 @@ def test_derivatives_are_those_of_the_picture():
         np.testing.assert_allclose(jacobian[:, place] / scale, slope / scale, atol=5e-3)
 
 
-def test_no_annuli_no_fits():
+def test_no_annuli_no_fits() -> None:
     nothing = circles(np.zeros(0), np.zeros((0, 2)), np.zeros(0))
     signals, _, _ = draw_annuli(5.0, np.random.default_rng(6))
     assert isinstance(fit_annuli(signals, nothing, nothing, NOISE), AnnulusFits)

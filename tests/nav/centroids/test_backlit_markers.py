@@ -13,10 +13,11 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
-from geometry.stereo import EYES, paper_rig
+from geometry.se3 import RigidTransform
+from geometry.stereo import EYES, Eye, paper_rig
 from nav.centroids.binary_centroids import window_centroids
 from nav.navigator import DETECTOR, Navigator
-from nav.pair_measurement import regions_of
+from nav.pair_measurement import PairMeasurement, regions_of
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason
 from nav.tracking.rim_boxes import rim_boxes
 from tests.support.painted_pairs import FACE_RGB, background, expose, make_pose, paint_disc
@@ -30,7 +31,7 @@ MARKER_RGB = (24.0, 7.0, 7.0)
 LENS_SIGMA_PX = 0.5
 
 
-def drawn_light(place, eye, markers, face_behind_m):
+def drawn_light(place: RigidTransform, eye: Eye, markers: int, face_behind_m: float) -> np.ndarray:
     """A face with the sky in its opening, and so many of its markers before it. [DN]"""
     image = background(RIG, "cloud")
     paint_disc(
@@ -50,7 +51,13 @@ def drawn_light(place, eye, markers, face_behind_m):
     return cv2.GaussianBlur(image, (0, 0), LENS_SIGMA_PX)
 
 
-def seen_by(sensor, place, rng, markers=LAYOUT.count, face_behind_m=0.0):
+def seen_by(
+    sensor: str,
+    place: RigidTransform,
+    rng: np.random.Generator,
+    markers: int = LAYOUT.count,
+    face_behind_m: float = 0.0,
+) -> StereoImages:
     """The pair as a `mono` or a `mosaic` sensor behind a lens gives it."""
     shots, mosaics = [], []
     for eye in EYES:
@@ -66,13 +73,13 @@ def seen_by(sensor, place, rng, markers=LAYOUT.count, face_behind_m=0.0):
     return images if sensor == "mono" else replace(images, left_mosaic=mosaics[0], right_mosaic=mosaics[1])
 
 
-def measured(images, place):
+def measured(images: StereoImages, place: RigidTransform) -> PairMeasurement:
     return NAVIGATOR.measure(images, regions_of(rim_boxes(RIG, DROGUE.rim_radius_m, place), DETECTOR))
 
 
 @pytest.mark.parametrize("sensor", ["mono", "mosaic"])
 @pytest.mark.parametrize(("z_m", "face_behind_m"), [(2.0, 0.0), (5.0, 0.0), (5.0, 0.02), (10.0, 0.0)])
-def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(sensor, z_m, face_behind_m):
+def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(sensor: str, z_m: float, face_behind_m: float) -> None:
     rng = np.random.default_rng([8, int(z_m)])
     place = make_pose(0.06, 0.01, z_m, 6, -5, 10)
     # From 20 mm behind the markers the face seems to end a pixel earlier than the layout says, at 5 m.
@@ -109,7 +116,7 @@ def test_a_backlit_ring_is_found_and_fitted_to_its_covariance(sensor, z_m, face_
 
 @pytest.mark.parametrize("sensor", ["mono", "mosaic"])
 @pytest.mark.parametrize("z_m", [2.0, 5.0, 10.0])
-def test_a_face_without_markers_shows_no_ring(sensor, z_m):
+def test_a_face_without_markers_shows_no_ring(sensor: str, z_m: float) -> None:
     place = make_pose(0.06, 0.01, z_m, 6, -5, 10)
     images = seen_by(sensor, place, np.random.default_rng([9, int(z_m)]), markers=0)
     observation = measured(images, place).observation
@@ -118,7 +125,7 @@ def test_a_face_without_markers_shows_no_ring(sensor, z_m):
 
 
 @pytest.mark.parametrize("part", ["noise", "clouds", "half"])
-def test_no_ring_is_read_into_noise(part):
+def test_no_ring_is_read_into_noise(part: str) -> None:
     for seed in range(20):
         rng = np.random.default_rng([10, seed])
         light = np.full((180, 180), 6.0)

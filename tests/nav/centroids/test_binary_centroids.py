@@ -10,10 +10,12 @@ import pytest
 
 from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import marker_layout
+from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.pinhole import PinholeCamera
-from geometry.stereo import EYES, StereoRig, paper_rig
+from geometry.se3 import RigidTransform
+from geometry.stereo import EYES, Eye, StereoRig, paper_rig
 from nav.centroids.binary_centroids import binary_centroids, quantisation_variance_px2
 from nav.detector.color_blob import ColorBlobDetector
 from nav.matching.marker_channel import marker_channel, marker_color
@@ -25,17 +27,19 @@ LAYOUT = marker_layout(DROGUE)
 WHITE_RGB = (200.0, 200.0, 195.0)
 
 
-def same(image, **kwargs) -> StereoImages:
+def same(image: np.ndarray, **kwargs: float | str) -> StereoImages:
     return StereoImages(image, image, 0.0, 1e-3, **kwargs)
 
 
-def rim_box(rig, place, drogue, eye) -> tuple[float, float, float, float]:
+def rim_box(
+    rig: StereoRig, place: RigidTransform, drogue: DrogueParameters, eye: Eye
+) -> tuple[float, float, float, float]:
     x, y = rig.project(place.translation_m, eye)
     reach = rig.camera.fx_px * drogue.rim_radius_m / place.translation_m[2]
     return x - reach, y - reach, 2 * reach, 2 * reach
 
 
-def overlap(a, b) -> float:
+def overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
     """Intersection over union of two boxes."""
     width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
     height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
@@ -43,7 +47,7 @@ def overlap(a, b) -> float:
     return shared / (a[2] * a[3] + b[2] * b[3] - shared)
 
 
-def test_colour_of_markers():
+def test_colour_of_markers() -> None:
     assert marker_color(DROGUE) == 0
     assert marker_color(PRESETS["white-8"]) is None
     assert marker_color(DROGUE.model_copy(update={"marker_reflectance_rgb": (0.1, 0.7, 0.1)})) == 1
@@ -51,7 +55,7 @@ def test_colour_of_markers():
     assert marker_color(lit) == 0
 
 
-def test_channel_is_the_colours_lead_over_the_others():
+def test_channel_is_the_colours_lead_over_the_others() -> None:
     image = np.array([[[200, 30, 50], [40, 90, 160], [210, 205, 208]]], np.uint8)
     assert marker_channel(same(image), "left", 0).tolist() == [[150, 0, 2]]
     assert marker_channel(same(image), "left", None).tolist() == [[30, 40, 205]]
@@ -59,14 +63,14 @@ def test_channel_is_the_colours_lead_over_the_others():
     assert marker_channel(same(mono), "right", 0).tolist() == mono.tolist()
 
 
-def test_channel_without_black_level():
+def test_channel_without_black_level() -> None:
     image = np.array([[[100, 60, 70], [3, 9, 20]]], np.uint16)
     images = same(image, bits=12, black_level_dn=64.0)
     assert marker_channel(images, "left", None).tolist() == [[0, 0]]
     assert marker_channel(images, "left", 0).tolist() == [[30, 0]]
 
 
-def test_channel_of_gamma_images_is_linear():
+def test_channel_of_gamma_images_is_linear() -> None:
     light = np.linspace(0, 1, 64)
     code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     image = np.round(255 * code).astype(np.uint8)[None, :, None] * np.array([1, 0, 0], np.uint8)
@@ -76,7 +80,7 @@ def test_channel_of_gamma_images_is_linear():
 
 
 @pytest.mark.parametrize("color", [0, 1, 2])
-def test_mosaic_channel_lies_on_the_images_grid(color):
+def test_mosaic_channel_lies_on_the_images_grid(color: int) -> None:
     # A plane of light in one colour: its interpolated value must be the plane's, at every pixel inside.
     v, u = np.mgrid[:40, :60].astype(np.float64)
     plane = 100 + 6.0 * u + 10.0 * v
@@ -99,7 +103,7 @@ def test_mosaic_channel_lies_on_the_images_grid(color):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 5.0, 10.0, 20.0, 40.0])
-def test_centroids_are_as_good_as_their_declared_variance(z_m):
+def test_centroids_are_as_good_as_their_declared_variance(z_m: float) -> None:
     errors, variances = [], []
     for seed in range(4):
         rng = np.random.default_rng([seed, int(z_m)])
@@ -121,7 +125,7 @@ def test_centroids_are_as_good_as_their_declared_variance(z_m):
     assert np.abs(np.mean(np.concatenate(errors), axis=0)).max() < 4 * declared / np.sqrt(64)
 
 
-def test_quantisation_law():
+def test_quantisation_law() -> None:
     # The sum over rows, done directly for a disc of radius 20: 2 ends of 40 rows, variance 1/12, lever x.
     radius = 20.0
     rows = np.arange(-19.5, 20)
@@ -130,7 +134,7 @@ def test_quantisation_law():
     assert quantisation_variance_px2(np.array(radius)) == pytest.approx(variance, rel=1e-3)
 
 
-def test_discs_at_the_images_edge_are_dropped():
+def test_discs_at_the_images_edge_are_dropped() -> None:
     place = make_pose(0.06, 0.28, 1.7)
     images = paint_pair(RIG, DROGUE, place, None)
     truth = project_disc_centers(RIG, place, LAYOUT.centers_m, LAYOUT.radius_m, "left")
@@ -144,7 +148,7 @@ def test_discs_at_the_images_edge_are_dropped():
 
 
 @pytest.mark.parametrize("box", [(2000.0, 10.0, 50.0, 50.0), (-300.0, 10.0, 20.0, 50.0), (10.0, 10.0, 0.0, 0.0)])
-def test_boxes_beside_the_image_hold_nothing(box):
+def test_boxes_beside_the_image_hold_nothing(box: tuple[float, ...]) -> None:
     image = np.zeros((960, 1280), np.uint8)
     assert len(binary_centroids(image, box, LAYOUT).blobs) == 0
 
@@ -152,7 +156,7 @@ def test_boxes_beside_the_image_hold_nothing(box):
 @pytest.mark.parametrize("name", ["red-8", "red-7", "red-5", "white-8"])
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
 @pytest.mark.parametrize("z_m", [1.7, 6.0, 40.0])
-def test_detector_boxes_the_rim(name, kind, z_m):
+def test_detector_boxes_the_rim(name: str, kind: str, z_m: float) -> None:
     if name == "white-8" and kind == "cloud" and z_m == 40:
         pytest.skip("white markers of 5 px before a white cloud show no contrast")
     drogue = PRESETS[name]
@@ -168,7 +172,7 @@ def test_detector_boxes_the_rim(name, kind, z_m):
         assert overlap(found.box_xywh_px, rim_box(RIG, place, drogue, eye)) > 0.9
 
 
-def test_detector_on_a_small_rig():
+def test_detector_on_a_small_rig() -> None:
     rig = StereoRig(PinholeCamera(320, 240, 533.3, 533.3, 159.5, 119.5), 0.12)
     for z_m in (2.0, 5.0, 10.0):
         place = make_pose(0.06, 0, z_m, 5, 5, 10)
@@ -179,7 +183,7 @@ def test_detector_on_a_small_rig():
             assert overlap(found.box_xywh_px, rim_box(rig, place, DROGUE, eye)) > 0.85
 
 
-def test_detector_is_not_misled_by_other_red_things():
+def test_detector_is_not_misled_by_other_red_things() -> None:
     place = make_pose(0.06, 0, 20, 5, 5, 10)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(13))
     pictures = []

@@ -9,7 +9,7 @@ from nav.centroids import blurred_edges
 from nav.centroids.blurred_edges import blurred_step
 
 
-def test_a_blurred_step_is_the_error_function():
+def test_a_blurred_step_is_the_error_function() -> None:
     z = np.concatenate([np.linspace(-12, 12, 20_001), [-1e3, 0.0, 1e3]]).astype(np.float32)
     step, bell = blurred_step(z)
     exact = z.astype(np.float64)
@@ -19,7 +19,7 @@ def test_a_blurred_step_is_the_error_function():
     np.testing.assert_allclose(bell, np.exp(-(exact**2)), rtol=3e-6, atol=1e-12)
 
 
-def test_far_from_an_edge_there_are_no_denormal_numbers():
+def test_far_from_an_edge_there_are_no_denormal_numbers() -> None:
     # Nor in products of two of them, which the normal equations are made of.
     _, bell = blurred_step(np.linspace(-20, 20, 20_001, dtype=np.float32))
     squares = bell[bell != 0].astype(np.float64) ** 2
@@ -27,18 +27,18 @@ def test_far_from_an_edge_there_are_no_denormal_numbers():
     assert (bell == 0).any()
 
 
-def test_both_sides_of_a_blurred_step_are_alike():
+def test_both_sides_of_a_blurred_step_are_alike() -> None:
     z = np.linspace(0, 6, 5001, dtype=np.float32)[1:]
     high, low = blurred_step(z)[0], blurred_step(-z)[0]
     # One rounding of a number below one: an edge that is steeper on one side would move centres.
     np.testing.assert_allclose(high - np.float32(0.5), np.float32(0.5) - low, atol=6e-8)
 
 
-def float32(rng, *shape):
+def float32(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return rng.normal(size=shape).astype(np.float32)
 
 
-def test_pixels_that_see_no_edge_get_no_picture_whatever_the_outline_is():
+def test_pixels_that_see_no_edge_get_no_picture_whatever_the_outline_is() -> None:
     x, y, ones = float32(np.random.default_rng(6), 3, 2, 50)
     pictures, inside = np.zeros((2, 3, 50), np.float32), np.full((2, 50), np.nan, np.float32)
     inside[1] = 1.0

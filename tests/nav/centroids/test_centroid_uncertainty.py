@@ -8,12 +8,12 @@ import pytest
 from nav.centroids.centroid_uncertainty import sector_sums, zone_sums
 
 
-def float32(rng, *shape):
+def float32(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return rng.normal(size=shape).astype(np.float32)
 
 
 @pytest.mark.parametrize("count", [8, 16])
-def test_sectors_are_those_of_the_arc_tangent(count):
+def test_sectors_are_those_of_the_arc_tangent(count: int) -> None:
     rng = np.random.default_rng(3)
     x, y, ones = float32(rng, 3, 4000), float32(rng, 3, 4000), np.ones((3, 4000), np.float32)
     turn = np.arctan2(y, x) / (2 * np.pi) * count
@@ -31,7 +31,7 @@ def test_sectors_are_those_of_the_arc_tangent(count):
     assert on_axes.tolist() == [2, 0, 1, 0, 1, 0, 1, 1]
 
 
-def test_zones_are_open_intervals_of_present_pixels():
+def test_zones_are_open_intervals_of_present_pixels() -> None:
     inside = np.array([[0.0, 0.2, 0.5, 0.8, 1.0, 0.5]], np.float32)
     present = np.array([[1, 1, 1, 1, 1, 0]], np.float32)
     sums = zone_sums(

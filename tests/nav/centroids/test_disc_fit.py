@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,11 +16,11 @@ from geometry.stereo import EYES, paper_rig
 from nav.centroids.blurred_edges import START_WIDTH_PX, ellipse_parameters
 from nav.centroids.disc_fit import fit_discs
 from nav.centroids.discs import disc_model
-from nav.centroids.ellipses import circles
+from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.face_background import FaceBackground, background_shares
 from nav.centroids.marker_signal import MarkerSignal, marker_signals
 from nav.centroids.outline_pixels import disc_pixels
-from studies.acceptance.rendered.centroid_bounds import center_bound_px
+from studies.acceptance.rendered.centroid_bounds import PixelLight, center_bound_px
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, fit_many, rough_start
 from tests.support.grey_centroid import grey_centroids
 from tests.support.painted_pairs import make_pose, paint_pair
@@ -25,7 +28,7 @@ from tests.support.painted_pairs import make_pose, paint_pair
 
 @pytest.mark.parametrize("light", [DAY, DUSK], ids=["day", "dusk"])
 @pytest.mark.parametrize("z_m", [2, 5, 10, 20, 40])
-def test_error_reaches_the_bound_and_the_covariance_tells_it(light, z_m):
+def test_error_reaches_the_bound_and_the_covariance_tells_it(light: PixelLight, z_m: float) -> None:
     radius, rng = 2133.333 * 0.05 / z_m, np.random.default_rng([5, z_m])
     error, cov, radial = fit_many(radius, light, rng)
     rms, bound = np.sqrt(np.mean(error**2)), center_bound_px(0.985 * radius, light)
@@ -41,10 +44,10 @@ def test_error_reaches_the_bound_and_the_covariance_tells_it(light, z_m):
 
 
 @pytest.mark.parametrize("radius_px", [5.0, 10.0])
-def test_what_lies_beside_discs_does_not_widen_their_covariance(radius_px):
+def test_what_lies_beside_discs_does_not_widen_their_covariance(radius_px: float) -> None:
     rng = np.random.default_rng([6, round(radius_px)])
 
-    def rough_beside(lit, x, y, _):
+    def rough_beside(lit: np.ndarray, x: np.ndarray, y: np.ndarray, _: int) -> np.ndarray:
         # Three times the noise of a pixel, from where hardly any light of the disc comes.
         return lit + 150 * rng.standard_normal(lit.shape) * (np.hypot(x, y) > radius_px + 1.5)
 
@@ -61,7 +64,7 @@ def test_what_lies_beside_discs_does_not_widen_their_covariance(radius_px):
 
 
 @pytest.mark.parametrize("z_m", [2, 5, 10])
-def test_shading_moves_grey_centroids_but_not_the_fit(z_m):
+def test_shading_moves_grey_centroids_but_not_the_fit(z_m: int) -> None:
     radius, rng = 2133.333 * 0.05 / z_m, np.random.default_rng(6)
     signals, truth = draw_discs(radius, DAY, rng, shading=0.1, noisy=False)
     start = rough_start(truth, rng)
@@ -74,10 +77,10 @@ def test_shading_moves_grey_centroids_but_not_the_fit(z_m):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 3])
-def test_a_slope_of_the_face_beside_large_discs_does_not_move_the_fit(z_m):
+def test_a_slope_of_the_face_beside_large_discs_does_not_move_the_fit(z_m: float) -> None:
     radius, rng = 2133.333 * 0.05 / z_m, np.random.default_rng(16)
 
-    def spoil(lit, x, y, number):
+    def spoil(lit: np.ndarray, x: np.ndarray, y: np.ndarray, number: int) -> np.ndarray:
         beside = 1 - (lit - DAY.background_e) / DAY.contrast_e
         return lit + 0.05 * DAY.contrast_e * beside * y / radius + 0 * x
 
@@ -89,15 +92,15 @@ def test_a_slope_of_the_face_beside_large_discs_does_not_move_the_fit(z_m):
     assert np.abs(error).max() < 0.05 * np.sqrt(np.pi) * START_WIDTH_PX / 20
 
 
-def test_grey_centroids_of_even_discs_are_true():
+def test_grey_centroids_of_even_discs_are_true() -> None:
     rng = np.random.default_rng(7)
     signals, truth = draw_discs(6.0, DAY, rng, noisy=False)
     # The window cuts the tail of the blur where it ends, within 2.5 px: 1e-3 of the light of the outermost pixels.
     np.testing.assert_allclose(grey_centroids(signals, truth), truth.centers_px, atol=2e-3)
 
 
-def spoil_first(kind, light):
-    def spoil(lit, x, y, number):
+def spoil_first(kind: str, light: PixelLight) -> Callable[..., Any]:
+    def spoil(lit: np.ndarray, x: np.ndarray, y: np.ndarray, number: int) -> np.ndarray:
         if number != 0:
             return lit
         if kind == "shadow":
@@ -115,7 +118,7 @@ def spoil_first(kind, light):
 @pytest.mark.parametrize(
     ("kind", "reason"), [("shadow", "uneven"), ("hidden", "uneven"), ("clipped", "clipped"), ("gone", "no contrast")]
 )
-def test_spoilt_discs_are_rejected_with_a_reason(kind, reason, difference):
+def test_spoilt_discs_are_rejected_with_a_reason(kind: str, reason: str, difference: bool) -> None:
     rng = np.random.default_rng(8)
     signals, truth = draw_discs(10.0, DAY, rng, spoil=spoil_first(kind, DAY), difference=difference)
     start = rough_start(truth, rng)
@@ -128,7 +131,7 @@ def test_spoilt_discs_are_rejected_with_a_reason(kind, reason, difference):
     assert np.sqrt(np.mean(error**2)) < 1.8 * center_bound_px(10.0, DAY)
 
 
-def test_discs_over_the_images_edge_are_rejected():
+def test_discs_over_the_images_edge_are_rejected() -> None:
     rng = np.random.default_rng(9)
     signals, truth = draw_discs(10.0, DAY, rng)
     cut = [MarkerSignal(s.values[:, 12:], s.clipped[:, 12:], (12.0, 0.0), 1, True) for s in signals]
@@ -138,14 +141,14 @@ def test_discs_over_the_images_edge_are_rejected():
     assert np.isnan(grey_centroids(cut, truth)[[0, COUNT]]).all()
 
 
-def test_no_discs_no_fits():
+def test_no_discs_no_fits() -> None:
     nothing = circles(np.zeros(0), np.zeros((0, 2)), np.zeros(0))
     signals, _ = draw_discs(5.0, DAY, np.random.default_rng(1))
     assert fit_discs(signals, nothing).reasons == ()
     assert grey_centroids(signals, nothing).shape == (0, 2)
 
 
-def test_derivatives_are_those_of_the_picture():
+def test_derivatives_are_those_of_the_picture() -> None:
     rng = np.random.default_rng(10)
     signals, truth = draw_discs(9.0, DAY, rng)
     pixels = disc_pixels(signals, truth)
@@ -165,7 +168,9 @@ def test_derivatives_are_those_of_the_picture():
         np.testing.assert_allclose(jacobian[:, place] / scale, slope / scale, atol=5e-3)
 
 
-def draw_face(rng, sky_e, radius_px=2.8, margin_px=0.55, noisy=True):
+def draw_face(
+    rng: np.random.Generator, sky_e: float, radius_px: float = 2.8, margin_px: float = 0.55, noisy: bool = True
+) -> tuple[list[MarkerSignal], Ellipses, FaceBackground, np.ndarray]:
     """Eight discs on a ring of dark face in each eye, with light beyond the face's rim and within its opening."""
     ring_px, count = 5.4 * radius_px, 8
     cell = int(2 * ring_px + 6 * radius_px)
@@ -190,7 +195,7 @@ def draw_face(rng, sky_e, radius_px=2.8, margin_px=0.55, noisy=True):
 
 
 @pytest.mark.parametrize("sky_e", [-2000.0, 2000.0], ids=["blue", "warm"])
-def test_light_beyond_a_narrow_face_does_not_move_the_centres(sky_e):
+def test_light_beyond_a_narrow_face_does_not_move_the_centres(sky_e: float) -> None:
     rng = np.random.default_rng(13)
     outward, plain = [], []
     for _ in range(6):
@@ -208,7 +213,7 @@ def test_light_beyond_a_narrow_face_does_not_move_the_centres(sky_e):
     assert rejected > 0.5 or abs(np.mean(np.concatenate(plain))) > 0.02
 
 
-def test_shares_beyond_the_face_follow_the_markers():
+def test_shares_beyond_the_face_follow_the_markers() -> None:
     rng = np.random.default_rng(14)
     signals, truth, around, _ = draw_face(rng, 0.0, noisy=False)
     pixels = disc_pixels(signals, truth)
@@ -229,7 +234,7 @@ def test_shares_beyond_the_face_follow_the_markers():
 
 @pytest.mark.parametrize("color", [0, 2])
 @pytest.mark.parametrize("radius_px", [10.0, 39.0])
-def test_mosaic_sites_keep_their_places(color, radius_px):
+def test_mosaic_sites_keep_their_places(color: int, radius_px: float) -> None:
     rng = np.random.default_rng(11)
     signals, truth = draw_discs(radius_px, DAY, rng)
     mosaics = []
@@ -250,7 +255,7 @@ def test_mosaic_sites_keep_their_places(color, radius_px):
 
 @pytest.mark.parametrize("kind", ["sky", "cloud"])
 @pytest.mark.parametrize("z_m", [2.0, 10.0, 40.0])
-def test_drawn_drogue_is_measured_at_its_ellipse_centres(kind, z_m):
+def test_drawn_drogue_is_measured_at_its_ellipse_centres(kind: str, z_m: float) -> None:
     rig, drogue = paper_rig(), PRESETS["red-8"]
     layout, rng = marker_layout(drogue), np.random.default_rng([12, int(z_m)])
     place = make_pose(0.06, 0.002, z_m, 7, -6, 10)

@@ -8,12 +8,12 @@ import pytest
 from nav.centroids.ellipses import Ellipses, shape_inverses, shape_radii
 
 
-def shapes_of(rng, count):
+def shapes_of(rng: np.random.Generator, count: int) -> np.ndarray:
     arms = rng.normal(0, 3, (count, 2, 2))
     return arms @ arms.transpose(0, 2, 1) + 0.5 * np.eye(2)
 
 
-def test_closed_forms_of_shapes():
+def test_closed_forms_of_shapes() -> None:
     shapes = shapes_of(np.random.default_rng(1), 200)
     # Rounding, of matrices with condition numbers of up to some hundred.
     np.testing.assert_allclose(shape_inverses(shapes) @ shapes, np.broadcast_to(np.eye(2), shapes.shape), atol=1e-11)
@@ -21,7 +21,7 @@ def test_closed_forms_of_shapes():
 
 
 @pytest.mark.parametrize("axes", [(-1.0, -2.0), (1.0, -2.0), (0.0, 2.0)])
-def test_an_ellipse_has_positive_semi_axes(axes):
+def test_an_ellipse_has_positive_semi_axes(axes: tuple[float, float]) -> None:
     shapes = np.stack([np.eye(2), np.diag(axes)])
     with pytest.raises(ValueError, match="shapes_px: must be positive"):
         Ellipses(np.zeros(2, np.int64), np.zeros((2, 2)), shapes)

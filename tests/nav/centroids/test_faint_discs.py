@@ -13,11 +13,11 @@ from nav.centroids.disc_fit import fit_discs
 from nav.centroids.discs import contrasts, disc_model, initial_disc_parameters, rejection_reasons
 from nav.centroids.outline_pixels import disc_pixels
 from nav.numerics.levenberg_marquardt import evaluate
-from studies.acceptance.rendered.centroid_bounds import center_bound_px
+from studies.acceptance.rendered.centroid_bounds import PixelLight, center_bound_px
 from tests.support.drawn_discs import DAY, DUSK, draw_discs, fit_many, rough_start
 
 
-def faint(contrast_sigma):
+def faint(contrast_sigma: float) -> PixelLight:
     """Light in which a pixel of a disc stands so many deviations of its own noise above the pixels beside it."""
     background_e = 20.0
     other_e2 = background_e + DUSK.read_noise_e**2
@@ -26,7 +26,7 @@ def faint(contrast_sigma):
 
 
 @pytest.mark.parametrize(("z_m", "contrast_sigma"), [(2, 3.3), (5, 3.3), (10, 3.3), (20, 4.0), (40, 4.5)])
-def test_faint_discs_are_fitted_to_the_bound_and_the_covariance_tells_it(z_m, contrast_sigma):
+def test_faint_discs_are_fitted_to_the_bound_and_the_covariance_tells_it(z_m: int, contrast_sigma: float) -> None:
     radius, light, rng = 2133.333 * 0.05 / z_m, faint(contrast_sigma), np.random.default_rng([15, z_m])
     error, cov, _ = fit_many(radius, light, rng)
     # As in better light: 256 errors know their rms to 4.4 %, and the plane of shading costs up to a fifth.
@@ -34,7 +34,7 @@ def test_faint_discs_are_fitted_to_the_bound_and_the_covariance_tells_it(z_m, co
     assert 0.7 < np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).mean() / 2 < 1.3
 
 
-def test_what_is_too_faint_is_rejected_and_never_an_outline_without_inside():
+def test_what_is_too_faint_is_rejected_and_never_an_outline_without_inside() -> None:
     rng, reasons = np.random.default_rng(16), set()
     for contrast_sigma in (0.5, 1.0, 1.5, 2.7):
         for _ in range(6):
@@ -46,7 +46,7 @@ def test_what_is_too_faint_is_rejected_and_never_an_outline_without_inside():
     assert {"no contrast"} <= reasons and None not in reasons
 
 
-def test_an_outline_turned_inside_out_is_no_disc():
+def test_an_outline_turned_inside_out_is_no_disc() -> None:
     rng = np.random.default_rng(17)
     signals, truth = draw_discs(10.0, DAY, rng)
     pixels = disc_pixels(signals, truth)

@@ -12,12 +12,15 @@ from nav.centroids.ellipses import Ellipses
 from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.motion_blur import motion_blurred
 from nav.centroids.outline_pixels import disc_pixels
+from studies.acceptance.rendered.centroid_bounds import PixelLight
 from tests.support.drawn_discs import COUNT, DAY, DUSK, coverage, draw_discs, expose, rough_start
 
 PARTS = 32
 
 
-def draw_moving(radius_px, light, rng, way, growth=0.0):
+def draw_moving(
+    radius_px: float, light: PixelLight, rng: np.random.Generator, way: tuple[float, float], growth: float = 0.0
+) -> tuple[list[MarkerSignal], Ellipses]:
     """Signals of a ring of COUNT discs in each eye that moves by `way`, grows about its middle, and their places."""
     reach_px = np.hypot(*way)
     ring_px = 3 * (radius_px + reach_px + 8)
@@ -45,7 +48,9 @@ def draw_moving(radius_px, light, rng, way, growth=0.0):
     ("radius_px", "way", "growth"),
     [(30.0, (9.0, -4.0), 0.006), (12.0, (0.0, 6.0), -0.004), (8.0, (2.5, 1.0), 0.0), (4.0, (1.5, -1.5), 0.0)],
 )
-def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, radius_px, way, growth):
+def test_moving_discs_are_found_where_they_were_at_mid_exposure(
+    monkeypatch: pytest.MonkeyPatch, radius_px: float, way: tuple[float, float], growth: float
+) -> None:
     rng, normalized, errors, unaware = np.random.default_rng([3, int(radius_px)]), [], [], []
     for _ in range(2):
         signals, truth = draw_moving(radius_px, DAY, rng, way, growth)
@@ -72,14 +77,14 @@ def test_moving_discs_are_found_where_they_were_at_mid_exposure(monkeypatch, rad
 
 @pytest.mark.parametrize("light", [DAY, DUSK])
 @pytest.mark.parametrize("radius_px", [30.0, 8.0, 3.0])
-def test_still_discs_are_not_said_to_move(radius_px, light):
+def test_still_discs_are_not_said_to_move(radius_px: float, light: PixelLight) -> None:
     rng = np.random.default_rng([5, int(radius_px)])
     for _ in range(6):
         signals, truth = draw_discs(radius_px, light, rng)
         assert fit_discs(signals, rough_start(truth, rng)).motion is None
 
 
-def test_what_has_no_edges_does_not_move():
+def test_what_has_no_edges_does_not_move() -> None:
     rng = np.random.default_rng(7)
     _, truth = draw_moving(12.0, DAY, rng, (3.0, 0.0))
     noise = rng.normal(50, 20, (2, 200, 200)).astype(np.float32)
@@ -88,7 +93,7 @@ def test_what_has_no_edges_does_not_move():
     assert not fits.accepted.all() and fits.motion is None
 
 
-def test_derivatives_are_those_of_the_moving_picture():
+def test_derivatives_are_those_of_the_moving_picture() -> None:
     rng = np.random.default_rng(9)
     signals, truth = draw_moving(12.0, DAY, rng, (4.0, 2.0))
     pixels = disc_pixels(signals, truth, blur_px=2.5)

@@ -10,18 +10,18 @@ from nav.centroids.marker_signal import MarkerSignal
 from nav.centroids.outline_pixels import annulus_pixels, disc_pixels
 
 
-def float32(rng, *shape):
+def float32(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return rng.normal(size=shape).astype(np.float32)
 
 
-def outlines(rng, count, radius_px, side_px):
+def outlines(rng: np.random.Generator, count: int, radius_px: float, side_px: int) -> Ellipses:
     shape = np.array([[1.0, 0.1], [0.1, 0.9]])
     centers = rng.uniform(0.45 * side_px, 0.55 * side_px, (count, 2))
     eyes = np.arange(count) % 2
     return Ellipses(eyes, centers, np.tile(radius_px * shape, (count, 1, 1)))
 
 
-def inwards(outline, index, x, y):
+def inwards(outline: Ellipses, index: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Inward distances of all pixels from one outline; docs/explanation/centroids.md has the formula for circles."""
     arms = np.linalg.solve(
         outline.shapes_px[index], np.stack([x, y]).reshape(2, -1) - outline.centers_px[index][:, None]
@@ -31,7 +31,7 @@ def inwards(outline, index, x, y):
 
 @pytest.mark.parametrize("radius_px", [6.0, 40.0])
 @pytest.mark.parametrize("kind", ["disc", "annulus"])
-def test_chosen_pixels_are_those_near_edges_and_few_of_the_others(kind, radius_px):
+def test_chosen_pixels_are_those_near_edges_and_few_of_the_others(kind: str, radius_px: float) -> None:
     rng = np.random.default_rng([4, int(radius_px)])
     side = int(3 * radius_px + 20)
     signals = [
@@ -70,7 +70,7 @@ def test_chosen_pixels_are_those_near_edges_and_few_of_the_others(kind, radius_p
             assert (taken & within).sum() <= within.sum() / 16 + 4 * radius_px / 4
 
 
-def test_an_outline_over_the_edge_of_the_image_is_cut():
+def test_an_outline_over_the_edge_of_the_image_is_cut() -> None:
     rng = np.random.default_rng(5)
     signals = [MarkerSignal(float32(rng, 60, 60), np.zeros((60, 60), bool), (0.0, 0.0), 1, True) for _ in "lr"]
     centers = np.array([[30.0, 30.0], [9.0, 30.0], [30.0, 51.0], [13.6, 30.0]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import shapely
 
 from nav.centroids.disc_fit import fit_discs
+from nav.centroids.discs import DiscFits
 from nav.centroids.ellipses import Ellipses, circles
 from nav.centroids.marker_signal import MarkerSignal
 from render.analytic_engine.pixel_coverage import pixel_coverage
@@ -17,7 +19,7 @@ from render.camera.optics import blur
 COUNT, BACKGROUND_DN, CONTRAST_DN = 8, 6.0, 100.0
 
 
-def box_sampled_discs(radius_px, rng):
+def box_sampled_discs(radius_px: float, rng: np.random.Generator) -> tuple[list[np.ndarray], Ellipses]:
     """Pictures of COUNT discs in each eye, the exact share of each pixel's box after the renderer's blur, and truth."""
     cell = int(2 * radius_px + 18)
     angle = np.linspace(0, 2 * np.pi, int(64 * radius_px), endpoint=False)
@@ -35,7 +37,7 @@ def box_sampled_discs(radius_px, rng):
     return pictures, Ellipses(np.repeat([0, 1], COUNT), np.concatenate(centers), shapes)
 
 
-def signals_of(pictures, own=(None, None)):
+def signals_of(pictures: list[np.ndarray], own: Sequence[np.ndarray | None] = (None, None)) -> list[MarkerSignal]:
     return [
         MarkerSignal(picture, picture > 1e6, (0.0, 0.0), 1, True, colour)
         for picture, colour in zip(pictures, own, strict=True)
@@ -43,7 +45,7 @@ def signals_of(pictures, own=(None, None)):
 
 
 @pytest.mark.parametrize("radius_px", [53.0, 21.0, 5.0, 2.7])
-def test_blur_of_whole_pixels_does_not_move_centers(radius_px):
+def test_blur_of_whole_pixels_does_not_move_centers(radius_px: float) -> None:
     rng = np.random.default_rng(3)
     pictures, truth = box_sampled_discs(radius_px, rng)
     start = circles(truth.eyes, truth.centers_px + rng.normal(0, 0.1, (len(truth), 2)), 1.02 * truth.radii_px)
@@ -52,21 +54,21 @@ def test_blur_of_whole_pixels_does_not_move_centers(radius_px):
     assert np.sqrt(np.mean(error**2)) < 2e-4 + 4e-3 / radius_px
 
 
-def noisy(pictures, rng, deviation_dn=0.6):
+def noisy(pictures: list[np.ndarray], rng: np.random.Generator, deviation_dn: float = 0.6) -> list[np.ndarray]:
     return [(p + deviation_dn * rng.standard_normal(p.shape)).astype(np.float32) for p in pictures]
 
 
-def rms_error(signals, truth):
+def rms_error(signals: list[MarkerSignal], truth: Ellipses) -> tuple[float, DiscFits]:
     fits = fit_discs(signals, circles(truth.eyes, truth.centers_px + 0.05, truth.radii_px))
     assert fits.accepted.all()
     return np.sqrt(np.mean((fits.ellipses.centers_px - truth.centers_px) ** 2)), fits
 
 
-def with_shot_noise(pictures, rng):
+def with_shot_noise(pictures: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
     return [(p + np.sqrt(0.2 + 0.03 * p) * rng.standard_normal(p.shape)).astype(np.float32) for p in pictures]
 
 
-def test_noise_of_the_other_colors_is_left_out_where_they_are_even():
+def test_noise_of_the_other_colors_is_left_out_where_they_are_even() -> None:
     rng, lead_rms, rms = np.random.default_rng(4), [], []
     for _ in range(4):
         pictures, truth = box_sampled_discs(21.0, rng)
@@ -81,7 +83,7 @@ def test_noise_of_the_other_colors_is_left_out_where_they_are_even():
     assert np.linalg.norm(rms) < np.linalg.norm(lead_rms)
 
 
-def test_the_difference_stays_where_another_light_lies_beside_a_disc():
+def test_the_difference_stays_where_another_light_lies_beside_a_disc() -> None:
     rng = np.random.default_rng(5)
     pictures, truth = box_sampled_discs(21.0, rng)
     sky = [np.zeros_like(p) for p in pictures]
@@ -98,7 +100,7 @@ def test_the_difference_stays_where_another_light_lies_beside_a_disc():
     assert kept == pytest.approx(alone) and kept < 0.01
 
 
-def test_a_difference_without_its_color_is_fitted_as_it_is():
+def test_a_difference_without_its_color_is_fitted_as_it_is() -> None:
     rng = np.random.default_rng(6)
     pictures, truth = box_sampled_discs(8.0, rng)
     signals = signals_of(with_shot_noise(pictures, rng))

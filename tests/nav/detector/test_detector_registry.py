@@ -2,6 +2,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,23 +29,25 @@ from tests.support.painted_pairs import make_pose, paint_pair
 DROGUE = PRESETS["red-8"]
 
 
-def test_the_default_is_among_the_names():
+def test_the_default_is_among_the_names() -> None:
     assert DEFAULT_DETECTOR in detector_names()
     assert open_detector(DEFAULT_DETECTOR, DROGUE).name == DEFAULT_DETECTOR
 
 
 @pytest.mark.parametrize("name", ["", "yolo", "mobile-xl", "weights.pt"])
-def test_a_name_that_does_not_exist_lists_those_that_do(name):
+def test_a_name_that_does_not_exist_lists_those_that_do(name: str) -> None:
     with pytest.raises(ValueError, match=r"detector: must be one of color-blob.* or a file \*\.onnx"):
         open_detector(name, DROGUE)
 
 
-def test_networks_have_a_file():
+def test_networks_have_a_file() -> None:
     assert network_file("color-blob") is None
     assert str(network_file("other/mine.onnx")) == "other/mine.onnx"
 
 
-def test_networks_of_the_package_are_known_by_name(red_squares, monkeypatch):
+def test_networks_of_the_package_are_known_by_name(
+    red_squares: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = red_squares(metadata=ModelMetadata(input_size_px=(320, 256)))
     assert network_file("squares") is None
     monkeypatch.setattr(registry, "_WEIGHTS", file.parent)
@@ -51,14 +56,14 @@ def test_networks_of_the_package_are_known_by_name(red_squares, monkeypatch):
     assert open_detector("squares", DROGUE).name == "squares"
 
 
-def test_a_file_is_opened_once_and_called_by_its_name(red_squares):
+def test_a_file_is_opened_once_and_called_by_its_name(red_squares: Callable[..., Any]) -> None:
     file = red_squares(metadata=ModelMetadata(input_size_px=(320, 256)))
     make = detector_factory(str(file))
     assert make(DROGUE).name == "squares"
     assert make(DROGUE) is make(PRESETS["white-8"])
 
 
-def test_color_blob_has_the_detection_as_its_only_candidate():
+def test_color_blob_has_the_detection_as_its_only_candidate() -> None:
     from geometry.pinhole import PinholeCamera
     from geometry.stereo import StereoRig
 
@@ -74,7 +79,7 @@ def test_color_blob_has_the_detection_as_its_only_candidate():
         assert detector.candidates(images, min(1.0, detection.score + 1e-6))[eye] == () or detection.score == 1
 
 
-def test_navigation_uses_the_detector_that_is_named(smoke_dataset, red_squares):
+def test_navigation_uses_the_detector_that_is_named(smoke_dataset: Path, red_squares: Callable[..., Any]) -> None:
     dataset = BlindDataset(smoke_dataset)
     # A network whose threshold no score reaches.
     blind = str(red_squares(metadata=ModelMetadata(input_size_px=(640, 480), score_threshold=1.0)))
@@ -84,7 +89,7 @@ def test_navigation_uses_the_detector_that_is_named(smoke_dataset, red_squares):
         navigate(dataset, ["joint"], detector="nobody")
 
 
-def test_naming_detectors_imports_nothing_heavy():
+def test_naming_detectors_imports_nothing_heavy() -> None:
     code = (
         "import sys, nav.detector.detector_registry as registry; registry.detector_names();"
         "print([name for name in ('torch', 'onnxruntime', 'cv2', 'onnx') if name in sys.modules])"

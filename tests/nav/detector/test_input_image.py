@@ -19,7 +19,7 @@ def srgb(light: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("image_size", "input_size"), SIZES)
-def test_boxes_come_back(image_size, input_size):
+def test_boxes_come_back(image_size: tuple[int, int], input_size: tuple[int, int]) -> None:
     place = letterbox(image_size, input_size)
     rng = np.random.default_rng(1)
     boxes = np.hstack((rng.uniform(-50, 1200, (20, 2)), rng.uniform(1, 800, (20, 2))))
@@ -28,7 +28,9 @@ def test_boxes_come_back(image_size, input_size):
 
 
 @pytest.mark.parametrize(("image_size", "input_size"), SIZES)
-def test_the_whole_image_fills_one_direction_and_lies_in_the_middle(image_size, input_size):
+def test_the_whole_image_fills_one_direction_and_lies_in_the_middle(
+    image_size: tuple[int, int], input_size: tuple[int, int]
+) -> None:
     ((left, top, width, height),) = letterbox(image_size, input_size).to_input(np.array([[-0.5, -0.5, *image_size]]))
     assert left >= 0 and top >= 0
     # Margins differ by a pixel where they are odd.
@@ -38,7 +40,7 @@ def test_the_whole_image_fills_one_direction_and_lies_in_the_middle(image_size, 
 
 
 @pytest.mark.parametrize(("image_size", "input_size"), SIZES)
-def test_pixels_move_as_boxes_do(image_size, input_size):
+def test_pixels_move_as_boxes_do(image_size: tuple[int, int], input_size: tuple[int, int]) -> None:
     """The centre of gravity of a bright rectangle on black lies in the middle of its box."""
     width, height = image_size
     x, y, w, h = 40, 60, 90, 70
@@ -58,13 +60,13 @@ def test_pixels_move_as_boxes_do(image_size, input_size):
     assert inside.sum() == pytest.approx(wide * high, rel=0.02)
 
 
-def test_what_the_image_leaves_is_grey():
+def test_what_the_image_leaves_is_grey() -> None:
     pixels, _ = input_image(stereo(np.zeros((400, 1000, 3), np.uint8), encoding="gamma"), "left", (320, 320))
     assert (pixels[:90] == PADDING_DN).all() and (pixels[-90:] == PADDING_DN).all()
     assert (pixels[100:220] == 0).all()
 
 
-def test_halving_averages_four_pixels():
+def test_halving_averages_four_pixels() -> None:
     picture = np.random.default_rng(2).integers(0, 256, (64, 128, 3), dtype=np.uint8)
     pixels, _ = input_image(stereo(picture, encoding="gamma"), "left", (64, 32))
     means = picture.reshape(32, 2, 64, 2, 3).mean(axis=(1, 3))
@@ -74,7 +76,7 @@ def test_halving_averages_four_pixels():
 
 @pytest.mark.parametrize(("bits", "black_dn"), [(8, 0.0), (12, 0.0), (8, 16.0), (12, 240.0)])
 @pytest.mark.parametrize("encoding", ["linear", "gamma"])
-def test_the_same_light_looks_the_same_from_every_sensor(bits, black_dn, encoding):
+def test_the_same_light_looks_the_same_from_every_sensor(bits: int, black_dn: float, encoding: str) -> None:
     light = np.tile(np.linspace(0.05, 1, 128)[None, :, None], (64, 1, 3))
     top = 2**bits - 1
     black = black_dn / top
@@ -89,13 +91,13 @@ def test_the_same_light_looks_the_same_from_every_sensor(bits, black_dn, encodin
     assert abs(pixels - 255 * srgb(light)).max() <= 0.5 * 2.5 / (1 - black) + 1.1
 
 
-def test_a_mono_picture_has_three_equal_channels():
+def test_a_mono_picture_has_three_equal_channels() -> None:
     picture = np.random.default_rng(3).integers(0, 256, (64, 96), dtype=np.uint8)
     pixels, _ = input_image(stereo(picture, encoding="gamma"), "left", (96, 64))
     assert (pixels == picture[..., None]).all()
 
 
-def test_eyes_and_channels_keep_their_order():
+def test_eyes_and_channels_keep_their_order() -> None:
     picture = np.random.default_rng(4).integers(0, 256, (32, 64, 3), dtype=np.uint8)
     images = stereo(picture, encoding="gamma")
     both = [input_image(images, eye, (64, 32))[0] for eye in ("left", "right")]
@@ -107,11 +109,11 @@ def test_eyes_and_channels_keep_their_order():
 
 
 @pytest.mark.parametrize("size", [(640, 470), (0, 32), (-32, 32), (31, 31)])
-def test_sizes_that_no_network_takes_are_refused(size):
+def test_sizes_that_no_network_takes_are_refused(size: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match=f"input_size_px: must be multiples of 32, got {size[0]}x{size[1]}"):
         letterbox((1280, 960), size)
 
 
-def test_absurd_sizes_are_refused():
+def test_absurd_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="input_size_px: must be at most 4096 a side, got 3200x3200000"):
         letterbox((1280, 960), (3200, 3_200_000))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -15,13 +18,13 @@ LARGE_PX = 160.0
 NONE = (np.zeros((0, 4)), np.zeros(0))
 
 
-def found(*rows):
+def found(*rows: tuple[int, int, float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Boxes and scores of rows x, y, side, score."""
     return np.array([[x, y, side, side] for x, y, side, _ in rows], float), np.array([row[3] for row in rows], float)
 
 
 @pytest.mark.parametrize("side_px", [20.0, 127.0, 129.0, 160.0, 199.0, 201.0, 400.0])
-def test_a_drogue_found_by_both_passes_has_one_box(side_px):
+def test_a_drogue_found_by_both_passes_has_one_box(side_px: float) -> None:
     boxes, scores = merge_scales(found((10, 10, side_px, 0.8)), found((11, 10, side_px, 0.7)), LARGE_PX, 20)
     assert len(boxes) == 1
     # From the full size well below the limit, from half the size well above it, near it the better one.
@@ -29,12 +32,12 @@ def test_a_drogue_found_by_both_passes_has_one_box(side_px):
 
 
 @pytest.mark.parametrize("side_px", [150.0, 170.0])
-def test_near_the_limit_either_pass_is_enough(side_px):
+def test_near_the_limit_either_pass_is_enough(side_px: float) -> None:
     only = found((10, 10, side_px, 0.6))
     assert len(merge_scales(only, NONE, LARGE_PX, 20)[0]) == len(merge_scales(NONE, only, LARGE_PX, 20)[0]) == 1
 
 
-def test_parts_of_a_large_drogue_get_no_boxes():
+def test_parts_of_a_large_drogue_get_no_boxes() -> None:
     large, marker, aside = (100, 100, 300, 0.8), (150, 150, 40, 0.7), (500, 20, 40, 0.6)
     boxes, scores = merge_scales(found(marker, aside), found(large), LARGE_PX, 20)
     assert scores.tolist() == [0.8, 0.6] and boxes[1, 0] == 500
@@ -43,25 +46,25 @@ def test_parts_of_a_large_drogue_get_no_boxes():
     assert len(boxes) == 2
 
 
-def test_the_number_of_boxes_is_limited():
+def test_the_number_of_boxes_is_limited() -> None:
     many = found(*((50 * index, 0, 30, 0.9 - 0.1 * index) for index in range(6)))
     assert merge_scales(many, NONE, LARGE_PX, 2)[1].tolist() == pytest.approx([0.9, 0.8])
     assert len(merge_scales(NONE, NONE, LARGE_PX, 20)[0]) == 0
 
 
-def test_half_a_size_is_a_multiple_of_32():
+def test_half_a_size_is_a_multiple_of_32() -> None:
     assert half_size_px((640, 480)) == (320, 256)
     assert half_size_px((64, 32)) == (32, 32)
 
 
-def test_boxes_come_back_from_half_the_size():
+def test_boxes_come_back_from_half_the_size() -> None:
     # 640 x 480 is centred in 320 x 256, with eight pixels of grey above and below.
     placement = letterbox((640, 480), (320, 256))
     boxes, _ = to_full_size((np.array([[10.0, 28.0, 50.0, 60.0]]), np.array([0.5])), placement)
     np.testing.assert_allclose(boxes, [[20.0, 40.0, 100.0, 120.0]], atol=1e-9)
 
 
-def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares):
+def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares: Callable[..., Any]) -> None:
     # The network of these tests predicts boxes of two cells, of 8 px or more, around red cells.
     image = np.full((256, 320, 3), 90, np.uint8)
     image[64:192, 64:192] = (255, 0, 0)
@@ -76,7 +79,7 @@ def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares):
     assert sides[0.0] == pytest.approx(16) and sides[12.0] == pytest.approx(32)
 
 
-def test_a_network_of_one_size_cannot_have_a_second_pass(red_squares):
+def test_a_network_of_one_size_cannot_have_a_second_pass(red_squares: Callable[..., Any]) -> None:
     metadata = ModelMetadata(input_size_px=(320, 256), large_from_px=100.0)
     file = red_squares(metadata=metadata, shape=(2, 3, 256, 320))
     with pytest.raises(ValueError, match="large_from_px: takes 320x256 px only, and not half of it"):
@@ -84,6 +87,6 @@ def test_a_network_of_one_size_cannot_have_a_second_pass(red_squares):
 
 
 @pytest.mark.parametrize("wrong", [-1, float("nan"), 5000, "160", True])
-def test_wrong_limits_are_named(wrong):
+def test_wrong_limits_are_named(wrong: float) -> None:
     with pytest.raises(ValueError, match="large_from_px: must be 0 to 4096"):
         ModelMetadata(large_from_px=wrong)

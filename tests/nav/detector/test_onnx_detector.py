@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -39,7 +41,7 @@ def one_line(error: pytest.ExceptionInfo[ValueError], file: Path) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_finds_the_boxes_of_a_hand_made_network(red_squares):
+def test_finds_the_boxes_of_a_hand_made_network(red_squares: Callable[..., Any]) -> None:
     detector = OnnxDetector(red_squares(metadata=METADATA))
     found = detector.detect(red_squares_pair())
     for eye in EYES:
@@ -53,7 +55,7 @@ def test_finds_the_boxes_of_a_hand_made_network(red_squares):
         assert detection.score == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
 
 
-def test_candidates_are_sorted_and_above_the_least_score(red_squares):
+def test_candidates_are_sorted_and_above_the_least_score(red_squares: Callable[..., Any]) -> None:
     detector = OnnxDetector(red_squares(metadata=METADATA))
     found = detector.candidates(red_squares_pair(times=3), least_score=0.2)
     for eye in EYES:
@@ -62,7 +64,7 @@ def test_candidates_are_sorted_and_above_the_least_score(red_squares):
         assert scores == sorted(scores, reverse=True) and min(scores) >= 0.2
 
 
-def test_no_drogue_is_none_and_not_an_error(red_squares):
+def test_no_drogue_is_none_and_not_an_error(red_squares: Callable[..., Any]) -> None:
     grey = np.full((IMAGE_PX[1], IMAGE_PX[0], 3), 120, np.uint8)
     detector = OnnxDetector(red_squares(metadata=METADATA))
     pair = StereoImages(grey, grey, 0.0, 0.0)
@@ -71,21 +73,21 @@ def test_no_drogue_is_none_and_not_an_error(red_squares):
     assert detector.candidates(pair, 0.5) == {"left": (), "right": ()}
 
 
-def test_one_eye_may_see_no_drogue(red_squares):
+def test_one_eye_may_see_no_drogue(red_squares: Callable[..., Any]) -> None:
     pair = red_squares_pair()
     pair = replace(pair, right=np.full_like(pair.right, 120))
     found = OnnxDetector(red_squares(metadata=METADATA)).detect(pair)
     assert found.left is not None and found.right is None
 
 
-def test_the_threshold_is_that_of_the_file(red_squares):
+def test_the_threshold_is_that_of_the_file(red_squares: Callable[..., Any]) -> None:
     for threshold, sees in ((0.99995, True), (0.99996, False)):
         # The square's score is 0.9999546.
         detector = OnnxDetector(red_squares(metadata=replace(METADATA, score_threshold=threshold)))
         assert (detector.detect(red_squares_pair()).left is not None) == sees
 
 
-def test_input_size_is_that_of_the_file_or_the_given_one(red_squares):
+def test_input_size_is_that_of_the_file_or_the_given_one(red_squares: Callable[..., Any]) -> None:
     file = red_squares(metadata=METADATA)
     assert OnnxDetector(file).input_size_px == (320, 256)
     larger = OnnxDetector(file, input_size_px=(640, 512))
@@ -98,7 +100,7 @@ def test_input_size_is_that_of_the_file_or_the_given_one(red_squares):
         OnnxDetector(file, input_size_px=(300, 200))
 
 
-def test_a_network_of_fixed_size_needs_no_metadata(red_squares):
+def test_a_network_of_fixed_size_needs_no_metadata(red_squares: Callable[..., Any]) -> None:
     file = red_squares(shape=("b", 3, 256, 320))
     assert OnnxDetector(file).detect(red_squares_pair()).left is not None
     with pytest.raises(ValueError, match="takes 320x256 px only") as error:
@@ -120,7 +122,9 @@ def test_a_network_of_fixed_size_needs_no_metadata(red_squares):
         ({"metadata": METADATA, "shape": ("b", 1, "h", "w")}, r"one float32 input \(B, 3, H, W\)|not an ONNX network"),
     ],
 )
-def test_networks_of_another_kind_are_refused(red_squares, kwargs, message):
+def test_networks_of_another_kind_are_refused(
+    red_squares: Callable[..., Any], kwargs: dict[str, Any], message: str
+) -> None:
     file = red_squares(**kwargs)
     with pytest.raises(ValueError, match=message) as error:
         OnnxDetector(file)
@@ -142,7 +146,7 @@ def test_networks_of_another_kind_are_refused(red_squares, kwargs, message):
         ('{"colour": 1}', "metadata: has unknown keys colour"),
     ],
 )
-def test_metadata_that_makes_no_sense_is_refused(red_squares, text, message):
+def test_metadata_that_makes_no_sense_is_refused(red_squares: Callable[..., Any], text: str, message: str) -> None:
     file = red_squares()
     model = onnx.load(file)
     helper.set_model_props(model, {METADATA_KEY: text})
@@ -153,7 +157,7 @@ def test_metadata_that_makes_no_sense_is_refused(red_squares, text, message):
 
 
 @pytest.mark.parametrize("content", [b"", b"not a network", b"\x89PNG\r\n\x1a\n" + bytes(100), bytes(1000)])
-def test_files_that_are_no_networks_are_refused(tmp_path, content):
+def test_files_that_are_no_networks_are_refused(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "network.onnx"
     file.write_bytes(content)
     with pytest.raises(ValueError, match="is truncated or not an ONNX network") as error:
@@ -162,7 +166,7 @@ def test_files_that_are_no_networks_are_refused(tmp_path, content):
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_refused(red_squares, share):
+def test_a_truncated_file_is_refused(red_squares: Callable[..., Any], share: float) -> None:
     file = red_squares(metadata=METADATA)
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
@@ -171,14 +175,14 @@ def test_a_truncated_file_is_refused(red_squares, share):
     one_line(error, file)
 
 
-def test_files_that_cannot_be_read_are_named(tmp_path):
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     for file in (tmp_path / "missing.onnx", tmp_path):
         with pytest.raises(ValueError, match="cannot be read") as error:
             OnnxDetector(file)
         one_line(error, file)
 
 
-def test_a_file_cannot_name_other_files_to_be_read(red_squares, tmp_path):
+def test_a_file_cannot_name_other_files_to_be_read(red_squares: Callable[..., Any], tmp_path: Path) -> None:
     file = red_squares(metadata=METADATA)
     model = onnx.load(file)
     (tmp_path / "secret").write_bytes(bytes(60))
@@ -192,7 +196,7 @@ def test_a_file_cannot_name_other_files_to_be_read(red_squares, tmp_path):
     one_line(error, file)
 
 
-def test_threads_must_be_positive(red_squares):
+def test_threads_must_be_positive(red_squares: Callable[..., Any]) -> None:
     with pytest.raises(ValueError, match="threads: must be at least 1, got 0"):
         OnnxDetector(red_squares(metadata=METADATA), threads=0)
 
@@ -202,7 +206,9 @@ def test_threads_must_be_positive(red_squares):
     [NetworkConfig("l"), NetworkConfig("s", "se", "concat")],
     ids=lambda config: "-".join(config.to_dict().values()),
 )
-def test_exported_network_has_the_outputs_of_torch(network, tmp_path, config):
+def test_exported_network_has_the_outputs_of_torch(
+    network: Callable[..., Any], tmp_path: Path, config: NetworkConfig
+) -> None:
     trained, file = network(config), tmp_path / "net" / "network.onnx"
     metadata = replace(METADATA, network=config.to_dict(), manifest_sha256="ab" * 32, training={"passes": 7})
     before = {name: value.clone() for name, value in trained.state_dict().items()}
@@ -223,7 +229,7 @@ def test_exported_network_has_the_outputs_of_torch(network, tmp_path, config):
             np.testing.assert_allclose(output, reference, atol=2e-4 * max(1.0, float(np.abs(reference).max())))
 
 
-def test_an_export_that_fails_leaves_nothing_behind(network, tmp_path):
+def test_an_export_that_fails_leaves_nothing_behind(network: Callable[..., Any], tmp_path: Path) -> None:
     (tmp_path / "network.onnx").mkdir()
     with pytest.raises(OSError, match=r"network\.onnx: cannot be written"):
         export_onnx(network(NetworkConfig("s")), tmp_path / "network.onnx", METADATA)

@@ -45,7 +45,7 @@ def decode_slowly(maps: list[np.ndarray], image: int, least_score: float, most: 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize(("least_score", "most"), [(0.01, 20), (0.8, 20), (0.3, 3)])
-def test_agrees_with_a_slow_reference(seed, least_score, most):
+def test_agrees_with_a_slow_reference(seed: int, least_score: float, most: int) -> None:
     maps = random_maps(seed)
     for image, (boxes, scores) in enumerate(decode_maps(maps, least_score, most)):
         expected = decode_slowly(maps, image, least_score, most)
@@ -55,7 +55,7 @@ def test_agrees_with_a_slow_reference(seed, least_score, most):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_boxes_are_sorted_apart_and_above_the_least_score(seed):
+def test_boxes_are_sorted_apart_and_above_the_least_score(seed: int) -> None:
     for boxes, scores in decode_maps(random_maps(seed), 0.2):
         assert len(boxes) <= 20
         assert (np.diff(scores) <= 0).all()
@@ -65,13 +65,13 @@ def test_boxes_are_sorted_apart_and_above_the_least_score(seed):
             assert all(iou(list(box), list(other)) <= 0.5 for other in boxes[:index])
 
 
-def test_nothing_scores_enough():
+def test_nothing_scores_enough() -> None:
     for boxes, scores in decode_maps([each * 0 - 20 for each in random_maps(0)], 0.01):
         assert boxes.shape == (0, 4) and scores.shape == (0,)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
-def test_values_that_are_not_finite_never_become_boxes(value):
+def test_values_that_are_not_finite_never_become_boxes(value: float) -> None:
     maps = random_maps(1)
     for each in maps:
         each[:, :, ::2] = value
@@ -79,7 +79,7 @@ def test_values_that_are_not_finite_never_become_boxes(value):
         assert np.isfinite(boxes).all() and np.isfinite(scores).all()
 
 
-def test_many_good_cells_are_decoded():
+def test_many_good_cells_are_decoded() -> None:
     maps = random_maps(2, images=1)
     for each in maps:
         each[:, 0] = 9.0

@@ -24,12 +24,12 @@ def shipped(name: str) -> OnnxDetector:
     return OnnxDetector(file)
 
 
-def test_the_default_is_a_network_that_ships():
+def test_the_default_is_a_network_that_ships() -> None:
     assert DEFAULT_DETECTOR in NETWORKS
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_network_says_where_it_comes_from(name):
+def test_a_network_says_where_it_comes_from(name: str) -> None:
     file, metadata = network_file(name), shipped(name).metadata
     assert file is not None and file.stat().st_size <= 12e6
     assert metadata.licence == "Apache-2.0"
@@ -43,14 +43,14 @@ def test_a_network_says_where_it_comes_from(name):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_no_test_scene_is_one_that_was_learned(name):
+def test_no_test_scene_is_one_that_was_learned(name: str) -> None:
     # Scenes follow from a recipe's seed and their number.
     learned = {load_recipe(corpus["name"]).recipe.seed for corpus in shipped(name).metadata.training["datasets"]}
     assert load_recipe("detector-test").recipe.seed not in learned
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_network_finds_all_drogues_of_rendered_pairs(name, smoke_dataset, tmp_path):
+def test_a_network_finds_all_drogues_of_rendered_pairs(name: str, smoke_dataset: Path, tmp_path: Path) -> None:
     scores = tmp_path / "scores.json"
     options = ["--detector", name, "--split", "all", "--json", str(scores)]
     assert run(["benchmark", str(smoke_dataset), *options]) == DONE
@@ -60,7 +60,7 @@ def test_a_network_finds_all_drogues_of_rendered_pairs(name, smoke_dataset, tmp_
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_network_finds_nothing_where_nothing_is(name):
+def test_a_network_finds_nothing_where_nothing_is(name: str) -> None:
     # Mist, and noise as of a sensor in the dark.
     noise = np.random.default_rng(5).normal(20, 6, (480, 640, 3)).clip(0, 255).astype(np.uint8)
     mist = np.full((480, 640, 3), 150, np.uint8)

@@ -13,7 +13,9 @@ RIM_PX = 12.0
 BLACK = 4
 
 
-def pictures(sky, face=(6, 6, 6), size=(100, 120)):
+def pictures(
+    sky: tuple[int, ...], face: tuple[int, ...] = (6, 6, 6), size: tuple[int, int] = (100, 120)
+) -> StereoImages:
     """A dark disc before an even sky, the same in both eyes. [DN above black]"""
     rows, columns = np.ogrid[: size[0], : size[1]]
     eyes = []
@@ -26,23 +28,23 @@ def pictures(sky, face=(6, 6, 6), size=(100, 120)):
 
 
 @pytest.mark.parametrize("sky", [(40, 80, 160), (90, 90, 90), (150, 120, 100)])
-def test_the_sky_has_no_lead_left(sky):
+def test_the_sky_has_no_lead_left(sky: tuple[int, ...]) -> None:
     weight = balancing_weight(pictures(sky), 0, MIDDLES_PX, RIM_PX)
     assert sky[0] - weight * max(sky[1:]) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_what_the_drogue_itself_shows_does_not_count():
+def test_what_the_drogue_itself_shows_does_not_count() -> None:
     one, other = (
         balancing_weight(pictures((60, 90, 120), face), 0, MIDDLES_PX, RIM_PX) for face in ((6,) * 3, (200, 0, 0))
     )
     assert one == other
 
 
-def test_a_sky_of_the_markers_own_colour_is_taken_off_in_part():
+def test_a_sky_of_the_markers_own_colour_is_taken_off_in_part() -> None:
     assert balancing_weight(pictures((200, 20, 10)), 0, MIDDLES_PX, RIM_PX) == 1.6
 
 
-def test_black_night_and_a_drogue_beyond_the_image_change_nothing():
+def test_black_night_and_a_drogue_beyond_the_image_change_nothing() -> None:
     assert balancing_weight(pictures((0, 0, 0)), 0, MIDDLES_PX, RIM_PX) == PLAIN
     away = np.array([[500.0, 500.0], [-300.0, 40.0]])
     assert balancing_weight(pictures((60, 90, 120)), 0, away, RIM_PX, 1.4) == 1.4
@@ -51,7 +53,7 @@ def test_black_night_and_a_drogue_beyond_the_image_change_nothing():
 @pytest.mark.parametrize("window", [(0, 0, 120, 100), (37, 21, 80, 64), (64, 50, 119, 99), (101, 0, 120, 33)])
 @pytest.mark.parametrize("color", [0, 1, 2, None])
 @pytest.mark.parametrize("kind", ["linear", "gamma", "mono", "mosaic"])
-def test_part_of_the_channel_is_that_part_of_the_whole(window, color, kind):
+def test_part_of_the_channel_is_that_part_of_the_whole(window: tuple[int, ...], color: int, kind: str) -> None:
     rng = np.random.default_rng(5)
     shape = (100, 120) if kind == "mono" else (100, 120, 3)
     images = StereoImages(
@@ -73,7 +75,7 @@ def test_part_of_the_channel_is_that_part_of_the_whole(window, color, kind):
 
 @pytest.mark.parametrize("turn", range(8))
 @pytest.mark.parametrize("color", [0, 2])
-def test_the_edge_of_a_bright_sky_leads_nowhere_in_a_mosaic(color, turn):
+def test_the_edge_of_a_bright_sky_leads_nowhere_in_a_mosaic(color: int, turn: int) -> None:
     v, u = np.mgrid[:60, :80].astype(np.float64)
     away_px = (u - 40) * np.cos(turn * np.pi / 4) + (v - 30) * np.sin(turn * np.pi / 4)
     mosaic = np.round(8 + 190 / (1 + np.exp(-2 * away_px))).astype(np.uint8)

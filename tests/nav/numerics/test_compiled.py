@@ -57,7 +57,7 @@ def call(package: Path) -> tuple[int, int, str]:
     return int(value), int(hits), "".join(where)
 
 
-def test_a_function_is_compiled_anew_when_one_that_it_calls_has_changed(package):
+def test_a_function_is_compiled_anew_when_one_that_it_calls_has_changed(package: Path) -> None:
     beside = str(package / "nav" / "loops" / "__pycache__")
     assert call(package) == (3, 0, beside)
     assert call(package) == (3, 1, beside)
@@ -66,7 +66,7 @@ def test_a_function_is_compiled_anew_when_one_that_it_calls_has_changed(package)
     assert call(package) == (21, 1, beside)
 
 
-def test_a_package_that_cannot_be_written_is_cached_at_home_and_else_not_at_all(package):
+def test_a_package_that_cannot_be_written_is_cached_at_home_and_else_not_at_all(package: Path) -> None:
     # A file where the folder would be: permissions would not keep a superuser out.
     (package / "nav" / "loops" / "__pycache__").touch()
     value, hits, where = call(package)

@@ -7,11 +7,11 @@ import numpy as np
 from nav.numerics import least_squares_loops
 
 
-def float32(rng, *shape):
+def float32(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return rng.normal(size=shape).astype(np.float32)
 
 
-def test_sums_of_least_squares_are_those_of_numpy():
+def test_sums_of_least_squares_are_those_of_numpy() -> None:
     rng = np.random.default_rng(1)
     jacobian, residuals, weights = float32(rng, 5, 7, 300), float32(rng, 5, 300), rng.random((5, 300), np.float32)
     normal, gradient = np.empty((5, 7, 7)), np.empty((5, 7))
@@ -37,7 +37,7 @@ def test_sums_of_least_squares_are_those_of_numpy():
     np.testing.assert_allclose(filled.sum(axis=1), 7, rtol=1e-4)
 
 
-def test_damped_steps_solve_their_systems():
+def test_damped_steps_solve_their_systems() -> None:
     rng = np.random.default_rng(2)
     arms = rng.normal(size=(6, 9, 9))
     matrices, gradients, dampings = arms @ arms.transpose(0, 2, 1) + np.eye(9), rng.normal(size=(6, 9)), rng.random(6)

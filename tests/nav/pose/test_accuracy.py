@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parameters import even_ring
 from geometry.circles import project_disc_centers
-from geometry.se3 import angles_from_axis, log_twist
+from geometry.se3 import RigidTransform, angles_from_axis, log_twist
 from geometry.stereo import EYES, paper_rig
 from nav.pose.adjustment import adjust
 from nav.pose.baselines import mean_plane
@@ -33,14 +35,16 @@ def ring(count: int, marker_radius_m: float = 0.05) -> MarkerLayout:
     return MarkerLayout(centers, marker_radius_m, None)
 
 
-def observe(layout, place, sigma_px, rng=None) -> Observation:
+def observe(
+    layout: MarkerLayout, place: RigidTransform, sigma_px: float, rng: np.random.Generator | None = None
+) -> Observation:
     pixels = np.stack([project_disc_centers(RIG, place, layout.centers_m, layout.radius_m, eye) for eye in EYES])
     if rng is not None:
         pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     return Observation(RIG, layout, pixels, np.tile(sigma_px**2 * np.eye(2), (2, layout.count, 1, 1)))
 
 
-def solved(method, observation) -> Solution:
+def solved(method: Callable[..., Any], observation: Observation) -> Solution:
     answer = method(observation)
     assert not isinstance(answer, NoFixReason), answer.reason
     return answer
@@ -50,7 +54,7 @@ def pitch_deg(solution: Solution) -> float:
     return float(np.degrees(angles_from_axis(solution.left_from_drogue.rotation[:, 2])[0]))
 
 
-def tangent_error(estimate, truth, layout) -> np.ndarray:
+def tangent_error(estimate: RigidTransform, truth: RigidTransform, layout: MarkerLayout) -> np.ndarray:
     """Error in the reported tangent, truth brought to the nearest turn of the ring's symmetry."""
     turns = 2 * np.pi * np.arange(layout.symmetry_order) / layout.symmetry_order
     errors = []
@@ -64,7 +68,7 @@ def tangent_error(estimate, truth, layout) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [5, 7, 8])
 @pytest.mark.parametrize("z_m", [1.7, 5.0, 20.0])
-def test_methods_are_exact_without_noise(count, z_m):
+def test_methods_are_exact_without_noise(count: int, z_m: float) -> None:
     place = make_pose(0.1, -0.02, z_m, 7, -5, 11)
     # Points instead of discs: triangulation then sees the markers' very centres.
     # Little noise is assumed, so that the tilt of 8.6 degrees counts as certain at 20 m and no prior draws it to zero.
@@ -79,7 +83,7 @@ def test_methods_are_exact_without_noise(count, z_m):
 
 
 @pytest.mark.parametrize("name", [*MONOCULAR, "circle-fit", "disparity-plane"])
-def test_monocular_and_circle_methods_are_exact_without_noise(name):
+def test_monocular_and_circle_methods_are_exact_without_noise(name: str) -> None:
     draws = draw_poses(np.random.default_rng(53), 10, (1.7, 10.0), 0.01, tilt_deg=(6.0, 10.0))
     point_sized = MarkerLayout(draws.layout.centers_m, 1e-6, None)
     for index, place in enumerate(draws.places):
@@ -98,14 +102,14 @@ def test_monocular_and_circle_methods_are_exact_without_noise(name):
 
 
 @pytest.mark.parametrize("z_m", [1.7, 2.0, 5.0])
-def test_joint_models_the_shift_of_ellipse_centres(z_m):
+def test_joint_models_the_shift_of_ellipse_centres(z_m: float) -> None:
     place = make_pose(0.1, 0.02, z_m, 10, 10, 3)
     solution = solved(joint, observe(ring(8), place, 0.05))
     # Ignoring the shift costs 0.28 mm at 1.5 m and 0.1 mm at 5 m; with it only the convergence limit remains.
     np.testing.assert_allclose(solution.left_from_drogue.translation_m, place.translation_m, atol=1e-6)
 
 
-def test_golden_bound_of_the_joint_adjustment():
+def test_golden_bound_of_the_joint_adjustment() -> None:
     place = make_pose(ON_AXIS_X_M, 0, 10)
     features = observed_features(observe(ring(8), place, 1.0), with_hub=False)
     information = adjust(features, place.rotation[None], place.translation_m[None]).information[0]
@@ -116,7 +120,7 @@ def test_golden_bound_of_the_joint_adjustment():
     assert np.degrees(deviation[3]) == pytest.approx(16.4, abs=0.06)
 
 
-def test_golden_bound_of_mean_and_plane():
+def test_golden_bound_of_mean_and_plane() -> None:
     observation = observe(ring(8, marker_radius_m=1e-6), make_pose(ON_AXIS_X_M, 0, 10), 1.0)
     step_px = 1e-3
     variance = np.zeros(2)
@@ -133,7 +137,7 @@ def test_golden_bound_of_mean_and_plane():
     assert np.sqrt(variance[1]) == pytest.approx(56.5, abs=0.06)
 
 
-def test_golden_share_of_triples_without_a_real_root():
+def test_golden_share_of_triples_without_a_real_root() -> None:
     layout = ring(8, marker_radius_m=1e-6)
     triples = list(combinations(range(8), 3))
     # The widest triples of eight: their gaps are 2, 3 and 3 places.
@@ -148,7 +152,7 @@ def test_golden_share_of_triples_without_a_real_root():
     assert np.mean(negative) == pytest.approx(0.895, abs=0.025)
 
 
-def test_golden_flip_rate():
+def test_golden_flip_rate() -> None:
     rng = np.random.default_rng(2)
     place = make_pose(ON_AXIS_X_M, 0, 20, 6, 0, 5)
     count = 600
@@ -163,7 +167,7 @@ def test_golden_flip_rate():
     assert flips / count == pytest.approx(0.180, abs=0.067)
 
 
-def test_depth_error_of_the_joint_adjustment_grows_with_the_square_of_distance():
+def test_depth_error_of_the_joint_adjustment_grows_with_the_square_of_distance() -> None:
     rng = np.random.default_rng(3)
     distances = np.array([2.5, 5.0, 10.0])
     rms = []
@@ -179,7 +183,7 @@ def test_depth_error_of_the_joint_adjustment_grows_with_the_square_of_distance()
     assert slope == pytest.approx(2.0, abs=0.24)
 
 
-def test_covariance_of_the_joint_adjustment_is_that_of_its_errors():
+def test_covariance_of_the_joint_adjustment_is_that_of_its_errors() -> None:
     rng = np.random.default_rng(4)
     layout = ring(8)
     count, scores = 200, []
@@ -192,7 +196,7 @@ def test_covariance_of_the_joint_adjustment_is_that_of_its_errors():
     assert np.mean(scores) == pytest.approx(1.0, abs=0.164)
 
 
-def test_a_marker_that_one_eye_missed_still_counts():
+def test_a_marker_that_one_eye_missed_still_counts() -> None:
     place = make_pose(ON_AXIS_X_M, 0, 5, 7, 7)
     whole = observe(ring(8), place, 0.05)
     pixels = whole.pixels_px.copy()
@@ -206,7 +210,7 @@ def test_a_marker_that_one_eye_missed_still_counts():
     assert np.linalg.det(half.covariance) < np.linalg.det(without.covariance)
 
 
-def test_the_paper_withstands_one_wrong_marker_where_the_mean_does_not():
+def test_the_paper_withstands_one_wrong_marker_where_the_mean_does_not() -> None:
     rng = np.random.default_rng(5)
     errors = {paper: [], mean_plane: []}
     for _ in range(60):
@@ -222,7 +226,7 @@ def test_the_paper_withstands_one_wrong_marker_where_the_mean_does_not():
     assert np.mean(errors[paper]) < 0.5 * np.mean(errors[mean_plane])
 
 
-def test_missing_markers_do_not_shift_the_mean():
+def test_missing_markers_do_not_shift_the_mean() -> None:
     place = make_pose(0.1, 0.05, 5, 7, -3, 4)
     whole = observe(ring(8, marker_radius_m=1e-6), place, 0.05)
     pixels = whole.pixels_px.copy()
@@ -231,6 +235,6 @@ def test_missing_markers_do_not_shift_the_mean():
     np.testing.assert_allclose(solution.left_from_drogue.translation_m, place.translation_m, atol=1e-7)
 
 
-def test_constant_never_tilts():
+def test_constant_never_tilts() -> None:
     solution = solved(METHODS["constant"], observe(ring(8), make_pose(0, 0, 5, 7, -5, 4), 0.05))
     np.testing.assert_allclose(solution.left_from_drogue.rotation[:, 2], [0, 0, 1], atol=1e-12)

@@ -14,9 +14,9 @@ from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES
 from nav.pose.adjustment import AdjustmentState, Loss, adjust, linearise, project_features
-from nav.pose.features import stack_features
+from nav.pose.features import Features, stack_features
 from nav.pose.pose_method import StatedTolerances
-from tests.support.painted_pairs import draw_poses
+from tests.support.painted_pairs import Draws, draw_poses
 
 SIGMA_PX = 0.1
 STATED = StatedTolerances(
@@ -25,18 +25,18 @@ STATED = StatedTolerances(
 LOSSES = [Loss(), Loss(huber_sigmas=1.0), Loss(tilt_prior_rad=0.1)]
 
 
-def features_of(draws, radii_count: float = 1.0, tolerances=None):
+def features_of(draws: Draws, radii_count: float = 1.0, tolerances: StatedTolerances | None = None) -> Features:
     cov = np.array([[1.0, 0.3], [0.3, 2.0]]) * SIGMA_PX**2
     given = () if tolerances is None else (tolerances,)
     features = stack_features(draws.rig, draws.layout, draws.pixels_px, cov, *given)
     return replace(features, radii_m=radii_count * features.radii_m)
 
 
-def poses_of(draws):
+def poses_of(draws: Draws) -> tuple[np.ndarray, np.ndarray]:
     return np.array([p.rotation for p in draws.places]), np.array([p.translation_m for p in draws.places])
 
 
-def test_residuals_are_those_of_opencv_whitened():
+def test_residuals_are_those_of_opencv_whitened() -> None:
     draws = draw_poses(np.random.default_rng(70), 6, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, radii_count=0.0)
     rotations, translations = poses_of(draws)
@@ -57,7 +57,7 @@ def test_residuals_are_those_of_opencv_whitened():
 
 @pytest.mark.parametrize("tolerances", [None, STATED])
 @pytest.mark.parametrize("loss", [Loss(), Loss(tilt_prior_rad=0.1)])
-def test_derivatives_by_the_pose_are_those_of_the_residuals(tolerances, loss):
+def test_derivatives_by_the_pose_are_those_of_the_residuals(tolerances: StatedTolerances | None, loss: Loss) -> None:
     draws = draw_poses(np.random.default_rng(71), 5, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 0.0, tolerances)
     rotations, translations = poses_of(draws)
@@ -78,7 +78,7 @@ def test_derivatives_by_the_pose_are_those_of_the_residuals(tolerances, loss):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_costs_are_sums_over_residuals(loss):
+def test_costs_are_sums_over_residuals(loss: Loss) -> None:
     draws = draw_poses(np.random.default_rng(72), 8, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 1.0, STATED)
     rotations, translations = poses_of(draws)
@@ -99,7 +99,7 @@ def test_costs_are_sums_over_residuals(loss):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_adjusted_poses_are_minima(loss):
+def test_adjusted_poses_are_minima(loss: Loss) -> None:
     draws = draw_poses(np.random.default_rng(73), 12, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, 1.0, STATED)
     found = adjust(features, *poses_of(draws), loss)
@@ -113,15 +113,15 @@ def test_adjusted_poses_are_minima(loss):
     assert gain.max() < 1e-5
 
 
-def minimum_by_scipy(draws, features, index: int) -> tuple[np.ndarray, np.ndarray, float]:
+def minimum_by_scipy(draws: Draws, features: Features, index: int) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotation, translation and cost of the least-squares pose, from the true pose as start."""
     true = draws.places[index]
     root = np.linalg.inv(np.linalg.cholesky(np.array([[1.0, 0.3], [0.3, 2.0]]) * SIGMA_PX**2))
 
-    def moved(step):
+    def moved(step: np.ndarray) -> RigidTransform:
         return RigidTransform(Rotation.from_rotvec(step[3:]).as_matrix() @ true.rotation, true.translation_m + step[:3])
 
-    def residuals(step):
+    def residuals(step: np.ndarray) -> np.ndarray:
         seen = [project_disc_centers(draws.rig, moved(step), features.points_m, features.radii_m, eye) for eye in EYES]
         return ((np.array(seen) - draws.pixels_px[index]) @ root.T).ravel()
 
@@ -134,7 +134,7 @@ def minimum_by_scipy(draws, features, index: int) -> tuple[np.ndarray, np.ndarra
 # deviations of the minimum. Discs: the derivatives neglect the shift of the ellipse centres, of a relative size of
 # (0.075 m / 1.7 m)^2 = 2e-3; times the root of 40 residuals of one deviation this is 0.012 deviations.
 @pytest.mark.parametrize(("radii_count", "sigmas"), [(0.0, 1e-4), (1.0, 0.02)])
-def test_adjusted_poses_are_those_of_scipy(radii_count, sigmas):
+def test_adjusted_poses_are_those_of_scipy(radii_count: float, sigmas: float) -> None:
     draws = draw_poses(np.random.default_rng(76), 6, (1.7, 10.0), SIGMA_PX)
     features = features_of(draws, radii_count)
     found = adjust(features, *poses_of(draws))
@@ -147,7 +147,7 @@ def test_adjusted_poses_are_those_of_scipy(radii_count, sigmas):
         assert 0 <= found.costs[index] - cost + 1e-9 < sigmas**2 / 2 + 2e-9
 
 
-def test_a_pose_behind_the_cameras_has_infinite_cost_and_is_not_adjusted():
+def test_a_pose_behind_the_cameras_has_infinite_cost_and_is_not_adjusted() -> None:
     draws = draw_poses(np.random.default_rng(74), 2, 3.0, SIGMA_PX)
     features = features_of(draws)
     rotations, translations = poses_of(draws)
@@ -157,7 +157,7 @@ def test_a_pose_behind_the_cameras_has_infinite_cost_and_is_not_adjusted():
     np.testing.assert_array_equal(found.translations_m[0], translations[0])
 
 
-def test_an_unmeasured_feature_has_no_residuals():
+def test_an_unmeasured_feature_has_no_residuals() -> None:
     draws = draw_poses(np.random.default_rng(75), 3, 4.0, SIGMA_PX)
     whole = features_of(draws, 1.0, STATED)
     mask = np.arange(10) == 3

@@ -11,14 +11,14 @@ from nav.pose.pose_method import NoFixReason, Observation
 from tests.support.painted_pairs import draw_poses
 
 
-def test_circle_centre_is_exact_and_robust_to_its_start():
+def test_circle_centre_is_exact_and_robust_to_its_start() -> None:
     angle = np.linspace(0, 2 * np.pi, 5, endpoint=False)
     points = np.column_stack([3 + 0.2 * np.cos(angle), -1 + 0.2 * np.sin(angle)])
     np.testing.assert_allclose(fit_circle_center(points), [3, -1], atol=1e-12)
     assert fit_circle_center(np.column_stack([np.arange(5.0), 2 * np.arange(5.0)])) is None
 
 
-def test_the_circle_fit_does_not_use_the_radius():
+def test_the_circle_fit_does_not_use_the_radius() -> None:
     draws = draw_poses(np.random.default_rng(57), 5, 5.0, 0.1)
     for index in range(5):
         small = draws.observation(index)
@@ -31,7 +31,7 @@ def test_the_circle_fit_does_not_use_the_radius():
         )
 
 
-def test_the_circle_fit_needs_four_points_and_a_circle():
+def test_the_circle_fit_needs_four_points_and_a_circle() -> None:
     draws = draw_poses(np.random.default_rng(58), 1, 5.0, 0.1)
     pixels = draws.pixels_px[0].copy()
     pixels[0, [1, 2, 4, 6, 7]] = np.nan
@@ -40,7 +40,7 @@ def test_the_circle_fit_needs_four_points_and_a_circle():
     assert "3 markers in both eyes, a circle fit needs 4" in answer.reason
 
 
-def test_depth_of_the_circle_fit():
+def test_depth_of_the_circle_fit() -> None:
     draws = draw_poses(np.random.default_rng(59), 200, 5.0, 0.05)
     ratios = [
         (circle_fit(draws.observation(i)).left_from_drogue.translation_m[2] - p.translation_m[2]) / draws.bound(i, 8)[2]
@@ -50,7 +50,7 @@ def test_depth_of_the_circle_fit():
     assert 3.6 * 0.85 < np.sqrt(np.mean(np.square(ratios))) < 8 * 1.15
 
 
-def test_the_plane_of_disparities_is_better_than_that_of_points():
+def test_the_plane_of_disparities_is_better_than_that_of_points() -> None:
     draws = draw_poses(np.random.default_rng(60), 300, 20.0, 0.1)
     rmse = []
     for method in (disparity_plane, mean_plane):

@@ -9,32 +9,32 @@ import pytest
 
 from geometry.circles import project_disc_centers
 from nav.pose.joint import joint, joint_hub
-from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.joint_batch import JointBatch, solve_joint_batch
 from nav.pose.pose_method import EXACT, Solution, StatedTolerances
-from tests.support.painted_pairs import draw_poses, make_pose
+from tests.support.painted_pairs import Draws, draw_poses, make_pose
 
 FOCAL_PX = 8e-3 / 3.75e-6
 BASELINE_M = 0.12
 RING_M = 0.28
 
 
-def solve(draws, hub: bool, tolerances: StatedTolerances = EXACT):
+def solve(draws: Draws, hub: bool, tolerances: StatedTolerances = EXACT) -> JointBatch:
     pixels = draws.pixels_px if hub else draws.pixels_px[:, :, : draws.layout.count]
     batch = solve_joint_batch(draws.rig, draws.layout, pixels, draws.sigma_px**2 * np.eye(2), tolerances)
     assert batch.sound.all()
     return batch
 
 
-def errors_of(draws, batch) -> np.ndarray:
+def errors_of(draws: Draws, batch: JointBatch) -> np.ndarray:
     return np.array([draws.errors(i, batch.rotations[i], batch.translations_m[i]) for i in range(len(draws.places))])
 
 
-def nees(errors, batch) -> float:
+def nees(errors: np.ndarray, batch: JointBatch) -> float:
     tangent = errors[:, [0, 1, 2, 5, 6, 7]]
     return float(np.mean([e @ np.linalg.solve(c, e) / 6 for e, c in zip(tangent, batch.covariances, strict=True)]))
 
 
-def flips(draws, batch) -> np.ndarray:
+def flips(draws: Draws, batch: JointBatch) -> np.ndarray:
     """Whether the estimated pitch and yaw point away from the true ones."""
     return np.array(
         [
@@ -44,13 +44,13 @@ def flips(draws, batch) -> np.ndarray:
     )
 
 
-def tilt_rmse_deg(errors) -> float:
+def tilt_rmse_deg(errors: np.ndarray) -> float:
     return float(np.degrees(np.sqrt((errors[:, 3:5] ** 2).mean())))
 
 
 @pytest.mark.parametrize("sigma_px", [0.02, 0.1])
 @pytest.mark.parametrize("z_m", [1.7, 5.0, 15.0, 40.0])
-def test_joint_hub_reaches_the_bound_and_never_flips(z_m, sigma_px):
+def test_joint_hub_reaches_the_bound_and_never_flips(z_m: float, sigma_px: float) -> None:
     draws = draw_poses(np.random.default_rng(11), 500, z_m, sigma_px)
     batch = solve(draws, hub=True)
     errors = errors_of(draws, batch)
@@ -73,7 +73,7 @@ def frontal_tilt_sigma_deg(sigma_px: float, z_m: float) -> float:
     return float(np.degrees(sigma_px * z_m**2 / (FOCAL_PX * RING_M * spread)))
 
 
-def flip_law_is_met(z_m, pitch_deg, count, seed):
+def flip_law_is_met(z_m: float, pitch_deg: float, count: int, seed: int) -> None:
     draws = draw_poses(np.random.default_rng(seed), 1, z_m, 0.1)
     place = make_pose(0.06, 0, z_m, pitch_deg, 0, 5)
     rng = np.random.default_rng(seed)
@@ -89,14 +89,14 @@ def flip_law_is_met(z_m, pitch_deg, count, seed):
 
 
 @pytest.mark.parametrize(("z_m", "pitch_deg"), [(10.0, 2.0), (15.0, 5.0), (20.0, 6.0)])
-def test_flips_without_a_hub_follow_the_law(z_m, pitch_deg):
+def test_flips_without_a_hub_follow_the_law(z_m: float, pitch_deg: float) -> None:
     flip_law_is_met(z_m, pitch_deg, 1500, 12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("z_m", [10.0, 15.0, 20.0, 30.0, 40.0])
 @pytest.mark.parametrize("share", [0.3, 0.6, 1.0, 1.5, 2.0])
-def test_flips_without_a_hub_follow_the_law_everywhere(z_m, share):
+def test_flips_without_a_hub_follow_the_law_everywhere(z_m: float, share: float) -> None:
     pitch_deg = share * frontal_tilt_sigma_deg(0.1, z_m)
     if pitch_deg > 10:
         pytest.skip("the law is of tilts up to 10 degrees")
@@ -104,7 +104,7 @@ def test_flips_without_a_hub_follow_the_law_everywhere(z_m, share):
 
 
 @pytest.mark.parametrize(("z_m", "published_deg", "lower_cost_deg"), [(20.0, 2.98, 3.62), (40.0, 5.29, 7.28)])
-def test_the_mean_over_both_tilts_beats_the_lower_cost(z_m, published_deg, lower_cost_deg):
+def test_the_mean_over_both_tilts_beats_the_lower_cost(z_m: float, published_deg: float, lower_cost_deg: float) -> None:
     draws = draw_poses(np.random.default_rng(14), 800, z_m, 0.1)
     batch = solve(draws, hub=False)
     assert not batch.tilt_sign_reliable.any()
@@ -118,7 +118,7 @@ def test_the_mean_over_both_tilts_beats_the_lower_cost(z_m, published_deg, lower
 
 
 @pytest.mark.parametrize("z_m", [2.0, 5.0, 8.0])
-def test_joint_without_hub_reaches_the_bound_where_the_tilt_is_certain(z_m):
+def test_joint_without_hub_reaches_the_bound_where_the_tilt_is_certain(z_m: float) -> None:
     draws = draw_poses(np.random.default_rng(15), 500, z_m, 0.05, tilt_deg=(5.0, 10.0))
     batch = solve(draws, hub=False)
     assert batch.tilt_sign_reliable.all()
@@ -130,7 +130,7 @@ def test_joint_without_hub_reaches_the_bound_where_the_tilt_is_certain(z_m):
     assert nees(errors, batch) == pytest.approx(1.0, abs=0.104)
 
 
-def test_batch_and_single_frame_agree():
+def test_batch_and_single_frame_agree() -> None:
     draws = draw_poses(np.random.default_rng(16), 12, (1.7, 40.0), 0.1)
     for method, hub in ((joint, False), (joint_hub, True)):
         batch = solve(draws, hub)
@@ -146,7 +146,7 @@ def test_batch_and_single_frame_agree():
             )
 
 
-def test_every_edge_of_the_hub_has_its_own_ellipse_centre():
+def test_every_edge_of_the_hub_has_its_own_ellipse_centre() -> None:
     draws = draw_poses(np.random.default_rng(17), 20, (1.7, 3.0), 0.05)
     for index, place in enumerate(draws.places):
         solution = joint_hub(draws.observation(index, pixels_px=draws.exact_px[index]))
@@ -158,7 +158,7 @@ def test_every_edge_of_the_hub_has_its_own_ellipse_centre():
         assert solution.note == ""
 
 
-def test_without_a_measured_hub_the_solution_is_that_of_joint_with_a_note():
+def test_without_a_measured_hub_the_solution_is_that_of_joint_with_a_note() -> None:
     draws = draw_poses(np.random.default_rng(18), 5, 15.0, 0.1)
     for index in range(5):
         plain, without = joint(draws.observation(index)), joint_hub(draws.observation(index, hub=False))
@@ -172,7 +172,7 @@ def test_without_a_measured_hub_the_solution_is_that_of_joint_with_a_note():
         assert without.covariance[3, 3] > 20 * with_hub.covariance[3, 3]
 
 
-def test_the_noise_of_the_hub_counts():
+def test_the_noise_of_the_hub_counts() -> None:
     draws = draw_poses(np.random.default_rng(19), 1, 10.0, 0.05, tilt_deg=(6.0, 8.0))
     sharp = draws.observation(0)
     blunt = type(sharp)(sharp.rig, sharp.layout, sharp.pixels_px, sharp.cov_px2, sharp.hub_px, 1e8 * sharp.hub_cov_px2)
@@ -180,7 +180,7 @@ def test_the_noise_of_the_hub_counts():
     np.testing.assert_allclose(joint_hub(blunt).covariance, joint(sharp).covariance, rtol=1e-3, atol=1e-12)
 
 
-def test_one_edge_in_one_eye_is_enough_for_the_sign():
+def test_one_edge_in_one_eye_is_enough_for_the_sign() -> None:
     draws = draw_poses(np.random.default_rng(20), 30, 20.0, 0.05, tilt_deg=(3.0, 10.0))
     for index, place in enumerate(draws.places):
         pixels = draws.pixels_px[index].copy()
@@ -191,7 +191,9 @@ def test_one_edge_in_one_eye_is_enough_for_the_sign():
 
 
 @pytest.mark.parametrize(("sigma_px", "fixed_mm", "prior_mm"), [(0.02, 16.1, 3.8), (0.1, 17.1, 13.4)])
-def test_a_prior_on_the_rings_radius_corrects_for_a_wrong_radius(sigma_px, fixed_mm, prior_mm):
+def test_a_prior_on_the_rings_radius_corrects_for_a_wrong_radius(
+    sigma_px: float, fixed_mm: float, prior_mm: float
+) -> None:
     draws = draw_poses(np.random.default_rng(21), 1000, 10.0, sigma_px, ring_sigma_m=5e-4)
     fixed, free = solve(draws, hub=False), solve(draws, hub=False, tolerances=StatedTolerances(5e-4))
     errors_fixed, errors_free = errors_of(draws, fixed), errors_of(draws, free)
@@ -204,7 +206,7 @@ def test_a_prior_on_the_rings_radius_corrects_for_a_wrong_radius(sigma_px, fixed
     assert 0.85 < nees(errors_free, free) < 1.2
 
 
-def test_a_tolerance_of_zero_is_the_fixed_ring():
+def test_a_tolerance_of_zero_is_the_fixed_ring() -> None:
     draws = draw_poses(np.random.default_rng(22), 5, 10.0, 0.05, tilt_deg=(6.0, 8.0))
     fixed, tight = solve(draws, hub=True), solve(draws, hub=True, tolerances=StatedTolerances(1e-9))
     # A nanometre of radius is 4e-8 m of distance at 10 m.
@@ -213,7 +215,7 @@ def test_a_tolerance_of_zero_is_the_fixed_ring():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("z_m", [1.7, 2.0, 3.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0])
-def test_joint_hub_reaches_the_bound_closely(z_m):
+def test_joint_hub_reaches_the_bound_closely(z_m: float) -> None:
     draws = draw_poses(np.random.default_rng(23), 10_000, z_m, 0.05)
     batch = solve(draws, hub=True)
     errors = errors_of(draws, batch)

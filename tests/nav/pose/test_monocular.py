@@ -18,7 +18,7 @@ def circle_cone(center: np.ndarray, normal: np.ndarray, radius: float) -> np.nda
     return cone if np.linalg.det(cone) < 0 else -cone
 
 
-def test_pose_of_a_circle_in_closed_form():
+def test_pose_of_a_circle_in_closed_form() -> None:
     rng = np.random.default_rng(51)
     for _ in range(200):
         center = np.append(rng.uniform(-0.3, 0.3, 2), 1.0) * rng.uniform(1.5, 20)
@@ -36,7 +36,7 @@ def test_pose_of_a_circle_in_closed_form():
         np.testing.assert_allclose(other / np.linalg.norm(other), mine / np.linalg.norm(mine), atol=1e-9)
 
 
-def test_conic_through_points_of_a_circle():
+def test_conic_through_points_of_a_circle() -> None:
     rng = np.random.default_rng(52)
     angle = np.sort(rng.uniform(0, 2 * np.pi, 7))
     points = np.column_stack([0.2 + 0.1 * np.cos(angle), -0.3 + 0.05 * np.sin(angle)])
@@ -50,7 +50,7 @@ def test_conic_through_points_of_a_circle():
 
 @pytest.mark.parametrize("z_m", [2.0, 5.0])
 @pytest.mark.parametrize("name", ["mono-ippe", "mono-sqpnp", "mono-lm"])
-def test_monocular_methods_reach_the_bound_of_one_eye(name, z_m):
+def test_monocular_methods_reach_the_bound_of_one_eye(name: str, z_m: float) -> None:
     draws = draw_poses(np.random.default_rng(54), 250, z_m, 0.05, tilt_deg=(6.0, 10.0))
     left = type(draws)(draws.rig, draws.layout, 0.05, draws.places, draws.exact_px[:, :1], draws.pixels_px[:, :1])
     ratios = []
@@ -64,7 +64,7 @@ def test_monocular_methods_reach_the_bound_of_one_eye(name, z_m):
 
 
 @pytest.mark.parametrize(("z_m", "z_rmse_mm"), [(2.0, 0.41), (5.0, 2.5), (10.0, 10.0)])
-def test_depth_of_the_ellipse(z_m, z_rmse_mm):
+def test_depth_of_the_ellipse(z_m: float, z_rmse_mm: float) -> None:
     draws = draw_poses(np.random.default_rng(55), 200, z_m, 0.1)
     errors = [
         METHODS["mono-circle"](draws.observation(i)).left_from_drogue.translation_m[2] - place.translation_m[2]
@@ -74,7 +74,7 @@ def test_depth_of_the_ellipse(z_m, z_rmse_mm):
     assert 1e3 * np.sqrt(np.mean(np.square(errors))) < 1.15 * z_rmse_mm
 
 
-def test_the_hub_chooses_the_branch_of_the_ellipse():
+def test_the_hub_chooses_the_branch_of_the_ellipse() -> None:
     draws = draw_poses(np.random.default_rng(56), 60, 15.0, 0.1, tilt_deg=(5.0, 10.0))
     wrong = {True: 0, False: 0}
     for index, place in enumerate(draws.places):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,33 +16,33 @@ from geometry.pinhole import PinholeCamera
 from nav.pose.joint_batch import solve_joint_batch
 from nav.pose.pose_method import NoFixReason, Observation, Solution, StatedTolerances
 from nav.pose.pose_methods import METHODS
-from tests.support.painted_pairs import draw_poses
+from tests.support.painted_pairs import Draws, draw_poses
 
 MONO = [name for name in METHODS if name.startswith("mono-")]
 HUB = ["joint-hub", "joint-robust"]
 
 
 @pytest.fixture
-def draws():
+def draws() -> Draws:
     return draw_poses(np.random.default_rng(71), 1, 5.0, 0.05, tilt_deg=(6.0, 8.0))
 
 
-def changed(draws, change) -> Observation:
+def changed(draws: Draws, change: Callable[..., Any]) -> Observation:
     good = draws.observation(0)
     arrays = [np.array(a) for a in (good.pixels_px, good.cov_px2, good.hub_px, good.hub_cov_px2)]
     change(*arrays)
     return Observation(good.rig, good.layout, *arrays)
 
 
-def reason_of(method, observation) -> str:
+def reason_of(method: str, observation: Observation) -> str:
     answer = METHODS[method](observation)
     assert isinstance(answer, NoFixReason)
     return answer.reason
 
 
 @pytest.mark.parametrize("method", MONO)
-def test_the_left_eye_suffices(draws, method):
-    def right_eye_lost(pixels, cov, hub, hub_cov):
+def test_the_left_eye_suffices(draws: Draws, method: str) -> None:
+    def right_eye_lost(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         pixels[1], hub[1] = np.nan, np.nan
 
     solution = METHODS[method](changed(draws, right_eye_lost))
@@ -53,8 +55,8 @@ def test_the_left_eye_suffices(draws, method):
 
 @pytest.mark.parametrize("method", MONO)
 @pytest.mark.parametrize("left_over", [0, 3])
-def test_the_right_eye_replaces_the_left_one(draws, method, left_over):
-    def left_eye_lost(pixels, cov, hub, hub_cov):
+def test_the_right_eye_replaces_the_left_one(draws: Draws, method: str, left_over: int) -> None:
+    def left_eye_lost(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         pixels[0, left_over:], hub[0] = np.nan, np.nan
 
     solution = METHODS[method](changed(draws, left_eye_lost))
@@ -79,7 +81,7 @@ def test_the_right_eye_replaces_the_left_one(draws, method, left_over):
 
 
 @pytest.mark.parametrize("method", MONO)
-def test_the_right_eye_is_as_exact(method):
+def test_the_right_eye_is_as_exact(method: str) -> None:
     draws = draw_poses(np.random.default_rng(73), 6, (1.7, 10.0), 0.01, tilt_deg=(6.0, 10.0))
     for index, place in enumerate(draws.places):
         pixels = draws.exact_px[index].copy()
@@ -91,39 +93,39 @@ def test_the_right_eye_is_as_exact(method):
         np.testing.assert_allclose(solution.left_from_drogue.translation_m, place.translation_m, atol=atol)
 
 
-def nothing_seen(pixels, cov, hub, hub_cov):
+def nothing_seen(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     pixels[:] = np.nan
 
 
-def three_left(pixels, cov, hub, hub_cov):
+def three_left(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     pixels[0, 3:], pixels[1] = np.nan, np.nan
 
 
-def two_in_each(pixels, cov, hub, hub_cov):
+def two_in_each(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     pixels[:, 2:] = np.nan
 
 
-def on_one_line(pixels, cov, hub, hub_cov):
+def on_one_line(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     pixels[0, :, 1] = 300.0
 
 
-def on_one_line_right(pixels, cov, hub, hub_cov):
+def on_one_line_right(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     pixels[0], pixels[1, :, 1] = np.nan, 300.0
 
 
-def huge(pixels, cov, hub, hub_cov):
+def huge(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     pixels[0, 3] = 1e300
 
 
-def infinite_right(pixels, cov, hub, hub_cov):
+def infinite_right(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     pixels[0], pixels[1, 5, 0] = np.nan, np.inf
 
 
-def huge_covariance(pixels, cov, hub, hub_cov):
+def huge_covariance(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     cov[0, 2] = 1e300 * np.eye(2)
 
 
-def not_a_number(pixels, cov, hub, hub_cov):
+def not_a_number(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
     cov[0, 2, 0, 0] = np.nan
 
 
@@ -142,14 +144,14 @@ def not_a_number(pixels, cov, hub, hub_cov):
         (not_a_number, "marker 2 of the left eye has no positive covariance"),
     ],
 )
-def test_reasons_of_monocular_methods(draws, method, change, reason):
+def test_reasons_of_monocular_methods(draws: Draws, method: str, change: Callable[..., Any], reason: str) -> None:
     assert reason in reason_of(method, changed(draws, change))
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in MONO])
 @pytest.mark.parametrize("factor", [0.5, 0.67, 1.5, 2.0])
 @pytest.mark.parametrize("z_m", [3.0, 10.0])
-def test_another_rigs_baseline(method, factor, z_m):
+def test_another_rigs_baseline(method: str, factor: float, z_m: float) -> None:
     draws = draw_poses(np.random.default_rng(74), 1, z_m, 0.05, tilt_deg=(6.0, 8.0))
     good = draws.observation(0)
     assert isinstance(METHODS[method](good), Solution)
@@ -159,7 +161,7 @@ def test_another_rigs_baseline(method, factor, z_m):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_rig_of_much_smaller_images(draws, method):
+def test_a_rig_of_much_smaller_images(draws: Draws, method: str) -> None:
     good, camera = draws.observation(0), draws.rig.camera
     small = PinholeCamera(camera.width_px // 5, camera.height_px // 5, camera.fx_px / 5, camera.fy_px / 5, 127.5, 95.5)
     rig = replace(draws.rig, camera=small)
@@ -175,10 +177,10 @@ def bad_measurements() -> st.SearchStrategy[tuple[str, int, int, float]]:
 @pytest.mark.parametrize("method", METHODS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(bad=bad_measurements())
-def test_invalid_measurements_give_no_pose(draws, method, bad):
+def test_invalid_measurements_give_no_pose(draws: Draws, method: str, bad: tuple[str, int, int, float]) -> None:
     kind, eye, marker, number = bad
 
-    def spoilt(pixels, cov, hub, hub_cov):
+    def spoilt(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         hub[:] = np.nan
         if kind == "few":
             kept = pixels[:, [marker, (marker + 3) % 8]].copy()
@@ -196,8 +198,8 @@ def test_invalid_measurements_give_no_pose(draws, method, bad):
 
 
 @pytest.mark.parametrize("method", [*MONO, "joint", "joint-hub"])
-def test_a_wrong_order_of_markers(draws, method):
-    def shuffled(pixels, cov, hub, hub_cov):
+def test_a_wrong_order_of_markers(draws: Draws, method: str) -> None:
+    def shuffled(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         pixels[:] = pixels[:, [0, 4, 1, 5, 2, 6, 3, 7]]
 
     reason = reason_of(method, changed(draws, shuffled))
@@ -205,33 +207,33 @@ def test_a_wrong_order_of_markers(draws, method):
 
 
 @pytest.mark.parametrize("method", HUB)
-def test_reasons_of_a_bad_hub(draws, method):
-    def far_away(pixels, cov, hub, hub_cov):
+def test_reasons_of_a_bad_hub(draws: Draws, method: str) -> None:
+    def far_away(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         hub[1, 0] = np.inf
 
-    def no_covariance(pixels, cov, hub, hub_cov):
+    def no_covariance(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         hub_cov[0, 1] = 0
 
     assert "hub edge 0 of the right eye lies far outside" in reason_of(method, changed(draws, far_away))
     assert "hub edge 1 of the left eye has no positive covariance" in reason_of(method, changed(draws, no_covariance))
 
 
-def test_a_wrong_feature_as_the_hub(draws):
-    def elsewhere(pixels, cov, hub, hub_cov):
+def test_a_wrong_feature_as_the_hub(draws: Draws) -> None:
+    def elsewhere(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         hub += 300.0
 
     assert "do not fit the drogue" in reason_of("joint-hub", changed(draws, elsewhere))
     assert isinstance(METHODS["joint-robust"](changed(draws, elsewhere)), Solution)
 
 
-def test_joint_robust_needs_enough_inliers(draws):
-    def scattered(pixels, cov, hub, hub_cov):
+def test_joint_robust_needs_enough_inliers(draws: Draws) -> None:
+    def scattered(pixels: np.ndarray, cov: np.ndarray, hub: np.ndarray, hub_cov: np.ndarray) -> None:
         pixels += np.random.default_rng(72).uniform(-15, 15, pixels.shape)
 
     assert "agree with each other" in reason_of("joint-robust", changed(draws, scattered))
 
 
-def test_observation_checks_the_hub(draws):
+def test_observation_checks_the_hub(draws: Draws) -> None:
     good = draws.observation(0)
     with pytest.raises(ValueError, match="hub_px, hub_cov_px2: give both or neither"):
         Observation(good.rig, good.layout, good.pixels_px, good.cov_px2, good.hub_px)
@@ -244,12 +246,12 @@ def test_observation_checks_the_hub(draws):
 
 @pytest.mark.parametrize("name", ["ring_radius_m", "ellipticity", "placement_m", "hub_lateral_m", "disparity_px"])
 @pytest.mark.parametrize("value", [-1e-3, np.nan, np.inf])
-def test_a_tolerance_is_a_size(name, value):
+def test_a_tolerance_is_a_size(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name}: must be 0 or more"):
         StatedTolerances(**{name: value})
 
 
-def test_arrays_of_the_batch(draws):
+def test_arrays_of_the_batch(draws: Draws) -> None:
     with pytest.raises(ValueError, match=r"pixels_px: must have shape \(B, 1 or 2, 8, 2\), got \(1, 2, 7, 2\)"):
         solve_joint_batch(draws.rig, draws.layout, draws.pixels_px[:, :, :7], np.eye(2))
     crooked = MarkerLayout(draws.layout.centers_m * np.linspace(1, 1.1, 8)[:, None], 0.05, None)
@@ -257,7 +259,7 @@ def test_arrays_of_the_batch(draws):
         solve_joint_batch(draws.rig, crooked, draws.pixels_px[:, :, :8], np.eye(2), StatedTolerances(5e-4))
 
 
-def test_a_batch_marks_frames_that_have_no_pose(draws):
+def test_a_batch_marks_frames_that_have_no_pose(draws: Draws) -> None:
     frames = np.repeat(draws.pixels_px, 4, axis=0)
     frames[1] = np.nan
     frames[2, :, 2:] = np.nan

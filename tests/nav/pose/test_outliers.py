@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,10 +12,10 @@ from nav.pose.baselines import mean_plane
 from nav.pose.joint import joint, joint_robust
 from nav.pose.paper import _row_differences, paper, paper_literal, paper_reading, three_sphere_candidates
 from nav.pose.pose_method import NoFixReason, Solution, StatedTolerances
-from tests.support.painted_pairs import draw_poses
+from tests.support.painted_pairs import Draws, draw_poses
 
 
-def corrupt(rng, draws, count: int, eyes: str = "one") -> np.ndarray:
+def corrupt(rng: np.random.Generator, draws: Draws, count: int, eyes: str = "one") -> np.ndarray:
     """Pixels with `count` markers of every frame moved by 3 to 10 px, in one eye, both eyes or in one eye's columns."""
     pixels = draws.pixels_px.copy()
     for frame in pixels:
@@ -23,7 +26,7 @@ def corrupt(rng, draws, count: int, eyes: str = "one") -> np.ndarray:
     return pixels
 
 
-def distances_m(method, draws, pixels, hub=True) -> np.ndarray:
+def distances_m(method: Callable[..., Any], draws: Draws, pixels: np.ndarray, hub: bool = True) -> np.ndarray:
     """Position errors of frames with a pose, which all but one in a hundred must have.
 
     Of five markers with a wrong one, four are left: noise makes one of them disagree with the others now and then.
@@ -40,7 +43,7 @@ def distances_m(method, draws, pixels, hub=True) -> np.ndarray:
 @pytest.mark.parametrize("hub", [True, False])
 @pytest.mark.parametrize("eyes", ["one", "both", "columns"])
 @pytest.mark.parametrize("markers", [7, 8])
-def test_one_outlier_hardly_matters(markers, eyes, hub):
+def test_one_outlier_hardly_matters(markers: int, eyes: str, hub: bool) -> None:
     rng = np.random.default_rng(31)
     draws = draw_poses(rng, 40, (1.7, 10.0), 0.1, markers=markers)
     clean = distances_m(joint_robust, draws, draws.pixels_px, hub)
@@ -51,7 +54,7 @@ def test_one_outlier_hardly_matters(markers, eyes, hub):
 
 
 @pytest.mark.parametrize("markers", [7, 8])
-def test_two_outliers_are_found_and_nothing_else(markers):
+def test_two_outliers_are_found_and_nothing_else(markers: int) -> None:
     rng = np.random.default_rng(32)
     draws = draw_poses(rng, 30, (1.7, 10.0), 0.1, markers=markers)
     wrong = corrupt(rng, draws, 2)
@@ -66,7 +69,7 @@ def test_two_outliers_are_found_and_nothing_else(markers):
 @pytest.mark.parametrize("hub", [True, False])
 @pytest.mark.parametrize("wrong_markers", [1, 2])
 @pytest.mark.parametrize("markers", [7, 8])
-def test_acceptance_errors_with_outliers(markers, wrong_markers, hub):
+def test_acceptance_errors_with_outliers(markers: int, wrong_markers: int, hub: bool) -> None:
     rng = np.random.default_rng(42)
     draws = draw_poses(rng, 1000, (1.7, 10.0), 0.1, markers=markers)
     clean = distances_m(joint_robust, draws, draws.pixels_px, hub)
@@ -75,7 +78,7 @@ def test_acceptance_errors_with_outliers(markers, wrong_markers, hub):
     assert wrong.mean() < {1: 1.25, 2: 1.5}[wrong_markers] * clean.mean()
 
 
-def test_the_inlier_mask_excludes_the_outlier():
+def test_the_inlier_mask_excludes_the_outlier() -> None:
     rng = np.random.default_rng(33)
     draws = draw_poses(rng, 30, (1.7, 10.0), 0.05)
     for index in range(30):
@@ -88,7 +91,7 @@ def test_the_inlier_mask_excludes_the_outlier():
         assert solution.used_hub.all()
 
 
-def test_a_wrong_hub_is_an_outlier():
+def test_a_wrong_hub_is_an_outlier() -> None:
     draws = draw_poses(np.random.default_rng(34), 10, 5.0, 0.05, tilt_deg=(6.0, 10.0))
     for index in range(10):
         pixels = draws.pixels_px[index].copy()
@@ -104,7 +107,7 @@ def test_a_wrong_hub_is_an_outlier():
         )
 
 
-def test_four_good_markers_are_kept_with_one_large_residual():
+def test_four_good_markers_are_kept_with_one_large_residual() -> None:
     draws = draw_poses(np.random.default_rng(44), 12, 5.0, 0.1, markers=5)
     pixels = draws.exact_px.copy()
     # Up in one eye and down in the other, 4.7 deviations apart: no pose takes that up, and the marker's sum is 21.8.
@@ -118,7 +121,7 @@ def test_four_good_markers_are_kept_with_one_large_residual():
         assert np.linalg.norm(solution.left_from_drogue.translation_m - place.translation_m) < 5 * 2e-3
 
 
-def test_five_markers_cannot_identify_two_outliers():
+def test_five_markers_cannot_identify_two_outliers() -> None:
     rng = np.random.default_rng(35)
     draws = draw_poses(rng, 10, (1.7, 10.0), 0.05, markers=5)
     pixels = corrupt(rng, draws, 2)
@@ -128,7 +131,7 @@ def test_five_markers_cannot_identify_two_outliers():
         assert right, "a pose that claims to agree with wrong markers"
 
 
-def order_of_table_2(method, sigma_px, count, seed):
+def order_of_table_2(method: Callable[..., Any], sigma_px: float, count: int, seed: int) -> list[float]:
     """Mean position errors with 5, 7 and 8 markers, one of them wrong in one eye."""
     means = []
     for markers in (5, 7, 8):
@@ -138,7 +141,7 @@ def order_of_table_2(method, sigma_px, count, seed):
     return means
 
 
-def test_table_2_of_the_paper_has_its_order():
+def test_table_2_of_the_paper_has_its_order() -> None:
     five, seven, eight = order_of_table_2(paper, 0.35, 300, 36)
     assert eight < seven < five
 
@@ -147,12 +150,12 @@ def test_table_2_of_the_paper_has_its_order():
 @pytest.mark.parametrize("sigma_px", [0.1, 0.2, 0.35])
 # Errors of the paper's method have long tails: of 1,500 draws the ratio of means, 0.95, has a deviation of 0.03.
 @pytest.mark.parametrize(("method", "count"), [(paper, 15_000), (joint_robust, 1500)])
-def test_table_2_has_its_order_at_any_noise(method, count, sigma_px):
+def test_table_2_has_its_order_at_any_noise(method: str, count: int, sigma_px: float) -> None:
     five, seven, eight = order_of_table_2(method, sigma_px, count, 37)
     assert eight < seven < five
 
 
-def test_the_literal_score_is_zero_for_every_candidate():
+def test_the_literal_score_is_zero_for_every_candidate() -> None:
     draws = draw_poses(np.random.default_rng(38), 20, (1.7, 10.0), 0.3)
     for index in range(20):
         observation = draws.observation(index)
@@ -162,7 +165,7 @@ def test_the_literal_score_is_zero_for_every_candidate():
         assert scores.max() == 0
 
 
-def test_the_literal_score_is_much_worse_than_full_reprojection():
+def test_the_literal_score_is_much_worse_than_full_reprojection() -> None:
     rng = np.random.default_rng(39)
     draws = draw_poses(rng, 150, (1.7, 10.0), 0.1)
     wrong = corrupt(rng, draws, 1)
@@ -177,7 +180,7 @@ def test_the_literal_score_is_much_worse_than_full_reprojection():
 @pytest.mark.parametrize(
     ("reading", "published_mm"), [("own_vdiff", 29.0), ("center_per_eye", 13.3), ("full_reproj", 12.8)]
 )
-def test_other_readings_choose_candidates(reading, published_mm):
+def test_other_readings_choose_candidates(reading: str, published_mm: float) -> None:
     rng = np.random.default_rng(40)
     draws = draw_poses(rng, 200, (1.7, 10.0), 0.1)
     mean_mm = 1e3 * distances_m(paper_reading(reading), draws, corrupt(rng, draws, 1)).mean()
@@ -186,7 +189,7 @@ def test_other_readings_choose_candidates(reading, published_mm):
     assert mean_mm == pytest.approx(published_mm, rel=0.35)
 
 
-def test_the_literal_method_is_deterministic():
+def test_the_literal_method_is_deterministic() -> None:
     draws = draw_poses(np.random.default_rng(41), 3, 5.0, 0.1)
     for index in range(3):
         first, second = (paper_literal(draws.observation(index)).left_from_drogue.as_matrix() for _ in range(2))
@@ -194,12 +197,12 @@ def test_the_literal_method_is_deterministic():
         np.testing.assert_allclose(first, second, atol=1e-9)
 
 
-def test_unknown_reading():
+def test_unknown_reading() -> None:
     with pytest.raises(ValueError, match="e_v: must be one of literal, own_vdiff, center_per_eye, full_reproj"):
         paper_reading("best")
 
 
-def test_a_wrong_ring_radius_makes_no_outliers():
+def test_a_wrong_ring_radius_makes_no_outliers() -> None:
     draws = draw_poses(np.random.default_rng(43), 20, 2.0, 0.02, ring_sigma_m=5e-4)
     for index in range(20):
         built = draws.observation(index)

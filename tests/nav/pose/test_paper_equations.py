@@ -22,11 +22,11 @@ MARKERS = np.column_stack([np.array(even_ring(8, RING_M)), np.zeros(8)])
 WIDE = [i for i, t in enumerate(combinations(range(8), 3)) if sorted(np.diff([*t, t[0] + 8])) == [2, 3, 3]]
 
 
-def markers_m(*pose) -> np.ndarray:
+def markers_m(*pose: float) -> np.ndarray:
     return make_pose(*pose).apply(MARKERS)
 
 
-def test_eq_4_as_printed_is_no_plane_through_the_origin():
+def test_eq_4_as_printed_is_no_plane_through_the_origin() -> None:
     origin = np.array([0.06, 0.1, 5.0])
     (x1, y1, z1), (x2, y2, z2) = markers_m(*origin, 8, -6, 5)[:2]
     right_side = x2**2 + y2**2 + z2**2 - x1**2 - y1**2 - z1**2
@@ -37,14 +37,14 @@ def test_eq_4_as_printed_is_no_plane_through_the_origin():
     assert sideways + 2 * (z2 + z1) * origin[2] - right_side == pytest.approx(4 * z1 * origin[2])
 
 
-def test_eq_5_has_rank_2():
+def test_eq_5_has_rank_2() -> None:
     p1, p2, p3 = markers_m(0.06, 0.1, 5, 8, -6, 5)[[0, 3, 5]]
     rows = np.stack([p2 - p1, p3 - p1, p3 - p2])
     np.testing.assert_allclose(rows[2], rows[1] - rows[0], atol=1e-15)
     assert np.linalg.matrix_rank(rows) == 2
 
 
-def test_eq_8_as_printed_is_no_rotation():
+def test_eq_8_as_printed_is_no_rotation() -> None:
     corrected = rotation_from_angles(0.1, 0.2, 0.3)
     # The reference number has seven digits.
     assert corrected[0, 0] == pytest.approx(0.9421547, abs=5e-8)
@@ -54,13 +54,13 @@ def test_eq_8_as_printed_is_no_rotation():
     assert np.abs(printed @ printed.T - np.eye(3)).max() > 0.8
 
 
-def test_eqs_10_and_11_need_the_sign_of_the_normal():
+def test_eqs_10_and_11_need_the_sign_of_the_normal() -> None:
     normal = rotation_from_angles(0.1, 0.2, 0.3)[:, 2]
     assert np.arcsin(-normal[1]) == pytest.approx(0.1)
     assert np.arcsin(normal[1]) == pytest.approx(-0.1)
 
 
-def test_eq_12_as_printed_has_no_disparity():
+def test_eq_12_as_printed_has_no_disparity() -> None:
     points = markers_m(0.3, -0.2, 8, 8, -6, 5)
     left, right = (points @ RIG.camera.matrix().T / points[:, 2:] for _ in EYES)
     assert np.abs(left - right).max() == 0
@@ -70,14 +70,14 @@ def test_eq_12_as_printed_has_no_disparity():
     np.testing.assert_allclose(seen[0][:, 0] - seen[1][:, 0], disparity, atol=1e-11)
 
 
-def test_eq_13_is_zero_wherever_the_point_is():
+def test_eq_13_is_zero_wherever_the_point_is() -> None:
     points = np.random.default_rng(1).uniform([-2, -1.5, 1.7], [2, 1.5, 40], (1000, 3))
     rows = [RIG.project(points, eye)[:, 1] for eye in EYES]
     # So its derivative by the depth, by which eq. 16 divides, is zero too.
     assert np.abs(rows[0] - rows[1]).max() == 0
 
 
-def test_eq_13_with_unequal_cameras_measures_their_calibration():
+def test_eq_13_with_unequal_cameras_measures_their_calibration() -> None:
     points = np.random.default_rng(2).uniform([-2, -1.5, 1.7], [2, 1.5, 40], (1000, 3))
     longer = replace(RIG.camera, fy_px=1.001 * RIG.camera.fy_px, cy_px=RIG.camera.cy_px + 0.5)
     difference = longer.project(points)[:, 1] - RIG.camera.project(points)[:, 1]
@@ -85,7 +85,7 @@ def test_eq_13_with_unequal_cameras_measures_their_calibration():
     np.testing.assert_allclose(difference, mismatch, atol=1e-9)
 
 
-def test_eqs_14_and_15_as_printed_do_not_hold_back_a_wrong_marker():
+def test_eqs_14_and_15_as_printed_do_not_hold_back_a_wrong_marker() -> None:
     residual_px = np.array([10.0, 20.0])
     energy = residual_px**2 / 2
     # Huber's law with threshold 1, linear in the energy, is quadratic in the residual like plain least squares.
@@ -96,14 +96,14 @@ def test_eqs_14_and_15_as_printed_do_not_hold_back_a_wrong_marker():
 
 
 @pytest.mark.parametrize(("power", "rate"), [(2, 1 / 2), (4, 3 / 4)])
-def test_eq_16_creeps_where_the_least_loss_is_zero(power, rate):
+def test_eq_16_creeps_where_the_least_loss_is_zero(power: int, rate: float) -> None:
     z = 1.0
     for step in range(1, 9):
         z -= (z**power / power) / z ** (power - 1)
         assert z == pytest.approx(rate**step)
 
 
-def test_eq_16_jumps_away_where_the_least_loss_is_not_zero():
+def test_eq_16_jumps_away_where_the_least_loss_is_not_zero() -> None:
     least, z, largest_after_arrival, arrived = 1e-3, 1.0, 0.0, False
     for _ in range(50):
         z -= (z**2 / 2 + least) / z
@@ -114,7 +114,7 @@ def test_eq_16_jumps_away_where_the_least_loss_is_not_zero():
     assert largest_after_arrival > 0.05
 
 
-def test_the_three_spheres_touch():
+def test_the_three_spheres_touch() -> None:
     circles = triple_circles(markers_m(0.3, -0.2, 8, 8, -6, 5))
     assert len(circles.radii2_m2) == 56
     # Squares of 8 m in float64, divided by the sine of the narrowest triple.
@@ -123,7 +123,7 @@ def test_the_three_spheres_touch():
 
 
 @pytest.mark.parametrize(("z_m", "share"), [(2.0, 0.51), (10.0, 0.90)])
-def test_noise_leaves_no_root_or_a_distant_one(z_m, share):
+def test_noise_leaves_no_root_or_a_distant_one(z_m: float, share: float) -> None:
     rng = np.random.default_rng(1)
     missing, axial_mm = [], []
     for _ in range(500):
@@ -137,7 +137,7 @@ def test_noise_leaves_no_root_or_a_distant_one(z_m, share):
     assert np.percentile(axial_mm, 95) == pytest.approx(13, rel=0.15)
 
 
-def test_markers_of_10_cm_radius_do_not_fit_inside_the_rim():
+def test_markers_of_10_cm_radius_do_not_fit_inside_the_rim() -> None:
     rim_radius_m, marker_radius_m = 0.33, 0.10
     places = np.array(even_ring(8, rim_radius_m - marker_radius_m))
     assert np.linalg.norm(places[1] - places[0]) == pytest.approx(0.176, abs=5e-4)
@@ -165,7 +165,7 @@ def mean_errors_mm(markers: int, bad: bool) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(("markers", "least_loss"), [(5, 1.5), (8, 1.0)])
-def test_the_step_in_depth_brings_little_and_costs_where_a_marker_is_wrong(markers, least_loss):
+def test_the_step_in_depth_brings_little_and_costs_where_a_marker_is_wrong(markers: int, least_loss: float) -> None:
     with_step, without = mean_errors_mm(markers, bad=False)
     # Ratios of 1.17 and 0.92 over 1500 poses, of 5 and of 8 markers; 0.07 over these 400, by bootstrap, three of it.
     assert 0.92 - 0.21 < with_step / without < 1.17 + 0.21

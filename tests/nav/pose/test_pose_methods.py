@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +35,7 @@ number = 7
 
 
 @pytest.fixture
-def install(tmp_path, monkeypatch):
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Install a tiny distribution whose entry points are the given lines."""
 
     def write(lines: str, name: str = "other_estimators") -> None:
@@ -50,13 +52,13 @@ def install(tmp_path, monkeypatch):
     return write
 
 
-def test_built_in_methods():
+def test_built_in_methods() -> None:
     assert list(METHODS) == NAMES.split()
     assert names_of_runner() == method_names()
     assert method_names()[: len(METHODS)] == tuple(METHODS)
 
 
-def test_a_method_of_another_package(install):
+def test_a_method_of_another_package(install: Callable[..., Any]) -> None:
     install("never = other_estimators:never")
     assert method_names() == (*METHODS, "never")
     observation = draw_poses(np.random.default_rng(81), 1, 5.0, 0.1).observation(0)
@@ -65,13 +67,13 @@ def test_a_method_of_another_package(install):
     assert answer.reason == "never sure"
 
 
-def test_a_name_that_is_taken(install):
+def test_a_name_that_is_taken(install: Callable[..., Any]) -> None:
     install("joint = other_estimators:never")
     with pytest.raises(ValueError, match="other_estimators:never registers 'joint', which is taken"):
         method_names()
 
 
-def test_two_packages_with_one_name(install):
+def test_two_packages_with_one_name(install: Callable[..., Any]) -> None:
     install("never = other_estimators:never")
     install("never = more_estimators:never", "more_estimators")
     with pytest.raises(ValueError, match="registers 'never', which is taken"):
@@ -86,7 +88,7 @@ def test_two_packages_with_one_name(install):
         ("broken = other_estimators:number", "method: 'broken' must be a function, got int"),
     ],
 )
-def test_a_method_that_cannot_be_loaded(install, line, fault):
+def test_a_method_that_cannot_be_loaded(install: Callable[..., Any], line: str, fault: str) -> None:
     install(line)
     # It is listed, because listing loads nothing.
     assert "broken" in method_names()
@@ -94,14 +96,14 @@ def test_a_method_that_cannot_be_loaded(install, line, fault):
         pose_method("broken")
 
 
-def test_a_method_that_returns_another_type(install):
+def test_a_method_that_returns_another_type(install: Callable[..., Any]) -> None:
     install("nothing = other_estimators:nothing")
     observation = draw_poses(np.random.default_rng(82), 1, 5.0, 0.1).observation(0)
     with pytest.raises(ValueError, match="method: 'nothing' must answer Solution or NoFixReason, got NoneType"):
         pose_method("nothing")(observation)
 
 
-def test_an_unknown_name_lists_all(install):
+def test_an_unknown_name_lists_all(install: Callable[..., Any]) -> None:
     install("never = other_estimators:never")
     with pytest.raises(ValueError, match=r"no pose method named 'best'; there are paper, .*, constant, never"):
         pose_method("best")

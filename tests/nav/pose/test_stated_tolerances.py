@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from nav.pose.adjustment import AdjustmentState, linearise
-from nav.pose.features import stack_features, whiten, whiten_with_displacement
+from nav.pose.features import Features, stack_features, whiten, whiten_with_displacement
 from nav.pose.joint import joint_hub, joint_robust
 from nav.pose.joint_batch import solve_joint_batch
 from nav.pose.pose_method import EXACT, StatedTolerances
 from nav.pose.pose_methods import METHODS
-from tests.support.painted_pairs import draw_poses
+from tests.support.painted_pairs import Draws, draw_poses
 
 STATED = StatedTolerances(
     ring_radius_m=5e-4, ellipticity=0.002, placement_m=3e-4, hub_lateral_m=1e-3, disparity_px=0.19
@@ -24,19 +24,19 @@ EACH = [
 ]
 
 
-def features_of(draws, tolerances, eyes: int = 2):
+def features_of(draws: Draws, tolerances: StatedTolerances, eyes: int = 2) -> Features:
     pixels = draws.pixels_px[:, :eyes]
     return stack_features(draws.rig, draws.layout, pixels, draws.sigma_px**2 * np.eye(2), tolerances)
 
 
-def state_of(draws, features, departures):
+def state_of(draws: Draws, features: Features, departures: float | np.ndarray) -> AdjustmentState:
     rotations = np.array([place.rotation for place in draws.places])
     translations = np.array([place.translation_m for place in draws.places])
     return AdjustmentState(rotations, translations, departures * np.ones((len(rotations), features.departures)))
 
 
 @pytest.mark.parametrize("eyes", [1, 2])
-def test_a_displaced_feature_has_the_joint_covariance_of_both_eyes(eyes):
+def test_a_displaced_feature_has_the_joint_covariance_of_both_eyes(eyes: int) -> None:
     draws = draw_poses(np.random.default_rng(60), 4, (1.7, 10.0), 0.1)
     rng = np.random.default_rng(61)
     roots = rng.normal(0, 0.1, (4, eyes, 10, 2, 2))
@@ -63,7 +63,7 @@ def test_a_displaced_feature_has_the_joint_covariance_of_both_eyes(eyes):
 
 
 @pytest.mark.parametrize("tolerances", [STATED, *EACH])
-def test_derivatives_are_those_of_the_residuals(tolerances):
+def test_derivatives_are_those_of_the_residuals(tolerances: StatedTolerances) -> None:
     draws = draw_poses(np.random.default_rng(62), 5, (1.7, 10.0), 0.1)
     features = features_of(draws, tolerances)
     step = 1e-4
@@ -76,7 +76,7 @@ def test_derivatives_are_those_of_the_residuals(tolerances):
         np.testing.assert_allclose(now, slope, atol=2e-3 * max(1.0, np.abs(slope).max()))
 
 
-def test_a_marker_in_one_eye_has_its_own_covariance():
+def test_a_marker_in_one_eye_has_its_own_covariance() -> None:
     draws = draw_poses(np.random.default_rng(63), 1, 3.0, 0.1)
     for lost in (0, 1):
         pixels = draws.pixels_px.copy()
@@ -88,7 +88,7 @@ def test_a_marker_in_one_eye_has_its_own_covariance():
         np.testing.assert_allclose(two.measured[2:, 0, 1 - lost, 2], one.measured[2:, 0, 0, 2], rtol=0.01)
 
 
-def toleranced(draws, rng, tolerances):
+def toleranced(draws: Draws, rng: np.random.Generator, tolerances: StatedTolerances) -> np.ndarray:
     """Pixels of drogues and rigs that depart from the nominal, to first order in the departures."""
     features = features_of(draws, replace(tolerances, placement_m=0.0))
     nominal = linearise(features, state_of(draws, features, 0.0))
@@ -103,7 +103,7 @@ def toleranced(draws, rng, tolerances):
 
 @pytest.mark.parametrize("tolerances", [STATED, *EACH])
 @pytest.mark.parametrize("features", [8, 10])
-def test_covariances_include_the_stated_tolerances(tolerances, features):
+def test_covariances_include_the_stated_tolerances(tolerances: StatedTolerances, features: int) -> None:
     rng = np.random.default_rng(64)
     draws = draw_poses(rng, 120, (1.7, 6.0), 0.03, tilt_deg=(6.0, 10.0))
     pixels = toleranced(draws, rng, tolerances)[:, :, :features]
@@ -119,7 +119,7 @@ def test_covariances_include_the_stated_tolerances(tolerances, features):
     assert np.mean(squares) == pytest.approx(1.0, abs=0.19)
 
 
-def test_one_eye_has_no_disparity_tolerance():
+def test_one_eye_has_no_disparity_tolerance() -> None:
     draws = draw_poses(np.random.default_rng(65), 3, 5.0, 0.1)
     for index in range(3):
         exact, told = (
@@ -130,7 +130,7 @@ def test_one_eye_has_no_disparity_tolerance():
         np.testing.assert_allclose(exact.covariance, told.covariance, rtol=1e-6, atol=1e-15)
 
 
-def test_a_displaced_marker_is_no_outlier():
+def test_a_displaced_marker_is_no_outlier() -> None:
     rng = np.random.default_rng(66)
     draws = draw_poses(rng, 5, 2.0, 0.02)
     pixels = toleranced(draws, rng, STATED)
@@ -144,7 +144,7 @@ def test_a_displaced_marker_is_no_outlier():
         assert np.flatnonzero(~wrong.used.all(axis=0)).tolist() == [3]
 
 
-def test_tiny_tolerances_change_nothing():
+def test_tiny_tolerances_change_nothing() -> None:
     draws = draw_poses(np.random.default_rng(67), 3, 5.0, 0.1)
     tiny = StatedTolerances(1e-9, 1e-9, 1e-9, 1e-9, 1e-9)
     for index in range(3):

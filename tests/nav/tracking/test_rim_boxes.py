@@ -17,17 +17,17 @@ CAMERA = RIG.camera
 RIM_RADIUS_M = 0.3
 
 
-def facing(x_m, z_m):
+def facing(x_m: float, z_m: float) -> RigidTransform:
     """A drogue that faces the left eye's image plane."""
     return RigidTransform(np.eye(3), np.array([x_m, 0.0, z_m]))
 
 
-def x_at(edge_px, z_m):
+def x_at(edge_px: float, z_m: float) -> float:
     """Where something stands that the left eye sees in a column. [m]"""
     return (edge_px - CAMERA.cx_px) / CAMERA.fx_px * z_m
 
 
-def test_a_rim_that_faces_the_camera_has_a_square_box():
+def test_a_rim_that_faces_the_camera_has_a_square_box() -> None:
     found = rim_boxes(RIG, RIM_RADIUS_M, facing(0.06, 8.0))
     radius_px = CAMERA.fx_px * RIM_RADIUS_M / 8.0
     for eye, eye_x_m in (("left", 0.0), ("right", RIG.baseline_m)):
@@ -38,7 +38,7 @@ def test_a_rim_that_faces_the_camera_has_a_square_box():
 
 
 @pytest.mark.parametrize(("beyond_px", "is_seen"), [(-1.0, True), (1.0, False)])
-def test_a_rim_of_which_less_than_half_is_in_the_image_has_no_box(beyond_px, is_seen):
+def test_a_rim_of_which_less_than_half_is_in_the_image_has_no_box(beyond_px: float, is_seen: bool) -> None:
     # The right eye sees it further left.
     found = rim_boxes(RIG, RIM_RADIUS_M, facing(x_at(CAMERA.width_px - 0.5 + beyond_px, 8.0), 8.0))
     assert (found.left is not None) is is_seen
@@ -46,12 +46,12 @@ def test_a_rim_of_which_less_than_half_is_in_the_image_has_no_box(beyond_px, is_
 
 
 @pytest.mark.parametrize("place", [facing(0.0, -8.0), facing(0.0, 0.0), facing(0.0, 5000.0)])
-def test_a_rim_behind_the_eyes_or_too_far_away_has_no_box(place):
+def test_a_rim_behind_the_eyes_or_too_far_away_has_no_box(place: RigidTransform) -> None:
     found = rim_boxes(RIG, RIM_RADIUS_M, place)
     assert (found.left, found.right) == (None, None)
 
 
-def test_a_rim_where_the_lens_polynomial_overflows_has_no_box():
+def test_a_rim_where_the_lens_polynomial_overflows_has_no_box() -> None:
     lens = Lens(CAMERA, BrownConrady(k1=0.1, k3=0.1))
     rig = replace(RIG, lenses=(lens, lens))
     with np.errstate(over="ignore", invalid="ignore"):

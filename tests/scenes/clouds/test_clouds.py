@@ -19,7 +19,7 @@ TWO_LAYERS = {
 }
 
 
-def environment(**changes):
+def environment(**changes: Mist | float | tuple[CloudLayer]) -> Environment:
     values = {
         "sun_elevation_deg": 40.0,
         "sun_azimuth_deg": 60.0,
@@ -32,7 +32,7 @@ def environment(**changes):
     return Environment.model_validate(values | changes)
 
 
-def layer(**changes):
+def layer(**changes: float | str) -> CloudLayer:
     values = {
         "height_above_camera_m": 1000.0,
         "cover_fraction": 0.4,
@@ -43,7 +43,7 @@ def layer(**changes):
     return CloudLayer.model_validate(values | changes)
 
 
-def upwards(count=128, half_width=1.2, sign=1.0):
+def upwards(count: int = 128, half_width: float = 1.2, sign: float = 1.0) -> np.ndarray:
     """(count, count, 3) directions around the zenith or nadir."""
     x, y = np.meshgrid(np.linspace(-half_width, half_width, count), np.linspace(-half_width, half_width, count))
     rays = np.stack([x, y, np.full_like(x, sign)], axis=-1)
@@ -51,7 +51,7 @@ def upwards(count=128, half_width=1.2, sign=1.0):
 
 
 @pytest.mark.parametrize("cover", [0.2, 0.5])
-def test_cover_is_the_share_of_the_plan(cover):
+def test_cover_is_the_share_of_the_plan(cover: float) -> None:
     shares = []
     for seed in range(6):
         cloud = layer(cover_fraction=cover, texture_seed=seed)
@@ -63,7 +63,7 @@ def test_cover_is_the_share_of_the_plan(cover):
     assert np.mean(shares) == pytest.approx(cover, abs=0.1)
 
 
-def test_no_cloud_without_cover_and_no_sky_under_an_overcast():
+def test_no_cloud_without_cover_and_no_sky_under_an_overcast() -> None:
     rays = upwards()
     for kind in ("cumulus", "stratus"):
         clear = EnvironmentRadiance(environment()).radiance(rays)
@@ -73,7 +73,7 @@ def test_no_cloud_without_cover_and_no_sky_under_an_overcast():
     assert opacity_towards(thick, direction_from_angles(40.0, 60.0)) > 0.99
 
 
-def test_cumulus_is_darker_below_than_on_its_sunny_side():
+def test_cumulus_is_darker_below_than_on_its_sunny_side() -> None:
     """Seen from above clouds send back most of the sunlight, seen from below they let a part of it through."""
     over, under = (
         luminance(
@@ -90,7 +90,7 @@ def test_cumulus_is_darker_below_than_on_its_sunny_side():
     assert np.median(under) < 0.6 * np.percentile(over, 90)
 
 
-def test_light_under_an_overcast_is_what_two_streams_let_through():
+def test_light_under_an_overcast_is_what_two_streams_let_through() -> None:
     """Level illuminance below against that above: 1 / (1 + 0.11 depth) of it, and none of it from the sun itself."""
     stratus = layer(kind="stratus", cover_fraction=1.0, optical_depth=30.0, thickness_m=400.0)
     open_sky, under = EnvironmentRadiance(environment()), EnvironmentRadiance(environment(clouds=(stratus,)))
@@ -101,7 +101,7 @@ def test_light_under_an_overcast_is_what_two_streams_let_through():
     assert share == pytest.approx(diffuse_transmission(stratus), rel=0.35)
 
 
-def test_edges_towards_the_sun_are_lined_with_silver():
+def test_edges_towards_the_sun_are_lined_with_silver() -> None:
     """Against the sun thin edges outshine the body of a cloud; with the sun in the back they do not."""
     x, y = np.meshgrid(np.linspace(-0.2, 0.2, 160), np.linspace(0.1, 0.4, 120))
     rays = np.stack([np.ones_like(x), -x, y], axis=-1)
@@ -118,7 +118,7 @@ def test_edges_towards_the_sun_are_lined_with_silver():
     assert ratios[0] > 1.5 and ratios[1] < 1.2
 
 
-def test_coarse_march_agrees_with_every_ray():
+def test_coarse_march_agrees_with_every_ray() -> None:
     """A large picture is seen on every second ray and marched on every fourth but for edges."""
     around = EnvironmentRadiance(environment(clouds=(layer(),)))
     rays = upwards(count=320, half_width=0.2)
@@ -129,7 +129,7 @@ def test_coarse_march_agrees_with_every_ray():
     assert large.mean() == pytest.approx(parts.mean(), rel=0.01)
 
 
-def test_mist_hides_sun_and_sky_and_thins_out_in_the_limit():
+def test_mist_hides_sun_and_sky_and_thins_out_in_the_limit() -> None:
     rays = upwards()
     clear = EnvironmentRadiance(environment())
     thin = EnvironmentRadiance(environment(mist=Mist(visibility_m=100_000, above_m=0.1, below_m=0.1)))
@@ -147,7 +147,7 @@ def test_mist_hides_sun_and_sky_and_thins_out_in_the_limit():
 
 @pytest.mark.parametrize("kind", ["cumulus", "stratus", "cirrus"])
 @pytest.mark.parametrize("height_m", [800.0, -800.0])
-def test_finite_everywhere_at_any_hour(kind, height_m):
+def test_finite_everywhere_at_any_hour(kind: str, height_m: float) -> None:
     rng = np.random.default_rng(3)
     rays = rng.standard_normal((20, 20, 3))
     rays[0, 0] = [1.0, 0.0, 0.0]
@@ -161,7 +161,7 @@ def test_finite_everywhere_at_any_hour(kind, height_m):
         assert np.isfinite(seen).all() and (seen > 0).all()
 
 
-def test_recipes_with_one_layer_still_read_and_draw_the_same_sky():
+def test_recipes_with_one_layer_still_read_and_draw_the_same_sky() -> None:
     base: RecipeTable = {
         "name": "weather-test",
         "frames": {"count": 10, "scenes": 10},
@@ -179,6 +179,6 @@ def test_recipes_with_one_layer_still_read_and_draw_the_same_sky():
     assert abs(sum(mist is not None for mist in mists) - 20) < 13
 
 
-def test_layers_the_camera_would_touch_are_refused():
+def test_layers_the_camera_would_touch_are_refused() -> None:
     with pytest.raises(ValueError, match="inside, use mist"):
         layer(height_above_camera_m=50.0)

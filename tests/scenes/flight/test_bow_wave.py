@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.sequence_ranges import Follower, Receiver, SequenceRanges
+from datasets_manifest.recipe.sequence_ranges import Follower, HoseParameters, Receiver, SequenceRanges
 from scenes.flight.airflow import GUST_PERIOD_S, bow_wave
 from scenes.flight.trajectory import SimulationInputs, simulate
 
 
-def test_bow_wave_of_a_half_body():
+def test_bow_wave_of_a_half_body() -> None:
     source = np.zeros((3, 1))
     points = np.array([[[0.9]], [[0.0]], [[0.0]]])
     # V a^2 / 4 r^2 by hand: 120 x 0.25 / 4 / 0.81 = 9.26 m/s, straight away from the source.
@@ -21,7 +21,7 @@ def test_bow_wave_of_a_half_body():
 
 
 @pytest.mark.parametrize(("radius_m", "beside_and_behind_m", "abeam_m"), [(0.5, 0.19, 0.34), (0.15, 0.02, 0.05)])
-def test_a_nose_pushes_the_drogue_away(radius_m, beside_and_behind_m, abeam_m):
+def test_a_nose_pushes_the_drogue_away(radius_m: float, beside_and_behind_m: float, abeam_m: float) -> None:
     """A nose 0.9 m to the left of the hanging drogue: as far behind it, as that of a receiver, or level with it."""
     hose = SequenceRanges(frames_per_sequence=1, receiver=Receiver(manoeuvres=("station",))).hose
     samples = round(18 / GUST_PERIOD_S)
@@ -33,7 +33,7 @@ def test_a_nose_pushes_the_drogue_away(radius_m, beside_and_behind_m, abeam_m):
         assert (way[-round(3.9 / GUST_PERIOD_S) :, 1] - way[0, 1]).mean() == pytest.approx(pushed_m, abs=0.008)
 
 
-def simulate_beside(hose, radius_m, inwards_m, source_m):
+def simulate_beside(hose: HoseParameters, radius_m: float, inwards_m: np.ndarray, source_m: np.ndarray) -> np.ndarray:
     """(T, 3) way of a drogue beside a source that comes in from the left to its place about the hanging drogue."""
     from_drogue = np.zeros((len(inwards_m), 3, 1))
     from_drogue[:, 1, 0] = -inwards_m

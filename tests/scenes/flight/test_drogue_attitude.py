@@ -7,7 +7,7 @@ import numpy as np
 from scenes.flight.hose_dynamics import mouth_directions
 
 
-def test_the_drogue_points_with_a_lag_of_its_own():
+def test_the_drogue_points_with_a_lag_of_its_own() -> None:
     period_s = 0.02
     link = np.tile([1.0, 0.0, 0.0], (100, 1))
     wind = 50.0 * link

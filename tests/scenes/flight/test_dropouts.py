@@ -10,6 +10,8 @@ import pytest
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.recipe import Recipe, load_recipe
 from datasets_manifest.recipe.sequence_ranges import DropoutRanges
+from datasets_manifest.types.appearance import Obstacle
+from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
 from geometry.se3 import log_twist
 from geometry.stereo import EYES
@@ -41,17 +43,17 @@ def recipe(kind: str, **changes: Unpack[RecipeTable]) -> Recipe:
     return build_recipe(change_recipe(BASE, sequence={"losses": {"kinds": [kind]}}), **changes)
 
 
-def event(drawn):
+def event(drawn: Recipe) -> DropoutEvent:
     return sample_dropout(frame_generator(drawn.seed, 0, "loss"), drawn.sequence.losses, 0)
 
 
-def lost(drawn):
+def lost(drawn: Recipe) -> list[int]:
     """Frames of the stretch itself, without coming and going."""
     happens = event(drawn)
     return [k for k in range(FRAMES) if happens.begin_s <= k / 20 <= happens.end_s]
 
 
-def lines_of_sight(frame):
+def lines_of_sight(frame: FrameSpec) -> tuple[np.ndarray, np.ndarray]:
     """(2 N, 3) origins and unit directions from both eyes to all corners of the drogue. [m]"""
     points = frame.left_from_drogue.apply(drogue_hull_m(frame.drogue))
     origins = np.repeat([frame.rig.eye_offset_m(eye) for eye in EYES], len(points), axis=0)
@@ -59,7 +61,7 @@ def lines_of_sight(frame):
     return origins, ways / np.linalg.norm(ways, axis=1, keepdims=True)
 
 
-def clearance_m(bar, origins, directions):
+def clearance_m(bar: Obstacle, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """(N,) distance of lines from a bar's surface; negative where they pierce it. [m]"""
     axis, center = bar.left_from_object.rotation[:, 2], bar.left_from_object.translation_m
     normal = np.cross(directions, axis)
@@ -68,7 +70,7 @@ def clearance_m(bar, origins, directions):
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4, 5])
-def test_a_bar_hides_all_of_the_drogue_and_comes_from_outside_the_picture(seed):
+def test_a_bar_hides_all_of_the_drogue_and_comes_from_outside_the_picture(seed: int) -> None:
     drawn = recipe("occlusion", seed=seed)
     frames = {k: sample_frame(drawn, k) for k in range(FRAMES)}
     for k in lost(drawn):
@@ -91,14 +93,14 @@ def test_a_bar_hides_all_of_the_drogue_and_comes_from_outside_the_picture(seed):
             assert clearance_m(bar, np.tile(flown.rig.eye_offset_m(eye), (4, 1)), rays).min() > -1e-6
 
 
-def bar_at(drawn, time_s):
+def bar_at(drawn: Recipe, time_s: float) -> Obstacle:
     from scenes.flight.sequence import _flight
 
     flight = _flight(drawn.seed, 0, drawn.sequence, drawn.drogue, drawn.pose, drawn.rig.baseline_m)
     return flight._bar.at(time_s, drawn.rig.camera)
 
 
-def test_nothing_else_of_a_sequence_changes_with_a_bar():
+def test_nothing_else_of_a_sequence_changes_with_a_bar() -> None:
     with_bar, without = recipe("occlusion"), recipe("none")
     for k in (0, 10, 16, 39):
         changed = sample_frame(with_bar, k).model_copy(update={"bystanders": (), "loss": None})
@@ -106,7 +108,7 @@ def test_nothing_else_of_a_sequence_changes_with_a_bar():
 
 
 @pytest.mark.parametrize("seed", [2, 3])
-def test_a_turned_receiver_sees_nothing_of_the_drogue_from_the_same_place(seed):
+def test_a_turned_receiver_sees_nothing_of_the_drogue_from_the_same_place(seed: int) -> None:
     drawn, plain = recipe("out-of-view", seed=seed), recipe("none", seed=seed)
     inside = lost(drawn)
     for k in range(0, FRAMES, 3):
@@ -125,7 +127,7 @@ def test_a_turned_receiver_sees_nothing_of_the_drogue_from_the_same_place(seed):
             assert not frame.rig.camera.contains(frame.rig.image(points, eye)).any()
 
 
-def test_the_turn_is_in_the_twists():
+def test_the_turn_is_in_the_twists() -> None:
     drawn = recipe(
         "out-of-view",
         frames={"count": 2000},
@@ -146,7 +148,7 @@ def test_the_turn_is_in_the_twists():
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
-def test_the_sun_comes_beside_the_drogue_and_goes(seed):
+def test_the_sun_comes_beside_the_drogue_and_goes(seed: int) -> None:
     drawn, plain = recipe("glare", seed=seed), recipe("none", seed=seed)
     happens = event(drawn)
     beside = {}
@@ -174,7 +176,7 @@ def test_the_sun_comes_beside_the_drogue_and_goes(seed):
     assert headings[0] == pytest.approx(-headings[1]) and abs(headings[0]) == pytest.approx(happens.sweep_rad)
 
 
-def test_a_formation_that_turns_flies_where_it_heads():
+def test_a_formation_that_turns_flies_where_it_heads() -> None:
     happens = sample_dropout(np.random.default_rng(1), DropoutRanges(kinds=("glare",)), 0)
     time_s, step_s = 2.3, 1e-3
     moved = (
@@ -186,7 +188,7 @@ def test_a_formation_that_turns_flies_where_it_heads():
     np.testing.assert_allclose(moved, 120.0 * np.array([np.cos(heading), np.sin(heading)]), atol=0.05)
 
 
-def test_it_comes_lasts_and_goes_smoothly():
+def test_it_comes_lasts_and_goes_smoothly() -> None:
     happens = DropoutEvent("occlusion", 2.0, 4.0, 0.5, 1, 1.0, 1.0, 0.5, 0.1, 0.2)
     times = np.linspace(0, 6, 6001)
     phase = np.array([happens.phase(time) for time in times])
@@ -198,7 +200,7 @@ def test_it_comes_lasts_and_goes_smoothly():
     assert [happens.is_active(time) for time in (1.4, 1.6, 3.0, 4.4, 4.6)] == [False, True, True, True, False]
 
 
-def test_kinds_come_in_turn_and_draws_do_not_depend_on_them():
+def test_kinds_come_in_turn_and_draws_do_not_depend_on_them() -> None:
     ranges = DropoutRanges(kinds=("occlusion", "none", "glare"))
     drawn = [sample_dropout(frame_generator(1, k, "loss"), ranges, k) for k in range(6)]
     assert [None if one is None else one.kind for one in drawn] == ["occlusion", None, "glare"] * 2
@@ -245,20 +247,20 @@ def bar_recipe(obstacle_distance_m: float, start_m: float) -> Recipe:
     return recipe("occlusion", sequence={"losses": losses, "receiver": receiver})
 
 
-def test_a_bar_as_thick_as_its_distance_is_refused():
+def test_a_bar_as_thick_as_its_distance_is_refused() -> None:
     drawn = bar_recipe(0.4, start_m=2.0)
     with pytest.raises(ValueError, match=r"obstacle_distance_m: a bar that hides the drogue throughout"):
         sample_frame(drawn, 0)
 
 
 @pytest.mark.parametrize(("start_m", "obstacle_m"), [(4.0, 5.0), (4.0, 3.6)])
-def test_a_bar_that_does_not_stand_before_the_drogue_is_refused(start_m, obstacle_m):
+def test_a_bar_that_does_not_stand_before_the_drogue_is_refused(start_m: float, obstacle_m: float) -> None:
     drawn = bar_recipe(obstacle_m, start_m)
     with pytest.raises(ValueError, match=r"sequence.losses.obstacle_distance_m: .* is not in front of all of"):
         sample_frame(drawn, 0)
 
 
-def test_a_sun_below_the_horizon_is_refused():
+def test_a_sun_below_the_horizon_is_refused() -> None:
     low = recipe("glare", pose={"camera_pitch_deg": 5}, sequence={"receiver": {"offset_down_m": 0.9}})
     # The drogue is seen 8.5 degrees below the axis, which is pitched up by 5, and the sun at most 2.8 above it.
     with pytest.raises(ValueError, match=r"sun_offset_deg: the sun beside .* below the horizon"):
@@ -277,7 +279,7 @@ def test_a_turn_must_lose_a_drogue_that_is_beside_the_axis(offset_right_m: list[
     turned(40)
 
 
-def test_recipes_without_losses_do_not_know_of_them():
+def test_recipes_without_losses_do_not_know_of_them() -> None:
     drawn = load_recipe("docking-10m").recipe
     text = drawn.model_dump_json()
     assert not any(word in text for word in ("losses", "in_turn", "scattered_fraction"))
@@ -285,7 +287,7 @@ def test_recipes_without_losses_do_not_know_of_them():
 
 
 @pytest.mark.mitsuba
-def test_records_of_a_hidden_drogue_say_so():
+def test_records_of_a_hidden_drogue_say_so() -> None:
     from labelgen.frame_labels import label_frame
     from labelgen.validation.label_checks import check_against_passes
     from render.camera.sensor import expose

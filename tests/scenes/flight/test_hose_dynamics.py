@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.sequence_ranges import HOSES, Follower
+from datasets_manifest.recipe.sequence_ranges import HOSES, Follower, HoseParameters
 from scenes.flight.airflow import GUST_PERIOD_S, dryden, sample_gusts
 from scenes.flight.hose_dynamics import GRAVITY_M_S2, LINKS, TIME_STEP_S, HoseModel, HoseState
 from scenes.flight.trajectory import SimulationInputs, simulate
@@ -16,13 +16,15 @@ STILL_AIR = FULL_SIZE.model_copy(update={"airspeed_m_s": 0.0})
 POD = np.zeros((3, 1))
 
 
-def stream(hose):
+def stream(hose: HoseParameters) -> np.ndarray:
     air = np.zeros((3, 1, LINKS + 1))
     air[0] = hose.airspeed_m_s
     return air
 
 
-def run(hose, state, seconds, step_s=TIME_STEP_S):
+def run(
+    hose: HoseParameters, state: HoseState, seconds: float, step_s: float = TIME_STEP_S
+) -> tuple[np.ndarray, np.ndarray]:
     """Drogue's places, and energy with velocities at the times of the places, step by step."""
     model, air, places, energies = HoseModel(hose), stream(hose), [], []
     for _ in range(round(seconds / step_s)):
@@ -35,12 +37,12 @@ def run(hose, state, seconds, step_s=TIME_STEP_S):
     return np.array(places), np.array(energies)
 
 
-def longest_error(nodes, hose):
+def longest_error(nodes: np.ndarray, hose: HoseParameters) -> float:
     lengths = np.linalg.norm(np.diff(nodes, axis=-1), axis=-3)
     return np.abs(lengths * LINKS / hose.length_m - 1).max()
 
 
-def turned_sideways(hose, angle_deg):
+def turned_sideways(hose: HoseParameters, angle_deg: float) -> HoseState:
     """The equilibrium turned about the vertical through the pod: a swing that the air pulls back."""
     state, angle = HoseModel(hose).equilibrium(), np.radians(angle_deg)
     x, y = state.nodes_m[0].copy(), state.nodes_m[1].copy()
@@ -48,17 +50,17 @@ def turned_sideways(hose, angle_deg):
     return state
 
 
-def with_a_kick(hose, speed_m_s, at_rest_of=None):
+def with_a_kick(hose: HoseParameters, speed_m_s: float, at_rest_of: HoseParameters | None = None) -> HoseState:
     state = HoseModel(at_rest_of or hose).equilibrium()
     state.velocities_m_s[1, 0] = np.linspace(0, speed_m_s, LINKS + 1)
     return state
 
 
-def zero_crossings_s(values, step_s):
+def zero_crossings_s(values: np.ndarray, step_s: float) -> np.ndarray:
     return np.flatnonzero(values[1:] * values[:-1] < 0) * step_s
 
 
-def test_equilibrium_of_the_full_size_hose():
+def test_equilibrium_of_the_full_size_hose() -> None:
     aft, side, up = HoseModel(FULL_SIZE).equilibrium().nodes_m[:, 0, -1]
     # The project's acceptance values.
     assert aft == pytest.approx(14.2, abs=0.2) and -up == pytest.approx(4.9, abs=0.2) and side == 0
@@ -69,7 +71,7 @@ LIGHT = FULL_SIZE.model_copy(update={"drogue_diameter_m": 0.1, "drogue_mass_kg":
 
 
 @pytest.mark.parametrize("hose", [*HOSES.values(), LIGHT], ids=[*HOSES, "light drogue"])
-def test_equilibrium_stays_at_rest(hose):
+def test_equilibrium_stays_at_rest(hose: HoseParameters) -> None:
     state = HoseModel(hose).equilibrium()
     begun = state.nodes_m.copy()
     run(hose, state, 2.0)
@@ -77,19 +79,19 @@ def test_equilibrium_stays_at_rest(hose):
     np.testing.assert_allclose(state.nodes_m, begun, atol=1e-9)
 
 
-def test_without_wind_the_hose_hangs_down():
+def test_without_wind_the_hose_hangs_down() -> None:
     nodes = HoseModel(STILL_AIR).equilibrium().nodes_m[:, 0]
     np.testing.assert_allclose(nodes, [[0.0], [0.0], [-1.0]] * np.linspace(0, 15, LINKS + 1), atol=1e-12)
 
 
-def test_free_lateral_period():
+def test_free_lateral_period() -> None:
     places, _ = run(FULL_SIZE, turned_sideways(FULL_SIZE, 3.0), 16.5)
     crossings = zero_crossings_s(places[:, 1], TIME_STEP_S)
     # The project's acceptance value.
     assert 2 * np.diff(crossings).mean() == pytest.approx(3.9, abs=0.2)
 
 
-def test_a_heavy_drogue_on_a_light_hose_is_a_pendulum():
+def test_a_heavy_drogue_on_a_light_hose_is_a_pendulum() -> None:
     hose = VACUUM.model_copy(update={"mass_per_length_kg_m": 0.05, "airspeed_m_s": 0.0, "length_m": 4.0})
     places, _ = run(hose, with_a_kick(hose, 0.05), 20.0, step_s=0.001)
     period_s = 2 * np.diff(zero_crossings_s(places[1:, 1], 0.001)).mean()
@@ -99,7 +101,7 @@ def test_a_heavy_drogue_on_a_light_hose_is_a_pendulum():
     assert period_s == pytest.approx(closed_s, rel=3e-4)
 
 
-def test_energy_is_kept_in_vacuum():
+def test_energy_is_kept_in_vacuum() -> None:
     # A kick that whirls the whole hose about; its kinetic energy is the scale.
     swing = VACUUM.model_copy(update={"airspeed_m_s": 0.0})
     state = with_a_kick(swing, 6.0)
@@ -109,7 +111,7 @@ def test_energy_is_kept_in_vacuum():
     assert np.ptp(energies[1:]) < 1e-5 * kinetic_j
 
 
-def test_energy_does_not_grow_without_wind():
+def test_energy_does_not_grow_without_wind() -> None:
     # From the slant of flight at 120 m/s, which in still air is a fall with whips.
     _, energies = run(STILL_AIR, with_a_kick(STILL_AIR, 3.0, at_rest_of=FULL_SIZE), 12.0)
     # A step may gain what a step loses to drag, never more: far below a millionth of the energy.
@@ -117,7 +119,7 @@ def test_energy_does_not_grow_without_wind():
     assert energies[-1] < energies[0] - 1000
 
 
-def gusty(severity, seconds, seed=3, body_radius_m=0.0):
+def gusty(severity: str, seconds: float, seed: int = 3, body_radius_m: float = 0.0) -> SimulationInputs:
     samples = round(seconds / GUST_PERIOD_S)
     gusts = sample_gusts(
         np.random.default_rng(seed), dryden(severity, FULL_SIZE.turbulence_altitude_m), 120.0, (samples, 1)
@@ -129,7 +131,7 @@ def gusty(severity, seconds, seed=3, body_radius_m=0.0):
 
 
 @pytest.mark.parametrize("case", ["severe", "fall"])
-def test_links_keep_their_lengths(case):
+def test_links_keep_their_lengths(case: str) -> None:
     if case == "severe":
         nodes = simulate(FULL_SIZE, gusty("severe", 20.0)).nodes_m
     else:
@@ -143,14 +145,14 @@ def test_links_keep_their_lengths(case):
     assert longest_error(nodes, FULL_SIZE) < 1e-4
 
 
-def test_half_the_time_step_gives_the_same_trajectory():
+def test_half_the_time_step_gives_the_same_trajectory() -> None:
     around = gusty("moderate", 20.0, body_radius_m=0.5)
     coarse, fine = (simulate(FULL_SIZE, around, time_step_s=step_s).nodes_m[:, :, 0, -1] for step_s in (0.002, 0.001))
     # The project's acceptance value, against how far the drogue moves.
     assert np.linalg.norm(coarse - fine, axis=1).max() < 0.01 * np.ptp(coarse, axis=0).max()
 
 
-def test_sequences_side_by_side_are_those_alone():
+def test_sequences_side_by_side_are_those_alone() -> None:
     around = gusty("moderate", 4.0)
     twice = SimulationInputs(
         np.repeat(around.gusts_m_s, 2, axis=2),
@@ -168,7 +170,7 @@ def test_sequences_side_by_side_are_those_alone():
         np.testing.assert_allclose(both.eye_m[..., sequence], alone.eye_m[..., 0], atol=1e-9)
 
 
-def test_a_released_hose_begins_where_it_is_let_go():
+def test_a_released_hose_begins_where_it_is_let_go() -> None:
     place = np.array([9.0, 6.0, -5.0])
     nodes = simulate(FULL_SIZE, gusty("none", 0.1), release_m=place).nodes_m
     np.testing.assert_allclose(nodes[0, :, 0, -1], place, atol=1e-9)
@@ -177,7 +179,7 @@ def test_a_released_hose_begins_where_it_is_let_go():
     assert nodes[0, 2, 0, LINKS // 2] < place[2] / 2
 
 
-def test_a_hose_that_does_not_reach_is_refused():
+def test_a_hose_that_does_not_reach_is_refused() -> None:
     with pytest.raises(ValueError, match=r"release_m: a hose of 15 m cannot hang .* 16 m away"):
         simulate(FULL_SIZE, gusty("none", 0.1), release_m=np.array([16.0, 0.0, 0.0]))
     with pytest.raises(ValueError, match=r"hose.mass_per_length_kg_m: .* make it heavier"):
@@ -191,7 +193,7 @@ def test_a_hose_that_does_not_reach_is_refused():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("severity", "sd_m"), [("light", 0.30), ("moderate", 0.60), ("severe", 1.25)])
-def test_drogue_swings_as_far_as_it_should(severity, sd_m):
+def test_drogue_swings_as_far_as_it_should(severity: str, sd_m: float) -> None:
     sequences, seconds, settling_s = 20, 130.0, 20.0
     samples = round(seconds / GUST_PERIOD_S)
     gusts = sample_gusts(

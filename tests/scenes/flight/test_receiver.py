@@ -9,7 +9,7 @@ from datasets_manifest.recipe.sequence_ranges import CLOSURE_ACCELERATION_M_S2, 
 from scenes.flight.receiver import Guidance, closure_distance_m, desired_offsets_m
 
 
-def test_a_run_keeps_speed_and_acceleration():
+def test_a_run_keeps_speed_and_acceleration() -> None:
     time_s = np.linspace(-1, 30, 31001)
     way = closure_distance_m(time_s, 8.3, 0.6)
     speed, acceleration = np.gradient(way, time_s), np.gradient(np.gradient(way, time_s), time_s)
@@ -22,7 +22,7 @@ def test_a_run_keeps_speed_and_acceleration():
     )
 
 
-def test_manoeuvres():
+def test_manoeuvres() -> None:
     receiver, time_s = Receiver(start_m=10, end_m=2, abort_m=3), np.linspace(0, 60, 601)
     docking, station, missed = (
         desired_offsets_m(receiver, manoeuvre, (0.5, -0.2), time_s)
@@ -35,7 +35,7 @@ def test_manoeuvres():
     np.testing.assert_allclose(missed[:, :2], station[:, :2])
 
 
-def follow(follower, drogue, period_s=0.02):
+def follow(follower: Follower, drogue: np.ndarray, period_s: float = 0.02) -> np.ndarray:
     guidance, places = Guidance(follower, period_s, np.zeros((3, 1))), []
     for place in drogue:
         places.append(guidance.position_m[0, 0])
@@ -44,7 +44,7 @@ def follow(follower, drogue, period_s=0.02):
     return np.array(places)
 
 
-def test_a_follower_has_the_bandwidth_that_is_stated():
+def test_a_follower_has_the_bandwidth_that_is_stated() -> None:
     time_s = 0.02 * np.arange(6000)
     follower = Follower(bandwidth_hz=0.5, delay_s=0.0, acceleration_limit_m_s2=100)
     for hertz in (0.1, 0.5):
@@ -55,7 +55,7 @@ def test_a_follower_has_the_bandwidth_that_is_stated():
         assert np.abs(error).max() == pytest.approx(abs(s**2 / (s**2 + 1.6 * s + 1)), rel=0.12)
 
 
-def test_a_follower_keeps_its_limit_and_knows_only_the_past():
+def test_a_follower_keeps_its_limit_and_knows_only_the_past() -> None:
     step = np.ones(400)
     slow = follow(Follower(bandwidth_hz=1.0, delay_s=0.0, acceleration_limit_m_s2=0.5), step)
     # Differences of places, of which each piece is a parabola.
@@ -65,7 +65,7 @@ def test_a_follower_keeps_its_limit_and_knows_only_the_past():
     assert np.abs(late[:71]).max() == 0 and late[75] > 0
 
 
-def test_a_follower_at_its_limit_does_not_swing_past():
+def test_a_follower_at_its_limit_does_not_swing_past() -> None:
     # 8 m at 1 m/s2: its law of second order alone would go 5.7 m too far.
     way = follow(Follower(bandwidth_hz=0.8, delay_s=0.0, acceleration_limit_m_s2=1.0), np.full(1500, 8.0))
     # The overshoot of the law itself is 1.5 %, of what is left when it takes over.

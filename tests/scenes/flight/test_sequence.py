@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, load_recipe
-from drogue_models.marker_layout import marker_layout
+from drogue_models.marker_layout import MarkerLayout, marker_layout
 from geometry.circles import disc_outline
-from geometry.se3 import exp_twist, log_twist
-from geometry.stereo import EYES
+from geometry.se3 import RigidTransform, exp_twist, log_twist
+from geometry.stereo import EYES, StereoRig
 from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
 from scenes.flight.sequence import _flight
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
@@ -27,11 +27,11 @@ def recipe(**sequence: Any) -> Recipe:
     return build_recipe(STATION_KEEPING, sequence=sequence)
 
 
-def frame_text(drawn, index):
+def frame_text(drawn: Recipe, index: int) -> str:
     return sample_frame(drawn, index).model_dump_json()
 
 
-def test_each_frame_is_the_same_alone_and_in_any_order():
+def test_each_frame_is_the_same_alone_and_in_any_order() -> None:
     drawn = recipe(**RELEASED)
     in_order = [frame_text(drawn, index) for index in (3, 4, 25)]
     for index, text in reversed(list(zip((3, 4, 25), in_order, strict=True))):
@@ -40,7 +40,7 @@ def test_each_frame_is_the_same_alone_and_in_any_order():
     assert frame_text(recipe(**RELEASED, turbulence="moderate"), 3) != in_order[0]
 
 
-def test_sequences_scenes_and_times():
+def test_sequences_scenes_and_times() -> None:
     drawn = recipe(**RELEASED, frame_rate_hz=50)
     frames = [sample_frame(drawn, index) for index in range(60)]
     assert [frame.sequence_id for frame in frames] == [index // 20 for index in range(60)]
@@ -53,7 +53,7 @@ def test_sequences_scenes_and_times():
     assert times[20] - times[19] > 1.0
 
 
-def test_hose_hangs_between_pod_and_coupling():
+def test_hose_hangs_between_pod_and_coupling() -> None:
     drawn = recipe(turbulence="moderate", tanker_motion_m=0.5)
     for index in (0, 7, 19):
         frame = sample_frame(drawn, index)
@@ -70,7 +70,7 @@ def test_hose_hangs_between_pod_and_coupling():
         )
 
 
-def test_twists_are_the_rates_of_the_poses():
+def test_twists_are_the_rates_of_the_poses() -> None:
     # So many pairs a second that poses beside each other give the rate in the middle to second order.
     # The pod stands still in the axes that its own motion turns.
     moving = {"frame_rate_hz": 1000, "turbulence": "moderate", "tanker_motion_m": 0}
@@ -90,14 +90,14 @@ def test_twists_are_the_rates_of_the_poses():
     assert np.abs(frame.drogue_twist_per_s).max() > 0.1
 
 
-def test_a_moving_pose_goes_where_its_twist_points():
+def test_a_moving_pose_goes_where_its_twist_points() -> None:
     frame = sample_frame(recipe(**RELEASED, turbulence="moderate"), 5)
     moved = frame.left_from_drogue @ exp_twist(1e-3 * frame.drogue_twist_per_s)
     expected = exp_twist(1e-3 * frame.left_twist_per_s) @ frame.left_from_drogue_at(1e-3)
     np.testing.assert_allclose(moved.as_matrix(), expected.as_matrix(), atol=1e-12)
 
 
-def in_view(rig, layout, pose):
+def in_view(rig: StereoRig, layout: MarkerLayout, pose: RigidTransform) -> list[tuple[int, bool]]:
     """Whole markers and hub in either eye, without occlusion."""
     counts = []
     for eye in EYES:
@@ -108,13 +108,13 @@ def in_view(rig, layout, pose):
     return counts
 
 
-def share_in_view(drawn, frames):
+def share_in_view(drawn: Recipe, frames: range) -> float:
     layout = marker_layout(drawn.drogue)
     seen = [in_view(drawn.rig, layout, sample_left_from_drogue(drawn, index)) for index in frames]
     return np.mean([all(markers >= 4 and hub for markers, hub in views) for views in seen])
 
 
-def test_a_guided_receiver_keeps_the_drogue_in_view():
+def test_a_guided_receiver_keeps_the_drogue_in_view() -> None:
     drawn = load_recipe("docking-10m").recipe
     poses = [sample_left_from_drogue(drawn, index) for index in (0, 449, 450, 899)]
     # From 10 m to 1.7 m, as far as the follower lags and the drogue pitches: a few centimetres.
@@ -128,7 +128,7 @@ def test_a_guided_receiver_keeps_the_drogue_in_view():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turbulence", ["light", "moderate"])
-def test_guided_receivers_of_many_sequences_keep_the_drogue_in_view(turbulence):
+def test_guided_receivers_of_many_sequences_keep_the_drogue_in_view(turbulence: str) -> None:
     drawn = load_recipe("docking-10m", seed=11).recipe
     sequence = drawn.sequence.model_copy(update={"turbulence": (turbulence,)})
     frames = drawn.frames.model_copy(update={"count": 12 * 450})
@@ -136,7 +136,7 @@ def test_guided_receivers_of_many_sequences_keep_the_drogue_in_view(turbulence):
     assert share_in_view(drawn, range(0, 12 * 450, 6)) >= 0.97
 
 
-def test_guidance_makes_the_drogue_stand_stiller_in_the_picture():
+def test_guidance_makes_the_drogue_stand_stiller_in_the_picture() -> None:
     guided, loose = (
         recipe(turbulence="moderate", receiver={"follower": {"bandwidth_hz": hertz}}) for hertz in (0.8, 0)
     )
@@ -147,12 +147,12 @@ def test_guidance_makes_the_drogue_stand_stiller_in_the_picture():
     assert spread[1] > 2 * spread[0]
 
 
-def test_a_small_pair_flies():
+def test_a_small_pair_flies() -> None:
     small = recipe(hose="small-uav", turbulence="light", receiver={"body_radius_m": 0.15})
     assert sample_left_from_drogue(small, 0).translation_m[2] == pytest.approx(4.0, abs=0.2)
 
 
-def test_recipes_without_sequences_do_not_know_of_them():
+def test_recipes_without_sequences_do_not_know_of_them() -> None:
     drawn = load_recipe("smoke").recipe
     assert "sequence" not in drawn.model_dump() and drawn.sequence is None
     sequence = load_recipe("docking-10m").recipe

@@ -66,7 +66,7 @@ def test_an_exposure_must_last(time_s: float) -> None:
         build_recipe(STATION_KEEPING, exposure={"time_s": time_s})
 
 
-def test_a_drogue_that_hangs_down_is_not_looked_at_from_the_side():
+def test_a_drogue_that_hangs_down_is_not_looked_at_from_the_side() -> None:
     still = {"hose": {"preset": "small-uav", "airspeed_m_s": 0}, "turbulence": "none"}
     drawn = build_recipe(STATION_KEEPING, sequence=still)
     with pytest.raises(
@@ -75,7 +75,7 @@ def test_a_drogue_that_hangs_down_is_not_looked_at_from_the_side():
         sample_frame(drawn, 0)
 
 
-def test_a_drogue_that_comes_to_the_lens_is_refused():
+def test_a_drogue_that_comes_to_the_lens_is_refused() -> None:
     drawn = build_recipe(STATION_KEEPING)
     # No recipe asks for it; a swing may bring it about, here a drogue that has grown.
     grown = drawn.model_copy(update={"drogue": drawn.drogue.model_copy(update={"rim_radius_m": 4.2})})

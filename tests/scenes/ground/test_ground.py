@@ -13,7 +13,7 @@ from scenes.ground_view import FARTHEST_M, MipTile, ground_view, pixel_angle_rad
 from scenes.sky.photometry import luminance
 
 
-def environment(kind, **changes):
+def environment(kind: str, **changes: float) -> Environment:
     values = {
         "sun_elevation_deg": 40.0,
         "sun_azimuth_deg": 60.0,
@@ -27,7 +27,9 @@ def environment(kind, **changes):
     return Environment.model_validate(values | changes)
 
 
-def light(sky_cd_m2=2000.0, beam_lux=60_000.0, elevation_deg=40.0, azimuth_deg=0.0):
+def light(
+    sky_cd_m2: float = 2000.0, beam_lux: float = 60_000.0, elevation_deg: float = 40.0, azimuth_deg: float = 0.0
+) -> GroundLight:
     e, a = np.radians([elevation_deg, azimuth_deg])
     direction = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     return GroundLight(
@@ -38,7 +40,7 @@ def light(sky_cd_m2=2000.0, beam_lux=60_000.0, elevation_deg=40.0, azimuth_deg=0
     )
 
 
-def rays(depression_deg, half_width_deg=8.0, rows=60, columns=160):
+def rays(depression_deg: float, half_width_deg: float = 8.0, rows: int = 60, columns: int = 160) -> np.ndarray:
     """A level picture whose middle looks down by so much, towards the east."""
     azimuth = np.radians(np.linspace(half_width_deg, -half_width_deg, columns))
     down = np.radians(depression_deg) + np.radians(np.linspace(-0.4, 0.4, rows) * half_width_deg)
@@ -48,7 +50,7 @@ def rays(depression_deg, half_width_deg=8.0, rows=60, columns=160):
 
 
 @pytest.mark.parametrize("kind", GROUND_KINDS)
-def test_is_a_function_of_environment_and_direction(kind):
+def test_is_a_function_of_environment_and_direction(kind: str) -> None:
     directions = rays(12.0, rows=24)
     one, two = (Ground(environment(kind), light()).radiance(directions) for _ in range(2))
     assert np.isfinite(one).all() and (one >= 0).all()
@@ -58,7 +60,7 @@ def test_is_a_function_of_environment_and_direction(kind):
 
 
 @pytest.mark.parametrize("kind", ["fields", "forest", "dry"])
-def test_land_reflects_what_it_should_on_average(kind):
+def test_land_reflects_what_it_should_on_average(kind: str) -> None:
     """Over many kilometres the picture averages to the environment's reflectance."""
     above = rays(50.0, 25.0)
     lit = light()
@@ -68,7 +70,7 @@ def test_land_reflects_what_it_should_on_average(kind):
     np.testing.assert_allclose(mean, want, rtol=0.15)
 
 
-def test_dark_light_makes_dark_ground_and_towns_light_up():
+def test_dark_light_makes_dark_ground_and_towns_light_up() -> None:
     directions = rays(12.0, rows=24)
     day, dusk = (Ground(environment("fields"), light(s, b)).radiance(directions) for s, b in ((2000, 6e4), (2, 60)))
     np.testing.assert_allclose(luminance(dusk).mean() / luminance(day).mean(), 1e-3, rtol=1e-3)
@@ -76,7 +78,7 @@ def test_dark_light_makes_dark_ground_and_towns_light_up():
     assert luminance(night).max() > 30 * 1e-3
 
 
-def test_a_tile_is_averaged_over_the_footprint():
+def test_a_tile_is_averaged_over_the_footprint() -> None:
     """White noise over n texels squared keeps 1 / n of its standard deviation; bilinear steps blur on."""
     tile = MipTile(power_noise(1, "test", 512, 0.0, 1.0)[..., None], 1.0)
     x, y = np.meshgrid(np.linspace(0, 5000, 300, dtype=np.float32), np.linspace(0, 5000, 300, dtype=np.float32))
@@ -85,7 +87,7 @@ def test_a_tile_is_averaged_over_the_footprint():
     np.testing.assert_allclose(deviations, [2 / 3 / 4, 2 / 3 / 16], rtol=0.1)
 
 
-def test_a_tile_repeats_without_a_seam():
+def test_a_tile_repeats_without_a_seam() -> None:
     tile = land_tile("fields")
     x = np.linspace(8192 - 40, 8192 + 40, 81, dtype=np.float32)[None].repeat(3, axis=0)
     y = np.full_like(x, 777.0)
@@ -93,7 +95,7 @@ def test_a_tile_repeats_without_a_seam():
     np.testing.assert_allclose(tile.sample(x, y, width), tile.sample(x - 8192, y, width), atol=1e-5)
 
 
-def test_far_ground_does_not_shimmer():
+def test_far_ground_does_not_shimmer() -> None:
     """Half a pixel's shift changes distant ground by less than near ground: detail is left out before it aliases."""
     ground = Ground(environment("town", altitude_m=1000.0), light())
     changes = []
@@ -108,7 +110,7 @@ def test_far_ground_does_not_shimmer():
     assert changes[1] < changes[0] < 0.25
 
 
-def test_no_seam_between_bands_of_rows():
+def test_no_seam_between_bands_of_rows() -> None:
     """Rows are computed in bands; a flat tone must not change from one to the next."""
     ground = Ground(environment("sea", altitude_m=6000.0, wind_speed_m_s=1.0), light(beam_lux=0.0))
     rows = luminance(ground.radiance(rays(25.0, 6.0, rows=120))).mean(axis=1)
@@ -116,7 +118,7 @@ def test_no_seam_between_bands_of_rows():
     assert steps.max() < 6 * np.median(steps) + 0.01
 
 
-def test_fresnel_is_that_of_water():
+def test_fresnel_is_that_of_water() -> None:
     assert float(fresnel(np.array(1.0))) == pytest.approx(((1.34 - 1) / (1.34 + 1)) ** 2)
     assert float(fresnel(np.array(1e-6))) == pytest.approx(1.0, abs=1e-4)
     brewster = np.arctan(1.34)
@@ -126,13 +128,13 @@ def test_fresnel_is_that_of_water():
     assert float(fresnel(np.cos(brewster))) == pytest.approx(want, rel=1e-9)
 
 
-def test_slopes_are_those_of_cox_and_munk():
+def test_slopes_are_those_of_cox_and_munk() -> None:
     """Total mean square slope 0.003 + 0.00512 U (their equation for clean seas), within the fit's own 0.004."""
     for wind in (2.0, 7.0, 14.0):
         assert sum(slope_variances(wind)) == pytest.approx(0.003 + 0.00512 * wind, abs=0.004)
 
 
-def test_a_calm_sea_mirrors_the_sky():
+def test_a_calm_sea_mirrors_the_sky() -> None:
     """From straight above, unruffled water returns the sky's radiance times Fresnel's share."""
     ground = Ground(environment("sea", wind_speed_m_s=0.0), light(beam_lux=0.0))
     seen = ground.radiance(rays(85.0, 2.0)).mean(axis=(0, 1))
@@ -143,7 +145,7 @@ def test_a_calm_sea_mirrors_the_sky():
     np.testing.assert_allclose(seen, want, rtol=0.03)
 
 
-def test_the_glint_holds_the_suns_light():
+def test_the_glint_holds_the_suns_light() -> None:
     """Integrated over the half sphere of views, weighted with the sine, the glint gives back R E sin(elevation)."""
     lit = light(beam_lux=1e5, elevation_deg=60.0)
     sea = Sea(lit, 5.0, 0.3)
@@ -161,7 +163,7 @@ def test_the_glint_holds_the_suns_light():
     assert reflected == pytest.approx(float(fresnel(np.cos(np.radians(30.0)))), rel=0.06)
 
 
-def test_glint_lies_under_the_sun_and_widens_with_the_wind():
+def test_glint_lies_under_the_sun_and_widens_with_the_wind() -> None:
     widths = []
     for wind in (2.0, 12.0):
         ground = Ground(environment("sea", wind_speed_m_s=wind), light(elevation_deg=30.0))
@@ -173,13 +175,13 @@ def test_glint_lies_under_the_sun_and_widens_with_the_wind():
     assert widths[1] > 1.3 * widths[0]
 
 
-def test_a_coast_has_both_and_a_bright_line_between():
+def test_a_coast_has_both_and_a_bright_line_between() -> None:
     seen = Ground(environment("coast", ground_texture_seed=5, altitude_m=1500.0), light()).radiance(rays(9.0, 16.0))
     blue = seen[..., 2] / seen[..., 0]
     assert (blue > 1.2).mean() > 0.05 and (blue < 0.8).mean() > 0.05
 
 
-def test_red_things_lie_about():
+def test_red_things_lie_about() -> None:
     """Red roofs: what a search for red discs must not fall for."""
     near = rays(45.0, 10.0, 400, 400)
     for kind in ("town", "fields"):
@@ -190,7 +192,7 @@ def test_red_things_lie_about():
         assert max(shares) > 0
 
 
-def test_rays_that_miss_the_ground_see_its_rim():
+def test_rays_that_miss_the_ground_see_its_rim() -> None:
     directions = rays(0.0, 1.0)
     view = ground_view(directions, 3000.0, pixel_angle_rad(directions))
     assert np.isfinite(view.x_m).all() and float(view.x_m.max()) <= FARTHEST_M * 1.001

@@ -8,7 +8,7 @@ import pytest
 
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import CloudLight, render_cloud_layer
-from scenes.environment_radiance import environment_radiance
+from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.sea import GroundLight
@@ -19,7 +19,7 @@ from tests.support.recipe_builder import between, build_recipe
 FOCAL_PX, SIZE_PX = 400.0, 192
 
 
-def environment(kind="fields", **changes):
+def environment(kind: str = "fields", **changes: float | tuple[CloudLayer | float, ...]) -> Environment:
     values = {
         "sun_elevation_deg": 40.0,
         "sun_azimuth_deg": 60.0,
@@ -33,7 +33,7 @@ def environment(kind="fields", **changes):
     return Environment.model_validate(values | changes)
 
 
-def looking(sign, side_px=SIZE_PX):
+def looking(sign: int, side_px: int = SIZE_PX) -> np.ndarray:
     """(H, W, 3) directions of a pinhole that looks straight up (1) or down (-1); columns go east, rows north."""
     offset = (np.arange(side_px) - (side_px - 1) / 2) / FOCAL_PX
     x, y = np.meshgrid(offset, offset)
@@ -41,21 +41,21 @@ def looking(sign, side_px=SIZE_PX):
     return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def flow_px(before, after):
+def flow_px(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """How far a picture has moved to the right and down, by OpenCV's phase correlation."""
     window = cv2.createHanningWindow(before.shape[::-1], cv2.CV_64F)
     pictures = [np.asarray(picture, dtype=np.float64) - float(np.mean(picture)) for picture in (before, after)]
     return np.array(cv2.phaseCorrelate(*pictures, window)[0])
 
 
-def light():
+def light() -> GroundLight:
     direction = np.array([0.6, 0.0, 0.8])
     return GroundLight(np.full(3, 6000.0), direction, np.full(3, 60_000.0), lambda rays: np.full_like(rays, 2000.0))
 
 
 @pytest.mark.parametrize("kind", ["fields", "forest"])
 @pytest.mark.parametrize("flown_m", [(37.5, 0.0), (-22.5, 15.0)])
-def test_ground_below_flows_by_focal_length_times_way_over_altitude(kind, flown_m):
+def test_ground_below_flows_by_focal_length_times_way_over_altitude(kind: str, flown_m: tuple[float, float]) -> None:
     here = environment(kind)
     ground = Ground(here, light())
     there = ground.moved_to(here.model_copy(update={"camera_offset_m": flown_m}))
@@ -69,7 +69,7 @@ def test_ground_below_flows_by_focal_length_times_way_over_altitude(kind, flown_
     assert np.abs(shifted - before[40:-40, 40:-40]).mean() < 0.02 * before.std()
 
 
-def test_ships_are_passed_as_the_sea_is():
+def test_ships_are_passed_as_the_sea_is() -> None:
     flown_m = np.array([60.0, 0.0])
     for seed in range(40):
         here = environment("sea", ground_texture_seed=seed)
@@ -86,7 +86,7 @@ def test_ships_are_passed_as_the_sea_is():
     np.testing.assert_allclose(flow_px(*pictures), -FOCAL_PX * flown_m / 1500.0, atol=0.25)
 
 
-def test_clouds_flow_by_their_own_distance():
+def test_clouds_flow_by_their_own_distance() -> None:
     flown_m, height_m = (45.0, -30.0), 1200.0
     shared = {"optical_depth": 3.0, "texture_seed": 4, "feature_size_m": 300.0, "heading_deg": 30.0}
     sun = CloudLight(np.array([0.6, 0.0, 0.8]), np.full(3, 6e4), np.full(3, 6e3), np.full(3, 2e3))
@@ -103,7 +103,7 @@ def test_clouds_flow_by_their_own_distance():
     assert np.linalg.norm(flow_px(before, after) - expected_px) < 0.09 * np.linalg.norm(expected_px) + 0.33
 
 
-def test_clouds_of_a_large_picture_flow_too():
+def test_clouds_of_a_large_picture_flow_too() -> None:
     # So many rays that clouds are marched on every second one, and enlarged.
     side_px, flown_m, height_m = 256, (48.0, -32.0), 1200.0
     cirrus = CloudLayer(kind="cirrus", height_above_camera_m=height_m, cover_fraction=0.7, feature_size_m=300.0,
@@ -119,7 +119,7 @@ CUMULUS = CloudLayer(height_above_camera_m=900.0, cover_fraction=0.45, feature_s
                      texture_seed=1, thickness_m=300.0)  # fmt: skip
 
 
-def test_clouds_that_pass_before_the_sun_take_its_light():
+def test_clouds_that_pass_before_the_sun_take_its_light() -> None:
     here = environment(clouds=(CUMULUS,), sun_elevation_deg=30.0)
     to_sun = environment_radiance(here).beam_direction
     ray = to_sun[None, None].astype(np.float32)
@@ -139,13 +139,13 @@ def test_clouds_that_pass_before_the_sun_take_its_light():
     np.testing.assert_allclose(disc_towards(environment_radiance(here), ray), clear_disc * open_shares[0], rtol=1e-5)
 
 
-def disc_towards(around, ray):
+def disc_towards(around: EnvironmentRadiance, ray: np.ndarray) -> np.ndarray:
     disc = np.zeros((1, 1, 3), dtype=np.float32)
     around.add_discs(disc, ray)
     return disc
 
 
-def test_sky_and_light_stay_as_they_are():
+def test_sky_and_light_stay_as_they_are() -> None:
     cloud = CloudLayer(height_above_camera_m=-900.0, cover_fraction=0.4, feature_size_m=900.0, optical_depth=10.0,
                        texture_seed=1, thickness_m=300.0)  # fmt: skip
     here = environment(clouds=(cloud,))
@@ -159,7 +159,7 @@ def test_sky_and_light_stay_as_they_are():
     assert environment_radiance(here).environment.camera_offset_m == (0.0, 0.0)
 
 
-def test_a_sequence_flies_with_its_airspeed_and_starts_again():
+def test_a_sequence_flies_with_its_airspeed_and_starts_again() -> None:
     recipe = build_recipe(
         name="passing",
         frames={"count": 40, "scenes": 2},
@@ -185,6 +185,6 @@ def test_a_sequence_flies_with_its_airspeed_and_starts_again():
     assert all(one == still[0] for one in still[:20])
 
 
-def test_single_pairs_do_not_know_of_flight():
+def test_single_pairs_do_not_know_of_flight() -> None:
     recipe = build_recipe(name="single", frames={"count": 1}, distance=between(3, 9))
     assert "camera_offset_m" not in sample_frame(recipe, 0).environment.model_dump()

@@ -29,7 +29,7 @@ BASE: RecipeTable = {
 }
 
 
-def picture(sun_row=40, sun_column=180, sun=50_000.0):
+def picture(sun_row: int = 40, sun_column: int = 180, sun: float = 50_000.0) -> np.ndarray:
     """Sky of 1 over ground of 0.25, redder to the right of the middle, and a sun of one texel."""
     values = np.ones((HEIGHT, 2 * HEIGHT, 3), dtype=np.float32)
     values[HEIGHT // 2 :] = 0.25
@@ -39,7 +39,7 @@ def picture(sun_row=40, sun_column=180, sun=50_000.0):
     return values
 
 
-def write(path, values):
+def write(path: Path, values: np.ndarray) -> None:
     if path.suffix == ".hdr":
         cv2.imwrite(str(path), values[..., ::-1])
     else:
@@ -60,13 +60,13 @@ def environment(folder: Path, name: str = "sky.exr", **keys: float | list[float]
     return sample_frame(recipe(folder, name, **keys), 0).environment
 
 
-def texel_direction(row, column, rotation_deg=0.0):
+def texel_direction(row: int, column: int, rotation_deg: float = 0.0) -> np.ndarray:
     polar, azimuth = (row + 0.5) * np.pi / HEIGHT, np.radians(rotation_deg) - (column + 0.5 - HEIGHT) * np.pi / HEIGHT
     return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("sky.exr", 1e-6), ("sky.hdr", 0.01)])
-def test_levels_colours_and_sides_are_kept(tmp_path, name, tolerance):
+def test_levels_colours_and_sides_are_kept(tmp_path: Path, name: str, tolerance: float) -> None:
     """Radiance files keep eight bits of mantissa: 0.4 % of the largest channel."""
     write(tmp_path / name, picture(sun=0))
     around = environment_radiance(environment(tmp_path, name))
@@ -78,7 +78,7 @@ def test_levels_colours_and_sides_are_kept(tmp_path, name, tolerance):
     assert texel_direction(30, HEIGHT + 20)[1] < 0
 
 
-def test_the_sun_becomes_a_beam_of_the_same_light(tmp_path):
+def test_the_sun_becomes_a_beam_of_the_same_light(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture())
     light = load_map(environment(tmp_path, cd_m2_per_unit=1000.0, rotation_deg=30).map)
     edges = np.cos(np.array([40, 41]) * np.pi / HEIGHT)
@@ -88,7 +88,7 @@ def test_the_sun_becomes_a_beam_of_the_same_light(tmp_path):
     assert light.image.max() == 2000
 
 
-def test_the_disc_is_drawn_where_the_sun_was(tmp_path):
+def test_the_disc_is_drawn_where_the_sun_was(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture())
     around = environment_radiance(environment(tmp_path))
     directions = around.beam_direction[None, None].astype(np.float32)
@@ -97,19 +97,19 @@ def test_the_disc_is_drawn_where_the_sun_was(tmp_path):
     np.testing.assert_allclose(seen[0, 0], around.beam_illuminance_lux / SUN_SOLID_ANGLE_SR, rtol=1e-6)
 
 
-def test_an_even_sky_has_no_sun(tmp_path):
+def test_an_even_sky_has_no_sun(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture(sun=0))
     assert load_map(environment(tmp_path).map).sun_lux.max() == 0
 
 
-def test_illuminance_is_as_asked_for(tmp_path):
+def test_illuminance_is_as_asked_for(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture())
     around = environment_radiance(environment(tmp_path, horizontal_illuminance_lux=70000))
     # The light map has 128 rows, as this picture: only the split of the sun's texel among cosines is left.
     assert float(luminance(around.ground_illuminance_lux)) == pytest.approx(70_000, rel=0.01)
 
 
-def test_rotations_are_drawn_by_scene(tmp_path):
+def test_rotations_are_drawn_by_scene(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture())
     drawn = recipe(tmp_path, scenes=4, cd_m2_per_unit=1.0, rotation_deg=[0, 360])
     environments = [sample_frame(drawn, index).environment for index in range(4)]
@@ -118,7 +118,7 @@ def test_rotations_are_drawn_by_scene(tmp_path):
     np.testing.assert_allclose([env.sun_elevation_deg for env in environments], 90 - 40.5 * 180 / HEIGHT, atol=1e-4)
 
 
-def test_a_frame_works_in_another_process(tmp_path):
+def test_a_frame_works_in_another_process(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture())
     frame = sample_frame(recipe(tmp_path), 1)
     # The frame is stored without the folder: it is looked for where the process runs.
@@ -137,7 +137,7 @@ def test_a_frame_works_in_another_process(tmp_path):
     assert FrameSpec.model_validate_json(frame.model_dump_json()).environment.map.sha256 == frame.environment.map.sha256
 
 
-def test_a_changed_file_is_refused(tmp_path):
+def test_a_changed_file_is_refused(tmp_path: Path) -> None:
     write(tmp_path / "sky.exr", picture())
     drawn = recipe(tmp_path)
     write(tmp_path / "sky.exr", picture(sun=0))
@@ -145,7 +145,7 @@ def test_a_changed_file_is_refused(tmp_path):
         sample_frame(drawn, 0)
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"environment\.map: .*sky\.exr cannot be read: No such file"):
         recipe(tmp_path)
 
@@ -158,13 +158,13 @@ def test_a_missing_file_is_named(tmp_path):
         (np.zeros((32, 64, 3), dtype=np.float32), "is black"),
     ],
 )
-def test_wrong_pictures_are_refused(tmp_path, values, message):
+def test_wrong_pictures_are_refused(tmp_path: Path, values: np.ndarray, message: str) -> None:
     write(tmp_path / "sky.exr", values)
     with pytest.raises(ValueError, match=message):
         environment(tmp_path)
 
 
-def test_a_file_that_is_no_picture_is_refused(tmp_path):
+def test_a_file_that_is_no_picture_is_refused(tmp_path: Path) -> None:
     for name in ("sky.exr", "sky.hdr"):
         (tmp_path / name).write_bytes(b"no picture")
         with pytest.raises(ValueError, match="cannot be read as"):

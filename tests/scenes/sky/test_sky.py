@@ -11,7 +11,7 @@ from scenes.sky.night import moon_illuminance_lux, star_catalogue
 from scenes.sky.photometry import REC709_FROM_XYZ, direction_from_angles, hemisphere, luminance
 
 
-def environment(**changes):
+def environment(**changes: Moon | float | tuple[CloudLayer, ...]) -> Environment:
     values = {
         "sun_elevation_deg": 40.0,
         "sun_azimuth_deg": 60.0,
@@ -24,7 +24,7 @@ def environment(**changes):
     return Environment.model_validate(values | changes)
 
 
-def test_zenith_luminance_is_the_published_formula():
+def test_zenith_luminance_is_the_published_formula() -> None:
     """Y_z = (4.0453 T - 4.9710) tan((4/9 - T/120)(pi - 2 s)) - 0.2155 T + 2.4192 [kcd/m2], worked by hand for T = 3."""
     sky = ClearSky(environment(turbidity=3.0, sun_elevation_deg=50.0))
     s = np.radians(40.0)
@@ -33,7 +33,7 @@ def test_zenith_luminance_is_the_published_formula():
     assert float(got) == pytest.approx(expected * 1e3, rel=2e-4)
 
 
-def colour_temperature_k(radiance):
+def colour_temperature_k(radiance: np.ndarray) -> float:
     """After McCamy 1992, Color Research and Application 17(2), 142; above 12,500 K it only ranks."""
     xyz = np.linalg.inv(REC709_FROM_XYZ) @ np.asarray(radiance, dtype=float)
     x, y = xyz[:2] / xyz.sum()
@@ -41,7 +41,7 @@ def colour_temperature_k(radiance):
     return 449 * n**3 + 3525 * n**2 + 6823.3 * n + 5520.33
 
 
-def test_colours_of_the_clear_sky():
+def test_colours_of_the_clear_sky() -> None:
     """Blue overhead, about white towards a sun of 18 degrees, warm towards a setting one."""
     high = ClearSky(environment(sun_elevation_deg=50.0, turbidity=2.5))
     # Clear zeniths are measured between about 12,000 and 25,000 K; with the sun outside the air for white instead of
@@ -53,26 +53,26 @@ def test_colours_of_the_clear_sky():
     assert towards[1] < 4200
 
 
-def test_sunlight_at_the_ground_has_the_level_of_a_clear_day():
+def test_sunlight_at_the_ground_has_the_level_of_a_clear_day() -> None:
     """Direct normal illuminance under a high sun is 80-105 klux on clear days (IES handbook)."""
     sky = ClearSky(environment(sun_elevation_deg=60.0))
     assert 80_000 < float(luminance(sky.sun_illuminance_lux)) < 105_000
 
 
-def test_low_sun_is_dimmer_and_redder():
+def test_low_sun_is_dimmer_and_redder() -> None:
     high, low = (ClearSky(environment(sun_elevation_deg=e)).sun_illuminance_lux for e in (60.0, 5.0))
     assert np.all(low < high)
     assert low[0] / low[2] > 2 * high[0] / high[2]
 
 
-def test_brightest_near_the_sun():
+def test_brightest_near_the_sun() -> None:
     sky = ClearSky(environment())
     towards = sky.radiance(sky.sun_direction)
     away = sky.radiance(direction_from_angles(40.0, 60.0 + 180.0))
     assert luminance(towards) > 2 * luminance(away)
 
 
-def test_blue_overhead_and_finite_everywhere():
+def test_blue_overhead_and_finite_everywhere() -> None:
     rng = np.random.default_rng(2)
     directions = rng.standard_normal((500, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -84,7 +84,7 @@ def test_blue_overhead_and_finite_everywhere():
 
 
 @pytest.mark.parametrize("cloud_height_m", [None, 1500.0, -1200.0])
-def test_no_seam_at_the_horizon(cloud_height_m):
+def test_no_seam_at_the_horizon(cloud_height_m: float | None) -> None:
     """Just above and just below the horizon haze has made sky, ground and cloud one."""
     clouds = ()
     if cloud_height_m is not None:
@@ -107,7 +107,7 @@ def test_no_seam_at_the_horizon(cloud_height_m):
     assert np.abs(image[1] / image[0] - 1).max() < 0.03
 
 
-def test_ground_contrast_falls_as_koschmieder_says():
+def test_ground_contrast_falls_as_koschmieder_says() -> None:
     """Contrast of ground against horizon goes with exp(-extinction x distance)."""
     around = EnvironmentRadiance(environment(sun_azimuth_deg=0.0))
     contrasts = []
@@ -126,21 +126,21 @@ def test_ground_contrast_falls_as_koschmieder_says():
     np.testing.assert_allclose(contrasts, expected, rtol=0.05)
 
 
-def test_plate_illuminance_of_level_ground_agrees_with_the_sky_integral():
+def test_plate_illuminance_of_level_ground_agrees_with_the_sky_integral() -> None:
     around = EnvironmentRadiance(environment())
     up = around.plate_illuminance_lux(np.array([0.0, 0.0, 1.0]))
     # Two quadratures of the same sky, 4 and 1.4 degrees wide.
     np.testing.assert_allclose(up, around.ground_illuminance_lux, rtol=0.01)
 
 
-def test_texture_repeats_without_a_seam():
+def test_texture_repeats_without_a_seam() -> None:
     x = np.linspace(0, 8, 4097, dtype=np.float32)[None]
     values = sample_texture(5, 1.6, x, np.zeros_like(x))[0]
     jumps = np.abs(np.diff(values))
     assert jumps.max() < 12 * np.median(jumps) + 0.2
 
 
-def level_illuminance_lux(sky):
+def level_illuminance_lux(sky: ClearSky) -> float:
     directions, weight = hemisphere(45)
     from_sky = float((luminance(sky.radiance(directions)) * weight).sum())
     return from_sky + float(luminance(sky.beam.beam_illuminance_lux())) * max(sky.beam.direction[2], 0.0)
@@ -158,25 +158,25 @@ def level_illuminance_lux(sky):
         (-50.0, 0.0006, 0.002),
     ],
 )
-def test_light_of_the_whole_clear_sky_is_what_is_measured(elevation_deg, low_lux, high_lux):
+def test_light_of_the_whole_clear_sky_is_what_is_measured(elevation_deg: float, low_lux: int, high_lux: int) -> None:
     assert low_lux < level_illuminance_lux(ClearSky(environment(sun_elevation_deg=elevation_deg))) < high_lux
 
 
 @pytest.mark.parametrize("elevation_deg", [0.0, -4.0, -8.0, -12.0, -25.0])
-def test_zenith_is_as_bright_as_an_even_sky_of_the_same_light_or_darker(elevation_deg):
+def test_zenith_is_as_bright_as_an_even_sky_of_the_same_light_or_darker(elevation_deg: float) -> None:
     """Twilight and night are brightest near the horizon: the zenith has 0.3 to 1 of E / pi."""
     sky = ClearSky(environment(sun_elevation_deg=elevation_deg))
     zenith = float(luminance(sky.radiance(np.array([0.0, 0.0, 1.0]))))
     assert 0.3 < zenith * np.pi / level_illuminance_lux(sky) < 1.0
 
 
-def test_moonless_night_has_the_luminance_of_dark_sites():
+def test_moonless_night_has_the_luminance_of_dark_sites() -> None:
     """21.9 to 21.3 magnitudes a square arc second at the zenith, with and without the brighter stars."""
     zenith = ClearSky(environment(sun_elevation_deg=-40.0)).radiance(np.array([0.0, 0.0, 1.0]))
     assert 1.9e-4 < float(luminance(zenith)) < 3.3e-4
 
 
-def test_light_grows_with_the_sun_without_a_jump():
+def test_light_grows_with_the_sun_without_a_jump() -> None:
     elevations = np.arange(-20.0, 40.0, 0.5)
     light = np.log([level_illuminance_lux(ClearSky(environment(sun_elevation_deg=e))) for e in elevations])
     # Fastest in nautical twilight, where it falls from 2-3.5 to 0.004-0.008 lux over 6 degrees: 0.52 in half a degree.
@@ -192,7 +192,7 @@ def test_light_grows_with_the_sun_without_a_jump():
         np.testing.assert_allclose(below, above, rtol=0.02)
 
 
-def test_twilight_glows_over_the_sun_and_is_blue_overhead():
+def test_twilight_glows_over_the_sun_and_is_blue_overhead() -> None:
     sky = ClearSky(environment(sun_elevation_deg=-6.0))
     towards, away = (sky.radiance(direction_from_angles(3.0, 60.0 + turn)) for turn in (0.0, 180.0))
     zenith = sky.radiance(np.array([0.0, 0.0, 1.0]))
@@ -201,7 +201,7 @@ def test_twilight_glows_over_the_sun_and_is_blue_overhead():
     assert zenith[2] > 1.5 * zenith[0]
 
 
-def test_full_moon_is_as_bright_as_measured_and_fades_with_its_phase():
+def test_full_moon_is_as_bright_as_measured_and_fades_with_its_phase() -> None:
     """0.25 lux at most from a high full moon, about a tenth of it from a half one (Krisciunas and Schaefer 1991)."""
     night = environment(sun_elevation_deg=-50.0, moon=Moon(elevation_deg=60.0, azimuth_deg=20.0))
     sky = ClearSky(night)
@@ -212,7 +212,7 @@ def test_full_moon_is_as_bright_as_measured_and_fades_with_its_phase():
 
 
 @pytest.mark.parametrize("phase_deg", [0.0, 60.0, 90.0, 120.0])
-def test_disc_of_the_moon_sends_what_the_moon_sends(phase_deg):
+def test_disc_of_the_moon_sends_what_the_moon_sends(phase_deg: float) -> None:
     """Radiance of the drawn disc over its solid angle is the moon's illuminance, and the sun's side is lit."""
     moon = Moon(elevation_deg=45.0, azimuth_deg=0.0, phase_angle_deg=phase_deg)
     sky = ClearSky(environment(sun_elevation_deg=-50.0, sun_azimuth_deg=0.0, moon=moon))
@@ -232,7 +232,7 @@ def test_disc_of_the_moon_sends_what_the_moon_sends(phase_deg):
         assert light[:120].sum() > light[121:].sum()  # the sun stands below
 
 
-def test_there_are_as_many_stars_as_there_are():
+def test_there_are_as_many_stars_as_there_are() -> None:
     """About 5000 stars to magnitude 6, some 500 to magnitude 4 and 15 to 25 to magnitude 1 on the whole sky (Allen)."""
     directions, lux = star_catalogue()
     magnitude = -2.5 * np.log10(lux) - 14.18

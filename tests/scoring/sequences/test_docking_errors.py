@@ -25,6 +25,7 @@ from droguekit.scoring.sequences.docking_errors import (
 )
 from droguekit.scoring.sequences.filter_errors import SequenceData
 from droguekit.scoring.sequences.sequence_truth import TrueSequence, true_sequences, true_state
+from geometry.se3 import RigidTransform
 from nav.docking import capture_radius_m, docking_quantities
 
 TIP_LEFT_M = np.array([0.45, 0.35, 1.0])
@@ -40,7 +41,7 @@ def test_the_arrival_is_where_the_rim_plane_meets_the_tip(build: SimpleNamespace
         pose = build.pose(*rng.uniform(-0.3, 0.6, 2), rng.uniform(2, 9), *rng.uniform(-15, 15, 2))
         velocity = np.array([*rng.uniform(-0.1, 0.1, 2), -rng.uniform(0.5, 1.5)])
 
-        def ahead(time_s: float, pose=pose, velocity=velocity) -> float:
+        def ahead(time_s: float, pose: RigidTransform = pose, velocity: np.ndarray = velocity) -> float:
             return float(pose.rotation[:, 2] @ (pose.translation_m + time_s * velocity - TIP_LEFT_M))
 
         contact_s = brentq(ahead, 0, 60, xtol=1e-12)

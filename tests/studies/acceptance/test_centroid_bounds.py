@@ -23,13 +23,13 @@ RADII_PX = [2133.333 * 0.05 / z_m for z_m in (1.5, 2, 5, 10, 15, 20, 30, 40)]
         (PixelLight(10, 50, 4.8, 0.7, 0.5, 0.01), (0.0145, 0.0168, 0.0266, 0.0378, 0.0455, 0.0528, 0.0648, 0.0750)),
     ],
 )
-def test_bound_agrees_with_the_independent_table(light, table_px):
+def test_bound_agrees_with_the_independent_table(light: PixelLight, table_px: tuple[float, ...]) -> None:
     bounds = [center_bound_px(radius, light) for radius in RADII_PX]
     # The table has two to three digits and read noise from rounded data sheets.
     np.testing.assert_allclose(bounds, table_px, rtol=0.045)
 
 
-def test_coverage_is_that_of_a_supersampled_disc():
+def test_coverage_is_that_of_a_supersampled_disc() -> None:
     samples, center, radius, sigma = 41, np.array([0.3, -0.2]), 3.3, 0.5
     grid = np.arange(-8.0, 9)
     exact = outline_coverage(*disc_outline_px(center, radius), grid, grid, sigma)
@@ -46,7 +46,7 @@ def test_coverage_is_that_of_a_supersampled_disc():
     assert exact.sum() == pytest.approx(np.pi * radius**2, rel=1e-6)
 
 
-def test_bound_falls_with_the_root_of_the_radius_and_with_contrast():
+def test_bound_falls_with_the_root_of_the_radius_and_with_contrast() -> None:
     dark = PixelLight(1000, 10, 0, 0, 0.5)
     near, far = center_bound_px(40, dark), center_bound_px(10, dark)
     # Curvature of the edge over its blur changes the law by (0.58 / 10)^2 / 2.
@@ -54,7 +54,7 @@ def test_bound_falls_with_the_root_of_the_radius_and_with_contrast():
     assert center_bound_px(10, replace(dark, contrast_e=5)) / far == pytest.approx(2, rel=5e-3)
 
 
-def test_bound_depends_on_the_pixels_phase_little():
+def test_bound_depends_on_the_pixels_phase_little() -> None:
     bounds = [center_bound_px(5, DAY, (shift, 0.3)) for shift in (0, 0.25, 0.5)]
     # The blur is wider than a pixel's Nyquist limit allows aliasing beyond a few percent.
     assert max(bounds) / min(bounds) < 1.05

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,13 +20,13 @@ from studies.engine_agreement.costs import CostComparison, EngineCost, cost_from
 from studies.engine_agreement.paired_frames import FAMILIES, paired_frames, recipe_of_family, write_sky_recipe
 
 
-def run(*arguments):
+def run(*arguments: str) -> Any:
     app = Typer()
     app.command()(main)
     return CliRunner().invoke(app, [*arguments, "--engines", "analytic", "analytic"])
 
 
-def test_an_engine_reaches_all_bars_against_itself_and_is_not_asked_twice(tmp_path):
+def test_an_engine_reaches_all_bars_against_itself_and_is_not_asked_twice(tmp_path: Path) -> None:
     options = ["--out", str(tmp_path), "--part", "frames", "--part", "plates", "--plate-samples", "1"]
     options += ["--family", "smoke", "--station", "3", "--count", "1", "--samples", "4"]
     first = run(*options)
@@ -50,13 +52,13 @@ def test_an_engine_reaches_all_bars_against_itself_and_is_not_asked_twice(tmp_pa
         ("demo/clear", "family: recipe demo has none named 'clear'; there are none"),
     ],
 )
-def test_a_family_that_does_not_exist_is_named_in_one_line(tmp_path, name, message):
+def test_a_family_that_does_not_exist_is_named_in_one_line(tmp_path: Path, name: str, message: str) -> None:
     result = run("--out", str(tmp_path), "--part", "frames", "--family", name)
     assert result.exit_code == 2
     assert message in result.output and len(result.output.strip().splitlines()) == 1
 
 
-def test_every_family_is_of_its_kind():
+def test_every_family_is_of_its_kind() -> None:
     frames = paired_frames(FAMILIES, [10.0], len(FAMILIES), 4, seed=1)
     wanted = [name.partition("/")[2] for name in FAMILIES]
     assert [frame.frame.family for frame in frames if "/" in frame.family] == [name for name in wanted if name]
@@ -65,7 +67,7 @@ def test_every_family_is_of_its_kind():
     assert len({frame.frame.environment.model_dump_json() for frame in frames}) == len(FAMILIES)
 
 
-def test_the_picture_of_a_sky_gives_its_sun_back(tmp_path):
+def test_the_picture_of_a_sky_gives_its_sun_back(tmp_path: Path) -> None:
     drawn = environment_radiance(sample_frame(recipe_of_family("world-89/sea", 1), 0).environment)
     recipe = write_sky_recipe(tmp_path)
     (frame,) = paired_frames([str(recipe)], [10.0], 1, 4, seed=3)
@@ -77,7 +79,7 @@ def test_the_picture_of_a_sky_gives_its_sun_back(tmp_path):
     assert write_sky_recipe(tmp_path) == recipe and (tmp_path / "sky.exr").stat().st_mtime_ns == written
 
 
-def test_findings_count_for_what_they_were_made_from_alone(tmp_path):
+def test_findings_count_for_what_they_were_made_from_alone(tmp_path: Path) -> None:
     findings = ResultStore(tmp_path / "found")
     assert findings.get("frame", {"seed": 1}) is None
     findings.keep("frame", {"seed": 1, "tilt": (1, 2)}, {"value": 0.1})
@@ -88,7 +90,7 @@ def test_findings_count_for_what_they_were_made_from_alone(tmp_path):
     assert findings.get("frame", {"seed": 1, "tilt": (1, 2)}) is None
 
 
-def test_an_engine_without_noise_is_never_matched_by_one_that_has_some():
+def test_an_engine_without_noise_is_never_matched_by_one_that_has_some() -> None:
     cost = CostComparison(10.0, EngineCost(16, 1.0, 0.0), EngineCost(256, 3.0, 0.10))
     assert not cost.is_reached and cost_from_row(cost.row()) == cost
     # No sampling, no noise: the fewest samples do.

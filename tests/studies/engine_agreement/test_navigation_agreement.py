@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import io
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
 from tests.support.small_datasets import rendered
 
 
-def drawn(seed, other_size=1.0, shift=0.0):
+def drawn(seed: int, other_size: float = 1.0, shift: float = 0.0) -> list[PairedErrors]:
     """Errors at two distances, a hundred times as large at the far one; a third of their variance is the renderer's."""
     rng = np.random.Generator(np.random.Philox(seed))
     stations = []
@@ -42,17 +44,17 @@ def drawn(seed, other_size=1.0, shift=0.0):
     return stations
 
 
-def missed(stations):
+def missed(stations: list[PairedErrors]) -> set[str]:
     return {bar.name.split(",")[0] for bar in navigation_requirements(stations) if not bar.reached}
 
 
-def test_errors_of_one_law_pass_as_often_as_the_intervals_say():
+def test_errors_of_one_law_pass_as_often_as_the_intervals_say() -> None:
     passed = sum(not missed(drawn(seed)) for seed in range(40))
     # Two intervals of 95 % and one of 95 % for five components: at least 0.85 of all; 40 draws, 4 standard errors.
     assert passed >= 40 * (0.85 - 4 * np.sqrt(0.85 * 0.15 / 40))
 
 
-def test_larger_errors_are_found_at_any_scale():
+def test_larger_errors_are_found_at_any_scale() -> None:
     assert missed(drawn(1, other_size=1.5)) >= {"position errors", "attitude errors"}
     ratio = size_ratios(drawn(1, other_size=1.5))[0]
     # 100 pairs know a ratio of root mean squares with this correlation to 6 %.
@@ -60,31 +62,31 @@ def test_larger_errors_are_found_at_any_scale():
     assert ratio.interval[0] < ratio.ratio < ratio.interval[1]
 
 
-def test_a_pull_to_one_side_is_found():
+def test_a_pull_to_one_side_is_found() -> None:
     assert "x error" in missed(drawn(2, shift=1.0))
     row = mean_differences(drawn(2, shift=1.0))[0]
     # A shift of one common deviation, in units of a root mean square of 1.22 to 1.5.
     assert 0.5 < row.mean < 1.0
 
 
-def test_pairs_are_spread_over_distances():
+def test_pairs_are_spread_over_distances() -> None:
     assert pairs_by_station((5.0, 10.0, 40.0), 8) == {5.0: 3, 10.0: 3, 40.0: 2}
     assert pairs_by_station((5.0, 10.0, 40.0), 2) == {5.0: 1, 10.0: 1}
 
 
-def test_samples_grow_with_distance_and_stay_within_their_bounds():
+def test_samples_grow_with_distance_and_stay_within_their_bounds() -> None:
     samples = [station_recipe("blender", d, 1, 0).recipe.render.samples_per_px for d in (1.7, 5.0, 10.0, 40.0)]
     assert samples == [4, 64, 256, 576]
 
 
 @pytest.mark.parametrize("distance_m", [5.0, 40.0])
-def test_no_engine_may_spend_more_on_edges(distance_m):
+def test_no_engine_may_spend_more_on_edges(distance_m: float) -> None:
     settings = station_recipe("mitsuba", distance_m, 1, 0).recipe.render
     assert {settings.open_samples_per_px, settings.edge_samples_per_px} == {settings.samples_per_px}
     assert not settings.denoise
 
 
-def test_one_engine_against_itself_errs_alike_and_stays_when_run_again(tmp_path):
+def test_one_engine_against_itself_errs_alike_and_stays_when_run_again(tmp_path: Path) -> None:
     report = PlainProgress(io.StringIO())
     paired = render_paired(tmp_path, ("analytic", "analytic"), 10.0, 2, 3, report)
     assert paired.one == paired.other
@@ -99,7 +101,7 @@ def test_one_engine_against_itself_errs_alike_and_stays_when_run_again(tmp_path)
     assert 0 < np.abs(errors.one[:, :3]).max() < 0.1
 
 
-def small_dataset(folder, engine, seed=1):
+def small_dataset(folder: Path, engine: str, seed: int = 1) -> Path:
     text = recipe_text(
         name="small",
         seed=seed,
@@ -111,7 +113,7 @@ def small_dataset(folder, engine, seed=1):
     return rendered(text, folder)
 
 
-def test_datasets_of_other_frames_are_refused(tmp_path):
+def test_datasets_of_other_frames_are_refused(tmp_path: Path) -> None:
     one, other = (small_dataset(tmp_path / str(seed), "analytic", seed) for seed in (1, 2))
     with pytest.raises(ValueError, match="do not hold the same frames"):
         paired_errors(PairedDatasets(3.0, one, other))
@@ -120,7 +122,7 @@ def test_datasets_of_other_frames_are_refused(tmp_path):
 @pytest.mark.mitsuba
 @pytest.mark.blender
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is missing: pip install 'droguekit[blender]'")
-def test_both_engines_make_datasets_of_one_truth(tmp_path):
+def test_both_engines_make_datasets_of_one_truth(tmp_path: Path) -> None:
     one, other = (Dataset(small_dataset(tmp_path / name, name)).record(0) for name in ("mitsuba", "blender"))
     assert (one.engine, other.engine) == ("mitsuba", "blender")
     tables = [record.model_dump(mode="json") for record in (one, other)]
@@ -131,7 +133,7 @@ def test_both_engines_make_datasets_of_one_truth(tmp_path):
         assert ours == pytest.approx(theirs, rel=0.02)
 
 
-def take_out_pixels(table):
+def take_out_pixels(table: dict[str, Any]) -> list[float]:
     """Remove from a record's table what comes from pixels, and return what the passes say of them."""
     for key in ("engine", "engine_version", "file_sha256"):
         del table[key]

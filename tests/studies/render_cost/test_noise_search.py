@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -26,7 +29,7 @@ def test_only_pixels_of_the_masks_count() -> None:
     assert (found.noise_inside, found.mean_cd_m2, found.samples) == (0.0, 4.0, 7)
 
 
-def renderer(power: float, tried: list[int]):  # type: ignore[no-untyped-def]
+def renderer(power: float, tried: list[int]) -> Callable[..., Any]:  # type: ignore[no-untyped-def]
     """Noise that falls with a power of the samples, 0.4 at one."""
 
     def measure(samples: int) -> NoiseEstimate:

@@ -24,7 +24,7 @@ def random_predictions(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.rand(1, count, generator=generator), boxes
 
 
-def test_anchor_points_are_the_centres_of_their_cells():
+def test_anchor_points_are_the_centres_of_their_cells() -> None:
     for stride, offset, shape in ((8, 0, (16, 20)), (16, 320, (8, 10)), (32, 400, (4, 5))):
         for row, column in ((0, 0), (1, 2), (shape[0] - 1, shape[1] - 1)):
             index = offset + row * shape[1] + column
@@ -32,7 +32,7 @@ def test_anchor_points_are_the_centres_of_their_cells():
             assert CELLS.strides_px[index].item() == stride
 
 
-def test_iou_agrees_with_pycocotools():
+def test_iou_agrees_with_pycocotools() -> None:
     rng = np.random.default_rng(1)
     a, b = (np.hstack((rng.uniform(0, 60, (7, 2)), rng.uniform(5, 60, (7, 2)))) for _ in range(2))
     ours = intersection_over_union(corners(a.tolist())[:, None], corners(b.tolist())[None])
@@ -40,7 +40,7 @@ def test_iou_agrees_with_pycocotools():
     np.testing.assert_allclose(ours.numpy(), mask.iou(a, b, [0] * 7), atol=1e-5)
 
 
-def test_complete_iou_in_closed_form():
+def test_complete_iou_in_closed_form() -> None:
     square = (10.0, 20.0, 40.0, 40.0)
     half = (20.0, 30.0, 20.0, 20.0)
     beside = (110.0, 20.0, 40.0, 40.0)
@@ -49,7 +49,7 @@ def test_complete_iou_in_closed_form():
     torch.testing.assert_close(got, torch.tensor([1.0, 0.25, -(100**2) / (140**2 + 40**2)]), rtol=1e-5, atol=1e-6)
 
 
-def test_complete_iou_has_a_gradient_for_boxes_that_do_not_touch():
+def test_complete_iou_has_a_gradient_for_boxes_that_do_not_touch() -> None:
     box = corners([(100.0, 0.0, 10.0, 10.0)]).requires_grad_()
     complete_iou(box, corners([(0.0, 0.0, 10.0, 10.0)])).sum().backward()
     assert box.grad is not None
@@ -58,7 +58,7 @@ def test_complete_iou_has_a_gradient_for_boxes_that_do_not_touch():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_cells_are_assigned_to_boxes_that_contain_them(seed):
+def test_cells_are_assigned_to_boxes_that_contain_them(seed: int) -> None:
     truth = corners([(5, 9, 17, 17), (60, 10, 70, 90), (3, 60, 40, 50)])
     scores, boxes = random_predictions(seed)
     present = torch.tensor([[True, True, True, False]])
@@ -77,7 +77,7 @@ def test_cells_are_assigned_to_boxes_that_contain_them(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_order_of_boxes_does_not_matter(seed):
+def test_the_order_of_boxes_does_not_matter(seed: int) -> None:
     truth = corners([(5, 9, 60, 50), (30, 20, 70, 90), (3, 60, 40, 50)])
     scores, boxes = random_predictions(seed)
     present = torch.ones(1, 3, dtype=torch.bool)
@@ -89,7 +89,7 @@ def test_the_order_of_boxes_does_not_matter(seed):
     assert torch.equal(plain.box_index[plain.foreground], order[turned.box_index[turned.foreground]])
 
 
-def test_a_box_without_cells_gets_the_nearest_one():
+def test_a_box_without_cells_gets_the_nearest_one() -> None:
     scores, boxes = random_predictions(3)
     truth = corners([(45.0, 53.0, 2.0, 2.0)])
     assigned = assign_anchors(scores, boxes, CELLS.centers_px, truth[None], torch.ones(1, 1, dtype=torch.bool))
@@ -99,7 +99,7 @@ def test_a_box_without_cells_gets_the_nearest_one():
     assert CELLS.strides_px[cell].item() == 8
 
 
-def test_a_cell_in_two_boxes_is_assigned_to_the_one_with_the_higher_iou():
+def test_a_cell_in_two_boxes_is_assigned_to_the_one_with_the_higher_iou() -> None:
     scores, boxes = random_predictions(4)
     outer, inner = (0.0, 0.0, 100.0, 100.0), (20.0, 20.0, 60.0, 60.0)
     boxes = corners([outer])[None].repeat(1, boxes.shape[1], 1)

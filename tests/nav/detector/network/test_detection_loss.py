@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 from pycocotools import mask
@@ -37,7 +40,7 @@ def perfect_maps(box: tuple[float, float, float, float], shift_px: float = 0.0) 
     return maps
 
 
-def test_loss_of_right_boxes_is_zero_and_grows_with_their_shift():
+def test_loss_of_right_boxes_is_zero_and_grows_with_their_shift() -> None:
     box = (40.0, 30.0, 61.0, 53.0)
     losses = [
         detection_loss(perfect_maps(box, shift_px), [torch.tensor([box])]).box.item() for shift_px in (0, 1, 2, 4, 8)
@@ -47,7 +50,7 @@ def test_loss_of_right_boxes_is_zero_and_grows_with_their_shift():
     assert losses == sorted(losses) and losses[1] > 1e-3
 
 
-def test_images_without_boxes_only_push_scores_down():
+def test_images_without_boxes_only_push_scores_down() -> None:
     maps = [each.requires_grad_() for each in blank_maps(2)]
     loss = detection_loss(maps, [NONE, NONE])
     loss.total.backward()
@@ -58,7 +61,7 @@ def test_images_without_boxes_only_push_scores_down():
         assert bool((each.grad[:, 1:] == 0).all())
 
 
-def test_an_image_without_boxes_does_not_disturb_its_neighbours():
+def test_an_image_without_boxes_does_not_disturb_its_neighbours() -> None:
     maps = blank_maps(2)
     alone = detection_loss([each[:1] for each in maps], BOXES[:1])
     both = detection_loss(maps, BOXES)
@@ -66,7 +69,7 @@ def test_an_image_without_boxes_does_not_disturb_its_neighbours():
     assert both.score.item() >= alone.score.item()
 
 
-def test_minimising_the_loss_makes_the_predictions_right():
+def test_minimising_the_loss_makes_the_predictions_right() -> None:
     """Maps are optimised without a network: assignment, loss and decoding in numpy use the same box coordinates."""
     maps = [each.requires_grad_() for each in blank_maps(2)]
     optimiser = torch.optim.Adam(maps, lr=0.1)
@@ -85,7 +88,7 @@ def test_minimising_the_loss_makes_the_predictions_right():
 
 
 @pytest.mark.parametrize("boxes", [BOXES, [NONE, NONE]], ids=["boxes", "none"])
-def test_gradients_in_autocast_are_float32_and_finite(network, boxes):
+def test_gradients_in_autocast_are_float32_and_finite(network: Callable[..., Any], boxes: list[torch.Tensor]) -> None:
     torch_network = network(NetworkConfig("s")).train()
     images = torch.rand(2, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -97,7 +100,7 @@ def test_gradients_in_autocast_are_float32_and_finite(network, boxes):
         assert bool(weight.grad.isfinite().all()), name
 
 
-def test_extreme_predictions_keep_the_loss_finite():
+def test_extreme_predictions_keep_the_loss_finite() -> None:
     for logit, log_distance in ((80.0, 50.0), (-80.0, -50.0)):
         maps = [torch.full_like(each, log_distance) for each in blank_maps(2)]
         for each in maps:
@@ -112,6 +115,6 @@ def test_extreme_predictions_keep_the_loss_finite():
 @pytest.mark.parametrize(
     ("boxes", "message"), [([NONE], "one for each of 2 images, got 1"), ([NONE, torch.zeros(4)], r"must be \(n, 4\)")]
 )
-def test_boxes_that_fit_no_batch_are_refused(boxes, message):
+def test_boxes_that_fit_no_batch_are_refused(boxes: list[torch.Tensor], message: str) -> None:
     with pytest.raises(ValueError, match=f"boxes_xywh_px: .*{message}"):
         detection_loss(blank_maps(2), boxes)

@@ -2,8 +2,10 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ MAX_WEIGHTS_BYTES = 12e6
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: "-".join(config.to_dict().values()))
-def test_there_is_one_output_map_per_stride(network, config):
+def test_there_is_one_output_map_per_stride(network: Callable[..., Any], config: NetworkConfig) -> None:
     height, width = 64, 96
     with torch.no_grad():
         maps = network(config)(torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(1)))
@@ -37,7 +39,7 @@ def test_there_is_one_output_map_per_stride(network, config):
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: "-".join(config.to_dict().values()))
-def test_configuration_survives_json(config):
+def test_configuration_survives_json(config: NetworkConfig) -> None:
     assert NetworkConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
@@ -49,7 +51,7 @@ def test_configuration_survives_json(config):
         ({"depth": 3}, "network: has no depth"),
     ],
 )
-def test_a_configuration_that_does_not_exist_is_refused(values, message):
+def test_a_configuration_that_does_not_exist_is_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         NetworkConfig.from_dict(values)
 
@@ -58,11 +60,11 @@ def test_a_configuration_that_does_not_exist_is_refused(values, message):
 @pytest.mark.parametrize(
     ("channels", "size"), [(8, 3), (16, 3), (64, 3), (72, 3), (240, 5), (256, 5), (512, 5), (960, 5)]
 )
-def test_eca_kernel_size(channels, size):
+def test_eca_kernel_size(channels: int, size: int) -> None:
     assert eca_kernel_size(channels) == size
 
 
-def test_eca_weighs_a_channel_by_the_means_of_its_neighbours():
+def test_eca_weighs_a_channel_by_the_means_of_its_neighbours() -> None:
     attention = EfficientChannelAttention(8)
     kernel = torch.tensor([0.3, -0.7, 1.1])
     with torch.no_grad():
@@ -77,7 +79,7 @@ def test_eca_weighs_a_channel_by_the_means_of_its_neighbours():
 
 # The published MobileNetV3 models of torchvision have these bottlenecks.
 @pytest.mark.parametrize(("channels", "squeezed"), [(16, 8), (72, 24), (96, 24), (120, 32), (480, 120), (960, 240)])
-def test_squeezed_channels(channels, squeezed):
+def test_squeezed_channels(channels: int, squeezed: int) -> None:
     assert squeezed_channels(channels) == squeezed
 
 
@@ -88,7 +90,9 @@ def test_squeezed_channels(channels, squeezed):
     ("variant", "published", "published_multiply_adds", "last", "hidden"),
     [("l", 5_483_032, 0.217e9, (160, 960), 1280), ("s", 2_542_856, 0.057e9, (96, 576), 1024)],
 )
-def test_backbone_has_the_published_size(variant, published, published_multiply_adds, last, hidden):
+def test_backbone_has_the_published_size(
+    variant: str, published: int, published_multiply_adds: float, last: tuple[int, int], hidden: int
+) -> None:
     backbone = complexity(MobileNetV3(variant, "se"), (224, 224))
     classifier = (last[1] + 1) * hidden + (hidden + 1) * 1000
     assert backbone.parameters + last[0] * last[1] + 2 * last[1] + classifier == published
@@ -98,7 +102,7 @@ def test_backbone_has_the_published_size(variant, published, published_multiply_
 
 
 @pytest.mark.parametrize("variant", ["l", "s"])
-def test_eca_replaces_every_squeeze_and_excitation(variant):
+def test_eca_replaces_every_squeeze_and_excitation(variant: str) -> None:
     kinds = {"eca": EfficientChannelAttention, "se": SqueezeExcitation}
     wanted = sum(block.has_attention for block in BLOCKS[variant])
     for name, kind in kinds.items():
@@ -108,11 +112,11 @@ def test_eca_replaces_every_squeeze_and_excitation(variant):
 
 
 @pytest.mark.parametrize("variant", ["l", "s"])
-def test_weights_fit_into_the_package(variant):
+def test_weights_fit_into_the_package(variant: str) -> None:
     assert 4 * complexity(DetectorNetwork(NetworkConfig(variant)), (64, 64)).parameters < MAX_WEIGHTS_BYTES
 
 
-def test_fusion_weights_of_each_location_sum_to_one():
+def test_fusion_weights_of_each_location_sum_to_one() -> None:
     generator = torch.Generator().manual_seed(3)
     levels = [3 * torch.randn(2, 8, 4, 6, generator=generator) for _ in STRIDES]
     weights = AdaptiveFusion(8).level_weights(levels)
@@ -122,7 +126,7 @@ def test_fusion_weights_of_each_location_sum_to_one():
     torch.testing.assert_close(weights.sum(dim=1), torch.ones(2, 4, 6), rtol=0, atol=1e-6)
 
 
-def test_fusion_of_equal_levels_is_that_level():
+def test_fusion_of_equal_levels_is_that_level() -> None:
     fusion = AdaptiveFusion(8).eval()
     level = torch.randn(1, 8, 4, 6, generator=torch.Generator().manual_seed(4))
     # A weighted mean of equal numbers in float32, then two convolutions.
@@ -130,7 +134,7 @@ def test_fusion_of_equal_levels_is_that_level():
 
 
 @pytest.mark.parametrize(("stride", "target"), list(product(STRIDES, STRIDES)))
-def test_levels_are_resized_to_each_other(stride, target):
+def test_levels_are_resized_to_each_other(stride: int, target: int) -> None:
     features = torch.randn(1, 4, 64 // stride, 96 // stride, generator=torch.Generator().manual_seed(5))
     resized = LevelResize(4, stride, target)(features)
     assert tuple(resized.shape) == (1, 4, 64 // target, 96 // target)
@@ -140,7 +144,7 @@ def test_levels_are_resized_to_each_other(stride, target):
 
 
 @pytest.mark.parametrize("variant", ["l", "s"])
-def test_an_untrained_network_predicts_no_drogue_and_boxes_of_four_strides(variant):
+def test_an_untrained_network_predicts_no_drogue_and_boxes_of_four_strides(variant: str) -> None:
     torch_network = DetectorNetwork(NetworkConfig(variant)).train()
     images = torch.rand(2, 3, 64, 96, generator=torch.Generator().manual_seed(6))
     with torch.no_grad():
@@ -151,7 +155,7 @@ def test_an_untrained_network_predicts_no_drogue_and_boxes_of_four_strides(varia
         assert float((each[:, 1:].exp() - 2).abs().max()) < 1.0
 
 
-def test_depthwise_convolution_in_autocast_is_the_float32_one_where_bf16_is_slow():
+def test_depthwise_convolution_in_autocast_is_the_float32_one_where_bf16_is_slow() -> None:
     features = torch.randn(2, 16, 12, 14, generator=torch.Generator().manual_seed(7))
     for kernel, stride in ((5, 1), (3, 2), (5, 2)):
         layer = DepthwiseConv(16, kernel, stride)
@@ -162,7 +166,7 @@ def test_depthwise_convolution_in_autocast_is_the_float32_one_where_bf16_is_slow
         torch.testing.assert_close(output.float(), layer(features), rtol=2**-8, atol=1e-5)
 
 
-def test_autocast_outputs_are_float32_and_nearly_the_same(network):
+def test_autocast_outputs_are_float32_and_nearly_the_same(network: Callable[..., Any]) -> None:
     torch_network = network(NetworkConfig("s"))
     images = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(8))
     with torch.no_grad():
@@ -175,7 +179,7 @@ def test_autocast_outputs_are_float32_and_nearly_the_same(network):
         assert float((output - reference).abs().mean() / reference.std()) < 0.1
 
 
-def test_complexity_of_layers_worked_by_hand():
+def test_complexity_of_layers_worked_by_hand() -> None:
     # 3x3 from 3 to 8 channels at stride 2, depthwise 5x5, 1x1 from 8 to 4; 12x10 images.
     layers = nn.Sequential(
         nn.Conv2d(3, 8, 3, 2, 1), nn.Conv2d(8, 8, 5, padding=2, groups=8, bias=False), nn.Conv2d(8, 4, 1)
@@ -187,7 +191,7 @@ def test_complexity_of_layers_worked_by_hand():
     assert found.gflops == pytest.approx(2 * found.multiply_adds / 1e9)
 
 
-def test_the_documented_sizes_are_right():
+def test_the_documented_sizes_are_right() -> None:
     page = (Path(__file__).resolve().parents[4] / "docs/explanation/detector-network.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([ls])` (\w+) (\w+) \| ([\d,]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.MULTILINE)
     assert rows
@@ -202,7 +206,7 @@ def test_the_documented_sizes_are_right():
             assert f"{small.gflops + per_pixel * (area - 64 * 64):.2f}" == stated
 
 
-def test_complexity_does_not_change_the_network():
+def test_complexity_does_not_change_the_network() -> None:
     torch_network = DetectorNetwork(NetworkConfig("s")).train()
     before = {name: value.clone() for name, value in torch_network.state_dict().items()}
     small, large = (complexity(torch_network, size).multiply_adds for size in ((96, 64), (192, 128)))
@@ -212,7 +216,7 @@ def test_complexity_does_not_change_the_network():
     assert all(torch.equal(value, before[name]) for name, value in torch_network.state_dict().items())
 
 
-def test_the_gain_of_images_can_be_folded_into_the_first_layer(network):
+def test_the_gain_of_images_can_be_folded_into_the_first_layer(network: Callable[..., Any]) -> None:
     folded = network(NetworkConfig("s")).eval()
     images = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
