@@ -12,21 +12,11 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 from datasets_manifest.types.records import PixelBox
-
-VIEW_FOLDERS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("L", "R"))
-"""Names of the two folders of a dataset with a folder a view, in the order in which they are looked for."""
-
-
-def image_key(path: PurePath) -> str:
-    """An image's file name, preceded by its folder where there is a folder for each view."""
-    is_view = any(path.parent.name in names for names in VIEW_FOLDERS)
-    return f"{path.parent.name}/{path.name}" if is_view else path.name
-
 
 _DROGUE = "drogue"
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
@@ -23,10 +24,12 @@ from datasets_manifest.storage.layout import (
     RECORD_FILE,
     frame_folder,
     image_file,
+    mosaic_file,
 )
 from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import Pixels
+from datasets_manifest.types.pixel_values import PixelValues
 from datasets_manifest.types.records import PixelBox
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, StereoRig
@@ -45,12 +48,19 @@ class ImportedPair:
         names: of the left and the right image in the source.
         time_s: the source's time stamp, nominally of mid-exposure. [s]
         left, right: (H, W, 3) red, green, blue, or (H, W) grey.
+        left_mosaic, right_mosaic: (H, W) raw RGGB mosaic of a Bayer sensor, else None.
+        turned_count: images that were turned as their EXIF orientation says.
+        values: what the source says of the pixel values, or None.
     """
 
     names: tuple[str, str]
     time_s: float
     left: Pixels
     right: Pixels
+    left_mosaic: Pixels | None = None
+    right_mosaic: Pixels | None = None
+    turned_count: int = 0
+    values: PixelValues | None = None
 
 
 class ImportedPairs(Protocol):
@@ -59,10 +69,12 @@ class ImportedPairs(Protocol):
     Attributes:
         count: number of pairs.
         left_out: images that cannot be imported, with the reason, a line each.
+        remarks: what was understood without being said, a line each.
     """
 
     count: int
     left_out: tuple[str, ...]
+    remarks: tuple[str, ...]
 
     def __iter__(self) -> Iterator[ImportedPair]:
         """The pairs, each read on demand.
@@ -81,10 +93,11 @@ class ImportSettings:
         name: of the dataset.
         rig: the cameras.
         drogue: the drogue to look for.
-        encoding: of the pixel values; by default `gamma` for 8 bits and `linear` for more.
-        black_level_dn: pixel value without light, in the source. [DN]
-        bits: significant bits of images with more than 8; by default as many as the first pair needs.
-        exposure_s: exposure time; 0 where it is unknown. [s]
+        encoding: of the pixel values; by default what the source says, else `gamma` for 8 bits and `linear` for more.
+        black_level_dn: pixel value without light, in the source; by default what the source says, else 0. [DN]
+        bits: significant bits of images with more than 8; by default what the source says, else as many as the first
+            pair needs.
+        exposure_s: exposure time where the source does not say it; 0 where it is unknown. [s]
         boxes: around the drogue.
     """
 
@@ -92,13 +105,28 @@ class ImportSettings:
     rig: StereoRig
     drogue: DrogueParameters
     encoding: Literal["linear", "gamma"] | None = None
-    black_level_dn: float = 0.0
+    black_level_dn: float | None = None
     bits: int | None = None
     exposure_s: float = 0.0
     boxes: DrawnBoxes | None = None
 
 
-def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, advance: Callable[[], None]) -> int:
+@dataclass(frozen=True)
+class ImportSummary:
+    """What was written.
+
+    Attributes:
+        box_count: boxes whose image was found.
+        remarks: what was understood without being said, a line each.
+    """
+
+    box_count: int
+    remarks: tuple[str, ...]
+
+
+def write_imported(
+    source: ImportedPairs, settings: ImportSettings, out: Path, advance: Callable[[], None]
+) -> ImportSummary:
     """Write the pairs of a source as a dataset without truth.
 
     Args:
@@ -107,29 +135,34 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
         out: the dataset's folder; must not exist yet.
         advance: called after each pair.
 
-    Returns:
-        Number of boxes whose image was found.
-
     Raises:
-        ValueError: an image that cannot be read, or of another size, depth or colour than rig and first pair.
+        ValueError: an image that cannot be read, or of another size, depth or colour than rig and first pair; pairs
+            that are not in the order of time; or settings that contradict what the source says.
         OSError: it cannot be written; nothing is left behind.
     """
     depth: PixelDepth | None = None
+    meant = settings
+    time_s, turned_count = -math.inf, 0
     names: list[tuple[str, str]] = []
     box_count = 0
     with new_folder(out) as folder:
         for frame_index, pair in enumerate(source):
-            depth = depth or PixelDepth(pair, settings.bits)
+            if not pair.time_s > time_s:
+                raise ValueError(f"{pair.names[0]}: its time of {pair.time_s} s must be later than the pair's before")
+            meant, encoding = _as_said(settings, pair), meant.encoding
+            depth = depth or PixelDepth(pair, meant.bits)
+            if frame_index and meant.encoding != encoding:
+                raise ValueError(f"{pair.names[0]}: at {pair.time_s} s must have the encoding of the first pair")
+            time_s, turned_count = pair.time_s, turned_count + pair.turned_count
             target = frame_folder(folder, frame_index)
             target.mkdir(parents=True)
-            for eye, name, image in zip(EYES, pair.names, (pair.left, pair.right), strict=True):
-                pixels = depth.checked(image, name, settings.rig)
-                (target / image_file(eye)).write_bytes(encode_png(pixels))
-            _write(target / RECORD_FILE, _record(pair, settings, depth.kept_level_dn(settings.black_level_dn)))
+            for name, pixels in _stored_images(pair, depth, settings.rig).items():
+                (target / name).write_bytes(encode_png(pixels))
+            _write(target / RECORD_FILE, _record(pair, meant, depth.kept_level_dn(meant.black_level_dn or 0.0)))
             names.append(pair.names)
             advance()
         assert depth is not None  # a source without pairs was refused
-        _write(folder / BLIND_FILE, _index(settings, depth, source.count).model_dump(mode="json"))
+        _write(folder / BLIND_FILE, _index(meant, depth, source.count).model_dump(mode="json"))
         for name, text in calibration_files(settings.rig).items():
             (folder / CALIBRATION_FOLDER).mkdir(exist_ok=True)
             (folder / CALIBRATION_FOLDER / name).write_text(text, encoding="utf-8")
@@ -138,7 +171,56 @@ def write_imported(source: ImportedPairs, settings: ImportSettings, out: Path, a
             box_count = len(table["annotations"])
             (folder / ANNOTATIONS_FOLDER).mkdir()
             _write(folder / ANNOTATIONS_FOLDER / "all.json", table)
-    return box_count
+    remarks = [*source.remarks, _pixel_value_line(settings, meant, depth)]
+    if turned_count:
+        remarks.append(f"orientation: {turned_count} images are turned as their EXIF says, as cv2.imread turns them")
+    return ImportSummary(box_count, tuple(remarks))
+
+
+def _as_said(settings: ImportSettings, pair: ImportedPair) -> ImportSettings:
+    """The settings with what the source says of a pair's pixel values.
+
+    Raises:
+        ValueError: the two contradict each other.
+    """
+    said = pair.values
+    if said is None:
+        return settings
+    for option, given, value in (
+        ("--encoding", settings.encoding, said.encoding),
+        ("--black-level", settings.black_level_dn, said.black_level_dn),
+        ("--bits", settings.bits, said.bits),
+    ):
+        if given not in (None, value):
+            raise ValueError(f"{option}: the source says {value}, got {given}; leave the option out")
+    bits = said.bits if said.bits > 8 else None
+    return replace(
+        settings, encoding=said.encoding, black_level_dn=said.black_level_dn, bits=bits, exposure_s=said.exposure_s
+    )
+
+
+def _pixel_value_line(settings: ImportSettings, meant: ImportSettings, depth: PixelDepth) -> str:
+    """What the pixel values were taken for."""
+    black_dn = meant.black_level_dn or 0.0
+    line = f"pixel values: {depth.bits} bits, {depth.encoding(meant.encoding)}, black level {black_dn:g} DN"
+    if meant is not settings:
+        return f"{line}, as the source says"
+    options = {"--encoding": meant.encoding, "--black-level": meant.black_level_dn}
+    if depth.output_bits != 8:
+        options["--bits"] = meant.bits
+    unsaid = [option for option, value in options.items() if value is None]
+    return f"{line}; assumed, without {', '.join(unsaid)}" if unsaid else line
+
+
+def _stored_images(pair: ImportedPair, depth: PixelDepth, rig: StereoRig) -> dict[str, Pixels]:
+    """A pair's images by file name, with the depth in which they are stored."""
+    first, second = pair.names
+    mosaics = [(mosaic_file("left"), first, pair.left_mosaic), (mosaic_file("right"), second, pair.right_mosaic)]
+    found = [(file, name, mosaic) for file, name, mosaic in mosaics if mosaic is not None]
+    if len(found) != (len(mosaics) if depth.color == "bayer" else 0):
+        raise ValueError(f"{first}: at {pair.time_s} s must have the depth and colours of the first pair")
+    found += [(image_file("left"), first, pair.left), (image_file("right"), second, pair.right)]
+    return {file: depth.checked(image, name, rig) for file, name, image in found}
 
 
 class PixelDepth:
@@ -146,13 +228,15 @@ class PixelDepth:
 
     def __init__(self, pair: ImportedPair, bits: int | None) -> None:
         image = pair.left
-        self.color: Literal["rgb", "mono"] = "rgb" if image.ndim == 3 else "mono"
+        self.color: Literal["rgb", "bayer", "mono"] = "rgb" if image.ndim == 3 else "mono"
+        if pair.left_mosaic is not None:
+            self.color = "bayer"
         self._dtype = image.dtype
         self.output_bits: Literal[8, 12] = 8 if image.dtype == np.uint8 else _KEPT_BITS
         if bits is not None and self.output_bits == 8:
             raise ValueError(f"{pair.names[0]}: has 8 bits; leave the number of bits out")
         is_deep = max(int(pair.left.max()), int(pair.right.max())) >= 2**_KEPT_BITS
-        self._bits = bits or (_DEEPEST_BITS if is_deep else _KEPT_BITS)
+        self.bits = 8 if self.output_bits == 8 else bits or (_DEEPEST_BITS if is_deep else _KEPT_BITS)
 
     def encoding(self, given: Literal["linear", "gamma"] | None) -> Literal["linear", "gamma"]:
         """The encoding of the pixel values; unless it is given, `gamma` for 8 bits and `linear` for more."""
@@ -164,7 +248,7 @@ class PixelDepth:
         Raises:
             ValueError: outside the range of the images.
         """
-        kept = level_dn if self.output_bits == 8 else level_dn * 2.0 ** (_KEPT_BITS - self._bits)
+        kept = level_dn if self.output_bits == 8 else level_dn * 2.0 ** (_KEPT_BITS - self.bits)
         if not 0 <= kept < 2**self.output_bits - 1:
             raise ValueError(f"black level: must be below the images' largest number, got {level_dn:g}")
         return kept
@@ -180,13 +264,14 @@ class PixelDepth:
             raise ValueError(
                 f"{name}: must be {size[0]}x{size[1]} px as calibrated, got {image.shape[1]}x{image.shape[0]}"
             )
-        if image.dtype != self._dtype or (image.ndim == 3) != (self.color == "rgb"):
+        is_color = image.ndim == 3
+        if image.dtype != self._dtype or is_color == (self.color == "mono"):
             raise ValueError(f"{name}: must have the depth and colours of the first pair")
         if self.output_bits == 8:
             return image
-        if int(image.max()) >= 2**self._bits:
-            raise ValueError(f"{name}: has values beyond {self._bits} bits; name the camera's bits")
-        shift = self._bits - _KEPT_BITS
+        if int(image.max()) >= 2**self.bits:
+            raise ValueError(f"{name}: has values beyond {self.bits} bits; name the camera's bits")
+        shift = self.bits - _KEPT_BITS
         return np.asarray(image >> shift if shift >= 0 else image << -shift, dtype=np.uint16)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from rosbags.highlevel import AnyReader
@@ -14,38 +15,52 @@ from rosbags.typesys import Stores, get_typestore
 
 from datasets_manifest.calibration.camera_info import CameraInfo, rig_of_camera_info
 from datasets_manifest.importers.imported_dataset import ImportedPair
-from datasets_manifest.importers.ros_images import decode_image, message_stamp_ns
+from datasets_manifest.importers.ros_images import RosImage, decode_image, message_stamp_ns
+from datasets_manifest.importers.stamp_pairs import match_stamps, smallest_difference_ns
+from datasets_manifest.types.pixel_values import PIXEL_VALUES_TOPIC, PixelValues, parse_pixel_values
 from geometry.se3 import Array
 from geometry.stereo import EYES, StereoRig
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+_TEXT_TYPE = "std_msgs/msg/String"
+# A bag may be played into another namespace.
+_PIXEL_VALUES_NAME: Final = PIXEL_VALUES_TOPIC.rsplit("/", 1)[1]
+# Words of the left and the right topic's names; those of RealSense and EuRoC are numbered.
+_VIEW_WORDS = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("camera0", "camera1"))
+_RECTIFIED = re.compile(r"(?<![a-z])rect(?![a-z])|rectified")
+# Pairs that wait for an earlier time stamp; more would fill the memory, and come from clocks that were set.
+_MOST_WAITING = 256
+# Sizes of rounding in the matrices of a rectified image.
+_ROUNDING = 1e-9
 
 
 class RosBag:
-    """The pairs of a bag: images with equal time stamps.
+    """The pairs of a bag, in the order of their time stamps.
 
     Attributes:
         count: number of pairs.
         left_out: images without a partner.
+        remarks: what was understood.
     """
 
-    def __init__(self, path: Path, topics: tuple[str, str] | None = None) -> None:
+    def __init__(self, path: Path, topics: tuple[str, str] | None = None, tolerance_ns: int = 0) -> None:
         """List the pairs of a bag; images are decoded later.
 
         Args:
-            path: a rosbag2 folder, or a `.bag` file of ROS 1.
+            path: a rosbag2 folder, a `.mcap` or `.db3` file of one, or a `.bag` file of ROS 1.
             topics: of the left and the right images; by default the two whose names differ in left and right.
+            tolerance_ns: by how much the time stamps of a pair may differ. [ns]
 
         Raises:
-            ValueError: not a bag, a damaged one, or topics that do not fit.
+            ValueError: not a bag, a damaged one, or topics or time stamps that do not fit.
         """
         self._path = path
         with self._open() as reader:
             self._topics = topics or _stereo_topics(reader)
             for topic in self._topics:
                 if not any(c.topic == topic and c.msgtype in _IMAGE_TYPES for c in reader.connections):
-                    raise ValueError(f"{path}: has no images on {topic}; there are {_image_topics(reader)}")
+                    raise ValueError(f"{path}: has no images on {topic}; there are {_topics_of(reader, _IMAGE_TYPES)}")
             stamps: dict[str, set[int]] = {topic: set() for topic in self._topics}
             for connection, _, message in _messages(reader, self._topics, path):
                 stamp_ns = message_stamp_ns(message)
@@ -54,56 +69,116 @@ class RosBag:
                         f"{path}: {connection.topic} has two images stamped {stamp_ns} ns, which cannot be paired"
                     )
                 stamps[connection.topic].add(stamp_ns)
+            self._values = self._pixel_values(reader)
         left, right = (stamps[topic] for topic in self._topics)
-        self._both = left & right
-        alone = {self._topics[0]: left - right, self._topics[1]: right - left}
-        self.left_out = tuple(
-            f"{topic}: {len(times)} images without one of the same time stamp on the other topic"
-            for topic, times in alone.items()
-            if times
-        )
-        self.count = len(self._both)
+        self._pairs = match_stamps(left, right, tolerance_ns, str(path))
+        self.count = len(self._pairs)
         if not self.count:
-            raise ValueError(f"{path}: no images on {' and '.join(self._topics)} have equal time stamps")
+            nearest_ns = smallest_difference_ns(left, right)
+            hint = (
+                "" if nearest_ns is None else f"; the nearest differ by {nearest_ns / 1e6:g} ms (--stamp-tolerance-ms)"
+            )
+            raise ValueError(f"{path}: no images on {' and '.join(self._topics)} have equal time stamps{hint}")
+        within = f" within {tolerance_ns / 1e6:g} ms" if tolerance_ns else ""
+        alone = [len(times) - self.count for times in (left, right)]
+        self.left_out = tuple(
+            f"{topic}: {count} images without one of the same time stamp{within} on the other topic"
+            for topic, count in zip(self._topics, alone, strict=True)
+            if count
+        )
+        apart_ns = max(abs(first - second) for first, second in self._pairs)
+        said = f"times: those of the left images; the right ones' differ by up to {apart_ns / 1e6:g} ms"
+        self.remarks: tuple[str, ...] = (said,) if apart_ns else ()
 
     def __iter__(self) -> Iterator[ImportedPair]:
-        waiting: dict[int, dict[str, Any]] = {}
+        places = [{pair[eye]: place for place, pair in enumerate(self._pairs)} for eye in range(len(EYES))]
+        waiting: dict[int, dict[int, Any]] = {}
+        due = 0
         with self._open() as reader:
             for connection, _, message in _messages(reader, self._topics, self._path):
-                stamp_ns = message_stamp_ns(message)
-                if stamp_ns not in self._both:
+                eye = self._topics.index(connection.topic)
+                place = places[eye].get(message_stamp_ns(message))
+                if place is None:
                     continue
-                views = waiting.setdefault(stamp_ns, {})
-                views[connection.topic] = message
-                if len(views) == len(EYES):
-                    name = f"{self._path}: at {stamp_ns} ns"
-                    left, right = (decode_image(views[topic], name) for topic in self._topics)
-                    del waiting[stamp_ns]
-                    yield ImportedPair(self._topics, 1e-9 * stamp_ns, left, right)
+                waiting.setdefault(place, {})[eye] = message
+                while len(waiting.get(due, ())) == len(EYES):
+                    views = waiting.pop(due)
+                    yield self._pair(due, views[0], views[1])
+                    due += 1
+                if len(waiting) > _MOST_WAITING:
+                    raise ValueError(
+                        f"{self._path}: {len(waiting)} pairs were recorded before the one stamped "
+                        f"{self._pairs[due][0]} ns, which is earlier; a bag must hold the times of one clock"
+                    )
 
-    def rig(self) -> StereoRig:
+    def _pair(self, place: int, left: Any, right: Any) -> ImportedPair:
+        stamps = self._pairs[place]
+        images: list[RosImage] = []
+        for topic, stamp_ns, message in zip(self._topics, stamps, (left, right), strict=True):
+            images.append(decode_image(message, f"{self._path}: {topic} at {stamp_ns} ns"))
+        first, second = images
+        if self._values is not None and stamps[0] not in self._values:
+            raise ValueError(f"{self._path}: its {_PIXEL_VALUES_NAME} say nothing of the pair at {stamps[0]} ns")
+        return ImportedPair(
+            self._topics,
+            1e-9 * stamps[0],
+            first.pixels,
+            second.pixels,
+            left_mosaic=first.mosaic,
+            right_mosaic=second.mosaic,
+            turned_count=first.is_turned + second.is_turned,
+            values=None if self._values is None else self._values[stamps[0]],
+        )
+
+    def rig(self, topics: tuple[str, str] | None = None) -> StereoRig:
         """The cameras, from the CameraInfo of both image topics; their rectified left one is the left frame.
 
+        Args:
+            topics: of the left and the right CameraInfo; by default `camera_info` beside each image topic.
+
         Raises:
-            ValueError: there is none, or it does not describe a stereo pair.
+            ValueError: there is none, it changes, or it does not describe the images of a stereo pair.
         """
-        for topic in self._topics:
-            if "image_rect" in topic:
-                raise ValueError(
-                    f"{topic}: is rectified, and its CameraInfo is the raw images'; choose those by --topics, or give "
-                    "--calibration"
-                )
-        topics = tuple(topic.removesuffix("/compressed").rsplit("/", 1)[0] + "/camera_info" for topic in self._topics)
+        if topics is None:
+            bases = [topic.removesuffix("/compressed").rsplit("/", 1)[0] for topic in self._topics]
+            topics = f"{bases[0]}/camera_info", f"{bases[1]}/camera_info"
         found: dict[str, Any] = {}
         with self._open() as reader:
             for connection, _, message in _messages(reader, topics, self._path):
-                found.setdefault(connection.topic, message)
-                if len(found) == len(EYES):
-                    break
-        if len(found) < len(EYES):
-            raise ValueError(f"{self._path}: has no CameraInfo on {' and '.join(topics)}; give --calibration")
-        left, right = (_camera_info(found[topic], f"{self._path}: {topic}") for topic in topics)
+                if connection.msgtype != _INFO_TYPE:
+                    continue
+                first = found.setdefault(connection.topic, message)
+                if _fields(first) != _fields(message):
+                    raise ValueError(
+                        f"{self._path}: {connection.topic} changes at {message_stamp_ns(message)} ns, and a rig is "
+                        "fixed; give --calibration"
+                    )
+            missing = [topic for topic in topics if topic not in found]
+            if missing:
+                raise ValueError(
+                    f"{self._path}: has no CameraInfo on {' and '.join(missing)}; choose it by --camera-info "
+                    f"LEFT,RIGHT from {_topics_of(reader, (_INFO_TYPE,))}, or give --calibration"
+                )
+        left, right = (
+            _camera_info(found[topic], f"{self._path}: {topic}", images)
+            for topic, images in zip(topics, self._topics, strict=True)
+        )
         return rig_of_camera_info(left, right)
+
+    def _pixel_values(self, reader: AnyReader) -> dict[int, PixelValues] | None:
+        """What the bag says of the pixel values, by time stamp, or None where it says nothing."""
+        topics = {c.topic for c in reader.connections if c.msgtype == _TEXT_TYPE}
+        topics = {topic for topic in topics if topic.rsplit("/", 1)[-1] == _PIXEL_VALUES_NAME}
+        if len(topics) > 1:
+            raise ValueError(f"{self._path}: has several rigs' pixel values, on {' and '.join(sorted(topics))}")
+        found: dict[int, PixelValues] = {}
+        for connection, _, message in _messages(reader, tuple(topics), self._path):
+            try:
+                values = parse_pixel_values(str(message.data))
+            except ValueError as error:
+                raise ValueError(f"{self._path}: {connection.topic}: {error}") from error
+            found[values.stamp_ns] = values
+        return found or None
 
     @contextmanager
     def _open(self) -> Iterator[AnyReader]:
@@ -130,29 +205,51 @@ def _messages(reader: AnyReader, topics: tuple[str, ...], path: Path) -> Iterato
     except GeneratorExit:
         raise
     except Exception as error:
-        raise ValueError(f"{path}: is damaged: {type(error).__name__}: {error}") from error
+        raise ValueError(f"{path}: is damaged: {type(error).__name__}: {' '.join(str(error).split())}") from error
 
 
-def _image_topics(reader: AnyReader) -> str:
-    return ", ".join(sorted(c.topic for c in reader.connections if c.msgtype in _IMAGE_TYPES)) or "none"
+def _topics_of(reader: AnyReader, types: tuple[str, ...]) -> str:
+    return ", ".join(sorted({c.topic for c in reader.connections if c.msgtype in types})) or "none"
 
 
 def _stereo_topics(reader: AnyReader) -> tuple[str, str]:
-    """The image topics whose names differ in left and right."""
-    topics = {connection.topic for connection in reader.connections if connection.msgtype in _IMAGE_TYPES}
-    pairs = sorted((topic, topic.replace("left", "right")) for topic in topics if "left" in topic)
-    pairs = [pair for pair in pairs if pair[1] in topics]
+    """The image topics whose names differ in the words for left and right."""
+    topics = {c.topic for c in reader.connections if c.msgtype in _IMAGE_TYPES}
+    topics = {topic for topic in topics if not topic.endswith("/compressedDepth")}
+    pairs = {(topic, topic.replace(left, right)) for topic in topics for left, right in _VIEW_WORDS if left in topic}
+    pairs = {pair for pair in pairs if pair[1] in topics}
     if len(pairs) != 1:
         raise ValueError(
             f"topics: {len(pairs)} pairs of image topics are named left and right; choose by --topics LEFT,RIGHT from "
-            f"{_image_topics(reader)}"
+            f"{_topics_of(reader, _IMAGE_TYPES)}"
         )
-    return pairs[0]
+    return pairs.pop()
 
 
-def _camera_info(message: Any, topic: str) -> CameraInfo:
-    size_px, model = (int(message.width), int(message.height)), str(message.distortion_model)
-    return CameraInfo(topic, size_px, model, *(_numbers(message, name) for name in ("d", "k", "r", "p")))
+def _camera_info(message: Any, name: str, image_topic: str) -> CameraInfo:
+    """A CameraInfo, of images as they were delivered.
+
+    Raises:
+        ValueError: it is of a part of the sensor, or of other images than those of the topic.
+    """
+    region, size_px = message.roi, (int(message.width), int(message.height))
+    is_cut = (region.width, region.height) not in ((0, 0), size_px) or region.x_offset or region.y_offset
+    if is_cut or message.binning_x > 1 or message.binning_y > 1:
+        raise ValueError(f"{name}: has a region of interest or binning, which is not read; give --calibration")
+    D, K, R, P = (_numbers(message, field) for field in "dkrp")
+    if _RECTIFIED.search(image_topic):
+        want = P.reshape(3, 4)[:, :3].ravel()
+        if D.any() or not np.allclose(R, np.eye(3).ravel(), atol=_ROUNDING) or not np.allclose(K, want, rtol=_ROUNDING):
+            raise ValueError(
+                f"{image_topic}: is rectified, and {name} is of the raw images; choose those by --topics, or give "
+                "--calibration"
+            )
+    return CameraInfo(name, size_px, str(message.distortion_model), D, K, R, P)
+
+
+def _fields(info: Any) -> tuple[Any, ...]:
+    """All that describes the camera in a CameraInfo, to compare two of them."""
+    return info.width, info.height, info.distortion_model, *(_numbers(info, name).tolist() for name in "dkrp")
 
 
 def _numbers(info: Any, name: str) -> Array:

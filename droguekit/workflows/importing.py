@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from droguekit.batch.progress import ProgressReport
     from geometry.stereo import StereoRig
 
-_RATE_HZ = 25.0
+_BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -25,11 +25,14 @@ class ImportOptions:
         drogue: preset or TOML file.
         boxes: COCO file of boxes of the drogue by image name, or None.
         box_category: name of their category; the one named drogue when None.
-        topics: `LEFT,RIGHT` of a bag, or None where it has one pair of them.
-        rate_hz: pairs a second in a folder; 25 when None. [Hz]
-        encoding: `linear` or `gamma`; by depth when None.
-        black_level_dn: number that no light gives.
-        bits: that 16-bit images use; as in the first pair when None.
+        topics: `LEFT,RIGHT` image topics of a bag, or None where it has one pair of them.
+        camera_info: `LEFT,RIGHT` CameraInfo topics of a bag; those beside the images when None.
+        folders: `LEFT,RIGHT` folders in a folder of images, or None where it has one pair of them.
+        rate_hz: pairs a second in a folder; when None the times that its files say, else 25. [Hz]
+        stamp_tolerance_ms: by how much the time stamps of a pair may differ. [ms]
+        encoding: `linear` or `gamma`; what the source says, else by depth, when None.
+        black_level_dn: pixel value without light; what the source says, else 0, when None. [DN]
+        bits: that 16-bit images use; what the source says, else as in the first pair, when None.
     """
 
     calibration: Path | None = None
@@ -38,9 +41,12 @@ class ImportOptions:
     boxes: Path | None = None
     box_category: str | None = None
     topics: str | None = None
+    camera_info: str | None = None
+    folders: str | None = None
     rate_hz: float | None = None
+    stamp_tolerance_ms: float = 0.0
     encoding: str | None = None
-    black_level_dn: float = 0.0
+    black_level_dn: float | None = None
     bits: int | None = None
 
     def __post_init__(self) -> None:
@@ -54,12 +60,32 @@ class ImportOptions:
         if self.calibration_unit not in _UNITS_M:
             raise ValueError(f"--calibration-unit: must be one of {', '.join(_UNITS_M)}, got {self.calibration_unit!r}")
         for name, value, low, high in (
-            ("rate", _RATE_HZ if self.rate_hz is None else self.rate_hz, 1e-3, 1e4),
+            ("rate", self.rate_hz, 1e-3, 1e4),
+            ("stamp-tolerance-ms", self.stamp_tolerance_ms, 0, 1000),
             ("black-level", self.black_level_dn, 0, 65535),
-            ("bits", 12 if self.bits is None else self.bits, 9, 16),
+            ("bits", self.bits, 9, 16),
         ):
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 raise ValueError(f"--{name}: must be from {low:g} to {high:g}, got {value:g}")
+
+    @property
+    def stamp_tolerance_ns(self) -> int:
+        """By how much the time stamps of a pair may differ. [ns]"""
+        return round(self.stamp_tolerance_ms * 1e6)
+
+    def pair_of(self, name: Literal["topics", "camera_info", "folders"]) -> tuple[str, str] | None:
+        """The two names of an option, or None where it is not given.
+
+        Raises:
+            ValueError: it has not two names.
+        """
+        text = getattr(self, name)
+        if text is None:
+            return None
+        names = [part.strip() for part in text.split(",")]
+        if len(names) != 2 or not all(names) or names[0] == names[1]:
+            raise ValueError(f"--{name.replace('_', '-')}: must be LEFT,RIGHT, got {text!r}")
+        return names[0], names[1]
 
 
 def import_images(source: Path, out: Path, options: ImportOptions, report: ProgressReport) -> int:
@@ -76,8 +102,6 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
     from datasets_manifest.importers.imported_dataset import ImportSettings, write_imported
     from drogue_models.presets import load_drogue
 
-    if _is_bag(source) and (options.rate_hz is not None or options.boxes is not None):
-        raise ValueError("--rate, --boxes: are for folders of images; a bag has stamps, and no names for its images")
     if options.box_category is not None and options.boxes is None:
         raise ValueError("--box-category: names the category of --boxes, which is missing")
     pairs, rig = _open_source(source, options)
@@ -93,39 +117,84 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
     )
     report.begin("pairs", pairs.count)
     try:
-        used = write_imported(pairs, settings, out, report.advance)
+        written = write_imported(pairs, settings, out, report.advance)
     finally:
         report.end()
     for line in pairs.left_out:
         report.say(f"left out: {line}")
+    for line in written.remarks:
+        report.say(line)
     if given is not None:
-        report.say(f"boxes: {used} of {len(given.boxes)} belong to these images")
+        report.say(f"boxes: {written.box_count} of {len(given.boxes)} belong to these images")
     return pairs.count
 
 
 def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, StereoRig]:
-    """The pairs and the rig that took them."""
-    from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo
+    """The pairs and the rig that took them; whether there are pairs is found out before the calibration is read."""
+    bag_path = _bag_path(source)
+    if bag_path is not None:
+        return _open_bag(bag_path, options)
+    for name in ("topics", "camera_info"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"--{name.replace('_', '-')}: {source} is not a ROS bag")
+    from datasets_manifest.importers.folder_layout import find_pairs
     from datasets_manifest.importers.image_folder import ImageFolder
 
-    unit_m, topics = _UNITS_M[options.calibration_unit], options.topics
-    given = None if options.calibration is None else read_opencv_stereo(options.calibration, unit_m)
-    if not _is_bag(source):
-        if topics is not None:
-            raise ValueError(f"--topics: {source} is not a ROS bag")
-        if given is None:
-            raise ValueError("--calibration: images need one; see docs/how-to/calibrate.md for how to make it")
-        return ImageFolder(source, given.camera.width_px, options.rate_hz or _RATE_HZ), given
-    names = None if topics is None else tuple(topics.split(","))
-    if names is not None and len(names) != 2:
-        raise ValueError(f"--topics: must be LEFT,RIGHT, got {topics!r}")
+    found = find_pairs(source, options.rate_hz, options.pair_of("folders"), options.stamp_tolerance_ns)
+    rig = _given_rig(options)
+    if rig is None:
+        raise ValueError("--calibration: images need one; see docs/how-to/calibrate.md for how to make it")
+    return ImageFolder(source, found, rig.camera.width_px), rig
+
+
+def _open_bag(path: Path, options: ImportOptions) -> tuple[ImportedPairs, StereoRig]:
+    if any(given is not None for given in (options.rate_hz, options.boxes, options.folders)):
+        raise ValueError(
+            "--rate, --boxes, --folders: are for folders of images; a bag has time stamps, and no names for its images"
+        )
     try:
         from datasets_manifest.importers.ros_bag import RosBag
     except ModuleNotFoundError as error:
-        raise ValueError(f"{source}: {error.name} is missing: pip install 'droguekit[exports]'") from error
-    bag = RosBag(source, names)
-    return bag, given or bag.rig()
+        raise ValueError(f"{path}: {error.name} is missing: pip install 'droguekit[exports]'") from error
+    if options.calibration is not None and options.camera_info is not None:
+        raise ValueError("--calibration, --camera-info: give one of the two")
+    bag = RosBag(path, options.pair_of("topics"), options.stamp_tolerance_ns)
+    return bag, _given_rig(options) or bag.rig(options.pair_of("camera_info"))
 
 
-def _is_bag(source: Path) -> bool:
-    return source.suffix == ".bag" or (source / "metadata.yaml").is_file()
+def _given_rig(options: ImportOptions) -> StereoRig | None:
+    from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo
+
+    if options.calibration is None:
+        return None
+    return read_opencv_stereo(options.calibration, _UNITS_M[options.calibration_unit])
+
+
+def _bag_path(source: Path) -> Path | None:
+    """The bag that SOURCE is or has in it, or None where it is a folder without one.
+
+    Raises:
+        ValueError: there is no such place, it is another kind of file, or it has several bags, or images beside one.
+    """
+    if not source.exists():
+        raise ValueError(f"{source}: there is no such file or folder")
+    if not source.is_dir():
+        if source.suffix.lower() in _BAG_SUFFIXES:
+            return source
+        raise ValueError(
+            f"{source}: must be a folder of images, or a ROS bag: a folder with metadata.yaml, or a .bag, .mcap or "
+            ".db3 file"
+        )
+    if (source / "metadata.yaml").is_file():
+        return source
+    from datasets_manifest.importers.folder_layout import has_images
+
+    visible = sorted(path for path in source.iterdir() if not path.name.startswith("."))
+    bags = [path for path in visible if path.suffix.lower() in _BAG_SUFFIXES or (path / "metadata.yaml").is_file()]
+    if not bags:
+        return None
+    if len(bags) > 1:
+        raise ValueError(f"{source}: holds several bags, such as {bags[0]} and {bags[1]}; import them one by one")
+    if has_images(source):
+        raise ValueError(f"{source}: holds images and the bag {bags[0]}; name the bag, or move it elsewhere")
+    return bags[0]

@@ -101,15 +101,95 @@ def test_views_side_by_side_are_the_same_pairs(smoke_dataset: Path, pictures: Pa
 
 def test_a_bag_brings_its_calibration(smoke_dataset: Path, tmp_path: Path) -> None:
     (bag,) = write_export("rosbag", smoke_dataset, tmp_path / "bags", ExportLog())
-    assert run(["import", str(bag), "--out", str(tmp_path / "imported"), "--encoding", "linear"]) == DONE
+    assert run(["import", str(bag), "--out", str(tmp_path / "imported")]) == DONE
     imported, source = BlindDataset(tmp_path / "imported"), Dataset(smoke_dataset)
     for place, index in enumerate(source.frame_indices):
         got, want = imported.pair(place), source.images(index)
         np.testing.assert_array_equal(got.images.left, want.left)
+        for name in ("encoding", "black_level_dn", "bits", "exposure_s"):
+            assert getattr(got.images, name) == getattr(want, name), name
         assert got.images.time_s == pytest.approx(want.time_s, abs=1e-9)
         rig = source.manifest.recipe.rig
         assert got.rig.camera == rig.camera and got.rig.lenses is None
         assert got.rig.baseline_m == pytest.approx(rig.baseline_m, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("option", "fault"),
+    [
+        (("--encoding", "gamma"), "--encoding: the source says linear, got gamma; leave the option out"),
+        (("--black-level", "99"), "--black-level: the source says "),
+        (("--rate", "10"), "--rate, --boxes, --folders: are for folders of images"),
+        (("--folders", "left,right"), "--rate, --boxes, --folders: are for folders of images"),
+        (("--camera-info", "/a"), "--camera-info: must be LEFT,RIGHT, got '/a'"),
+        (("--camera-info", "/a,/b"), "has no CameraInfo on /a and /b; choose it by --camera-info"),
+        (("--topics", "/a,/a"), "--topics: must be LEFT,RIGHT, got '/a,/a'"),
+        (("--stamp-tolerance-ms", "-1"), "--stamp-tolerance-ms: must be from 0 to 1000, got -1"),
+    ],
+)
+def test_options_that_do_not_go_with_a_bag_are_one_line(
+    option: tuple[str, str], fault: str, smoke_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (bag,) = write_export("rosbag", smoke_dataset, tmp_path / "bags", ExportLog())
+    assert run(["import", str(bag), "--out", str(tmp_path / "imported"), *option]) == WRONG_INPUT
+    said = capsys.readouterr().err
+    assert fault in said and said.count("\n") == 1
+    assert not (tmp_path / "imported").exists()
+
+
+def test_a_bag_in_a_folder_is_found(smoke_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The folder that `export` made, its bag, and the bag's file alone."""
+    (bag,) = write_export("rosbag", smoke_dataset, tmp_path / "bags", ExportLog())
+    (file,) = bag.glob("*.mcap")
+    for place, source in enumerate((tmp_path / "bags", bag, file)):
+        assert run(["import", str(source), "--out", str(tmp_path / f"imported-{place}")]) == DONE
+    first, *others = (sorted((tmp_path / f"imported-{place}" / "frames").rglob("*.*")) for place in range(3))
+    for files in others:
+        assert [path.read_bytes() for path in files] == [path.read_bytes() for path in first]
+    shutil.copytree(bag, tmp_path / "bags" / "second")
+    assert run(["import", str(tmp_path / "bags"), "--out", str(tmp_path / "several")]) == WRONG_INPUT
+    assert "holds several bags, such as" in capsys.readouterr().err
+
+
+def test_what_pixel_values_were_taken_for_is_said(
+    smoke_dataset: Path, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments(pictures, smoke_dataset, tmp_path / "said")) == DONE
+    said = capsys.readouterr()
+    assert "pixel values: 8 bits, linear, black level" in said.err + said.out
+    assert "assumed" not in said.err + said.out
+    calibration = str(smoke_dataset / "calibration" / "opencv_stereo.yaml")
+    assert run(["import", str(pictures), "--out", str(tmp_path / "unsaid"), "--calibration", calibration]) == DONE
+    said = capsys.readouterr()
+    line = "pixel values: 8 bits, gamma, black level 0 DN; assumed, without --encoding, --black-level"
+    assert line in said.err + said.out and "times: 25 pairs a second (--rate)" in said.err + said.out
+    (bag,) = write_export("rosbag", smoke_dataset, tmp_path / "bags", ExportLog())
+    assert run(["import", str(bag), "--out", str(tmp_path / "bag")]) == DONE
+    said = capsys.readouterr()
+    assert "DN, as the source says" in said.err + said.out
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        ("nowhere", "nowhere: there is no such file or folder"),
+        ("film.mp4", "film.mp4: must be a folder of images, or a ROS bag"),
+        ("empty", "empty: holds no images"),
+        ("bad.mcap", "bad.mcap: is not a ROS bag"),
+        ("bad.db3", "bad.db3: is not a ROS bag"),
+    ],
+)
+def test_source_is_checked_before_the_calibration(
+    name: str, fault: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    for file in ("film.mp4", "bad.mcap", "bad.db3"):
+        (tmp_path / file).write_bytes(b"no bag")
+    for calibration in ((), ("--calibration", str(tmp_path / "none.yaml"))):
+        order = ["import", str(tmp_path / name), "--out", str(tmp_path / "imported"), *calibration]
+        assert run(order) == WRONG_INPUT
+        said = capsys.readouterr().err
+        assert fault in said and "calibration" not in said and said.count("\n") == 1
 
 
 def test_boxes_come_along(smoke_dataset: Path, pictures: Path, tmp_path: Path) -> None:
@@ -171,6 +251,10 @@ def test_the_preview_shows_imported_pairs(smoke_dataset: Path, pictures: Path, t
         (("--rate", "0"), "--rate"),
         (("--calibration-unit", "ft"), "--calibration-unit"),
         (("--topics", "a,b"), "is not a ROS bag"),
+        (("--camera-info", "a,b"), "is not a ROS bag"),
+        (("--folders", "a"), "--folders: must be LEFT,RIGHT, got 'a'"),
+        (("--folders", "a,b"), "a is not a folder"),
+        (("--stamp-tolerance-ms", "1"), "--stamp-tolerance-ms needs a time stamp in the name of every image"),
         (("--boxes", "none.json"), "none.json"),
         (("--box-category", "basket"), "--box-category"),
     ],

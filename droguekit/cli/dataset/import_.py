@@ -19,7 +19,9 @@ EXAMPLES = (
 
 
 def import_(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A folder of images, or a ROS bag.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="A folder of images, or a ROS bag (folder, .mcap, .db3, .bag).")
+    ],
     out: Annotated[Path, output_option("--out", "DIR", "The new dataset's folder.")],
     calibration: Annotated[
         Path | None,
@@ -40,17 +42,41 @@ def import_(
     topics: Annotated[
         str | None, typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics, where a bag has several.")
     ] = None,
+    camera_info: Annotated[
+        str | None,
+        typer.Option(
+            "--camera-info", metavar="LEFT,RIGHT", help="A bag's CameraInfo topics; by default beside the images'."
+        ),
+    ] = None,
+    folders: Annotated[
+        str | None,
+        typer.Option("--folders", metavar="LEFT,RIGHT", help="The views' folders in SOURCE, where it has several."),
+    ] = None,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", help="Pairs per second in a folder; 25 by default.", show_default=False),
+        typer.Option(
+            "--rate",
+            metavar="HZ",
+            help="Pairs per second in a folder; by default the time stamps in file names, else 25.",
+            show_default=False,
+        ),
     ] = None,
+    stamp_tolerance_ms: Annotated[
+        float, typer.Option(metavar="MS", help="By how much time stamps of left and right may differ.")
+    ] = 0.0,
     encoding: Annotated[
         str | None,
-        typer.Option(metavar="linear|gamma", help="Encoding of pixel values; by default gamma for 8 bit, else linear."),
+        typer.Option(
+            metavar="linear|gamma",
+            help="Encoding of pixel values; by default what a bag says, else gamma for 8 bits and linear for more.",
+        ),
     ] = None,
-    black_level: Annotated[float, typer.Option(metavar="DN", help="Pixel value without light.")] = 0.0,
+    black_level: Annotated[
+        float | None, typer.Option(metavar="DN", help="Pixel value without light; by default what a bag says, else 0.")
+    ] = None,
     bits: Annotated[
-        int | None, typer.Option(help="Bits used in 16-bit images; by default as in the first pair.")
+        int | None,
+        typer.Option(help="Bits used in 16-bit images; by default what a bag says, else as many as the first pair's."),
     ] = None,
 ) -> None:
     """Make a dataset without truth from real stereo images, for `navigate`, `preview` and `benchmark`.
@@ -59,7 +85,19 @@ def import_(
     points that it measures.
     """
     options = ImportOptions(
-        calibration, calibration_unit, drogue, boxes, box_category, topics, rate, encoding, black_level, bits
+        calibration,
+        calibration_unit,
+        drogue,
+        boxes,
+        box_category,
+        topics,
+        camera_info,
+        folders,
+        rate,
+        stamp_tolerance_ms,
+        encoding,
+        black_level,
+        bits,
     )
     count = import_images(source, out, options, progress_report())
     typer.echo(f"wrote {out}: {count} pairs")

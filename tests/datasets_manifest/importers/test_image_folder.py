@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.importers.image_folder import ImageFolder, read_image
+from datasets_manifest.importers.folder_layout import find_pairs
+from datasets_manifest.importers.image_files import read_image
+from datasets_manifest.importers.image_folder import ImageFolder
 
 WIDTH, HEIGHT = 32, 24
 
@@ -36,7 +38,7 @@ def test_two_files_a_pair(names: str, tmp_path: Path) -> None:
     for index in (9, 10, 2):
         for name, value in zip(names.split(), (index, index + 20), strict=True):
             save(tmp_path / name.format(index), picture(value))
-    folder = ImageFolder(tmp_path, WIDTH, 10.0)
+    folder = ImageFolder(tmp_path, find_pairs(tmp_path, 10.0), WIDTH)
     pairs = list(folder)
     assert folder.count == 3 and folder.left_out == ()
     assert [int(pair.left[0, 0, 0]) for pair in pairs] == [2, 9, 10]
@@ -48,17 +50,17 @@ def test_two_files_a_pair(names: str, tmp_path: Path) -> None:
 
 def test_views_side_by_side(tmp_path: Path) -> None:
     save(tmp_path / "0001.png", np.concatenate([picture(4), picture(5)], axis=1))
-    (pair,) = ImageFolder(tmp_path, WIDTH, 25.0)
+    (pair,) = ImageFolder(tmp_path, find_pairs(tmp_path), WIDTH)
     np.testing.assert_array_equal(pair.left, picture(4))
     np.testing.assert_array_equal(pair.right, picture(5))
     with pytest.raises(ValueError, match=r"0001\.png: must be two views of 20 px"):
-        list(ImageFolder(tmp_path, 20, 25.0))
+        list(ImageFolder(tmp_path, find_pairs(tmp_path), 20))
 
 
 def test_files_without_a_partner_are_told(tmp_path: Path) -> None:
     for name in ("left/1.png", "right/1.png", "left/2.png", "right/3.png"):
         save(tmp_path / name, picture(1))
-    folder = ImageFolder(tmp_path, WIDTH, 25.0)
+    folder = ImageFolder(tmp_path, find_pairs(tmp_path), WIDTH)
     assert folder.count == 1
     assert [Path(line.split(":")[0]).name for line in folder.left_out] == ["2.png", "3.png"]
 
@@ -66,14 +68,14 @@ def test_files_without_a_partner_are_told(tmp_path: Path) -> None:
 def test_depth_and_grey_stay(tmp_path: Path) -> None:
     deep = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 5
     save(tmp_path / "deep.png", deep)
-    np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), deep)
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png")[0], deep)
 
 
 def test_folders_and_files_that_do_not_do_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no such folder"):
-        ImageFolder(tmp_path / "none", WIDTH, 25.0)
+        find_pairs(tmp_path / "none")
     with pytest.raises(ValueError, match="holds no images"):
-        ImageFolder(tmp_path, WIDTH, 25.0)
+        ImageFolder(tmp_path, find_pairs(tmp_path), WIDTH)
     save(tmp_path / "a.png", picture(1))
     whole = (tmp_path / "a.png").read_bytes()
     for damaged in (b"", whole[:40], b"text"):
@@ -86,4 +88,4 @@ def test_two_files_of_one_view_are_refused(tmp_path: Path) -> None:
     for name in ("left/1.png", "left/1.bmp", "right/1.png"):
         save(tmp_path / name, picture(1))
     with pytest.raises(ValueError, match="are the same view's"):
-        ImageFolder(tmp_path, WIDTH, 25.0)
+        ImageFolder(tmp_path, find_pairs(tmp_path), WIDTH)

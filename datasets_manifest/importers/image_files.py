@@ -1,0 +1,91 @@
+"""Image files of a user's camera as pixels, as `cv2.imread` gives them."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, UnidentifiedImageError
+
+from datasets_manifest.types.images import Pixels
+
+IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
+
+_UPRIGHT: Final = 1
+# OpenCV applies the EXIF orientation of these; TIFF has the same number as a tag of its own.
+_TURNED_BY_OPENCV: Final = ("JPEG", "MPO", "PNG", "TIFF")
+
+
+def read_image(path: Path) -> tuple[Pixels, bool]:
+    """An image file, as `decode_image_file` gives it.
+
+    Raises:
+        ValueError: it cannot be read or decoded; names the file.
+    """
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return decode_image_file(data, str(path))
+
+
+def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]:
+    """The image in the bytes of a file.
+
+    The image is turned as its EXIF orientation says, since `cv2.imread` turns the pictures of a calibration so too.
+
+    Args:
+        data: (N,) bytes.
+        name: of the image, for errors.
+
+    Returns:
+        (H, W, 3) red, green, blue, or (H, W) grey, with its stored depth; and whether its orientation turned or
+        mirrored it.
+
+    Raises:
+        ValueError: it cannot be decoded, is not of 8 or 16 bits, has several pages, or an orientation that OpenCV does
+            not apply; names the image.
+    """
+    orientation = _orientation(data, name)
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
+    except cv2.error as error:
+        raise ValueError(f"{name}: cannot be read: {' '.join(str(error).split())[:200]}") from error
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{name}: is truncated, or not an image of 8 or 16 bits")
+    pixels = np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
+    return pixels, orientation != _UPRIGHT
+
+
+def _orientation(data: NDArray[np.uint8], name: str) -> int:
+    """The EXIF orientation, 1 to 8, that OpenCV applies to an image; 1 where the image cannot be identified.
+
+    Raises:
+        ValueError: it has an orientation that OpenCV does not apply, or several pages.
+    """
+    try:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(data.tobytes())) as image:
+            warnings.simplefilter("ignore")
+            kind, pages = image.format, int(getattr(image, "n_frames", 1))
+            said = int(image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT))
+            exif = Image.Exif()
+            exif.load(image.info.get("exif", b""))
+            applied = said if kind == "TIFF" else int(exif.get(ExifTags.Base.Orientation, _UPRIGHT))
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, TypeError, KeyError, OverflowError):
+        return _UPRIGHT  # whether it is an image at all, OpenCV decides
+    if pages > 1 and kind != "MPO":
+        raise ValueError(f"{name}: holds {pages} images; save each as a file of its own")
+    said, applied = (number if 1 < number <= 8 else _UPRIGHT for number in (said, applied))
+    if kind not in _TURNED_BY_OPENCV:
+        applied = _UPRIGHT
+    if said != applied:
+        raise ValueError(
+            f"{name}: has the orientation {said} of EXIF, which cv2.imread does not apply, so that a calibration may "
+            "not fit; save it upright"
+        )
+    return applied

@@ -1,0 +1,125 @@
+"""Image files as OpenCV's own reader gives them; Pillow and the definition of EXIF are the oracles."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from datasets_manifest.importers.image_files import decode_image_file, read_image
+
+# Four corners of four colours, so that each of the eight orientations looks different.
+STORED = np.zeros((16, 24, 3), np.uint8)
+STORED[:8, :12], STORED[:8, 12:] = (240, 16, 16), (16, 240, 16)
+STORED[8:, :12], STORED[8:, 12:] = (16, 16, 240), (240, 240, 16)
+# EXIF 2.3, tag 274: where the stored first row and first column are in the upright picture.
+UPRIGHT: dict[int, Any] = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: a.swapaxes(0, 1)[:, ::-1],
+    7: lambda a: a.swapaxes(0, 1)[::-1, ::-1],
+    8: lambda a: a.swapaxes(0, 1)[::-1],
+}
+FORMATS: dict[str, dict[str, Any]] = {
+    "JPEG": {"quality": 100, "subsampling": 0},
+    "PNG": {},
+    "TIFF": {},
+    "WEBP": {"lossless": True},
+}
+
+
+def encoded(picture: np.ndarray, kind: str, orientation: int | None = None) -> np.ndarray:
+    exif = Image.Exif()
+    if orientation is not None:
+        exif[274] = orientation
+    stream = io.BytesIO()
+    Image.fromarray(picture).save(stream, kind, exif=exif, **FORMATS[kind])
+    return np.frombuffer(stream.getvalue(), np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_orientation_is_applied_as_the_calibration_snippet_applies_it(
+    kind: str, orientation: int, tmp_path: Path
+) -> None:
+    path = tmp_path / f"picture.{kind.lower()}"
+    encoded(STORED, kind, orientation).tofile(path)
+    pixels, is_turned = read_image(path)
+    # JPEG's transform is not lossless; the colours differ by 200.
+    np.testing.assert_allclose(pixels.astype(int), UPRIGHT[orientation](STORED), atol=30)
+    assert is_turned == (orientation != 1)
+    # docs/how-to/calibrate.md reads its boards so; OpenCV 4.11 gives None for a TIFF on its side.
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert (grey is None) == (kind == "TIFF" and orientation > 4)
+    if grey is None:
+        return
+    np.testing.assert_allclose(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(int), grey, atol=2)
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_orientation_turns_deep_images_alike(orientation: int) -> None:
+    deep = STORED[:, :, 0].astype(np.uint16) * 257
+    pixels, _ = decode_image_file(encoded(deep, "PNG", orientation), "deep")
+    np.testing.assert_array_equal(pixels, UPRIGHT[orientation](deep))
+
+
+@pytest.mark.parametrize("orientation", [2, 3, 6])
+def test_orientation_that_opencv_does_not_apply_is_refused(orientation: int) -> None:
+    with pytest.raises(ValueError, match=rf"a\.webp: has the orientation {orientation} of EXIF.*save it upright"):
+        decode_image_file(encoded(STORED, "WEBP", orientation), "a.webp")
+    # The advice: Pillow's picture, saved upright.
+    upright = UPRIGHT[orientation](STORED)
+    np.testing.assert_array_equal(decode_image_file(encoded(upright, "WEBP"), "a.webp")[0], upright)
+
+
+def test_orientation_in_xmp_alone_is_refused() -> None:
+    xmp = b'<x:xmpmeta><rdf:RDF><rdf:Description tiff:Orientation="3"/></rdf:RDF></x:xmpmeta>'
+    stream = io.BytesIO()
+    Image.fromarray(STORED).save(stream, "JPEG", xmp=xmp)
+    with pytest.raises(ValueError, match="has the orientation 3"):
+        decode_image_file(np.frombuffer(stream.getvalue(), np.uint8), "a.jpg")
+
+
+def test_an_orientation_beyond_the_definition_is_upright() -> None:
+    np.testing.assert_array_equal(decode_image_file(encoded(STORED, "PNG", 9), "a.png")[0], STORED)
+
+
+def test_webp_is_read() -> None:
+    np.testing.assert_array_equal(decode_image_file(encoded(STORED, "WEBP"), "a.webp")[0], STORED)
+
+
+@pytest.mark.parametrize("kind", ["TIFF", "WEBP"])
+def test_several_images_in_one_file_are_refused(kind: str) -> None:
+    stream = io.BytesIO()
+    Image.fromarray(STORED).save(stream, kind, save_all=True, append_images=[Image.fromarray(STORED[::-1])])
+    with pytest.raises(ValueError, match=r"pages\.x: holds 2 images"):
+        decode_image_file(np.frombuffer(stream.getvalue(), np.uint8), "pages.x")
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9])
+def test_truncated_files_are_refused(kind: str, share: float) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (60, 80, 3), np.uint8)
+    data = encoded(noise, kind)
+    with pytest.raises(ValueError, match=r"cut\.x: is truncated"):
+        decode_image_file(data[: int(share * len(data))], "cut.x")
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA", "P", "1", "I;16"])
+def test_modes_are_those_of_opencv(mode: str) -> None:
+    """Alpha is dropped and palettes are resolved, as before orientations were applied."""
+    picture = Image.fromarray(STORED[:, :, 0].astype(np.uint16) * 250) if mode == "I;16" else Image.fromarray(STORED)
+    stream = io.BytesIO()
+    (picture if mode == "I;16" else picture.convert(mode)).save(stream, "PNG")
+    data = np.frombuffer(stream.getvalue(), np.uint8)
+    want = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    want = want if want.ndim == 2 else want[:, :, 2::-1]
+    np.testing.assert_array_equal(decode_image_file(data, mode)[0], want)
