@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.support.shared_folder import shared_folder
+
 # The same draws on every machine, however busy it is; `make fuzz` draws anew.
 settings.register_profile("suite", deadline=None, derandomize=True, database=None)
 settings.load_profile("suite")
@@ -43,9 +45,9 @@ def smoke_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from droguekit.batch.progress import PlainProgress
     from droguekit.batch.render_dataset import render_dataset
 
-    source = load_recipe("smoke")
-    out = tmp_path_factory.mktemp("smoke") / "dataset"
-    told = io.StringIO()
-    summary = render_dataset(source, out, range(source.recipe.frames.count), 2, PlainProgress(told))
-    assert summary.drops == (), told.getvalue()
-    return out
+    def render(out: Path) -> None:
+        source, told = load_recipe("smoke"), io.StringIO()
+        summary = render_dataset(source, out, range(source.recipe.frames.count), 2, PlainProgress(told))
+        assert summary.drops == (), told.getvalue()
+
+    return shared_folder(tmp_path_factory, "smoke", render)

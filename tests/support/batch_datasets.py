@@ -17,6 +17,7 @@ from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import RunSummary, render_dataset
 from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, between, recipe_text
+from tests.support.shared_folder import shared_folder
 
 TINY_RECIPE = recipe_text(
     name="tiny",
@@ -130,9 +131,11 @@ def hashes() -> Hashes:
 @pytest.fixture(scope="session")
 def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of `tiny_recipe`, made by one worker in ascending order; to be read only."""
-    out = tmp_path_factory.mktemp("tiny") / "dataset"
-    assert _make(out).drops == ()
-    return out
+
+    def render(out: Path) -> None:
+        assert _make(out).drops == ()
+
+    return shared_folder(tmp_path_factory, "tiny", render)
 
 
 @pytest.fixture(scope="session")
@@ -170,20 +173,24 @@ def troubled(troubled_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.fixture(scope="session")
 def quick_dataset(troubled_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of `quick_recipe`, made by one worker without an accident; to be read only."""
-    out = tmp_path_factory.mktemp("quick") / "dataset"
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.syspath_prepend(troubled_site)
-        summary = _make(out, text=QUICK_RECIPE)
-    assert (summary.drops, summary.totals.retries) == ((), 0)
-    return out
+
+    def render(out: Path) -> None:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.syspath_prepend(troubled_site)
+            summary = _make(out, text=QUICK_RECIPE)
+        assert (summary.drops, summary.totals.retries) == ((), 0)
+
+    return shared_folder(tmp_path_factory, "quick", render)
 
 
 @pytest.fixture(scope="session")
 def analytic_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset of `analytic_recipe`, made by one worker; to be read only."""
-    out = tmp_path_factory.mktemp("analytic") / "dataset"
-    assert _make(out, text=ANALYTIC_RECIPE).drops == ()
-    return out
+
+    def render(out: Path) -> None:
+        assert _make(out, text=ANALYTIC_RECIPE).drops == ()
+
+    return shared_folder(tmp_path_factory, "analytic", render)
 
 
 @pytest.fixture(scope="session")

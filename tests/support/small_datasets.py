@@ -8,11 +8,12 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Unpack
 
 from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
-from tests.support.recipe_builder import RIG_160_PX, RecipeTable, between, recipe_text
+from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, RecipeTable, between, recipe_text
 
 # Single pairs between 2 and 5 m, some of them without a drogue.
 SINGLE_PAIRS: RecipeTable = {
@@ -31,6 +32,18 @@ STATION_KEEPING: RecipeTable = {
     "frames": {"count": 60, "scenes": 2},
     "exposure": {"time_s": 0.002},
     "sequence": {"frames_per_sequence": 20, "receiver": {"manoeuvres": ["station"], "start_m": 4.0}},
+}
+
+# Near drogues, to train networks on: 40 pairs of ten scenes.
+TOY: RecipeTable = {
+    "name": "toy",
+    "description": "Near drogues.",
+    "seed": 5,
+    "rig": RIG_320_PX | {"focal_px": 300.0, "encoding": "gamma"},
+    "frames": {"count": 40, "scenes": 10, "empty_fraction": 0.1},
+    "distance": between(2.0, 4.0, "log-uniform"),
+    "render": {"engine": "analytic"},
+    "split": {"train": 1.0, "val": 0.0, "test": 0.0},
 }
 
 # A receiver keeps its station behind a drogue that is let go above the wind: it swings, and shows its side to the
@@ -73,3 +86,8 @@ def rendered(text: str, out: Path, frames: Iterable[int] | None = None) -> Path:
     summary = render_dataset(RecipeSource(recipe, text), out, chosen, 0, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     return out
+
+
+def render_toy(folder: Path, **changes: Unpack[RecipeTable]) -> Path:
+    """The dataset of `TOY` with these changes, in this process."""
+    return rendered(recipe_text(TOY, **changes), folder)

@@ -2,54 +2,28 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
-from droguekit.batch.progress import PlainProgress
-from droguekit.batch.render_dataset import render_dataset
 from nav.training.corpus import CachedPair, Corpus, ImageCache
-
-RECIPE = {
-    "seed": "5",
-    "rig": '{preset = "rgb-ideal", width_px = 320, height_px = 240, focal_px = 300.0, encoding = "gamma"}',
-    "frames": "{count = 40, scenes = 10, empty_fraction = 0.1}",
-    "distance": '{law = "log-uniform", low_m = 2.0, high_m = 4.0}',
-    "render": '{engine = "analytic"}',
-    "split": "{train = 1.0, val = 0.0, test = 0.0}",
-}
-
-
-def make_dataset(folder: Path, **changes: str) -> Path:
-    values = {"name": '"toy"', "description": '"Near drogues."', **RECIPE, **changes}
-    text = "".join(f"{key} = {value}\n" for key, value in values.items())
-    recipe, told = parse_recipe(text), io.StringIO()
-    summary = render_dataset(RecipeSource(recipe, text), folder, range(recipe.frames.count), 0, PlainProgress(told))
-    assert summary.drops == (), told.getvalue()
-    return folder
-
-
-@pytest.fixture
-def render_toy() -> Callable[..., Path]:
-    return make_dataset
+from tests.support.shared_folder import shared_folder
+from tests.support.small_datasets import render_toy
 
 
 @pytest.fixture(scope="session")
 def toy_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """40 pairs, all to train on; to be read only."""
-    return make_dataset(tmp_path_factory.mktemp("toy") / "dataset")
+    return shared_folder(tmp_path_factory, "toy", render_toy)
 
 
 @pytest.fixture(scope="session")
 def split_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight pairs of four scenes in all three splits; to be read only (copy it to change it)."""
-    frames, split = "{count = 8, scenes = 4}", "{train = 0.5, val = 0.25, test = 0.25}"
-    return make_dataset(tmp_path_factory.mktemp("split") / "dataset", frames=frames, split=split)
+    frames, split = {"count": 8, "scenes": 4, "empty_fraction": None}, {"train": 0.5, "val": 0.25, "test": 0.25}
+    return shared_folder(tmp_path_factory, "split", lambda out: render_toy(out, frames=frames, split=split))
 
 
 def paint_ellipse(image: np.ndarray, box: tuple[float, float, float, float], color: int = 255) -> None:

@@ -17,6 +17,8 @@ from droguekit.batch.progress import PlainProgress
 from geometry.stereo import EYES
 from nav.detector.input_image import input_image
 from nav.training.corpus import Corpus, open_corpus
+from tests.support.recipe_builder import RIG_160_PX
+from tests.support.small_datasets import render_toy
 
 SIZE_PX = (96, 128)
 
@@ -120,18 +122,16 @@ def test_damage_is_named_before_training(
     assert str(place) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_datasets_without_anything_to_learn_from_are_refused(
-    split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path
-) -> None:
-    rig = '{preset = "rgb-ideal", width_px = 160, height_px = 120, focal_px = 150.0}'
-    two = "{count = 2, scenes = 1}"
+def test_datasets_without_anything_to_learn_from_are_refused(split_dataset: Path, tmp_path: Path) -> None:
+    rig = RIG_160_PX | {"focal_px": 150.0, "encoding": None}
+    two = {"count": 2, "scenes": 1, "empty_fraction": None}
     other = render_toy(tmp_path / "other", frames=two, rig=rig)
     with pytest.raises(ValueError, match=r"other: its images are 160 x 120 px, but those of .* 320 x 240 px"):
         open_small([split_dataset, other], tmp_path / "cache")
-    empty = render_toy(tmp_path / "empty", frames="{count = 2, scenes = 1, empty_fraction = 1.0}")
+    empty = render_toy(tmp_path / "empty", frames={"count": 2, "scenes": 1, "empty_fraction": 1.0})
     with pytest.raises(ValueError, match="empty: has no pair with a drogue"):
         open_small([split_dataset, empty], tmp_path / "cache")
-    untaught = render_toy(tmp_path / "untaught", frames=two, split="{train = 0.0, val = 0.0, test = 1.0}")
+    untaught = render_toy(tmp_path / "untaught", frames=two, split={"train": 0.0, "val": 0.0, "test": 1.0})
     with pytest.raises(ValueError, match="untaught: has no pair in the split train"):
         open_small([untaught], tmp_path / "cache")
     with pytest.raises(ValueError, match="is the same dataset as"):
@@ -140,12 +140,10 @@ def test_datasets_without_anything_to_learn_from_are_refused(
         open_small([], tmp_path / "cache")
 
 
-def test_several_datasets_form_one_sequence_of_pairs(
-    split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_several_datasets_form_one_sequence_of_pairs(split_dataset: Path, tmp_path: Path) -> None:
     # Another rig, whose images have the same size.
-    rig = '{preset = "rgb-ideal", width_px = 320, height_px = 240, focal_px = 220.0}'
-    second = render_toy(tmp_path / "second", seed="6", frames="{count = 2, scenes = 1}", rig=rig)
+    rig, frames = {"focal_px": 220.0, "encoding": None}, {"count": 2, "scenes": 1, "empty_fraction": None}
+    second = render_toy(tmp_path / "second", seed=6, frames=frames, rig=rig)
     corpus = open_small([split_dataset, second], tmp_path / "cache")
     assert [stamp.name for stamp in corpus.datasets] == ["toy", "toy"]
     assert len(corpus.places) == 10

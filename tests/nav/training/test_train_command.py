@@ -6,16 +6,18 @@ import pytest
 import torch
 
 from droguekit.cli.main import DONE, WRONG_INPUT, run
+from tests.support.recipe_builder import RecipeTable, between, recipe_text
 
-RECIPE = """
-name = "two-scenes"
-description = "Four small pairs."
-rig = {preset = "rgb-ideal", width_px = 320, height_px = 240, focal_px = 300.0}
-frames = {count = 4, scenes = 2}
-distance = {law = "log-uniform", low_m = 2.0, high_m = 10.0}
-render = {engine = "analytic"}
-split = {train = 0.5, val = 0.5, test = 0.0}
-"""
+BASE: RecipeTable = {
+    "name": "two-scenes",
+    "description": "Four small pairs.",
+    "rig": {"preset": "rgb-ideal", "width_px": 320, "height_px": 240, "focal_px": 300.0},
+    "frames": {"count": 4, "scenes": 2},
+    "distance": between(2.0, 10.0, "log-uniform"),
+    "render": {"engine": "analytic"},
+    "split": {"train": 0.5, "val": 0.5, "test": 0.0},
+}
+RECIPE = recipe_text(BASE)
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +45,7 @@ def test_a_recipe_becomes_a_detector(tmp_path: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(
     ("text", "options", "message"),
     [
-        (RECIPE.replace("train = 0.5, val = 0.5", "train = 0.0, val = 1.0"), [], "has no split to train on"),
+        (recipe_text(BASE, split={"train": 0.0, "val": 1.0}), [], "has no split to train on"),
         (RECIPE, ["--device", "cuda"], "torch finds no CUDA device"),
     ],
     ids=["no split", "no device"],

@@ -8,7 +8,6 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +36,7 @@ from nav.training.training_state import (
     open_compute_device,
     restore_state,
 )
+from tests.support.small_datasets import render_toy
 
 # One thread and float32: the same sums in the same order, whoever else uses the machine.
 SMALL = {
@@ -173,10 +173,8 @@ def test_a_training_in_bf16_exports_what_float32_computes(split_dataset: Path, t
         np.testing.assert_allclose(got, reference, atol=2e-4 * max(1.0, float(reference.abs().max())))
 
 
-def test_several_datasets_have_no_hash_of_one(
-    split_dataset: Path, render_toy: Callable[..., Path], tmp_path: Path
-) -> None:
-    second = render_toy(tmp_path / "second", seed="6", frames="{count = 2, scenes = 1}")
+def test_several_datasets_have_no_hash_of_one(split_dataset: Path, tmp_path: Path) -> None:
+    second = render_toy(tmp_path / "second", seed=6, frames={"count": 2, "scenes": 1, "empty_fraction": None})
     changes = {"image_passes": 4, "final_size_px": (64, 96), "final_fraction": 0.5}
     settings, out = build_settings(None, {**SMALL, **changes}), tmp_path / "out"
     result = train([split_dataset, second], out, settings, PlainProgress(io.StringIO()))

@@ -339,7 +339,7 @@ def test_dataset_is_made_and_valid(tmp_path: Path) -> None:
     recipe = source.recipe
     recipe = recipe.model_copy(update={"render": recipe.render.model_copy(update={"engine": "analytic"})})
     told = io.StringIO()
-    summary = render_dataset(RecipeSource(recipe, source.text), tmp_path / "dataset", range(6), 1, PlainProgress(told))
+    summary = render_dataset(RecipeSource(recipe, source.text), tmp_path / "dataset", range(6), 0, PlainProgress(told))
     assert summary.drops == (), told.getvalue()
     report = validate_dataset(tmp_path / "dataset")
     assert report.faults == []

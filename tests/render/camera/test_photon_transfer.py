@@ -153,7 +153,7 @@ def test_electrons_of_a_lit_marker(
 def test_electrons_of_a_lit_marker_by_path_tracing(
     engine: RenderEngine, power: float, f_number: float, distance_m: float
 ) -> None:
-    frame = lit_frame(f_number=f_number, distance_m=distance_m, scale=0.4)
+    frame = lit_frame(f_number=f_number, distance_m=distance_m, scale=0.25)
     assert lit_electrons(frame, power, engine.name) == pytest.approx(
         expected_electrons(frame, power, distance_m), rel=WITHIN
     )

@@ -23,7 +23,7 @@ def settled(engine: RenderEngine) -> tuple[Recipe, FrameSpec, StereoRadiance]:
     """A frame at a third of the paper's scale, its recipe, and what many paths through every pixel make of it."""
     recipe = paper_view_recipe(scale=1 / 3, stations_m=(3.0,))
     frame = sample_frame(recipe, 0)
-    many = {"samples_per_px": 400, "open_samples_per_px": 36, "edge_samples_per_px": 2500, "denoise": False}
+    many = {"samples_per_px": 196, "open_samples_per_px": 36, "edge_samples_per_px": 1024, "denoise": False}
     return recipe, frame, engine.render(reseeded(frame, 99), recipe.render.model_copy(update=many))
 
 

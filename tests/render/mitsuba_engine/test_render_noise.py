@@ -35,7 +35,7 @@ def test_stated_noise_is_the_difference_of_two_renders(engine: RenderEngine) -> 
 
 
 def test_more_samples_leave_less_noise(engine: RenderEngine) -> None:
-    frame_recipe = paper_view_recipe(scale=0.25, stations_m=(2.5,))
+    frame_recipe = paper_view_recipe(scale=0.25, stations_m=(3.5,))
     frame = sample_frame(frame_recipe, 0)
     few_samples, many_samples = (
         frame_recipe.render.model_copy(update={"samples_per_px": n, "edge_samples_per_px": 4 * n} | UNREACHABLE)

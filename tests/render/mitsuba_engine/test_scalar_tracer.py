@@ -40,7 +40,7 @@ RECIPE = recipe_text(
     rig={"preset": "rgb-ideal", "width_px": 160, "height_px": 120, "focal_px": 266.67},
     frames={"count": 2},
     distance=stations(2.5, 4.0),
-    render={"samples_per_px": 64, "surround_samples_per_px": 16},
+    render={"samples_per_px": 64, "edge_samples_per_px": 64, "surround_samples_per_px": 16},
 )
 
 # A disc smaller than a ray's step aside, right before the camera and seen from behind: as if a ray had slipped into a

@@ -16,6 +16,7 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.batch.render_dataset import render_dataset
 from droguekit.workflows.rendering import open_recipe
 from geometry.se3 import RigidTransform
+from tests.support.shared_folder import shared_folder
 
 # Of both sequences of the recipe, near and far, with gaps between.
 DOCKING_FRAMES = (0, 1, 2, 5, 200, 449, 450, 452)
@@ -37,7 +38,7 @@ def _render_recipe(folder: Path, source: RecipeSource, frames: Iterable[int]) ->
 @pytest.fixture(scope="session")
 def docking(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight pairs of `docking-10m`; to be read only."""
-    return _render(tmp_path_factory.mktemp("docking") / "dataset", "docking-10m", DOCKING_FRAMES)
+    return shared_folder(tmp_path_factory, "docking", lambda out: _render(out, "docking-10m", DOCKING_FRAMES))
 
 
 @pytest.fixture(scope="session")
@@ -46,7 +47,8 @@ def single_pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = open_recipe("docking-10m", None, "analytic")
     frames = source.recipe.frames.model_copy(update={"count": 8, "empty_fraction": 0.5})
     recipe = Recipe.model_validate(dict(source.recipe) | {"sequence": None, "frames": frames})
-    folder = _render_recipe(tmp_path_factory.mktemp("single") / "dataset", RecipeSource(recipe, source.text), range(4))
+    single = RecipeSource(recipe, source.text)
+    folder = shared_folder(tmp_path_factory, "single", lambda out: _render_recipe(out, single, range(4)))
     data = Dataset(folder)
     assert [data.record(k).left_from_drogue is None for k in range(4)] == [True, False, True, False]
     return folder
@@ -55,7 +57,7 @@ def single_pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three pairs of `semi-physical-7`, at its first three stations; to be read only."""
-    return _render(tmp_path_factory.mktemp("bench") / "dataset", "semi-physical-7", range(3))
+    return shared_folder(tmp_path_factory, "bench", lambda out: _render(out, "semi-physical-7", range(3)))
 
 
 @pytest.fixture(scope="session")

@@ -78,7 +78,7 @@ def test_every_named_image_lies_in_the_moved_folder(with_images: Path, mixed_dat
 def test_deep_images_are_told_of_and_copied_with_eight_bits(
     dataset_by_preset: Callable[..., Path], tmp_path: Path
 ) -> None:
-    dataset = dataset_by_preset("mono", "output_bits = 12")
+    dataset = dataset_by_preset("mono", {"output_bits": 12})
     log = ExportLog()
     write_export("coco", dataset, tmp_path / "without", log)
     assert log.losses["images of 12 bits in 16, nearly black to programs for 8: add --images for copies"] == 6
@@ -107,7 +107,7 @@ def chunks(png: bytes) -> dict[bytes, bytes]:
 def test_copies_of_sixteen_bits_lose_nothing_and_say_how_many_bits_count(
     preset: str, channels: int, dataset_by_preset: Callable[..., Path], tmp_path: Path
 ) -> None:
-    dataset = dataset_by_preset(preset, "output_bits = 12")
+    dataset = dataset_by_preset(preset, {"output_bits": 12})
     log = ExportLog()
     write_export("coco", dataset, tmp_path / "out", log, image_bits=16)
     assert not any("bits" in what for what in log.losses)

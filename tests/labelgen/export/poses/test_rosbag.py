@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from geometry.se3 import RigidTransform
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
 from labelgen.export.poses.rosbag import POSE_TOPIC, camera_info_topic, image_topic
+from tests.support.recipe_builder import Section
 
 Messages = dict[str, list[tuple[int, Any]]]
 
@@ -62,21 +64,27 @@ def test_images_and_times_are_the_datasets(bag: Messages, small_dataset: Path) -
 
 
 @pytest.mark.parametrize(
-    ("preset", "more", "encoding", "bits", "black_level_dn"),
+    ("preset", "rig", "encoding", "bits", "black_level_dn"),
     [
         # The sensors' black level is 64 of 4096.
-        ("rgb-ideal", "", "linear", 8, 4),
-        ("mono", "output_bits = 12", "linear", 12, 64),
+        ("rgb-ideal", {}, "linear", 8, 4),
+        ("mono", {"output_bits": 12}, "linear", 12, 64),
         # On the sRGB curve, which begins at the black level, nothing but light gives a number.
-        ("mono", 'encoding = "gamma"', "gamma", 8, 0),
+        ("mono", {"encoding": "gamma"}, "gamma", 8, 0),
         # The bag has the mosaic, which is linear.
-        ("paper-colour", 'encoding = "gamma"', "linear", 8, 4),
+        ("paper-colour", {"encoding": "gamma"}, "linear", 8, 4),
     ],
 )
 def test_what_the_numbers_mean_stands_beside_every_pair(
-    preset: str, more: str, encoding: str, bits: int, black_level_dn: int, dataset_by_preset: Any, tmp_path: Path
+    preset: str,
+    rig: Section,
+    encoding: str,
+    bits: int,
+    black_level_dn: int,
+    dataset_by_preset: Callable[..., Path],
+    tmp_path: Path,
 ) -> None:
-    source = Dataset(dataset_by_preset(preset, more))
+    source = Dataset(dataset_by_preset(preset, rig))
     (folder,) = write_export("rosbag", source.path, tmp_path / "bags", ExportLog())
     found = [json.loads(message.data) for _, message in read_bag(folder)["/stereo/pixel_values"]]
     for index, values in zip(source.frame_indices, found, strict=True):
