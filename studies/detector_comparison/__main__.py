@@ -36,7 +36,7 @@ from studies.detector_comparison.options import (
     input_size_px,
     print_status,
 )
-from studies.detector_comparison.yolo import (
+from studies.detector_comparison.yolov8 import (
     YoloDetector,
     check_corpus,
     export_corpus,

@@ -1,6 +1,6 @@
 """`python -m studies.render_cost`: cost of a stereo pair by our renderer and by plain Cycles and Mitsuba scripts.
 
-Noise and cost of every renderer at one distance are kept on disk.
+The numbers of each distance are kept on disk.
 """
 
 from __future__ import annotations
@@ -12,83 +12,24 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from datasets_manifest.atomic import write_text_atomic
-from datasets_manifest.types.frame import FrameSpec
 from droguekit.batch.worker_pool import run_in_own_process
-from render.camera.sensor import expose
-from render.compositing import inside_one_part
-from render.engine import load_engine
-from render.mitsuba_engine.trace_request import DROGUE_PARTS
-from scenes.sky.photometry import REC709_LUMINANCE
-from studies.render_cost.cycles_messages import cpu_seconds
 from studies.render_cost.noise_search import (
     SCENES,
     STATIONS_M,
-    MeasuredView,
     NoiseEstimate,
     RenderCost,
-    frame_at,
-    recipe_at,
-    relative_noise,
-    with_seed_offset,
 )
-from studies.render_cost.plain_renderers import measure_plain_cycles, measure_plain_mitsuba
+from studies.render_cost.renderers import measure_own_path, measure_plain_cycles, measure_plain_mitsuba
 
-_PICTURES_FOR_NOISE = 4
 OWN, CYCLES, MITSUBA = "own path", "plain Cycles", "plain Mitsuba"
 _EXAMPLES = """Examples:
 
   python -m studies.render_cost
 
   python -m studies.render_cost --station 10 --station 40 --full-samples 4"""
-
-
-def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEstimate, RenderCost, MeasuredView]:
-    """Noise and cost of our renderer with default settings.
-
-    Args:
-        distance_m: of the drogue. [m]
-        seed: of the frame.
-        repeat: pairs over which the cost is averaged; fewer than `SCENES`.
-
-    Returns:
-        Noise, cost, and the view for the other renderers.
-    """
-    cv2.setNumThreads(1)
-    engine = load_engine("mitsuba")
-    settings = recipe_at(distance_m, seed).render
-    # Loading the engine and compiling kernels do not count.
-    engine.render(frame_at(distance_m, seed, index=repeat), settings)
-    spent_s = 0.0
-    # Each in a scene of its own, so that no sky is cached; the last one is the view that all renderers draw.
-    for index in reversed(range(repeat)):
-        began_s = cpu_seconds()
-        frame = frame_at(distance_m, seed, index)
-        radiance = engine.render(frame, settings)
-        expose(frame, radiance)
-        spent_s += cpu_seconds() - began_s
-
-    def luminance(drawn: FrameSpec) -> NDArray[np.float64]:
-        seen: NDArray[np.float64] = engine.render(drawn, settings).left.radiance_cd_m2 @ REC709_LUMINANCE
-        return seen
-
-    drogue = DROGUE_PARTS[radiance.left.part_id] > 0
-    inside = drogue & inside_one_part(radiance.left.part_id)
-    seen = [luminance(with_seed_offset(frame, by)) for by in range(_PICTURES_FOR_NOISE)]
-    pairs = list(zip(seen[::2], seen[1::2], strict=True))
-    noise, noise_inside = (
-        float(np.sqrt(np.mean([relative_noise(one, other, mask) ** 2 for one, other in pairs])))
-        for mask in (drogue, inside)
-    )
-    mean = float(np.mean(seen, axis=0)[drogue].mean())
-    found = NoiseEstimate(samples=settings.samples_per_px, noise=noise, noise_inside=noise_inside, mean_cd_m2=mean)
-    view = MeasuredView(frame=frame, settings=settings, drogue=drogue, inside=inside)
-    return found, RenderCost(spent_s / repeat), view
 
 
 def compare_at(

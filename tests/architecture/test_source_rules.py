@@ -68,6 +68,18 @@ def wall_clock(tree: ast.AST) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, "time.time") for alias in node.names if alias.name in ("time", "time_ns"))
 
 
+def sent_from_an_entry_point(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and name of everything of a `__main__` module that it gives to other processes.
+
+    A process that multiprocessing spawns does not import `PACKAGE.__main__`, so it finds nothing of it.
+    """
+    own = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and dotted(node.func) in ("run_in_own_process", "run_tasks"):
+            names = (each for argument in node.args for each in ast.walk(argument) if isinstance(each, ast.Name))
+            yield from ((name.lineno, name.id) for name in names if name.id in own)
+
+
 def found_in(packages: tuple[str, ...], rule: Callable[[ast.AST], Iterator[tuple[int, str]]]) -> list[str]:
     return [
         f"{path.relative_to(REPOSITORY)}:{line}: {what}"
@@ -111,6 +123,20 @@ def test_data_do_not_depend_on_the_time_of_day() -> None:
 )
 def test_a_look_at_the_clock_is_found(code: str) -> None:
     assert list(wall_clock(ast.parse(code)))
+
+
+def test_other_processes_get_nothing_from_an_entry_point() -> None:
+    found = {
+        str(path.relative_to(REPOSITORY)): [*sent_from_an_entry_point(ast.parse(path.read_text(encoding="utf-8")))]
+        for path in source_files()
+        if path.name == "__main__.py"
+    }
+    assert found and not any(found.values()), found
+
+
+def test_a_function_that_an_entry_point_sends_is_found() -> None:
+    code = "def work(): ...\nrun_in_own_process(partial(work, 1))\nrun_in_own_process(partial(imported, 1))\n"
+    assert [*sent_from_an_entry_point(ast.parse(code))] == [(2, "work")]
 
 
 def test_modules_stay_small() -> None:

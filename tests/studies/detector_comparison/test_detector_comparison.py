@@ -41,7 +41,7 @@ from studies.detector_comparison.ablation import (
     measured_networks,
 )
 from studies.detector_comparison.options import input_size_px
-from studies.detector_comparison.yolo import (
+from studies.detector_comparison.yolov8 import (
     check_corpus,
     export_corpus,
     run_script,

@@ -1,6 +1,7 @@
-"""A stereo pair as plain scripts around Mitsuba and Blender render it: every pixel gets the same number of samples.
+"""Noise and cost of a stereo pair by our renderer, and by plain scripts around Mitsuba and Blender.
 
-Mitsuba renders with its own sensor and path integrator, in a process of its own; Blender by `cycles_script`.
+A plain script gives every pixel the same number of samples. Mitsuba renders with its own sensor and path integrator, in
+a process of its own; Blender by `cycles_script`.
 """
 
 from __future__ import annotations
@@ -15,29 +16,88 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datasets_manifest.types.frame import FrameSpec
 from geometry.se3 import exp_twist
 from geometry.stereo import EYES, Eye
 from render.blender_engine.camera_path import EyePath
 from render.blender_engine.messages import FrameSetup, ImageWindow
 from render.blender_engine.process import bpy_version, read_light
 from render.blender_engine.stage import Stage
+from render.camera.sensor import expose
+from render.compositing import inside_one_part
 from render.engine import load_engine
+from render.mitsuba_engine.trace_request import DROGUE_PARTS
 from scenes.environment_radiance import environment_radiance
 from scenes.sky.photometry import REC709_LUMINANCE
 from studies.render_cost.cycles_messages import CyclesRequest, DenoisedPicture, cpu_seconds
-from studies.render_cost.noise_search import MeasuredView, NoiseEstimate, RenderCost, noise_of, reach_noise
+from studies.render_cost.noise_search import (
+    MeasuredView,
+    NoiseEstimate,
+    RenderCost,
+    frame_at,
+    noise_of,
+    reach_noise,
+    recipe_at,
+    relative_noise,
+    with_seed_offset,
+)
 
 STEP = 8
 """Samples of one launch; further launches take the rest, which bounds memory."""
 _NEAREST_M, _FARTHEST_M = 0.01, 1e5
 _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 _MOST_PATHS_MITSUBA = 100_000_000
+_PICTURES_FOR_NOISE = 4
 _Crop = tuple[int, int, int, int]
 _PILOT_SAMPLES = 4
 _MOST_PATHS_CYCLES = 20_000_000
+
+
+def measure_own_path(distance_m: float, seed: int, repeat: int) -> tuple[NoiseEstimate, RenderCost, MeasuredView]:
+    """Noise and cost of our renderer with default settings.
+
+    Args:
+        distance_m: of the drogue. [m]
+        seed: of the frame.
+        repeat: pairs over which the cost is averaged; fewer than `SCENES`.
+
+    Returns:
+        Noise, cost, and the view for the other renderers.
+    """
+    cv2.setNumThreads(1)
+    engine = load_engine("mitsuba")
+    settings = recipe_at(distance_m, seed).render
+    # Loading the engine and compiling kernels do not count.
+    engine.render(frame_at(distance_m, seed, index=repeat), settings)
+    spent_s = 0.0
+    # Each in a scene of its own, so that no sky is cached; the last one is the view that all renderers draw.
+    for index in reversed(range(repeat)):
+        began_s = cpu_seconds()
+        frame = frame_at(distance_m, seed, index)
+        radiance = engine.render(frame, settings)
+        expose(frame, radiance)
+        spent_s += cpu_seconds() - began_s
+
+    def luminance(drawn: FrameSpec) -> NDArray[np.float64]:
+        seen: NDArray[np.float64] = engine.render(drawn, settings).left.radiance_cd_m2 @ REC709_LUMINANCE
+        return seen
+
+    drogue = DROGUE_PARTS[radiance.left.part_id] > 0
+    inside = drogue & inside_one_part(radiance.left.part_id)
+    seen = [luminance(with_seed_offset(frame, by)) for by in range(_PICTURES_FOR_NOISE)]
+    pairs = list(zip(seen[::2], seen[1::2], strict=True))
+    noise, noise_inside = (
+        float(np.sqrt(np.mean([relative_noise(one, other, mask) ** 2 for one, other in pairs])))
+        for mask in (drogue, inside)
+    )
+    mean = float(np.mean(seen, axis=0)[drogue].mean())
+    found = NoiseEstimate(samples=settings.samples_per_px, noise=noise, noise_inside=noise_inside, mean_cd_m2=mean)
+    view = MeasuredView(frame=frame, settings=settings, drogue=drogue, inside=inside)
+    return found, RenderCost(spent_s / repeat), view
 
 
 def measure_plain_mitsuba(view: MeasuredView, noise: float) -> tuple[NoiseEstimate, RenderCost]:

@@ -17,7 +17,7 @@ from geometry.stereo import Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.detector.onnx_cost import network_cost
 from studies.detector_comparison.latency import _latency, measure_latency
-from studies.detector_comparison.yolo import YoloDetector, decode_rows
+from studies.detector_comparison.yolov8 import YoloDetector, decode_rows
 
 
 def images(width_px: int = 128, height_px: int = 96) -> StereoImages:
