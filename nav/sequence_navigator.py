@@ -23,7 +23,7 @@ from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.smoother import SMOOTHER_SUFFIX
 from nav.navigator import CentroidChoice, Navigator
 from nav.pair_measurement import PairMeasurement
-from nav.tracked_observer import TrackedObserver
+from nav.tracked_detection import TrackedObserver
 from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
 
 

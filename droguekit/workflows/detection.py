@@ -49,7 +49,7 @@ def detect_dataset(
         raise ValueError(f"--least-score: must be from 0 to 1, got {least_score:g}")
     detector_of = detector_factory(DEFAULT_DETECTOR if name_or_file is None else name_or_file)
     if tracker is not None:
-        from nav.tracking.tracked_detector import tracked_detector_factory
+        from nav.tracked_detection import tracked_detector_factory
 
         detector_of = tracked_detector_factory(detector_of, tracker)
     detecting = DetectorRunner(dataset, detector_of)

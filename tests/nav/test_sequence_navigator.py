@@ -21,7 +21,7 @@ from nav.filtering.motion_model import FilterSettings
 from nav.navigator import Navigator
 from nav.runner import add_smoothed, open_navigator
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings
-from nav.tracked_observer import TrackedObserver
+from nav.tracked_detection import TrackedObserver
 from nav.tracking.tracker import tracker_names
 from tests.support.painted_pairs import fly_past
 

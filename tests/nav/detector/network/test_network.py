@@ -21,8 +21,7 @@ from nav.detector.network.backbone import (
     eca_kernel_size,
     squeezed_channels,
 )
-from nav.detector.network.neck import AdaptiveFusion, LevelResize
-from nav.detector.network.network import DetectorNetwork, NetworkConfig, complexity
+from nav.detector.network.network import AdaptiveFusion, DetectorNetwork, LevelResize, NetworkConfig, complexity
 from nav.detector.output_maps import STRIDES
 
 CONFIGS = [NetworkConfig(*each) for each in product(("l", "s"), ("eca", "se"), ("asff", "concat"))]
