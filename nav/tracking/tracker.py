@@ -17,6 +17,13 @@ from geometry.stereo import EYES, Eye
 from nav.detector.detector import Detection, StereoDetection
 from nav.tracking.region import Box, EyeImage, box_center, box_size, eye_image, move_box
 
+BERNOULLI, FLOW, MIL, POSE_PREDICT = "bernoulli", "flow", "mil", "pose-predict"
+REDETECT_EVERY = 25
+"""The detector checks a tracker after this many pairs: once a second at the seed paper's 25 pairs a second."""
+# A longer time between two pairs separates two sequences. [s]
+_LONGEST_GAP_S = 1.0
+# Boxes with a smaller intersection over union show different things.
+_SAME_PLACE_IOU = 0.5
 # Boxes of one drogue lie at the same height in both images and have the same size. These changes of offset, in box
 # sides plus pixels, and of log-scale cover the noise of every tracker and a badly calibrated rig.
 _LARGEST_OFFSET_CHANGE, _LARGEST_OFFSET_CHANGE_PX, _LARGEST_SCALE_CHANGE = 0.12, 3.0, 0.2
@@ -24,6 +31,42 @@ _LARGEST_OFFSET_CHANGE, _LARGEST_OFFSET_CHANGE_PX, _LARGEST_SCALE_CHANGE = 0.12,
 _TOLERANCE_SIGMAS = 3.0
 # Boxes with less of their width or height on the image are not followed.
 _SMALLEST_VISIBLE_PX = 4.0
+
+
+class Tracker(Protocol):
+    """Follows one drogue through the pairs of a sequence, in both eyes."""
+
+    name: str
+
+    def start(self, images: StereoImages, found: StereoDetection) -> None:
+        """Start anew with the boxes of a pair.
+
+        Args:
+            images: the pair.
+            found: its boxes; an eye without one is not followed until `correct` gives it one.
+        """
+        ...
+
+    def follow(self, images: StereoImages, predicted: StereoDetection) -> StereoDetection:
+        """Boxes in the next pair.
+
+        Args:
+            images: the next pair in time.
+            predicted: boxes where a motion estimate expects the drogue; None for an eye without a prediction.
+
+        Returns:
+            The boxes; None for an eye in which the drogue is lost.
+        """
+        ...
+
+    def correct(self, images: StereoImages, found: StereoDetection) -> None:
+        """Learn from boxes of the last `follow`'s pair that are better than its answer, such as those of a pose.
+
+        Args:
+            images: that pair.
+            found: better boxes; None for an eye without one.
+        """
+        ...
 
 
 class EyeTracker(Protocol):
@@ -187,53 +230,6 @@ def _box_in_other_eye(seen: Box, offset: _StereoOffset, eye: Eye) -> Box:
     return move_box(seen, center, scale)
 
 
-BERNOULLI, FLOW, MIL, POSE_PREDICT = "bernoulli", "flow", "mil", "pose-predict"
-REDETECT_EVERY = 25
-"""The detector checks a tracker after this many pairs: once a second at the seed paper's 25 pairs a second."""
-# A longer time between two pairs separates two sequences. [s]
-_LONGEST_GAP_S = 1.0
-# Boxes with a smaller intersection over union show different things.
-_SAME_PLACE_IOU = 0.5
-
-PixelBox = tuple[float, float, float, float]
-
-
-class Tracker(Protocol):
-    """Follows one drogue through the pairs of a sequence, in both eyes."""
-
-    name: str
-
-    def start(self, images: StereoImages, found: StereoDetection) -> None:
-        """Start anew with the boxes of a pair.
-
-        Args:
-            images: the pair.
-            found: its boxes; an eye without one is not followed until `correct` gives it one.
-        """
-        ...
-
-    def follow(self, images: StereoImages, predicted: StereoDetection) -> StereoDetection:
-        """Boxes in the next pair.
-
-        Args:
-            images: the next pair in time.
-            predicted: boxes where a motion estimate expects the drogue; None for an eye without a prediction.
-
-        Returns:
-            The boxes; None for an eye in which the drogue is lost.
-        """
-        ...
-
-    def correct(self, images: StereoImages, found: StereoDetection) -> None:
-        """Learn from boxes of the last `follow`'s pair that are better than its answer, such as those of a pose.
-
-        Args:
-            images: that pair.
-            found: better boxes; None for an eye without one.
-        """
-        ...
-
-
 def tracker_names() -> tuple[str, ...]:
     """Names that `open_tracker` knows."""
     return (BERNOULLI, FLOW, MIL, POSE_PREDICT)
@@ -274,6 +270,6 @@ def begins_sequence(last_s: float | None, now_s: float) -> bool:
     return last_s is None or not 0 < now_s - last_s <= _LONGEST_GAP_S
 
 
-def is_same_place(one: PixelBox, other: PixelBox) -> bool:
+def is_same_place(one: Box, other: Box) -> bool:
     """Whether two boxes of one image overlap enough to show the same thing."""
     return bool(intersection_over_union(one, other) >= _SAME_PLACE_IOU)
