@@ -15,8 +15,8 @@ from geometry.stereo import EYES, Eye
 from nav.detector.detector import StereoDetection
 from nav.lens_correction import distort_observation
 from nav.matching.marker_channel import PLAIN
+from nav.pose.method_registry import pose_method
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason, Observation, Solution
-from nav.pose.pose_methods import pose_method
 from nav.refinement import rough_pose
 
 

@@ -17,8 +17,8 @@ from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
 from nav.navigator import Navigator
 from nav.pair_measurement import PairMeasurement, estimate_pose
+from nav.pose.method_registry import METHODS, pose_method
 from nav.pose.pose_method import NoFixReason, Observation
-from nav.pose.pose_methods import METHODS, pose_method
 from tests.support.painted_pairs import make_pose, paint_pair
 
 RIG = paper_rig()

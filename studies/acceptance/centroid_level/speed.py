@@ -21,8 +21,8 @@ from geometry.stereo import paper_rig
 from nav.navigator import Navigator
 from nav.pair_measurement import PairMeasurement
 from nav.pose.joint import joint
+from nav.pose.method_registry import pose_method
 from nav.pose.pose_method import Observation, Solution
-from nav.pose.pose_methods import pose_method
 from studies.acceptance.acceptance_table import AcceptanceRow, at_most
 from studies.acceptance.centroid_level.drawn_frames import Corruption, draw_poses, draw_shifts, ellipse_centers_px
 from studies.acceptance.centroid_level.monte_carlo import DOCKING_RANGE_M

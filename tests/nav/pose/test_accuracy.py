@@ -18,9 +18,9 @@ from nav.pose.adjustment import adjust
 from nav.pose.baselines import mean_plane
 from nav.pose.features import observed_features
 from nav.pose.joint import joint
+from nav.pose.method_registry import METHODS
 from nav.pose.paper import paper, triple_circles
 from nav.pose.pose_method import NoFixReason, Observation, Solution
-from nav.pose.pose_methods import METHODS
 from tests.support.painted_pairs import draw_poses, make_pose
 
 RIG = paper_rig()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nav.pose.method_registry import METHODS
 from nav.pose.monocular import circle_poses, conic_through
-from nav.pose.pose_methods import METHODS
 from tests.support.painted_pairs import draw_poses
 
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from drogue_models.marker_layout import MarkerLayout
 from geometry.pinhole import PinholeCamera
 from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.method_registry import METHODS
 from nav.pose.pose_method import NoFixReason, Observation, Solution, StatedTolerances
-from nav.pose.pose_methods import METHODS
 from tests.support.painted_pairs import Draws, draw_poses
 
 MONO = [name for name in METHODS if name.startswith("mono-")]

@@ -11,8 +11,8 @@ from nav.pose.adjustment import AdjustmentState, linearise
 from nav.pose.features import Features, stack_features, whiten, whiten_with_displacement
 from nav.pose.joint import joint_hub, joint_robust
 from nav.pose.joint_batch import solve_joint_batch
+from nav.pose.method_registry import METHODS
 from nav.pose.pose_method import EXACT, StatedTolerances
-from nav.pose.pose_methods import METHODS
 from tests.support.painted_pairs import Draws, draw_poses
 
 STATED = StatedTolerances(

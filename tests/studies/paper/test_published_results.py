@@ -12,8 +12,8 @@ from droguekit.scoring.poses.pose_errors import pose_error
 from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform, rotation_from_angles
 from geometry.stereo import EYES, paper_rig
+from nav.pose.method_registry import pose_method
 from nav.pose.pose_method import Observation, Solution
-from nav.pose.pose_methods import pose_method
 from studies.paper.published_results import (
     CONTRADICTION,
     DETECTION_FPS,

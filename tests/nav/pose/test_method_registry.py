@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nav.pose.method_registry import METHODS, method_names, pose_method
 from nav.pose.pose_method import NoFixReason
-from nav.pose.pose_methods import METHODS, method_names, pose_method
 from nav.runner import method_names as names_of_runner
 from tests.support.painted_pairs import draw_poses
 
