@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from datasets_manifest.random_streams import sample_generator
-from nav.training.batches import BatchMaker
 from nav.training.corpus import Corpus
+from nav.training.trainer import BatchMaker
 from nav.training.training_settings import build_settings
 
 
