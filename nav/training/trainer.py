@@ -47,6 +47,9 @@ _WHOLE_FRACTION = 0.25  # of the others: the whole image, as in the detector
 _MOSAIC_RANGES = ViewRanges(scale=(0.4, 1.4), rotation_deg=4, flip_fraction=0.5)
 _SINGLE_RANGES = ViewRanges(scale=(0.65, 1.5), rotation_deg=4, flip_fraction=0.5)
 _AHEAD_BATCHES = 2
+_STEPS_PER_CURVE_POINT = 10
+# Validation every third epoch before the last input size; the best weights are chosen among those at that size.
+_EPOCHS_PER_VALIDATION = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +144,6 @@ class BatchMaker:
         paint_distractors(rng, canvas, boxes)
         boxes = cutout(rng, canvas, boxes)
         return color_jitter(rng, canvas), boxes
-
-
-_STEPS_PER_CURVE_POINT = 10
-# Validation every third epoch before the last input size; the best weights are chosen among those at that size.
-_EPOCHS_PER_VALIDATION = 3
 
 
 def learning_rate(settings: TrainingSettings, step: int) -> float:
