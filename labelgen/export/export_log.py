@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from datasets_manifest.storage.reader import Dataset
     from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
     from geometry.pinhole import PinholeCamera
+    from geometry.stereo import StereoRig
 
 
 _LARGEST_ID = 2**63 - 1
@@ -74,6 +75,18 @@ class ExportLog:
     def losses(self) -> dict[str, int]:
         """Counts by reason, sorted by name."""
         return dict(sorted(self._losses.items()))
+
+
+def require_pinholes(dataset: object, rig: StereoRig, name: str) -> None:
+    """Check that a format for images of pinholes can hold those of a rig.
+
+    Raises:
+        ValueError: the rig has real lenses; names formats that hold their images and poses.
+    """
+    if rig.lenses is not None:
+        raise ValueError(
+            f"{dataset}: has images of real lenses, and {name} holds those of pinholes only; use speed or rosbag"
+        )
 
 
 def record_fault(record: PairRecord) -> str | None:

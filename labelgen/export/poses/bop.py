@@ -33,7 +33,7 @@ from drogue_models.parts import drogue_part_ids
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist
 from geometry.stereo import EYES, Eye
-from labelgen.export.export_log import ExportLog
+from labelgen.export.export_log import ExportLog, require_pinholes
 from labelgen.export.frame_files import export_image
 from labelgen.part_pixels import parts_mask
 from labelgen.segmentation_masks import Mask, amodal_masks, union_of_masks
@@ -76,8 +76,7 @@ def write_bop(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """
     source = Dataset(dataset)
     recipe = source.manifest.recipe
-    if recipe.rig.lenses is not None:
-        raise ValueError("rig: BOP holds pinhole images only, and this rig has real lenses; take one of ideal eyes")
+    require_pinholes(dataset, recipe.rig, "BOP")
     splits = source.manifest.split_of_frame()
     targets: list[dict[str, int]] = []
     with new_folder(out) as folder:

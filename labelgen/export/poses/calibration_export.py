@@ -11,6 +11,7 @@ from datasets_manifest.calibration.calibration_files import (
     camera_info,
     camera_info_file,
     kalibr_camchain,
+    kalibr_fault,
     opencv_stereo,
 )
 from datasets_manifest.storage.manifest import read_manifest
@@ -30,7 +31,11 @@ def write_kalibr(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     Raises:
         ValueError: also for lenses with a k3, which Kalibr cannot describe.
     """
-    return _write(out, {KALIBR_FILE: kalibr_camchain(read_manifest(dataset).recipe.rig)})
+    rig = read_manifest(dataset).recipe.rig
+    fault = kalibr_fault(rig)
+    if fault is not None:
+        raise ValueError(f"rig: {fault}; use opencv or ros-camera-info")
+    return _write(out, {KALIBR_FILE: kalibr_camchain(rig)})
 
 
 def write_camera_info(dataset: Location, out: Path, log: ExportLog) -> list[Path]:

@@ -22,7 +22,7 @@ from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye, StereoRig
-from labelgen.export.export_log import ExportLog
+from labelgen.export.export_log import ExportLog, require_pinholes
 from labelgen.export.frame_files import export_image
 from labelgen.export.keypoints import log_cut_labels, view_of
 from labelgen.part_pixels import drogue_hull_m
@@ -49,10 +49,7 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
     """
     source = Dataset(dataset)
     rig, splits = source.manifest.recipe.rig, source.manifest.split_of_frame()
-    if rig.lenses is not None:
-        raise ValueError(
-            f"{dataset}: has the images of real lenses, and KITTI holds rectified ones only; use speed or bop"
-        )
+    require_pinholes(dataset, rig, "KITTI")
     calibration = kitti_calibration(rig)
     with new_folder(out) as folder, ExitStack() as stack:
         training, sets = folder / "training", folder / "ImageSets"

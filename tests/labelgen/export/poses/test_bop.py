@@ -249,6 +249,6 @@ def test_real_lenses_are_refused(tmp_path: Path) -> None:
         tmp_path / "real",
         build_manifest(tmp_path / "real", recipe, "1", dict.fromkeys(range(recipe.frames.scenes), "train")),
     )
-    with pytest.raises(ValueError, match="BOP holds pinhole images only"):
+    with pytest.raises(ValueError, match="BOP holds those of pinholes only"):
         write_bop(tmp_path / "real", tmp_path / "out", ExportLog())
     assert not (tmp_path / "out").exists()

@@ -150,6 +150,6 @@ def sees_drogue(part_id: np.ndarray) -> np.ndarray:
 
 def test_kitti_refuses_eyes_that_are_not_rectified(dataset_by_preset: Callable[..., Any], tmp_path: Path) -> None:
     dataset = dataset_by_preset("paper-real", {"eyes": {"k1": [-0.1, -0.1]}})
-    with pytest.raises(ValueError, match="KITTI holds rectified ones only"):
+    with pytest.raises(ValueError, match="KITTI holds those of pinholes only"):
         write_export("kitti", dataset, tmp_path / "out", ExportLog())
     assert not (tmp_path / "out").exists()
