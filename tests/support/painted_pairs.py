@@ -13,7 +13,7 @@ from datasets_manifest.types.images import StereoImages
 from drogue_models.marker_layout import MarkerLayout
 from drogue_models.parameters import DrogueParameters, even_ring
 from drogue_models.presets import PRESETS
-from geometry.circles import project_disc_centers
+from geometry.circles import ellipse_center_points, project_disc_centers
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, angles_from_axis, exp_twist, log_twist, rotation_from_angles
 from geometry.stereo import EYES, StereoRig, paper_rig
@@ -174,25 +174,28 @@ class Draws:
         turn = log_twist(RigidTransform(rotation @ true.rotation.T, np.zeros(3)))[3:]
         return np.concatenate([translation_m - true.translation_m, angles, turn])
 
-    def bound(self, index: int, features: int) -> np.ndarray:
-        """(5,) Cramer-Rao bounds of X, Y, Z [m], pitch and yaw [rad] by differences of the exact projection."""
-        steps = np.diag([1e-6] * 6)
-        centers, radii = drogue_features(self.layout)
-        pixels, derived = [], []
-        for step in np.concatenate([steps, -steps]):
-            true = self.places[index]
-            rotation = exp_twist([0, 0, 0, *step[3:]]).rotation @ true.rotation
-            moved = RigidTransform(rotation, true.translation_m + step[:3])
-            seen = [
-                project_disc_centers(self.rig, moved, centers[:features], radii[:features], eye)
-                for eye in EYES[: self.exact_px.shape[1]]
-            ]
-            pixels.append(np.ravel(seen))
-            derived.append([*moved.translation_m, *angles_from_axis(rotation[:, 2])])
-        jacobian = (np.array(pixels[:6]) - pixels[6:]) / 2e-6
-        outputs = (np.array(derived[:6]) - derived[6:]) / 2e-6
-        covariance = outputs.T @ np.linalg.inv(jacobian @ jacobian.T) @ outputs
-        return self.sigma_px * np.sqrt(np.diag(covariance))
+    def bounds(self, features: int) -> np.ndarray:
+        """(B, 5) Cramer-Rao bounds of X, Y, Z [m], pitch and yaw [rad] by differences of the exact projection.
+
+        Args:
+            features: how many of them count, the markers first.
+        """
+        steps = 1e-6 * np.concatenate([np.eye(6), -np.eye(6)])
+        turns = np.array([exp_twist([0, 0, 0, *step[3:]]).rotation for step in steps])
+        # (B, 12, ...): every pose, moved by every step.
+        rotations = turns @ np.array([place.rotation for place in self.places])[:, None]
+        translations = np.array([place.translation_m for place in self.places])[:, None] + steps[:, :3]
+        centers, radii = (each[:features] for each in drogue_features(self.layout))
+        centers_m, axes = centers @ np.swapaxes(rotations, 2, 3) + translations[:, :, None], rotations[:, :, None, :, 2]
+        pixels = [
+            self.rig.camera.project(ellipse_center_points(centers_m - self.rig.eye_offset_m(eye), axes, radii))
+            for eye in EYES[: self.exact_px.shape[1]]
+        ]
+        seen = np.stack(pixels, axis=2).reshape(len(self.places), len(steps), -1)
+        derived = np.concatenate([translations, np.stack(angles_from_axis(rotations[..., 2]), axis=-1)], axis=-1)
+        jacobian, outputs = ((each[:, :6] - each[:, 6:]) / 2e-6 for each in (seen, derived))
+        covariance = np.swapaxes(outputs, 1, 2) @ np.linalg.inv(jacobian @ np.swapaxes(jacobian, 1, 2)) @ outputs
+        return self.sigma_px * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 
 def drogue_features(layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:

@@ -42,10 +42,11 @@ def test_the_circle_fit_needs_four_points_and_a_circle() -> None:
 
 def test_depth_of_the_circle_fit() -> None:
     draws = draw_poses(np.random.default_rng(59), 200, 5.0, 0.05)
-    ratios = [
-        (circle_fit(draws.observation(i)).left_from_drogue.translation_m[2] - p.translation_m[2]) / draws.bound(i, 8)[2]
+    errors_m = [
+        circle_fit(draws.observation(i)).left_from_drogue.translation_m[2] - p.translation_m[2]
         for i, p in enumerate(draws.places)
     ]
+    ratios = np.array(errors_m) / draws.bounds(8)[:, 2]
     # Published as 3.6 to 8 times the bound of the known ring, over all distances; 5 % of sampling, three of it.
     assert 3.6 * 0.85 < np.sqrt(np.mean(np.square(ratios))) < 8 * 1.15
 

@@ -54,7 +54,7 @@ def test_joint_hub_reaches_the_bound_and_never_flips(z_m: float, sigma_px: float
     draws = draw_poses(np.random.default_rng(11), 500, z_m, sigma_px)
     batch = solve(draws, hub=True)
     errors = errors_of(draws, batch)
-    bounds = np.array([draws.bound(i, 10) for i in range(len(errors))])
+    bounds = draws.bounds(10)
     ratio = np.sqrt(((errors[:, :5] / bounds) ** 2).mean(axis=0))
     # Measured as 0.99-1.04 in every cell. A root mean square of 500 is known to 1/sqrt(1000) = 3.2 %; three of it and a
     # half, as the worst of 40 is looked at.
@@ -123,7 +123,7 @@ def test_joint_without_hub_reaches_the_bound_where_the_tilt_is_certain(z_m: floa
     batch = solve(draws, hub=False)
     assert batch.tilt_sign_reliable.all()
     errors = errors_of(draws, batch)
-    bounds = np.array([draws.bound(i, 8) for i in range(len(errors))])
+    bounds = draws.bounds(8)
     ratio = np.sqrt(((errors[:, :5] / bounds) ** 2).mean(axis=0))
     # Measured as 0.98-1.05; sampling as above.
     assert ratio.max() < 1.05 + 0.11
@@ -219,7 +219,7 @@ def test_joint_hub_reaches_the_bound_closely(z_m: float) -> None:
     draws = draw_poses(np.random.default_rng(23), 10_000, z_m, 0.05)
     batch = solve(draws, hub=True)
     errors = errors_of(draws, batch)
-    bounds = np.array([draws.bound(i, 10) for i in range(len(errors))])
+    bounds = draws.bounds(10)
     # Measured as 0.99-1.04; 10,000 draws: 0.7 %, three of it.
     assert np.sqrt(((errors[:, :5] / bounds) ** 2).mean(axis=0)).max() < 1.04 + 0.021
     assert 0.97 < nees(errors, batch) < 1.03
