@@ -16,7 +16,8 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, sync_playwright
 
 from droguekit.visualization.print_pdf import NO_BROWSER, find_browser
-from tests.support.browsed_dataset import BrowsedDataset, browse_dataset
+from tests.support.browsed_dataset import BrowsedDataset, browse_dataset, open_browsed
+from tests.support.shared_folder import shared_folder
 
 PHONE_PX = 360
 DESKTOP_PX = 1280
@@ -279,4 +280,6 @@ def open_page(browser: Browser) -> Iterator[OpenPage]:
 @pytest.fixture(scope="session")
 def browsed(tmp_path_factory: pytest.TempPathFactory) -> BrowsedDataset:
     """Twelve pairs with estimates of several methods, and their page; to be read only (copy it to damage it)."""
-    return browse_dataset(tmp_path_factory.mktemp("<b>&amp; 'page\" #1%20"))
+    name = "<b>&amp; 'page\" #1%20"
+    shared = shared_folder(tmp_path_factory, "browsed", lambda folder: browse_dataset(folder / name))
+    return open_browsed(shared / name)

@@ -61,17 +61,22 @@ def invent_estimate(record: PairRecord, method: str) -> Estimate:
     return PoseEstimate(frame_index=index, method=method, left_from_drogue=moved, features=tuple(features))
 
 
-def browse_dataset(folder: Path) -> BrowsedDataset:
+def browse_dataset(folder: Path) -> None:
     """Render the pairs, invent estimates of several methods on them, and write the page of both."""
-    dataset = Dataset(rendered(RECIPE, folder / "dataset"))
-    records = {index: dataset.record(index) for index in dataset.frame_indices}
-    estimates = {m: {i: invent_estimate(r, m) for i, r in records.items()} for m in ("own", OTHER, *HOSTILE)}
+    rendered(RECIPE, folder / "dataset")
+    estimates = open_browsed(folder).estimates
     write_estimates(folder / "e.jsonl", [estimate for found in estimates.values() for estimate in found.values()])
     summary = write_browse(folder / "dataset", folder / "page", folder / "e.jsonl", 0, PlainProgress(io.StringIO()))
     assert (summary.shown, summary.skipped) == (PAIRS, ())
-    return BrowsedDataset(
-        folder, records, dict(dataset.manifest.split_of_frame()), folder / "page" / "index.html", estimates
-    )
+
+
+def open_browsed(folder: Path) -> BrowsedDataset:
+    """What `browse_dataset` has made there."""
+    dataset = Dataset(folder / "dataset")
+    records = {index: dataset.record(index) for index in dataset.frame_indices}
+    estimates = {m: {i: invent_estimate(r, m) for i, r in records.items()} for m in ("own", OTHER, *HOSTILE)}
+    splits = dict(dataset.manifest.split_of_frame())
+    return BrowsedDataset(folder, records, splits, folder / "page" / "index.html", estimates)
 
 
 def shown_frames(page: Any) -> list[int]:

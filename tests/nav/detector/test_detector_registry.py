@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +22,7 @@ from nav.detector.detector_registry import (
 )
 from nav.detector.model_metadata import ModelMetadata
 from nav.runner import navigate
+from tests.support.detector_networks import write_red_squares
 from tests.support.painted_pairs import make_pose, paint_pair
 
 DROGUE = PRESETS["red-8"]
@@ -45,10 +44,8 @@ def test_networks_have_a_file() -> None:
     assert str(network_file("other/mine.onnx")) == "other/mine.onnx"
 
 
-def test_networks_of_the_package_are_known_by_name(
-    red_squares: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = red_squares(metadata=ModelMetadata(input_size_px=(320, 256)))
+def test_networks_of_the_package_are_known_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = write_red_squares(tmp_path, metadata=ModelMetadata(input_size_px=(320, 256)))
     assert network_file("squares") is None
     monkeypatch.setattr(registry, "_WEIGHTS", file.parent)
     assert detector_names() == ("color-blob", "squares")
@@ -56,8 +53,8 @@ def test_networks_of_the_package_are_known_by_name(
     assert open_detector("squares", DROGUE).name == "squares"
 
 
-def test_a_file_is_opened_once_and_called_by_its_name(red_squares: Callable[..., Any]) -> None:
-    file = red_squares(metadata=ModelMetadata(input_size_px=(320, 256)))
+def test_a_file_is_opened_once_and_called_by_its_name(tmp_path: Path) -> None:
+    file = write_red_squares(tmp_path, metadata=ModelMetadata(input_size_px=(320, 256)))
     make = detector_factory(str(file))
     assert make(DROGUE).name == "squares"
     assert make(DROGUE) is make(PRESETS["white-8"])
@@ -79,10 +76,10 @@ def test_color_blob_has_the_detection_as_its_only_candidate() -> None:
         assert detector.candidates(images, min(1.0, detection.score + 1e-6))[eye] == () or detection.score == 1
 
 
-def test_navigation_uses_the_detector_that_is_named(smoke_dataset: Path, red_squares: Callable[..., Any]) -> None:
+def test_navigation_uses_the_detector_that_is_named(smoke_dataset: Path, tmp_path: Path) -> None:
     dataset = BlindDataset(smoke_dataset)
     # A network whose threshold no score reaches.
-    blind = str(red_squares(metadata=ModelMetadata(input_size_px=(640, 480), score_threshold=1.0)))
+    blind = str(write_red_squares(tmp_path, metadata=ModelMetadata(input_size_px=(640, 480), score_threshold=1.0)))
     estimates = list(navigate(dataset, ["joint"], detector=blind))
     assert estimates and all(isinstance(each, NoFix) and "no drogue detected" in each.reason for each in estimates)
     with pytest.raises(ValueError, match="detector: must be one of"):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from nav.detector.input_image import letterbox
 from nav.detector.model_metadata import ModelMetadata
 from nav.detector.multiscale_inference import half_size_px, merge_scales, to_full_size
 from nav.detector.onnx_detector import OnnxDetector
+from tests.support.detector_networks import write_red_squares
 
 LARGE_PX = 160.0
 NONE = (np.zeros((0, 4)), np.zeros(0))
@@ -64,7 +64,7 @@ def test_boxes_come_back_from_half_the_size() -> None:
     np.testing.assert_allclose(boxes, [[20.0, 40.0, 100.0, 120.0]], atol=1e-9)
 
 
-def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares: Callable[..., Any]) -> None:
+def test_the_second_pass_sees_squares_that_are_twice_as_large(tmp_path: Path) -> None:
     # The network of these tests predicts boxes of two cells, of 8 px or more, around red cells.
     image = np.full((256, 320, 3), 90, np.uint8)
     image[64:192, 64:192] = (255, 0, 0)
@@ -72,16 +72,16 @@ def test_the_second_pass_sees_squares_that_are_twice_as_large(red_squares: Calla
     sides = {}
     for large_from_px in (0.0, 12.0):
         metadata = ModelMetadata(input_size_px=(320, 256), score_threshold=0.6, large_from_px=large_from_px)
-        detector = OnnxDetector(red_squares(metadata=metadata))
+        detector = OnnxDetector(write_red_squares(tmp_path, metadata=metadata))
         assert len(detector.pass_sizes_px) == 1 + (large_from_px > 0)
         sides[large_from_px] = min(box.box_xywh_px[2] for box in detector.candidates(images, 0.6)["left"])
     # With a limit of 12 px, boxes of 16 px at full size are not taken from the full-size pass.
     assert sides[0.0] == pytest.approx(16) and sides[12.0] == pytest.approx(32)
 
 
-def test_a_network_of_one_size_cannot_have_a_second_pass(red_squares: Callable[..., Any]) -> None:
+def test_a_network_of_one_size_cannot_have_a_second_pass(tmp_path: Path) -> None:
     metadata = ModelMetadata(input_size_px=(320, 256), large_from_px=100.0)
-    file = red_squares(metadata=metadata, shape=(2, 3, 256, 320))
+    file = write_red_squares(tmp_path, metadata=metadata, shape=(2, 3, 256, 320))
     with pytest.raises(ValueError, match="large_from_px: takes 320x256 px only, and not half of it"):
         OnnxDetector(file)
 

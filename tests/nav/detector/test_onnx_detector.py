@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from nav.detector.model_metadata import METADATA_KEY, ModelMetadata
 from nav.detector.network.network import NetworkConfig
 from nav.detector.onnx_detector import OnnxDetector
 from nav.training.onnx_conversion import INPUT_NAME, OUTPUT_NAMES, export_onnx
+from tests.support.detector_networks import make_network, write_red_squares
 
 METADATA = ModelMetadata(input_size_px=(320, 256), score_threshold=0.6, licence="Apache-2.0")
 # In cells of 8 px of the 320x256 input: column and row of a red square of one cell.
@@ -41,8 +41,8 @@ def one_line(error: pytest.ExceptionInfo[ValueError], file: Path) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_finds_the_boxes_of_a_hand_made_network(red_squares: Callable[..., Any]) -> None:
-    detector = OnnxDetector(red_squares(metadata=METADATA))
+def test_finds_the_boxes_of_a_hand_made_network(tmp_path: Path) -> None:
+    detector = OnnxDetector(write_red_squares(tmp_path, metadata=METADATA))
     found = detector.detect(red_squares_pair())
     for eye in EYES:
         detection = found.of(eye)
@@ -55,8 +55,8 @@ def test_finds_the_boxes_of_a_hand_made_network(red_squares: Callable[..., Any])
         assert detection.score == pytest.approx(1 / (1 + np.exp(-10)), abs=1e-5)
 
 
-def test_candidates_are_sorted_and_above_the_least_score(red_squares: Callable[..., Any]) -> None:
-    detector = OnnxDetector(red_squares(metadata=METADATA))
+def test_candidates_are_sorted_and_above_the_least_score(tmp_path: Path) -> None:
+    detector = OnnxDetector(write_red_squares(tmp_path, metadata=METADATA))
     found = detector.candidates(red_squares_pair(times=3), least_score=0.2)
     for eye in EYES:
         scores = [each.score for each in found[eye]]
@@ -64,31 +64,31 @@ def test_candidates_are_sorted_and_above_the_least_score(red_squares: Callable[.
         assert scores == sorted(scores, reverse=True) and min(scores) >= 0.2
 
 
-def test_no_drogue_is_none_and_not_an_error(red_squares: Callable[..., Any]) -> None:
+def test_no_drogue_is_none_and_not_an_error(tmp_path: Path) -> None:
     grey = np.full((IMAGE_PX[1], IMAGE_PX[0], 3), 120, np.uint8)
-    detector = OnnxDetector(red_squares(metadata=METADATA))
+    detector = OnnxDetector(write_red_squares(tmp_path, metadata=METADATA))
     pair = StereoImages(grey, grey, 0.0, 0.0)
     found = detector.detect(pair)
     assert found.left is None and found.right is None
     assert detector.candidates(pair, 0.5) == {"left": (), "right": ()}
 
 
-def test_one_eye_may_see_no_drogue(red_squares: Callable[..., Any]) -> None:
+def test_one_eye_may_see_no_drogue(tmp_path: Path) -> None:
     pair = red_squares_pair()
     pair = replace(pair, right=np.full_like(pair.right, 120))
-    found = OnnxDetector(red_squares(metadata=METADATA)).detect(pair)
+    found = OnnxDetector(write_red_squares(tmp_path, metadata=METADATA)).detect(pair)
     assert found.left is not None and found.right is None
 
 
-def test_the_threshold_is_that_of_the_file(red_squares: Callable[..., Any]) -> None:
+def test_the_threshold_is_that_of_the_file(tmp_path: Path) -> None:
     for threshold, sees in ((0.99995, True), (0.99996, False)):
         # The square's score is 0.9999546.
-        detector = OnnxDetector(red_squares(metadata=replace(METADATA, score_threshold=threshold)))
+        detector = OnnxDetector(write_red_squares(tmp_path, metadata=replace(METADATA, score_threshold=threshold)))
         assert (detector.detect(red_squares_pair()).left is not None) == sees
 
 
-def test_input_size_is_that_of_the_file_or_the_given_one(red_squares: Callable[..., Any]) -> None:
-    file = red_squares(metadata=METADATA)
+def test_input_size_is_that_of_the_file_or_the_given_one(tmp_path: Path) -> None:
+    file = write_red_squares(tmp_path, metadata=METADATA)
     assert OnnxDetector(file).input_size_px == (320, 256)
     larger = OnnxDetector(file, input_size_px=(640, 512))
     assert larger.input_size_px == (640, 512)
@@ -100,8 +100,8 @@ def test_input_size_is_that_of_the_file_or_the_given_one(red_squares: Callable[.
         OnnxDetector(file, input_size_px=(300, 200))
 
 
-def test_a_network_of_fixed_size_needs_no_metadata(red_squares: Callable[..., Any]) -> None:
-    file = red_squares(shape=("b", 3, 256, 320))
+def test_a_network_of_fixed_size_needs_no_metadata(tmp_path: Path) -> None:
+    file = write_red_squares(tmp_path, shape=("b", 3, 256, 320))
     assert OnnxDetector(file).detect(red_squares_pair()).left is not None
     with pytest.raises(ValueError, match="takes 320x256 px only") as error:
         OnnxDetector(file, input_size_px=(640, 480))
@@ -119,13 +119,14 @@ def test_a_network_of_fixed_size_needs_no_metadata(red_squares: Callable[..., An
         ({"metadata": METADATA, "shape": (1, 3, 256, 320)}, "takes one image a pass"),
         ({"metadata": METADATA, "shape": ("b", 3, 250, 320)}, "must be multiples of 32, got 320x250"),
         ({"metadata": METADATA, "shape": ("b", 3, 32, 32_000)}, "must be at most 4096, got 32000x32"),
-        ({"metadata": METADATA, "shape": ("b", 1, "h", "w")}, r"one float32 input \(B, 3, H, W\)|not an ONNX network"),
+        (
+            {"metadata": METADATA, "shape": ("b", 1, "h", "w")},
+            r"one float32 input \(B, 3, H, W\)|not an ONNX network",
+        ),
     ],
 )
-def test_networks_of_another_kind_are_refused(
-    red_squares: Callable[..., Any], kwargs: dict[str, Any], message: str
-) -> None:
-    file = red_squares(**kwargs)
+def test_networks_of_another_kind_are_refused(tmp_path: Path, kwargs: dict[str, Any], message: str) -> None:
+    file = write_red_squares(tmp_path, **kwargs)
     with pytest.raises(ValueError, match=message) as error:
         OnnxDetector(file)
     one_line(error, file)
@@ -146,8 +147,8 @@ def test_networks_of_another_kind_are_refused(
         ('{"colour": 1}', "metadata: has unknown keys colour"),
     ],
 )
-def test_metadata_that_makes_no_sense_is_refused(red_squares: Callable[..., Any], text: str, message: str) -> None:
-    file = red_squares()
+def test_metadata_that_makes_no_sense_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    file = write_red_squares(tmp_path)
     model = onnx.load(file)
     helper.set_model_props(model, {METADATA_KEY: text})
     onnx.save(model, file)
@@ -166,8 +167,8 @@ def test_files_that_are_no_networks_are_refused(tmp_path: Path, content: bytes) 
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_refused(red_squares: Callable[..., Any], share: float) -> None:
-    file = red_squares(metadata=METADATA)
+def test_a_truncated_file_is_refused(tmp_path: Path, share: float) -> None:
+    file = write_red_squares(tmp_path, metadata=METADATA)
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
     with pytest.raises(ValueError) as error:
@@ -182,8 +183,8 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         one_line(error, file)
 
 
-def test_a_file_cannot_name_other_files_to_be_read(red_squares: Callable[..., Any], tmp_path: Path) -> None:
-    file = red_squares(metadata=METADATA)
+def test_a_file_cannot_name_other_files_to_be_read(tmp_path: Path) -> None:
+    file = write_red_squares(tmp_path, metadata=METADATA)
     model = onnx.load(file)
     (tmp_path / "secret").write_bytes(bytes(60))
     (weights,) = (each for each in model.graph.initializer if each.name == "weights")
@@ -196,9 +197,9 @@ def test_a_file_cannot_name_other_files_to_be_read(red_squares: Callable[..., An
     one_line(error, file)
 
 
-def test_threads_must_be_positive(red_squares: Callable[..., Any]) -> None:
+def test_threads_must_be_positive(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="threads: must be at least 1, got 0"):
-        OnnxDetector(red_squares(metadata=METADATA), threads=0)
+        OnnxDetector(write_red_squares(tmp_path, metadata=METADATA), threads=0)
 
 
 @pytest.mark.parametrize(
@@ -206,10 +207,8 @@ def test_threads_must_be_positive(red_squares: Callable[..., Any]) -> None:
     [NetworkConfig("l"), NetworkConfig("s", "se", "concat")],
     ids=lambda config: "-".join(config.to_dict().values()),
 )
-def test_exported_network_has_the_outputs_of_torch(
-    network: Callable[..., Any], tmp_path: Path, config: NetworkConfig
-) -> None:
-    trained, file = network(config), tmp_path / "net" / "network.onnx"
+def test_exported_network_has_the_outputs_of_torch(tmp_path: Path, config: NetworkConfig) -> None:
+    trained, file = make_network(config), tmp_path / "net" / "network.onnx"
     metadata = replace(METADATA, network=config.to_dict(), manifest_sha256="ab" * 32, training={"passes": 7})
     before = {name: value.clone() for name, value in trained.state_dict().items()}
     export_onnx(trained.train(), file, metadata)
@@ -229,8 +228,8 @@ def test_exported_network_has_the_outputs_of_torch(
             np.testing.assert_allclose(output, reference, atol=2e-4 * max(1.0, float(np.abs(reference).max())))
 
 
-def test_an_export_that_fails_leaves_nothing_behind(network: Callable[..., Any], tmp_path: Path) -> None:
+def test_an_export_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "network.onnx").mkdir()
     with pytest.raises(OSError, match=r"network\.onnx: cannot be written"):
-        export_onnx(network(NetworkConfig("s")), tmp_path / "network.onnx", METADATA)
+        export_onnx(make_network(NetworkConfig("s")), tmp_path / "network.onnx", METADATA)
     assert [path.name for path in tmp_path.iterdir()] == ["network.onnx"]

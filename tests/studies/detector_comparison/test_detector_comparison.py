@@ -7,7 +7,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -48,6 +47,7 @@ from studies.detector_comparison.yolov8 import (
     training_image_count,
     training_length,
 )
+from tests.support.detector_networks import write_maps_network, write_rows_network
 
 
 @pytest.fixture(scope="module")
@@ -215,17 +215,15 @@ def test_errors_of_our_detectors_are_found_before_anything_is_trained(
 
 
 def test_a_network_of_ours_that_cannot_be_counted_is_refused_before_anything_is_trained(
-    screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
+    screen_dataset: Path, tmp_path: Path
 ) -> None:
-    odd = maps_network(tmp_path / "odd.onnx", is_countable=False)
+    odd = write_maps_network(tmp_path / "odd.onnx", is_countable=False)
     with pytest.raises(ValueError, match="its shape cannot be inferred"):
         compare_peers(order(screen_dataset, tmp_path, ours=(odd,)), tmp_path / "out", print)
     assert list(tmp_path.iterdir()) == [odd]
 
 
-def test_trained_peers_are_timed_and_scored_by_the_benchmark(
-    screen_dataset: Path, rows_network: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_trained_peers_are_timed_and_scored_by_the_benchmark(screen_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     truth = {image.image_id: image for image in read_detection_truth(screen_dataset).images if image.split == "test"}
     some = next(image for image in truth.values() if image.box_xywh is not None and image.eye == "left")
@@ -234,8 +232,8 @@ def test_trained_peers_are_timed_and_scored_by_the_benchmark(
     rows = np.zeros((2, 5, 2), np.float32)
     # 320 x 240 px fit into 64 x 64 as 64 x 48, from row 8 on. The one network finds the drogue in one image.
     rows[0, :, 0] = [x + width / 2, y + 8 + height / 2, width, height, 0.8]
-    rows_network(out / "yolov8s.onnx", rows)
-    rows_network(out / "yolov8n.onnx", np.zeros_like(rows))
+    write_rows_network(out / "yolov8s.onnx", rows)
+    write_rows_network(out / "yolov8n.onnx", np.zeros_like(rows))
     told: list[str] = []
     found = compare_peers(order(screen_dataset, tmp_path), out, told.append)
     assert not any("training" in line or "installing" in line for line in told)
@@ -255,21 +253,19 @@ def test_trained_peers_are_timed_and_scored_by_the_benchmark(
     assert table["detectors"]["yolov8n"]["ap50"] == 0.0 < table["detectors"]["yolov8s"]["ap50"] < 1.0
 
 
-def test_the_pairs_of_the_test_dataset_are_scored(
-    screen_dataset: Path, smoke_dataset: Path, rows_network: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_pairs_of_the_test_dataset_are_scored(screen_dataset: Path, smoke_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for name in PEERS:
-        rows_network(out / f"{name}.onnx", np.zeros((2, 5, 2), np.float32))
+        write_rows_network(out / f"{name}.onnx", np.zeros((2, 5, 2), np.float32))
     compare_peers(order(screen_dataset, tmp_path, test=smoke_dataset), out, lambda line: None)
     scored = json.loads((out / "scores.json").read_text())["dataset"]
     assert scored["sha256"] == Dataset(smoke_dataset).manifest.dataset_sha256
 
 
 def test_ablations_are_scored_by_the_benchmark_and_one_view_finds_the_same_boxes(
-    screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
+    screen_dataset: Path, tmp_path: Path
 ) -> None:
-    file = maps_network(tmp_path / "detector.onnx")
+    file = write_maps_network(tmp_path / "detector.onnx")
     nowhere = tmp_path / "nowhere"
     ablation = AblationOptions(nowhere, screen_dataset, "s", 1, (64, 64), 1, 0, "cpu", 2)
     rows = measured_networks(ablation, {"eca-asff": file, ONE_VIEW: file}, lambda line: None)
@@ -289,10 +285,8 @@ def test_ablations_are_scored_by_the_benchmark_and_one_view_finds_the_same_boxes
             assert single.box_xywh_px == pytest.approx(paired.box_xywh_px, abs=1e-3)
 
 
-def test_a_benchmark_accepts_networks_whose_operations_cannot_be_counted(
-    screen_dataset: Path, maps_network: Callable[..., Path], tmp_path: Path
-) -> None:
-    plain, odd = (maps_network(tmp_path / f"{name}.onnx", name == "plain") for name in ("plain", "odd"))
+def test_a_benchmark_accepts_networks_whose_operations_cannot_be_counted(screen_dataset: Path, tmp_path: Path) -> None:
+    plain, odd = (write_maps_network(tmp_path / f"{name}.onnx", name == "plain") for name in ("plain", "odd"))
     words = ["benchmark", str(screen_dataset), "--detector", str(plain), "--detector", str(odd)]
     assert run([*words, "--json", str(tmp_path / "scores.json")]) == DONE
     scores = json.loads((tmp_path / "scores.json").read_text())["detectors"]

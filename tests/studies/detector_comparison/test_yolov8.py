@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from nav.detector.detector import Detection, StereoDetection
 from nav.detector.onnx_cost import network_cost
 from studies.detector_comparison.latency import _latency, measure_latency
 from studies.detector_comparison.yolov8 import YoloDetector, decode_rows
+from tests.support.detector_networks import write_rows_network
 
 
 def images(width_px: int = 128, height_px: int = 96) -> StereoImages:
@@ -40,13 +40,11 @@ def test_nothing_found_is_no_box() -> None:
     assert (boxes.shape, scores.shape) == ((0, 4), (0,))
 
 
-def test_boxes_stand_in_the_full_sized_image_counted_from_pixel_centres(
-    rows_network: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_boxes_stand_in_the_full_sized_image_counted_from_pixel_centres(tmp_path: Path) -> None:
     rows = np.zeros((2, 5, 3), np.float32)
     # The whole picture of the left eye: 128 x 96 px fit into 64 x 64 as 64 x 48, from row 8 to 56.
     rows[0, :, 0] = [32, 32, 64, 48, 0.8]
-    detector = YoloDetector(rows_network(tmp_path / "rows.onnx", rows), 1)
+    detector = YoloDetector(write_rows_network(tmp_path / "rows.onnx", rows), 1)
     found = detector.candidates(images(), 0.25)
     assert found["right"] == ()
     np.testing.assert_allclose(found["left"][0].box_xywh_px, [-0.5, -0.5, 128, 96], atol=1e-4)
@@ -63,8 +61,8 @@ def test_files_that_are_no_networks_are_named(tmp_path: Path, content: bytes | N
         YoloDetector(file, 1)
 
 
-def test_networks_of_another_kind_are_refused(rows_network: Callable[..., Path], tmp_path: Path) -> None:
-    file = rows_network(tmp_path / "flat.onnx", np.zeros((2, 5), np.float32))
+def test_networks_of_another_kind_are_refused(tmp_path: Path) -> None:
+    file = write_rows_network(tmp_path / "flat.onnx", np.zeros((2, 5), np.float32))
     with pytest.raises(ValueError, match="must take two images and give rows of boxes"):
         YoloDetector(file, 1)
 

@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 import torch
 from pycocotools import mask
@@ -10,6 +7,7 @@ from pycocotools import mask
 from nav.detector.network.detection_loss import detection_loss
 from nav.detector.network.network import NetworkConfig
 from nav.detector.output_maps import STRIDES, decode_maps
+from tests.support.detector_networks import make_network
 
 HEIGHT, WIDTH = 128, 160
 NONE = torch.zeros(0, 4)
@@ -88,8 +86,8 @@ def test_minimising_the_loss_makes_the_predictions_right() -> None:
 
 
 @pytest.mark.parametrize("boxes", [BOXES, [NONE, NONE]], ids=["boxes", "none"])
-def test_gradients_in_autocast_are_float32_and_finite(network: Callable[..., Any], boxes: list[torch.Tensor]) -> None:
-    torch_network = network(NetworkConfig("s")).train()
+def test_gradients_in_autocast_are_float32_and_finite(boxes: list[torch.Tensor]) -> None:
+    torch_network = make_network(NetworkConfig("s")).train()
     images = torch.rand(2, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         loss = detection_loss(torch_network(images), boxes)

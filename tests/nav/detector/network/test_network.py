@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -23,16 +22,17 @@ from nav.detector.network.backbone import (
 )
 from nav.detector.network.network import AdaptiveFusion, DetectorNetwork, LevelResize, NetworkConfig, complexity
 from nav.detector.output_maps import STRIDES
+from tests.support.detector_networks import make_network
 
 CONFIGS = [NetworkConfig(*each) for each in product(("l", "s"), ("eca", "se"), ("asff", "concat"))]
 MAX_WEIGHTS_BYTES = 12e6
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: "-".join(config.to_dict().values()))
-def test_there_is_one_output_map_per_stride(network: Callable[..., Any], config: NetworkConfig) -> None:
+def test_there_is_one_output_map_per_stride(config: NetworkConfig) -> None:
     height, width = 64, 96
     with torch.no_grad():
-        maps = network(config)(torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(1)))
+        maps = make_network(config)(torch.rand(2, 3, height, width, generator=torch.Generator().manual_seed(1)))
     assert [tuple(each.shape) for each in maps] == [(2, 5, height // stride, width // stride) for stride in STRIDES]
     assert all(bool(each.isfinite().all()) for each in maps)
 
@@ -165,8 +165,8 @@ def test_depthwise_convolution_in_autocast_is_the_float32_one_where_bf16_is_slow
         torch.testing.assert_close(output.float(), layer(features), rtol=2**-8, atol=1e-5)
 
 
-def test_autocast_outputs_are_float32_and_nearly_the_same(network: Callable[..., Any]) -> None:
-    torch_network = network(NetworkConfig("s"))
+def test_autocast_outputs_are_float32_and_nearly_the_same() -> None:
+    torch_network = make_network(NetworkConfig("s"))
     images = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(8))
     with torch.no_grad():
         exact = torch_network(images)
@@ -215,8 +215,8 @@ def test_complexity_does_not_change_the_network() -> None:
     assert all(torch.equal(value, before[name]) for name, value in torch_network.state_dict().items())
 
 
-def test_the_gain_of_images_can_be_folded_into_the_first_layer(network: Callable[..., Any]) -> None:
-    folded = network(NetworkConfig("s")).eval()
+def test_the_gain_of_images_can_be_folded_into_the_first_layer() -> None:
+    folded = make_network(NetworkConfig("s")).eval()
     images = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
         before = folded(images)
