@@ -20,30 +20,26 @@ from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
 from droguekit.batch.execution import ExecutionOptions
-from droguekit.batch.render_dataset import RunSummary
 from droguekit.cli.main import INTERRUPTED
+from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE, file_hashes, render_recipe
 
-Make = Callable[..., RunSummary]
-Hashes = Callable[[Path], dict[str, str]]
 Troubled = Callable[..., Path]
 
 
-def test_an_engine_that_aborts_once_is_forgiven(
-    troubled: Troubled, quick_recipe: str, make: Make, quick_dataset: Path, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_an_engine_that_aborts_once_is_forgiven(troubled: Troubled, quick_dataset: Path, tmp_path: Path) -> None:
     troubled(abort_once=[2, 5])
-    stormy = make(tmp_path / "stormy", workers=2, text=quick_recipe)
+    stormy = render_recipe(tmp_path / "stormy", workers=2, text=QUICK_RECIPE)
     assert (stormy.drops, stormy.totals.retries, sorted(stormy.totals.made)) == ((), 2, list(range(8)))
-    assert hashes(tmp_path / "stormy") == hashes(quick_dataset)
+    assert file_hashes(tmp_path / "stormy") == file_hashes(quick_dataset)
 
 
 def test_frames_that_abort_always_are_reported_and_made_later(
-    troubled: Troubled, quick_recipe: str, make: Make, quick_dataset: Path, hashes: Hashes, tmp_path: Path
+    troubled: Troubled, quick_dataset: Path, tmp_path: Path
 ) -> None:
     troubled(abort=[3])
     told = io.StringIO()
     out = tmp_path / "stormy"
-    stormy = make(out, workers=2, text=quick_recipe, told=told)
+    stormy = render_recipe(out, workers=2, text=QUICK_RECIPE, told=told)
     reason = "its worker process died (SIGABRT), attempt 3 of 3"
     assert [(drop.frame_index, drop.reason) for drop in stormy.drops] == [(3, reason)]
     assert read_manifest(out).drops == stormy.drops
@@ -59,51 +55,47 @@ def test_frames_that_abort_always_are_reported_and_made_later(
     assert 0.01 < lines[-1]["workers_peak_gib"] < 4.0
     # Accidents of an earlier run do not count in the next one.
     troubled()
-    assert make(out, text=quick_recipe).dataset_sha256 == read_manifest(quick_dataset).dataset_sha256
-    assert hashes(out) == hashes(quick_dataset)
+    assert render_recipe(out, text=QUICK_RECIPE).dataset_sha256 == read_manifest(quick_dataset).dataset_sha256
+    assert file_hashes(out) == file_hashes(quick_dataset)
 
 
 @pytest.mark.slow  # for as long as the time that the frame is given
-def test_a_frame_that_hangs_is_stopped_and_tried_again(
-    troubled: Troubled, quick_recipe: str, make: Make, quick_dataset: Path, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_a_frame_that_hangs_is_stopped_and_tried_again(troubled: Troubled, quick_dataset: Path, tmp_path: Path) -> None:
     marks = troubled(hang_once=[1])
     told, out = io.StringIO(), tmp_path / "out"
-    summary = make(out, [1], ExecutionOptions(1, timeout_s=60.0), quick_recipe, told)
+    summary = render_recipe(out, [1], ExecutionOptions(1, timeout_s=60.0), QUICK_RECIPE, told)
     assert (marks / "hang-1").exists()
     assert "frame 1: it was still at work after 60 s and was stopped, attempt 1 of 3; it is tried" in told.getvalue()
     # The frame takes about 50 ms; where a crowded machine gives all its attempts too little time, it is made later.
     assert summary.totals.made == [1] or [drop.frame_index for drop in summary.drops] == [1]
-    assert make(out, [1], text=quick_recipe).pairs == 1
-    assert hashes(layout.frame_folder(out, 1)) == hashes(layout.frame_folder(quick_dataset, 1))
+    assert render_recipe(out, [1], text=QUICK_RECIPE).pairs == 1
+    assert file_hashes(layout.frame_folder(out, 1)) == file_hashes(layout.frame_folder(quick_dataset, 1))
 
 
-def test_a_frame_that_is_refused_is_dropped_at_once_with_its_reason(
-    troubled: Troubled, quick_recipe: str, make: Make, tmp_path: Path
-) -> None:
+def test_a_frame_that_is_refused_is_dropped_at_once_with_its_reason(troubled: Troubled, tmp_path: Path) -> None:
     troubled(refuse=[6])
-    summary = make(tmp_path / "out", text=quick_recipe)
+    summary = render_recipe(tmp_path / "out", text=QUICK_RECIPE)
     assert [(drop.frame_index, drop.reason) for drop in summary.drops] == [(6, "frame 6 is beyond me")]
     assert (summary.pairs, summary.totals.retries) == (7, 0)
 
 
-def test_an_error_of_all_frames_ends_the_run(troubled: Troubled, quick_recipe: str, make: Make, tmp_path: Path) -> None:
+def test_an_error_of_all_frames_ends_the_run(troubled: Troubled, tmp_path: Path) -> None:
     troubled(refuse=[*range(8)])
     with pytest.raises(RuntimeError, match="beyond me"):
-        make(tmp_path / "out", text=quick_recipe)
+        render_recipe(tmp_path / "out", text=QUICK_RECIPE)
     assert not (tmp_path / "out").exists()
 
 
 def test_a_full_disk_ends_the_run_and_the_rest_goes_on_later(
-    troubled: Troubled, quick_recipe: str, make: Make, quick_dataset: Path, hashes: Hashes, tmp_path: Path
+    troubled: Troubled, quick_dataset: Path, tmp_path: Path
 ) -> None:
     troubled(no_space=[4])
     with pytest.raises(OSError, match="frame 4: cannot be made: /scratch: No space left on device"):
-        make(tmp_path / "out", text=quick_recipe)
+        render_recipe(tmp_path / "out", text=QUICK_RECIPE)
     assert layout.frame_indices(tmp_path / "out") == [0, 1, 2, 3]
     troubled()
-    assert make(tmp_path / "out", text=quick_recipe).kept == 4
-    assert hashes(tmp_path / "out") == hashes(quick_dataset)
+    assert render_recipe(tmp_path / "out", text=QUICK_RECIPE).kept == 4
+    assert file_hashes(tmp_path / "out") == file_hashes(quick_dataset)
 
 
 @pytest.fixture
@@ -119,29 +111,26 @@ def small_disk(tmp_path: Path) -> Iterator[Callable[[str], object]]:
 
 def test_a_disk_that_is_full_and_one_that_is_read_only(
     small_disk: Callable[[str], object],
-    analytic_recipe: str,
-    make: Make,
     analytic_dataset: Path,
-    hashes: Hashes,
     tmp_path: Path,
 ) -> None:
     out = tmp_path / "disk" / "out"
     with pytest.raises(OSError, match="No space left on device"):
-        make(out, text=analytic_recipe)
+        render_recipe(out, text=ANALYTIC_RECIPE)
     there = layout.frame_indices(out)
     assert 0 < len(there) < 8
     assert leftovers(out) == []
     small_disk("ro,size=50m")
     with pytest.raises(OSError, match="Read-only file system"):
-        make(out, text=analytic_recipe)
+        render_recipe(out, text=ANALYTIC_RECIPE)
     small_disk("rw,size=50m")
-    assert make(out, text=analytic_recipe).kept == len(there)
-    assert hashes(out) == hashes(analytic_dataset)
+    assert render_recipe(out, text=ANALYTIC_RECIPE).kept == len(there)
+    assert file_hashes(out) == file_hashes(analytic_dataset)
 
 
 @pytest.fixture
 def waiting_run(
-    troubled: Troubled, quick_recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    troubled: Troubled, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[], subprocess.Popen[str]]:
     """Starts `render` with one worker in a process of its own, and returns when it works on frame 2."""
     troubled(wait=[2])
@@ -149,7 +138,7 @@ def waiting_run(
         os.mkfifo(tmp_path / name)
     monkeypatch.setenv("TROUBLE_BEGUN", str(tmp_path / "begun"))
     monkeypatch.setenv("TROUBLE_GO_ON", str(tmp_path / "go-on"))
-    (tmp_path / "quick.toml").write_text(quick_recipe)
+    (tmp_path / "quick.toml").write_text(QUICK_RECIPE)
 
     def start() -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "droguekit.cli.main", "render", str(tmp_path / "quick.toml")]
@@ -180,8 +169,6 @@ def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
     waiting_run: Callable[[], subprocess.Popen[str]],
     number: signal.Signals,
     troubled: Troubled,
-    quick_recipe: str,
-    make: Make,
     tmp_path: Path,
 ) -> None:
     with waiting_run() as process:
@@ -199,11 +186,11 @@ def test_one_signal_finishes_the_frame_in_hand_and_says_how_to_go_on(
     assert layout.frame_indices(out) == [0, 1, 2]
     assert leftovers(out) == []
     troubled()
-    assert make(out, text=quick_recipe).kept == 3
+    assert render_recipe(out, text=QUICK_RECIPE).kept == 3
 
 
 def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
-    waiting_run: Callable[[], subprocess.Popen[str]], troubled: Troubled, quick_recipe: str, make: Make, tmp_path: Path
+    waiting_run: Callable[[], subprocess.Popen[str]], troubled: Troubled, tmp_path: Path
 ) -> None:
     with waiting_run() as process:
         assert process.stderr is not None
@@ -216,12 +203,10 @@ def test_a_second_signal_stops_at_once_and_loses_only_the_frame_in_hand(
     out = tmp_path / "out"
     assert layout.frame_indices(out) == [0, 1]
     troubled()
-    assert make(out, text=quick_recipe).kept == 2
+    assert render_recipe(out, text=QUICK_RECIPE).kept == 2
 
 
-def test_a_jump_of_the_clock_changes_nothing(
-    troubled: Troubled, quick_recipe: str, make: Make, quick_dataset: Path, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_a_jump_of_the_clock_changes_nothing(troubled: Troubled, quick_dataset: Path, tmp_path: Path) -> None:
     library = tmp_path / "jumping_clock.so"
     source = tmp_path / "jumping_clock.c"
     # The time of day jumps a day back or forth with every look at it; the monotonic clock stays.
@@ -239,7 +224,7 @@ def test_a_jump_of_the_clock_changes_nothing(
     if compiler is None:
         pytest.skip("needs a C compiler to set another clock under the process")
     subprocess.run([compiler, "-shared", "-fPIC", "-o", library, source], check=True)
-    (tmp_path / "quick.toml").write_text(quick_recipe)
+    (tmp_path / "quick.toml").write_text(QUICK_RECIPE)
     command = [sys.executable, "-m", "droguekit.cli.main", "render", str(tmp_path / "quick.toml")]
     subprocess.run(
         [*command, "--out", str(tmp_path / "out"), "--workers", "1", "--timeout", "600"],
@@ -247,4 +232,4 @@ def test_a_jump_of_the_clock_changes_nothing(
         check=True,
         capture_output=True,
     )
-    assert hashes(tmp_path / "out") == hashes(quick_dataset)
+    assert file_hashes(tmp_path / "out") == file_hashes(quick_dataset)

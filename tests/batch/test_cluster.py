@@ -19,13 +19,11 @@ from droguekit.batch import cluster
 from droguekit.batch.cluster import ClusterTask, WorkerBuild, current_build
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.frame_task import FrameTask, OtherBuildError
-from droguekit.batch.render_dataset import RunSummary
 from droguekit.cli.main import WRONG_INPUT, run
+from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE, file_hashes, render_recipe
 
 distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
 
-Make = Callable[..., RunSummary]
-Hashes = Callable[[Path], dict[str, str]]
 Start = Callable[..., subprocess.Popen[bytes]]
 Troubled = Callable[..., Path]
 
@@ -88,13 +86,13 @@ class OnFrame:
 
 
 def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
-    start: Start, scheduler: str, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
+    start: Start, scheduler: str, tmp_path: Path
 ) -> None:
     from datasets_manifest.recipe.recipe import parse_recipe
     from droguekit.batch.render_dataset import render_dataset
 
-    text = analytic_recipe.replace("count = 8", "count = 24")
-    make(tmp_path / "calm", text=text)
+    text = ANALYTIC_RECIPE.replace("count = 8", "count = 24")
+    render_recipe(tmp_path / "calm", text=text)
     workers = [worker(start, scheduler) for _ in range(3)]
 
     def change_the_crew() -> None:
@@ -107,20 +105,18 @@ def test_a_worker_that_is_killed_and_one_that_comes_later_change_nothing(
         RecipeSource(parse_recipe(text), text), out, range(24), ExecutionOptions(0, scheduler=scheduler), report
     )
     assert summary.drops == ()
-    assert hashes(out) == hashes(tmp_path / "calm")
+    assert file_hashes(out) == file_hashes(tmp_path / "calm")
     lines = [json.loads(line) for line in (out / layout.EVENTS_FILE).read_text().splitlines()]
     frames = [line for line in lines if line["event"] == "frame"]
     assert sorted(line["frame"] for line in frames) == [*range(24)]
     assert all(line["workers_gib"] > 0 for line in frames)
 
 
-def test_a_request_to_stop_finishes_the_frames_in_hand(
-    start: Start, scheduler: str, analytic_recipe: str, tmp_path: Path
-) -> None:
+def test_a_request_to_stop_finishes_the_frames_in_hand(start: Start, scheduler: str, tmp_path: Path) -> None:
     from datasets_manifest.recipe.recipe import parse_recipe
     from droguekit.batch.render_dataset import render_dataset
 
-    text = analytic_recipe.replace("count = 8", "count = 24")
+    text = ANALYTIC_RECIPE.replace("count = 8", "count = 24")
     worker(start, scheduler)
     report = OnFrame(2, lambda: os.kill(os.getpid(), signal.SIGINT))
     out = tmp_path / "out"
@@ -139,10 +135,7 @@ def test_a_frame_that_ends_every_worker_takes_none_with_it(
     start: Start,
     scheduler: str,
     troubled: Troubled,
-    quick_recipe: str,
-    make: Make,
     quick_dataset: Path,
-    hashes: Hashes,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -151,14 +144,14 @@ def test_a_frame_that_ends_every_worker_takes_none_with_it(
     monkeypatch.setattr(cluster, "ALLOWED_FAILURES", 0)
     worker(start, scheduler, "--nanny")
     out, told = tmp_path / "out", io.StringIO()
-    summary = make(out, [1, 2, 3, 4], ExecutionOptions(0, scheduler=scheduler), quick_recipe, told)
+    summary = render_recipe(out, [1, 2, 3, 4], ExecutionOptions(0, scheduler=scheduler), QUICK_RECIPE, told)
     reason = "3 Dask workers died or ran out of time with it alone"
     assert [(drop.frame_index, drop.reason) for drop in summary.drops] == [(2, reason)], told.getvalue()
     assert sorted(summary.totals.made) == [1, 3, 4]
     assert summary.totals.retries >= 1
     for frame_index in (1, 3, 4):
         made, calm = (layout.frame_folder(dataset, frame_index) for dataset in (out, quick_dataset))
-        assert hashes(made) == hashes(calm)
+        assert file_hashes(made) == file_hashes(calm)
 
 
 @pytest.mark.slow  # for as long as the time that the frame is given
@@ -166,29 +159,23 @@ def test_a_frame_that_hangs_ends_its_worker_and_is_made_by_the_next(
     start: Start,
     scheduler: str,
     troubled: Troubled,
-    quick_recipe: str,
-    make: Make,
     quick_dataset: Path,
-    hashes: Hashes,
     tmp_path: Path,
 ) -> None:
     marks = troubled(hang_once=[1])
     worker(start, scheduler, "--nanny")
     out = tmp_path / "out"
     # The frame takes about 50 ms; where a crowded machine gives all its attempts too little time, it is made later.
-    summary = make(out, [1], ExecutionOptions(0, timeout_s=60.0, scheduler=scheduler), quick_recipe)
+    summary = render_recipe(out, [1], ExecutionOptions(0, timeout_s=60.0, scheduler=scheduler), QUICK_RECIPE)
     assert (marks / "hang-1").exists()
     assert summary.totals.made == [1] or [drop.frame_index for drop in summary.drops] == [1]
-    assert make(out, [1], text=quick_recipe).pairs == 1
-    assert hashes(layout.frame_folder(out, 1)) == hashes(layout.frame_folder(quick_dataset, 1))
+    assert render_recipe(out, [1], text=QUICK_RECIPE).pairs == 1
+    assert file_hashes(layout.frame_folder(out, 1)) == file_hashes(layout.frame_folder(quick_dataset, 1))
 
 
 def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
     start: Start,
-    analytic_recipe: str,
-    make: Make,
     analytic_dataset: Path,
-    hashes: Hashes,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -218,17 +205,15 @@ def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
         scheduler_options={"dashboard": False, "dashboard_address": ":0"},
     ) as cluster:
         cluster.scale(jobs=2)
-        summary = make(
-            tmp_path / "out", workers=ExecutionOptions(0, scheduler=cluster.scheduler_address), text=analytic_recipe
+        summary = render_recipe(
+            tmp_path / "out", workers=ExecutionOptions(0, scheduler=cluster.scheduler_address), text=ANALYTIC_RECIPE
         )
     assert len((tmp_path / "started").read_text().split()) >= 1
     assert summary.drops == ()
-    assert hashes(tmp_path / "out") == hashes(analytic_dataset)
+    assert file_hashes(tmp_path / "out") == file_hashes(analytic_dataset)
 
 
-def test_workers_of_another_build_are_refused(
-    start: Start, scheduler: str, analytic_recipe: str, tmp_path: Path
-) -> None:
+def test_workers_of_another_build_are_refused(start: Start, scheduler: str, tmp_path: Path) -> None:
     from datasets_manifest.recipe.recipe import parse_recipe
 
     worker(start, scheduler)
@@ -240,13 +225,13 @@ def test_workers_of_another_build_are_refused(
     (tmp_path / layout.EVENTS_FILE).touch()
     with distributed.Client(scheduler, set_as_default=False) as client:
         for message, build in builds.items():
-            task = FrameTask(parse_recipe(analytic_recipe), tmp_path)
+            task = FrameTask(parse_recipe(ANALYTIC_RECIPE), tmp_path)
             with pytest.raises(OtherBuildError, match=message):
                 client.submit(ClusterTask(task, build, 600.0), 0, pure=False).result()
-        lost = ClusterTask(FrameTask(parse_recipe(analytic_recipe), tmp_path / "elsewhere"), here, 600.0)
+        lost = ClusterTask(FrameTask(parse_recipe(ANALYTIC_RECIPE), tmp_path / "elsewhere"), here, 600.0)
         with pytest.raises(FileNotFoundError, match=r"does not see .*elsewhere; give a folder on shared storage"):
             client.submit(lost, 0, pure=False).result()
-        late = ClusterTask(FrameTask(parse_recipe(analytic_recipe), tmp_path, "analytic 0.1"), here, 600.0)
+        late = ClusterTask(FrameTask(parse_recipe(ANALYTIC_RECIPE), tmp_path, "analytic 0.1"), here, 600.0)
         with pytest.raises(OtherBuildError, match=r"made by analytic 0\.1, but this is"):
             client.submit(late, 0, pure=False).result()
 

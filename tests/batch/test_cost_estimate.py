@@ -26,6 +26,7 @@ from droguekit.batch.frame_task import FrameReport
 from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
 from droguekit.batch.worker_pool import WorkerLimits
 from droguekit.workflows.planning import cost_lines
+from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE
 from tests.support.recipe_builder import RecipeTable, between, build_recipe
 
 BASE: RecipeTable = {
@@ -235,8 +236,8 @@ def test_every_worker_flies_every_sequence_once_and_a_new_process_the_one_it_com
     assert cost(24, 1, sequences=1).work_s(1) == 0.5 + 1000
 
 
-def test_the_probe_reckons_from_what_it_measures(analytic_recipe: str) -> None:
-    recipe = parse_recipe(analytic_recipe)
+def test_the_probe_reckons_from_what_it_measures() -> None:
+    recipe = parse_recipe(ANALYTIC_RECIPE)
     plan = plan_recipe(recipe)
     found = probe_cost(recipe, plan)
     order = np.argsort(plan.drawn.distances_m)
@@ -251,10 +252,8 @@ def test_the_probe_reckons_from_what_it_measures(analytic_recipe: str) -> None:
     assert found.drops == ()
 
 
-def test_a_frame_that_the_engine_refuses_is_a_drop_of_the_probe(
-    quick_recipe: str, troubled: Callable[..., Path]
-) -> None:
-    recipe = parse_recipe(quick_recipe)
+def test_a_frame_that_the_engine_refuses_is_a_drop_of_the_probe(troubled: Callable[..., Path]) -> None:
+    recipe = parse_recipe(QUICK_RECIPE)
     plan = plan_recipe(recipe)
     order = choose_probe_frames(plan.drawn, 8)
     troubled(refuse=[order.warm_up[0], order.counted[1]])

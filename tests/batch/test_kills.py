@@ -16,11 +16,8 @@ import pytest
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
-from droguekit.batch.render_dataset import RunSummary
 from labelgen.validation.dataset_checks import validate_dataset
-
-Make = Callable[..., RunSummary]
-Hashes = Callable[[Path], dict[str, str]]
+from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes, render_recipe
 
 # A look at the folder this often; what is awaited may take as long as the machine needs.
 _LOOK_EVERY_S = 0.02
@@ -90,12 +87,12 @@ class KilledRun:
         return True
 
 
-def torture(recipe_text: str, kills: int, make: Make, hashes: Hashes, folder: Path) -> None:
+def torture(recipe_text: str, kills: int, folder: Path) -> None:
     """Kill a run so many times while it renders a recipe, and compare with an undisturbed one."""
     calm, out, recipe, scratch = folder / "calm", folder / "out", folder / "recipe.toml", folder / "scratch"
     recipe.write_text(recipe_text)
     scratch.mkdir()
-    planned = make(calm, text=recipe_text).planned
+    planned = render_recipe(calm, text=recipe_text).planned
     rng = np.random.Generator(np.random.Philox(8))
     run = KilledRun(recipe, out, scratch, rng)
     try:
@@ -118,24 +115,20 @@ def torture(recipe_text: str, kills: int, make: Make, hashes: Hashes, folder: Pa
     print(
         f"{run.kills} kills, {run.begins()} starts, {run.frames()} of {planned} pairs, {len(leftovers(out))} leftovers"
     )
-    summary = make(out, text=recipe_text)
+    summary = render_recipe(out, text=recipe_text)
     assert summary.drops == ()
     assert leftovers(out) == []
     assert [*scratch.iterdir()] == []
     assert summary.dataset_sha256 == read_manifest(calm).dataset_sha256
-    assert hashes(out) == hashes(calm)
+    assert file_hashes(out) == file_hashes(calm)
     assert validate_dataset(out).passed
 
 
-def test_kills_at_random_instants_change_nothing(
-    analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
-) -> None:
-    torture(analytic_recipe.replace("count = 8", "count = 16"), 3, make, hashes, tmp_path)
+def test_kills_at_random_instants_change_nothing(tmp_path: Path) -> None:
+    torture(ANALYTIC_RECIPE.replace("count = 8", "count = 16"), 3, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.torture
-def test_fifty_kills_over_two_hundred_pairs_change_nothing(
-    analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
-) -> None:
-    torture(analytic_recipe.replace("count = 8", "count = 200"), 50, make, hashes, tmp_path)
+def test_fifty_kills_over_two_hundred_pairs_change_nothing(tmp_path: Path) -> None:
+    torture(ANALYTIC_RECIPE.replace("count = 8", "count = 200"), 50, tmp_path)

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest, with_build, write_manifest
-from droguekit.batch.render_dataset import RunSummary
 from droguekit.cli.main import DONE, WRONG_INPUT, run
 from labelgen.validation.dataset_checks import validate_dataset
-
-Make = Callable[..., RunSummary]
-Hashes = Callable[[Path], dict[str, str]]
+from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes, render_recipe
 
 
 @pytest.fixture(scope="module")
-def recipe_file(tmp_path_factory: pytest.TempPathFactory, analytic_recipe: str) -> Path:
+def recipe_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recipe") / "quick.toml"
-    path.write_text(analytic_recipe)
+    path.write_text(ANALYTIC_RECIPE)
     return path
 
 
@@ -52,17 +48,15 @@ def merge(out: Path, *shards: Path) -> int:
     return run(["merge", str(out), *map(str, shards)])
 
 
-def test_shards_are_the_dataset_that_one_run_makes(
-    made_shards: tuple[Path, ...], whole: Path, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_shards_are_the_dataset_that_one_run_makes(made_shards: tuple[Path, ...], whole: Path, tmp_path: Path) -> None:
     assert [layout.frame_indices(shard) for shard in made_shards] == [[0, 3, 6], [1, 4, 7], [2, 5]]
     assert merge(tmp_path / "out", *made_shards[::-1]) == DONE
-    assert hashes(tmp_path / "out") == hashes(whole)
+    assert file_hashes(tmp_path / "out") == file_hashes(whole)
     assert validate_dataset(tmp_path / "out").passed
 
 
 def test_a_merge_goes_on_where_it_stopped(
-    made_shards: tuple[Path, ...], whole: Path, hashes: Hashes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made_shards: tuple[Path, ...], whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     assert merge(out, *made_shards) == DONE
@@ -72,7 +66,7 @@ def test_a_merge_goes_on_where_it_stopped(
     capsys.readouterr()
     assert merge(out, *made_shards) == DONE
     assert "joined 2 pairs" in capsys.readouterr().out
-    assert hashes(out) == hashes(whole)
+    assert file_hashes(out) == file_hashes(whole)
 
 
 def test_missing_frames_are_named(
@@ -93,9 +87,9 @@ def test_a_damaged_frame_is_not_joined(
 
 
 def test_a_shard_of_another_recipe_is_refused(
-    made_shards: tuple[Path, ...], make: Make, analytic_recipe: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    made_shards: tuple[Path, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    make(tmp_path / "other", [2, 5], text=analytic_recipe.replace("seed = 5", "seed = 6"))
+    render_recipe(tmp_path / "other", [2, 5], text=ANALYTIC_RECIPE.replace("seed = 5", "seed = 6"))
     assert merge(tmp_path / "out", *made_shards[:2], tmp_path / "other") == WRONG_INPUT
     assert "other: is of another recipe than" in (told := capsys.readouterr().err)
     assert "they differ in seed" in told

@@ -25,12 +25,10 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import open_storage
 from datasets_manifest.storage.writer import encode_record, leftovers
 from droguekit.batch.execution import ExecutionOptions
-from droguekit.batch.render_dataset import RunSummary, render_dataset
+from droguekit.batch.render_dataset import render_dataset
 from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from labelgen.validation.dataset_checks import validate_dataset
-
-Make = Callable[..., RunSummary]
-Hashes = Callable[[Path], dict[str, str]]
+from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes, render_recipe
 
 BUCKET = "pairs"
 # What moto takes for credentials; any others would do.
@@ -59,24 +57,24 @@ def place(server: ThreadedMotoServer, request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def text(analytic_recipe: str) -> str:
+def text() -> str:
     """A recipe of five small pairs."""
-    return analytic_recipe.replace("count = 8", "count = 5")
+    return ANALYTIC_RECIPE.replace("count = 8", "count = 5")
 
 
 @pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory, text: str, make: Make) -> Path:
+def local(tmp_path_factory: pytest.TempPathFactory, text: str) -> Path:
     """What one undisturbed run makes on this machine's disk, a folder a frame."""
     out = tmp_path_factory.mktemp("local") / "dataset"
-    make(out, workers=0, text=text)
+    render_recipe(out, workers=0, text=text)
     return out
 
 
 @pytest.fixture(scope="module")
-def local_tars(tmp_path_factory: pytest.TempPathFactory, text: str, make: Make) -> Path:
+def local_tars(tmp_path_factory: pytest.TempPathFactory, text: str) -> Path:
     """The same in tar files of two pairs."""
     out = tmp_path_factory.mktemp("local-tars") / "dataset"
-    make(out, workers=ExecutionOptions(0, pairs_per_tar=2), text=text)
+    render_recipe(out, workers=ExecutionOptions(0, pairs_per_tar=2), text=text)
     return out
 
 
@@ -93,10 +91,10 @@ def contents(dataset: Path | str) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("pairs_per_tar", [None, 2])
 def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
-    place: str, pairs_per_tar: int | None, text: str, local: Path, local_tars: Path, make: Make
+    place: str, pairs_per_tar: int | None, text: str, local: Path, local_tars: Path
 ) -> None:
     spread = ExecutionOptions(0, pairs_per_tar=pairs_per_tar)
-    first = make(place, range(1, 4), spread, text)
+    first = render_recipe(place, range(1, 4), spread, text)
     assert (first.kept, first.pairs) == (0, 3)
     # A frame half written, one that lacks a file, and one with another picture.
     storage = open_storage(place)
@@ -104,7 +102,7 @@ def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
     if pairs_per_tar is None:
         storage.delete("frames/000001/right.png")
         storage.write("frames/000002/left.png", storage.read("frames/000003/left.png"))
-    summary = make(place, workers=0, text=text)
+    summary = render_recipe(place, workers=0, text=text)
     assert (summary.kept, len(summary.totals.made)) == ((1, 4) if pairs_per_tar is None else (3, 2))
     assert summary.dataset_sha256 == read_manifest(local).dataset_sha256
     assert contents(place) == contents(local)
@@ -120,16 +118,14 @@ def test_a_run_makes_the_dataset_that_it_would_make_on_disk(
 
 
 @pytest.fixture(scope="module")
-def packed(server: ThreadedMotoServer, make: Make, text: str) -> str:
+def packed(server: ThreadedMotoServer, text: str) -> str:
     """A dataset in tar files on the object store; to be read only."""
     place = f"s3://{BUCKET}/packed"
-    make(place, workers=ExecutionOptions(0, pairs_per_tar=2), text=text)
+    render_recipe(place, workers=ExecutionOptions(0, pairs_per_tar=2), text=text)
     return place
 
 
-def test_commands_read_it_there(
-    packed: str, local: Path, hashes: Hashes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_read_it_there(packed: str, local: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number, dataset in enumerate((str(local), packed)):
         out = tmp_path / str(number)
         assert run(["validate", dataset]) == DONE
@@ -140,7 +136,7 @@ def test_commands_read_it_there(
             assert run(["export", dataset, "--format", name, "--out", str(out / name)]) == DONE
     told = capsys.readouterr().out
     assert f"{packed}: 5 pairs, no faults" in told and "tar files                                 3        0" in told
-    one, other = hashes(tmp_path / "0"), hashes(tmp_path / "1")
+    one, other = file_hashes(tmp_path / "0"), file_hashes(tmp_path / "1")
     one.pop("estimates.jsonl"), other.pop("estimates.jsonl")  # hold times
     assert one == other
     assert len(one) > 20
@@ -155,8 +151,8 @@ def test_images_and_records_are_those_on_disk(packed: str, local: Path) -> None:
         assert (there.part_ids(index, "left") == here.part_ids(index, "left")).all()
 
 
-def test_a_changed_tar_file_is_found(make: Make, text: str, place: str) -> None:
-    make(place, range(2), ExecutionOptions(0, pairs_per_tar=2), text)
+def test_a_changed_tar_file_is_found(text: str, place: str) -> None:
+    render_recipe(place, range(2), ExecutionOptions(0, pairs_per_tar=2), text)
     storage = open_storage(place)
     file = FrameStore(place)._shard(0).frames[1]["left_parts.png"]
     data = bytearray(storage.read("shards/000000.tar"))
@@ -169,15 +165,13 @@ def test_a_changed_tar_file_is_found(make: Make, text: str, place: str) -> None:
         in faults
     )
     assert run(["validate", place]) == FAULT
-    assert make(place, range(2), 0, text).totals.made == [1]
+    assert render_recipe(place, range(2), 0, text).totals.made == [1]
     assert validate_dataset(place).passed
 
 
-def test_shards_are_merged_from_there_and_to_there(
-    local: Path, place: str, make: Make, text: str, tmp_path: Path
-) -> None:
-    make(f"{place}/even", range(0, 5, 2), ExecutionOptions(0, pairs_per_tar=4), text)
-    make(tmp_path / "odd", range(1, 5, 2), 0, text)
+def test_shards_are_merged_from_there_and_to_there(local: Path, place: str, text: str, tmp_path: Path) -> None:
+    render_recipe(f"{place}/even", range(0, 5, 2), ExecutionOptions(0, pairs_per_tar=4), text)
+    render_recipe(tmp_path / "odd", range(1, 5, 2), 0, text)
     assert list_frames(f"{place}/even") == [0, 2, 4]
     # Complete within the run: neighbours of a part come together in one file.
     assert open_storage(f"{place}/even").names("frames") == []
@@ -186,7 +180,7 @@ def test_shards_are_merged_from_there_and_to_there(
 
 
 def test_a_run_that_is_killed_with_all_its_processes_goes_on(
-    place: str, text: str, local: Path, make: Make, tmp_path: Path
+    place: str, text: str, local: Path, tmp_path: Path
 ) -> None:
     recipe = tmp_path / "recipe.toml"
     recipe.write_text(text)
@@ -204,7 +198,7 @@ def test_a_run_that_is_killed_with_all_its_processes_goes_on(
         for victim in (process.pid, *map(int, children)):
             os.kill(victim, signal.SIGKILL)
     assert [*temporary.iterdir()] == []
-    summary = make(place, workers=0, text=text)
+    summary = render_recipe(place, workers=0, text=text)
     assert summary.kept + len(summary.totals.made) == 5 and summary.kept >= 1
     assert contents(place) == contents(local)
     assert leftovers(place) == []
@@ -231,9 +225,9 @@ class Trouble:
 
 
 def test_a_store_that_does_not_answer_has_not_said_that_anything_is_missing(
-    place: str, text: str, make: Make, monkeypatch: pytest.MonkeyPatch
+    place: str, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(place, range(2), 0, text)
+    render_recipe(place, range(2), 0, text)
     storage = open_storage(place)
     before = {name: storage.read(name) for name in storage.files_ending("") if name != layout.EVENTS_FILE}
     trouble = Trouble(monkeypatch)
@@ -244,13 +238,13 @@ def test_a_store_that_does_not_answer_has_not_said_that_anything_is_missing(
     ):
         trouble.refuse(refused)
         with pytest.raises(OSError, match=f"{place}/.*: cannot be read: .*reduce your request rate"):
-            make(place, range(2), 0, text)
+            render_recipe(place, range(2), 0, text)
     trouble.refuse(lambda method, key: method == "head_object")
     with pytest.raises(OSError, match="reduce your request rate"):
         storage.root_exists()
     trouble.refuse(lambda method, key: False)
     assert {name: storage.read(name) for name in before} == before
-    assert (summary := make(place, range(2), 0, text)).kept == 2 and not summary.totals.made
+    assert (summary := render_recipe(place, range(2), 0, text)).kept == 2 and not summary.totals.made
 
 
 @pytest.mark.slow
@@ -267,12 +261,12 @@ def test_a_large_object_is_sent_in_parts(place: str) -> None:
 
 
 @pytest.mark.slow
-def test_dask_workers_write_there_themselves(place: str, text: str, local: Path, make: Make) -> None:
+def test_dask_workers_write_there_themselves(place: str, text: str, local: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
     options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "host": "127.0.0.1"}
     with distributed.LocalCluster(processes=True, **options) as cluster:
         spread = ExecutionOptions(0, scheduler=cluster.scheduler_address, pairs_per_tar=2)
-        assert make(place, workers=spread, text=text).drops == ()
+        assert render_recipe(place, workers=spread, text=text).drops == ()
     assert contents(place) == contents(local)
     assert leftovers(place) == [] and open_storage(place).names(layout.FRAMES_FOLDER) == []
 
@@ -302,7 +296,7 @@ class Ends:
 
 
 def test_a_lost_connection_ends_the_run_in_one_line_and_finished_frames_stay(
-    server: ThreadedMotoServer, place: str, text: str, local: Path, make: Make
+    server: ThreadedMotoServer, place: str, text: str, local: Path
 ) -> None:
     host, port = server.get_host_and_port()
     with pytest.raises(OSError, match=f"{place}/.*cannot be ") as caught:
@@ -310,7 +304,7 @@ def test_a_lost_connection_ends_the_run_in_one_line_and_finished_frames_stay(
     assert "\n" not in str(caught.value)
     ThreadedMotoServer.__init__(server, ip_address=host, port=port, verbose=False)
     server.start()  # its contents belong to the process
-    summary = make(place, workers=0, text=text)
+    summary = render_recipe(place, workers=0, text=text)
     assert summary.kept == 2
     assert contents(place) == contents(local)
 

@@ -7,7 +7,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -18,34 +17,27 @@ from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
 from droguekit.batch.frame_task import FrameTask
-from droguekit.batch.render_dataset import RunSummary
 from droguekit.batch.worker_pool import run_in_own_process
-
-Make = Callable[..., RunSummary]
-Hashes = Callable[[Path], dict[str, str]]
+from tests.support.batch_datasets import ANALYTIC_RECIPE, TINY_RECIPE, file_hashes, render_recipe
 
 
-def test_reverse_order_and_two_workers_give_the_same_files(
-    tiny_dataset: Path, make: Make, hashes: Hashes, tmp_path: Path
-) -> None:
-    summary = make(tmp_path / "again", [3, 2, 1, 0], 2)
+def test_reverse_order_and_two_workers_give_the_same_files(tiny_dataset: Path, tmp_path: Path) -> None:
+    summary = render_recipe(tmp_path / "again", [3, 2, 1, 0], 2)
     assert summary.dataset_sha256 == read_manifest(tiny_dataset).dataset_sha256
-    assert hashes(tmp_path / "again") == hashes(tiny_dataset)
+    assert file_hashes(tmp_path / "again") == file_hashes(tiny_dataset)
 
 
-def test_a_whole_dataset_is_left_as_it_is(tiny_dataset: Path, make: Make, hashes: Hashes, tmp_path: Path) -> None:
+def test_a_whole_dataset_is_left_as_it_is(tiny_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "copy"
     shutil.copytree(tiny_dataset, out)
     before = {path: path.stat().st_mtime_ns for path in (out / layout.FRAMES_FOLDER).rglob("*")}
-    summary = make(out)
+    summary = render_recipe(out)
     assert (summary.totals.made, summary.kept, summary.pairs, summary.planned) == ([], 4, 4, 4)
     assert {path: path.stat().st_mtime_ns for path in (out / layout.FRAMES_FOLDER).rglob("*")} == before
-    assert hashes(out) == hashes(tiny_dataset)
+    assert file_hashes(out) == file_hashes(tiny_dataset)
 
 
-def test_missing_truncated_and_changed_frames_are_made_again(
-    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_missing_truncated_and_changed_frames_are_made_again(analytic_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "copy"
     shutil.copytree(analytic_dataset, out)
     shutil.rmtree(layout.frame_folder(out, 0))
@@ -53,37 +45,31 @@ def test_missing_truncated_and_changed_frames_are_made_again(
     image.write_bytes(image.read_bytes()[:1000])
     record = layout.frame_folder(out, 2) / layout.RECORD_FILE
     record.write_text(record.read_text().replace('"family":"clear"', '"family":"foggy"'))
-    summary = make(out, workers=0, text=analytic_recipe)
+    summary = render_recipe(out, workers=0, text=ANALYTIC_RECIPE)
     assert set(summary.totals.made) == {0, 1, 2}
     assert summary.kept == 5
-    assert hashes(out) == hashes(analytic_dataset)
+    assert file_hashes(out) == file_hashes(analytic_dataset)
 
 
-def test_frames_that_no_manifest_vouches_for_are_made_again(
-    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_frames_that_no_manifest_vouches_for_are_made_again(analytic_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "copy"
     shutil.copytree(analytic_dataset, out)
     (out / layout.MANIFEST_FILE).unlink()
-    assert make(out, workers=0, text=analytic_recipe).kept == 0
-    assert hashes(out) == hashes(analytic_dataset)
+    assert render_recipe(out, workers=0, text=ANALYTIC_RECIPE).kept == 0
+    assert file_hashes(out) == file_hashes(analytic_dataset)
 
 
-def test_a_part_is_a_dataset_that_the_rest_completes(
-    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_a_part_is_a_dataset_that_the_rest_completes(analytic_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "parts"
-    first = make(out, range(1, 3), workers=0, text=analytic_recipe)
+    first = render_recipe(out, range(1, 3), workers=0, text=ANALYTIC_RECIPE)
     assert (first.pairs, first.planned) == (2, 8)
     assert [entry.frame_index for entry in read_manifest(out).frames] == [1, 2]
-    second = make(out, workers=0, text=analytic_recipe)
+    second = render_recipe(out, workers=0, text=ANALYTIC_RECIPE)
     assert (second.kept, second.pairs) == (2, 8)
-    assert hashes(out) == hashes(analytic_dataset)
+    assert file_hashes(out) == file_hashes(analytic_dataset)
 
 
-def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
-    analytic_dataset: Path, analytic_recipe: str, make: Make, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_a_run_that_was_killed_goes_on_to_the_same_dataset(analytic_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed"
     script = tmp_path / "run.py"
     # Tells of each finished frame on a line, which is when the test kills it.
@@ -98,7 +84,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
         "    def say(self, text): pass\n"
         "    def end(self): pass\n"
         "if __name__ == '__main__':\n"
-        f"    text = {analytic_recipe!r}\n"
+        f"    text = {ANALYTIC_RECIPE!r}\n"
         f"    render_dataset(RecipeSource(parse_recipe(text), text), Path({str(out)!r}), range(8), 1, Tell())\n"
     )
     with subprocess.Popen(
@@ -109,19 +95,17 @@ def test_a_run_that_was_killed_goes_on_to_the_same_dataset(
         run.kill()
     made_before = len(layout.frame_indices(out))
     assert 1 <= made_before < 8
-    assert make(out, workers=0, text=analytic_recipe).kept == made_before
+    assert render_recipe(out, workers=0, text=ANALYTIC_RECIPE).kept == made_before
     assert leftovers(out) == []
-    assert hashes(out) == hashes(analytic_dataset)
+    assert file_hashes(out) == file_hashes(analytic_dataset)
 
 
-def test_events_tell_of_every_frame_and_are_only_added_to(
-    analytic_dataset: Path, analytic_recipe: str, make: Make, tmp_path: Path
-) -> None:
+def test_events_tell_of_every_frame_and_are_only_added_to(analytic_dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "copy"
     shutil.copytree(analytic_dataset, out)
     before = (out / layout.EVENTS_FILE).read_text()
     shutil.rmtree(layout.frame_folder(out, 3))
-    make(out, text=analytic_recipe)
+    render_recipe(out, text=ANALYTIC_RECIPE)
     text = (out / layout.EVENTS_FILE).read_text()
     assert text.startswith(before)
     first = [json.loads(line) for line in before.splitlines()]
@@ -132,48 +116,46 @@ def test_events_tell_of_every_frame_and_are_only_added_to(
     assert all(seconds >= 0 for seconds in new[1]["stage_s"].values())
 
 
-def test_another_recipe_is_refused_with_the_keys_that_differ(
-    tiny_dataset: Path, tiny_recipe: str, make: Make, hashes: Hashes
-) -> None:
-    before = hashes(tiny_dataset)
-    other = tiny_recipe.replace("seed = 5", "seed = 4").replace("high_m = 12.0", "high_m = 13.0")
+def test_another_recipe_is_refused_with_the_keys_that_differ(tiny_dataset: Path) -> None:
+    before = file_hashes(tiny_dataset)
+    other = TINY_RECIPE.replace("seed = 5", "seed = 4").replace("high_m = 12.0", "high_m = 13.0")
     with pytest.raises(ValueError, match=r"another recipe: they differ in seed, distance\.high_m; give another folder"):
-        make(tiny_dataset, text=other)
-    assert hashes(tiny_dataset) == before
+        render_recipe(tiny_dataset, text=other)
+    assert file_hashes(tiny_dataset) == before
 
 
-def test_frames_of_another_engine_build_are_not_mixed_in(tiny_recipe: str, tiny_dataset: Path, tmp_path: Path) -> None:
-    task = FrameTask(parse_recipe(tiny_recipe), tmp_path, engine_version="mitsuba 0.1")
+def test_frames_of_another_engine_build_are_not_mixed_in(tiny_dataset: Path, tmp_path: Path) -> None:
+    task = FrameTask(parse_recipe(TINY_RECIPE), tmp_path, engine_version="mitsuba 0.1")
     with pytest.raises(ValueError, match=r"made by mitsuba 0\.1, but this is mitsuba .*, whose pixels differ"):
         run_in_own_process(partial(task, 0))
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("frames", [[0, 0], [4], [-1]])
-def test_frames_that_the_recipe_does_not_have_are_refused(make: Make, tmp_path: Path, frames: list[int]) -> None:
+def test_frames_that_the_recipe_does_not_have_are_refused(tmp_path: Path, frames: list[int]) -> None:
     with pytest.raises(ValueError, match="frames: must be different indices from 0 to 3"):
-        make(tmp_path / "out", frames)
+        render_recipe(tmp_path / "out", frames)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_with_other_things_is_refused_and_untouched(make: Make, tmp_path: Path) -> None:
+def test_a_folder_with_other_things_is_refused_and_untouched(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(ValueError, match=r"holds other files \(thesis\.tex\); give a new or empty folder"):
-        make(tmp_path)
+        render_recipe(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_file_is_no_place_for_a_dataset(make: Make, tmp_path: Path) -> None:
+def test_a_file_is_no_place_for_a_dataset(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(ValueError, match="is a file; give a folder"):
-        make(tmp_path / "file")
+        render_recipe(tmp_path / "file")
 
 
-def test_two_runs_do_not_write_into_one_folder(make: Make, tmp_path: Path) -> None:
+def test_two_runs_do_not_write_into_one_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     with (out / layout.EVENTS_FILE).open("a") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with pytest.raises(ValueError, match="another run is writing into it"):
-            make(out)
+            render_recipe(out)
     assert [path.name for path in out.iterdir()] == [layout.EVENTS_FILE]

@@ -19,6 +19,7 @@ from droguekit.batch.render_dataset import RunSummary, render_dataset
 from tests.support.recipe_builder import RIG_160_PX, RIG_320_PX, between, recipe_text
 from tests.support.shared_folder import shared_folder
 
+# Four pairs of 320 x 240 pixels.
 TINY_RECIPE = recipe_text(
     name="tiny",
     seed=5,
@@ -77,7 +78,7 @@ class TroubledEngine(AnalyticEngine):
         return not known
 """
 
-# Pairs of 160 x 120 pixels without a renderer.
+# Eight pairs of 160 x 120 pixels by the engine `troubled`.
 QUICK_RECIPE = recipe_text(
     name="quick",
     seed=5,
@@ -88,40 +89,26 @@ QUICK_RECIPE = recipe_text(
     split={"train": 0.5, "test": 0.5},
 )
 
+# The same pairs by the engine that ships.
 ANALYTIC_RECIPE = QUICK_RECIPE.replace('"troubled"', '"analytic"')
 
-Make = Callable[..., RunSummary]
-Hashes = Callable[[Path], dict[str, str]]
 
-
-def _make(
-    out: Path,
+def render_recipe(
+    out: Path | str,
     frames: Sequence[int] | None = None,
     workers: int | ExecutionOptions = 1,
     text: str = TINY_RECIPE,
     told: io.StringIO | None = None,
 ) -> RunSummary:
+    """Render frames of a recipe, all of them unless some are named; progress goes to `told` or nowhere."""
     recipe = parse_recipe(text)
     chosen = range(recipe.frames.count) if frames is None else frames
     return render_dataset(RecipeSource(recipe, text), out, chosen, workers, PlainProgress(told or io.StringIO()))
 
 
-@pytest.fixture(scope="session")
-def tiny_recipe() -> str:
-    """Four pairs of 320 x 240 pixels, as TOML."""
-    return TINY_RECIPE
-
-
-@pytest.fixture(scope="session")
-def make() -> Make:
-    """Renders frames of a recipe silently: `make(out, frames, workers, text, told)`."""
-    return _make
-
-
-@pytest.fixture(scope="session")
-def hashes() -> Hashes:
+def file_hashes(dataset: Path) -> dict[str, str]:
     """Hashes of a dataset's files by their path, without the events, which tell of times and hosts."""
-    return lambda dataset: {
+    return {
         str(path.relative_to(dataset)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(dataset.rglob("*"))
         if path.is_file() and path.name != EVENTS_FILE
@@ -130,10 +117,10 @@ def hashes() -> Hashes:
 
 @pytest.fixture(scope="session")
 def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of `tiny_recipe`, made by one worker in ascending order; to be read only."""
+    """The dataset of `TINY_RECIPE`, made by one worker in ascending order; to be read only."""
 
     def render(out: Path) -> None:
-        assert _make(out).drops == ()
+        assert render_recipe(out).drops == ()
 
     return shared_folder(tmp_path_factory, "tiny", render)
 
@@ -172,12 +159,12 @@ def troubled(troubled_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="session")
 def quick_dataset(troubled_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of `quick_recipe`, made by one worker without an accident; to be read only."""
+    """The dataset of `QUICK_RECIPE`, made by one worker without an accident; to be read only."""
 
     def render(out: Path) -> None:
         with pytest.MonkeyPatch.context() as monkeypatch:
             monkeypatch.syspath_prepend(troubled_site)
-            summary = _make(out, text=QUICK_RECIPE)
+            summary = render_recipe(out, text=QUICK_RECIPE)
         assert (summary.drops, summary.totals.retries) == ((), 0)
 
     return shared_folder(tmp_path_factory, "quick", render)
@@ -185,21 +172,9 @@ def quick_dataset(troubled_site: Path, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture(scope="session")
 def analytic_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset of `analytic_recipe`, made by one worker; to be read only."""
+    """The dataset of `ANALYTIC_RECIPE`, made by one worker; to be read only."""
 
     def render(out: Path) -> None:
-        assert _make(out, text=ANALYTIC_RECIPE).drops == ()
+        assert render_recipe(out, text=ANALYTIC_RECIPE).drops == ()
 
     return shared_folder(tmp_path_factory, "analytic", render)
-
-
-@pytest.fixture(scope="session")
-def quick_recipe() -> str:
-    """Eight pairs by the engine `troubled`, as TOML."""
-    return QUICK_RECIPE
-
-
-@pytest.fixture(scope="session")
-def analytic_recipe() -> str:
-    """The same pairs by the engine that ships, as TOML."""
-    return ANALYTIC_RECIPE

@@ -33,15 +33,16 @@ from labelgen.part_pixels import drogue_box
 from render.version import RENDER_VERSION
 from scenes.sampler import sample_left_from_drogue, split_of_scenes
 from studies.publish.__main__ import PUBLISHED, publish
+from tests.support.batch_datasets import ANALYTIC_RECIPE
 
 OTHER_FEATURES = ("SSE", "SSE2")
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory, analytic_recipe: str) -> Path:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight pairs without a renderer; to be read only."""
     out = tmp_path_factory.mktemp("published") / "dataset"
-    _render(analytic_recipe, out)
+    _render(ANALYTIC_RECIPE, out)
     return out
 
 
@@ -75,8 +76,8 @@ def test_what_is_published_reads_back_the_same(dataset: Path) -> None:
     assert len(publication.labels) == 8
 
 
-def test_a_regeneration_is_identical(dataset: Path, tmp_path: Path, analytic_recipe: str) -> None:
-    _render(analytic_recipe, tmp_path / "again")
+def test_a_regeneration_is_identical(dataset: Path, tmp_path: Path) -> None:
+    _render(ANALYTIC_RECIPE, tmp_path / "again")
     assert verdicts(compare_with_published(tmp_path / "again", build_publication(dataset))) == ("identical", 8, 8)
 
 
@@ -127,8 +128,8 @@ def test_last_bits_of_a_preset_make_no_other_recipe(dataset: Path) -> None:
     assert compare_with_published(dataset, there).verdict == "identical"
 
 
-def test_another_seed_is_another_dataset(dataset: Path, tmp_path: Path, analytic_recipe: str) -> None:
-    _render(analytic_recipe, tmp_path / "other", seed=6)
+def test_another_seed_is_another_dataset(dataset: Path, tmp_path: Path) -> None:
+    _render(ANALYTIC_RECIPE, tmp_path / "other", seed=6)
     comparison = compare_with_published(tmp_path / "other", build_publication(dataset))
     assert verdicts(comparison) == ("different", 0, 0)
     assert comparison.label_faults[0].endswith("is not the published quick: seed")

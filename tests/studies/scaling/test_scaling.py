@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,8 +16,8 @@ from droguekit.batch.progress import PlainProgress
 from droguekit.cli.main import DONE, run
 from studies.scaling.__main__ import RESULTS_FILE, measure, table
 from studies.scaling.spreading_cost import dask_cost
+from tests.support.batch_datasets import ANALYTIC_RECIPE, file_hashes
 
-Hashes = Callable[[Path], dict[str, str]]
 PAGE = Path(__file__).resolve().parents[3] / "docs/how-to/scale-out.md"
 
 
@@ -55,9 +54,7 @@ def test_the_table_divides_clock_by_clock() -> None:
     assert second.split() == ["200", "2", "104.0", "200.0", "0.90", "1.92", "1.92"]
 
 
-def test_the_kubernetes_job_makes_shards_that_merge(
-    analytic_recipe: str, analytic_dataset: Path, hashes: Hashes, tmp_path: Path
-) -> None:
+def test_the_kubernetes_job_makes_shards_that_merge(analytic_dataset: Path, tmp_path: Path) -> None:
     yaml = pytest.importorskip("yaml", reason="PyYAML comes with Dask: pip install 'droguekit[cluster]'")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     job = yaml.safe_load(block)["spec"]
@@ -66,9 +63,9 @@ def test_the_kubernetes_job_makes_shards_that_merge(
     assert f"--shard $JOB_COMPLETION_INDEX/{job['completions']}" in text
     text = text.replace(f"/{job['completions']}", "/2").replace("/data", str(tmp_path))
     text = text.replace("exec droguekit", f"exec {sys.executable} -m droguekit.cli.main")
-    (tmp_path / "recipe.toml").write_text(analytic_recipe)
+    (tmp_path / "recipe.toml").write_text(ANALYTIC_RECIPE)
     for index in ("0", "1"):
         subprocess.run([*shell, text], env={**os.environ, "JOB_COMPLETION_INDEX": index}, check=True)
     shards = [str(tmp_path / "shard-0"), str(tmp_path / "shard-1")]
     assert run(["merge", str(tmp_path / "whole"), *shards]) == DONE
-    assert hashes(tmp_path / "whole") == hashes(analytic_dataset)
+    assert file_hashes(tmp_path / "whole") == file_hashes(analytic_dataset)
