@@ -1,6 +1,6 @@
-"""Navigation in real time: pairs arrive at a rate, and each stage of the work has its own thread.
+"""Navigation in real time: pairs arrive from a source, and each stage of the work has its own thread.
 
-The camera thread reads the next pair before its arrival time, because a camera delivers pixels and not files. Another
+The source is a running camera, or the replay of a dataset at a rate. Its thread takes the pairs as they arrive. Another
 thread detects the drogue and estimates poses; the caller's thread writes the answers. Where the detector runs on every
 pair it has a thread of its own, since OpenCV and the network's runtime release the interpreter lock. A tracker runs in
 Python, as pose estimation does, and the two would only block each other. A free stage takes the newest pair; older
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from queue import Full, Queue
@@ -188,6 +188,68 @@ class MonotonicClock:
         stop.wait(max(0.0, time_s - monotonic()))
 
 
+@dataclass(frozen=True, eq=False)
+class ArrivedPair:
+    """A pair that a source delivered.
+
+    Attributes:
+        pair: the pair.
+        arrived_s: when it arrived, by the clock of the processing. [s]
+        read_s: how long making pixels of it took, before or after its arrival. [s]
+    """
+
+    pair: BlindPair
+    arrived_s: float
+    read_s: float
+
+
+class PairSource(Protocol):
+    """Pairs that arrive whether or not anybody is ready for them."""
+
+    def arrivals(self) -> Iterator[ArrivedPair | SkippedPair]:
+        """Wait for pairs, and yield each when it has arrived, and those that were skipped, in their order.
+
+        Raises:
+            ValueError: a pair cannot be read; names it.
+        """
+        ...
+
+    def stop(self) -> None:
+        """End `arrivals` soon; from any thread."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _MeasuredPair:
+    """A pair between measurement and pose estimation, and the frame indices of late pairs before it."""
+
+    late: tuple[int, ...]
+    arrival: ArrivedPair
+    pair: MeasuredPair
+    started_s: float
+    finished_s: float
+
+
+def process_arrivals(
+    source: PairSource, navigator: SequenceNavigator, clock: Clock
+) -> Generator[PairEstimates | SkippedPair]:
+    """Yield the answers to all pairs that arrive from a source, until it ends.
+
+    Args:
+        source: of the pairs; stopped when the generator is closed.
+        navigator: before its first pair.
+        clock: of the pairs' arrival times.
+
+    Yields:
+        Answers in the order of the pairs.
+
+    Raises:
+        ValueError: a pair that cannot be read.
+    """
+    warm_up_jit()
+    return _Stages(source, navigator, clock).answers()
+
+
 class PairStream(Protocol):
     """Stereo pairs that can be read one by one, such as a `BlindDataset`."""
 
@@ -200,26 +262,6 @@ class PairStream(Protocol):
             ValueError: it cannot be read; names the file.
         """
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class _ArrivedPair:
-    """A pair, its arrival time, and how long reading it took."""
-
-    pair: BlindPair
-    arrived_s: float
-    read_s: float
-
-
-@dataclass(frozen=True, eq=False)
-class _MeasuredPair:
-    """A pair between measurement and pose estimation, and the frame indices of late pairs before it."""
-
-    late: tuple[int, ...]
-    arrival: _ArrivedPair
-    pair: MeasuredPair
-    started_s: float
-    finished_s: float
 
 
 def replay(
@@ -241,28 +283,64 @@ def replay(
     """
     if not 0 < rate_hz < float("inf"):
         raise ValueError(f"rate_hz: must be positive and finite, got {rate_hz:g}")
-    warm_up_jit()
-    return _Replay(source, navigator, rate_hz, clock).answers()
+    return process_arrivals(_Replay(source, rate_hz, clock), navigator, clock)
 
 
 class _Replay:
-    """Threads and queues of one replay."""
+    """Pairs of a dataset, which arrive at a rate.
 
-    def __init__(self, source: PairStream, navigator: SequenceNavigator, rate_hz: float, clock: Clock) -> None:
-        self._source, self._navigator, self._rate_hz, self._clock = source, navigator, rate_hz, clock
+    Each is read before its arrival time, because a camera delivers pixels and not files.
+    """
+
+    def __init__(self, source: PairStream, rate_hz: float, clock: Clock) -> None:
+        self._source, self._rate_hz, self._clock = source, rate_hz, clock
         self._stop = threading.Event()
-        self._arrived_pairs: LatestItemQueue[_ArrivedPair] = LatestItemQueue()
+
+    def stop(self) -> None:
+        """See `PairSource`."""
+        self._stop.set()
+
+    def arrivals(self) -> Iterator[ArrivedPair | SkippedPair]:
+        """See `PairSource`. After a slow read, it skips to the newest pair that is in time."""
+        indices, start_s, index = self._source.frame_indices, None, 0
+        while index < len(indices) and not self._stop.is_set():
+            read_start_s = self._clock.now_s()
+            pair = self._source.pair(indices[index])
+            read_s = self._clock.now_s() - read_start_s
+            start_s = self._clock.now_s() if start_s is None else start_s
+            arrived_s = start_s + index / self._rate_hz
+            self._clock.wait_until(arrived_s, self._stop)
+            yield ArrivedPair(pair, arrived_s, read_s)
+            next_index = max(index + 1, min(self._next_index(start_s, read_s), len(indices) - 1))
+            for late in indices[index + 1 : next_index]:
+                yield SkippedPair(late)
+            index = next_index
+
+    def _next_index(self, start_s: float, read_s: float) -> int:
+        """Index of the newest pair that has arrived if it can be read before the next arrival, else of the next one."""
+        elapsed_pairs = (self._clock.now_s() - start_s) * self._rate_hz
+        newest = int(elapsed_pairs)
+        return newest if elapsed_pairs + read_s * self._rate_hz <= newest + 1 else newest + 1
+
+
+class _Stages:
+    """Threads of the stages and the queues between them."""
+
+    def __init__(self, source: PairSource, navigator: SequenceNavigator, clock: Clock) -> None:
+        self._source, self._navigator, self._clock = source, navigator, clock
+        self._stop = threading.Event()
+        self._arrived_pairs: LatestItemQueue[ArrivedPair] = LatestItemQueue()
         self._measured_pairs: SingleItemQueue[_MeasuredPair] = SingleItemQueue()
         self._answers: Queue[PairEstimates | SkippedPair | BaseException | None] = Queue(_WAITING_ANSWERS)
 
     def answers(self) -> Generator[PairEstimates | SkippedPair]:
-        """See `replay`."""
+        """See `process_arrivals`."""
         workers = (
             (self._measure_stage, self._estimate_stage)
             if self._navigator.detects_every_pair
             else (self._combined_stage,)
         )
-        stages = (self._read_stage, *workers)
+        stages = (self._arrival_stage, *workers)
         threads = [threading.Thread(target=self._run_stage, args=(stage,), name=stage.__name__) for stage in stages]
         try:
             for thread in threads:
@@ -273,6 +351,7 @@ class _Replay:
                 yield answer
         finally:
             self._stop.set()
+            self._source.stop()
             self._arrived_pairs.close()
             self._measured_pairs.close()
             for thread in threads:
@@ -292,28 +371,13 @@ class _Replay:
                 self._answers.put(answer, timeout=_POLL_S)
                 return
 
-    def _read_stage(self) -> None:
-        """Read each pair before its arrival time; after a slow read, skip to the newest pair that is in time."""
-        indices, start_s, index = self._source.frame_indices, None, 0
-        while index < len(indices) and not self._stop.is_set():
-            read_start_s = self._clock.now_s()
-            pair = self._source.pair(indices[index])
-            read_s = self._clock.now_s() - read_start_s
-            start_s = self._clock.now_s() if start_s is None else start_s
-            arrived_s = start_s + index / self._rate_hz
-            self._clock.wait_until(arrived_s, self._stop)
-            self._arrived_pairs.put(indices[index], _ArrivedPair(pair, arrived_s, read_s))
-            next_index = max(index + 1, min(self._next_index(start_s, read_s), len(indices) - 1))
-            for late in indices[index + 1 : next_index]:
-                self._arrived_pairs.skip(late)
-            index = next_index
+    def _arrival_stage(self) -> None:
+        for each in self._source.arrivals():
+            if isinstance(each, SkippedPair):
+                self._arrived_pairs.skip(each.frame_index)
+            else:
+                self._arrived_pairs.put(each.pair.frame_index, each)
         self._arrived_pairs.close()
-
-    def _next_index(self, start_s: float, read_s: float) -> int:
-        """Index of the newest pair that has arrived if it can be read before the next arrival, else of the next one."""
-        elapsed_pairs = (self._clock.now_s() - start_s) * self._rate_hz
-        newest = int(elapsed_pairs)
-        return newest if elapsed_pairs + read_s * self._rate_hz <= newest + 1 else newest + 1
 
     def _measure_stage(self) -> None:
         # A pair is taken only when the next stage is free, so that none ages between the stages.
@@ -331,7 +395,7 @@ class _Replay:
             self._emit_with_late(self._measure(*newest_pair))
         self._emit(None)
 
-    def _measure(self, late: tuple[int, ...], arrival: _ArrivedPair) -> _MeasuredPair:
+    def _measure(self, late: tuple[int, ...], arrival: ArrivedPair) -> _MeasuredPair:
         started_s = self._clock.now_s()
         pair = self._navigator.measure(arrival.pair)
         return _MeasuredPair(late, arrival, pair, started_s, finished_s=self._clock.now_s())
