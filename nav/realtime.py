@@ -415,7 +415,13 @@ class _Stages:
         }
         latency_s = self._clock.now_s() - arrival.arrived_s
         estimates = tuple(
-            estimate.model_copy(update={"latency_s": latency_s, "stage_s": around_s | estimate.stage_s})
+            estimate.model_copy(
+                update={
+                    "latency_s": latency_s,
+                    "stage_s": around_s | estimate.stage_s,
+                    "time_s": answers.time_s,
+                }
+            )
             for estimate in answers.estimates
         )
         return replace(answers, estimates=estimates, stage_s=around_s | answers.stage_s, latency_s=latency_s)

@@ -53,11 +53,11 @@ class SequenceSmoother:
         It has no latency, since it follows only after the end of the sequence.
         """
         if isinstance(smoothed, NoFix):
-            return smoothed.model_copy(update={"latency_s": None})
+            return smoothed.model_copy(update={"latency_s": None, "time_s": measured.time_s})
         if isinstance(measured, NoFix):
             return measured.model_copy(update={"method": measured.method + SMOOTHER_SUFFIX, "latency_s": None})
         docking = docking_quantities(smoothed, pair.rig, pair.drogue, self._settings.capture_radius_m)
-        return smoothed.model_copy(update={"docking": docking, "latency_s": None})
+        return smoothed.model_copy(update={"docking": docking, "latency_s": None, "time_s": measured.time_s})
 
 
 LATE = "late: newer images had come before this pair could be worked on"
@@ -89,15 +89,19 @@ def navigate(
     return add_smoothed(process_dataset(dataset, open_navigator(settings, detector)), settings)
 
 
-def open_navigator(settings: SequenceSettings, detector: str) -> SequenceNavigator:
+def open_navigator(settings: SequenceSettings, detector: str | None = None) -> SequenceNavigator:
     """Create a navigator for a sequence of pairs.
+
+    Args:
+        settings: what it measures.
+        detector: a name from `nav.detector.detector_registry.detector_names`, or a network's file; by default ours.
 
     Raises:
         ValueError: a method, detector or tracker that does not exist, or a setting out of range.
     """
     for method in settings.methods:
         pose_method(method)
-    return SequenceNavigator(settings, detector_factory(detector))
+    return SequenceNavigator(settings, detector_factory(DEFAULT_DETECTOR if detector is None else detector))
 
 
 def process_dataset(dataset: BlindDataset, navigator: SequenceNavigator) -> Generator[PairEstimates]:

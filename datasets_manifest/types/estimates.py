@@ -17,6 +17,10 @@ from geometry.stereo import Eye
 TANGENT = "left: t' = t + dt, R' = exp([w]x) R; order dt [m], w [rad]"
 
 
+def _is_none(value: float | None) -> bool:
+    return value is None
+
+
 class Feature(FrozenModel):
     """One measured image point.
 
@@ -109,7 +113,8 @@ class PoseEstimate(FrozenModel):
         regions: search regions, at most one an eye.
         motion: as estimated by a filter, or None.
         docking: where it was requested.
-        latency_s: from the arrival of the images to this result, where they arrived at a rate. [s]
+        latency_s: from the arrival of the images to this result, in real time. [s]
+        time_s: of the images, in real time. [s]
     """
 
     status: Literal["fix"] = "fix"
@@ -125,10 +130,11 @@ class PoseEstimate(FrozenModel):
     motion: Motion | None = None
     docking: Docking | None = None
     latency_s: float | None = Field(default=None, ge=0)
+    time_s: float | None = Field(default=None, exclude_if=_is_none)
 
 
 class NoFix(FrozenModel):
-    """No pose, with the reason."""
+    """No pose, with the reason; other attributes as those of a pose."""
 
     status: Literal["no_fix"] = "no_fix"
     frame_index: int = Field(ge=0)
@@ -138,6 +144,7 @@ class NoFix(FrozenModel):
     stage_s: dict[str, float] = Field(default_factory=dict)
     regions: tuple[Region, ...] = ()
     latency_s: float | None = Field(default=None, ge=0)
+    time_s: float | None = Field(default=None, exclude_if=_is_none)
 
 
 Estimate = PoseEstimate | NoFix

@@ -1,10 +1,10 @@
-"""Estimate poses in a dataset without its truth, and measure latencies where pairs arrive at a rate."""
+"""Estimate poses in a dataset without its truth, and measure latencies where pairs arrive in real time."""
 
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -36,7 +36,7 @@ class LatencyPercentiles:
 
 @dataclass(frozen=True)
 class LatencyReport:
-    """Latencies of pairs that arrived at a rate.
+    """Latencies of pairs that arrived in real time.
 
     Attributes:
         rate_hz: of arrival. [Hz]
@@ -44,6 +44,7 @@ class LatencyReport:
         late: how many were skipped because newer ones had arrived.
         latency: from arrival to estimates; None where all were skipped.
         stages: time of each stage, in the order of processing.
+        left_out: numbers of a camera's images that were not used, by their reason; None for a dataset.
     """
 
     rate_hz: float
@@ -51,15 +52,19 @@ class LatencyReport:
     late: int
     latency: LatencyPercentiles | None
     stages: dict[str, LatencyPercentiles]
+    left_out: dict[str, int] | None = None
 
     def to_json(self) -> str:
         """The content of the latency file."""
-        return json.dumps({"schema": _SCHEMA, **asdict(self)}, indent=1) + "\n"
+        content = {key: value for key, value in asdict(self).items() if key != "left_out" or value is not None}
+        return json.dumps({"schema": _SCHEMA, **content}, indent=1) + "\n"
 
     def lines(self) -> list[str]:
         """The report as a table."""
         rows = {"whole": self.latency, **self.stages} if self.latency is not None else {}
         head = [f"{self.pairs} pairs at {self.rate_hz:g} Hz, {self.late} late"]
+        if self.left_out:
+            head.append("left out: " + ", ".join(f"{count} {reason}" for reason, count in self.left_out.items()))
         if rows:
             head.append(f"{'ms':<12}{'median':>8}{'95 %':>8}{'99 %':>8}{'largest':>9}")
         return head + [
@@ -70,42 +75,57 @@ class LatencyReport:
 
 
 class LatencyTally:
-    """Collects latencies pair by pair."""
+    """Collects latencies pair by pair.
 
-    def __init__(self, rate_hz: float) -> None:
-        """Start without pairs, at a rate of arrival. [Hz]"""
-        self._rate_hz = rate_hz
-        self._latencies_s: list[float] = []
-        self._stages_s: defaultdict[str, list[float]] = defaultdict(list)
-        self._late = 0
+    Attributes:
+        pairs: how many arrived so far.
+        late: how many of them were skipped.
+    """
+
+    def __init__(self, newest: int | None = None) -> None:
+        """Start without pairs.
+
+        Args:
+            newest: of so many processed pairs the times are kept; of all when None.
+        """
+        self._latencies_s: deque[float] = deque(maxlen=newest)
+        self._stages_s: dict[str, deque[float]] = {}
+        self.pairs = self.late = 0
 
     def skipped(self) -> None:
         """Count a skipped pair."""
-        self._late += 1
+        self.pairs += 1
+        self.late += 1
 
     def processed(self, latency_s: float, stage_s: dict[str, float]) -> None:
         """Add a processed pair's latency and the times of its stages. [s]"""
+        # A stage that only some pairs need, such as the detector beside a tracker, takes no time for the others.
+        for stage in [stage for stage in stage_s if stage not in self._stages_s]:
+            self._stages_s[stage] = deque([0.0] * len(self._latencies_s), self._latencies_s.maxlen)
+        self.pairs += 1
         self._latencies_s.append(latency_s)
-        for stage, spent_s in stage_s.items():
-            self._stages_s[stage].append(spent_s)
+        for stage, times_s in self._stages_s.items():
+            times_s.append(stage_s.get(stage, 0.0))
 
-    def report(self) -> LatencyReport:
-        """The latencies so far."""
-        done = len(self._latencies_s)
+    def report(self, rate_hz: float, left_out: dict[str, int] | None = None) -> LatencyReport:
+        """The latencies so far.
+
+        Args:
+            rate_hz: of arrival. [Hz]
+            left_out: see `LatencyReport`.
+        """
         return LatencyReport(
-            rate_hz=self._rate_hz,
-            pairs=done + self._late,
-            late=self._late,
-            latency=_percentiles(self._latencies_s, done) if done else None,
-            # A stage that only some pairs need, such as the detector beside a tracker, takes no time for the others.
-            stages={stage: _percentiles(spent_s, done) for stage, spent_s in self._stages_s.items()},
+            rate_hz=rate_hz,
+            pairs=self.pairs,
+            late=self.late,
+            latency=_percentiles(self._latencies_s) if self._latencies_s else None,
+            stages={stage: _percentiles(times_s) for stage, times_s in self._stages_s.items()},
+            left_out=left_out,
         )
 
 
-def _percentiles(times_s: list[float], count: int) -> LatencyPercentiles:
-    """Percentiles of times, padded with zeros up to a count."""
-    padded_ms = 1e3 * np.array(times_s + [0.0] * (count - len(times_s)))
-    middle, high, highest, most = np.percentile(padded_ms, [50, 95, 99, 100]).tolist()
+def _percentiles(times_s: Iterable[float]) -> LatencyPercentiles:
+    middle, high, highest, most = np.percentile(1e3 * np.array(list(times_s)), [50, 95, 99, 100]).tolist()
     return LatencyPercentiles(middle, high, highest, most)
 
 
@@ -120,7 +140,9 @@ class NavigationOptions:
         redetect_every: pairs between two checks of the tracker by the detector; the default number when None.
         filtered, smoothed: whether to add filtered and smoothed estimates.
         capture_radius_m: of the docking quantities; from the drogue's opening when None. [m]
-        rate_hz: pairs arrive at this rate; as fast as they are processed when None. [Hz]
+        is_live: whether pairs come from a running camera instead of a dataset.
+        rate_hz: pairs of a dataset arrive at this rate, as fast as they are processed when None; a camera is asked for
+            it. [Hz]
         latency_out: file for the latencies as JSON, or None.
     """
 
@@ -131,6 +153,7 @@ class NavigationOptions:
     filtered: bool = False
     smoothed: bool = False
     capture_radius_m: float | None = None
+    is_live: bool = False
     rate_hz: float | None = None
     latency_out: Path | None = None
 
@@ -148,8 +171,8 @@ class NavigationOptions:
                 raise ValueError(f"--capture-radius: must be above 0 m, got {self.capture_radius_m:g}")
         if self.rate_hz is not None and not 1e-3 <= self.rate_hz <= 1e4:
             raise ValueError(f"--rate: must be from 0.001 to 10000 Hz, got {self.rate_hz:g}")
-        if self.latency_out is not None and self.rate_hz is None:
-            raise ValueError("--latency: needs --rate; without one there is no time of arrival")
+        if self.latency_out is not None and self.rate_hz is None and not self.is_live:
+            raise ValueError("--latency: needs --rate or --live; without one there is no time of arrival")
 
 
 @dataclass(frozen=True)
@@ -167,11 +190,19 @@ class NavigationSummary:
 
     Attributes:
         fixes: of every method.
-        latency: None where pairs did not arrive at a rate.
+        latency: None where pairs did not arrive in real time.
+        fault: what ended a camera's run too early, as one line; None for nothing.
     """
 
     fixes: list[FixCount]
     latency: LatencyReport | None
+    fault: str | None = None
+
+    def lines(self) -> list[str]:
+        """The summary for the user."""
+        width = max(16, *(len(fixes.method) for fixes in self.fixes))
+        lines = [f"{fixes.method:<{width}} {fixes.fixes} fixes in {fixes.pairs} pairs" for fixes in self.fixes]
+        return lines + ([] if self.latency is None else self.latency.lines())
 
 
 def navigate_dataset(
@@ -195,14 +226,14 @@ def navigate_dataset(
     from nav.runner import add_smoothed
 
     options = NavigationOptions() if options is None else options
-    settings = _settings(methods, options)
-    _check_places(out, options.latency_out)
+    settings = sequence_settings(methods, options)
+    check_places(out, options.latency_out)
     blind = BlindDataset(dataset)
-    tally = None if options.rate_hz is None else LatencyTally(options.rate_hz)
+    tally = None if options.rate_hz is None else LatencyTally()
     fixes: Counter[str] = Counter()
 
     def counted(answers: Iterable[PairEstimates | SkippedPair]) -> Iterator[Estimate]:
-        for estimate in add_smoothed(_with_progress(answers, tally, report), settings):
+        for estimate in add_smoothed(tallied(answers, tally, report.advance), settings):
             fixes[estimate.method] += estimate.status == "fix"
             yield estimate
 
@@ -216,7 +247,7 @@ def navigate_dataset(
             write_estimates(out, counted(answers))
         finally:
             report.end()
-    latency = None if tally is None else tally.report()
+    latency = None if tally is None or options.rate_hz is None else tally.report(options.rate_hz)
     if latency is not None and options.latency_out is not None:
         write_text_atomic(options.latency_out, latency.to_json())
     return NavigationSummary(
@@ -224,7 +255,7 @@ def navigate_dataset(
     )
 
 
-def _check_places(out: Path, latency_out: Path | None) -> None:
+def check_places(out: Path, latency_out: Path | None) -> None:
     """Check the output files before the work.
 
     Raises:
@@ -237,7 +268,12 @@ def _check_places(out: Path, latency_out: Path | None) -> None:
         raise ValueError(f"--latency: must be another file than --out, got {latency_out}")
 
 
-def _settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSettings:
+def sequence_settings(methods: Sequence[str], options: NavigationOptions) -> SequenceSettings:
+    """What navigation measures; all methods when `methods` is empty.
+
+    Raises:
+        ValueError: no such way to measure centres.
+    """
     from nav.runner import CENTROID_CHOICES, method_names
     from nav.sequence_navigator import SequenceSettings
     from nav.tracking.tracker import REDETECT_EVERY
@@ -260,29 +296,33 @@ def _estimate_pairs(
     blind: BlindDataset, settings: SequenceSettings, options: NavigationOptions
 ) -> Generator[PairEstimates | SkippedPair]:
     """Estimates of all pairs, as fast as possible or in real time."""
-    from nav.detector.detector_registry import DEFAULT_DETECTOR
     from nav.realtime import MonotonicClock, replay
     from nav.runner import open_navigator, process_dataset
 
-    navigator = open_navigator(settings, DEFAULT_DETECTOR if options.detector is None else options.detector)
+    navigator = open_navigator(settings, options.detector)
     if options.rate_hz is None:
         return process_dataset(blind, navigator)
     return replay(blind, navigator, options.rate_hz, MonotonicClock())
 
 
-def _with_progress(
-    answers: Iterable[PairEstimates | SkippedPair], tally: LatencyTally | None, report: ProgressReport
+def tallied(
+    answers: Iterable[PairEstimates | SkippedPair], tally: LatencyTally | None, advance: Callable[[], None]
 ) -> Iterator[PairEstimates | SkippedPair]:
-    """Pass on the estimates, and report progress and latencies; time until the next request counts as output."""
+    """Pass on the estimates, and collect latencies; time until the next request counts as output.
+
+    Args:
+        answers: of the pairs.
+        tally: that collects, or None.
+        advance: called after each pair.
+    """
     from nav.sequence_navigator import SkippedPair
 
     for each in answers:
         start = perf_counter()
         yield each
-        report.advance()
-        if tally is None:
-            continue
         if isinstance(each, SkippedPair):
-            tally.skipped()
-        elif each.latency_s is not None:
+            if tally is not None:
+                tally.skipped()
+        elif tally is not None and each.latency_s is not None:
             tally.processed(each.latency_s, {**each.stage_s, "output": perf_counter() - start})
+        advance()

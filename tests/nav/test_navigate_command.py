@@ -32,6 +32,7 @@ class Flight:
     """Drawn pairs as an importer reads them."""
 
     left_out = ()
+    remarks = ()
 
     def __init__(self, pairs: list[BlindPair]) -> None:
         self._pairs, self.count = pairs, len(pairs)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import DatasetArgument, DetectorOption, output_option
-from droguekit.workflows.navigation import NavigationOptions, navigate_dataset
+from droguekit.cli.arguments import DetectorOption
+from droguekit.cli.main import FAULT
+from droguekit.cli.navigation import navigate_options as its
+from droguekit.workflows.live_navigation import LiveOptions, navigate_pairs
+from droguekit.workflows.navigation import NavigationOptions
 
 EXAMPLES = (
     "droguekit navigate data/demo --out estimates.jsonl",
@@ -18,55 +18,53 @@ EXAMPLES = (
     "droguekit navigate data/demo --detector my-network.onnx --out estimates.jsonl",
     "droguekit navigate data/docking-10m --method joint-hub --tracker bernoulli --filter --out estimates.jsonl",
     "droguekit navigate data/docking-10m --method joint-hub --tracker bernoulli --rate 25 --out estimates.jsonl",
+    "droguekit navigate --live 0 --calibration stereo.yaml --method joint-hub --filter --out flight.jsonl",
+    "droguekit navigate --live rtsp://camera/stereo --calibration stereo.yaml --method joint-hub --out flight.jsonl",
+    "droguekit navigate --live ros:/left/image_raw,/right/image_raw --calibration stereo.yaml --out flight.jsonl",
 )
 
 
 def navigate(
-    dataset: DatasetArgument,
-    out: Annotated[Path, output_option("--out", "FILE.jsonl", "Write one estimate a line.")],
-    method: Annotated[
-        list[str] | None, typer.Option("--method", metavar="NAME", help="Repeatable; all methods by default.")
-    ] = None,
-    centroids: Annotated[
-        str,
-        typer.Option(
-            "--centroids",
-            metavar="own|binary|edge",
-            help="How to measure centres: each method's own way (as the paper, or edge fits), or one for all.",
-        ),
-    ] = "own",
+    out: its.EstimatesOption,
+    dataset: its.DatasetOrNone = None,
+    method: its.MethodOption = None,
+    centroids: its.CentroidsOption = "own",
     detector: DetectorOption = None,
-    tracker: Annotated[
-        str | None,
-        typer.Option(
-            "--tracker",
-            metavar="NAME",
-            help="Follow the drogue; the detector only starts, checks, and searches again after a loss.",
-        ),
-    ] = None,
-    redetect_every: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="The detector checks the tracker on every N-th pair; 25 by default."),
-    ] = None,
-    filtered: Annotated[
-        bool, typer.Option("--filter", help="Add filtered estimates as METHOD+filter, with docking quantities.")
-    ] = False,
-    smoothed: Annotated[
-        bool, typer.Option("--smooth", help="Add estimates smoothed over each sequence as METHOD+smoother.")
-    ] = False,
-    capture_radius: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="Largest miss that is a capture; by default from the drogue's opening."),
-    ] = None,
-    rate: Annotated[
-        float | None,
-        typer.Option(metavar="HZ", help="Real time: pairs arrive at this rate; late ones are skipped and counted."),
-    ] = None,
-    latency: Annotated[
-        Path | None, output_option("--latency", "FILE.json", "Write the latencies of --rate by stage.")
-    ] = None,
+    tracker: its.TrackerOption = None,
+    redetect_every: its.RedetectOption = None,
+    filtered: its.FilterOption = False,
+    smoothed: its.SmoothOption = False,
+    capture_radius: its.CaptureRadiusOption = None,
+    rate: its.RateOption = None,
+    latency: its.LatencyOption = None,
+    live: its.LiveOption = None,
+    calibration: its.CalibrationOption = None,
+    calibration_unit: its.CalibrationUnitOption = None,
+    drogue: its.DrogueOption = None,
+    encoding: its.EncodingOption = None,
+    black_level: its.BlackLevelOption = None,
+    bits: its.BitsOption = None,
+    timeout: its.TimeoutOption = None,
+    stamp_tolerance_ms: its.StampToleranceOption = None,
+    camera_format: its.CameraFormatOption = None,
 ) -> None:
-    """Estimate the drogue's pose in every pair of a dataset, from images, rig and drogue dimensions alone."""
+    """Estimate the drogue's pose in every pair, from images, rig and drogue dimensions alone.
+
+    Pairs come from a dataset, or with --live from a running camera until Ctrl-C. Exits with 1 where a camera's run ends
+    by a fault; the estimates before it are kept.
+    """
+    camera = LiveOptions(
+        live,
+        calibration,
+        calibration_unit,
+        drogue,
+        encoding,
+        black_level,
+        bits,
+        timeout,
+        stamp_tolerance_ms,
+        camera_format,
+    )
     options = NavigationOptions(
         centroids=centroids,
         detector=detector,
@@ -75,13 +73,14 @@ def navigate(
         filtered=filtered,
         smoothed=smoothed,
         capture_radius_m=capture_radius,
+        is_live=live is not None,
         rate_hz=rate,
         latency_out=latency,
     )
-    done = navigate_dataset(dataset, method or (), out, progress_report(), options)
-    width = max(16, *(len(fixes.method) for fixes in done.fixes))
-    for fixes in done.fixes:
-        typer.echo(f"{fixes.method:<{width}} {fixes.fixes} fixes in {fixes.pairs} pairs")
-    for line in [] if done.latency is None else done.latency.lines():
+    done = navigate_pairs(dataset, camera, method or (), out, progress_report(), options)
+    for line in done.lines():
         typer.echo(line)
     typer.echo(f"wrote {out}")
+    if done.fault is not None:
+        typer.echo(f"droguekit: error: {done.fault}", err=True)
+        raise typer.Exit(FAULT)
