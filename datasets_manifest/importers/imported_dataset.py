@@ -219,8 +219,11 @@ def _stored_images(pair: ImportedPair, depth: PixelDepth, rig: StereoRig) -> dic
     found = [(file, name, mosaic) for file, name, mosaic in mosaics if mosaic is not None]
     if len(found) != (len(mosaics) if depth.color == "bayer" else 0):
         raise ValueError(f"{first}: at {pair.time_s} s must have the depth and colours of the first pair")
-    found += [(image_file("left"), first, pair.left), (image_file("right"), second, pair.right)]
-    return {file: depth.checked(image, name, rig) for file, name, image in found}
+    images = [(image_file("left"), first, pair.left), (image_file("right"), second, pair.right)]
+    return {
+        **{file: depth.checked(mosaic, name, rig, is_mosaic=True) for file, name, mosaic in found},
+        **{file: depth.checked(image, name, rig) for file, name, image in images},
+    }
 
 
 class PixelDepth:
@@ -253,8 +256,14 @@ class PixelDepth:
             raise ValueError(f"black level: must be below the images' largest number, got {level_dn:g}")
         return kept
 
-    def checked(self, image: Pixels, name: str, rig: StereoRig) -> Pixels:
+    def checked(self, image: Pixels, name: str, rig: StereoRig, is_mosaic: bool = False) -> Pixels:
         """The image with the depth in which it is stored.
+
+        Args:
+            image: of a view, or its raw mosaic.
+            name: of the image, for errors.
+            rig: gives the size.
+            is_mosaic: whether it is the mosaic, which has one channel.
 
         Raises:
             ValueError: of another size than the rig's, or of another depth or colour than the first pair.
@@ -264,8 +273,7 @@ class PixelDepth:
             raise ValueError(
                 f"{name}: must be {size[0]}x{size[1]} px as calibrated, got {image.shape[1]}x{image.shape[0]}"
             )
-        is_color = image.ndim == 3
-        if image.dtype != self._dtype or is_color == (self.color == "mono"):
+        if image.dtype != self._dtype or (image.ndim == 3) != (self.color != "mono" and not is_mosaic):
             raise ValueError(f"{name}: must have the depth and colours of the first pair")
         if self.output_bits == 8:
             return image

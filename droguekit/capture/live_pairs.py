@@ -118,9 +118,8 @@ class LivePairs:
         if (view.mosaic is None) == (depth.color == "bayer"):
             raise ValueError(f"{name}: must have the colours of the first pair")
         rig, mosaic = self._settings.rig, view.mosaic
-        return LoadedImage(
-            depth.checked(view.pixels, name, rig), None if mosaic is None else depth.checked(mosaic, name, rig)
-        )
+        kept = None if mosaic is None else depth.checked(mosaic, name, rig, is_mosaic=True)
+        return LoadedImage(depth.checked(view.pixels, name, rig), kept)
 
     def _describe(self, images: StereoImages) -> str:
         """What the numbers are taken to be, as one line."""
