@@ -1,6 +1,6 @@
-"""True poses as lists: SPEED+'s JSON, a folder an eye, and the TUM RGB-D benchmark's text, a file a sequence.
+"""True poses as SPEED+'s JSON lists, a folder an eye.
 
-A folder of SPEED+ is a data set of its own. `camera.json` describes the delivered images of the eye; `train.json`,
+A folder is a data set of its own. `camera.json` describes the delivered images of the eye; `train.json`,
 `validation.json` and `test.json` list file name, attitude and position; the pictures lie under `images`. The names are
 those of SPEED+ (doi:10.25740/wv398fc4383), in which `tango` is the target, here the drogue, and `vbs` the camera:
 `r_Vo2To_vbs_true` is the drogue's origin in the eye's axes [m], and `q_vbs2tango_true`, scalar first, has the rotation
@@ -10,9 +10,7 @@ turned and shifted camera that took it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import ExitStack
-from itertools import groupby
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,7 +25,7 @@ from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.records import PairRecord
 from geometry.distortion import Lens
 from geometry.stereo import EYES, Eye, StereoRig
-from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
+from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import export_image
 
 _SPEED_LISTS = {"train": "train.json", "val": "validation.json", "test": "test.json"}
@@ -125,53 +123,3 @@ class _PoseList:
     def finish(self) -> None:
         """Close the list."""
         self._stream.write("\n]\n")
-
-
-_TUM_HEADER = (
-    "# drogue in the left camera (x right, y down, z forward) at mid-exposure\n# time_s tx_m ty_m tz_m qx qy qz qw\n"
-)
-
-
-def write_tum(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
-    """Write a file for each sequence, with a line for each pair.
-
-    Args:
-        dataset: folder.
-        out: folder to make.
-        log: receives the progress, and counts pairs without a pose.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: a record that cannot be read, or times that do not ascend.
-        OSError: it cannot be written; nothing half-written is left.
-
-    Source: the benchmark's page on its file formats.
-    """
-    order, names = SequenceOrder(), []
-    with new_folder(out) as folder:
-        stamped = _stamped(order, log.records(Dataset(dataset)))
-        for sequence_id, pairs in groupby(stamped, key=lambda pair: pair[0].sequence_id):
-            names.append(f"{sequence_name(sequence_id)}.txt")
-            with (folder / names[-1]).open("w", encoding="utf-8") as stream:
-                stream.write(_TUM_HEADER)
-                for record, stamp_ns in pairs:
-                    if record.left_from_drogue is None:
-                        log.lost("pairs without a drogue are left out")
-                        continue
-                    stream.write(_tum_line(record, stamp_ns))
-    return [out / name for name in names]
-
-
-def _stamped(order: SequenceOrder, records: Iterator[PairRecord]) -> Iterator[tuple[PairRecord, int]]:
-    for record in records:
-        yield record, order.stamp_ns(record)
-
-
-def _tum_line(record: PairRecord, stamp_ns: int) -> str:
-    assert record.left_from_drogue is not None
-    pose = record.left_from_drogue
-    seconds, nanoseconds = divmod(stamp_ns, 10**9)
-    numbers = [*pose.translation_m.tolist(), *Rotation.from_matrix(pose.rotation).as_quat().tolist()]
-    return f"{seconds}.{nanoseconds:09d} " + " ".join(repr(number) for number in numbers) + "\n"

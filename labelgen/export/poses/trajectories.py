@@ -1,0 +1,183 @@
+"""Trajectories of the drogue in the left camera as the TUM RGB-D benchmark's text, a file a sequence.
+
+Source: the benchmark's page on its file formats; evo reads it as `tum`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack
+from itertools import groupby
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from datasets_manifest.atomic import new_folder
+from datasets_manifest.storage.blind import read_blind_index
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import BLIND_FILE
+from datasets_manifest.storage.reader import Dataset, read_shutter
+from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.types.estimates import PoseEstimate, read_estimates
+from datasets_manifest.types.records import PairRecord
+from drogue_models.marker_layout import marker_layout
+from geometry.se3 import RigidTransform
+from labelgen.export.export_log import ExportLog, SequenceOrder, sequence_name
+
+TRUTH_FOLDER = "truth"
+
+_HEADER = (
+    "# drogue in the left camera (x right, y down, z forward) at mid-exposure\n# time_s tx_m ty_m tz_m qx qy qz qw\n"
+)
+
+_FOLDER_NAME = re.compile(r"[A-Za-z0-9][-+.\w]*")
+
+
+def write_tum(dataset: Location, out: Path, log: ExportLog, estimates: Path | None = None) -> list[Path]:
+    """Write a file for each sequence, with a line for each pair.
+
+    With estimates, the truth is in the folder `truth` and each method's poses are in a folder of its name, in files of
+    the same names. Methods know the attitude only up to a turn that maps the ring of markers onto itself; of these
+    attitudes the one nearest the truth is written. A dataset without truth has no such folder, and attitudes as
+    estimated.
+
+    Args:
+        dataset: folder.
+        out: folder to make.
+        log: receives the progress, and counts pairs without a pose.
+        estimates: file of a method's or several methods' estimates, or None for the truth alone.
+
+    Returns:
+        The files; with estimates the folders.
+
+    Raises:
+        ValueError: a record or an estimate that cannot be read, times that do not ascend, or estimates of another
+            dataset.
+        OSError: it cannot be written; nothing half-written is left.
+    """
+    if estimates is not None:
+        with new_folder(out) as folder:
+            names = _write_estimates(dataset, folder, log, estimates)
+        return [out / name for name in names]
+    order, names = SequenceOrder(), []
+    with new_folder(out) as folder:
+        stamped = _stamped(order, log.records(Dataset(dataset)))
+        for sequence_id, pairs in groupby(stamped, key=lambda pair: pair[0].sequence_id):
+            names.append(f"{sequence_name(sequence_id)}.txt")
+            with (folder / names[-1]).open("w", encoding="utf-8") as stream:
+                stream.write(_HEADER)
+                for record, stamp_ns in pairs:
+                    if record.left_from_drogue is None:
+                        log.lost("pairs without a drogue are left out")
+                        continue
+                    stream.write(_line(record.left_from_drogue, stamp_ns))
+    return [out / name for name in names]
+
+
+def _stamped(order: SequenceOrder, records: Iterator[PairRecord]) -> Iterator[tuple[PairRecord, int]]:
+    for record in records:
+        yield record, order.stamp_ns(record)
+
+
+def _line(pose: RigidTransform, stamp_ns: int) -> str:
+    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    numbers = [*pose.translation_m.tolist(), *Rotation.from_matrix(pose.rotation).as_quat().tolist()]
+    return f"{seconds}.{nanoseconds:09d} " + " ".join(repr(number) for number in numbers) + "\n"
+
+
+def _write_estimates(dataset: Location, folder: Path, log: ExportLog, estimates: Path) -> list[str]:
+    """Write truth and estimates, and return the names of their folders."""
+    methods = _poses_by_method(estimates)
+    has_truth = not open_storage(dataset).exists(BLIND_FILE)
+    with ExitStack() as stack:
+        writer = _TrajectoryFolders(stack, folder, [*([TRUTH_FOLDER] if has_truth else []), *methods])
+        seen = set()
+        for frame_index, stamp_ns, name, record in _places(dataset, log, has_truth):
+            seen.add(frame_index)
+            truth = None if record is None else record.left_from_drogue
+            if truth is not None:
+                writer.add(TRUTH_FOLDER, name, _line(truth, stamp_ns))
+            for method, poses in methods.items():
+                pose = poses.get(frame_index)
+                if pose is None:
+                    log.lost(f"pairs in which {method} gives no pose are left out")
+                    continue
+                if record is not None and truth is not None:
+                    pose = _nearest_turn(pose, truth, _turns(record))
+                writer.add(method, name, _line(pose, stamp_ns))
+        strange = {index for poses in methods.values() for index in poses} - seen
+        if strange:
+            raise ValueError(f"{estimates}: frame {min(strange)} is not in the dataset")
+    return writer.names
+
+
+def _poses_by_method(estimates: Path) -> dict[str, dict[int, RigidTransform]]:
+    methods: dict[str, dict[int, RigidTransform]] = {}
+    for estimate in read_estimates(estimates):
+        if _FOLDER_NAME.fullmatch(estimate.method) is None or estimate.method == TRUTH_FOLDER:
+            raise ValueError(f"{estimates}: method {estimate.method!r} cannot be a folder")
+        poses = methods.setdefault(estimate.method, {})
+        if estimate.frame_index in poses:
+            raise ValueError(f"{estimates}: method {estimate.method!r}: frame {estimate.frame_index} occurs twice")
+        if isinstance(estimate, PoseEstimate):
+            poses[estimate.frame_index] = estimate.left_from_drogue
+    if not methods:
+        raise ValueError(f"{estimates}: holds no estimates")
+    return methods
+
+
+def _places(dataset: Location, log: ExportLog, has_truth: bool) -> Iterator[tuple[int, int, str, PairRecord | None]]:
+    """Frame index, time stamp [ns], name of the sequence and record, if there is one, of every pair."""
+    if has_truth:
+        order = SequenceOrder()
+        for record in log.records(Dataset(dataset)):
+            yield record.frame_index, order.stamp_ns(record), sequence_name(record.sequence_id), record
+        return
+    frames, last_ns = FrameStore(dataset), -1
+    for frame_index in read_blind_index(dataset).frames:
+        stamp_ns = round(read_shutter(frames, frame_index).time_s * 1e9)
+        if stamp_ns <= last_ns:
+            raise ValueError(f"frame {frame_index}: time_s: must be later than the pair's before it")
+        last_ns = stamp_ns
+        yield frame_index, stamp_ns, sequence_name(None), None
+
+
+def _turns(record: PairRecord) -> NDArray[np.float64]:
+    """(S, 3, 3) turns about the drogue's axis that map its ring of markers onto itself."""
+    assert record.frame.drogue is not None
+    count = marker_layout(record.frame.drogue).symmetry_order
+    turns: NDArray[np.float64] = Rotation.from_euler("z", 2 * np.pi * np.arange(count)[:, None] / count).as_matrix()
+    return turns
+
+
+def _nearest_turn(pose: RigidTransform, truth: RigidTransform, turns: NDArray[np.float64]) -> RigidTransform:
+    turned = pose.rotation @ turns
+    # The angle between two attitudes is the smaller, the larger the trace of their quotient.
+    nearest = int(np.einsum("ij,nij->n", truth.rotation, turned).argmax())
+    return RigidTransform(turned[nearest], pose.translation_m)
+
+
+class _TrajectoryFolders:
+    """A folder for each trajectory, with a file for each sequence, one open at a time in each."""
+
+    def __init__(self, stack: ExitStack, folder: Path, names: list[str]) -> None:
+        self._stack, self._folder, self.names = stack, folder, names
+        self._open: dict[str, tuple[str, IO[str]]] = {}
+        for name in names:
+            (folder / name).mkdir()
+
+    def add(self, name: str, sequence: str, line: str) -> None:
+        """Append a pose."""
+        open_sequence, stream = self._open.get(name, ("", None))
+        if stream is None or open_sequence != sequence:
+            if stream is not None:
+                stream.close()
+            path = self._folder / name / f"{sequence}.txt"
+            stream = self._stack.enter_context(path.open("w", encoding="utf-8", newline="\n"))
+            stream.write(_HEADER)
+            self._open[name] = sequence, stream
+        stream.write(line)
