@@ -38,11 +38,16 @@ class Progress(Protocol):
 
 
 class ExportLog:
-    """Reports progress and counts, by reason, everything that an export drops, cuts or changes."""
+    """Reports progress and counts, by reason, everything that an export drops, cuts or changes.
+
+    Attributes:
+        remarks: what whoever reads the export has to know and the format cannot say, a line each.
+    """
 
     def __init__(self, progress: Progress | None = None) -> None:
         self._progress = progress
         self._losses: Counter[str] = Counter()
+        self.remarks: list[str] = []
 
     def records(self, source: Dataset) -> Iterator[PairRecord]:
         """The records of all pairs in the order of their indices, one at a time.

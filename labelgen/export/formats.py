@@ -1,7 +1,7 @@
 """The export formats; a format's module is imported when it is used.
 
-A writer takes the dataset's location, the folder to write into, a log and, where images are optional, their bits. It
-iterates over `log.records(...)`, holds one pair at a time, logs what its format cannot hold, and makes files appear
+A writer takes the dataset's location, the folder to write into, a log and the options that its format has. It iterates
+over `log.records(...)`, holds one pair at a time, logs what its format cannot hold, and makes files appear
 whole or not at all: single files by `open_text_atomic`, folders by `new_folder`, both of `datasets_manifest.atomic`.
 The same dataset gives the same bytes.
 """
@@ -32,12 +32,14 @@ class ExportFormat:
         writer: `module:function` of its `Writer`, which returns the main files or folders that it wrote.
         extra: the extra of pyproject.toml with its dependencies, or None.
         images_are_optional: whether the writer takes `image_bits`, and writes images where it is given.
+        takes_estimates: whether the writer takes `estimates`, and writes them where they are given.
     """
 
     description: str
     writer: str
     extra: str | None = None
     images_are_optional: bool = False
+    takes_estimates: bool = False
 
 
 FORMATS: dict[str, ExportFormat] = {
@@ -56,6 +58,15 @@ FORMATS: dict[str, ExportFormat] = {
     "yolo-detect": ExportFormat(
         "ultralytics boxes of drogue, markers and hub", "labelgen.export.annotations.yolo:write_yolo_detect"
     ),
+    "cvat": ExportFormat("CVAT for images 1.1: boxes, masks and points", "labelgen.export.annotations.cvat:write_cvat"),
+    "label-studio": ExportFormat(
+        "Label Studio tasks: boxes, polygons and keypoints",
+        "labelgen.export.annotations.label_studio:write_label_studio",
+    ),
+    "fiftyone": ExportFormat(
+        "FiftyOne stereo groups: detections with masks, keypoints",
+        "labelgen.export.annotations.fiftyone_samples:write_fiftyone",
+    ),
     "speed": ExportFormat(
         "SPEED+ pose lists and camera, a folder an eye", "labelgen.export.poses.pose_lists:write_speed"
     ),
@@ -67,7 +78,9 @@ FORMATS: dict[str, ExportFormat] = {
     "rosbag": ExportFormat(
         "ROS 2 bags (MCAP): images, CameraInfo, TF, true pose", "labelgen.export.poses.rosbag:write_rosbag", "exports"
     ),
-    "tum": ExportFormat("true trajectories as TUM text", "labelgen.export.poses.pose_lists:write_tum"),
+    "tum": ExportFormat(
+        "true trajectories as TUM text", "labelgen.export.poses.trajectories:write_tum", takes_estimates=True
+    ),
     "bop": ExportFormat(
         "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.poses.bop:write_bop"
     ),
@@ -84,7 +97,13 @@ FORMATS: dict[str, ExportFormat] = {
 
 
 def write_export(
-    name: str, dataset: Location, out: Path, log: ExportLog, image_bits: ImageBits | None = None
+    name: str,
+    dataset: Location,
+    out: Path,
+    log: ExportLog,
+    *,
+    image_bits: ImageBits | None = None,
+    estimates: Path | None = None,
 ) -> list[Path]:
     """Write a dataset in a format.
 
@@ -94,6 +113,7 @@ def write_export(
         out: folder to write into.
         log: receives the progress and what the format cannot hold.
         image_bits: copies images too, of at most so many bits, in a format that otherwise names the dataset's.
+        estimates: writes these poses too, in a format that has trajectories.
 
     Returns:
         The main files or folders that were written.
@@ -109,6 +129,9 @@ def write_export(
     if image_bits is not None and not chosen.images_are_optional:
         names = ", ".join(other for other, format_ in FORMATS.items() if format_.images_are_optional)
         raise ValueError(f"--images: is for {names}; {name} has images without it, or cannot have any")
+    if estimates is not None and not chosen.takes_estimates:
+        names = ", ".join(other for other, format_ in FORMATS.items() if format_.takes_estimates)
+        raise ValueError(f"--estimates: is for {names}; {name} has true poses alone, or none")
     module, function = chosen.writer.split(":")
     try:
         writer: Writer = getattr(importlib.import_module(module), function)
@@ -120,11 +143,15 @@ def write_export(
     if folder is not None and out.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"--out: must lie outside the dataset's folder, got {out}")
     # Imported here, as the list of formats is also the command's help, which loads nothing that reads a dataset.
+    from datasets_manifest.storage.layout import BLIND_FILE
     from datasets_manifest.storage.manifest import read_manifest
 
-    if not read_manifest(dataset).frames:
+    # Estimates need no truth, and a dataset without it has no manifest.
+    is_blind = estimates is not None and open_storage(dataset).exists(BLIND_FILE)
+    if not is_blind and not read_manifest(dataset).frames:
         raise ValueError(f"{dataset}: its manifest lists no pairs yet; let `render` finish first")
+    given = {"image_bits": image_bits, "estimates": estimates}
     try:
-        return writer(dataset, out, log) if image_bits is None else writer(dataset, out, log, image_bits)
+        return writer(dataset, out, log, **{option: value for option, value in given.items() if value is not None})
     finally:
         log.end()

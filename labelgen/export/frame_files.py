@@ -63,14 +63,17 @@ def export_image(
         eye: which image.
         target: the PNG to make. An image of 8 bits is linked or copied. Of 12 bits, the upper 8 are written, or all of
             them in 16: moved to the top, with an sBIT chunk that says how many are significant.
-        log: counts the images that lose bits.
+        log: counts the images that lose bits or their raw mosaic.
         bits: of a sample, at most.
 
     Raises:
         ValueError: the image is missing or damaged; names the file.
         OSError: it cannot be written.
     """
-    name, stored_bits = image_file(eye), source.manifest.recipe.sensor.output_bits
+    name, sensor = image_file(eye), source.manifest.recipe.sensor
+    stored_bits = sensor.output_bits
+    if sensor.color == "bayer":
+        log.lost("images of a Bayer sensor: interpolated, without the raw mosaic, which navigation prefers")
     if stored_bits == 8:
         export_file(source, frame_index, name, target)
         return

@@ -16,6 +16,7 @@ from labelgen.export.formats import FORMATS, write_export
 EXAMPLES = (
     "droguekit export data/demo --format coco --out data/demo-coco",
     "droguekit export data/demo --format coco --images --out data/demo-coco   (annotations/ and images/)",
+    "droguekit export data/demo --format tum --estimates out/estimates.jsonl --out data/demo-tum   (for evo)",
     "droguekit export data/demo --format blind --out data/demo-blind",
 )
 
@@ -33,6 +34,10 @@ def export(
             metavar="8|16", help="With --images: bits of copies of 12-bit images; 8 by default.", show_default=False
         ),
     ] = None,
+    estimates: Annotated[
+        Path | None,
+        typer.Option("--estimates", metavar="FILE.jsonl", help="With tum: write these poses too, for evo."),
+    ] = None,
 ) -> None:
     """Write a dataset's labels in another format, with the images where the format has them.
 
@@ -44,10 +49,12 @@ def export(
         raise ValueError(f"--image-bits: must be 8 or 16, got {image_bits}")
     log = ExportLog(progress_report())
     bits = cast(Literal[8, 16], image_bits or 8) if images else None
-    for path in write_export(format_, dataset, out, log, bits):
+    for path in write_export(format_, dataset, out, log, image_bits=bits, estimates=estimates):
         typer.echo(f"wrote {path}")
     for what, count in log.losses.items():
         typer.echo(f"{format_}: {count} x {what}")
+    for remark in log.remarks:
+        typer.echo(f"{format_}: {remark}")
 
 
 _FORMAT_LINES = "\n".join(f"  {name:<17} {format_.description}" for name, format_ in FORMATS.items())

@@ -23,8 +23,7 @@ from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, Storage, join, open_storage
 from datasets_manifest.storage.writer import canonical_json
-from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, PixelPoint
-from drogue_models.parts import Part, marker_id
+from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
 from labelgen.export.annotations.part_masks import DroguePixels
@@ -144,7 +143,8 @@ def _write(
                     export_image(source, record.frame_index, eye, copy, log, images.bits)
                 elif bits > 8:
                     log.lost(f"images of {bits} bits in 16, nearly black to programs for 8: add --images for copies")
-                _log_missing_labels(log, record, eye, annotations)
+                masked = None if drogue is None else len(annotations) if part_id is not None else 0
+                log_missing_labels(log, record, eye, masked)
         for writer in writers.values():
             writer.finish()
     return list(files.values())
@@ -156,18 +156,26 @@ def _copy_name(record: PairRecord, eye: Eye, split: str, file: str) -> str:
     return f"{split}/{name}" if file == "all" else name
 
 
-def _log_missing_labels(log: ExportLog, record: PairRecord, eye: Eye, annotations: list[dict[str, Any]]) -> None:
-    """Log what the annotations of a view lack."""
+def log_missing_labels(log: ExportLog, record: PairRecord, eye: Eye, objects: int | None) -> None:
+    """Log what the annotations of a view lack.
+
+    Args:
+        log: counts it.
+        record: the truth.
+        eye: which view.
+        objects: number of annotated objects with masks, the drogue among them; 0 where the drogue has none, and None
+            where nothing is annotated.
+    """
     log_cut_labels(log, record, eye)
-    if not annotations:
+    if objects is None:
         return
     view = view_of(record, eye)
     log_absent_keypoints(log, view_keypoints(view, record.frame.rig.camera, 0), len(view.markers))
-    if "segmentation" not in annotations[0]:
+    if objects == 0:
         log.lost("views without masks, markers and hub: the dataset has no part ids of them")
         return
     features = len(view.markers) + (view.hub is not None)
-    log.lost("markers and hubs of which no pixel is seen: without a label", features - len(annotations) + 1)
+    log.lost("markers and hubs of which no pixel is seen: without a label", features - objects + 1)
 
 
 class _CocoFile:
@@ -326,32 +334,26 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
     view = view_of(record, eye)
     if view.box_visible_xywh_px is None:
         return []
-    pixels = _drogue_pixels(record, eye, part_id)
-    hub = [] if view.hub is None else [(HUB, int(Part.HUB), 1, view.hub)]
-    markers = [(MARKER, marker_id(index), 2 + index, marker) for index, marker in enumerate(view.markers)]
     image_id = coco_image_id(record.frame_index, eye)
     if image_id >= _FEATURE_ID_STEP:
         raise ValueError(f"frame {record.frame_index}: must be below {_FEATURE_ID_STEP // 2 - 1} for COCO's ids")
     entries = []
-    feature: FeatureView
-    for category, part, number, feature in [*hub, *markers]:
-        seen = pixels.feature(part)
-        if not len(seen):
-            continue
+    for seen in drogue_pixels(record, eye, part_id).features(view):
+        feature, index = seen.feature, seen.marker_index
         entries.append(
             {
-                "id": number * _FEATURE_ID_STEP + image_id,
+                "id": (1 if index is None else 2 + index) * _FEATURE_ID_STEP + image_id,
                 "image_id": image_id,
-                "category_id": category,
+                "category_id": HUB if index is None else MARKER,
                 "iscrowd": 0,
-                "bbox": seen.corner_box(),
-                "area": len(seen),
-                "segmentation": seen.segmentation(),
+                "bbox": seen.pixels.corner_box(),
+                "area": len(seen.pixels),
+                "segmentation": seen.pixels.segmentation(),
                 "keypoints": [0] * (3 * count),
                 "num_keypoints": 0,
                 NAMESPACE: {
                     "drogue_annotation_id": image_id,
-                    "marker_index": None if category == HUB else number - 2,
+                    "marker_index": index,
                     "center_proj": _corner_point(feature.center_proj_px),
                     "center_ellipse": _corner_point(feature.center_ellipse_px),
                     "visible_fraction": feature.visible_fraction,
@@ -369,14 +371,15 @@ def _drogue_mask(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> di
     Raises:
         ValueError: there are none, where the record has a box around some.
     """
-    pixels = _drogue_pixels(record, eye, part_id).drogue()
+    pixels = drogue_pixels(record, eye, part_id).drogue()
     if not len(pixels):
         path = f"{FRAMES_FOLDER}/{record.frame_index:06d}/{parts_file(eye)}"
         raise ValueError(f"{path}: no pixel shows the drogue in the visible box of the record; run droguekit validate")
     return pixels.segmentation()
 
 
-def _drogue_pixels(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> DroguePixels:
+def drogue_pixels(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> DroguePixels:
+    """Masks of a view that shows the drogue."""
     view = view_of(record, eye)
     assert view.box_visible_xywh_px is not None
     return DroguePixels(part_id, view.box_visible_xywh_px, len(view.markers))

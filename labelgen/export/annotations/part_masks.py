@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
-from datasets_manifest.types.records import PixelBox
+from datasets_manifest.types.records import FeatureView, PixelBox, ViewRecord
+from drogue_models.parts import Part, marker_id
 from labelgen.part_pixels import FeaturePixels, drogue_mask
 
 Indices = NDArray[np.int64]
@@ -53,8 +54,30 @@ class MaskPixels:
             float(int(self.rows.max()) - low_v + 1),
         ]
 
+    def crop(self) -> tuple[int, int, NDArray[np.bool_]]:
+        """First column and row of the box around the pixels, and (h, w) which pixels of the box they are."""
+        u, v, width, height = map(round, self.corner_box())
+        inside = np.zeros((height, width), dtype=np.bool_)
+        inside[self.rows - v, self.columns - u] = True
+        return u, v, inside
+
     def __len__(self) -> int:
         return len(self.columns)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFeature:
+    """A marker, or the hub, of which a pixel is seen.
+
+    Attributes:
+        marker_index: of the marker, None for the hub.
+        feature: its labels.
+        pixels: those that see it.
+    """
+
+    marker_index: int | None
+    feature: FeatureView
+    pixels: MaskPixels
 
 
 class DroguePixels:
@@ -81,9 +104,16 @@ class DroguePixels:
         """The whole drogue."""
         return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count)))
 
-    def feature(self, part: int) -> MaskPixels:
-        """One marker, or the hub."""
-        return self._set(*self._features.indices(part))
+    def features(self, view: ViewRecord) -> list[SeenFeature]:
+        """Hub and markers of which a pixel is seen."""
+        labels: list[tuple[int | None, FeatureView]] = [] if view.hub is None else [(None, view.hub)]
+        labels += list(enumerate(view.markers))
+        seen = []
+        for index, feature in labels:
+            pixels = self._set(*self._features.indices(int(Part.HUB) if index is None else marker_id(index)))
+            if len(pixels):
+                seen.append(SeenFeature(index, feature, pixels))
+        return seen
 
     def _set(self, columns: Indices, rows: Indices) -> MaskPixels:
         return MaskPixels(columns + self._low[0], rows + self._low[1], self._size_px)

@@ -21,12 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from datasets_manifest.atomic import new_folder
 from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices
+from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.frame import Sensor
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.pixel_values import PIXEL_VALUES_TOPIC, PixelValues
 from datasets_manifest.types.records import PairRecord
+from drogue_models.presets import PRESETS
 from geometry.body_axes import FLU_FROM_FRD
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
@@ -71,6 +73,7 @@ def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
         OSError: it cannot be written; nothing incomplete is left.
     """
     source = Dataset(dataset)
+    log.remarks.append(_drogue_remark(source.manifest.recipe))
     order = SequenceOrder()
     names = []
     with new_folder(out) as folder, ExitStack() as bag_is_open:
@@ -85,6 +88,16 @@ def write_rosbag(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             if record.left_from_drogue is None:
                 log.lost("pairs without a drogue have no pose")
     return [out / name for name in names]
+
+
+def _drogue_remark(recipe: Recipe) -> str:
+    """How to tell the command `import`, which takes a bag for one of the preset red-8, which drogue it shows."""
+    if recipe.variants:
+        return "shows several drogues, and import knows one for all pairs"
+    name = recipe.drogue.name
+    if PRESETS.get(name) != recipe.drogue:
+        return "import it with --drogue and a .toml file of the drogue, which is in the dataset's recipe.toml"
+    return f"import it with --drogue {name}"
 
 
 class _Bag:

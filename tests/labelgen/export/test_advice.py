@@ -35,6 +35,7 @@ FOLLOWED = {
     "; use opencv or ros-camera-info": "test_calibrations_for_a_third_radial_coefficient_hold_it",
     "; there are ": "test_the_formats_that_are_listed_exist",
     "--images: is for ": "test_the_formats_with_images_on_request_copy_them",
+    "--estimates: is for ": "test_the_formats_for_estimates_are_named",
     "pip install 'droguekit[": "test_the_extra_that_is_named_has_the_package",
     "; let `render` finish first": "test_a_dataset_whose_rendering_is_finished_is_exported",
     "; run droguekit validate": "test_validate_names_the_file_without_a_drogue",
@@ -106,6 +107,15 @@ def test_the_formats_with_images_on_request_copy_them(mixed_dataset: Path, tmp_p
     for name in named.split(", "):
         write_export(name, mixed_dataset, tmp_path / name, ExportLog(), image_bits=8)
         assert len(list((tmp_path / name).rglob("*.png"))) == 18
+
+
+def test_the_formats_for_estimates_are_named(mixed_dataset: Path, tmp_path: Path) -> None:
+    estimates = tmp_path / "estimates.jsonl"
+    estimates.write_text('{"status": "no_fix", "frame_index": 0, "method": "none", "reason": "dark"}\n')
+    advice = advice_of(lambda: write_export("coco", mixed_dataset, tmp_path / "no", ExportLog(), estimates=estimates))
+    (named,) = re.findall("is for (.*);", advice)
+    for name in named.split(", "):
+        assert write_export(name, mixed_dataset, tmp_path / name, ExportLog(), estimates=estimates)
 
 
 @pytest.mark.parametrize(("name", "package"), [("parquet", "pyarrow"), ("rosbag", "rosbags")])

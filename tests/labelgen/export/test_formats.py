@@ -22,7 +22,20 @@ from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import FORMATS, write_export
 from tests.support.drawn_pairs import Pair
 
-NAMES = ("coco", "yolo", "yolo-image-order", "yolo-detect", "speed", "kitti", "webdataset", "parquet", "blind")
+NAMES = (
+    "coco",
+    "yolo",
+    "yolo-image-order",
+    "yolo-detect",
+    "speed",
+    "kitti",
+    "webdataset",
+    "parquet",
+    "blind",
+    "cvat",
+    "label-studio",
+    "fiftyone",
+)
 # Those that fill a folder of their own; the others replace single files.
 FOLDERS = tuple(name for name in NAMES if name not in ("coco", "parquet"))
 

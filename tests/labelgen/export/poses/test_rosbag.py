@@ -15,8 +15,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
+from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import leftovers
+from droguekit.cli.main import DONE, run
 from geometry.se3 import RigidTransform
 from labelgen.export.export_log import ExportLog
 from labelgen.export.formats import write_export
@@ -153,3 +155,29 @@ def test_a_damaged_pair_leaves_no_bag_behind(small_dataset: Path, tmp_path: Path
     with pytest.raises(ValueError, match="frame 3: time_s: must be later"):
         write_export("rosbag", small_dataset, tmp_path / "bags", ExportLog())
     assert not (tmp_path / "bags").exists() and leftovers(tmp_path) == []
+
+
+def test_the_drogue_that_import_must_be_told_is_named(
+    small_dataset: Path, mixed_dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["export", str(small_dataset), "--format", "rosbag", "--out", str(tmp_path / "one")]) == DONE
+    name = Dataset(small_dataset).manifest.recipe.drogue.name
+    assert f"rosbag: import it with --drogue {name}\n" in capsys.readouterr().out
+    log = ExportLog()
+    write_export("rosbag", mixed_dataset, tmp_path / "several", log)
+    assert log.remarks == ["shows several drogues, and import knows one for all pairs"]
+
+
+def test_a_bag_of_a_bayer_sensor_is_imported_with_its_mosaics(
+    dataset_by_preset: Callable[..., Path], tmp_path: Path
+) -> None:
+    source = Dataset(dataset_by_preset("paper-colour"))
+    (bag,) = write_export("rosbag", source.path, tmp_path / "bags", ExportLog())
+    assert run(["import", str(bag), "--out", str(tmp_path / "imported")]) == DONE
+    imported = BlindDataset(tmp_path / "imported")
+    for place, index in enumerate(source.frame_indices):
+        got, want = imported.pair(place).images, source.images(index)
+        assert want.left_mosaic is not None and want.right_mosaic is not None
+        np.testing.assert_array_equal(got.left_mosaic, want.left_mosaic)
+        np.testing.assert_array_equal(got.right_mosaic, want.right_mosaic)
+        assert (got.encoding, got.black_level_dn, got.exposure_s) == ("linear", want.black_level_dn, want.exposure_s)
