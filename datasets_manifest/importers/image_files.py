@@ -10,7 +10,7 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 
 from datasets_manifest.types.images import Pixels
 
@@ -19,6 +19,9 @@ IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tif
 _UPRIGHT: Final = 1
 # OpenCV applies the EXIF orientation of these; TIFF has the same number as a tag of its own.
 _TURNED_BY_OPENCV: Final = ("JPEG", "MPO", "PNG", "TIFF")
+# Only files that begin or hold these can have an orientation or pages; Pillow decodes a whole PNG to look for it.
+_TIFF_AND_WEBP: Final = (b"II", b"MM", b"RIFF")
+_ORIENTATION_MARKS: Final = (b"Exif", b"eXIf", b"exif", b"adobe.xmp", b"rientation")
 
 
 def read_image(path: Path) -> tuple[Pixels, bool]:
@@ -68,16 +71,19 @@ def _orientation(data: NDArray[np.uint8], name: str) -> int:
     Raises:
         ValueError: it has an orientation that OpenCV does not apply, or several pages.
     """
+    file = data.tobytes()
+    if not file.startswith(_TIFF_AND_WEBP) and not any(mark in file for mark in _ORIENTATION_MARKS):
+        return _UPRIGHT
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(data.tobytes())) as image:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(file)) as image:
             warnings.simplefilter("ignore")
             kind, pages = image.format, int(getattr(image, "n_frames", 1))
             said = int(image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT))
             exif = Image.Exif()
             exif.load(image.info.get("exif", b""))
             applied = said if kind == "TIFF" else int(exif.get(ExifTags.Base.Orientation, _UPRIGHT))
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, TypeError, KeyError, OverflowError):
-        return _UPRIGHT  # whether it is an image at all, OpenCV decides
+    except Exception:  # whatever a damaged file makes its reader raise; whether it is an image, OpenCV decides
+        return _UPRIGHT
     if pages > 1 and kind != "MPO":
         raise ValueError(f"{name}: holds {pages} images; save each as a file of its own")
     said, applied = (number if 1 < number <= 8 else _UPRIGHT for number in (said, applied))

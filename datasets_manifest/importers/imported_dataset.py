@@ -278,7 +278,7 @@ class PixelDepth:
         if self.output_bits == 8:
             return image
         if int(image.max()) >= 2**self.bits:
-            raise ValueError(f"{name}: has values beyond {self.bits} bits; name the camera's bits")
+            raise ValueError(f"{name}: has values beyond {self.bits} bits; say by --bits how many the camera has")
         shift = self.bits - _KEPT_BITS
         return np.asarray(image >> shift if shift >= 0 else image << -shift, dtype=np.uint16)
 

@@ -27,7 +27,13 @@ _TEXT_TYPE = "std_msgs/msg/String"
 # A bag may be played into another namespace.
 _PIXEL_VALUES_NAME: Final = PIXEL_VALUES_TOPIC.rsplit("/", 1)[1]
 # Words of the left and the right topic's names; those of RealSense and EuRoC are numbered.
-_VIEW_WORDS = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("camera0", "camera1"))
+_VIEW_WORDS = (
+    ("left", "right"),
+    ("infra1", "infra2"),
+    ("Infrared_1", "Infrared_2"),
+    ("cam0", "cam1"),
+    ("camera0", "camera1"),
+)
 _RECTIFIED = re.compile(r"(?<![a-z])rect(?![a-z])|rectified")
 # Pairs that wait for an earlier time stamp; more would fill the memory, and come from clocks that were set.
 _MOST_WAITING = 256
@@ -187,7 +193,7 @@ class RosBag:
             reader.open()
         except Exception as error:  # whatever a damaged bag makes its reader raise
             message = " ".join(str(error).split()) or type(error).__name__
-            raise ValueError(f"{self._path}: is not a ROS bag: {message}") from error
+            raise ValueError(f"{self._path}: cannot be read as a ROS bag: {message}") from error
         try:
             yield reader
         finally:
@@ -218,6 +224,8 @@ def _stereo_topics(reader: AnyReader) -> tuple[str, str]:
     topics = {topic for topic in topics if not topic.endswith("/compressedDepth")}
     pairs = {(topic, topic.replace(left, right)) for topic in topics for left, right in _VIEW_WORDS if left in topic}
     pairs = {pair for pair in pairs if pair[1] in topics}
+    if len(topics) < len(EYES):
+        raise ValueError(f"topics: a pair needs two image topics; there are {_topics_of(reader, _IMAGE_TYPES)}")
     if len(pairs) != 1:
         raise ValueError(
             f"topics: {len(pairs)} pairs of image topics are named left and right; choose by --topics LEFT,RIGHT from "

@@ -175,8 +175,8 @@ def test_what_pixel_values_were_taken_for_is_said(
         ("nowhere", "nowhere: there is no such file or folder"),
         ("film.mp4", "film.mp4: must be a folder of images, or a ROS bag"),
         ("empty", "empty: holds no images"),
-        ("bad.mcap", "bad.mcap: is not a ROS bag"),
-        ("bad.db3", "bad.db3: is not a ROS bag"),
+        ("bad.mcap", "bad.mcap: cannot be read as a ROS bag"),
+        ("bad.db3", "bad.db3: cannot be read as a ROS bag"),
     ],
 )
 def test_source_is_checked_before_the_calibration(

@@ -100,7 +100,7 @@ def listing(folder: Path) -> dict[Path, Any]:
     }
 
 
-@fuzz(250)
+@fuzz(190)
 @given(damage=damages(), name=st.sampled_from([*FORMATS, "validate", "validate", "validate", "read", "blind"]))
 def test_damaged_datasets(whole: Path, damage: Damage, name: str) -> None:
     with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
