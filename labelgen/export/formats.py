@@ -79,7 +79,9 @@ FORMATS: dict[str, ExportFormat] = {
         "ROS 2 bags (MCAP): images, CameraInfo, TF, true pose", "labelgen.export.poses.rosbag:write_rosbag", "exports"
     ),
     "tum": ExportFormat(
-        "true trajectories as TUM text", "labelgen.export.poses.trajectories:write_tum", takes_estimates=True
+        "trajectories as TUM text: the truth, and estimates beside it for evo",
+        "labelgen.export.poses.trajectories:write_tum",
+        takes_estimates=True,
     ),
     "bop": ExportFormat(
         "BOP: two sensors, poses in mm, masks, models with symmetries", "labelgen.export.poses.bop:write_bop"

@@ -13,6 +13,7 @@ import OpenEXR
 from hypothesis import given
 from hypothesis import strategies as st
 
+from datasets_manifest.importers.coco_boxes import read_boxes
 from datasets_manifest.recipe.recipe import load_recipe, parse_recipe
 from datasets_manifest.storage.image_codecs import decode_exr, decode_png, read_passes
 from datasets_manifest.storage.layout import frame_folder
@@ -55,6 +56,25 @@ def test_damaged_estimates(edit: Edit, other: Edit, is_once: bool) -> None:
         path = Path(place) / "estimates.jsonl"
         path.write_bytes(data if is_once else other(data))
         quietly(lambda: list(read_estimates(path)))
+
+
+@fuzz(40)
+@given(edit=st.one_of(byte_edits(), json_edits()), other=byte_edits(), is_once=st.booleans())
+def test_damaged_boxes(edit: Edit, other: Edit, is_once: bool) -> None:
+    images = [
+        {"id": 1, "file_name": "flight\\\\3f2a9c01-left_1.png", "width": 160, "height": 120},
+        {"id": 2, "file_name": "right_1.png"},
+    ]
+    annotations = [
+        {"id": k, "image_id": k, "category_id": 1, "bbox": [10, 20, 5, 6], "attributes": {"rotation": 0}}
+        for k in (1, 2)
+    ]
+    table = {"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "drogue"}]}
+    with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
+        path = Path(place) / "boxes.json"
+        data = edit(json.dumps(table).encode())
+        path.write_bytes(data if is_once else other(data))
+        quietly(lambda: read_boxes(path).of_views([("left_1.png", "right_1.png")], (160, 120)))
 
 
 @fuzz(30)

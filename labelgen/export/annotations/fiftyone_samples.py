@@ -1,8 +1,8 @@
 """Datasets as FiftyOne reads them: groups of a left and a right image with detections and keypoints.
 
-`metadata.json` and `samples.json` are FiftyOne's own serialization without a version, from which it infers the fields,
-and which its importer `FiftyOneDataset` reads in every version since 0.18. Lengths are shares of the image's width and
-height, counted from its corner. Masks are compressed arrays of the boxes' pixels, as FiftyOne stores them.
+`metadata.json` and `samples.json` are FiftyOne's own serialization without a version, of which its importer
+`FiftyOneDataset` infers the fields. Lengths are shares of the image's width and height, counted from its corner. Masks
+are compressed arrays of the boxes' pixels, as FiftyOne stores them.
 
 Source: FiftyOne's documentation of `FiftyOneDataset`, grouped datasets and instance masks.
 """
