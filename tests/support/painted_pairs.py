@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -95,7 +94,7 @@ def expose(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray:
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
 
-def draw_eye(
+def paint_eye(
     rig: StereoRig,
     drogue: DrogueParameters | None,
     place: RigidTransform,
@@ -126,10 +125,16 @@ def paint_pair(
     drogue: DrogueParameters | None,
     place: RigidTransform,
     rng: np.random.Generator | None,
-    **kwargs: Any,
+    kind: str = "sky",
+    marker_rgb: Sequence[float] = (150.0, 9.0, 9.0),
+    hidden: Sequence[int] = (),
+    extra_discs: Sequence[tuple[float, float, float, float]] = (),
 ) -> StereoImages:
-    images = [expose(draw_eye(rig, drogue, place, eye, **kwargs), rng) for eye in EYES]
-    return StereoImages(images[0], images[1], time_s=0.0, exposure_s=1e-3)
+    """Both eyes' images, see `paint_eye`; without noise where there is no generator."""
+    left, right = (
+        expose(paint_eye(rig, drogue, place, eye, kind, marker_rgb, hidden, extra_discs), rng) for eye in EYES
+    )
+    return StereoImages(left, right, time_s=0.0, exposure_s=1e-3)
 
 
 # A quarter of the seed paper's pixels behind half its focal length, so that whole flights are quick to draw.
