@@ -16,7 +16,7 @@ from geometry.distortion import Lens
 from geometry.pinhole import PinholeCamera
 from geometry.stereo import Eye, StereoRig
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
-from scenes.sky.night import EXTINCTION_MAG, star_catalogue
+from scenes.sky.sky_models import EXTINCTION_MAG, star_catalogue
 
 _FAR_M = 1e9
 # Nearer to the horizon the air hides stars.

@@ -14,8 +14,15 @@ from datasets_manifest.types.estimates import Estimate, PoseEstimate, read_estim
 from droguekit.scoring.confidence_intervals import CONFIDENCE, fraction_interval
 from droguekit.scoring.poses.centroid_errors import CentroidErrors, centroid_errors
 from droguekit.scoring.poses.drogue_truth import DrogueTruth, drogue_truth
-from droguekit.scoring.poses.method_comparison import PAPER_METHOD, PairGroups, best_method, compare_methods
-from droguekit.scoring.poses.method_scores import FrameScore, frame_scores, summarize
+from droguekit.scoring.poses.method_scores import (
+    PAPER_METHOD,
+    FrameScore,
+    PairGroups,
+    best_method,
+    compare_methods,
+    frame_scores,
+    summarize,
+)
 from droguekit.scoring.poses.pose_errors import estimates_by_method
 from droguekit.scoring.poses.reference import DistanceBin, Reference, build_reference, distance_bins
 from droguekit.scoring.results.benchmark_result import (

@@ -40,8 +40,7 @@ def main() -> None:
     inbox: queue.SimpleQueue[FrameSetup | PictureRequest] = queue.SimpleQueue()
     threading.Thread(target=_read_requests, args=(requests, inbox, folder), daemon=True).start()
     try:
-        from render.blender_engine.blender_pictures import render_picture
-        from render.blender_engine.blender_scene import BlenderScene
+        from render.blender_engine.blender_scene import BlenderScene, render_picture
     except ImportError as error:
         _answer(answers, {"error": str(error)})
         return

@@ -28,8 +28,14 @@ from scenes.flight.dropouts import (
 )
 from scenes.flight.frame_kinematics import HOSE_OVERLAP_M, WORLD_FROM_TANKER, FrameKinematics
 from scenes.flight.hose_dynamics import HoseModel, drogue_rotation, still_mouth_direction
-from scenes.flight.receiver import desired_offsets_m, sample_attitude
-from scenes.flight.trajectory import SETTLING_S, SimulationInputs, Trajectory, simulate
+from scenes.flight.trajectory import (
+    SETTLING_S,
+    SimulationInputs,
+    Trajectory,
+    desired_offsets_m,
+    sample_attitude,
+    simulate,
+)
 from scenes.framing import outline_points_m
 
 _SINES = 8

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.environment import Environment
-from scenes.sky.night import lit_side_of_moon, moon_illuminance_lux, night_radiance
 from scenes.sky.photometry import (
     SOLAR_ILLUMINANCE_LUX,
     SUN_RADIUS_RAD,
@@ -18,7 +17,14 @@ from scenes.sky.photometry import (
     beam_transmission,
     direction_from_angles,
 )
-from scenes.sky.sky_models import DaylightSky, TwilightSky, twilight_illuminance_lux
+from scenes.sky.sky_models import (
+    DaylightSky,
+    TwilightSky,
+    lit_side_of_moon,
+    moon_illuminance_lux,
+    night_radiance,
+    twilight_illuminance_lux,
+)
 
 # Below the first elevation the sky is the twilight model's, above the second the daylight model's. [deg]
 _TWILIGHT_BELOW_DEG, _DAYLIGHT_ABOVE_DEG = 2.0, 9.0

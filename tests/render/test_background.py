@@ -8,8 +8,8 @@ from geometry.se3 import RigidTransform
 from render.background import add_stars, background
 from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
-from scenes.sky.night import star_catalogue
 from scenes.sky.photometry import luminance
+from scenes.sky.sky_models import star_catalogue
 from tests.support.recipe_builder import paper_view_recipe
 
 

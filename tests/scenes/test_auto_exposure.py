@@ -10,10 +10,9 @@ import pytest
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.frame import Exposure
 from drogue_models.parameters import WHITE_PAINT
-from scenes.auto_exposure import automatic_exposure
 from scenes.environment_radiance import environment_radiance
 from scenes.environment_sampling import environment_of_scene
-from scenes.sampler import sample_frame
+from scenes.sampler import automatic_exposure, sample_frame
 from scenes.sky.photometry import luminance
 from tests.support.recipe_builder import RecipeTable, build_recipe, stations
 

@@ -13,7 +13,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.types.estimates import read_estimates
 from drogue_models.marker_layout import marker_layout
-from droguekit.scoring.poses.method_comparison import best_method
+from droguekit.scoring.poses.method_scores import best_method
 from droguekit.scoring.report.figures import FEW_METHODS, QUANTITIES, error_panel, legend_key, method_styles
 from droguekit.scoring.report.html_page import RowGroup, Table, page_template
 from droguekit.scoring.report.label_drawing import contact_tiles

@@ -11,7 +11,7 @@ from datasets_manifest.random_streams import named_generator
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from droguekit.scoring.confidence_intervals import CONFIDENCE, RESAMPLES, mean_interval, root_mean_square
 from droguekit.scoring.poses.drogue_truth import DrogueTruth
-from droguekit.scoring.poses.method_comparison import PairGroups, compare_methods
+from droguekit.scoring.poses.method_scores import PairGroups, compare_methods
 from droguekit.scoring.poses.pose_errors import COMPONENTS, PoseError, nees_parts, normalized_squares, pose_error
 from droguekit.scoring.results.pose_result import MethodComparison
 from droguekit.scoring.results.sequence_result import CameraAxes, FilterErrors, Lag, MotionBin, MotionNees, MotionRow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.sequence_ranges import CLOSURE_ACCELERATION_M_S2, Follower, Receiver
-from scenes.flight.receiver import Guidance, closure_distance_m, desired_offsets_m
+from scenes.flight.trajectory import Guidance, closure_distance_m, desired_offsets_m
 
 
 def test_a_run_keeps_speed_and_acceleration() -> None:

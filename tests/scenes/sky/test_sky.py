@@ -7,8 +7,8 @@ from datasets_manifest.types.environment import CloudLayer, Environment, Moon
 from scenes.clouds.cloud_density import sample_texture
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.clear_sky import ClearSky
-from scenes.sky.night import moon_illuminance_lux, star_catalogue
 from scenes.sky.photometry import REC709_FROM_XYZ, direction_from_angles, hemisphere, luminance
+from scenes.sky.sky_models import moon_illuminance_lux, star_catalogue
 
 
 def environment(**changes: Moon | float | tuple[CloudLayer, ...]) -> Environment:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from droguekit.scoring.confidence_intervals import ratio_intervals
-from droguekit.scoring.poses.method_comparison import PairGroups, compare_methods
+from droguekit.scoring.poses.method_scores import PairGroups, compare_methods
 from droguekit.scoring.poses.pose_errors import PoseError
 from droguekit.scoring.poses.reference import DistanceBin
 

@@ -13,7 +13,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.estimates import NoFix, write_estimates
 from datasets_manifest.types.records import PairRecord
 from droguekit.scoring.pose_benchmark import run_benchmark
-from droguekit.scoring.poses.method_comparison import best_method
+from droguekit.scoring.poses.method_scores import best_method
 from droguekit.scoring.report.figures import QUANTITIES, error_panel, method_styles
 from droguekit.scoring.report.label_drawing import contact_tiles, label_picture
 from droguekit.scoring.report.number_text import distance_text, percent, plain_number, three_digits
