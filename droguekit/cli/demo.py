@@ -7,10 +7,13 @@ from typing import Annotated
 
 import typer
 
+from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import RecipeArgument, WorkersOption, output_option
 from droguekit.cli.main import FAULT
-from droguekit.workflows.demonstration import run_demo
+from droguekit.workflows.benchmarking import benchmark_dataset
+from droguekit.workflows.navigation import navigate_dataset
+from droguekit.workflows.rendering import open_recipe, render_frames
 
 EXAMPLES = (
     "droguekit demo",
@@ -28,10 +31,20 @@ def demo(
 
     Writes dataset/, estimates.jsonl, benchmark.json and report.html. Run again, it keeps pairs that exist.
     """
-    files, summary = run_demo(recipe, out, workers, progress_report())
-    typer.echo(f"{summary.pairs} pairs in {files.dataset}, dataset sha256 {summary.dataset_sha256}")
-    typer.echo(f"numbers in {files.benchmark}")
-    typer.echo(f"open {files.report} in a browser to see how accurate the pose is at each distance")
+    dataset, estimates, numbers, page = (
+        out / name for name in ("dataset", "estimates.jsonl", "benchmark.json", "report.html")
+    )
+    source, show = open_recipe(recipe, None, None), progress_report()
+    count = source.recipe.frames.count
+    show.say(f"1 of 3: rendering {count} stereo pairs into {dataset}")
+    summary = render_frames(source, dataset, range(count), ExecutionOptions(workers), show)
+    show.say("2 of 3: estimating poses by every method, without the truth")
+    navigate_dataset(dataset, (), estimates, show)
+    show.say("3 of 3: comparing the estimates with the truth")
+    benchmark_dataset(dataset, estimates, numbers, page)
+    typer.echo(f"{summary.pairs} pairs in {dataset}, dataset sha256 {summary.dataset_sha256}")
+    typer.echo(f"numbers in {numbers}")
+    typer.echo(f"open {page} in a browser to see how accurate the pose is at each distance")
     if summary.drops:
-        typer.echo(f"{len(summary.drops)} pairs could not be made; {files.dataset}/manifest.json says why", err=True)
+        typer.echo(f"{len(summary.drops)} pairs could not be made; {dataset}/manifest.json says why", err=True)
         raise typer.Exit(FAULT)

@@ -1,16 +1,121 @@
-"""Run a detector on a dataset, without its truth."""
+"""The detector: trained from recipes and datasets, which needs torch, and run on a dataset without its truth.
+
+Packages are imported where they are used, so that `--help` stays fast.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from datasets_manifest.storage.storage import as_location
+from droguekit.batch.execution import ExecutionOptions
+from droguekit.workflows.rendering import open_recipe, render_frames
 
 if TYPE_CHECKING:
+    from datasets_manifest.recipe.recipe import RecipeSource
     from datasets_manifest.storage.storage import Location
     from droguekit.batch.progress import ProgressReport
     from droguekit.scoring.results.detection_result import DetectedBox, PairTimes
+    from nav.training.training_run import TrainingResult
+
+_NEEDED = ("torch", "onnx", "onnxscript", "tensorboard")
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """What a detector is trained on, and how.
+
+    Attributes:
+        sources: folders or URLs of datasets, and recipes to render.
+        settings_file: TOML of training settings, or None.
+        changes: to both the file and the defaults; None changes nothing.
+        size, final_size: `HEIGHTxWIDTH` of the network's input, or None for what file and defaults say.
+        cache: folder for resized images, or None for one in the training's folder.
+        start_from: shipped detector or file of initial weights, or None for random ones.
+        workers: processes that render; as many as cores and memory allow when None.
+    """
+
+    sources: tuple[str, ...]
+    settings_file: Path | None
+    changes: dict[str, Any]
+    size: str | None
+    final_size: str | None
+    cache: Path | None
+    start_from: str | None
+    workers: int | None
+
+
+def _find_source(source: str) -> Location | RecipeSource:
+    location = as_location(source)
+    if isinstance(location, str) or location.is_dir():
+        return location
+    return open_recipe(source, None, None)
+
+
+def _render_source(source: RecipeSource, out: Path, workers: int | None, report: ProgressReport) -> Path:
+    """Render the missing pairs of a recipe; returns the dataset's folder."""
+    recipe, place = source.recipe, out / "datasets" / source.recipe.name
+    report.say(f"rendering {recipe.frames.count} stereo pairs of {recipe.name} into {place}")
+    summary = render_frames(source, place, range(recipe.frames.count), ExecutionOptions(workers), report)
+    for drop in summary.drops:
+        report.say(f"{place}: frame {drop.frame_index} is missing: {drop.reason}")
+    return place
+
+
+def train_detector(options: TrainingOptions, out: Path, report: ProgressReport) -> TrainingResult:
+    """Render what is missing, train, evaluate and export.
+
+    Raises:
+        ValueError: a wrong setting, a dataset that cannot be used, or a folder of another training.
+        OSError: a file cannot be written.
+        KeyboardInterrupt: the user asked to stop, and the state is saved.
+    """
+    from datasets_manifest.recipe.recipe import RecipeSource
+    from droguekit.batch.stop_request import StopRequest
+    from nav.training.training_settings import build_settings, parse_size
+
+    changes = {name: value for name, value in options.changes.items() if value is not None}
+    sizes = {"size_px": options.size, "final_size_px": options.final_size}
+    parsed = {name: parse_size(text) for name, text in sizes.items() if text is not None}
+    missing = [name for name in _NEEDED if find_spec(name) is None]
+    if missing:
+        raise ValueError(f"train: {', '.join(missing)} is missing: pip install 'droguekit[train]'")
+    # Otherwise torch's threads wait by spinning, which wastes time where other processes use the cores too.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from nav.training.starting_weights import read_starting_weights
+
+    start = None if options.start_from is None else read_starting_weights(options.start_from)
+    network = None if start is None or start.network is None else start.network.to_dict()
+    settings = build_settings(options.settings_file, {**changes, **parsed}, network)
+    found = [_find_source(source) for source in options.sources]
+    from nav.training.training_run import check_training, train
+
+    # Rendering takes hours, so errors that would stop the training are found first.
+    if not any(not isinstance(each, RecipeSource) or each.recipe.split.train > 0 for each in found):
+        raise ValueError(f"{options.sources[0]}: has no split to train on; give the recipe `[split] train` above 0")
+    check_training(out, settings, start)
+    datasets = [
+        _render_source(each, out, options.workers, report) if isinstance(each, RecipeSource) else each for each in found
+    ]
+    with StopRequest(report.say) as stop:
+        return train(datasets, out, settings, report, options.cache, lambda: stop.is_requested, start)
+
+
+def training_lines(result: TrainingResult) -> Iterator[str]:
+    """Scores of a training, and the file of its network."""
+    for split, reached in (("val", result.validation), ("test", result.test)):
+        if reached is not None:
+            ap50, ap75, ap, recall50 = (
+                f"{100 * value:.2f} %" for value in (reached.ap50, reached.ap75, reached.ap, reached.recall50)
+            )
+            yield f"{split}: AP50 {ap50}, AP75 {ap75}, AP {ap}, recall at an overlap of 0.5 {recall50}"
+    threshold = f"{result.score_threshold:.3f}"
+    yield f"{result.file}: the weights after {result.best_step} steps, score threshold {threshold}"
 
 
 @dataclass(frozen=True)

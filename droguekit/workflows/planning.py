@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from datasets_manifest.recipe.recipe import Recipe
     from datasets_manifest.storage.manifest import Drop
-    from droguekit.batch.cost_estimate import CostEstimate
+    from droguekit.batch.frame_cost import CostEstimate
     from droguekit.batch.recipe_plan import LawCheck, RecipePlan
 
 _BAR_LENGTH = 40
@@ -41,8 +41,8 @@ def plan_lines(
         ValueError: no such recipe or engine, a wrong number, or none of the first frames can be made.
         OSError: the page or the temporary folder cannot be written.
     """
-    from droguekit.batch.cost_estimate import probe_cost
     from droguekit.batch.execution import default_workers
+    from droguekit.batch.frame_cost import probe_cost
     from droguekit.batch.recipe_plan import frame_timeout_s, plan_recipe
 
     if workers is not None and (not probe or workers < 1):
@@ -145,7 +145,7 @@ def _verdict(check: LawCheck) -> str:
 
 def cost_lines(cost: CostEstimate, workers: int) -> Iterator[str]:
     """The estimated time and size of a run by so many workers, and the measurements behind it."""
-    from droguekit.batch.cost_estimate import cpu_s
+    from droguekit.batch.frame_cost import cpu_s
 
     yield "measured, with one worker, once it was warm:"
     for frame_index, report in cost.probed.items():

@@ -12,8 +12,8 @@ from droguekit.workflows.rendering import open_recipe
 
 if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe
+    from droguekit.batch.frame_cost import MeasuredFrame
     from droguekit.batch.frame_task import FrameReport
-    from droguekit.batch.frame_timing import MeasuredFrame
 
 QUALITIES = ("corpus", "benchmark")
 
@@ -32,7 +32,7 @@ def render_timing_lines(repeat: int, pairs: int, workers: int | None, engine: st
         OSError: a process died, or a temporary folder cannot be written.
     """
     from droguekit.batch.execution import default_workers
-    from droguekit.batch.frame_timing import frames_per_second, measure_frames, warm_up_frames
+    from droguekit.batch.frame_cost import frames_per_second, measure_frames, warm_up_frames
 
     workers = default_workers() if workers is None else workers
     if workers < 1:

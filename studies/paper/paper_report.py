@@ -20,7 +20,17 @@ from droguekit.scoring.report.html_page import RowGroup, Table, page_template
 from droguekit.scoring.report.number_text import ABSENT, plain_number, three_digits
 from droguekit.scoring.results.detection_result import DetectionResult
 from droguekit.scoring.sequences.sequence_latency import processing_time_s
-from studies.paper.docking_experiment import DockingData, DockingRun, read_docking
+from studies.paper.docking_experiment import (
+    BOX_COLOR,
+    CENTROID_COLOR,
+    ESTIMATED_COLOR,
+    TRUE_COLOR,
+    DockingData,
+    DockingRun,
+    failure_reasons,
+    read_docking,
+    worst_frames,
+)
 from studies.paper.paper_figures import (
     AXES,
     PITCH,
@@ -63,14 +73,6 @@ from studies.paper.published_results import (
     style_of,
 )
 from studies.paper.semi_physical import SemiPhysicalRun, read_semi_physical
-from studies.paper.worst_frames import (
-    BOX_COLOR,
-    CENTROID_COLOR,
-    ESTIMATED_COLOR,
-    TRUE_COLOR,
-    failure_reasons,
-    worst_frames,
-)
 
 _PERCENTILES = (50, 90, 99)
 

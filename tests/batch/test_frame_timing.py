@@ -7,9 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
+import droguekit.batch.frame_cost as measure
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
-from droguekit.batch import frame_timing as measure
-from droguekit.batch.frame_timing import frames_per_second, warm_up_frames
+from droguekit.batch.frame_cost import frames_per_second, warm_up_frames
 from tests.support.batch_datasets import ANALYTIC_RECIPE
 
 

@@ -9,7 +9,7 @@ import typer
 
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import WorkersOption, output_option
-from droguekit.workflows.training import TrainingOptions, train_detector, training_lines
+from droguekit.workflows.detection import TrainingOptions, train_detector, training_lines
 
 EXAMPLES = (
     "droguekit train detector-small --out out/detector   (renders the recipe first)",

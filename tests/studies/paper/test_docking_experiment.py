@@ -16,10 +16,9 @@ from datasets_manifest.types.estimates import read_estimates, write_estimates
 from drogue_models.marker_layout import marker_layout
 from droguekit.scoring.report.html_page import Table
 from droguekit.scoring.report.number_text import ABSENT
-from studies.paper.docking_experiment import read_docking
+from studies.paper.docking_experiment import clipped, failure_reasons, outlines_px, read_docking, worst_frames
 from studies.paper.paper_report import failure_table, time_table
 from studies.paper.paper_tables import docking_claims, docking_table
-from studies.paper.worst_frames import clipped, failure_reasons, outlines_px, worst_frames
 
 WriteEstimates = Callable[..., Path]
 OFFSETS = {"paper": (0.003, -0.001, 0.020), "joint-hub": (0.0, 0.0, 0.0001), "somebody-else": (0.5, 0.0, 0.0)}

@@ -12,7 +12,8 @@ import pytest
 
 from datasets_manifest.recipe.recipe import Recipe, parse_recipe
 from datasets_manifest.storage.manifest import Drop
-from droguekit.batch.cost_estimate import (
+from droguekit.batch.failure_policy import make_drop
+from droguekit.batch.frame_cost import (
     CostEstimate,
     ProbeResult,
     choose_probe_frames,
@@ -21,7 +22,6 @@ from droguekit.batch.cost_estimate import (
     make_in_turn,
     probe_cost,
 )
-from droguekit.batch.failure_policy import make_drop
 from droguekit.batch.frame_task import FrameReport
 from droguekit.batch.recipe_plan import RecipePlan, plan_recipe
 from droguekit.batch.worker_pool import WorkerLimits
