@@ -6,7 +6,7 @@ import struct
 import tempfile
 import zlib
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import cv2
 import numpy as np
@@ -92,8 +92,51 @@ _EXR_PLAIN_VERSIONS = (2, 2 | 0x400)
 _EXR_MAX_HEADER_BYTES = 65536
 
 
+class EyePasses(Protocol):
+    """Radiance and passes of one eye, as an engine gives them."""
+
+    @property
+    def radiance_cd_m2(self) -> NDArray[np.float32]:
+        """(H, W, 3). [cd/m2]"""
+        ...
+
+    @property
+    def depth_m(self) -> NDArray[np.float32]:
+        """(H, W) planar depth, inf for sky. [m]"""
+        ...
+
+    @property
+    def normal(self) -> NDArray[np.float32]:
+        """(H, W, 3) in the eye's frame."""
+        ...
+
+    @property
+    def part_id(self) -> NDArray[np.uint8]:
+        """(H, W)."""
+        ...
+
+
+def encode_passes(seen: EyePasses) -> bytes:
+    """A single-part float32 EXR file: radiance as `R G B`, `depth.Z`, `normal.X/Y/Z`, part id as `id.X`."""
+    import OpenEXR
+
+    channels = {
+        **{name: seen.radiance_cd_m2[..., index] for index, name in enumerate("RGB")},
+        "depth.Z": seen.depth_m,
+        **{f"normal.{name}": seen.normal[..., index] for index, name in enumerate("XYZ")},
+        "id.X": seen.part_id.astype(np.float32),
+    }
+    # ZIP is what cv2, Mitsuba and Blender all read.
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    contiguous = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()}
+    with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
+        path = Path(folder) / "passes.exr"
+        OpenEXR.File(header, contiguous).write(str(path))
+        return path.read_bytes()
+
+
 def read_passes(data: bytes, name: str, camera: PinholeCamera) -> dict[str, NDArray[np.float32]]:
-    """(H, W) by channel: radiance [cd/m2], planar depth [m], normal and part id (`render.exr_writer`).
+    """(H, W) by channel: radiance [cd/m2], planar depth [m], normal and part id (`encode_passes`).
 
     Args:
         data: the whole file.

@@ -13,6 +13,7 @@ from functools import cache
 import cv2
 
 from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.storage.image_codecs import encode_passes
 from datasets_manifest.storage.layout import passes_file
 from datasets_manifest.storage.packing import Packing, pack_if_complete
 from datasets_manifest.storage.storage import Location
@@ -23,7 +24,6 @@ from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
 from render.engine import EyeRadiance, RenderEngine, StereoRadiance, load_engine
-from render.exr_writer import encode_passes
 from scenes.sampler import sample_frame
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.storage.image_codecs import read_passes
+from datasets_manifest.storage.image_codecs import encode_passes, read_passes
 from datasets_manifest.storage.layout import frame_folder
 from datasets_manifest.storage.manifest import Drop, build_manifest, read_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame
@@ -17,7 +17,6 @@ from drogue_models.parts import FIRST_MARKER_ID
 from geometry.stereo import EYES
 from labelgen.validation.dataset_checks import ValidationReport, validate_dataset
 from render.engine import EyeRadiance
-from render.exr_writer import encode_passes
 from tests.support.drawn_pairs import Pair
 
 SPLITS = ("train", "val", "test")

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.storage.image_codecs import encode_passes
 from datasets_manifest.storage.manifest import build_manifest, write_manifest
 from datasets_manifest.storage.writer import encode_files, write_frame
 from drogue_models.parts import drogue_part_ids
@@ -18,7 +19,6 @@ from geometry.pinhole import PinholeCamera
 from geometry.stereo import EYES, Eye
 from labelgen.export.export_log import ExportLog
 from labelgen.export.poses.bop import depth_numbers, write_bop
-from render.exr_writer import encode_passes
 from tests.support.drawn_pairs import Pair
 from tests.support.recipe_builder import build_recipe, stations
 
