@@ -15,16 +15,17 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from geometry.stereo import Eye
 from render.compositing import Compositor
 from render.mitsuba_engine.jit_arrays import jit_array
-from render.mitsuba_engine.paths.rays import FrameRays, SampledLight, means_by_pixel, with_duplicates
-from render.mitsuba_engine.paths.sample_allocation import (
-    PILOT_COUNT,
-    NoiseBudget,
+from render.mitsuba_engine.paths.rays import (
+    FrameRays,
+    SampledLight,
     StratifiedSamples,
     chunks_by_count,
+    means_by_pixel,
+    with_duplicates,
 )
 from render.mitsuba_engine.paths.sun_sky_integrator import trace_direct
 from render.mitsuba_engine.paths.surface_light import SMOOTHING_M, SurfaceLight
-from render.mitsuba_engine.render_noise import DUPLICATE_EVERY
+from render.mitsuba_engine.render_noise import DUPLICATE_EVERY, PILOT_COUNT, NoiseBudget
 from render.mitsuba_engine.trace_request import SamplingPlan
 
 MOST_SMOOTHING_STEPS = 2.5

@@ -1,7 +1,11 @@
-"""Rays of a frame in the stage's axes, through any place of a pixel at any time of the exposure."""
+"""Rays of a frame in the stage's axes, through any place of a pixel at any time of the exposure.
+
+`StratifiedSamples` are the places and moments of rays whose number differs from pixel to pixel.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,7 +23,7 @@ from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import pose_polynomial
 from render.mitsuba_engine.jit_arrays import jit_array
 from render.mitsuba_engine.paths.sun_sky_integrator import SceneLights, SkyIrradiance
-from render.mitsuba_engine.render_noise import DUPLICATE_EVERY
+from render.mitsuba_engine.render_noise import DUPLICATE_EVERY, LEAST_COUNT, MOST_COUNT
 from render.mitsuba_engine.scene import DrogueScene, as_mitsuba_reads, by_shape
 from render.mitsuba_engine.trace_request import SamplingPlan
 from scenes.environment_radiance import EnvironmentRadiance
@@ -198,3 +202,74 @@ def rows_of(vector: Any) -> NDArray[np.float32]:
 def with_duplicates(pixel: NDArray[np.int64]) -> NDArray[np.int64]:
     """Pixels, followed by one in `DUPLICATE_EVERY` of them a second time."""
     return np.concatenate([pixel, pixel[::DUPLICATE_EVERY]])
+
+
+class StratifiedSamples:
+    """Places and moments of samples whose number differs from pixel to pixel; one kernel serves all numbers.
+
+    Places are the first two dimensions of the Sobol sequence and moments the third, with their bits flipped at random
+    for each pixel. Any power of two of them is stratified in every division of a pixel into that many equal rectangles.
+
+    Source: I. M. Sobol', USSR Computational Mathematics and Mathematical Physics 7 (1967), 86,
+    doi:10.1016/0041-5553(67)90144-9.
+    """
+
+    def __init__(self, rays: FrameRays, pixel: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
+        """Take (P,) flat indices, and how many samples each pixel takes: multiples of `LEAST_COUNT`."""
+        self._counts, self._first = counts, np.cumsum(counts) - counts
+        row = jit_array(mi.UInt32, np.repeat(np.arange(len(pixel), dtype=np.uint32), counts))
+
+        def of_row(values: NDArray[np.generic]) -> mi.UInt32:
+            return dr.gather(mi.UInt32, jit_array(mi.UInt32, values), row)
+
+        index = dr.arange(mi.UInt32, int(counts.sum())) - of_row(self._first)
+        flips = rays.random_bits(3, len(pixel))
+        self.pixel = of_row(pixel)
+        self.place = mi.Point2f(
+            _unit_interval(dr.brev(index) ^ of_row(flips[0])),
+            _unit_interval(_sobol(index, (1,)) ^ of_row(flips[1])),
+        )
+        self.moment = _unit_interval(_sobol(index, (1, 3)) ^ of_row(flips[2]))
+
+    def means(self, channels: list[mi.Float]) -> NDArray[np.float32]:
+        """(P, len(channels)) means over the samples of each pixel."""
+        # Without this evaluation every sum would trace the rays again.
+        dr.eval(channels)
+        first = self._first // LEAST_COUNT
+        sums = [np.add.reduceat(np.array(dr.block_sum(channel, LEAST_COUNT)), first) for channel in channels]
+        means: NDArray[np.float32] = np.stack(sums, axis=-1) / self._counts[:, None].astype(np.float32)
+        return means
+
+
+def chunks_by_count(pixel: NDArray[np.int64], counts: NDArray[np.int64]) -> Iterator[tuple[NDArray, NDArray]]:  # type: ignore[type-arg]
+    """Pixels and their counts of samples, in chunks of about `MOST_LANES` samples."""
+    launch = np.cumsum(counts) // MOST_LANES
+    for rows in np.split(np.arange(len(pixel)), np.flatnonzero(np.diff(launch)) + 1):
+        if len(rows):
+            yield pixel[rows], counts[rows]
+
+
+def _sobol(index: mi.UInt32, initial: tuple[int, ...]) -> mi.UInt32:
+    """One dimension of the Sobol sequence as 32-bit binary fractions, for indices below `MOST_COUNT`.
+
+    Args:
+        index: positions in the sequence.
+        initial: first numbers of its recurrence, as many as the degree of its polynomial, whose coefficients are 1.
+    """
+    numbers = list(initial)
+    bits = mi.UInt32(0)
+    for place in range(MOST_COUNT.bit_length() - 1):
+        if place >= len(initial):
+            degree = len(initial)
+            number = numbers[-degree] << degree ^ numbers[-degree]
+            for back in range(1, degree):
+                number ^= numbers[-back] << back
+            numbers.append(number)
+        direction = numbers[place] << 31 - place
+        bits ^= dr.select((index & (1 << place)) != 0, mi.UInt32(direction), 0)
+    return bits
+
+
+def _unit_interval(bits: mi.UInt32) -> mi.Float:
+    """A 32-bit binary fraction as a number in [0, 1)."""
+    return mi.Float(bits >> 8) * mi.Float(2.0**-24)

@@ -16,7 +16,7 @@ from scenes.sampler import sample_frame
 from tests.support.recipe_builder import paper_view_recipe
 
 if TYPE_CHECKING:
-    from render.mitsuba_engine.paths.sample_allocation import StratifiedSamples
+    from render.mitsuba_engine.paths.rays import StratifiedSamples
 
 pytestmark = pytest.mark.mitsuba
 
@@ -33,14 +33,14 @@ class Bits:
 
 @pytest.fixture
 def place(engine: RenderEngine) -> type[StratifiedSamples]:
-    from render.mitsuba_engine.paths.sample_allocation import StratifiedSamples
+    from render.mitsuba_engine.paths.rays import StratifiedSamples
 
     return StratifiedSamples
 
 
 @pytest.fixture
 def counts_of(engine: RenderEngine) -> Callable[..., Any]:
-    from render.mitsuba_engine.paths.sample_allocation import counts_by_variance
+    from render.mitsuba_engine.render_noise import counts_by_variance
 
     return counts_by_variance
 
@@ -73,7 +73,7 @@ def test_numbers_are_those_of_sobol(engine: RenderEngine) -> None:
     import mitsuba as mi
     from scipy.stats.qmc import Sobol
 
-    from render.mitsuba_engine.paths.sample_allocation import _sobol
+    from render.mitsuba_engine.paths.rays import _sobol
 
     index = dr.arange(mi.UInt32, 64)
     ours = np.stack([np.array(dr.brev(index)), np.array(_sobol(index, (1,))), np.array(_sobol(index, (1, 3)))], axis=1)
@@ -132,7 +132,7 @@ def test_even_pixels_take_the_fewest_rays(counts_of: Callable[..., Any]) -> None
 def test_rays_that_agree_do_not_prove_a_pixel_even(engine: RenderEngine) -> None:
     """Nine rays miss what fills a twentieth of a pixel three times in five."""
     from render.compositing import Compositor, TracedEye
-    from render.mitsuba_engine.paths.sample_allocation import NoiseBudget
+    from render.mitsuba_engine.render_noise import NoiseBudget
 
     frame = sample_frame(paper_view_recipe(scale=0.1), 0)
     shape = (frame.rig.camera.height_px, frame.rig.camera.width_px)
