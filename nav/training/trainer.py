@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import sample_generator
 from nav.detector.input_image import PADDING_DN
-from nav.detector.network.detection_loss import DetectionLoss, detection_loss
+from nav.detector.network.head import DetectionLoss, detection_loss
 from nav.training.corpus import Corpus, EyeIndex
 from nav.training.evaluation import ValidationScores, average_precision, measure_batch_statistics, predict, to_tensor
 from nav.training.geometric_augmentation import (

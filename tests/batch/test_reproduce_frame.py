@@ -14,8 +14,8 @@ from datasets_manifest.storage.layout import RECORD_FILE, frame_folder
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.writer import write_frame
 from datasets_manifest.types.records import PairRecord
+from droguekit.batch.frame_task import reproduce_frame
 from droguekit.batch.render_dataset import describe_dataset
-from droguekit.batch.reproduce_frame import reproduce_frame
 
 Change = Callable[[dict[str, Any]], None]
 

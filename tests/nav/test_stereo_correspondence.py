@@ -15,8 +15,8 @@ from geometry.stereo import EYES, Eye, paper_rig
 from nav.centroids.binary_centroids import BinaryCentroids, quantisation_variance_px2
 from nav.matching.blobs import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
+from nav.navigator import correspond
 from nav.pose.pose_method import NoFixReason, Observation
-from nav.stereo_correspondence import correspond
 from tests.support.painted_pairs import make_pose
 
 RIG = paper_rig()

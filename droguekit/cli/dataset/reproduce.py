@@ -21,7 +21,7 @@ def reproduce(
     On the same processor with the same packages, both must be identical bit for bit. Elsewhere the random draws must be
     equal and the labels agree within 1e-9. The command says which of the two holds, and exits with 1 when neither does.
     """
-    from droguekit.batch.reproduce_frame import reproduce_frame
+    from droguekit.batch.frame_task import reproduce_frame
 
     result = reproduce_frame(dataset, frame)
     for difference in result.build_differences:

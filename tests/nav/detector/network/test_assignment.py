@@ -5,8 +5,7 @@ import pytest
 import torch
 from pycocotools import mask
 
-from nav.detector.network.detection_loss import assign_anchors, complete_iou, intersection_over_union
-from nav.detector.network.head import anchor_points, decode_boxes
+from nav.detector.network.head import anchor_points, assign_anchors, complete_iou, decode_boxes, intersection_over_union
 
 CELLS = anchor_points([torch.zeros(1, 5, 128 // stride, 160 // stride) for stride in (8, 16, 32)])
 MAX_CELLS = 10

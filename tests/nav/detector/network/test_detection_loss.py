@@ -4,7 +4,7 @@ import pytest
 import torch
 from pycocotools import mask
 
-from nav.detector.network.detection_loss import detection_loss
+from nav.detector.network.head import detection_loss
 from nav.detector.network.network import NetworkConfig
 from nav.detector.output_maps import STRIDES, decode_maps
 from tests.support.detector_networks import make_network
