@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from importlib.metadata import EntryPoint, entry_points
 
-from nav.pose.baselines import circle_fit, constant, disparity_plane, mean_plane
 from nav.pose.joint import joint, joint_hub, joint_robust
 from nav.pose.monocular import mono_circle, mono_ippe, mono_lm, mono_sqpnp
-from nav.pose.paper import paper, paper_literal
 from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
+from nav.pose.triangulation_methods import circle_fit, constant, disparity_plane, mean_plane, paper, paper_literal
 
 ENTRY_POINT_GROUP = "droguekit.pose_estimators"
 

@@ -15,12 +15,11 @@ from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform, angles_from_axis, log_twist
 from geometry.stereo import EYES, paper_rig
 from nav.pose.adjustment import adjust
-from nav.pose.baselines import mean_plane
 from nav.pose.features import observed_features
 from nav.pose.joint import joint
 from nav.pose.method_registry import METHODS
-from nav.pose.paper import paper, triple_circles
 from nav.pose.pose_method import NoFixReason, Observation, Solution
+from nav.pose.triangulation_methods import mean_plane, paper, triple_circles
 from tests.support.painted_pairs import draw_poses, make_pose
 
 RIG = paper_rig()

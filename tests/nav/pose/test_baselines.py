@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from drogue_models.marker_layout import MarkerLayout
-from nav.pose.baselines import circle_fit, disparity_plane, fit_circle_center, mean_plane
 from nav.pose.pose_method import NoFixReason, Observation
+from nav.pose.triangulation_methods import circle_fit, disparity_plane, fit_circle_center, mean_plane
 from tests.support.painted_pairs import draw_poses
 
 

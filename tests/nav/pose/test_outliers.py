@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nav.pose.baselines import mean_plane
 from nav.pose.joint import joint, joint_robust
-from nav.pose.paper import _row_differences, paper, paper_literal, paper_reading, three_sphere_candidates
 from nav.pose.pose_method import NoFixReason, Solution, StatedTolerances
+from nav.pose.triangulation_methods import (
+    _row_differences,
+    mean_plane,
+    paper,
+    paper_literal,
+    paper_reading,
+    three_sphere_candidates,
+)
 from tests.support.painted_pairs import Draws, draw_poses
 
 

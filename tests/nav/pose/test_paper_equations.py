@@ -11,8 +11,8 @@ import pytest
 from drogue_models.parameters import even_ring
 from geometry.se3 import rotation_from_angles
 from geometry.stereo import EYES, paper_rig
-from nav.pose.paper import paper, paper_with_step, triple_circles
 from nav.pose.pose_method import Solution
+from nav.pose.triangulation_methods import paper, paper_with_step, triple_circles
 from tests.support.painted_pairs import draw_poses, make_pose
 
 RIG = paper_rig()
