@@ -31,6 +31,8 @@ from scenes.flight.hose_dynamics import LINKS, TIME_STEP_S, HoseModel, HoseState
 _WORLD_FROM_LEVEL_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # Our choice: the response to a step overshoots by 1.5 %.
 _DAMPING = 0.8
+# Time in which hose and receiver forget their initial state: the slowest swing dies out within a few periods.
+SETTLING_S = 20.0
 
 
 def sample_attitude(rng: np.random.Generator, pose: PoseRanges) -> Array:
@@ -144,10 +146,6 @@ class Guidance:
         # The velocity is that of the previous step, as the next one is younger than the delay.
         older, newer = self._drogue_history[int(at) - 1 : int(at) + 1]
         return newer + (at - int(at)) * (newer - older), (newer - older) / self._period_s
-
-
-# Time in which hose and receiver forget their initial state: the slowest swing dies out within a few periods.
-SETTLING_S = 20.0
 
 
 @dataclass(frozen=True, eq=False)
