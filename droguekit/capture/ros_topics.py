@@ -13,8 +13,9 @@ from droguekit.capture.stereo_source import CapturedImage, LoadedImage
 from nav.realtime import Clock
 
 _TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_VIEWS = ("left", "right")
 _SPIN_S = 0.1
+# Messages that wait in ROS, as in its profile of sensor data.
+_DEPTH = 5
 
 
 class RosTopics:
@@ -86,14 +87,21 @@ class RosTopics:
         return [published[topic][0] for topic in self._topics]
 
     def _subscribe(self, view: int, kind: str) -> None:
-        from rclpy.qos import qos_profile_sensor_data
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
         from sensor_msgs.msg import CompressedImage, Image
+
+        topic = self._topics[view]
+        # Large images lose parts without repetition; asking for it where nobody offers it would get none.
+        offered = {info.qos_profile.reliability for info in self._node.get_publishers_info_by_topic(topic)}
+        is_reliable = offered == {ReliabilityPolicy.RELIABLE}
+        reliability = ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT
 
         def receive(message: Any) -> None:
             self._messages.append((view, message, self._clock.now_s()))
 
         message_type = Image if kind == _TYPES[0] else CompressedImage
-        self._node.create_subscription(message_type, self._topics[view], receive, qos_profile_sensor_data)
+        profile = QoSProfile(depth=_DEPTH, reliability=reliability)
+        self._node.create_subscription(message_type, topic, receive, profile)
 
     def images(self, stop: threading.Event, left_out: Counter[str]) -> Iterator[CapturedImage]:
         """See `ImageStream`. Topics never end: RunningCamera notices that nothing comes."""

@@ -27,6 +27,8 @@ _OVERFLOWED = "that came faster than they could be taken"
 # Images that may wait to be paired; a few, so that either view may come first.
 _WAITING = 8
 _POLL_S = 0.1
+# How long a stream may take to close; ROS aborts a process that ends before.
+_CLOSING_S = 1.0
 
 
 class LoadedImage(NamedTuple):
@@ -196,13 +198,19 @@ class RunningCamera:
 
     def pairs(self) -> Iterator[CapturedPair]:
         """See `StereoSource`."""
-        for stream in self._streams:
-            # A driver may block for ever, and must not keep the process from ending.
-            threading.Thread(target=self._read, args=(stream,), name=f"camera {stream.name}", daemon=True).start()
+        # A driver may block for ever, and must not keep the process from ending.
+        threads = [
+            threading.Thread(target=self._read, args=(stream,), name=f"camera {stream.name}", daemon=True)
+            for stream in self._streams
+        ]
         try:
+            for thread in threads:
+                thread.start()
             yield from self._paired()
         finally:
             self._stop.set()
+            for thread in threads:
+                thread.join(_CLOSING_S)
 
     def _read(self, stream: ImageStream) -> None:
         """The thread of one stream."""
@@ -304,7 +312,9 @@ class StampPairing:
                 own.popleft()
                 self._left_out[_ALONE] += 1
             return None
-        self._left_out[_ALONE] += len(own) + other.index(partner)
+        alone = len(own) + other.index(partner)
+        if alone:
+            self._left_out[_ALONE] += alone
         own.clear()
         while other.popleft() is not partner:
             pass

@@ -82,13 +82,13 @@ def _viewer_lines() -> Iterator[str]:
 
 
 def _video_lines() -> Iterator[str]:
-    """Load the package that writes MP4, which only videos of `preview` need."""
+    """Load the package that reads cameras and writes MP4, for `navigate --live` and videos of `preview`."""
     try:
         import av
     except ImportError as error:
         yield f"video      PyAV is optional: {error}; pip install 'droguekit[video]'"
         return
-    yield f"video      PyAV {av.__version__}, for MP4 files of droguekit preview"
+    yield f"video      PyAV {av.__version__}, for droguekit navigate --live and MP4 files of droguekit preview"
 
 
 def _browser_lines() -> Iterator[str]:
