@@ -39,10 +39,12 @@ def images_of(path: str | Path) -> tuple[list[CapturedImage], Counter[str]]:
 )
 def test_lossless_images_arrive_bit_for_bit(codec: Codec, image: np.ndarray, tmp_path: Path) -> None:
     images = [np.roll(image, shift, 0) for shift in range(3)]
-    encode(str(tmp_path / "flight"), images, codec)
+    # A camera that waits for light, or drops images, has no even rate.
+    encode(str(tmp_path / "flight"), images, codec, times=None if codec.container == "avi" else (0, 3, 4))
     captured, left_out = images_of(tmp_path / "flight")
     assert left_out == {}
-    assert [each.time_s for each in captured] == pytest.approx([0, 0.04, 0.08])
+    times_s = [0, 0.04, 0.08] if codec.container == "avi" else [0, 0.12, 0.16]
+    assert [each.time_s for each in captured] == pytest.approx(times_s)
     for each, want in zip(captured, images, strict=True):
         np.testing.assert_array_equal(each.load().pixels, want)
         assert each.load().mosaic is None

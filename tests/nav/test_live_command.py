@@ -28,6 +28,7 @@ from tests.support.live_streams import (
     PATIENCE_S,
     Wire,
     encode,
+    rtsp_camera,
     serve,
     side_by_side,
     write_calibration,
@@ -97,7 +98,9 @@ def reference(imported: Path, tmp_path_factory: pytest.TempPathFactory) -> Refer
     return estimates
 
 
-def assert_same(estimates: Iterable[Estimate], reference: Mapping[tuple[str, int], Estimate]) -> int:
+def assert_same(
+    estimates: Iterable[Estimate], reference: Mapping[tuple[str, int], Estimate], first_s: float = 0.0
+) -> int:
     """All estimates of pairs that were not late are those of the imported pairs; how many pairs they are."""
     done = [e for e in estimates if not (isinstance(e, NoFix) and e.reason.startswith("late:"))]
     for got in done:
@@ -108,7 +111,7 @@ def assert_same(estimates: Iterable[Estimate], reference: Mapping[tuple[str, int
         if isinstance(want, PoseEstimate):
             pose = want.left_from_drogue.as_matrix()
             np.testing.assert_allclose(got.left_from_drogue.as_matrix(), pose, atol=1e-9)
-        assert got.time_s == pytest.approx(got.frame_index / 25, abs=1e-3)  # Matroska's clock ticks in ms
+        assert got.time_s == pytest.approx(first_s + got.frame_index / 25, abs=1e-3)  # Matroska's clock ticks in ms
         assert (got.latency_s is None) == got.method.endswith("+smoother")
     return len({e.frame_index for e in done})
 
@@ -175,6 +178,26 @@ def test_a_lossless_transport_stream_gives_the_poses_of_import(
     estimates = list(read_estimates(out))
     assert sorted({e.frame_index for e in estimates}) == list(range(PAIRS))
     assert assert_same(estimates, reference(METHODS)) >= 1
+
+
+def test_a_lossless_rtsp_camera_gives_the_poses_of_import(
+    images: list[np.ndarray],
+    calibration: Path,
+    reference: Reference,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "estimates.jsonl"
+    # Before libav knows the clock, it gives the first image no time stamp.
+    with serve(rtsp_camera([images[0], *images])) as address:
+        address = address.replace("tcp://", "rtsp://me:secret@") + "/stereo"
+        assert run(live(address, calibration, out, *METHODS)) == FAULT
+    printed = capsys.readouterr()
+    assert "/stereo: the stream ended" in printed.err and "secret" not in printed.err
+    assert "left out: 1 without a time stamp\n" in printed.out
+    estimates = list(read_estimates(out))
+    assert sorted({e.frame_index for e in estimates}) == list(range(PAIRS))
+    assert assert_same(estimates, reference(METHODS), first_s=0.04) >= 1
 
 
 def jpeg_stream(images: list[np.ndarray], then: Callable[[Wire], object] = lambda wire: None) -> Callable[[Wire], None]:

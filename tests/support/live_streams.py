@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import socket
+import struct
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -135,3 +137,69 @@ def write_calibration(path: Path, width: int, height: int, focal_px: float, base
         storage.write(name, value)
     storage.release()
     return path
+
+
+def h264_units(images: Sequence[np.ndarray], codec: Codec = H264) -> list[list[bytes]]:
+    """The NAL units of each image."""
+    encoder: Any = av.CodecContext.create(codec.name, "w")
+    encoder.height, encoder.width = images[0].shape[:2]
+    encoder.pix_fmt, encoder.time_base = codec.pixels, Fraction(1, RATE_HZ)
+    encoder.options = dict(codec.options)
+    units = []
+    for index, image in enumerate(images):
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        frame.pts, frame.time_base = index, Fraction(1, RATE_HZ)
+        data = b"".join(bytes(packet) for packet in encoder.encode(frame))
+        units.append([unit for unit in re.split(b"\0{2,3}\1", data) if unit])
+    assert encoder.encode(None) == []
+    return units
+
+
+def rtsp_camera(images: Sequence[np.ndarray]) -> Callable[[Wire], None]:
+    """Answers as an RTSP server with one H.264 track, interleaved in its connection (RFC 2326, section 10.12)."""
+    units = h264_units(images)
+
+    def send(wire: Wire) -> None:
+        playing = False
+        while not playing:
+            request = b""
+            while not request.endswith(b"\r\n\r\n"):
+                request += wire.receive()
+            method = request.split()[0].decode()
+            cseq = re.search(rb"CSeq: *(\d+)", request, re.IGNORECASE)
+            assert cseq is not None
+            head, body = {
+                "OPTIONS": ("Public: OPTIONS, DESCRIBE, SETUP, PLAY", ""),
+                "DESCRIBE": ("Content-Type: application/sdp", _SDP),
+                "SETUP": ("Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 7", ""),
+                "PLAY": ("Session: 7\r\nRange: npt=0.000-", ""),
+            }[method]
+            lines = ("RTSP/1.0 200 OK", f"CSeq: {cseq[1].decode()}", head, f"Content-Length: {len(body)}", "", body)
+            wire.write("\r\n".join(lines).encode())
+            playing = method == "PLAY"
+        sequence, start = 0, 90_000  # libav takes a clock that starts at 0 for one that is not known
+        for index, image_units in enumerate(units):
+            pieces = [piece for unit in image_units for piece in _fragments(unit)]
+            for place, piece in enumerate(pieces):
+                marker = 0x80 if place == len(pieces) - 1 else 0
+                header = struct.pack(">BBHII", 0x80, marker | 96, sequence, start + index * 90_000 // RATE_HZ, 1)
+                wire.write(b"$\0" + struct.pack(">H", len(header) + len(piece)) + header + piece)
+                sequence = (sequence + 1) % 65536
+
+    return send
+
+
+_SDP = (
+    "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=stereo\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
+    "a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:track\r\n"
+)
+
+
+def _fragments(unit: bytes, most: int = 1400) -> list[bytes]:
+    """A NAL unit as payloads of RTP, whole or in fragments FU-A (RFC 6184, section 5.8)."""
+    if len(unit) <= most:
+        return [unit]
+    indicator, kind = (unit[0] & 0xE0) | 28, unit[0] & 0x1F
+    parts = [unit[place : place + most] for place in range(1, len(unit), most)]
+    flags = [(0x80 if index == 0 else 0) | (0x40 if index == len(parts) - 1 else 0) for index in range(len(parts))]
+    return [bytes([indicator, flag | kind]) + part for flag, part in zip(flags, parts, strict=True)]
