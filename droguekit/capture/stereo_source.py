@@ -117,11 +117,14 @@ class StereoSource(Protocol):
 
     Attributes:
         name: for messages.
-        left_out: numbers of images that were not used, by their reason.
     """
 
     name: str
-    left_out: Counter[str]
+
+    @property
+    def left_out(self) -> Counter[str]:
+        """Numbers of images that were not used, by their reason."""
+        ...
 
     def pairs(self) -> Iterator[CapturedPair]:
         """Pairs as they arrive, stamps ascending, until the source ends or soon after `stop`.
@@ -142,9 +145,14 @@ class VideoPlayback:
     def __init__(self, stream: ImageStream, clock: Clock) -> None:
         """Play a stream by a clock."""
         self.name = stream.name
-        self.left_out: Counter[str] = Counter()
+        self._left_out: Counter[str] = Counter()
         self._stream, self._clock = stream, clock
         self._stop = threading.Event()
+
+    @property
+    def left_out(self) -> Counter[str]:
+        """See `StereoSource`."""
+        return self._left_out
 
     def stop(self) -> None:
         """See `StereoSource`."""
@@ -153,8 +161,8 @@ class VideoPlayback:
     def pairs(self) -> Iterator[CapturedPair]:
         """See `StereoSource`."""
         self._stream.open()
-        loader, offset_s = _PairLoader(self.left_out), None
-        for image in _ascending(self._stream.images(self._stop, self.left_out), self.left_out):
+        loader, offset_s = _PairLoader(self._left_out), None
+        for image in _ascending(self._stream.images(self._stop, self._left_out), self._left_out):
             pair = loader.load((image,), self._clock)
             if pair is None:
                 continue
@@ -183,7 +191,9 @@ class RunningCamera:
             tolerance_s: largest difference of the stamps of left and right. [s]
         """
         self.name = name
-        self.left_out: Counter[str] = Counter()
+        # Of the streams' threads and of the one that makes pairs.
+        self._unread: Counter[str] = Counter()
+        self._unpaired: Counter[str] = Counter()
         self._streams, self._clock = streams, clock
         self._timeout_s, self._tolerance_s = timeout_s, tolerance_s
         self._stop = threading.Event()
@@ -191,6 +201,12 @@ class RunningCamera:
         self._images: deque[CapturedImage] = deque()
         self._opened, self._ended = 0, False
         self._error: Exception | None = None
+
+    @property
+    def left_out(self) -> Counter[str]:
+        """See `StereoSource`."""
+        with self._changed:
+            return self._unread + self._unpaired
 
     def stop(self) -> None:
         """See `StereoSource`."""
@@ -234,16 +250,16 @@ class RunningCamera:
             self._count(left_out)
             if len(self._images) == _WAITING:
                 self._images.popleft()
-                self.left_out[_OVERFLOWED] += 1
+                self._unread[_OVERFLOWED] += 1
             self._images.append(image)
             self._changed.notify_all()
 
     def _count(self, left_out: Counter[str]) -> None:
-        self.left_out.update(left_out)
+        self._unread.update(left_out)
         left_out.clear()
 
     def _paired(self) -> Iterator[CapturedPair]:
-        pairing, loader = StampPairing(self._tolerance_s, self.left_out), _PairLoader(self.left_out)
+        pairing, loader = StampPairing(self._tolerance_s, self._unpaired), _PairLoader(self._unpaired)
         last_s, seen = self._clock.now_s(), 0
         while not self._stop.is_set():
             image = self._take()
@@ -316,6 +332,7 @@ class StampPairing:
         if alone:
             self._left_out[_ALONE] += alone
         own.clear()
+        self._nearest_s = None
         while other.popleft() is not partner:
             pass
         return (image, partner) if image.view == 0 else (partner, image)

@@ -49,6 +49,12 @@ def test_views_of_cameras_that_are_not_triggered_together_are_no_pairs() -> None
     assert all(right - left == pytest.approx(0.013) for left, right in pairs)
 
 
+def test_after_a_pair_the_advice_is_of_what_came_since() -> None:
+    pairs, _, advice = paired([image(0, 0.0), image(1, 0.0005), image(0, 0.04), image(1, 0.047)], 0.001)
+    assert len(pairs) == 1
+    assert "differ by 7 ms or more" in advice
+
+
 def test_one_silent_camera_is_named() -> None:
     _, left_out, advice = paired([image(1, 0.04 * index) for index in range(40)], 0.001)
     assert advice == "; only the right camera delivers"
