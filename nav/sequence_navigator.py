@@ -21,8 +21,8 @@ from nav.docking import docking_quantities
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import FILTER_SUFFIX, PoseFilter
 from nav.filtering.smoother import SMOOTHER_SUFFIX
-from nav.navigator import CentroidChoice, Navigator
 from nav.pair_measurement import PairMeasurement
+from nav.pair_navigator import CentroidChoice, PairNavigator
 from nav.tracked_detection import TrackedObserver
 from nav.tracking.tracker import REDETECT_EVERY, begins_sequence, open_tracker
 
@@ -33,7 +33,7 @@ class SequenceSettings:
 
     Attributes:
         methods: names of pose methods.
-        centroids: see `Navigator`.
+        centroids: see `PairNavigator`.
         tracker: name of the tracker, or None where the detector looks at every pair.
         redetect_every: the detector checks the tracker every this many pairs.
         filtered: whether to add filtered estimates of each method, named with the suffix `+filter`.
@@ -75,7 +75,7 @@ class MeasuredPair:
     """
 
     pair: BlindPair
-    navigator: Navigator
+    navigator: PairNavigator
     measurement: PairMeasurement
     begins: bool
 
@@ -129,7 +129,7 @@ class SequenceNavigator:
         self._tracker = None if settings.tracker is None else open_tracker(settings.tracker)
         self._scene: tuple[StereoRig, DrogueParameters] | None = None
         self._last_s: float | None = None
-        self._navigator: Navigator | None = None
+        self._navigator: PairNavigator | None = None
         self._observer: TrackedObserver | None = None
         self._filters: dict[str, PoseFilter] = {}
 
@@ -150,7 +150,7 @@ class SequenceNavigator:
         self._scene, self._last_s = scene, time_s
         if self._navigator is None or not is_same:
             detector = self._make_detector(pair.drogue)
-            self._navigator = Navigator(pair.rig, pair.drogue, detector, self._settings.centroids)
+            self._navigator = PairNavigator(pair.rig, pair.drogue, detector, self._settings.centroids)
             self._observer = self._observer_of(self._navigator, pair)
         elif begins and self._observer is not None:
             self._observer.reset()
@@ -177,7 +177,7 @@ class SequenceNavigator:
             stage_s=_total_stage_times(estimates, filtered),
         )
 
-    def _observer_of(self, navigator: Navigator, pair: BlindPair) -> TrackedObserver | None:
+    def _observer_of(self, navigator: PairNavigator, pair: BlindPair) -> TrackedObserver | None:
         if self._tracker is None:
             return None
         settings = self._settings

@@ -18,8 +18,8 @@ from geometry.stereo import EYES, Eye, StereoRig
 from nav.detector.detector import Detection, Detector, StereoDetection
 from nav.filtering.motion_model import FilterSettings
 from nav.filtering.pose_filter import PoseFilter
-from nav.navigator import DETECTOR, Navigator
 from nav.pair_measurement import PairMeasurement, regions_of
+from nav.pair_navigator import DETECTOR, PairNavigator
 from nav.pose.pose_method import Solution
 from nav.tracking.rim_boxes import rim_boxes
 from nav.tracking.tracker import REDETECT_EVERY, Tracker, begins_sequence, is_same_place, open_tracker
@@ -131,7 +131,7 @@ class TrackedObserver:
 
     def __init__(
         self,
-        navigator: Navigator,
+        navigator: PairNavigator,
         tracker: Tracker,
         rig: StereoRig,
         drogue: DrogueParameters,

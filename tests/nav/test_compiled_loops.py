@@ -19,7 +19,7 @@ from datasets_manifest.recipe.recipe import load_recipe
 from nav.centroids import blurred_edges, centroid_uncertainty, outline_pixels
 from nav.numerics import least_squares_loops
 from nav.realtime import warm_up_jit
-from nav.navigator import Navigator
+from nav.pair_navigator import PairNavigator
 from nav.pose import adjustment_loops
 from render.engine import load_engine
 from render.camera.sensor import expose
@@ -36,7 +36,7 @@ recipe = load_recipe("pose-tier-a").recipe
 for index in (1, 4):
     frame = sample_frame(recipe, index)
     images = expose(frame, load_engine("analytic").render(frame, recipe.render))
-    (estimate,) = Navigator(recipe.rig, recipe.drogue).estimate(index, images, ["joint-hub"])
+    (estimate,) = PairNavigator(recipe.rig, recipe.drogue).estimate(index, images, ["joint-hub"])
     assert estimate.status == "fix"
 print(len(before), *sorted({name for name, _ in compiled() - before}))
 """

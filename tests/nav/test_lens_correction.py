@@ -16,7 +16,7 @@ from geometry.stereo import EYES, Eye, paper_rig
 from labelgen.frame_labels import label_frame
 from nav.centroids.ellipses import outline_shapes
 from nav.lens_correction import distort_points, undistort_points
-from nav.navigator import Navigator
+from nav.pair_navigator import PairNavigator
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
@@ -73,7 +73,7 @@ def test_poses_through_real_lenses() -> None:
         environment={"sun_elevation_deg": [30, 60], "sun_azimuth_deg": [120, 240]},
         render={"engine": "analytic"},
     )
-    engine, navigator = load_engine("analytic"), Navigator(recipe.rig, recipe.drogue)
+    engine, navigator = load_engine("analytic"), PairNavigator(recipe.rig, recipe.drogue)
     for index in range(4):
         frame = sample_frame(recipe, index)
         radiance = engine.render(frame, recipe.render)

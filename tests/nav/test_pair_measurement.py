@@ -15,8 +15,8 @@ from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.presets import PRESETS
 from geometry.circles import project_disc_centers
 from geometry.stereo import EYES, paper_rig
-from nav.navigator import Navigator
 from nav.pair_measurement import PairMeasurement, estimate_pose
+from nav.pair_navigator import PairNavigator
 from nav.pose.method_registry import METHODS, pose_method
 from nav.pose.pose_method import NoFixReason, Observation
 from tests.support.painted_pairs import make_pose, paint_pair
@@ -134,7 +134,7 @@ def test_random_points_never_raise(method: str) -> None:
 @pytest.mark.parametrize("size", [(480, 640), (961, 1280), (1, 1)])
 def test_images_of_another_size_than_the_rigs(size: tuple[int, int]) -> None:
     image = np.zeros((*size, 3), np.uint8)
-    estimates = Navigator(RIG, DROGUE).estimate(4, StereoImages(image, image, 0.0, 1e-3), list(METHODS))
+    estimates = PairNavigator(RIG, DROGUE).estimate(4, StereoImages(image, image, 0.0, 1e-3), list(METHODS))
     assert [estimate.method for estimate in estimates] == list(METHODS)
     for estimate in estimates:
         assert isinstance(estimate, NoFix)
@@ -145,7 +145,7 @@ def test_images_of_another_size_than_the_rigs(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_flat_images(level: int) -> None:
     image = np.full((960, 1280, 3), level, np.uint8)
-    measurement = Navigator(RIG, DROGUE).observe(StereoImages(image, image, 0.0, 1e-3))
+    measurement = PairNavigator(RIG, DROGUE).observe(StereoImages(image, image, 0.0, 1e-3))
     assert isinstance(measurement.observation, NoFixReason)
     assert "no drogue detected in the left image, nor in the right one" in measurement.observation.reason
 
@@ -156,7 +156,7 @@ def test_one_blind_eye(blind: str, z_m: float) -> None:
     place = make_pose(0.1, 0.05, z_m, 8, -7, 10)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(8))
     images = replace(images, **{blind: np.zeros_like(images.left)})
-    for estimate in Navigator(RIG, DROGUE).estimate(2, images, list(METHODS)):
+    for estimate in PairNavigator(RIG, DROGUE).estimate(2, images, list(METHODS)):
         if estimate.method in STEREO_METHODS:
             assert isinstance(estimate, NoFix)
             assert estimate.reason == f"markers in one eye only: no drogue detected in the {blind} image"
@@ -173,7 +173,7 @@ def test_one_blind_eye(blind: str, z_m: float) -> None:
 def test_a_single_eye_is_measured_by_the_edge_model_too() -> None:
     place = make_pose(0.1, 0.05, 5.0, 8, -7, 10)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(9))
-    navigator = Navigator(RIG, DROGUE)
+    navigator = PairNavigator(RIG, DROGUE)
     seen = navigator.refine(images, navigator.observe(images)).observation
     alone = replace(images, left=np.zeros_like(images.left))
     single = navigator.refine(alone, navigator.observe(alone)).observation
@@ -187,7 +187,7 @@ def test_a_single_eye_is_measured_by_the_edge_model_too() -> None:
 @pytest.mark.parametrize("kind", ["sky", "cloud", "ground"])
 def test_pictures_without_a_drogue(kind: str) -> None:
     images = paint_pair(RIG, None, make_pose(0, 0, 5), np.random.default_rng(7), kind=kind)
-    assert isinstance(Navigator(RIG, DROGUE).observe(images).observation, NoFixReason)
+    assert isinstance(PairNavigator(RIG, DROGUE).observe(images).observation, NoFixReason)
 
 
 def test_a_reason_of_the_method_keeps_the_features() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from datasets_manifest.recipe.recipe import load_recipe
 from geometry.se3 import RigidTransform
-from nav.navigator import Navigator
+from nav.pair_navigator import PairNavigator
 from render.camera.sensor import expose
 from render.engine import load_engine
 from scenes.sampler import sample_frame
@@ -23,7 +23,7 @@ def test_a_faint_thing_where_the_mirrored_tilt_shows_the_hub_does_not_mirror_it(
     recipe = recipe.model_copy(update={"seed": 20270105})
     frame = sample_frame(recipe, 611)
     images = expose(frame, load_engine("analytic").render(frame, recipe.render))
-    without, pose = Navigator(recipe.rig, recipe.drogue).estimate(611, images, ["joint", "joint-hub"])
+    without, pose = PairNavigator(recipe.rig, recipe.drogue).estimate(611, images, ["joint", "joint-hub"])
     truth = frame.left_from_drogue
     mirrored, true = (degrees_between(mode.left_from_drogue, truth) for mode in without.modes)
     assert mirrored > 5 > true

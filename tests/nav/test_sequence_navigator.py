@@ -18,7 +18,7 @@ from geometry.stereo import EYES
 from nav.detector.color_blob import ColorBlobDetector
 from nav.detector.detector import Detection, StereoDetection
 from nav.filtering.motion_model import FilterSettings
-from nav.navigator import Navigator
+from nav.pair_navigator import PairNavigator
 from nav.runner import add_smoothed, open_navigator
 from nav.sequence_navigator import SequenceNavigator, SequenceSettings
 from nav.tracked_detection import TrackedObserver
@@ -146,7 +146,7 @@ class TightTracker:
 
 def test_where_boxes_at_the_right_place_show_no_markers_those_of_the_detector_count(steady: list[BlindPair]) -> None:
     rig, drogue = steady[0].rig, steady[0].drogue
-    navigator = Navigator(rig, drogue)
+    navigator = PairNavigator(rig, drogue)
     observer = TrackedObserver(navigator, TightTracker(), rig, drogue, 25, FilterSettings())
     for pair in steady[:4]:
         followed, alone = observer.observe(pair.images), navigator.observe(pair.images)

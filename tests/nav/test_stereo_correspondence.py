@@ -15,7 +15,7 @@ from geometry.stereo import EYES, Eye, paper_rig
 from nav.centroids.binary_centroids import BinaryCentroids, quantisation_variance_px2
 from nav.matching.blobs import Blobs
 from nav.matching.ring_matching import least_markers, match_ring, symmetry_permutations
-from nav.navigator import correspond
+from nav.pair_navigator import correspond
 from nav.pose.pose_method import NoFixReason, Observation
 from tests.support.painted_pairs import make_pose
 

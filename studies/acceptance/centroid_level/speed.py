@@ -18,8 +18,8 @@ from droguekit.batch.progress import ProgressReport
 from droguekit.numerical_threads import one_thread
 from droguekit.scoring.poses.cramer_rao import feature_points
 from geometry.stereo import paper_rig
-from nav.navigator import Navigator
 from nav.pair_measurement import PairMeasurement
+from nav.pair_navigator import PairNavigator
 from nav.pose.joint import joint
 from nav.pose.method_registry import pose_method
 from nav.pose.pose_method import Observation, Solution
@@ -71,7 +71,7 @@ def _centroids_ms(dataset: Path, z_m: float) -> tuple[float, int]:
     at = [index for index in truth.frame_indices if truth.record(index).conditions.distance_m == z_m]
     times = []
     for pair in map(blind.pair, at):
-        navigator = Navigator(pair.rig, pair.drogue)
+        navigator = PairNavigator(pair.rig, pair.drogue)
         rough = navigator.observe(pair.images).with_rough()
         if not isinstance(rough.rough, Solution):
             continue
@@ -81,7 +81,7 @@ def _centroids_ms(dataset: Path, z_m: float) -> tuple[float, int]:
     return float(np.median(times)), len(times)
 
 
-def _edges_ms(navigator: Navigator, images: StereoImages, rough: PairMeasurement) -> float:
+def _edges_ms(navigator: PairNavigator, images: StereoImages, rough: PairMeasurement) -> float:
     """Time of the edge fits of one pair, without that of the pose between the markers' and the hub's."""
     started = perf_counter()
     fine = navigator.refine(images, rough).observation

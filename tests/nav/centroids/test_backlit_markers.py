@@ -16,8 +16,8 @@ from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, Eye, paper_rig
 from nav.centroids.binary_centroids import window_centroids
-from nav.navigator import DETECTOR, Navigator
 from nav.pair_measurement import PairMeasurement, regions_of
+from nav.pair_navigator import DETECTOR, PairNavigator
 from nav.pose.pose_method import OUTER_EDGE, NoFixReason
 from nav.tracking.rim_boxes import rim_boxes
 from tests.support.painted_pairs import FACE_RGB, background, expose, make_pose, paint_disc
@@ -25,7 +25,7 @@ from tests.support.painted_pairs import FACE_RGB, background, expose, make_pose,
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]
 LAYOUT = marker_layout(DROGUE)
-NAVIGATOR = Navigator(RIG, DROGUE)
+NAVIGATOR = PairNavigator(RIG, DROGUE)
 # In numbers of 8 bits, beside a face of 7 and a cloudy sky of 95 to 208: what is left of red paint towards the sun.
 MARKER_RGB = (24.0, 7.0, 7.0)
 LENS_SIGMA_PX = 0.5

@@ -22,7 +22,7 @@ from geometry.circles import project_disc_centers
 from geometry.se3 import RigidTransform, angles_from_rotation
 from geometry.stereo import EYES, paper_rig
 from nav.detector.detector import Detection, StereoDetection
-from nav.navigator import CENTROID_CHOICES, Navigator
+from nav.pair_navigator import CENTROID_CHOICES, PairNavigator
 from nav.pose.pose_method import EXACT, NoFixReason, StatedTolerances
 from nav.refinement import marker_shapes
 from nav.runner import method_names, navigate
@@ -34,7 +34,7 @@ from tests.support.painted_pairs import make_pose, paint_pair
 RIG = paper_rig()
 DROGUE = PRESETS["red-8"]
 LAYOUT = marker_layout(DROGUE)
-NAVIGATOR = Navigator(RIG, DROGUE)
+NAVIGATOR = PairNavigator(RIG, DROGUE)
 
 # Declared deviations are within a factor 1.5 of the centroids' (tests of the chain); a few draws stay within five.
 BOUND_SIGMAS = 1.5 * 5
@@ -91,7 +91,7 @@ def test_other_drogues(name: str) -> None:
     drogue = PRESETS[name]
     place = make_pose(0.2, 0.1, 8, -5, 7, 12)
     images = paint_pair(RIG, drogue, place, np.random.default_rng(22))
-    for estimate in Navigator(RIG, drogue).estimate(0, images, method_names()):
+    for estimate in PairNavigator(RIG, drogue).estimate(0, images, method_names()):
         assert isinstance(estimate, PoseEstimate)
         # The weakest of them, the paper's, misses by 40 mm on average at 10 m with five markers.
         assert np.linalg.norm(estimate.left_from_drogue.translation_m - place.translation_m) < 0.2
@@ -157,7 +157,7 @@ def test_centroids_can_be_the_same_for_all_methods() -> None:
     images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 10, 6, 3, 5), np.random.default_rng(7))
     places = {}
     for choice in CENTROID_CHOICES:
-        estimates = Navigator(RIG, DROGUE, centroids=choice).estimate(0, images, ["paper", "joint"])
+        estimates = PairNavigator(RIG, DROGUE, centroids=choice).estimate(0, images, ["paper", "joint"])
         places[choice] = np.array([[f.center_px for f in e.features if f.index != "hub"] for e in estimates])
     # Rounding; the two ways to measure differ by hundredths of a pixel.
     np.testing.assert_allclose(places["own"], [places["binary"][0], places["edge"][1]], atol=1e-9)
@@ -196,7 +196,7 @@ def test_what_is_stated_of_the_tolerances_reaches_the_method() -> None:
     images = paint_pair(RIG, DROGUE, make_pose(0.06, 0, 8, 6, 3, 5), np.random.default_rng(25))
     stated = StatedTolerances(ring_radius_m=5e-4, disparity_px=0.2)
     built, loose = (
-        Navigator(RIG, DROGUE, tolerances=tolerances).estimate(0, images, ["joint"])[0]
+        PairNavigator(RIG, DROGUE, tolerances=tolerances).estimate(0, images, ["joint"])[0]
         for tolerances in (EXACT, stated)
     )
     # Half a millimetre of 270 is 15 mm of 8 m; the disparity, known to 0.2 px, is worth 50 mm and takes 0.6 mm off.
@@ -214,10 +214,10 @@ import nav.runner
 from datasets_manifest.types.images import StereoImages
 from drogue_models.presets import PRESETS
 from geometry.stereo import paper_rig
-from nav.navigator import CENTROID_CHOICES, Navigator
+from nav.pair_navigator import CENTROID_CHOICES, PairNavigator
 image = np.zeros((960, 1280, 3), np.uint8)
 images = StereoImages(image, image, 0.0, 1.0)
-estimates = Navigator(paper_rig(), PRESETS["red-8"]).estimate(0, images, nav.runner.method_names())
+estimates = PairNavigator(paper_rig(), PRESETS["red-8"]).estimate(0, images, nav.runner.method_names())
 print(len(estimates), estimates[0].status)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -233,7 +233,7 @@ def test_haze_of_a_low_sun_is_not_taken_for_red_paint(frame_index: int) -> None:
     frame = sample_frame(recipe, frame_index)
     settings = recipe.render.model_copy(update={"samples_per_px": 16})
     images = expose(frame, load_engine("mitsuba").render(frame, settings))
-    (estimate,) = Navigator(recipe.rig, recipe.drogue).estimate(frame_index, images, ["joint-hub"])
+    (estimate,) = PairNavigator(recipe.rig, recipe.drogue).estimate(frame_index, images, ["joint-hub"])
     assert estimate.status == "fix"
     truth_m = frame.left_from_drogue.translation_m
     # 0.1 px of every centroid is 0.2 % of the depth at 40 m.
@@ -274,7 +274,7 @@ def test_an_eye_that_finds_nothing_looks_where_the_other_one_says(
     place = make_pose(0.05, -0.04, z_m, 4.0, -6.0, 3.0)
     images = paint_pair(RIG, DROGUE, place, np.random.default_rng(3))
     (known,) = NAVIGATOR.estimate(0, images, ["joint"])
-    (estimate,) = Navigator(RIG, DROGUE, OneEyed(blind, box_xywh_px)).estimate(0, images, ["joint"])
+    (estimate,) = PairNavigator(RIG, DROGUE, OneEyed(blind, box_xywh_px)).estimate(0, images, ["joint"])
     assert isinstance(known, PoseEstimate) and isinstance(estimate, PoseEstimate)
     assert {region.eye: region.source for region in estimate.regions}[blind] == "other eye"
     # Boxes decide where is looked: the same regions of pixels give the same centroids, but for rounding.

@@ -90,7 +90,7 @@ def _other_thread() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, thread_name_prefix="other-eye")
 
 
-class Navigator:
+class PairNavigator:
     """Finds one known drogue with one rig."""
 
     def __init__(
