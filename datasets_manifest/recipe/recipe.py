@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from importlib.resources import files
@@ -270,12 +271,13 @@ def recipe_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def load_recipe(name_or_path: str, seed: int | None = None) -> RecipeSource:
+def load_recipe(name_or_path: str, seed: int | None = None, changes: Mapping[str, Any] | None = None) -> RecipeSource:
     """A recipe by the name of a shipped one, or from a TOML file.
 
     Args:
         name_or_path: name, or path of a `.toml` file.
         seed: replaces the recipe's own.
+        changes: see `parse_recipe`; the text of the result stays that of the file.
 
     Raises:
         ValueError: there is no such recipe, or keys are wrong; names each key.
@@ -296,13 +298,22 @@ def load_recipe(name_or_path: str, seed: int | None = None) -> RecipeSource:
         except (OSError, UnicodeDecodeError) as error:
             raise ValueError(f"{path}: cannot be read: {error}") from error
     try:
-        return RecipeSource(parse_recipe(text, base, seed), text)
+        return RecipeSource(parse_recipe(text, base, seed, changes), text)
     except ValueError as error:
         raise ValueError(f"recipe {name_or_path}: {error}") from error
 
 
-def parse_recipe(text: str, base: Path | None = None, seed: int | None = None) -> Recipe:
+def parse_recipe(
+    text: str, base: Path | None = None, seed: int | None = None, changes: Mapping[str, Any] | None = None
+) -> Recipe:
     """A recipe from TOML text; relative paths in it are read against `base`.
+
+    Args:
+        text: TOML.
+        base: folder that relative paths start from.
+        seed: replaces the text's own.
+        changes: values in the place of those of the text, by key; a mapping changes the keys that it names and leaves
+            the others of its section, unless it names the section's law, whose keys are its own.
 
     Raises:
         ValueError: not TOML, or keys are wrong; names each key.
@@ -311,6 +322,7 @@ def parse_recipe(text: str, base: Path | None = None, seed: int | None = None) -
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"not valid TOML: {error}") from error
+    table = _with_changes(table, changes or {})
     if seed is not None:
         table["seed"] = seed
     drogue = table.get("drogue", "red-8")
@@ -330,6 +342,19 @@ def parse_recipe(text: str, base: Path | None = None, seed: int | None = None) -
         return Recipe.model_validate(table)
     except ValidationError as error:
         raise ValueError(explain(error)) from error
+
+
+def _with_changes(table: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The table with values replaced, section by section."""
+    changed = dict(table)
+    for key, value in changes.items():
+        before = changed.get(key)
+        if isinstance(value, Mapping):
+            kept = before if isinstance(before, dict) and "law" not in value else {}
+            changed[key] = _with_changes(kept, value)
+        else:
+            changed[key] = value
+    return changed
 
 
 def _load_variants(target: object, base: Path | None) -> None:

@@ -88,7 +88,13 @@ def read_blind_index(dataset: Location) -> BlindIndex:
 
 
 class BlindDataset:
-    """Stereo pairs without their truth; images are read on demand."""
+    """Stereo pairs without their truth; images are read on demand.
+
+    Attributes:
+        rig: the cameras of all pairs.
+        drogue: the drogue to look for, unless each pair has one of its own.
+        frame_indices: of the pairs, ascending.
+    """
 
     def __init__(self, path: Location) -> None:
         """Open the dataset in a folder, or at a URL such as `s3://bucket/name`.
@@ -98,8 +104,8 @@ class BlindDataset:
         """
         index = read_blind_index(path)
         self._frames = FrameStore(path)
-        self._rig: StereoRig = index.rig
-        self._drogue = index.drogue
+        self.rig: StereoRig = index.rig
+        self.drogue: DrogueParameters = index.drogue
         self._has_variants = index.drogues_differ
         self._sensor = index.sensor
         self.frame_indices: tuple[int, ...] = index.frames
@@ -111,6 +117,13 @@ class BlindDataset:
             ValueError: it is missing, truncated or of another size or depth than the rig's; names the file.
         """
         shutter = read_shutter(self._frames, frame_index)
-        images = read_images(self._frames, frame_index, self._rig.camera, self._sensor, shutter)
-        drogue = read_sought_drogue(self._frames, frame_index, self._drogue) if self._has_variants else self._drogue
-        return BlindPair(frame_index, images, self._rig, drogue)
+        images = read_images(self._frames, frame_index, self.rig.camera, self._sensor, shutter)
+        return BlindPair(frame_index, images, self.rig, self.sought_drogue(frame_index))
+
+    def sought_drogue(self, frame_index: int) -> DrogueParameters:
+        """The drogue to look for in a pair, which the pair may or may not show.
+
+        Raises:
+            ValueError: the pair's record is missing, truncated or wrong; names the file.
+        """
+        return read_sought_drogue(self._frames, frame_index, self.drogue) if self._has_variants else self.drogue

@@ -28,6 +28,7 @@ from datasets_manifest.storage.provenance import cpu_features, differing_builds,
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
 from datasets_manifest.storage.writer import encode_files, write_frame
+from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from droguekit.batch.worker_pool import run_in_own_process
 from geometry.stereo import EYES, Eye
@@ -71,7 +72,7 @@ class FrameTask:
             OtherBuildError: it is not the one that made the other frames.
             OSError: the frame could not be written; nothing of it is left.
         """
-        engine = _engine(self.recipe.render.engine)
+        engine = process_engine(self.recipe.render.engine)
         if self.engine_version not in (None, engine.version):
             raise OtherBuildError(
                 f"{self.dataset}: its frames were made by {self.engine_version}, but this is {engine.version}, whose "
@@ -132,16 +133,29 @@ class FrameReport:
     size_bytes: int
 
 
-def make_frame(
-    recipe: Recipe, frame_index: int, engine: RenderEngine
-) -> tuple[PairRecord, dict[str, bytes], dict[str, float]]:
-    """A frame in memory.
+@dataclass(frozen=True, eq=False)
+class RenderedPair:
+    """A stereo pair in memory.
 
-    Returns:
-        Its record (without the hashes of its files), its files by name, and CPU seconds by stage.
+    Attributes:
+        record: the truth, without the hashes of files.
+        images: of both cameras.
+        radiance: that the images were exposed from, with the passes.
+        stage_s: CPU seconds by stage. [s]
+    """
+
+    record: PairRecord
+    images: StereoImages
+    radiance: StereoRadiance
+    stage_s: dict[str, float]
+
+
+def render_frame(recipe: Recipe, frame_index: int, engine: RenderEngine) -> RenderedPair:
+    """Render and label a frame.
 
     Raises:
         FrameFaultError: the labels contradict the rendered passes.
+        ValueError: an index outside the recipe.
     """
     stage_s: dict[str, float] = {}
     with _timed(stage_s, "sample"):
@@ -155,11 +169,27 @@ def make_frame(
         faults = check_against_passes(record, radiance)
     if faults:
         raise FrameFaultError(f"labels and rendered passes disagree: {'; '.join(faults)}")
+    return RenderedPair(record, images, radiance, stage_s)
+
+
+def make_frame(
+    recipe: Recipe, frame_index: int, engine: RenderEngine
+) -> tuple[PairRecord, dict[str, bytes], dict[str, float]]:
+    """A frame's record and files in memory.
+
+    Returns:
+        Its record (without the hashes of its files), its files by name, and CPU seconds by stage.
+
+    Raises:
+        FrameFaultError: the labels contradict the rendered passes.
+    """
+    rendered = render_frame(recipe, frame_index, engine)
+    stage_s, radiance = rendered.stage_s, rendered.radiance
     with _timed(stage_s, "encode"):
-        files = encode_files(images, {eye: eye_radiance(radiance, eye).part_id for eye in EYES})
+        files = encode_files(rendered.images, {eye: eye_radiance(radiance, eye).part_id for eye in EYES})
         if recipe.outputs.exr:
             files.update({passes_file(eye): encode_passes(eye_radiance(radiance, eye)) for eye in EYES})
-    return record, files, stage_s
+    return rendered.record, files, stage_s
 
 
 def eye_radiance(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
@@ -168,7 +198,7 @@ def eye_radiance(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
 
 
 @cache
-def _engine(name: str) -> RenderEngine:
+def process_engine(name: str) -> RenderEngine:
     """The engine of this process, loaded once and used with one thread, on which the sameness of pixels rests."""
     cv2.setNumThreads(1)
     return load_engine(name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -61,14 +61,32 @@ def run_benchmark(dataset: Location, estimates: Path) -> BenchmarkResult:
         ValueError: the dataset or the file cannot be read, the file is empty, names pairs that the dataset lacks, or
             names one twice for a method.
     """
-    data = Dataset(dataset)
-    methods = estimates_by_method(read_estimates(estimates), data.frame_indices, str(estimates))
+    return score_estimates(Dataset(dataset), read_estimates(estimates), str(estimates))
+
+
+def score_estimates(
+    data: Dataset, estimates: Iterable[Estimate], source: str, frame_indices: Sequence[int] | None = None
+) -> BenchmarkResult:
+    """Score every method of these estimates.
+
+    Args:
+        data: the dataset.
+        estimates: of any number of methods. A pair without an estimate of a method counts as not fixed.
+        source: what to call the estimates in errors.
+        frame_indices: pairs to score on; all of the dataset when None.
+
+    Raises:
+        ValueError: a record cannot be read, there are no estimates, or they name other pairs than these or one of them
+            twice for a method.
+    """
+    indices = data.frame_indices if frame_indices is None else frame_indices
+    methods = estimates_by_method(estimates, indices, source)
     truths, states = {}, []
-    for index in data.frame_indices:
+    for index in indices:
         record = data.record(index)
         truths[index] = drogue_truth(record)
         states.append(true_state(record))
-    facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(data.frame_indices))
+    facts = DatasetFacts(name=data.manifest.name, sha256=data.manifest.dataset_sha256, pairs=len(indices))
     return score_methods(facts, truths, methods, true_sequences(states))
 
 

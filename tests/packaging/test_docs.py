@@ -19,7 +19,7 @@ from drogue_models.presets import PRESETS
 from droguekit.cli.main import COMMANDS, load_command
 from geometry.se3 import RigidTransform
 from geometry.stereo import EYES, paper_rig
-from nav.navigator import BINARY_METHODS
+from nav.pair_navigator import BINARY_METHODS
 from nav.pose.method_registry import ENTRY_POINT_GROUP
 from nav.pose.pose_method import Observation, Solution
 from nav.runner import method_names

@@ -107,18 +107,31 @@ def error_panel(result: BenchmarkResult, quantity: Quantity) -> str:
     Returns:
         An `<svg>` element.
     """
+    with drawing(_size_in(len(result.methods))) as (figure, axes):
+        _draw_errors(axes, result, quantity)
+        return svg_element(figure, quantity.key, f"{quantity.title} against distance, by method")
+
+
+def error_figure(result: BenchmarkResult, quantity: Quantity) -> Figure:
+    """The same panel as a figure of its own on white, with a legend, to show or to save."""
+    with drawing(LARGE_PANEL_IN) as (figure, axes):
+        figure.patch.set(alpha=1.0, facecolor="white")
+        _draw_errors(axes, result, quantity)
+        axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def _draw_errors(axes: Axes, result: BenchmarkResult, quantity: Quantity) -> None:
     names = list(result.methods)
     few = len(names) <= FEW_METHODS
-    with drawing(PANEL_IN if few else LARGE_PANEL_IN) as (figure, axes):
-        styles = method_styles(names)
-        # A little apart, so that methods do not cover each other, and all within an eighth of the true distance.
-        step = min(1.03, 1.25 ** (1 / len(names)))
-        for k, name in enumerate(names):
-            shift = step ** (k - (len(names) - 1) / 2)
-            _draw_method(axes, result.methods[name], quantity, styles[name], (shift, 1.0 if few else 0.3))
-        _draw_bound(axes, result.reference, quantity)
-        finish_distance_axes(axes, quantity.title)
-        return svg_element(figure, quantity.key, f"{quantity.title} against distance, by method")
+    styles = method_styles(names)
+    # A little apart, so that methods do not cover each other, and all within an eighth of the true distance.
+    step = min(1.03, 1.25 ** (1 / len(names)))
+    for k, name in enumerate(names):
+        shift = step ** (k - (len(names) - 1) / 2)
+        _draw_method(axes, name, result.methods[name], quantity, styles[name], (shift, 1.0 if few else 0.3))
+    _draw_bound(axes, result.reference, quantity)
+    finish_distance_axes(axes, quantity.title)
 
 
 def legend_key(style: MethodStyle | None) -> str:
@@ -135,7 +148,7 @@ def legend_key(style: MethodStyle | None) -> str:
 
 
 def _draw_method(
-    axes: Axes, method: MethodResult, quantity: Quantity, style: MethodStyle, place: tuple[float, float]
+    axes: Axes, name: str, method: MethodResult, quantity: Quantity, style: MethodStyle, place: tuple[float, float]
 ) -> None:
     """One line; `place` is its shift in distance and the opacity of its intervals."""
     shift, opacity = place
@@ -159,6 +172,7 @@ def _draw_method(
         linewidth=1.2,
         elinewidth=0.9,
         capsize=2 if opacity == 1 else 0,
+        label=name,
     )
 
 
@@ -168,7 +182,9 @@ def _draw_bound(axes: Axes, reference: Sequence[ReferenceBin], quantity: Quantit
     if drawn:
         # A single distance has no line, so a cross marks it.
         x, y = zip(*drawn, strict=True)
-        axes.plot(x, y, color=INK, linestyle=(0, (4, 2)), linewidth=1.6, marker="+", markersize=5, zorder=5)
+        axes.plot(
+            x, y, color=INK, linestyle=(0, (4, 2)), linewidth=1.6, marker="+", markersize=5, zorder=5, label="bound"
+        )
 
 
 def finish_distance_axes(axes: Axes, title: str) -> None:

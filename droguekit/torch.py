@@ -1,0 +1,227 @@
+"""Stereo pairs as PyTorch datasets: from disk, or rendered while a training runs.
+
+This module needs the extra `train`. A sample is a dictionary of tensors that torch's own collation stacks:
+
+| key | type | content |
+|---|---|---|
+| `left`, `right` | (3, H, W) or (1, H, W) uint8, or int16 for 12 bits | images, red, green, blue |
+| `frame_index` | int64 | index of the pair |
+| `time_s` | float64 | mid-exposure [s] |
+| `left_from_drogue` | (4, 4) float64 | the true pose [m], NaN without a drogue |
+| `boxes_px` | (2, 4) float32 | x, y of the low corner, width, height of the whole drogue by eye; NaN without |
+| `keypoints_px` | (2, M, 3) float32 | x, y of each marker's centre, and its visible share, by eye |
+
+Pixels count from the corner of the image, as in COCO.
+
+The last three are missing where a dataset has no truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset as MapDataset
+from torch.utils.data import IterableDataset, get_worker_info
+
+from datasets_manifest.random_streams import sample_generator
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource
+from datasets_manifest.storage.frame_store import FrameStore
+from datasets_manifest.storage.layout import RECORD_FILE, frame_name
+from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.images import Pixels
+from datasets_manifest.types.records import ViewRecord
+from drogue_models.marker_layout import marker_layout
+from droguekit.api.recipe_rendering import RECIPE_TEXT
+from droguekit.api.stereo_dataset import StereoDataset, StereoPair, stored_pair
+from droguekit.batch.frame_task import FrameTask
+from droguekit.batch.resume import open_dataset
+
+Sample = dict[str, torch.Tensor]
+Transform = Callable[[Sample], Any]
+
+# Pixel centres have whole coordinates; the corner of the image is at (-0.5, -0.5).
+_CORNER_PX = 0.5
+
+
+def sample_of_pair(pair: StereoPair, with_truth: bool = True) -> Sample:
+    """The tensors of a pair, as the head of this module lists them.
+
+    Args:
+        pair: of a dataset, or rendered.
+        with_truth: whether to read the truth.
+
+    Raises:
+        ValueError: a file is missing or damaged; names it.
+    """
+    sample = {
+        "left": _image_tensor(pair.left),
+        "right": _image_tensor(pair.right),
+        "frame_index": torch.tensor(pair.frame_index, dtype=torch.int64),
+        "time_s": torch.tensor(pair.images.time_s, dtype=torch.float64),
+    }
+    if with_truth:
+        pose = np.full((4, 4), np.nan) if pair.truth is None else pair.truth.as_matrix()
+        views = (pair.record.views.left, pair.record.views.right)
+        markers = marker_layout(pair.drogue).count
+        sample["left_from_drogue"] = torch.from_numpy(pose)
+        sample["boxes_px"] = torch.from_numpy(np.stack([_box_px(view) for view in views]))
+        sample["keypoints_px"] = torch.from_numpy(np.stack([_keypoints_px(view, markers) for view in views]))
+    return sample
+
+
+def _image_tensor(image: Pixels) -> torch.Tensor:
+    planes = image[None] if image.ndim == 2 else np.moveaxis(image, 2, 0)
+    # torch can do little with uint16; 12 bits fit into int16.
+    return torch.from_numpy(np.array(planes, dtype=np.uint8 if image.dtype == np.uint8 else np.int16))
+
+
+def _box_px(view: ViewRecord) -> np.ndarray[Any, np.dtype[np.float32]]:
+    if view.box_full_xywh_px is None:
+        return np.full(4, np.nan, np.float32)
+    x, y, width, height = view.box_full_xywh_px
+    return np.array([x + _CORNER_PX, y + _CORNER_PX, width, height], np.float32)
+
+
+def _keypoints_px(view: ViewRecord, count: int) -> np.ndarray[Any, np.dtype[np.float32]]:
+    points = np.full((count, 3), np.nan, np.float32)
+    points[:, 2] = 0.0
+    for row, marker in zip(points, view.markers, strict=False):
+        x, y = marker.center_proj_px
+        row[:] = x + _CORNER_PX, y + _CORNER_PX, marker.visible_fraction
+    return points
+
+
+class PairDataset(MapDataset[Any]):
+    """A dataset on disk, for `torch.utils.data.DataLoader`."""
+
+    def __init__(self, dataset: StereoDataset | str | Path, transform: Transform | None = None) -> None:
+        """Open the dataset.
+
+        Args:
+            dataset: a path, a URL, or a selection of pairs.
+            transform: changes each sample.
+
+        Raises:
+            ValueError: no such dataset, or it cannot be trusted.
+        """
+        self.dataset = dataset if isinstance(dataset, StereoDataset) else StereoDataset(dataset)
+        self._transform = transform
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.dataset)
+
+    def __getitem__(self, index: int) -> Any:
+        """The sample at a position.
+
+        Raises:
+            IndexError: no such position.
+            ValueError: a file is missing or damaged; names it.
+        """
+        sample = sample_of_pair(self.dataset[index], self.dataset.has_truth)
+        return sample if self._transform is None else self._transform(sample)
+
+
+class RenderStream(IterableDataset[Any]):
+    """Renders a recipe's frames while a training uses them.
+
+    Each process of a data loader, and each rank of a distributed training, renders its own part of the frames, one
+    after the other, and shows earlier ones again in between. What it renders goes to a cache on disk, which is a
+    dataset: the next epoch reads it, and `droguekit render` completes it.
+
+    The order is a function of the recipe's seed, the epoch and the number of processes, not of how fast anything runs.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        cache: str | Path,
+        *,
+        replays: int = 0,
+        transform: Transform | None = None,
+        rank: int = 0,
+        ranks: int = 1,
+    ) -> None:
+        """Make the cache, or check that it belongs to the recipe.
+
+        Args:
+            recipe: from `droguekit.load_recipe`.
+            cache: folder for the rendered frames; must be new, empty, or a dataset of the same recipe. Do not render
+                into it by other means at the same time.
+            replays: how many earlier frames follow each new one. With more, the training waits less for rendering.
+            transform: changes each sample.
+            rank: of this process in a distributed training.
+            ranks: number of these processes.
+
+        Raises:
+            ValueError: numbers out of range, or a folder that holds something else.
+            OSError: the folder cannot be written.
+        """
+        if replays < 0:
+            raise ValueError(f"replays: must not be negative, got {replays}")
+        if not 0 <= rank < ranks:
+            raise ValueError(f"rank: must be from 0 to ranks - 1 = {ranks - 1}, got {rank}")
+        self._recipe, self._cache = recipe, Path(cache)
+        self._replays, self._transform = replays, transform
+        self._rank, self._ranks = rank, ranks
+        self._epoch, self._batches_done, self._batch_size = 0, 0, 1
+        with open_dataset(self._cache, RecipeSource(recipe, RECIPE_TEXT)):
+            if FrameStore(self._cache).pairs_per_tar is not None:
+                raise ValueError(f"{cache}: keeps its pairs in tar files; give another folder for the cache")
+
+    def start_at(self, epoch: int, batches_done: int = 0, batch_size: int = 1) -> None:
+        """Choose where the next iteration begins, to go on with an interrupted training.
+
+        Args:
+            epoch: counted from 0; each has its own order of earlier frames.
+            batches_done: number of batches of this epoch that this rank's data loader has delivered.
+            batch_size: of the data loader.
+
+        Raises:
+            ValueError: a negative number, or an empty batch.
+        """
+        if min(epoch, batches_done) < 0 or batch_size < 1:
+            got = f"{epoch}, {batches_done}, {batch_size}"
+            raise ValueError(f"epoch, batches_done, batch_size: must be at least 0, 0 and 1, got {got}")
+        self._epoch, self._batches_done, self._batch_size = epoch, batches_done, batch_size
+
+    def __iter__(self) -> Iterator[Any]:
+        """The samples of this process, from the position that `start_at` chose.
+
+        Raises:
+            ValueError: a frame cannot be rendered.
+            OSError: a frame cannot be written.
+        """
+        info = get_worker_info()
+        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        # A data loader takes batches from its processes in turn.
+        done = len(range(worker, self._batches_done, workers)) * self._batch_size
+        shard = self._rank * workers + worker
+        reader = Dataset(self._cache)
+        task = FrameTask(self._recipe, self._cache, next(iter(reader.manifest.engines), None))
+        for frame_index in self.frame_order(shard, self._ranks * workers, done):
+            if not reader.frames.storage.exists(f"{frame_name(frame_index)}/{RECORD_FILE}"):
+                task(frame_index)
+            sample = sample_of_pair(stored_pair(reader, frame_index))
+            yield sample if self._transform is None else self._transform(sample)
+
+    def frame_order(self, shard: int, shards: int, start: int = 0) -> Iterator[int]:
+        """Indices of the frames that one of several processes shows in this epoch.
+
+        Args:
+            shard: which process, counted over all ranks.
+            shards: number of processes.
+            start: position to begin at.
+        """
+        own = range(shard, self._recipe.frames.count, shards)
+        for position in range(start, len(own) * (1 + self._replays)):
+            newest, replay = divmod(position, 1 + self._replays)
+            if replay == 0:
+                yield own[newest]
+            else:
+                rng = sample_generator(self._recipe.seed, self._epoch, position, f"replay {shard} of {shards}")
+                yield own[int(rng.integers(newest + 1))]

@@ -1,0 +1,75 @@
+"""Poses from arrays, against those that `droguekit navigate` writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import droguekit
+from datasets_manifest.storage.blind import BlindDataset
+from datasets_manifest.types.estimates import Estimate
+from nav.runner import navigate
+
+
+def numbers(estimate: Estimate) -> dict[str, Any]:
+    """All but the computing times."""
+    return estimate.model_dump(mode="json", exclude={"stage_s"})
+
+
+def test_poses_are_those_of_the_command(smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    navigator = droguekit.Navigator(dataset.rig, dataset.drogue)
+    expected = list(navigate(BlindDataset(smoke_dataset), ["joint-hub"]))
+    found = [navigator.estimate(pair.images, pair.frame_index) for pair in dataset]
+    assert [numbers(each) for each in found] == [numbers(each) for each in expected]
+    assert any(isinstance(each, droguekit.PoseEstimate) for each in found)
+
+
+def test_arrays_alone_give_the_same_pose(smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    pair = next(each for each in dataset if each.truth is not None)
+    assert pair.truth is not None
+    images = pair.images
+    whole = droguekit.Navigator(dataset.rig, dataset.drogue).estimate(images, 0)
+    navigator = droguekit.Navigator(
+        dataset.rig, dataset.drogue, encoding=images.encoding, black_level_dn=images.black_level_dn
+    )
+    alone = navigator(pair.left, pair.right)
+    assert isinstance(alone, droguekit.PoseEstimate)
+    assert numbers(alone) == numbers(whole)
+    assert np.linalg.norm(alone.left_from_drogue.translation_m - pair.truth.translation_m) < 0.05
+
+
+def test_no_drogue_gives_a_reason(smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    empty = np.full_like(dataset[0].left, 90)
+    answer = droguekit.Navigator(dataset.rig, dataset.drogue)(empty, empty)
+    assert isinstance(answer, droguekit.NoFix)
+    assert "no drogue detected" in answer.reason
+
+
+def test_images_of_another_size_give_a_reason(smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    small = np.zeros((24, 32, 3), np.uint8)
+    answer = droguekit.Navigator(dataset.rig, dataset.drogue)(small, small)
+    assert isinstance(answer, droguekit.NoFix)
+    assert "the images are 32x24 px" in answer.reason
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"method": "magic"}, "magic"),
+        ({"detector": "magic"}, "detector: must be one of"),
+        ({"centroids": "magic"}, "centroids: must be one of own, binary, edge"),
+        ({"encoding": "sepia"}, "encoding: must be linear or gamma"),
+        ({"tracker": "magic"}, "magic"),
+    ],
+)
+def test_unknown_names_are_refused(wrong: dict[str, Any], message: str, smoke_dataset: Path) -> None:
+    dataset = droguekit.open_dataset(smoke_dataset)
+    with pytest.raises(ValueError, match=message):
+        droguekit.Navigator(dataset.rig, dataset.drogue, **wrong)

@@ -1,0 +1,163 @@
+"""PyTorch datasets: samples against the pairs they come from, and the order in which pairs are rendered and shown."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+import droguekit
+from datasets_manifest.recipe.recipe import Recipe
+from droguekit.api.stereo_dataset import StereoDataset
+from droguekit.torch import PairDataset, RenderStream, sample_of_pair
+from tests.support.recipe_builder import build_recipe
+from tests.support.small_datasets import SINGLE_PAIRS
+
+
+@pytest.fixture(scope="module")
+def recipe() -> Recipe:
+    """Twelve pairs that render quickly."""
+    return build_recipe(SINGLE_PAIRS, seed=8, frames={"count": 12, "scenes": 3})
+
+
+def test_samples_are_the_pairs(pairs: StereoDataset) -> None:
+    dataset = PairDataset(pairs)
+    assert len(dataset) == len(pairs)
+    for sample, pair in zip((dataset[index] for index in range(len(dataset))), pairs, strict=True):
+        assert np.array_equal(sample["left"].numpy(), np.moveaxis(pair.left, 2, 0))
+        assert np.array_equal(sample["right"].numpy(), np.moveaxis(pair.right, 2, 0))
+        assert sample["frame_index"].item() == pair.frame_index
+        pose = sample["left_from_drogue"].numpy()
+        if pair.truth is None:
+            assert np.isnan(pose).all()
+            assert np.isnan(sample["boxes_px"].numpy()).all()
+            continue
+        assert np.array_equal(pose, pair.truth.as_matrix())
+        x, y, width, height = pair.record.views.right.box_full_xywh_px or (0.0,) * 4
+        assert np.allclose(sample["boxes_px"][1].numpy(), (x + 0.5, y + 0.5, width, height))
+        first = pair.record.views.left.markers[0]
+        expected = (*(np.array(first.center_proj_px) + 0.5), first.visible_fraction)
+        assert np.allclose(sample["keypoints_px"][0, 0].numpy(), expected)
+
+
+def test_keypoints_lie_on_markers(pairs: StereoDataset) -> None:
+    """Pixels, not records, tell where markers are: the part under a visible keypoint is that marker."""
+    checked = 0
+    for pair in pairs:
+        points = sample_of_pair(pair)["keypoints_px"].numpy()
+        for eye, of_eye in zip(("left", "right"), points, strict=True):
+            for index, (x, y, visible) in enumerate(of_eye):
+                if visible < 1:
+                    continue
+                assert pair.part_ids[eye][int(y), int(x)] == 32 + index
+                checked += 1
+    assert checked > 20
+
+
+def test_a_loader_with_processes_gives_every_pair_once(pairs: StereoDataset) -> None:
+    loader: DataLoader[Any] = DataLoader(
+        PairDataset(pairs), batch_size=4, num_workers=2, multiprocessing_context="spawn"
+    )
+    indices = [index for batch in loader for index in batch["frame_index"].tolist()]
+    assert indices == list(pairs.frame_indices)
+
+
+def test_twelve_bits_and_grey_have_their_types() -> None:
+    recipe = build_recipe(
+        SINGLE_PAIRS, rig={"preset": "mono", "width_px": 160, "height_px": 120, "focal_px": 266.0, "output_bits": 12}
+    )
+    sample = sample_of_pair(droguekit.render_pair(recipe, 0))
+    assert sample["left"].shape == (1, 120, 160)
+    assert sample["left"].dtype == torch.int16
+    assert 255 < int(sample["left"].max()) < 4096
+
+
+def shown(stream: RenderStream) -> list[int]:
+    """Frames in the order in which a stream gives them."""
+    return [sample["frame_index"].item() for sample in stream]
+
+
+def test_a_stream_renders_the_pairs_of_the_recipe(recipe: Recipe, tmp_path: Path) -> None:
+    stream = RenderStream(recipe, tmp_path / "cache")
+    for sample in stream:
+        pair = droguekit.render_pair(recipe, sample["frame_index"].item())
+        assert np.array_equal(sample["left"].numpy(), np.moveaxis(pair.left, 2, 0))
+    assert sorted(path.name for path in (tmp_path / "cache" / "frames").iterdir()) == [f"{k:06d}" for k in range(12)]
+
+
+def test_earlier_frames_come_again_in_between(recipe: Recipe, tmp_path: Path) -> None:
+    order = list(RenderStream(recipe, tmp_path / "cache", replays=3).frame_order(0, 1))
+    assert order[::4] == list(range(12))
+    assert len(order) == 48
+    for position, frame in enumerate(order):
+        assert frame <= position // 4
+    assert len(set(order[1::4])) > 3
+
+
+def test_epochs_differ_and_repeat(recipe: Recipe, tmp_path: Path) -> None:
+    stream = RenderStream(recipe, tmp_path / "cache", replays=3)
+    first = list(stream.frame_order(0, 1))
+    stream.start_at(epoch=1)
+    assert list(stream.frame_order(0, 1)) != first
+    stream.start_at(epoch=0)
+    assert list(stream.frame_order(0, 1)) == first
+
+
+@pytest.mark.parametrize("shards", [1, 2, 5])
+def test_processes_share_the_frames(shards: int, recipe: Recipe, tmp_path: Path) -> None:
+    stream = RenderStream(recipe, tmp_path / "cache", replays=2)
+    orders = [list(stream.frame_order(shard, shards)) for shard in range(shards)]
+    new = Counter(frame for order in orders for frame in order[::3])
+    assert new == Counter(range(12))
+    for shard, order in enumerate(orders):
+        assert {frame % shards for frame in order} == {shard}
+
+
+def test_ranks_and_processes_of_loaders_render_each_frame_once(recipe: Recipe, tmp_path: Path) -> None:
+    frames: list[int] = []
+    for rank in range(2):
+        stream = RenderStream(recipe, tmp_path / "cache", rank=rank, ranks=2)
+        loader: DataLoader[Any] = DataLoader(stream, batch_size=2, num_workers=2, multiprocessing_context="spawn")
+        frames += [index for batch in loader for index in batch["frame_index"].tolist()]
+    assert sorted(frames) == list(range(12))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_interrupted_training_goes_on_with_the_same_batches(workers: int, recipe: Recipe, tmp_path: Path) -> None:
+    context = "spawn" if workers else None
+
+    def batches(done: int) -> list[list[int]]:
+        stream = RenderStream(recipe, tmp_path / "cache", replays=1)
+        stream.start_at(epoch=2, batches_done=done, batch_size=3)
+        loader: DataLoader[Any] = DataLoader(stream, batch_size=3, num_workers=workers, multiprocessing_context=context)
+        return [batch["frame_index"].tolist() for batch in loader]
+
+    whole = batches(0)
+    assert len(whole) == 8
+    # The first batch of the rest comes from the first process again, whichever was next.
+    assert sorted(batches(4)) == sorted(whole[4:])
+    if workers == 0:
+        assert batches(3) == whole[3:]
+
+
+def test_a_cache_is_a_dataset_that_rendering_completes(recipe: Recipe, tmp_path: Path) -> None:
+    stream = RenderStream(recipe, tmp_path / "cache")
+    first = [frame for frame, _ in zip(shown(stream), range(3), strict=False)]
+    assert first == [0, 1, 2]
+    other = build_recipe(SINGLE_PAIRS, seed=9, frames={"count": 12, "scenes": 3})
+    with pytest.raises(ValueError, match="was made from another recipe: they differ in seed"):
+        RenderStream(other, tmp_path / "cache")
+
+
+def test_wrong_numbers_are_refused(recipe: Recipe, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="replays: must not be negative"):
+        RenderStream(recipe, tmp_path / "cache", replays=-1)
+    with pytest.raises(ValueError, match="rank: must be from 0 to ranks - 1 = 1, got 2"):
+        RenderStream(recipe, tmp_path / "cache", rank=2, ranks=2)
+    with pytest.raises(ValueError, match="must be at least 0, 0 and 1, got 0, -1, 1"):
+        RenderStream(recipe, tmp_path / "cache").start_at(0, -1)
