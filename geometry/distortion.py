@@ -6,7 +6,7 @@ corresponds to one pixel of the ideal, rectified image with the same ray, and th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,21 +57,21 @@ class BrownConrady:
         wanted = np.asarray(places, dtype=np.float64)
         ideal = wanted.copy()
         for _ in range(_MAX_STEPS):
-            seen, j_xx, j_xy, j_yy = self._distort(ideal)
+            seen, j_xx, j_xy, j_yx, j_yy = self._distort(ideal)
             error = wanted - seen
             if np.abs(error).max(initial=0.0) < _TOLERANCE:
                 return ideal
-            determinant = j_xx * j_yy - j_xy**2
+            determinant = j_xx * j_yy - j_xy * j_yx
             if not (determinant > 0).all():
                 break
             ideal[..., 0] += (j_yy * error[..., 0] - j_xy * error[..., 1]) / determinant
-            ideal[..., 1] += (j_xx * error[..., 1] - j_xy * error[..., 0]) / determinant
+            ideal[..., 1] += (j_xx * error[..., 1] - j_yx * error[..., 0]) / determinant
         raise ValueError(
             f"distortion: {self.coefficients().tolist()} is not invertible over the whole image; make it weaker"
         )
 
-    def _distort(self, p: Array) -> tuple[Array, Array, Array, Array]:
-        """Distorted points, and the entries xx, xy, yy of their symmetric Jacobian."""
+    def _distort(self, p: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """Distorted points, and the entries xx, xy, yx, yy of their Jacobian."""
         x, y = p[..., 0], p[..., 1]
         r2 = x * x + y * y
         radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -86,7 +86,80 @@ class BrownConrady:
         j_xx = radial + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x
         j_xy = 2.0 * x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
         j_yy = radial + 2.0 * y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x
-        return seen, j_xx, j_xy, j_yy
+        return seen, j_xx, j_xy, j_xy, j_yy
+
+
+@dataclass(frozen=True)
+class OpenCvDistortion(BrownConrady):
+    """OpenCV's whole lens model: rational radial distortion, tangential, thin prism, and a tilted sensor.
+
+    Attributes:
+        k1, k2, k3: radial, in the numerator.
+        k4, k5, k6: radial, in the denominator.
+        p1, p2: tangential.
+        s1, s2, s3, s4: thin prism, of the second and fourth power of the distance from the axis: s1, s2 along x and s3,
+            s4 along y.
+        tau_x, tau_y: tilt of the sensor about its axes. [rad]
+
+    Source: OpenCV's documentation of `calib3d`, "Detailed Description".
+    """
+
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    s1: float = 0.0
+    s2: float = 0.0
+    s3: float = 0.0
+    s4: float = 0.0
+    tau_x: float = 0.0
+    tau_y: float = 0.0
+
+    def coefficients(self) -> Array:
+        """(14,) k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y."""
+        return np.array([getattr(self, one.name) for one in fields(self)])
+
+    def _distort(self, p: Array) -> tuple[Array, Array, Array, Array, Array]:
+        x, y = p[..., 0], p[..., 1]
+        r2 = x * x + y * y
+        numerator = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        denominator = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
+        radial = numerator / denominator
+        # Derivatives by the square of the distance.
+        slope = self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3)
+        slope = (slope - radial * (self.k4 + r2 * (2.0 * self.k5 + r2 * 3.0 * self.k6))) / denominator
+        prism_x, prism_y = self.s1 + 2.0 * self.s2 * r2, self.s3 + 2.0 * self.s4 * r2
+        seen_x = x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x) + r2 * (self.s1 + self.s2 * r2)
+        seen_y = y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y + r2 * (self.s3 + self.s4 * r2)
+        cross = 2.0 * x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y
+        j_xx = radial + 2.0 * x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x + 2.0 * x * prism_x
+        j_xy = cross + 2.0 * y * prism_x
+        j_yx = cross + 2.0 * x * prism_y
+        j_yy = radial + 2.0 * y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x + 2.0 * y * prism_y
+        if self.tau_x == 0 == self.tau_y:
+            return np.stack([seen_x, seen_y], axis=-1), j_xx, j_xy, j_yx, j_yy
+        h = self._tilt()
+        w = h[2, 0] * seen_x + h[2, 1] * seen_y + h[2, 2]
+        u = (h[0, 0] * seen_x + h[0, 1] * seen_y + h[0, 2]) / w
+        v = (h[1, 0] * seen_x + h[1, 1] * seen_y + h[1, 2]) / w
+        u_x, u_y = (h[0, 0] - u * h[2, 0]) / w, (h[0, 1] - u * h[2, 1]) / w
+        v_x, v_y = (h[1, 0] - v * h[2, 0]) / w, (h[1, 1] - v * h[2, 1]) / w
+        return (
+            np.stack([u, v], axis=-1),
+            u_x * j_xx + u_y * j_yx,
+            u_x * j_xy + u_y * j_yy,
+            v_x * j_xx + v_y * j_yx,
+            v_x * j_xy + v_y * j_yy,
+        )
+
+    def _tilt(self) -> Array:
+        """(3, 3) homography from the plane across the axis to the tilted one."""
+        cos_x, sin_x, cos_y, sin_y = np.cos(self.tau_x), np.sin(self.tau_x), np.cos(self.tau_y), np.sin(self.tau_y)
+        about_x = np.array([[1.0, 0.0, 0.0], [0.0, cos_x, sin_x], [0.0, -sin_x, cos_x]])
+        about_y = np.array([[cos_y, 0.0, -sin_y], [0.0, 1.0, 0.0], [sin_y, 0.0, cos_y]])
+        turn = about_y @ about_x
+        along_axis = np.array([[turn[2, 2], 0.0, -turn[0, 2]], [0.0, turn[2, 2], -turn[1, 2]], [0.0, 0.0, 1.0]])
+        product: Array = along_axis @ turn
+        return product
 
 
 @dataclass(frozen=True, eq=False)

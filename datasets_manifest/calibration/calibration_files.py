@@ -17,6 +17,12 @@ OPENCV_STEREO_FILE = "opencv_stereo.yaml"
 KALIBR_FILE = "kalibr_camchain.yaml"
 
 
+# k1, k2, p1, p2.
+_RADTAN_COUNT = 4
+# k1, k2, p1, p2, k3.
+_PLUMB_BOB_COUNT = 5
+
+
 def calibration_files(rig: StereoRig) -> dict[str, str]:
     """All calibration files of a rig by name; without Kalibr's where it cannot describe the lenses."""
     files = {OPENCV_STEREO_FILE: opencv_stereo(rig)}
@@ -93,8 +99,8 @@ def opencv_stereo_matrices(rig: StereoRig) -> dict[str, Array]:
 
 def kalibr_fault(rig: StereoRig) -> str | None:
     """The reason why Kalibr cannot describe a rig, or None."""
-    if any(lens.distortion.k3 != 0 for lens in rig.lenses or ()):
-        return "Kalibr's radtan model has no k3, which the rig's lenses have"
+    if any(lens.distortion.coefficients()[_RADTAN_COUNT:].any() for lens in rig.lenses or ()):
+        return "Kalibr's radtan model has no k3 and no coefficients after it, which the rig's lenses have"
     return None
 
 
@@ -150,12 +156,20 @@ def camera_info(rig: StereoRig, eye: Eye) -> str:
         f"image_height: {rig.camera.height_px}",
         f"camera_name: {eye}",
         *_matrix("camera_matrix", m[f"M{number}"]),
-        "distortion_model: plumb_bob",
+        f"distortion_model: {ros_distortion_model(m[f'D{number}'])}",
         *_matrix("distortion_coefficients", m[f"D{number}"]),
         *_matrix("rectification_matrix", m[f"R{number}"]),
         *_matrix("projection_matrix", m[f"P{number}"]),
     ]
     return "\n".join(lines) + "\n"
+
+
+def ros_distortion_model(coefficients: Array) -> str:
+    """ROS's name of the model with these coefficients.
+
+    Source: `sensor_msgs/distortion_models.hpp`.
+    """
+    return "plumb_bob" if coefficients.size <= _PLUMB_BOB_COUNT else "rational_polynomial"
 
 
 def _matrix(name: str, values: Array) -> list[str]:

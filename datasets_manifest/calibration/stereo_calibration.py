@@ -8,13 +8,11 @@ calibration is kept: its rectified left camera is the frame of all poses. Withou
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from geometry.distortion import BrownConrady, Lens
+from geometry.distortion import BrownConrady, Lens, OpenCvDistortion
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import StereoRig
@@ -23,17 +21,21 @@ from geometry.stereo import StereoRig
 _BASELINES_M = (1e-3, 10.0)
 # In widths of the image, with a field of view of 157 degrees; shorter ones are in millimetres, or in image widths.
 _SHORTEST_FOCAL_LENGTH = 0.1
+# Skew below this is rounding. [px]
+_SKEW_PX = 1e-9
 # Numbers of coefficients of OpenCV's lens models; the first five are Brown-Conrady's.
 _COEFFICIENT_COUNTS = (4, 5, 8, 12, 14)
 _BROWN_CONRADY_COUNT = 5
 # Six printed decimals move the entries of a rotation by 5e-7, five by 5e-6; a typing error moves them by more.
 _ROTATION_TOLERANCE = 1e-4
 _EXACT = 1e-12
+# Of angles [rad] and relative lengths: what printed decimals move at most.
+_FIT_TOLERANCE = 1e-4
 # Rows of two rectified cameras that differ by less agree but for printed decimals. [px]
 _SAME_PX = 1e-3
 
 
-def camera_of_matrix(matrix: ArrayLike, size_px: tuple[int, int], name: str) -> PinholeCamera:
+def camera_of_matrix(matrix: object, size_px: tuple[int, int], name: str) -> PinholeCamera:
     """A camera from its matrix, the principal point of which lies in the image.
 
     Args:
@@ -44,7 +46,7 @@ def camera_of_matrix(matrix: ArrayLike, size_px: tuple[int, int], name: str) -> 
     Raises:
         ValueError: not such a matrix.
     """
-    m = _finite(matrix, (3, 3), name)
+    m = finite_matrix(matrix, (3, 3), name)
     if _is_camera_matrix(m.T) and not _is_camera_matrix(m):
         raise ValueError(
             f"{name}: is transposed, as MATLAB's IntrinsicMatrix is; give fx 0 cx, 0 fy cy, 0 0 1 (MATLAB also counts "
@@ -52,7 +54,7 @@ def camera_of_matrix(matrix: ArrayLike, size_px: tuple[int, int], name: str) -> 
         )
     if not _is_camera_matrix(m):
         raise ValueError(f"{name}: must be fx 0 cx, 0 fy cy, 0 0 1 with positive fx and fy, got {m.tolist()}")
-    if m[0, 1] != 0:
+    if abs(m[0, 1]) > _SKEW_PX:
         raise ValueError(f"{name}: has a skew of {m[0, 1]:g} px, which is not supported; calibrate without skew")
     camera = PinholeCamera(*size_px, *(float(m[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))))
     if camera.fx_px < _SHORTEST_FOCAL_LENGTH * camera.width_px:
@@ -73,7 +75,7 @@ def _is_camera_matrix(m: Array) -> bool:
     return bool(m[0, 0] > 0 < m[1, 1] and m[1, 0] == 0 and np.array_equal(m[2], [0, 0, 1]))
 
 
-def nearest_rotation(matrix: ArrayLike, name: str) -> Array:
+def nearest_rotation(matrix: object, name: str) -> Array:
     """The rotation nearest to a matrix with printed decimals.
 
     Args:
@@ -85,16 +87,16 @@ def nearest_rotation(matrix: ArrayLike, name: str) -> Array:
 
     Source: Higham 1986, "Computing the polar decomposition".
     """
-    m = _finite(matrix, (3, 3), name)
+    m = finite_matrix(matrix, (3, 3), name)
     u, _, v = np.linalg.svd(m)
     rotation: Array = u @ v
     error = float(np.abs(rotation - m).max())
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    if not error <= _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise ValueError(f"{name}: is not a rotation matrix, got {m.tolist()}")
     return m if error < _EXACT else rotation
 
 
-def distortion_of_coefficients(coefficients: ArrayLike, name: str) -> BrownConrady:
+def distortion_of_coefficients(coefficients: object, name: str) -> BrownConrady:
     """The lens model of OpenCV's coefficients k1, k2, p1, p2, k3 ...
 
     Args:
@@ -102,18 +104,13 @@ def distortion_of_coefficients(coefficients: ArrayLike, name: str) -> BrownConra
         name: of the coefficients, with their file; begins the errors.
 
     Raises:
-        ValueError: another number of coefficients, or a model that the rig cannot have.
+        ValueError: another number of coefficients, or some that are not finite.
     """
-    values = np.asarray(coefficients, dtype=np.float64).reshape(-1)
+    values = numbers(coefficients, name).reshape(-1)
     if len(values) not in (0, *_COEFFICIENT_COUNTS):
         raise ValueError(f"{name}: must have 4, 5, 8, 12 or 14 coefficients, got {len(values)}")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: must be finite, got {values.tolist()}")
     if np.any(values[_BROWN_CONRADY_COUNT:]):
-        raise ValueError(
-            f"{name}: must be k1, k2, p1, p2, k3; calibrate without the rational, thin-prism and tilted models, "
-            f"got {values.tolist()}"
-        )
+        return OpenCvDistortion(*values.tolist())
     return BrownConrady(*values[:_BROWN_CONRADY_COUNT].tolist())
 
 
@@ -129,18 +126,19 @@ def calibrated_lens(camera: PinholeCamera, distortion: BrownConrady, ideal_from_
         raise ValueError(f"{name}: {error}") from error
 
 
-def rig_of_cameras(left: Lens, right: Lens, right_from_left: RigidTransform) -> StereoRig:
+def rig_of_cameras(left: Lens, right: Lens, right_from_left: RigidTransform, name: str) -> StereoRig:
     """The rig of two calibrated cameras; its left frame is the left camera that OpenCV's `stereoRectify` makes.
 
     Args:
         left, right: cameras and lenses; their rotations are not used.
         right_from_left: from the left camera's axes to the right one's. [m]
+        name: of the translation, with its file; begins the errors.
 
     Raises:
         ValueError: an arrangement or a baseline that a rig cannot have.
     """
     baseline_m = float(np.linalg.norm(right_from_left.translation_m))
-    _check_baseline(baseline_m, "T")
+    _check_baseline(baseline_m, name)
     if _is_ideal(left, right, right_from_left):
         return StereoRig(left.camera, baseline_m)
     size_px = left.camera.width_px, left.camera.height_px
@@ -157,7 +155,7 @@ def rig_of_cameras(left: Lens, right: Lens, right_from_left: RigidTransform) -> 
     )
     if not P2[0, 3] < 0 or P2[1, 3] != 0:
         raise ValueError(
-            "T: the right camera must stand to the right of the left one, got "
+            f"{name}: the right camera must stand to the right of the left one, got "
             f"{right_from_left.translation_m.tolist()} m as its axes from the left one's (negative x); are the two "
             "swapped?"
         )
@@ -166,22 +164,30 @@ def rig_of_cameras(left: Lens, right: Lens, right_from_left: RigidTransform) -> 
 
 
 def rig_of_rectification(
-    left: Lens, right: Lens, P1: ArrayLike, P2: ArrayLike, names: tuple[str, str], unit_m: float = 1.0
+    eyes: tuple[Lens, Lens],
+    projections: tuple[object, object],
+    names: tuple[str, str],
+    unit_m: float = 1.0,
+    right_from_left: RigidTransform | None = None,
 ) -> StereoRig:
     """The rig of two calibrated cameras with a given rectification, the left camera of which is the rig's left frame.
 
     Args:
-        left, right: cameras and lenses; `ideal_from_real` are the rectifying rotations R1 and R2.
-        P1, P2: (3, 4) projections of the rectified images; the right one's last column begins with -fx B.
+        eyes: left and right camera with their lenses; `ideal_from_real` are the rectifying rotations R1 and R2.
+        projections: (3, 4) P1 and P2 of the rectified images; the right one's last column begins with -fx B.
         names: of P1 and P2, with their files; begin the errors.
         unit_m: the unit of B. [m]
+        right_from_left: R and T of the calibration, which the rectification must fit and which then give the baseline;
+            None where they are not known. [m]
 
     Raises:
-        ValueError: projections that do not rectify the pair, or a baseline that a rig cannot have.
+        ValueError: projections that do not rectify the pair, a baseline that a rig cannot have, or a rectification that
+            does not fit R and T.
 
     Source: the definition of `sensor_msgs/CameraInfo`; OpenCV's documentation of `stereoRectify`.
     """
-    first, second = (_finite(matrix, (3, 4), name) for matrix, name in zip((P1, P2), names, strict=True))
+    left, right = eyes
+    first, second = (finite_matrix(matrix, (3, 4), name) for matrix, name in zip(projections, names, strict=True))
     for matrix, name in zip((first, second), names, strict=True):
         if not _is_camera_matrix(matrix[:, :3]) or matrix[0, 1] != 0 or matrix[2, 3] != 0:
             raise ValueError(f"{name}: must be fx 0 cx tx, 0 fy cy ty, 0 0 1 0, got {matrix.tolist()}")
@@ -192,7 +198,7 @@ def rig_of_rectification(
     if first[0, 3] != 0 or not second[0, 3] < 0:
         raise ValueError(
             f"{names[1]}: entry (0, 3) must be -fx times the baseline, and that of {names[0]} 0, got "
-            f"{second[0, 3]:g} and {first[0, 3]:g}"
+            f"{second[0, 3]:g} and {first[0, 3]:g}; calibrate the two cameras as a pair"
         )
     # The principal points may differ along a row, where disparity is not 0 at infinity.
     differ = [entry for entry in ((0, 0), (1, 1), (1, 2)) if abs(first[entry] - second[entry]) > _SAME_PX]
@@ -205,6 +211,9 @@ def rig_of_rectification(
     if (right.camera.width_px, right.camera.height_px) != size_px:
         raise ValueError(f"{names[1]}: the images of both cameras must have the same size")
     baseline_m = float(-second[0, 3] / second[0, 0]) * unit_m
+    if right_from_left is not None:
+        _check_fit(left, right, right_from_left, baseline_m, names[1])
+        baseline_m = float(np.linalg.norm(right_from_left.translation_m))
     _check_baseline(baseline_m, names[1])
     camera = _rectified_camera(first, size_px)
     if all(_is_rectified(lens, camera) for lens in (left, right)):
@@ -212,50 +221,30 @@ def rig_of_rectification(
     return StereoRig(camera, baseline_m, lenses=(left, right))
 
 
-def read_opencv_stereo(path: Path, unit_m: float = 1.0) -> StereoRig:
-    """A rig from OpenCV's YAML, XML or JSON storage, with the names that OpenCV's own samples use.
-
-    Args:
-        path: the file, with M1, D1, M2, D2, R, T, image_width and image_height.
-        unit_m: the unit of T, which is that of the calibration board's squares. [m]
-
-    Raises:
-        ValueError: it cannot be read, or something is missing or impossible; names the file.
-    """
-    if not path.is_file():
-        raise ValueError(f"{path}: there is no such calibration file")
-    names = ("M1", "D1", "M2", "D2", "R", "T")
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        found = {name: storage.getNode(name).mat() for name in names}
-        sizes = [storage.getNode(name) for name in ("image_width", "image_height")]
-        width, height = (int(node.real()) if node.isInt() or node.isReal() else 0 for node in sizes)
-    except (cv2.error, SystemError, OverflowError, ValueError) as error:
-        raise ValueError(f"{path}: is not an OpenCV storage file: {' '.join(str(error).split())[:200]}") from error
-    missing = [name for name, value in found.items() if value is None]
-    missing += [name for name, value in (("image_width", width), ("image_height", height)) if value < 1]
-    if missing:
-        raise ValueError(f"{path}: lacks {', '.join(missing)}, as cv2.stereoCalibrate names them")
-    left, right = (
-        calibrated_lens(
-            camera_of_matrix(found[f"M{number}"], (width, height), f"{path}: M{number}"),
-            distortion_of_coefficients(found[f"D{number}"], f"{path}: D{number}"),
-            np.eye(3),
-            f"{path}: D{number}",
-        )
-        for number in (1, 2)
-    )
-    shift = _finite(found["T"], (3, 1), f"{path}: T").reshape(3) * unit_m
-    right_from_left = RigidTransform(nearest_rotation(found["R"], f"{path}: R"), shift)
-    try:
-        return rig_of_cameras(left, right, right_from_left)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
 def _rectified_camera(projection: Array, size_px: tuple[int, int]) -> PinholeCamera:
     """The ideal camera of a projection; its principal point may lie outside the image."""
     return PinholeCamera(*size_px, *(float(projection[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2))))
+
+
+def _check_fit(left: Lens, right: Lens, right_from_left: RigidTransform, baseline_m: float, name: str) -> None:
+    """Check that R1, R2 and B rectify cameras that stand as R and T say.
+
+    Raises:
+        ValueError: they do not; tells by how much.
+    """
+    turn = right.ideal_from_real @ right_from_left.rotation @ left.ideal_from_real.T
+    angle_rad = float(Rotation.from_matrix(turn).magnitude())
+    shift_m = right.ideal_from_real @ right_from_left.translation_m
+    want_m = float(np.linalg.norm(shift_m))
+    if not want_m > 0:
+        raise ValueError(f"{name}: does not fit a T of 0")
+    slope_rad = float(np.linalg.norm(np.cross(shift_m, [-1.0, 0.0, 0.0]))) / want_m if shift_m[0] < 0 else np.pi
+    if max(angle_rad, slope_rad, abs(baseline_m - want_m) / want_m) > _FIT_TOLERANCE:
+        raise ValueError(
+            f"{name}: the rectification R1, R2, P1, P2 does not fit R and T: its eyes are turned by "
+            f"{np.degrees(angle_rad):.3g} degrees, its baseline by {np.degrees(slope_rad):.3g} degrees, and it is "
+            f"{baseline_m:g} m long instead of {want_m:g} m; leave R1, R2, P1 and P2 out to have them computed"
+        )
 
 
 def _check_baseline(baseline_m: float, name: str) -> None:
@@ -285,11 +274,36 @@ def _is_ideal(left: Lens, right: Lens, right_from_left: RigidTransform) -> bool:
     )
 
 
-def _finite(values: ArrayLike, shape: tuple[int, int], name: str) -> Array:
-    """A matrix of a shape from its rows or its entries row by row."""
-    array = np.asarray(values, dtype=np.float64)
+def finite_matrix(values: object, shape: tuple[int, int], name: str) -> Array:
+    """A matrix of a shape from its rows or its entries row by row; `name` begins the errors.
+
+    Raises:
+        ValueError: of another size, or entries that are no finite numbers.
+    """
+    array = numbers(values, name)
     if array.size != shape[0] * shape[1]:
         raise ValueError(f"{name}: must have {shape[0]}x{shape[1]} entries, got {array.size}")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: must be finite, got {array.tolist()}")
     return array.reshape(shape)
+
+
+def numbers(values: object, name: str) -> Array:
+    """Numbers of a file, which may stand there as text, as YAML 1.1 reads 1e-05; `name` begins the errors.
+
+    Raises:
+        ValueError: something else, or not finite.
+    """
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name}: must be numbers, got {str(values)[:100]}") from error
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: must be finite, got {str(array.tolist())[:200]}")
+    return array
+
+
+def image_size(width: object, height: object) -> tuple[int, int] | None:
+    """The (width, height) of images from two numbers of a file; None where they are none, or no whole ones."""
+    sides = [
+        side for side in (width, height) if isinstance(side, int | float) and side >= 1 and float(side).is_integer()
+    ]
+    return (int(sides[0]), int(sides[1])) if len(sides) == len((width, height)) else None

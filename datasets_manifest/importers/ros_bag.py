@@ -136,11 +136,12 @@ class RosBag:
             values=None if self._values is None else self._values[stamps[0]],
         )
 
-    def rig(self, topics: tuple[str, str] | None = None) -> StereoRig:
+    def rig(self, topics: tuple[str, str] | None = None, unit_m: float = 1.0) -> StereoRig:
         """The cameras, from the CameraInfo of both image topics; their rectified left one is the left frame.
 
         Args:
             topics: of the left and the right CameraInfo; by default `camera_info` beside each image topic.
+            unit_m: the unit of the baseline in them; ROS's is the metre. [m]
 
         Raises:
             ValueError: there is none, it changes, or it does not describe the images of a stereo pair.
@@ -169,7 +170,7 @@ class RosBag:
             _camera_info(found[topic], f"{self._path}: {topic}", images)
             for topic, images in zip(topics, self._topics, strict=True)
         )
-        return rig_of_camera_info(left, right)
+        return rig_of_camera_info(left, right, unit_m)
 
     def _pixel_values(self, reader: AnyReader) -> dict[int, PixelValues] | None:
         """What the bag says of the pixel values, by time stamp, or None where it says nothing."""

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, InstanceOf, PlainSerializer, model_validator
 
 from drogue_models.frozen_model import FrozenModel
-from geometry.distortion import BrownConrady, Lens
+from geometry.distortion import BrownConrady, Lens, OpenCvDistortion
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, read_only
 from geometry.stereo import StereoRig
@@ -67,7 +67,10 @@ def _read_lenses(value: list[dict[str, Any]] | None) -> tuple[Lens, Lens] | None
 
 
 def _read_lens(value: dict[str, Any]) -> Lens:
-    return Lens(PinholeCamera(**value["camera"]), BrownConrady(**value["distortion"]), value["ideal_from_real"])
+    distortion = value["distortion"]
+    # Brown-Conrady's model has no coefficient named k4.
+    model = OpenCvDistortion if "k4" in distortion else BrownConrady
+    return Lens(PinholeCamera(**value["camera"]), model(**distortion), value["ideal_from_real"])
 
 
 def write_rig(rig: StereoRig) -> dict[str, Any]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 if TYPE_CHECKING:
+    from datasets_manifest.calibration.calibration_reader import StereoCalibration
     from datasets_manifest.importers.imported_dataset import ImportedPairs
     from droguekit.batch.progress import ProgressReport
-    from geometry.stereo import StereoRig
 
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+_IMAGE_SIZE = re.compile("([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -20,8 +22,9 @@ class ImportOptions:
     """How images become a dataset.
 
     Attributes:
-        calibration: file of OpenCV's stereo calibration; a bag's own when None.
+        calibration: file of the stereo calibration, or two that belong together; a bag's own when empty.
         calibration_unit: `m`, `cm` or `mm`, of its translation.
+        image_size: `WIDTHxHEIGHT` of one view, where OpenCV's files do not hold it.
         drogue: preset or TOML file.
         boxes: COCO file of boxes of the drogue by image name, or None.
         box_category: name of their category; the one named drogue when None.
@@ -35,8 +38,9 @@ class ImportOptions:
         bits: that 16-bit images use; what the source says, else as in the first pair, when None.
     """
 
-    calibration: Path | None = None
+    calibration: tuple[Path, ...] = ()
     calibration_unit: str = "m"
+    image_size: str | None = None
     drogue: str = "red-8"
     boxes: Path | None = None
     box_category: str | None = None
@@ -59,6 +63,10 @@ class ImportOptions:
             raise ValueError(f"--encoding: must be linear or gamma, got {self.encoding!r}")
         if self.calibration_unit not in _UNITS_M:
             raise ValueError(f"--calibration-unit: must be one of {', '.join(_UNITS_M)}, got {self.calibration_unit!r}")
+        if self.image_size is not None and _IMAGE_SIZE.fullmatch(self.image_size) is None:
+            raise ValueError(f"--image-size: must be WIDTHxHEIGHT such as 1280x960, got {self.image_size!r}")
+        if self.image_size is not None and not self.calibration:
+            raise ValueError("--image-size: belongs to --calibration, which is missing")
         for name, value, low, high in (
             ("rate", self.rate_hz, 1e-3, 1e4),
             ("stamp-tolerance-ms", self.stamp_tolerance_ms, 0, 1000),
@@ -67,6 +75,12 @@ class ImportOptions:
         ):
             if value is not None and not low <= value <= high:
                 raise ValueError(f"--{name}: must be from {low:g} to {high:g}, got {value:g}")
+
+    @property
+    def image_size_px(self) -> tuple[int, int] | None:
+        """(width, height) of one view, or None where it is not given. [px]"""
+        found = _IMAGE_SIZE.fullmatch(self.image_size or "")
+        return None if found is None else (int(found[1]), int(found[2]))
 
     @property
     def stamp_tolerance_ns(self) -> int:
@@ -98,23 +112,26 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
         ValueError: images, calibration or boxes that cannot be used, or options that do not go with the source.
         OSError: the dataset cannot be written.
     """
+    from datasets_manifest.calibration.rig_report import rig_report
     from datasets_manifest.importers.coco_boxes import read_boxes
     from datasets_manifest.importers.imported_dataset import ImportSettings, write_imported
     from drogue_models.presets import load_drogue
 
     if options.box_category is not None and options.boxes is None:
         raise ValueError("--box-category: names the category of --boxes, which is missing")
-    pairs, rig = _open_source(source, options)
+    pairs, calibration = _open_source(source, options)
     given = None if options.boxes is None else read_boxes(options.boxes, options.box_category)
     settings = ImportSettings(
         name=out.resolve().name,
-        rig=rig,
+        rig=calibration.rig,
         drogue=load_drogue(options.drogue),
         encoding=cast(Literal["linear", "gamma"] | None, options.encoding),
         black_level_dn=options.black_level_dn,
         bits=options.bits,
         boxes=given,
     )
+    for line in rig_report(calibration):
+        report.say(line)
     report.begin("pairs", pairs.count)
     try:
         written = write_imported(pairs, settings, out, report.advance)
@@ -129,8 +146,8 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
     return pairs.count
 
 
-def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, StereoRig]:
-    """The pairs and the rig that took them; whether there are pairs is found out before the calibration is read."""
+def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, StereoCalibration]:
+    """The pairs and their rig's calibration; whether there are pairs is found out before the calibration is read."""
     bag_path = _bag_path(source)
     if bag_path is not None:
         return _open_bag(bag_path, options)
@@ -141,33 +158,39 @@ def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, S
     from datasets_manifest.importers.image_folder import ImageFolder
 
     found = find_pairs(source, options.rate_hz, options.pair_of("folders"), options.stamp_tolerance_ns)
-    rig = _given_rig(options)
-    if rig is None:
+    calibration = _given_calibration(options)
+    if calibration is None:
         raise ValueError("--calibration: images need one; see docs/how-to/calibrate.md for how to make it")
-    return ImageFolder(source, found, rig.camera.width_px), rig
+    return ImageFolder(source, found, calibration.rig.camera.width_px), calibration
 
 
-def _open_bag(path: Path, options: ImportOptions) -> tuple[ImportedPairs, StereoRig]:
+def _open_bag(path: Path, options: ImportOptions) -> tuple[ImportedPairs, StereoCalibration]:
     if any(given is not None for given in (options.rate_hz, options.boxes, options.folders)):
         raise ValueError(
             "--rate, --boxes, --folders: are for folders of images; a bag has time stamps, and no names for its images"
         )
+    from datasets_manifest.calibration.calibration_reader import StereoCalibration
+
     try:
         from datasets_manifest.importers.ros_bag import RosBag
     except ModuleNotFoundError as error:
         raise ValueError(f"{path}: {error.name} is missing: pip install 'droguekit[exports]'") from error
-    if options.calibration is not None and options.camera_info is not None:
+    if options.calibration and options.camera_info is not None:
         raise ValueError("--calibration, --camera-info: give one of the two")
     bag = RosBag(path, options.pair_of("topics"), options.stamp_tolerance_ns)
-    return bag, _given_rig(options) or bag.rig(options.pair_of("camera_info"))
+    given = _given_calibration(options)
+    if given is None:
+        rig = bag.rig(options.pair_of("camera_info"), _UNITS_M[options.calibration_unit])
+        given = StereoCalibration(rig, "CameraInfo of the bag", is_rectification_given=True)
+    return bag, given
 
 
-def _given_rig(options: ImportOptions) -> StereoRig | None:
-    from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo
+def _given_calibration(options: ImportOptions) -> StereoCalibration | None:
+    from datasets_manifest.calibration.calibration_reader import read_calibration
 
-    if options.calibration is None:
+    if not options.calibration:
         return None
-    return read_opencv_stereo(options.calibration, _UNITS_M[options.calibration_unit])
+    return read_calibration(options.calibration, _UNITS_M[options.calibration_unit], options.image_size_px)
 
 
 def _bag_path(source: Path) -> Path | None:

@@ -48,15 +48,17 @@ class LiveOptions:
     Attributes:
         source: a device's number or file, two of them, a video file, an address, or `ros:LEFT,RIGHT`; None for no
             camera.
-        calibration, calibration_unit, drogue, encoding, black_level_dn, bits: see `ImportOptions`; None for its own.
+        calibration, calibration_unit, image_size, drogue, encoding, black_level_dn, bits: see `ImportOptions`; None for
+            its own.
         timeout_s: longest wait for a pair; 5 s when None. [s]
         stamp_tolerance_ms: largest difference of the time stamps of left and right; 1 ms when None. [ms]
         camera_format: libav's name of the pixel format or codec to ask a device for, or None.
     """
 
     source: str | None
-    calibration: Path | None = None
+    calibration: tuple[Path, ...] | None = None
     calibration_unit: str | None = None
+    image_size: str | None = None
     drogue: str | None = None
     encoding: str | None = None
     black_level_dn: float | None = None
@@ -77,7 +79,7 @@ class LiveOptions:
                 option = given[0].removesuffix("_dn").removesuffix("_s").replace("_", "-")
                 raise ValueError(f"--{option}: needs --live; a dataset has its own")
             return
-        if self.calibration is None:
+        if not self.calibration:
             raise ValueError("--live: needs the cameras' --calibration; docs/how-to/calibrate.md tells how to make it")
         if self.timeout_s is not None and not 0 < self.timeout_s <= 3600:
             raise ValueError(f"--timeout: must be above 0 and up to 3600 s, got {self.timeout_s:g}")
@@ -91,7 +93,7 @@ class LiveOptions:
         Raises:
             ValueError: a value is out of its range; names the command's option.
         """
-        names = ("calibration", "calibration_unit", "drogue", "encoding", "black_level_dn", "bits")
+        names = ("calibration", "calibration_unit", "image_size", "drogue", "encoding", "black_level_dn", "bits")
         given = {name: getattr(self, name) for name in names}
         return ImportOptions(**{name: value for name, value in given.items() if value is not None})
 
@@ -148,7 +150,7 @@ def navigate_live(
     check_places(out, options.latency_out)
     if out.is_file():
         raise ValueError(f"--out: {out} is there already, and a flight cannot be repeated; name another file")
-    pairs = LivePairs(*_camera(live, options.rate_hz, clock))
+    pairs = LivePairs(*_camera(live, options.rate_hz, clock, report))
     navigator = open_navigator(settings, options.detector)
     tally, fixes, fault = LatencyTally(_NEWEST), Counter[str](), None
     status = _Status(pairs, tally, fixes, report)
@@ -173,19 +175,25 @@ def navigate_live(
     return NavigationSummary(counts, latency, fault or pairs.fault)
 
 
-def _camera(live: LiveOptions, rate_hz: float | None, clock: Clock) -> tuple[StereoSource, CameraSettings]:
-    """The camera that the options name, and what its images do not say.
+def _camera(
+    live: LiveOptions, rate_hz: float | None, clock: Clock, report: ProgressReport
+) -> tuple[StereoSource, CameraSettings]:
+    """The camera that the options name, and what its images do not say; tells the rig.
 
     Raises:
         ValueError: there is no such camera, calibration or drogue.
     """
-    from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo
+    from datasets_manifest.calibration.calibration_reader import read_calibration
+    from datasets_manifest.calibration.rig_report import rig_report
     from drogue_models.presets import load_drogue
     from droguekit.capture.live_pairs import CameraSettings, open_source
 
     images = live.images()
-    assert live.source is not None and images.calibration is not None
-    rig = read_opencv_stereo(images.calibration, _UNITS_M[images.calibration_unit])
+    assert live.source is not None
+    calibration = read_calibration(images.calibration, _UNITS_M[images.calibration_unit], images.image_size_px)
+    for line in rig_report(calibration):
+        report.say(line)
+    rig = calibration.rig
     encoding = cast(Literal["linear", "gamma"] | None, images.encoding)
     settings = CameraSettings(rig, load_drogue(images.drogue), encoding, images.black_level_dn or 0.0, images.bits)
     return open_source(live.source, live.capture(rate_hz), rig, clock), settings

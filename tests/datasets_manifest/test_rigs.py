@@ -1,16 +1,19 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from datasets_manifest.calibration.calibration_files import opencv_stereo_matrices, write_calibration
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.recipe.rigs import resolve_rig
-from datasets_manifest.types.field_types import write_rig
-from geometry.stereo import EYES
+from datasets_manifest.types.field_types import Rig, write_rig
+from geometry.distortion import BrownConrady, Lens, OpenCvDistortion
+from geometry.stereo import EYES, StereoRig
 from tests.support.recipe_builder import RecipeTable, Section, build_recipe, stations
 
 BASE: RecipeTable = {
@@ -85,3 +88,13 @@ def test_engines_without_lenses_are_named() -> None:
 def test_wrong_eyes_are_refused(eyes: Section) -> None:
     with pytest.raises(ValueError, match="rig: "):
         build_recipe(BASE, rig={"preset": "mono", "focal_px": 600.0, "eyes": eyes})
+
+
+def test_long_lens_models_come_back_from_json() -> None:
+    short, long = BrownConrady(-0.05, 0.01, 1e-4, -2e-4, 0.003), OpenCvDistortion(*np.linspace(1e-4, 2e-3, 14).tolist())
+    ideal = resolve_rig("mono")[0]
+    rig = StereoRig(ideal.camera, ideal.baseline_m, lenses=(Lens(ideal.camera, short), Lens(ideal.camera, long)))
+    table = json.loads(json.dumps(write_rig(rig)))
+    # Records of rigs with short models keep the bytes that they had.
+    assert list(table["lenses"][0]["distortion"]) == ["k1", "k2", "p1", "p2", "k3"]
+    assert [lens.distortion for lens in TypeAdapter(Rig).validate_python(table).lenses] == [short, long]

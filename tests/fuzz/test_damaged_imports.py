@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 
-from datasets_manifest.calibration.calibration_files import opencv_stereo, opencv_stereo_matrices
-from datasets_manifest.calibration.stereo_calibration import read_opencv_stereo
+from datasets_manifest.calibration.calibration_files import calibration_files, opencv_stereo, opencv_stereo_matrices
+from datasets_manifest.calibration.calibration_reader import read_calibration
+from datasets_manifest.calibration.rig_report import rig_report
 from datasets_manifest.importers.ros_bag import RosBag
 from datasets_manifest.recipe.rigs import resolve_rig
 from datasets_manifest.storage.blind import BlindDataset
@@ -113,7 +114,7 @@ def test_folders_of_images(files: dict[str, bytes], options: dict[str, Any]) -> 
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
         out = base / "out"
-        settings = ImportOptions(calibration=base / "stereo.yaml", **options)
+        settings = ImportOptions(calibration=(base / "stereo.yaml",), **options)
         quietly(lambda: import_images(base / "in", out, settings, PlainProgress(io.StringIO())))
         assert leftovers(base) == []
         assert {path.relative_to(base / "in").as_posix() for path in (base / "in").rglob("*") if path.is_file()} == {
@@ -235,9 +236,22 @@ def test_calibrations(changes: list[Callable[[dict[str, Any]], None]], edits: li
             path.write_bytes(edit(path.read_bytes()))
 
         def use() -> None:
-            read = read_opencv_stereo(path)
+            read = read_calibration([path]).rig
             for camera in (read.camera, *(lens.camera for lens in map(read.lens, EYES) if lens is not None)):
                 # A camera whose axis misses its own image is a transposed matrix, or worse.
                 assert 0 < camera.cx_px < camera.width_px and 0 < camera.cy_px < camera.height_px
 
         quietly(use)
+
+
+@fuzz(40)
+@given(edit=byte_edits(), other=byte_edits(), layout=st.sampled_from(["opencv_stereo", "kalibr_camchain", "ros"]))
+def test_damaged_calibrations(edit: Edit, other: Edit, layout: str) -> None:
+    files = calibration_files(resolve_rig("paper-real", 3)[0])
+    texts = [text for name, text in files.items() if name.startswith(layout)]
+    with tempfile.TemporaryDirectory(prefix="droguekit-fuzz-") as place:
+        paths = [Path(place) / f"calibration-{number}.yaml" for number in range(len(texts))]
+        for path, text in zip(paths, texts, strict=True):
+            path.write_text(text)
+        paths[-1].write_bytes(edit(other(texts[-1].encode())))
+        quietly(lambda: rig_report(read_calibration(paths)))

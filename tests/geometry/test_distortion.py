@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geometry.circles import disc_image_centers, disc_outline, project_disc_centers
-from geometry.distortion import BrownConrady, Lens, border_px
+from geometry.distortion import BrownConrady, Lens, OpenCvDistortion, border_px
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import RigidTransform, exp_twist, rotation_from_angles
 from geometry.stereo import EYES, Eye, StereoRig, paper_rig
@@ -115,3 +115,40 @@ def test_a_fold_and_a_foreign_size_are_refused() -> None:
     small = Lens(PinholeCamera(640, 480, 1000.0, 1000.0, 319.5, 239.5))
     with pytest.raises(ValueError, match="lenses: images must be"):
         StereoRig(IDEAL.camera, 0.12, lenses=(small, small))
+
+
+# Of a wide-angle RGB-D camera, by orders of magnitude: rational with near-cancelling numerator and denominator.
+WIDE = OpenCvDistortion(0.52, -2.5, 4e-4, -3e-4, 1.5, k4=0.40, k5=-2.3, k6=1.4)
+PRISM = OpenCvDistortion(-0.1, 0.05, 2e-4, -1e-4, 0.01, 0.02, -0.01, 0.003, 1e-3, -5e-4, -8e-4, 3e-4)
+TILTED = OpenCvDistortion(-0.1, 0.05, 2e-4, -1e-4, 0.01, 0.02, -0.01, 0.003, 1e-3, -5e-4, -8e-4, 3e-4, 0.02, -0.03)
+
+
+@pytest.mark.parametrize("model", [WIDE, PRISM, TILTED], ids=["rational", "prism", "tilted"])
+def test_the_long_models_are_opencv_s(model: OpenCvDistortion) -> None:
+    places = np.random.default_rng(8).uniform(-0.6, 0.6, (500, 2))
+    points = np.column_stack([places, np.ones(500)])
+    camera = PinholeCamera(1280, 960, 1000.0, 1010.0, 634.0, 484.5)
+    wanted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix(), model.coefficients())
+    found = Lens(camera, model).project_rays(points)
+    # A handful of roundings at 1e3 px.
+    np.testing.assert_allclose(found, wanted[:, 0], atol=1e-9)
+    np.testing.assert_allclose(model.undistort(model.distort(places)), places, atol=1e-12)
+    # Central differences of a smooth function at unit scale.
+    step = 1e-6
+    slopes = np.stack([(model.distort(places + d) - model.distort(places - d)) / (2 * step) for d in step * np.eye(2)])
+    _, j_xx, j_xy, j_yx, j_yy = model._distort(places)
+    np.testing.assert_allclose(np.stack([[j_xx, j_xy], [j_yx, j_yy]]), slopes.transpose(2, 0, 1), atol=1e-8)
+
+
+def test_the_long_model_with_zeros_is_brown_conrady_s() -> None:
+    places = np.random.default_rng(9).uniform(-0.5, 0.5, (50, 2))
+    short = BrownConrady(-0.08, 0.03, 2e-4, -1e-4, 0.01)
+    long = OpenCvDistortion(*short.coefficients())
+    # Division by 1 and sums with 0 in another order.
+    np.testing.assert_allclose(long.distort(places), short.distort(places), atol=1e-15)
+    np.testing.assert_allclose(long.undistort(places), short.undistort(places), atol=1e-13)
+
+
+def test_a_long_model_that_folds_the_image_is_refused() -> None:
+    with pytest.raises(ValueError, match="is not invertible over the whole image"):
+        Lens(PinholeCamera(1280, 960, 500.0, 500.0, 639.5, 479.5), OpenCvDistortion(k4=3.0))

@@ -24,14 +24,19 @@ def import_(
     ],
     out: Annotated[Path, output_option("--out", "DIR", "The new dataset's folder.")],
     calibration: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             "--calibration",
             metavar="FILE",
-            help="OpenCV stereo calibration (M1, D1, M2, D2, R, T); by default the bag's.",
+            help="Stereo calibration of OpenCV, Kalibr, ROS, EuRoC or ORB-SLAM; given twice for two files: left and "
+            "right, or intrinsics and extrinsics. By default the bag's.",
         ),
     ] = None,
-    calibration_unit: Annotated[str, typer.Option(metavar="m|cm|mm", help="Unit of the calibration's T.")] = "m",
+    calibration_unit: Annotated[str, typer.Option(metavar="m|cm|mm", help="Unit of the calibration's baseline.")] = "m",
+    image_size: Annotated[
+        str | None,
+        typer.Option(metavar="WIDTHxHEIGHT", help="Of one view, in pixels, where OpenCV's files do not hold it."),
+    ] = None,
     drogue: Annotated[str, typer.Option("--drogue", metavar="NAME|FILE", help="Preset or .toml file.")] = "red-8",
     boxes: Annotated[
         Path | None, typer.Option("--boxes", metavar="FILE", help="COCO boxes of the drogue, by image name.")
@@ -85,19 +90,20 @@ def import_(
     points that it measures.
     """
     options = ImportOptions(
-        calibration,
-        calibration_unit,
-        drogue,
-        boxes,
-        box_category,
-        topics,
-        camera_info,
-        folders,
-        rate,
-        stamp_tolerance_ms,
-        encoding,
-        black_level,
-        bits,
+        calibration=tuple(calibration or ()),
+        calibration_unit=calibration_unit,
+        image_size=image_size,
+        drogue=drogue,
+        boxes=boxes,
+        box_category=box_category,
+        topics=topics,
+        camera_info=camera_info,
+        folders=folders,
+        rate_hz=rate,
+        stamp_tolerance_ms=stamp_tolerance_ms,
+        encoding=encoding,
+        black_level_dn=black_level,
+        bits=bits,
     )
     count = import_images(source, out, options, progress_report())
     typer.echo(f"wrote {out}: {count} pairs")

@@ -40,6 +40,7 @@ def navigate(
     live: its.LiveOption = None,
     calibration: its.CalibrationOption = None,
     calibration_unit: its.CalibrationUnitOption = None,
+    image_size: its.ImageSizeOption = None,
     drogue: its.DrogueOption = None,
     encoding: its.EncodingOption = None,
     black_level: its.BlackLevelOption = None,
@@ -55,8 +56,9 @@ def navigate(
     """
     camera = LiveOptions(
         live,
-        calibration,
+        None if not calibration else tuple(calibration),
         calibration_unit,
+        image_size,
         drogue,
         encoding,
         black_level,

@@ -70,10 +70,14 @@ LiveOption = Annotated[
     ),
 ]
 CalibrationOption = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="With --live: stereo calibration of the cameras, as for import.")
+    list[Path] | None,
+    typer.Option(metavar="FILE", help="With --live: stereo calibration of the cameras, one file or two as for import."),
 ]
 CalibrationUnitOption = Annotated[
-    str | None, typer.Option(metavar="m|cm|mm", help="With --live: unit of the calibration's T; m by default.")
+    str | None, typer.Option(metavar="m|cm|mm", help="With --live: unit of the calibration's baseline; m by default.")
+]
+ImageSizeOption = Annotated[
+    str | None, typer.Option(metavar="WIDTHxHEIGHT", help="With --live: of one view, where the calibration lacks it.")
 ]
 DrogueOption = Annotated[
     str | None, typer.Option(metavar="NAME|FILE", help="With --live: preset or .toml file; red-8 by default.")

@@ -96,7 +96,7 @@ def test_zeros_beyond_the_fifth_coefficient_are_no_other_model() -> None:
 @pytest.mark.parametrize(
     ("left", "right", "fault"),
     [
-        ({"K": np.zeros((3, 3))}, {}, "left.yaml: K is 0: the camera is not calibrated"),
+        ({"K": np.zeros((3, 3))}, {}, "left.yaml: K: is 0: the camera is not calibrated"),
         ({}, {"K": M2.T}, "right.yaml: K: is transposed"),
         ({}, {"R": np.zeros((3, 3))}, "right.yaml: R: is not a rotation"),
         ({}, {"distortion_model": "equidistant"}, "right.yaml: distortion model 'equidistant' is not read"),

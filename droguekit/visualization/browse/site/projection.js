@@ -18,21 +18,33 @@ var droguekit = {};
     return [camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px];
   }
 
-  /** Pixel of a distorting lens for a direction in the rectified rig (Brown and Conrady, OpenCV's coefficients). [px] */
+  /** Point on a sensor that is tilted about both axes [rad], of one on a sensor across the axis. */
+  function tilted(x, y, tauX, tauY) {
+    const [cosX, sinX, cosY, sinY] = [Math.cos(tauX), Math.sin(tauX), Math.cos(tauY), Math.sin(tauY)];
+    // The rotation about x, then the one about y.
+    const turned = [
+      cosY * x + sinX * sinY * y - cosX * sinY,
+      cosX * y + sinX,
+      sinY * x - sinX * cosY * y + cosX * cosY,
+    ];
+    const [alongX, alongY, depth] = [-cosX * sinY, sinX, cosX * cosY];
+    return [(depth * turned[0]) / turned[2] - alongX, (depth * turned[1]) / turned[2] - alongY];
+  }
+
+  /** Pixel of a distorting lens for a direction in the rectified rig (OpenCV's models and coefficients). [px] */
   function throughLens(lens, direction) {
     const turn = lens.real_from_ideal;
     const [u, v, w] = [0, 3, 6].map(
       (row) => turn[row] * direction[0] + turn[row + 1] * direction[1] + turn[row + 2] * direction[2],
     );
     const [x, y] = [u / w, v / w];
-    const [k1, k2, p1, p2, k3] = lens.distortion;
+    const [k1, k2, p1, p2, k3, k4 = 0, k5 = 0, k6 = 0, s1 = 0, s2 = 0, s3 = 0, s4 = 0, tauX = 0, tauY = 0] =
+      lens.distortion;
     const r2 = x * x + y * y;
-    const radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
-    return pixel(
-      lens.camera,
-      x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-      y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    );
+    const radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)));
+    const seenX = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2);
+    const seenY = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4);
+    return pixel(lens.camera, ...tilted(seenX, seenY, tauX, tauY));
   }
 
   /** Pixel of a point of the left camera's frame [m] in an eye, "left" or "right". [px] */
