@@ -166,6 +166,8 @@ class CocoFiles:
                 # pycocotools reports its progress on standard output.
                 with contextlib.redirect_stdout(io.StringIO()):
                     coco = COCO(str(file))
+                # pycocotools takes a file without annotations for one of images alone.
+                annotation_count = len(coco.dataset["annotations"])
         except FileNotFoundError:
             self._faults.append(f"{path}: is missing")
             return None
@@ -174,7 +176,7 @@ class CocoFiles:
             return None
         if set(coco.imgs) != ids:
             self._faults.append(f"{path}: has {len(coco.imgs)} images, its pairs have {len(ids)}")
-        if 0 in coco.anns or len(coco.anns) != len(coco.dataset["annotations"]):
+        if 0 in coco.anns or len(coco.anns) != annotation_count:
             self._faults.append(f"{path}: annotation ids must be unique and above 0")
         return coco
 

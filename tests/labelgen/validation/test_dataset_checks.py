@@ -173,6 +173,14 @@ def test_annotations_that_disagree_are_faults(small_dataset: Path) -> None:
     assert f"{parts[1]}: is missing" in faults
 
 
+def test_a_coco_file_without_annotations_is_a_fault(small_dataset: Path) -> None:
+    path = small_dataset / "annotations" / "all.json"
+    table = json.loads(path.read_text())
+    del table["annotations"]
+    path.write_text(json.dumps(table))
+    assert f"{path}: is truncated or not a COCO file: 'annotations'" in faults_of(small_dataset)
+
+
 def test_a_path_out_of_the_frame_is_a_fault(small_dataset: Path, full_pairs: list[Pair]) -> None:
     edit_record(
         small_dataset, full_pairs[0], lambda table: table["file_sha256"].update({"../../recipe.toml": "0" * 64})
