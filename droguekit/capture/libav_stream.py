@@ -134,7 +134,7 @@ class LibavStream:
         """Packets and their arrival times."""
         import av
 
-        errors, packets = 0, container.demux(container.streams.video[0])
+        errors, was_corrupt, packets = 0, False, container.demux(container.streams.video[0])
         while not stop.is_set():
             try:
                 packet = next(packets)
@@ -153,8 +153,10 @@ class LibavStream:
             except av.FFmpegError as error:
                 raise ValueError(f"{self.name}: went away: {error.strerror}") from error
             errors = 0
-            if packet.is_corrupt:
+            # Where a parser cuts a stream into images, it flags the image before the damaged one.
+            if packet.is_corrupt or was_corrupt:
                 cleanness.lose(packet.pts)
+            was_corrupt = packet.is_corrupt
             yield packet, self._clock.now_s()
 
     def _frames(self, packet: Packet, left_out: Counter[str], cleanness: _Cleanness) -> list[VideoFrame]:

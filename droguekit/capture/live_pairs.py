@@ -94,7 +94,8 @@ class LivePairs:
             if captured.left.pixels.dtype == np.uint16 and settings.bits is None:
                 raise ValueError(f"{self.source.name}: sends 16-bit numbers; give the camera's own depth by --bits")
             views = captured.left.pixels, captured.right.pixels, captured.left.mosaic, captured.right.mosaic
-            self._depth = PixelDepth(ImportedPair(captured.names, captured.time_s, *views), settings.bits)
+            names = (self.source.name, self.source.name)
+            self._depth = PixelDepth(ImportedPair(names, captured.time_s, *views), settings.bits)
         depth = self._depth
         left = self._checked(captured.left, captured.names[0], depth)
         right = self._checked(captured.right, captured.names[1], depth)

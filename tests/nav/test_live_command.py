@@ -24,6 +24,7 @@ from droguekit.cli.main import DONE, FAULT, WRONG_INPUT, run
 from geometry.se3 import RigidTransform, rotation_from_angles
 from tests.support.live_streams import (
     FFV1,
+    FFV1_DEEP,
     H264,
     PATIENCE_S,
     Wire,
@@ -244,6 +245,31 @@ def test_a_camera_of_another_size_is_refused_and_leaves_no_file(
     encode(str(tmp_path / "one.mkv"), [image[:, :WIDTH] for image in images])
     assert run(live(tmp_path / "one.mkv", calibration, out, "--method", "joint")) == WRONG_INPUT
     assert "one.mkv: left half 0: must be 640x480 px as calibrated, got 320x480" in last_line(capsys)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("deep", "options", "message"),
+    [
+        (False, ["--bits", "12"], "flight.mkv: has 8 bits; leave the number of bits out"),
+        (True, [], "flight.mkv: sends 16-bit numbers; give the camera's own depth by --bits"),
+        (True, ["--bits", "10"], "flight.mkv: left half 0: has values beyond 10 bits; name the camera's bits"),
+    ],
+)
+def test_the_depth_of_numbers_must_be_said_and_be_right(
+    images: list[np.ndarray],
+    calibration: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    deep: bool,
+    options: list[str],
+    message: str,
+) -> None:
+    sent = [image[:, :, 0].astype(np.uint16) << 4 for image in images] if deep else images
+    encode(str(tmp_path / "flight.mkv"), sent, FFV1_DEEP if deep else FFV1)
+    out = tmp_path / "estimates.jsonl"
+    assert run(live(tmp_path / "flight.mkv", calibration, out, "--method", "constant", *options)) == WRONG_INPUT
+    assert message in last_line(capsys)
     assert not out.exists()
 
 
