@@ -8,9 +8,8 @@ the code does the same.
     python scripts/yardstick.py record --out after.json      # on the other commit
     python scripts/yardstick.py compare before.json after.json
 
-`record --only NAME` records a few of the parts. The caches of compiled loops are removed first: a process that compiles
-them gives poses that differ in the last bits from one that loads them. So record the same parts in the same order on
-both commits.
+`record --only NAME` records a few of the parts. Compiled loops are cached beside their sources and may not see changes
+of other files, so the caches are removed first.
 """
 
 from __future__ import annotations

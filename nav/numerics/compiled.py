@@ -24,6 +24,16 @@ _Loop = TypeVar("_Loop", bound=Callable[..., Any])
 # The compiler may take sums in any order and turn divisions into products, so that a processor works on many pixels at
 # once. Infinities and NaN keep their meaning: a step that diverges must be seen.
 _FASTMATH = {"reassoc", "nsz", "contract", "arcp"}
+# A caller's machine code holds all that it calls, inlined. Numba would keep a copy of a large function in each of its
+# callers, each with its own order of sums, and the linker would take the first in the process for all: results would
+# depend on what else the process had compiled or loaded. Nothing calls the loops from C.
+_OPTIONS = {
+    "fastmath": _FASTMATH,
+    "forceinline": True,
+    "no_cfunc_wrapper": True,
+    "error_model": "numpy",
+    "nogil": True,
+}
 # In every file that holds compiled functions, this one included.
 _MARK = b"@compiled"
 
@@ -34,7 +44,7 @@ def compiled(loop: _Loop) -> _Loop:
     The result is kept beside the function's file, else in the user's cache folder; where neither can be written, every
     process compiles anew.
     """
-    quick: Any = numba.njit(loop, fastmath=_FASTMATH, error_model="numpy", nogil=True)
+    quick: Any = numba.njit(loop, **_OPTIONS)
     with suppress(RuntimeError):  # numba found no folder that can be written
         quick._cache = _KernelCache(loop)
     kernel: _Loop = quick

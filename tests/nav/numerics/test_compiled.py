@@ -1,4 +1,4 @@
-"""When compiled functions are compiled anew, and where the results are kept."""
+"""When functions are compiled anew, where the results are kept, and that they compute the same once loaded."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from nav.numerics import compiled
@@ -76,3 +77,64 @@ def test_a_package_that_cannot_be_written_is_cached_at_home_and_else_not_at_all(
     (package / "home").touch()
     assert call(package)[:2] == (3, 0)
     assert call(package)[:2] == (3, 0)
+
+
+POSES = """
+import sys
+import numpy as np
+from drogue_models.marker_layout import marker_layout
+from drogue_models.presets import PRESETS
+from geometry.stereo import paper_rig
+from nav.pose.adjustment import adjust
+from nav.pose.adjustment_loops import adjust_frames
+from nav.pose.features import stack_features
+from nav.pose.marker_geometry import project_markers
+
+rig, layout = paper_rig(), marker_layout(PRESETS["red-8"])
+rotations, translations_m = np.tile(np.eye(3), (20, 1, 1)), np.tile([0.1, 0.1, 5.0], (20, 1))
+pixels = project_markers(rig, layout, rotations, translations_m)
+pixels += np.random.default_rng(75).normal(0, 0.3, pixels.shape)
+poses = adjust(stack_features(rig, layout, pixels, np.eye(2)), rotations, translations_m + 0.02)
+np.savez(sys.argv[1], **vars(poses))
+print(sum(adjust_frames.stats.cache_hits.values()))
+"""
+
+
+def test_poses_of_loops_that_are_loaded_equal_those_of_loops_just_compiled(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    hits, poses = [], []
+    for name in ("compiled.npz", "loaded.npz"):
+        command = [sys.executable, "-c", POSES, str(tmp_path / name)]
+        hits.append(int(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout))
+        with np.load(tmp_path / name) as arrays:
+            poses.append(dict(arrays))
+    assert hits == [0, 1]
+    for name, values in poses[0].items():
+        np.testing.assert_array_equal(values, poses[1][name], err_msg=name)
+
+
+# Of functions that a loop calls, only those that compute nothing with floats may stay apart, as numba's count of
+# references does.
+APART = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from nav.realtime import warm_up_jit
+
+warm_up_jit()
+modules = [module for name, module in sys.modules.items() if name.startswith("nav.")]
+loops = {loop for module in modules for loop in vars(module).values() if isinstance(loop, Dispatcher)}
+for loop in loops:
+    parts = [part for each in loop.overloads.values() for part in each.library.get_defined_functions()]
+    apart = [part.name for part in parts if part.linkage.name != "external"
+             and any(f" {operation} " in str(part) for operation in ("fadd", "fsub", "fmul", "fdiv"))]
+    print(loop.__name__, *apart)
+"""
+
+
+@pytest.mark.slow
+def test_machine_code_of_a_loop_holds_all_the_arithmetic_that_the_loop_calls(tmp_path: Path) -> None:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", APART], env=environment, capture_output=True, text=True, check=True)
+    apart = {loop: parts for loop, *parts in map(str.split, done.stdout.splitlines())}
+    assert {"adjust_frames", "leverages", "draw_discs"} <= apart.keys()
+    assert {loop: parts for loop, parts in apart.items() if parts} == {}
