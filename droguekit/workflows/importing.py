@@ -154,8 +154,7 @@ def _open_source(source: Path, options: ImportOptions) -> tuple[ImportedPairs, S
     for name in ("topics", "camera_info"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')}: {source} is not a ROS bag")
-    from datasets_manifest.importers.folder_layout import find_pairs
-    from datasets_manifest.importers.image_folder import ImageFolder
+    from datasets_manifest.importers.image_folder import ImageFolder, find_pairs
 
     found = find_pairs(source, options.rate_hz, options.pair_of("folders"), options.stamp_tolerance_ns)
     calibration = _given_calibration(options)
@@ -210,7 +209,7 @@ def _bag_path(source: Path) -> Path | None:
         )
     if (source / "metadata.yaml").is_file():
         return source
-    from datasets_manifest.importers.folder_layout import has_images
+    from datasets_manifest.importers.image_folder import has_images
 
     visible = sorted(path for path in source.iterdir() if not path.name.startswith("."))
     bags = [path for path in visible if path.suffix.lower() in _BAG_SUFFIXES or (path / "metadata.yaml").is_file()]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.importers.folder_layout import find_pairs
+from datasets_manifest.importers.image_folder import find_pairs
 
 
 def touch(folder: Path, *names: str) -> Path:

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.importers.folder_layout import find_pairs
 from datasets_manifest.importers.image_files import read_image
-from datasets_manifest.importers.image_folder import ImageFolder
+from datasets_manifest.importers.image_folder import ImageFolder, find_pairs
 
 WIDTH, HEIGHT = 32, 24
 
