@@ -253,7 +253,11 @@ def test_a_camera_of_another_size_is_refused_and_leaves_no_file(
     [
         (False, ["--bits", "12"], "flight.mkv: has 8 bits; leave the number of bits out"),
         (True, [], "flight.mkv: sends 16-bit numbers; give the camera's own depth by --bits"),
-        (True, ["--bits", "10"], "flight.mkv: left half 0: has values beyond 10 bits; name the camera's bits"),
+        (
+            True,
+            ["--bits", "10"],
+            "flight.mkv: left half 0: has values beyond 10 bits; say by --bits how many the camera has",
+        ),
     ],
 )
 def test_the_depth_of_numbers_must_be_said_and_be_right(

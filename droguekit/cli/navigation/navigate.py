@@ -54,19 +54,9 @@ def navigate(
     Pairs come from a dataset, or with --live from a running camera until Ctrl-C. Exits with 1 where a camera's run ends
     by a fault; the estimates before it are kept.
     """
-    camera = LiveOptions(
-        live,
-        None if not calibration else tuple(calibration),
-        calibration_unit,
-        image_size,
-        drogue,
-        encoding,
-        black_level,
-        bits,
-        timeout,
-        stamp_tolerance_ms,
-        camera_format,
-    )
+    files = None if not calibration else tuple(calibration)
+    images = (files, calibration_unit, image_size, drogue, encoding, black_level, bits)
+    camera = LiveOptions(live, *images, timeout, stamp_tolerance_ms, camera_format)
     options = NavigationOptions(
         centroids=centroids,
         detector=detector,
