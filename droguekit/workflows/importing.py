@@ -130,13 +130,13 @@ def import_images(source: Path, out: Path, options: ImportOptions, report: Progr
         bits=options.bits,
         boxes=given,
     )
-    for line in rig_report(calibration):
-        report.say(line)
     report.begin("pairs", pairs.count)
     try:
         written = write_imported(pairs, settings, out, report.advance)
     finally:
         report.end()
+    for line in rig_report(calibration):
+        report.say(line)
     for line in pairs.left_out:
         report.say(f"left out: {line}")
     for line in written.remarks:

@@ -191,12 +191,13 @@ def _camera(
     images = live.images()
     assert live.source is not None
     calibration = read_calibration(images.calibration, _UNITS_M[images.calibration_unit], images.image_size_px)
-    for line in rig_report(calibration):
-        report.say(line)
     rig = calibration.rig
     encoding = cast(Literal["linear", "gamma"] | None, images.encoding)
     settings = CameraSettings(rig, load_drogue(images.drogue), encoding, images.black_level_dn or 0.0, images.bits)
-    return open_source(live.source, live.capture(rate_hz), rig, clock), settings
+    source = open_source(live.source, live.capture(rate_hz), rig, clock)
+    for line in rig_report(calibration):
+        report.say(line)
+    return source, settings
 
 
 class _Status:
