@@ -150,10 +150,11 @@ def navigate_live(
     check_places(out, options.latency_out)
     if out.is_file():
         raise ValueError(f"--out: {out} is there already, and a flight cannot be repeated; name another file")
-    pairs = LivePairs(*_camera(live, options.rate_hz, clock, report))
+    source, camera, remarks = _camera(live, options.rate_hz, clock)
+    pairs = LivePairs(source, camera)
     navigator = open_navigator(settings, options.detector)
     tally, fixes, fault = LatencyTally(_NEWEST), Counter[str](), None
-    status = _Status(pairs, tally, fixes, report)
+    status = _Status(pairs, remarks, tally, fixes, report)
     with _EstimateFile(out) as file, one_thread(), _ended_by_signals(pairs.stop):
         with closing(process_arrivals(pairs, navigator, clock)) as answers:
             try:
@@ -176,9 +177,9 @@ def navigate_live(
 
 
 def _camera(
-    live: LiveOptions, rate_hz: float | None, clock: Clock, report: ProgressReport
-) -> tuple[StereoSource, CameraSettings]:
-    """The camera that the options name, and what its images do not say; tells the rig.
+    live: LiveOptions, rate_hz: float | None, clock: Clock
+) -> tuple[StereoSource, CameraSettings, Sequence[str]]:
+    """The camera that the options name, what its images do not say, and what its calibration was taken for.
 
     Raises:
         ValueError: there is no such camera, calibration or drogue.
@@ -194,16 +195,21 @@ def _camera(
     rig = calibration.rig
     encoding = cast(Literal["linear", "gamma"] | None, images.encoding)
     settings = CameraSettings(rig, load_drogue(images.drogue), encoding, images.black_level_dn or 0.0, images.bits)
-    source = open_source(live.source, live.capture(rate_hz), rig, clock)
-    for line in rig_report(calibration):
-        report.say(line)
-    return source, settings
+    return open_source(live.source, live.capture(rate_hz), rig, clock), settings, rig_report(calibration)
 
 
 class _Status:
     """Tells what the camera delivers once it does, and every few seconds how it goes."""
 
-    def __init__(self, pairs: LivePairs, tally: LatencyTally, fixes: Counter[str], report: ProgressReport) -> None:
+    def __init__(
+        self,
+        pairs: LivePairs,
+        remarks: Sequence[str],
+        tally: LatencyTally,
+        fixes: Counter[str],
+        report: ProgressReport,
+    ) -> None:
+        self._remarks = remarks
         self._pairs, self._tally, self._fixes, self._report = pairs, tally, fixes, report
         self._told_s: float | None = None
 
@@ -211,7 +217,8 @@ class _Status:
         """Count a pair."""
         now_s = monotonic()
         if self._told_s is None:
-            self._report.say(f"{self._pairs.description}; Ctrl-C ends")
+            for line in (*self._remarks, f"{self._pairs.description}; Ctrl-C ends"):
+                self._report.say(line)
         elif now_s - self._told_s < _STATUS_EVERY_S:
             return
         else:
