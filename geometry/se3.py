@@ -25,9 +25,12 @@ def read_only(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
         name: the field's name, for the error.
 
     Raises:
-        ValueError: wrong shape, or a value that is not finite.
+        ValueError: wrong shape, or a value that is no finite number.
     """
-    array = np.array(values, dtype=np.float64)
+    try:
+        array = np.array(values, dtype=np.float64)
+    except TypeError as error:
+        raise ValueError(f"{name}: must hold numbers only") from error
     if array.ndim != len(shape) or any(want not in (-1, got) for want, got in zip(shape, array.shape, strict=True)):
         raise ValueError(f"{name}: must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():

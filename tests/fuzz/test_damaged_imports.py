@@ -239,7 +239,7 @@ def test_calibrations(changes: list[Callable[[dict[str, Any]], None]], edits: li
             read = read_calibration([path]).rig
             for camera in (read.camera, *(lens.camera for lens in map(read.lens, EYES) if lens is not None)):
                 # A camera whose axis misses its own image is a transposed matrix, or worse.
-                assert 0 < camera.cx_px < camera.width_px and 0 < camera.cy_px < camera.height_px
+                assert -0.5 <= camera.cx_px <= camera.width_px - 0.5 and -0.5 <= camera.cy_px <= camera.height_px - 0.5
 
         quietly(use)
 

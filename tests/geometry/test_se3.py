@@ -168,3 +168,10 @@ def test_wrong_last_row_is_refused() -> None:
     matrix[3, 0] = 0.1
     with pytest.raises(ValueError, match="matrix: last row"):
         RigidTransform.from_matrix(matrix)
+
+
+@pytest.mark.parametrize("value", [{"left": 1}, [[{}] * 4] * 4])
+def test_what_is_no_number_is_a_value_error(value: object) -> None:
+    """As it stands in a file that somebody edited; pydantic reports a ValueError alone."""
+    with pytest.raises(ValueError, match="matrix: must hold numbers only"):
+        RigidTransform.from_matrix(value)  # type: ignore[arg-type]
