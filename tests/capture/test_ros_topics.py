@@ -33,9 +33,8 @@ def test_without_rclpy_one_line_says_how_to_get_it(
     calibration = write_calibration(tmp_path / "stereo.yaml", 64, 48, 100.0, 0.12)
     options = ["--live", f"ros:{','.join(TOPICS)}", "--calibration", str(calibration), "--out", str(tmp_path / "out")]
     assert run(["navigate", *options]) == WRONG_INPUT
-    *rig, error = capsys.readouterr().err.splitlines()
+    (error,) = capsys.readouterr().err.splitlines()
     assert "topics of ROS 2 need rclpy for this Python" in error and "source ROS's setup.bash" in error
-    assert rig[0].startswith("rig (OpenCV): baseline 0.12 m")
 
 
 @contextmanager
