@@ -106,4 +106,4 @@ def import_(
         bits=bits,
     )
     count = import_images(source, out, options, progress_report())
-    typer.echo(f"wrote {out}: {count} pairs")
+    typer.echo(f"wrote {out}: {count} pair{'' if count == 1 else 's'}")
