@@ -104,7 +104,7 @@ def test_blind_pairs_hold_no_truth(tiny: Path) -> None:
     assert set(vars(BlindPair(0, None, None, None))) == {"frame_index", "images", "rig", "drogue"}
     full, empty = blind.pair(0), blind.pair(3)
     assert full.drogue == empty.drogue and full.rig is empty.rig
-    assert {name for name in vars(blind) if not name.startswith("_")} == {"frame_indices"}
+    assert {name for name in vars(blind) if not name.startswith("_")} == {"frame_indices", "rig", "drogue"}
     assert {name for name in dir(blind) if not name.startswith("_")} == {"frame_indices", "pair"}
 
 

@@ -1,0 +1,1 @@
+"""How much of its time a training waits for pairs that are rendered meanwhile."""
