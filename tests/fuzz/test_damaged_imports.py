@@ -84,7 +84,7 @@ def folders(draw: st.DrawFn) -> dict[str, bytes]:
         for name in template:
             is_usual = draw(st.integers(0, 9)) > 0
             path = f"{name.format(number)}{suffix if is_usual else draw(st.sampled_from(SUFFIXES))}"
-            if draw(st.integers(0, 19)) > 0 and not path.endswith("/"):
+            if draw(st.integers(0, 19)) > 0 and path.rpartition("/")[2]:
                 files[path] = data if is_usual else draw(pictures())
     if draw(st.integers(0, 9)) == 0:
         lines = ["2011-09-26 13:02:25.964389445", "1.0e-1", "", "nan", "2011-09-31 10:00:00.1"]
