@@ -134,6 +134,9 @@ class RenderStream(IterableDataset[Any]):
     dataset: the next epoch reads it, and `droguekit render` completes it.
 
     The order is a function of the recipe's seed, the epoch and the number of processes, not of how fast anything runs.
+
+    Attributes:
+        cache: folder of this rank's frames.
     """
 
     def __init__(
@@ -151,7 +154,7 @@ class RenderStream(IterableDataset[Any]):
         Args:
             recipe: from `droguekit.load_recipe`.
             cache: folder for the rendered frames; must be new, empty, or a dataset of the same recipe. Do not render
-                into it by other means at the same time.
+                into it by other means at the same time. With several ranks each has a folder of its own in it.
             replays: how many earlier frames follow each new one. With more, the training waits less for rendering.
             transform: changes each sample.
             rank: of this process in a distributed training.
@@ -165,12 +168,14 @@ class RenderStream(IterableDataset[Any]):
             raise ValueError(f"replays: must not be negative, got {replays}")
         if not 0 <= rank < ranks:
             raise ValueError(f"rank: must be from 0 to ranks - 1 = {ranks - 1}, got {rank}")
-        self._recipe, self._cache = recipe, Path(cache)
+        self._recipe = recipe
+        # Each rank locks and tidies a folder of its own, so that ranks may start at the same time.
+        self.cache = Path(cache) if ranks == 1 else Path(cache) / f"rank-{rank:03d}"
         self._replays, self._transform = replays, transform
         self._rank, self._ranks = rank, ranks
         self._epoch, self._batches_done, self._batch_size = 0, 0, 1
-        with open_dataset(self._cache, RecipeSource(recipe, RECIPE_TEXT)):
-            if FrameStore(self._cache).pairs_per_tar is not None:
+        with open_dataset(self.cache, RecipeSource(recipe, RECIPE_TEXT)):
+            if FrameStore(self.cache).pairs_per_tar is not None:
                 raise ValueError(f"{cache}: keeps its pairs in tar files; give another folder for the cache")
 
     def start_at(self, epoch: int, batches_done: int = 0, batch_size: int = 1) -> None:
@@ -201,8 +206,8 @@ class RenderStream(IterableDataset[Any]):
         # A data loader takes batches from its processes in turn.
         done = len(range(worker, self._batches_done, workers)) * self._batch_size
         shard = self._rank * workers + worker
-        reader = Dataset(self._cache)
-        task = FrameTask(self._recipe, self._cache, next(iter(reader.manifest.engines), None))
+        reader = Dataset(self.cache)
+        task = FrameTask(self._recipe, self.cache, next(iter(reader.manifest.engines), None))
         for frame_index in self.frame_order(shard, self._ranks * workers, done):
             if not reader.frames.storage.exists(f"{frame_name(frame_index)}/{RECORD_FILE}"):
                 task(frame_index)

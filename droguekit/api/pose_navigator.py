@@ -14,6 +14,7 @@ from nav.detector.detector_registry import DEFAULT_DETECTOR
 from nav.pair_navigator import CENTROID_CHOICES, CentroidChoice
 from nav.runner import open_navigator
 from nav.sequence_navigator import SequenceSettings
+from scenes.sampler import FRAME_PERIOD_S
 
 
 class Navigator:
@@ -46,7 +47,8 @@ class Navigator:
             drogue: the drogue to look for.
             method: name of a pose method, see `droguekit navigate --help`.
             detector: name of a shipped one, or a network file `*.onnx`.
-            encoding: of pixel values: `linear` in the light, or `gamma` (the sRGB curve).
+            encoding: of the arrays that are passed in: `linear` in the light, as the shipped recipes render, or `gamma`
+                (the sRGB curve), as most cameras deliver 8 bits. A wrong one costs accuracy.
             black_level_dn: pixel value without light. [DN]
             centroids: how centres of markers are measured, one of `own`, `binary`, `edge`.
             tracker: name of a tracker that follows the drogue from pair to pair; the detector runs on every pair when
@@ -85,7 +87,7 @@ class Navigator:
             StereoImages(
                 left=left,
                 right=right,
-                time_s=_PERIOD_S * self._next_index if time_s is None else time_s,
+                time_s=FRAME_PERIOD_S * self._next_index if time_s is None else time_s,
                 exposure_s=0.0,
                 bits=8 if left.dtype == "uint8" else 12,
                 encoding=self._encoding,
@@ -106,6 +108,3 @@ class Navigator:
         with one_thread():
             estimates = self._navigator.process(BlindPair(index, images, self.rig, self.drogue)).estimates
         return estimates[-1]
-
-
-_PERIOD_S = 0.04

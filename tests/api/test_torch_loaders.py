@@ -12,8 +12,10 @@ import torch
 from torch.utils.data import DataLoader
 
 import droguekit
-from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.recipe.recipe import Recipe, RecipeSource
+from droguekit.api.recipe_rendering import RECIPE_TEXT
 from droguekit.api.stereo_dataset import StereoDataset
+from droguekit.batch.resume import open_dataset
 from droguekit.torch import PairDataset, RenderStream, sample_of_pair
 from tests.support.recipe_builder import build_recipe
 from tests.support.small_datasets import SINGLE_PAIRS
@@ -125,6 +127,14 @@ def test_ranks_and_processes_of_loaders_render_each_frame_once(recipe: Recipe, t
         loader: DataLoader[Any] = DataLoader(stream, batch_size=2, num_workers=2, multiprocessing_context="spawn")
         frames += [index for batch in loader for index in batch["frame_index"].tolist()]
     assert sorted(frames) == list(range(12))
+
+
+def test_ranks_that_start_at_the_same_time_do_not_lock_each_other_out(recipe: Recipe, tmp_path: Path) -> None:
+    first = RenderStream(recipe, tmp_path / "cache", rank=0, ranks=2)
+    # Opening a cache locks it, and removes what killed runs have left there.
+    with open_dataset(first.cache, RecipeSource(recipe, RECIPE_TEXT)):
+        second = RenderStream(recipe, tmp_path / "cache", rank=1, ranks=2)
+        assert next(iter(second))["frame_index"].item() == 1
 
 
 @pytest.mark.parametrize("workers", [0, 2])
