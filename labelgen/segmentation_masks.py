@@ -10,7 +10,7 @@ from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.records import PairRecord
 from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids, part_name
-from drogue_models.tanker import tanker_mesh
+from drogue_models.tankers.wing_with_pod import tanker_mesh
 from geometry.distortion import border_px
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig

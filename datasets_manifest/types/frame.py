@@ -12,6 +12,7 @@ from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.field_types import Points3, Rig, Transform, Vector6
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
+from drogue_models.tankers.parameters import Tanker
 from geometry.se3 import RigidTransform, exp_twist
 
 DropoutKind = Literal["occlusion", "out-of-view", "glare"]
@@ -113,7 +114,8 @@ class FrameSpec(FrozenModel):
         world_from_left: world axes are x east, y north, z up; origin at the left eye.
         left_twist_per_s, drogue_twist_per_s: (6,) body twists over the exposure, each in its own frame, relative to
             axes that fly along with the tanker: velocity [m/s], then angular velocity [rad/s].
-        left_from_tanker: pose of the tanker (x aft, y right wing, z up, origin at the pod's hose exit), or None.
+        tanker: what `left_from_tanker` is the pose of; None for a swept wing with one pod.
+        left_from_tanker: pose of the tanker (x aft, y right wing, z up, origin where the hose leaves), or None.
         hose_nodes_left_m: (K, 3) centre line from coupling to pod in the left camera at mid-exposure, or None. [m]
         rig, sensor, exposure, environment: as named.
         rangefinder_reading_m: measured distance of the rim centre along the optical axis, or None without one. [m]
@@ -136,6 +138,7 @@ class FrameSpec(FrozenModel):
     world_from_left: Transform
     left_twist_per_s: Vector6
     drogue_twist_per_s: Vector6
+    tanker: Tanker | None = Field(default=None, exclude_if=lambda tanker: tanker is None)
     left_from_tanker: Transform | None
     hose_nodes_left_m: Points3 | None
     rig: Rig

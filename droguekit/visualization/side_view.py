@@ -18,7 +18,7 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
-from drogue_models.tanker import tanker_mesh
+from drogue_models.tankers.wing_with_pod import tanker_mesh
 from droguekit.scoring.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
 from droguekit.visualization.video_file import check_video, evenly, period_s, write_video
 from geometry.se3 import Array, RigidTransform

@@ -10,7 +10,7 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name, part_satin
 from drogue_models.solids import with_creases
-from drogue_models.tanker import tanker_mesh
+from drogue_models.tankers.wing_with_pod import tanker_mesh
 from render.blender_engine.messages import FrameSetup, PartMesh, StageLight, StageObjects, SurfaceAppearance
 from render.surfaces import (
     SMOOTH_PARTS,

@@ -23,7 +23,7 @@ from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parameters import SatinPaint
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_satin
 from drogue_models.solids import with_creases
-from drogue_models.tanker import tanker_mesh
+from drogue_models.tankers.wing_with_pod import tanker_mesh
 from geometry.se3 import RigidTransform
 from render.mitsuba_engine.jit_arrays import jit_array, jit_tensor
 from render.surfaces import (

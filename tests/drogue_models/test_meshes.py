@@ -10,7 +10,7 @@ from drogue_models.meshes import drogue_meshes, hose_mesh
 from drogue_models.parameters import DrogueParameters, even_ring
 from drogue_models.parts import Part, drogue_part_ids, marker_id, part_reflectance_rgb
 from drogue_models.presets import PRESETS
-from drogue_models.tanker import tanker_mesh
+from drogue_models.tankers.wing_with_pod import tanker_mesh
 
 RED_8 = PRESETS["red-8"]
 # What users may ask for at the edges: no hub, no ribs, many small markers, a rim thinner than the face, a deep hub.

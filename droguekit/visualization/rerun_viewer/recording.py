@@ -27,7 +27,7 @@ from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
 from drogue_models.meshes import drogue_meshes
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part
-from drogue_models.tanker import tanker_mesh
+from drogue_models.tankers.wing_with_pod import tanker_mesh
 from droguekit.scoring.poses.pose_errors import pose_error
 from droguekit.scoring.report.label_drawing import BOX_RGB, MARKER_RGB, Rgb, display_picture
 from geometry.circles import disc_outline

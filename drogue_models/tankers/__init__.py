@@ -1,0 +1,1 @@
+"""Parametric tankers in the frame whose origin is where the hose leaves."""
