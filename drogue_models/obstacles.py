@@ -7,8 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from drogue_models.frozen_model import FrozenModel
-from drogue_models.parameters import Metres
+from drogue_models.frozen_model import FrozenModel, Metres
 from geometry.se3 import Array
 
 OBSTACLE_SECTIONS = 64

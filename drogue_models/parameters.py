@@ -11,11 +11,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from drogue_models.frozen_model import FrozenModel
+from drogue_models.frozen_model import FrozenModel, Metres, ReflectanceRgb
 
-Metres = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
-Reflectance = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-ReflectanceRgb = tuple[Reflectance, Reflectance, Reflectance]
 PlanePoint = tuple[
     Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)],
     Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)],

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from drogue_models.parameters import DrogueParameters, ReflectanceRgb, SatinPaint
+from drogue_models.frozen_model import ReflectanceRgb
+from drogue_models.parameters import DrogueParameters, SatinPaint
 
 FIRST_MARKER_ID = 32
 MAX_MARKERS = 32

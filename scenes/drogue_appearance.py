@@ -8,8 +8,9 @@ from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.drogue_ranges import AppearanceRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import DrogueCondition, Obstacle, SurfaceCondition
+from drogue_models.frozen_model import ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape
-from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters, ReflectanceRgb
+from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
 from scenes.environment_sampling import sample_uniform

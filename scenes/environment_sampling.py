@@ -14,7 +14,7 @@ from datasets_manifest.recipe.environment_ranges import (
 )
 from datasets_manifest.types.environment import CloudLayer, Environment, EnvironmentMap, GroundKind, Mist, Moon
 from datasets_manifest.types.field_types import Range
-from drogue_models.parameters import ReflectanceRgb
+from drogue_models.frozen_model import ReflectanceRgb
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE
 from scenes.sky.equirectangular_sky import load_map
 

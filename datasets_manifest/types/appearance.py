@@ -8,9 +8,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from datasets_manifest.types.field_types import Transform
-from drogue_models.frozen_model import FrozenModel
+from drogue_models.frozen_model import FrozenModel, Reflectance, ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape
-from drogue_models.parameters import Reflectance, ReflectanceRgb
 from geometry.se3 import Array
 
 

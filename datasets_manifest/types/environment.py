@@ -8,8 +8,7 @@ from typing import Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from drogue_models.frozen_model import FrozenModel
-from drogue_models.parameters import ReflectanceRgb
+from drogue_models.frozen_model import FrozenModel, ReflectanceRgb
 
 CloudKind = Literal["cumulus", "stratus", "cirrus"]
 

@@ -10,8 +10,8 @@ import numpy as np
 from datasets_manifest.recipe.sequence_ranges import DropoutRanges
 from datasets_manifest.types.appearance import Obstacle
 from datasets_manifest.types.frame import DropoutKind
+from drogue_models.frozen_model import ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape
-from drogue_models.parameters import ReflectanceRgb
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from scenes.drogue_appearance import rotation_with_z

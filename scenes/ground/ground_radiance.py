@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.environment import Environment, GroundKind
-from drogue_models.parameters import ReflectanceRgb
+from drogue_models.frozen_model import ReflectanceRgb
 from scenes.clouds.ray_march import upsample
 from scenes.ground.land_tiles import LandKind, land_tile
 from scenes.ground.sea import GroundLight, Sea, draw_ships, sample_ships

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.random_streams import frame_generator
-from drogue_models.parameters import ReflectanceRgb
+from drogue_models.frozen_model import ReflectanceRgb
 from scenes.ground_view import Field, GroundView, MipTile, power_noise
 from scenes.sky.photometry import Radiance
 
