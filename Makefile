@@ -1,7 +1,7 @@
 # Every target does its own set-up (scripts/setup), which is quick the second time. Paths are relative, so the folder may
 # lie anywhere.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo docs test test-slow test-readers torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
+.PHONY: help setup demo docs test test-slow test-readers torture fuzz lint bench bench-engines bench-peers bench-scaling bench-feed bench-variety bench-detectors bars-nav-a bars-nav-b bars-nav-b-blender bars-nav-c bars-nav-d bars-nav-e bars-nav-docking publish clean
 SHELL := /bin/bash
 BIN := .venv/bin
 
@@ -66,6 +66,11 @@ bench-scaling: ## two workers against one on 200 pairs, and the overhead per fra
 bench-feed: ## how much of its time a training waits for pairs that are rendered meanwhile (minutes, on an idle machine)
 	@scripts/setup all
 	@$(BIN)/python -m studies.training_feed --out out/training-feed
+
+bench-variety: ## how much drogues, tankers and probes differ between scenes, and sheets of them all (an hour; resumes)
+	@scripts/setup all
+	@$(BIN)/python -m studies.world_variety measure --out out/world-variety world-89
+	@$(BIN)/python -m studies.world_variety sheets --out out/world-variety
 
 CORPUS ?= out/detector/datasets/detector-small
 bench-detectors: ## detectors OURS=FILE.onnx beside YOLOv8n and YOLOv8s, trained on CORPUS=DIR and timed in turns (hours; installs ultralytics; resumes)

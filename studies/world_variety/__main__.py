@@ -1,0 +1,67 @@
+"""Measures the variety of recipes, and draws sheets of drogues and tankers in four lights.
+
+`python -m studies.world_variety measure --out out/world-variety world-89 world-real`
+`python -m studies.world_variety sheets --out out/world-variety`
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from drogue_models.presets import PRESETS
+from droguekit.api.recipe_rendering import load_recipe, render_dataset
+from studies.world_variety.light_sheets import sheet_rows, write_sheet
+from studies.world_variety.variety_measures import Variety, measure_variety
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Render what is missing, then measure it or draw it."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.world_variety",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    measure = commands.add_parser("measure", help="one pair of each of many scenes; a line of numbers for each recipe")
+    measure.add_argument("recipes", nargs="+", metavar="RECIPE", help="name of a recipe, or a .toml file")
+    measure.add_argument("--scenes", type=int, default=200, metavar="N", help="scenes of each recipe (default 200)")
+    sheets = commands.add_parser("sheets", help="every drogue and every tanker at four distances in four lights")
+    for command in (measure, sheets):
+        command.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder; a second run goes on")
+        command.add_argument("--workers", type=int, metavar="N", help="processes that render (default: by the machine)")
+    options = parser.parse_args(arguments)
+    if options.command == "measure":
+        _measure(options.recipes, options.scenes, options.out, options.workers)
+    else:
+        _draw_sheets(options.out, options.workers)
+
+
+def _measure(recipes: Sequence[str], scenes: int, out: Path, workers: int | None) -> None:
+    print(
+        "recipe | pairs | drogues | distance mean | distance p10 | tankers | silhouettes | probes | probe sd x, y [px]"
+    )
+    for name in recipes:
+        recipe = load_recipe(name, frames={"count": scenes, "scenes": scenes})
+        dataset = render_dataset(recipe, out / recipe.name, workers=workers)
+        print(f"{recipe.name} | {_cells(measure_variety(dataset))}", flush=True)
+
+
+def _cells(found: Variety) -> str:
+    x_px, y_px = found.probe_sd_px
+    return (
+        f"{found.pairs} | {found.drogues} | {found.drogue_distance:.3f} | {found.drogue_distance_p10:.3f} | "
+        f"{found.tankers} | {found.silhouettes} | {found.probes} | {x_px:.0f}, {y_px:.0f}"
+    )
+
+
+def _draw_sheets(out: Path, workers: int | None) -> None:
+    drogues = {name: {"drogue": name} for name in PRESETS}
+    rows = sheet_rows(out / "drogues", drogues, workers, whole_image=False)
+    write_sheet(list(rows.values()), out / "drogues.png")
+    print(f"{out / 'drogues.png'}: {len(rows)} drogues")
+
+
+if __name__ == "__main__":
+    main()
