@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
 from drogue_models.parameters import BodyMesh, DrogueParameters, HubParameters
-from drogue_models.parts import Part, marker_id, part_name, part_reflectance_rgb
+from drogue_models.parts import Part, marker_id
 from drogue_models.solids import area_radius_m, bar, circle_m, loft, plate, pocketed_plate, revolve
 from geometry.se3 import Array
 
@@ -293,41 +292,6 @@ def _hub(drogue: DrogueParameters, hub: HubParameters) -> trimesh.Trimesh:
     thickness_m = _hub_thickness_m(drogue)
     profile = [(inner_m, 0.0), (outer_m, 0.0), (outer_m, thickness_m), (inner_m, thickness_m)]
     return revolve(np.array(profile) + np.array([0.0, hub.depth_m]), MARKER_SECTIONS)
-
-
-def encode_mesh_file(drogue: DrogueParameters, meshes: Mapping[int, trimesh.Trimesh], suffix: str) -> bytes:
-    """Contents of a file for viewers of 3-D models.
-
-    GLB keeps one node per part with its colour, PLY and OBJ have coloured vertices, STL has the shape only.
-
-    Args:
-        drogue: gives the colours.
-        meshes: of its parts, see `drogue_meshes`.
-        suffix: `.glb`, `.ply`, `.stl` or `.obj`.
-    """
-    scene = trimesh.Scene()
-    colored = []
-    for part, mesh in meshes.items():
-        name, linear = part_name(part), part_reflectance_rgb(drogue, part)
-        if suffix == ".glb":
-            # glTF's base colour is linear; its materials are metals unless told otherwise.
-            material = trimesh.visual.material.PBRMaterial(
-                name=name, baseColorFactor=[*linear, 1.0], metallicFactor=0.0, roughnessFactor=1.0
-            )
-            # Flat shading needs each triangle's own vertices.
-            flat = trimesh.Trimesh(**trimesh.triangles.to_kwargs(mesh.triangles), process=False)
-            flat.visual = trimesh.visual.TextureVisuals(material=material)
-            scene.add_geometry(flat, node_name=name, geom_name=name)
-        else:
-            mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=[_srgb(value) for value in linear] + [255])
-            colored.append(mesh)
-    data = (scene if suffix == ".glb" else trimesh.util.concatenate(colored)).export(file_type=suffix[1:])
-    return data.encode() if isinstance(data, str) else bytes(data)
-
-
-def _srgb(linear: float) -> int:
-    """A linear value as viewers of vertex colours expect it (IEC 61966-2-1)."""
-    return round(255 * (12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055))
 
 
 _EXAMPLE_SECTIONS = 48

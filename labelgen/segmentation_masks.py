@@ -8,14 +8,12 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.records import PairRecord
-from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids, part_name
-from drogue_models.tankers.wing_with_pod import tanker_mesh
 from geometry.distortion import border_px
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
 from render.analytic_engine.ring_passes import flat_part_masks
-from render.surfaces import missing_parts
+from render.surfaces import frame_surfaces, front_faces, is_feature
 
 Mask = NDArray[np.bool_]
 
@@ -99,33 +97,19 @@ def part_triangles(frame: FrameSpec, eye: Eye) -> dict[int, Array]:
     Raises:
         ValueError: a user's body mesh that is missing or was changed.
     """
+    surfaces = frame_surfaces(frame, RigidTransform.identity())
     meshes: list[tuple[int, trimesh.Trimesh, RigidTransform]] = []
-    if frame.drogue is not None and frame.left_from_drogue is not None:
-        gone = missing_parts(frame)
-        for part, mesh in drogue_meshes(frame.drogue).items():
-            if part not in gone:
-                meshes.append((part, _front(mesh) if _is_feature(part) else mesh, frame.left_from_drogue))
-        if frame.hose_nodes_left_m is not None:
-            here = RigidTransform(np.eye(3), np.zeros(3))
-            meshes.append((int(Part.HOSE), hose_mesh(frame.hose_nodes_left_m, frame.drogue.hose_radius_m), here))
-        if frame.left_from_tanker is not None:
-            meshes.append((int(Part.TANKER), tanker_mesh(), frame.left_from_tanker))
-    for obstacle in frame.bystanders:
-        part = int(Part[obstacle.kind.upper()])
-        meshes.append((part, obstacle_mesh(obstacle.shape), obstacle.left_from_object))
+    for surface in surfaces.fixed.values():
+        mesh = surface.painted.mesh
+        assert frame.left_from_drogue is not None
+        shown = front_faces(mesh) if is_feature(surface.part_id) else mesh
+        meshes.append((surface.part_id, shown, frame.left_from_drogue))
+    meshes += [(moved.part_id, moved.painted.mesh, moved.axes_from_mesh) for moved in surfaces.moved.values()]
     offset_m = frame.rig.eye_offset_m(eye)
     found: dict[int, list[Array]] = {}
     for part, mesh, left_from_mesh in meshes:
         found.setdefault(part, []).append(left_from_mesh.apply(np.asarray(mesh.triangles)) - offset_m)
     return {part: np.concatenate(triangles) for part, triangles in found.items()}
-
-
-def _is_feature(part: int) -> bool:
-    return part == Part.HUB or part >= FIRST_MARKER_ID
-
-
-def _front(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
 
 
 def silhouette(triangles_m: Array, rig: StereoRig, eye: Eye) -> NDArray[np.bool_]:

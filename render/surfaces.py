@@ -1,15 +1,26 @@
-"""What the surfaces of a frame reflect and emit: each part's paint with its ageing, dirt and lamps."""
+"""All surfaces of a frame: where they are, and what they reflect and emit with their ageing, dirt and lamps."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import cv2
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.types.appearance import AS_NEW, SurfaceCondition
+from datasets_manifest.types.appearance import AS_NEW, Obstacle, SurfaceCondition
 from datasets_manifest.types.frame import FrameSpec
+from drogue_models.drogue_surfaces import drogue_surfaces, hose_surface, obstacle_surface
+from drogue_models.painted_mesh import PaintedMesh
 from drogue_models.parts import FIRST_MARKER_ID, SURROUNDING_PARTS, Part, part_reflectance_rgb
+from drogue_models.tankers.wing_with_pod import wing_surfaces
+from geometry.se3 import Array, RigidTransform
 from scenes.sky.photometry import REC709_LUMINANCE
 
 DIRT_MAP_PX = 64
@@ -17,8 +28,210 @@ DIRT_MAP_PX = 64
 DIRT_RGB = (0.055, 0.050, 0.045)
 _BLOTCH_PX = 5.0
 _EDGE_PX = 1.2
-SMOOTH_PARTS = (Part.RIM, Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR)
-"""Parts with interpolated normals, whose meshes need creases at sharp edges; other parts have flat faces."""
+# A map with a larger standard deviation over its mean has edges that a pixel's few rays may miss.
+_EVEN_CONTRAST = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """One surface of a frame.
+
+    Attributes:
+        part_id: `drogue_models.parts`.
+        group: equal for all surfaces of one thing, such as the tanker.
+        painted: its mesh, texture coordinates and sheen.
+        axes_from_mesh: where the mesh is in the axes that were asked for.
+        reflectance: (3,) or (h, w, 3), the paint in its condition in this frame.
+        emission_cd_m2: (3,) emitted radiance. [cd/m2]
+        is_lamp: it may shine in another condition of the same drogue.
+        lights_others: whether paths from other surfaces find it. A lamp of a few centimetres would leave speckles.
+    """
+
+    part_id: int
+    group: str
+    painted: PaintedMesh
+    axes_from_mesh: RigidTransform
+    reflectance: NDArray[np.floating[Any]]
+    emission_cd_m2: Array
+    is_lamp: bool
+    lights_others: bool
+
+    @property
+    def uv(self) -> Array | None:
+        """(V, 2) texture coordinates if the reflectance is a map."""
+        return self.painted.uv if self.reflectance.ndim == 3 else None
+
+    @property
+    def kind(self) -> tuple[object, ...]:
+        """Equal for surfaces that can take each other's places in a loaded scene, given new vertices and paint."""
+        map_size = self.reflectance.shape[:-1]
+        look = self.painted.smooth, self.painted.sheen, map_size, self.is_lamp, self.lights_others
+        return (self.part_id, self.painted.topology, *look)
+
+    def hull_m(self) -> Array:
+        """(N, 3) points whose convex hull holds the surface, in the axes that were asked for. [m]"""
+        mesh = self.painted.mesh
+        # The box around a curved hose would hold much more than the hose.
+        points = mesh.vertices if self.part_id == Part.HOSE else trimesh.bounds.corners(mesh.bounds)
+        hull: Array = self.axes_from_mesh.apply(np.asarray(points))
+        return hull
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSurfaces:
+    """All surfaces of a frame by name.
+
+    Attributes:
+        fixed: the drogue's parts that have not come off, in the drogue frame.
+        moved: hose, tanker and bystanders.
+    """
+
+    fixed: dict[str, Surface]
+    moved: dict[str, Surface]
+
+    @property
+    def all(self) -> dict[str, Surface]:
+        """Fixed and moved surfaces."""
+        return self.fixed | self.moved
+
+    @property
+    def uneven_parts(self) -> set[int]:
+        """Part ids of the drogue's surfaces whose paint has edges of its own."""
+        return {surface.part_id for surface in self.fixed.values() if _is_uneven(surface)}
+
+
+def _is_uneven(surface: Surface) -> bool:
+    if surface.reflectance.ndim == 1:
+        return False
+    own = surface.reflectance is surface.painted.reflectance
+    return not own or surface.painted.contrast > _EVEN_CONTRAST
+
+
+def frame_surfaces(frame: FrameSpec, axes_from_left: RigidTransform) -> FrameSurfaces:
+    """All surfaces of a frame at mid-exposure.
+
+    Args:
+        frame: what it shows.
+        axes_from_left: axes in which the moved surfaces are given.
+
+    Raises:
+        ValueError: the user's body mesh is missing, changed, or not fit for use.
+    """
+    moved: dict[str, Surface] = {}
+    if frame.drogue is not None and frame.hose_nodes_left_m is not None:
+        hose = hose_surface(frame.drogue, axes_from_left.apply(frame.hose_nodes_left_m))
+        moved |= _named([hose], Part.HOSE, RigidTransform.identity(), _worn_fraction(frame, Part.HOSE))
+    if frame.left_from_tanker is not None:
+        moved |= _named(frame_tanker_surfaces(frame), Part.TANKER, axes_from_left @ frame.left_from_tanker)
+    for index, obstacle in enumerate(frame.bystanders):
+        part = Part[obstacle.kind.upper()]
+        name = f"part_{int(part)}_{index}"
+        pose = axes_from_left @ obstacle.left_from_object
+        moved[name] = _surface(obstacle_surfaces(obstacle), int(part), name, pose)
+    return FrameSurfaces(fixed=_fixed_surfaces(frame), moved=moved)
+
+
+def shows_surfaces(frame: FrameSpec) -> bool:
+    """Whether a frame has any surface to render."""
+    return frame.drogue is not None or frame.left_from_tanker is not None or len(frame.bystanders) > 0
+
+
+def frame_tanker_surfaces(frame: FrameSpec) -> tuple[PaintedMesh, ...]:
+    """Surfaces of the frame's tanker in the tanker frame."""
+    return wing_surfaces()
+
+
+def obstacle_surfaces(obstacle: Obstacle) -> PaintedMesh:
+    """The surface of a bystander in its own axes."""
+    return obstacle_surface(obstacle.shape, obstacle.reflectance_rgb)
+
+
+def _named(
+    surfaces: Iterable[PaintedMesh], part: Part, pose: RigidTransform, fraction: float = 1.0
+) -> dict[str, Surface]:
+    """Surfaces of one thing by name; `fraction` is a factor on their reflectance."""
+    group = f"part_{int(part)}"
+    named = {}
+    for index, painted in enumerate(surfaces):
+        name = group if index == 0 else f"{group}_{index}"
+        named[name] = _surface(painted, int(part), group, pose, fraction)
+    return named
+
+
+def _surface(painted: PaintedMesh, part_id: int, group: str, pose: RigidTransform, fraction: float = 1.0) -> Surface:
+    return Surface(
+        part_id=part_id,
+        group=group,
+        painted=painted,
+        axes_from_mesh=pose,
+        reflectance=_scaled(painted.reflectance, fraction),
+        emission_cd_m2=painted.emission_cd_m2,
+        is_lamp=bool(painted.emission_cd_m2.any()),
+        lights_others=False,
+    )
+
+
+def _fixed_surfaces(frame: FrameSpec) -> dict[str, Surface]:
+    if frame.drogue is None:
+        return {}
+    wear = None if frame.condition is None else frame.condition.wear
+    gone, found = missing_parts(frame), {}
+    for part, painted in drogue_surfaces(frame.drogue, wear).items():
+        if part not in gone:
+            lamp = part >= FIRST_MARKER_ID and frame.drogue.marker_luminance_cd_m2 > 0
+            surface = _surface(painted, part, "drogue", RigidTransform.identity())
+            found[f"part_{part}"] = replace(
+                surface,
+                reflectance=_in_condition(frame, part, painted.reflectance),
+                emission_cd_m2=lamp_radiance_rgb(frame, part) if lamp else painted.emission_cd_m2,
+                is_lamp=lamp or surface.is_lamp,
+                lights_others=lamp,
+            )
+    return found
+
+
+def feature_surfaces(fixed: dict[str, Surface]) -> dict[str, trimesh.Trimesh]:
+    """Visible faces of markers and hub by name; their side walls are sunk in the part around them."""
+    return {name: front_faces(surface.painted.mesh) for name, surface in fixed.items() if is_feature(surface.part_id)}
+
+
+def is_feature(part_id: int) -> bool:
+    """Whether a part is a marker or the hub."""
+    return part_id == Part.HUB or part_id >= FIRST_MARKER_ID
+
+
+def front_faces(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The front of a flat feature."""
+    return mesh.submesh([np.flatnonzero(mesh.face_normals[:, 2] < -0.5)], append=True)
+
+
+def _scaled(reflectance: NDArray[np.floating[Any]], fraction: float) -> NDArray[np.floating[Any]]:
+    return reflectance if fraction == 1.0 else np.minimum(reflectance * fraction, 1.0)
+
+
+def _worn_fraction(frame: FrameSpec, part_id: int) -> float:
+    """Factor on the reflectance of a part other than the markers and the hub."""
+    worn = frame.condition is not None and (part_id == Part.HOSE or part_id not in SURROUNDING_PARTS)
+    return frame.condition.body_reflectance_fraction if worn and frame.condition is not None else 1.0
+
+
+def _in_condition(frame: FrameSpec, part_id: int, paint: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Paint of a part of the drogue as the condition of this frame leaves it."""
+    if not is_feature(part_id):
+        return _scaled(paint, _worn_fraction(frame, part_id))
+    condition = surface_condition(frame, part_id)
+    faded = _scaled(paint, condition.reflectance_fraction)
+    return faded if condition.is_clean else _under_dirt(faded, condition)
+
+
+def _under_dirt(paint: NDArray[np.floating[Any]], condition: SurfaceCondition) -> NDArray[np.float32]:
+    """(h, w, 3) paint with dirt over the square around a marker or the hub; row 0 is the low y end."""
+    dirt = dirt_map(condition.dirt_seed, condition.dirt_fraction)
+    if paint.ndim == 3 and paint.shape[:2] != dirt.shape:
+        dirt = cv2.resize(dirt, (paint.shape[1], paint.shape[0]), interpolation=cv2.INTER_LINEAR)
+    share = dirt[..., None]
+    result: NDArray[np.float32] = (paint * (1.0 - share) + np.array(DIRT_RGB) * share).astype(np.float32)
+    return result
 
 
 def surface_condition(frame: FrameSpec, part_id: int) -> SurfaceCondition:
@@ -31,7 +244,7 @@ def surface_condition(frame: FrameSpec, part_id: int) -> SurfaceCondition:
 
 
 def clean_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
-    """(3,) diffuse reflectance of a part of the drogue, the hose or the tanker, without its dirt.
+    """(3,) diffuse reflectance of a part of the drogue, the hose or the tanker, without its dirt and wear.
 
     Raises:
         ValueError: the frame has no such part.
@@ -39,20 +252,10 @@ def clean_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]
     if frame.drogue is None:
         raise ValueError("drogue: the frame has none")
     paint = np.array(part_reflectance_rgb(frame.drogue, part_id))
-    if part_id == Part.HUB or part_id >= FIRST_MARKER_ID:
+    if is_feature(part_id):
         return paint * surface_condition(frame, part_id).reflectance_fraction
-    worn = frame.condition is not None and (part_id == Part.HOSE or part_id not in SURROUNDING_PARTS)
-    fraction = frame.condition.body_reflectance_fraction if worn and frame.condition is not None else 1.0
-    return np.minimum(paint * fraction, 1.0)
-
-
-def reflectance_map(frame: FrameSpec, part_id: int) -> NDArray[np.float32]:
-    """(64, 64, 3) reflectance with dirt over the square around a marker or the hub; row 0 is the low y end."""
-    condition = surface_condition(frame, part_id)
-    dirt = dirt_map(condition.dirt_seed, condition.dirt_fraction)[..., None]
-    paint = clean_reflectance_rgb(frame, part_id)
-    result: NDArray[np.float32] = (paint * (1.0 - dirt) + np.array(DIRT_RGB) * dirt).astype(np.float32)
-    return result
+    clean: NDArray[np.float64] = np.minimum(paint * _worn_fraction(frame, part_id), 1.0)
+    return clean
 
 
 def mean_reflectance_rgb(frame: FrameSpec, part_id: int) -> NDArray[np.float64]:
@@ -77,11 +280,6 @@ def missing_parts(frame: FrameSpec) -> set[int]:
     return {part for part in _features(frame) if surface_condition(frame, part).missing}
 
 
-def dirty_parts(frame: FrameSpec) -> set[int]:
-    """Part ids of the markers, and possibly the hub, that have dirt."""
-    return {part for part in _features(frame) if not surface_condition(frame, part).is_clean}
-
-
 def _features(frame: FrameSpec) -> list[int]:
     """Part ids of hub and markers of a drogue whose condition is not as new."""
     if frame.drogue is None or frame.condition is None:
@@ -89,6 +287,7 @@ def _features(frame: FrameSpec) -> list[int]:
     return [int(Part.HUB), *range(FIRST_MARKER_ID, FIRST_MARKER_ID + frame.drogue.marker_count)]
 
 
+@lru_cache(maxsize=64)
 def dirt_map(seed: int, dirt_fraction: float) -> NDArray[np.float32]:
     """Where dirt covers the square around a disc.
 
@@ -105,4 +304,5 @@ def dirt_map(seed: int, dirt_fraction: float) -> NDArray[np.float32]:
     if dirt_fraction <= 0:
         covered[:] = 0.0
     softened: NDArray[np.float32] = gaussian_filter(covered, _EDGE_PX, mode="wrap").astype(np.float32)
+    softened.flags.writeable = False
     return softened

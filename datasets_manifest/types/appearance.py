@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from datasets_manifest.types.field_types import Transform
 from drogue_models.frozen_model import FrozenModel, Reflectance, ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape
+from drogue_models.surface_wear import SurfaceWear
 from geometry.se3 import Array
 
 
@@ -47,11 +48,14 @@ class DrogueCondition(FrozenModel):
         hub: of the hub annulus.
         body_reflectance_fraction: factor on the reflectance of face, canopy, ribs, coupling and hose: below 1 for soot,
             above 1 for bleaching.
+        wear: what makes paint, cloth and metal of all parts uneven, or None for even paint.
     """
 
     markers: tuple[SurfaceCondition, ...] = ()
     hub: SurfaceCondition = AS_NEW
     body_reflectance_fraction: float = Field(default=1.0, ge=0.1, le=3)
+    # Left out where there is none, so that the hashes of other datasets stay those of earlier versions.
+    wear: SurfaceWear | None = Field(default=None, exclude_if=lambda wear: wear is None)
 
     def of_marker(self, index: int) -> SurfaceCondition:
         """Condition of one marker."""

@@ -12,7 +12,9 @@ from functools import cache
 import numpy as np
 import trimesh
 
-from drogue_models.solids import bar, loft, revolve
+from drogue_models.painted_mesh import PaintedMesh
+from drogue_models.parts import TANKER_GREY
+from drogue_models.solids import bar, loft, revolve, with_creases
 from geometry.se3 import Array
 
 TIP_Y_M, ROOT_Y_M = -9.0, 21.0
@@ -34,6 +36,12 @@ def _tanker() -> trimesh.Trimesh:
 def tanker_mesh() -> trimesh.Trimesh:
     """Wing, pylon and pod in the tanker frame, each closed. [m]"""
     return _tanker().copy()
+
+
+@cache
+def wing_surfaces() -> tuple[PaintedMesh, ...]:
+    """Wing, pylon and pod in light grey, in the tanker frame; nobody may change them."""
+    return (PaintedMesh(mesh=with_creases(tanker_mesh()), reflectance=np.array(TANKER_GREY), smooth=True),)
 
 
 def _aerofoil(points_a_side: int) -> Array:

@@ -18,10 +18,10 @@ from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
-from drogue_models.tankers.wing_with_pod import tanker_mesh
 from droguekit.scoring.report.label_drawing import Picture, display_picture, draw_box, draw_crosses, resized
 from droguekit.visualization.video_file import check_video, evenly, period_s, write_video
 from geometry.se3 import Array, RigidTransform
+from render.surfaces import frame_tanker_surfaces
 
 _INCHES, _DPI = (12.8, 5.4), 100
 _PICTURE_PX = 640
@@ -89,7 +89,8 @@ class SideView:
             for place in ((0.05, 0.60, 0.43, 0.31), (0.05, 0.10, 0.43, 0.41), (0.5, 0.06, 0.49, 0.87))
         )
         self._whole, self._close, self._camera = whole, close, camera
-        triangles = _side(tanker_mesh().triangles.reshape(-1, 3)).reshape(-1, 3, 2)
+        corners_m = np.concatenate([part.mesh.triangles for part in frame_tanker_surfaces(records[0].frame)])
+        triangles = _side(corners_m.reshape(-1, 3)).reshape(-1, 3, 2)
         for axes in (whole, close):
             axes.add_collection(PolyCollection(list(triangles), facecolors=_STEEL, edgecolors=_STEEL, linewidths=0.3))
             axes.set_aspect("equal", adjustable="box")

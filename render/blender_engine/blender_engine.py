@@ -36,6 +36,7 @@ from render.blender_engine.process import (
 from render.blender_engine.stage import Stage
 from render.compositing import TracedEye, amodal_counts
 from render.engine import EyeRadiance, StereoRadiance
+from render.surfaces import shows_surfaces
 from render.version import RENDER_VERSION
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.sky.photometry import REC709_LUMINANCE
@@ -108,7 +109,7 @@ class BlenderEngine:
         started = time.process_time()
         background = backgrounds(frame)
         self._stage_s["sky"] = time.process_time() - started
-        if frame.left_from_drogue is None and not frame.bystanders:
+        if not shows_surfaces(frame):
             return self._stereo({eye: _empty_eye(frame).composite_over(background[eye]) for eye in EYES}, 0.0)
         ambient = environment_radiance(frame.environment)
         try:

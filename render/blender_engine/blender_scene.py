@@ -26,6 +26,7 @@ from render.blender_engine.messages import (
     DistortedEye,
     FrameSetup,
     ImageWindow,
+    MovedMesh,
     PartMesh,
     PictureRequest,
     StageLight,
@@ -50,6 +51,7 @@ class SurfaceMaterial:
         output, both = nodes.new("ShaderNodeOutputMaterial"), nodes.new("ShaderNodeAddShader")
         self._diffuse, self._emission = nodes.new("ShaderNodeBsdfDiffuse"), nodes.new("ShaderNodeEmission")
         self._diffuse.inputs["Roughness"].default_value = 0.0
+        self._camera_only: Any = None
         self._map = None
         if has_map:
             self._map = nodes.new("ShaderNodeTexImage")
@@ -66,10 +68,10 @@ class SurfaceMaterial:
 
     def set(self, appearance: SurfaceAppearance, unit_cd_m2: float) -> None:
         """Set what the surface reflects and emits."""
-        if self._map is not None:
-            replace_image(self._map, appearance.reflectance)
-        else:
-            self._diffuse.inputs["Color"].default_value = (*appearance.reflectance.tolist(), 1.0)
+        if appearance.reflectance is not None:
+            self._set_paint(appearance.reflectance)
+        if not appearance.lights_others and self._camera_only is None:
+            self._camera_only = self._seen_by_camera_only()
         fraction, roughness = appearance.sheen or (0.0, 1.0)
         self._sheen.inputs["Fac"].default_value = fraction
         # Blender's roughness is the root of the distribution's width.
@@ -77,7 +79,23 @@ class SurfaceMaterial:
         strength = float(appearance.emission_cd_m2.max())
         color = appearance.emission_cd_m2 / strength if strength > 0 else np.zeros(3)
         self._emission.inputs["Color"].default_value = (*color.tolist(), 1.0)
-        self._emission.inputs["Strength"].default_value = strength / unit_cd_m2
+        held = self._emission.inputs["Strength"] if self._camera_only is None else self._camera_only
+        held.default_value = strength / unit_cd_m2
+
+    def _set_paint(self, reflectance: NDArray[np.floating[Any]]) -> None:
+        if self._map is not None:
+            replace_image(self._map, reflectance)
+        else:
+            self._diffuse.inputs["Color"].default_value = (*reflectance.tolist(), 1.0)
+
+    def _seen_by_camera_only(self) -> Any:
+        """Let other surfaces see no emission; returns the input that then holds its strength."""
+        nodes, links = self.material.node_tree.nodes, self.material.node_tree.links
+        path, product = nodes.new("ShaderNodeLightPath"), nodes.new("ShaderNodeMath")
+        product.operation = "MULTIPLY"
+        links.new(path.outputs["Is Camera Ray"], product.inputs[0])
+        links.new(product.outputs["Value"], self._emission.inputs["Strength"])
+        return product.inputs[1]
 
 
 def replace_image(node: Any, rgb: NDArray[np.floating[Any]]) -> None:
@@ -142,10 +160,8 @@ class BlenderScene:
         """Set objects, surfaces and lights as a frame has them."""
         if setup.stage is not None:
             self._replace_objects(setup.stage)
-        for name, vertices_m in setup.moved_m.items():
-            mesh = self._objects[name].data
-            mesh.vertices.foreach_set("co", vertices_m.ravel())
-            mesh.update()
+        for name, moved in setup.moved.items():
+            _set_vertices(self._objects[name].data, moved)
         for name, appearance in setup.appearances.items():
             self._surfaces[name].set(appearance, setup.light.unit_cd_m2)
         self._set_light(setup.light)
@@ -209,20 +225,29 @@ class _Sky:
         self._turn.inputs["Rotation"].default_value = angles.tolist()
 
 
+def _set_vertices(mesh: Any, placed: MovedMesh) -> None:
+    mesh.vertices.foreach_set("co", placed.vertices_m.ravel())
+    if placed.map_uv is not None:
+        corners = np.empty(len(mesh.loops), dtype=np.int32)
+        mesh.loops.foreach_get("vertex_index", corners)
+        mesh.uv_layers["map"].uv.foreach_set("vector", placed.map_uv[corners].ravel())
+    mesh.update()
+    if placed.normals is not None:
+        mesh.normals_split_custom_set_from_vertices(placed.normals)
+
+
 def _mesh_object(name: str, part: PartMesh) -> Any:
     mesh = bpy.data.meshes.new(name)
     count = len(part.faces)
     mesh.vertices.add(len(part.vertices_m))
-    mesh.vertices.foreach_set("co", part.vertices_m.ravel())
     mesh.loops.add(3 * count)
     mesh.loops.foreach_set("vertex_index", part.faces.ravel())
     mesh.polygons.add(count)
     mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
     mesh.polygons.foreach_set("use_smooth", np.full(count, part.smooth))
     if part.map_uv is not None:
-        layer = mesh.uv_layers.new(name="map")
-        layer.uv.foreach_set("vector", part.map_uv[part.faces.ravel()].ravel())
-    mesh.update()
+        mesh.uv_layers.new(name="map")
+    _set_vertices(mesh, MovedMesh(part.vertices_m, part.map_uv, part.normals))
     item = bpy.data.objects.new(name, mesh)
     item.pass_index = part.part_id
     # Moves shadow rays off coarse smooth meshes; these meshes are fine, and the Mitsuba engine does nothing similar.

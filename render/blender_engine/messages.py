@@ -27,6 +27,7 @@ class PartMesh:
         faces: (F, 3) int32, counter-clockwise seen from outside.
         smooth: whether normals are interpolated over the faces.
         map_uv: (V, 2) float32 texture coordinates, 0 to 1 from first column and row of the reflectance map, or None.
+        normals: (V, 3) float32 unit normals to interpolate, or None for those of the faces around each vertex.
     """
 
     part_id: int
@@ -34,6 +35,16 @@ class PartMesh:
     faces: NDArray[np.int32]
     smooth: bool
     map_uv: NDArray[np.float32] | None = None
+    normals: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MovedMesh:
+    """New vertices of an object, whose faces stay; attributes as in `PartMesh`."""
+
+    vertices_m: NDArray[np.float32]
+    map_uv: NDArray[np.float32] | None = None
+    normals: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +52,16 @@ class SurfaceAppearance:
     """What the surface of an object reflects and emits.
 
     Attributes:
-        reflectance: (3,) diffuse reflectance, or (h, w, 3) of it as a map.
+        reflectance: (3,) diffuse reflectance, or (h, w, 3) of it as a map; None where it is as it was.
         emission_cd_m2: (3,) emitted radiance. [cd/m2]
         sheen: share of the light that microfacets reflect, and their roughness; None for matt paint.
+        lights_others: whether paths from other surfaces find what it emits, or camera rays only.
     """
 
-    reflectance: NDArray[np.floating[Any]]
+    reflectance: NDArray[np.floating[Any]] | None
     emission_cd_m2: NDArray[np.float64]
     sheen: tuple[float, float] | None = None
+    lights_others: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +102,13 @@ class FrameSetup:
 
     Attributes:
         stage: the objects, or None when they are those of the last frame.
-        moved_m: (V, 3) vertices of the objects that move on the stage, by name. [m]
+        moved: vertices of the objects that move on the stage, by name.
         appearances: of all objects, by name.
         light: sky and sun.
     """
 
     stage: StageObjects | None
-    moved_m: dict[str, NDArray[np.float32]]
+    moved: dict[str, MovedMesh]
     appearances: dict[str, SurfaceAppearance]
     light: StageLight
 

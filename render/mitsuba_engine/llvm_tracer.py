@@ -36,7 +36,6 @@ from render.mitsuba_engine.trace_request import (
     parts_in,
     plan_pixels,
 )
-from render.surfaces import dirty_parts
 
 
 class LlvmTracer:
@@ -62,7 +61,7 @@ class LlvmTracer:
             passes = CenterPasses(frame, eye, scene)
             seen = [passes.part_ids(s) for s in times]
             sunlit = [passes.sunlit(ids, s) for (ids, _), s in zip(seen, times, strict=True)]
-            plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), dirty_parts(frame))
+            plans[eye] = plan_pixels([ids for ids, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), scene.uneven_parts)
             eyes[eye] = passes.traced_eye(*seen[0])
         stage_s["passes"], started = time.process_time() - started, time.process_time()
         result = _by_eye(_sample_light(request, scene, eyes, plans), eyes, stage_s)

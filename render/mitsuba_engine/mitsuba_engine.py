@@ -17,6 +17,7 @@ from render.engine import EyeRadiance, StereoRadiance
 from render.mitsuba_engine.render_noise import MonteCarloNoise, measure_noise
 from render.mitsuba_engine.trace_request import DROGUE_PARTS, TraceRequest, TraceResult
 from render.mitsuba_engine.variant import probe_variant
+from render.surfaces import shows_surfaces
 from render.version import RENDER_VERSION
 from scenes.environment_radiance import environment_radiance
 
@@ -66,7 +67,7 @@ class MitsubaEngine:
         started = time.process_time()
         background = backgrounds(frame)
         stage_s["sky"] = time.process_time() - started
-        if frame.drogue is None and not frame.bystanders:
+        if not shows_surfaces(frame):
             return self._stereo({eye: _empty_eye(background[eye]) for eye in EYES}, 0.0, None, stage_s)
         ambient = environment_radiance(frame.environment)
         traced = self._tracer.trace(

@@ -28,7 +28,6 @@ from render.mitsuba_engine.trace_request import (
     leaked_rays,
     plan_pixels,
 )
-from render.surfaces import dirty_parts
 
 # Motion blur is the mean of so many still images.
 _MOVING_SLICES = 8
@@ -61,7 +60,7 @@ class ScalarTracer:
             sunlit = [view.sunlit(scene, passes, s) for (passes, s) in zip(seen, times, strict=True)]
             alone = view.passes(scene.features, 0.0)
             plan = plan_pixels(
-                [part_id for part_id, _, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), dirty_parts(frame)
+                [part_id for part_id, _, _ in seen], sunlit, 1 + int(np.ceil(moves_px)), scene.uneven_parts
             )
             stage_s["passes"], started = stage_s["passes"] + time.process_time() - started, time.process_time()
             slices = _MOVING_SLICES if moves_px >= 0.05 else 1

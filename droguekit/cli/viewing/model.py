@@ -36,10 +36,11 @@ def model(
     if out.suffix.lower() not in FORMATS:
         raise ValueError(f"--out: must end in one of {', '.join(FORMATS)}, got {str(out)!r}")
     drogue = load_drogue(preset_or_file)
-    from drogue_models.meshes import drogue_meshes, encode_mesh_file
+    from drogue_models.drogue_surfaces import drogue_surfaces, encode_mesh_file
 
-    meshes = drogue_meshes(drogue)
-    _write(encode_mesh_file(drogue, meshes, out.suffix.lower()), out)
+    surfaces = drogue_surfaces(drogue)
+    _write(encode_mesh_file(surfaces, out.suffix.lower()), out)
+    meshes = {part: surface.mesh for part, surface in surfaces.items()}
     low = [min(float(mesh.bounds[0][axis]) for mesh in meshes.values()) for axis in range(3)]
     high = [max(float(mesh.bounds[1][axis]) for mesh in meshes.values()) for axis in range(3)]
     bounds = ", ".join(f"{axis} {a:.3f} to {b:.3f} m" for axis, a, b in zip("xyz", low, high, strict=True))

@@ -6,7 +6,7 @@ than the dataset.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import NamedTuple, TypeVar
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from datasets_manifest.storage.blind import BlindDataset
 from datasets_manifest.storage.layout import BLIND_FILE
@@ -24,15 +24,15 @@ from datasets_manifest.storage.storage import Location, open_storage
 from datasets_manifest.types.estimates import Estimate, PoseEstimate
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord, PixelBox, ViewRecord
-from drogue_models.meshes import drogue_meshes
+from drogue_models.drogue_surfaces import drogue_surfaces
+from drogue_models.painted_mesh import PaintedMesh
 from drogue_models.parameters import DrogueParameters
-from drogue_models.parts import FIRST_MARKER_ID, Part
-from drogue_models.tankers.wing_with_pod import tanker_mesh
 from droguekit.scoring.poses.pose_errors import pose_error
 from droguekit.scoring.report.label_drawing import BOX_RGB, MARKER_RGB, Rgb, display_picture
 from geometry.circles import disc_outline
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
+from render.surfaces import frame_tanker_surfaces
 
 Faces = NDArray[np.int64]
 _Body = TypeVar("_Body")
@@ -165,7 +165,7 @@ class PairRecorder:
             return
         frame = record.frame
         self._show("rig/drogue", frame.drogue, record.left_from_drogue, _drogue)
-        self._show("rig/tanker", _STEEL_RGB, frame.left_from_tanker, _tanker)
+        self._show("rig/tanker", frame_tanker_surfaces(frame), frame.left_from_tanker, _tanker)
         if frame.hose_nodes_left_m is None or frame.drogue is None:
             self._clear("rig/hose")
         else:
@@ -225,13 +225,8 @@ def blueprint() -> rrb.Blueprint:
 @lru_cache(maxsize=8)
 def _drogue(drogue: DrogueParameters) -> rr.Mesh3D:
     """The drogue's parts as one coloured mesh."""
-    vertices, faces, colors, count = [], [], [], 0
-    for part, mesh in drogue_meshes(drogue).items():
-        vertices.append(np.asarray(mesh.vertices))
-        faces.append(np.asarray(mesh.faces) + count)
-        colors.append(np.tile(_screen_color(drogue, part), (len(mesh.vertices), 1)))
-        count += len(mesh.vertices)
-    return _mesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors).astype(np.uint8))
+    colored = [(painted, _screen_color(painted.mean_reflectance)) for painted in drogue_surfaces(drogue).values()]
+    return _colored_mesh(colored)
 
 
 def _wires(drogue: DrogueParameters, color: Rgb) -> rr.LineStrips3D:
@@ -247,20 +242,22 @@ def _wires(drogue: DrogueParameters, color: Rgb) -> rr.LineStrips3D:
     return rr.LineStrips3D(closed, radii=_WIRES, colors=[color])
 
 
-def _screen_color(drogue: DrogueParameters, part: int) -> Array:
-    """A part's reflectance as screen colour, 0 to 255."""
-    if part >= FIRST_MARKER_ID:
-        rgb = drogue.marker_reflectance_rgb
-    elif part == Part.HUB and drogue.hub is not None:
-        rgb = drogue.hub.reflectance_rgb
-    elif part == Part.CANOPY:
-        rgb = drogue.canopy_reflectance_rgb
-    elif part in (Part.FACE, Part.RIM):
-        rgb = drogue.face_reflectance_rgb
-    else:
-        rgb = drogue.structure_reflectance_rgb
-    color: Array = 255.0 * np.array(rgb) ** (1 / 2.2)
+def _screen_color(reflectance_rgb: Array) -> Array:
+    """(3,) reflectance as screen colour, 0 to 255."""
+    color: Array = 255.0 * reflectance_rgb ** (1 / 2.2)
     return color
+
+
+def _colored_mesh(colored: Iterable[tuple[PaintedMesh, ArrayLike]]) -> rr.Mesh3D:
+    """Several surfaces, each in one colour (0 to 255), as one mesh."""
+    vertices, faces, colors, count = [], [], [], 0
+    for painted, color in colored:
+        mesh = painted.mesh
+        vertices.append(np.asarray(mesh.vertices))
+        faces.append(np.asarray(mesh.faces) + count)
+        colors.append(np.tile(np.asarray(color), (len(mesh.vertices), 1)))
+        count += len(mesh.vertices)
+    return _mesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors).astype(np.uint8))
 
 
 def _mesh(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> rr.Mesh3D:
@@ -275,10 +272,8 @@ def _mesh(vertices: Array, faces: Faces, colors: NDArray[np.uint8]) -> rr.Mesh3D
     )
 
 
-def _tanker(color: Rgb) -> rr.Mesh3D:
-    mesh = tanker_mesh()
-    colors = np.tile(np.array(color, dtype=np.uint8), (len(mesh.vertices), 1))
-    return _mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), colors)
+def _tanker(surfaces: tuple[PaintedMesh, ...]) -> rr.Mesh3D:
+    return _colored_mesh((painted, _STEEL_RGB) for painted in surfaces)
 
 
 def _eye(rig: StereoRig, eye: Eye) -> tuple[rr.Transform3D, rr.Pinhole]:

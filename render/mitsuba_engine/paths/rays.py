@@ -147,7 +147,7 @@ class FrameRays:
             sun_lux=sun_lux,
             sky=SkyIrradiance(as_mitsuba_reads(ambient.light_map), world_from_stage.rotation),
             open_to_sky=jit_array(mi.Float, by_shape(scene.scene, open_to_sky)),
-            parts_emit=frame.drogue is not None and frame.drogue.marker_luminance_cd_m2 > 0,
+            parts_emit=scene.emits,
         )
 
     def pixels_of_both_eyes(self, plans: dict[Eye, SamplingPlan], kind: str) -> NDArray[np.int64]:

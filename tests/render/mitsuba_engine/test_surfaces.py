@@ -14,7 +14,7 @@ from drogue_models.obstacles import ObstacleShape
 from drogue_models.parts import FIRST_MARKER_ID, Part
 from geometry.se3 import RigidTransform
 from render.engine import EyeRadiance, RenderEngine, load_engine
-from render.surfaces import clean_reflectance_rgb, reflectance_map
+from render.surfaces import clean_reflectance_rgb, frame_surfaces
 from scenes.sampler import sample_frame
 from tests.support.recipe_builder import build_recipe, paper_view_recipe, stations
 
@@ -75,7 +75,8 @@ def test_dirt_lies_where_its_map_has_it(engine: RenderEngine, recipe: Recipe, fr
     points = frame.left_from_drogue.inverse().apply(rays * seen.depth_m[rows, columns][:, None].astype(float))
     place = (points[:, :2] - frame.drogue.marker_positions_m[1]) / (2 * frame.drogue.marker_radius_m) + 0.5
     texels = np.clip((place * 64).astype(int), 0, 63)
-    expected = reflectance_map(soiled, part)[texels[:, 1], texels[:, 0], 0] / clean_reflectance_rgb(frame, part)[0]
+    soiled_map = frame_surfaces(soiled, RigidTransform.identity()).fixed[f"part_{part}"].reflectance
+    expected = soiled_map[texels[:, 1], texels[:, 0], 0] / clean_reflectance_rgb(frame, part)[0]
     ratio = seen.radiance_cd_m2[rows, columns, 0] / plain.radiance_cd_m2[rows, columns, 0]
     # A pixel is some ten texels wide: edges of blotches blur, which leaves the correlation high.
     assert np.corrcoef(ratio, expected)[0, 1] > 0.85
