@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from datasets_manifest.storage.image_codecs import check_pixel_count
 from datasets_manifest.types.images import Pixels
 
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
@@ -51,9 +52,10 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
         mirrored it.
 
     Raises:
-        ValueError: it cannot be decoded, is not of 8 or 16 bits, has several pages, or an orientation that OpenCV does
-            not apply; names the image.
+        ValueError: it cannot be decoded, has too many pixels, is not of 8 or 16 bits, has several pages, or an
+            orientation that OpenCV does not apply; names the image.
     """
+    _check_size(data, name)
     orientation = _orientation(data, name)
     try:
         image = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH) if data.size else None
@@ -63,6 +65,21 @@ def decode_image_file(data: NDArray[np.uint8], name: str) -> tuple[Pixels, bool]
         raise ValueError(f"{name}: is truncated, or not an image of 8 or 16 bits")
     pixels = np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
     return pixels, orientation != _UPRIGHT
+
+
+def _check_size(data: NDArray[np.uint8], name: str) -> None:
+    """Refuse an image that would fill the memory; what Pillow cannot identify is left to OpenCV."""
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data.tobytes())) as image:
+            width_px, height_px = image.size
+    except Image.DecompressionBombError as error:
+        raise ValueError(f"{name}: has too many pixels: {error}") from error
+    except Exception:  # whatever a damaged file makes its reader raise
+        return
+    try:
+        check_pixel_count(width_px, height_px)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _orientation(data: NDArray[np.uint8], name: str) -> int:
@@ -75,8 +92,7 @@ def _orientation(data: NDArray[np.uint8], name: str) -> int:
     if not file.startswith(_TIFF_AND_WEBP) and not any(mark in file for mark in _ORIENTATION_MARKS):
         return _UPRIGHT
     try:
-        with warnings.catch_warnings(), Image.open(io.BytesIO(file)) as image:
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(file)) as image:
             kind, pages = image.format, int(getattr(image, "n_frames", 1))
             said = int(image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT))
             exif = Image.Exif()

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from datasets_manifest.types.images import Pixels
 from geometry.pinhole import PinholeCamera
 
+MOST_PIXELS = 150_000_000
+"""Most pixels of an image whose size is not known from its rig: as many as the largest sensors and maps of 16k have."""
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 # Noise has no repeats to search for: Huffman coding alone takes half the time of level 1 and a sixth less space. Part
@@ -42,20 +44,25 @@ def encode_png(pixels: Pixels, is_piecewise_constant: bool = False) -> bytes:
     return data.tobytes()
 
 
-def decode_png(data: bytes, name: str) -> Pixels:
+def decode_png(data: bytes, name: str, camera: PinholeCamera) -> Pixels:
     """The image in PNG bytes, in RGB order, with its stored depth and channels.
 
     Args:
         data: the whole file.
         name: of the file, for errors.
+        camera: gives the size that the image must have; a file of another size never reaches the decoder, as a
+            megabyte can hold an image of gigabytes.
 
     Raises:
-        ValueError: not a PNG, truncated or damaged, or not 8 or 16 bit grey or RGB.
+        ValueError: not a PNG, truncated, damaged, of another size, or not 8 or 16 bit grey or RGB.
     """
-    fault = png_fault(data)
+    fault = png_fault(data, camera)
     if fault is not None:
         raise ValueError(f"{name}: {fault}")
-    image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise ValueError(f"{name}: the PNG cannot be decoded: {' '.join(str(error).split())[:200]}") from error
     if image is None:
         raise ValueError(f"{name}: the PNG cannot be decoded")
     if image.dtype not in (np.uint8, np.uint16) or (image.ndim == 3 and image.shape[2] != 3):
@@ -63,14 +70,22 @@ def decode_png(data: bytes, name: str) -> Pixels:
     return cast(Pixels, cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image)
 
 
-def png_fault(data: bytes) -> str | None:
-    """The fault in the chunks of a PNG, or None; checked first, so that damaged files never reach the decoder.
+def png_fault(data: bytes, camera: PinholeCamera) -> str | None:
+    """The fault in the size or the chunks of a PNG, or None; checked first, so that no such file reaches the decoder.
 
-    Source: PNG specification (ISO/IEC 15948), section 5.3: length, type, data, CRC of type and data.
+    Source: PNG specification (ISO/IEC 15948), sections 5.3 (length, type, data, CRC of type and data) and 11.2.2 (the
+    header with the size is the first chunk).
     """
     if not data.startswith(_PNG_SIGNATURE):
         return "not a PNG file"
     position = len(_PNG_SIGNATURE)
+    if len(data) < position + 16:
+        return "the PNG is truncated"
+    if data[position + 4 : position + 8] != b"IHDR":
+        return "the PNG is damaged (no header)"
+    size_px = struct.unpack_from(">II", data, position + 8)
+    if size_px != (camera.width_px, camera.height_px):
+        return f"must be {camera.width_px} x {camera.height_px} px, got {size_px[0]} x {size_px[1]}"
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
         end = position + 12 + length
@@ -164,10 +179,14 @@ def decode_exr(data: bytes) -> dict[str, NDArray[np.generic]]:
     """The planes of a single-part EXR file by channel, as stored.
 
     Raises:
-        ValueError: the library cannot read it; with its message on one line.
+        ValueError: no readable header, more than `MOST_PIXELS`, or a message of the library on one line.
     """
     import OpenEXR
 
+    window = _data_window(data)
+    if window is None:
+        raise ValueError("has no header of a plain EXR file of one part")
+    check_pixel_count(window[2] - window[0] + 1, window[3] - window[1] + 1)
     try:
         # The library reads files only.
         with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
@@ -178,6 +197,16 @@ def decode_exr(data: bytes) -> dict[str, NDArray[np.generic]]:
     except (RuntimeError, ValueError, TypeError, KeyError, IndexError, MemoryError) as error:
         message = " ".join(str(error).replace(folder, "").split()) or type(error).__name__
         raise ValueError(message) from error
+
+
+def check_pixel_count(width_px: int, height_px: int) -> None:
+    """Refuse an image that would fill the memory, before anything decodes it.
+
+    Raises:
+        ValueError: more than `MOST_PIXELS`, or a side of no pixels.
+    """
+    if min(width_px, height_px) < 1 or width_px * height_px > MOST_PIXELS:
+        raise ValueError(f"must have 1 to {MOST_PIXELS} pixels, got {width_px} x {height_px}")
 
 
 def _data_window(data: bytes) -> tuple[int, int, int, int] | None:

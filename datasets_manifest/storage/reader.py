@@ -126,7 +126,7 @@ class Dataset:
             ValueError: the file is missing, truncated or of another size than the rig's; names the file.
         """
         camera = self.manifest.recipe.rig.camera
-        return cast(NDArray[np.uint8], _read_gray(self.frames, frame_index, parts_file(eye), camera, np.uint8))
+        return cast(NDArray[np.uint8], _read(self.frames, frame_index, parts_file(eye), camera, np.uint8))
 
     def verify(self, frame_index: int) -> list[str]:
         """Compare a pair's files with their hashes.
@@ -221,11 +221,11 @@ def read_images(
     mosaics: dict[Eye, Pixels | None] = {"left": None, "right": None}
     for eye in EYES:
         if sensor.color == "mono":
-            pixels[eye] = _read_gray(frames, frame_index, image_file(eye), camera, dtype)
+            pixels[eye] = _read(frames, frame_index, image_file(eye), camera, dtype)
         else:
-            pixels[eye] = _read(frames, frame_index, image_file(eye), (camera.height_px, camera.width_px, 3), dtype)
+            pixels[eye] = _read(frames, frame_index, image_file(eye), camera, dtype, channels=(3,))
         if sensor.color == "bayer":
-            mosaics[eye] = _read_gray(frames, frame_index, mosaic_file(eye), camera, dtype)
+            mosaics[eye] = _read(frames, frame_index, mosaic_file(eye), camera, dtype)
     return StereoImages(
         left=pixels["left"],
         right=pixels["right"],
@@ -239,17 +239,16 @@ def read_images(
     )
 
 
-def _read_gray(
-    frames: FrameStore, frame_index: int, name: str, camera: PinholeCamera, dtype: type[np.unsignedinteger[Any]]
-) -> Pixels:
-    return _read(frames, frame_index, name, (camera.height_px, camera.width_px), dtype)
-
-
 def _read(
-    frames: FrameStore, frame_index: int, name: str, shape: tuple[int, ...], dtype: type[np.unsignedinteger[Any]]
+    frames: FrameStore,
+    frame_index: int,
+    name: str,
+    camera: PinholeCamera,
+    dtype: type[np.unsignedinteger[Any]],
+    channels: tuple[int, ...] = (),
 ) -> Pixels:
-    where = frames.where(frame_index, name)
-    image = decode_png(frames.read(frame_index, name), where)
+    where, shape = frames.where(frame_index, name), (camera.height_px, camera.width_px, *channels)
+    image = decode_png(frames.read(frame_index, name), where, camera)
     if image.shape != shape or image.dtype != dtype:
         raise ValueError(f"{where}: must be {shape} of {np.dtype(dtype).name}, got {image.shape} of {image.dtype}")
     return image

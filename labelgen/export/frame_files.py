@@ -78,7 +78,7 @@ def export_image(
         export_file(source, frame_index, name, target)
         return
     where = source.frames.where(frame_index, name)
-    pixels = decode_png(source.frames.read(frame_index, name), where)
+    pixels = decode_png(source.frames.read(frame_index, name), where, source.manifest.recipe.rig.camera)
     if bits == 8:
         data = encode_png((pixels >> (stored_bits - 8)).astype(np.uint8))
         log.lost(f"images of {stored_bits} bits: written with their upper 8")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from datasets_manifest.storage.frame_store import (
     read_shard_index,
     shard_numbers,
 )
-from datasets_manifest.storage.image_codecs import png_fault
+from datasets_manifest.storage.image_codecs import decode_png
 from datasets_manifest.storage.layout import CALIBRATION_FOLDER, RECORD_FILE, parts_file, shard_file, shard_index_file
 from datasets_manifest.storage.manifest import FrameEntry, Manifest, count_pairs
 from datasets_manifest.storage.reader import Dataset
@@ -332,15 +333,10 @@ def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> l
 
 
 def _read_part_ids(frames: FrameStore, record: PairRecord, eye: Eye) -> NDArray[np.uint8] | None:
-    """The part ids as OpenCV reads them, or None where they are missing or wrong."""
-    camera = record.frame.rig.camera
+    """The part ids, or None where they are missing or wrong."""
+    name = parts_file(eye)
     try:
-        data = frames.read(record.frame_index, parts_file(eye))
+        part_id = decode_png(frames.read(record.frame_index, name), name, record.frame.rig.camera)
     except ValueError:
         return None
-    part_id: NDArray[np.uint8] | None = None
-    if png_fault(data) is None:
-        part_id = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if part_id is None or part_id.dtype != np.uint8 or part_id.shape != (camera.height_px, camera.width_px):
-        return None
-    return part_id
+    return cast(NDArray[np.uint8], part_id) if part_id.dtype == np.uint8 and part_id.ndim == 2 else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -10,11 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.storage.image_codecs import decode_exr
+from datasets_manifest.storage.image_codecs import check_pixel_count, decode_exr
 from datasets_manifest.types.environment import EnvironmentMap, read_environment_map
 from scenes.sky.photometry import Radiance, luminance
 
 _SMALLEST_PX = 16
+_LONGEST_HDR_HEADER = 65536  # our choice; a header has some hundred bytes
 # Reach of the sun's glow in a photograph, and of the ring around it that replaces it. [rad]
 _SPOT_RAD, _AROUND_RAD = np.radians(3.0), np.radians(8.0)
 # A spot is the sun (or moon) if it is brighter than its surroundings by this factor, and if its illuminance of a facing
@@ -65,7 +67,7 @@ class EnvironmentMapLight:
 @lru_cache(maxsize=4)
 def _read_cached(sha256: str, suffix: str, file: Path, environment_map: EnvironmentMap) -> Radiance:
     data = read_environment_map(environment_map)
-    image = _decode_hdr(data) if suffix == ".hdr" else _decode_exr(data, file)
+    image = _decode_hdr(data, file) if suffix == ".hdr" else _decode_exr(data, file)
     height, width = image.shape[:2]
     if width != 2 * height or height < _SMALLEST_PX:
         raise ValueError(
@@ -109,7 +111,14 @@ def _load_cached(environment_map: EnvironmentMap, folder: Path) -> EnvironmentMa
     return EnvironmentMapLight(image=without, rotation_rad=rotation_rad, sun_direction=direction, sun_lux=sun_lux)
 
 
-def _decode_hdr(data: bytes) -> Radiance:
+def _decode_hdr(data: bytes, file: Path) -> Radiance:
+    # The line of the size ends the header (G. Ward, Real Pixels, Graphics Gems II, 1991).
+    size = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:_LONGEST_HDR_HEADER])
+    if size is not None:
+        try:
+            check_pixel_count(int(size[1]), int(size[2]))
+        except ValueError as error:
+            raise ValueError(f"environment.map: {file} {error}") from error
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:  # an empty file, or absurd dimensions

@@ -1,12 +1,21 @@
+"""PNG files of a dataset: bits, order of colours, and what damaged and oversized files do."""
+
 from __future__ import annotations
 
+import struct
+import zlib
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from datasets_manifest.storage.image_codecs import decode_png, encode_png
+from datasets_manifest.storage.image_codecs import MOST_PIXELS, check_pixel_count, decode_exr, decode_png, encode_png
+from geometry.pinhole import PinholeCamera
+
+
+def camera_of(width_px: int, height_px: int) -> PinholeCamera:
+    return PinholeCamera(width_px, height_px, 100.0, 100.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("shape", "dtype", "high"), [((5, 7, 3), np.uint8, 256), ((5, 7), np.uint8, 256)])
@@ -14,7 +23,7 @@ from datasets_manifest.storage.image_codecs import decode_png, encode_png
 def test_images_come_back_bit_for_bit(shape: tuple[int, ...], dtype: type[Any], high: int, wide: bool) -> None:
     dtype, high = (np.uint16, 4096) if wide else (dtype, high)
     image = np.random.default_rng(1).integers(0, high, shape, dtype=dtype)
-    again = decode_png(encode_png(image), "image")
+    again = decode_png(encode_png(image), "image", camera_of(7, 5))
     assert again.dtype == image.dtype
     np.testing.assert_array_equal(again, image)
 
@@ -35,7 +44,7 @@ def test_every_truncation_is_named(capfd: pytest.CaptureFixture[str]) -> None:
     data = encode_png(np.random.default_rng(3).integers(0, 256, (8, 8), dtype=np.uint8))
     for length in range(len(data)):
         with pytest.raises(ValueError, match=r"^x\.png: (not a PNG file|the PNG is truncated)$"):
-            decode_png(data[:length], "x.png")
+            decode_png(data[:length], "x.png", camera_of(8, 8))
     assert capfd.readouterr() == ("", "")
 
 
@@ -45,11 +54,53 @@ def test_every_flipped_byte_is_named() -> None:
         damaged = bytearray(data)
         damaged[position] ^= 0x40
         with pytest.raises(ValueError, match=r"^x\.png: "):
-            decode_png(bytes(damaged), "x.png")
+            decode_png(bytes(damaged), "x.png", camera_of(8, 8))
 
 
 def test_transparency_is_refused() -> None:
     done, data = cv2.imencode(".png", np.zeros((4, 4, 4), dtype=np.uint8))
     assert done
     with pytest.raises(ValueError, match=r"x\.png: must be 8 or 16 bit grey or RGB"):
-        decode_png(data.tobytes(), "x.png")
+        decode_png(data.tobytes(), "x.png", camera_of(4, 4))
+
+
+def png_of_zeros(width_px: int, height_px: int) -> bytes:
+    """A small file that holds a large grey image, written by the specification, without our encoder."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", width_px, height_px, 8, 0, 0, 0, 0)
+    rows = zlib.compress(bytes(min((width_px + 1) * height_px, 2**20)), 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("side_px", [9, 20_000, 60_000, 2**31 - 1])
+def test_an_image_of_another_size_never_reaches_the_decoder(side_px: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr(cv2, "imdecode", fail)
+    with pytest.raises(ValueError, match=rf"^x\.png: must be 8 x 8 px, got {side_px} x {side_px}$"):
+        decode_png(png_of_zeros(side_px, side_px), "x.png", camera_of(8, 8))
+
+
+def test_a_png_without_a_header_is_named() -> None:
+    data = png_of_zeros(8, 8)
+    without = data[:8] + data[8 + 25 :]
+    with pytest.raises(ValueError, match=r"^x\.png: the PNG is damaged \(no header\)$"):
+        decode_png(without, "x.png", camera_of(8, 8))
+
+
+@pytest.mark.parametrize("size", [(0, 5), (-3, 5), (MOST_PIXELS, 2)])
+def test_counts_of_pixels_that_no_image_has(size: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="pixels, got"):
+        check_pixel_count(*size)
+    check_pixel_count(MOST_PIXELS, 1)
+
+
+def test_an_exr_file_that_claims_too_many_pixels_never_reaches_the_decoder() -> None:
+    window = struct.pack("<iiii", 0, 0, 99_999, 99_999)
+    header = struct.pack("<ii", 20000630, 2) + b"dataWindow\0box2i\0" + struct.pack("<i", 16) + window + b"\0"
+    with pytest.raises(ValueError, match="must have 1 to 150000000 pixels, got 100000 x 100000"):
+        decode_exr(header)

@@ -95,9 +95,10 @@ def test_damaged_environment_maps(edit: Edit, other: Edit, suffix: str) -> None:
 @fuzz(20)
 @given(edit=byte_edits(), other=byte_edits())
 def test_damaged_images(whole: Path, edit: Edit, other: Edit) -> None:
+    camera = read_manifest(whole).recipe.rig.camera
     for name in ("left.png", "right_parts.png"):
         data = (frame_folder(whole, 0) / name).read_bytes()
-        quietly(lambda data=data: decode_png(edit(other(data)), "image"))
+        quietly(lambda data=data: decode_png(edit(other(data)), "image", camera))
 
 
 @fuzz(40)

@@ -123,3 +123,21 @@ def test_modes_are_those_of_opencv(mode: str) -> None:
     want = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     want = want if want.ndim == 2 else want[:, :, 2::-1]
     np.testing.assert_array_equal(decode_image_file(data, mode)[0], want)
+
+
+def test_a_picture_that_would_fill_the_memory_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr(cv2, "imdecode", fail)
+    # A bitmap's header holds its size at bytes 18 to 26.
+    stream = io.BytesIO()
+    Image.fromarray(STORED).save(stream, "BMP")
+    header = bytearray(stream.getvalue())
+    for side_px, message in (
+        (12_500, "must have 1 to 150000000 pixels, got 12500 x 12500"),
+        (60_000, "too many pixels"),
+    ):
+        header[18:26] = side_px.to_bytes(4, "little") * 2
+        with pytest.raises(ValueError, match=f"^a.bmp: .*{message}"):
+            decode_image_file(np.frombuffer(bytes(header), np.uint8), "a.bmp")

@@ -171,6 +171,12 @@ def test_a_file_that_is_no_picture_is_refused(tmp_path: Path) -> None:
             environment(tmp_path, name)
 
 
+def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "sky.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 50000 +X 100000\n" + bytes(64))
+    with pytest.raises(ValueError, match=r"sky\.hdr must have 1 to 150000000 pixels, got 50000 x 100000"):
+        environment(tmp_path, "sky.hdr")
+
+
 @pytest.mark.parametrize(
     ("name", "keys", "message"),
     [
