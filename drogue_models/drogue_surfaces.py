@@ -15,6 +15,7 @@ from drogue_models.obstacles import ObstacleShape
 from drogue_models.painted_mesh import PaintedMesh, Sheen, texels_at
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name, part_reflectance_rgb, part_satin
+from drogue_models.ring_wear import worn_part
 from drogue_models.solids import with_creases
 from drogue_models.surface_wear import SurfaceWear
 from geometry.se3 import Array
@@ -29,7 +30,7 @@ def drogue_surfaces(drogue: DrogueParameters, wear: SurfaceWear | None = None) -
     Raises:
         ValueError: the user's body mesh is missing, changed, or not fit for use.
     """
-    return {part: _painted(drogue, part, mesh) for part, mesh in _meshes(drogue).items()}
+    return {part: _painted(drogue, part, mesh, wear) for part, mesh in _meshes(drogue).items()}
 
 
 @lru_cache(maxsize=16)
@@ -37,12 +38,18 @@ def _meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
     return drogue_meshes(drogue)
 
 
-def _painted(drogue: DrogueParameters, part: int, mesh: trimesh.Trimesh) -> PaintedMesh:
+def _painted(drogue: DrogueParameters, part: int, mesh: trimesh.Trimesh, wear: SurfaceWear | None) -> PaintedMesh:
     satin = part_satin(drogue, part)
+    rgb = np.array(part_reflectance_rgb(drogue, part))
+    # Markers have dirt of their own, see `datasets_manifest.types.appearance.SurfaceCondition`.
+    worn = wear is not None and part < FIRST_MARKER_ID
+    painted, uv, reflectance = mesh, _square_uv(drogue, part, mesh), rgb
+    if worn and wear is not None:
+        painted, uv, reflectance = worn_part(drogue, part, mesh, rgb, wear)
     return PaintedMesh(
-        mesh=mesh,
-        reflectance=np.array(part_reflectance_rgb(drogue, part)),
-        uv=_square_uv(drogue, part, mesh),
+        mesh=painted,
+        reflectance=reflectance,
+        uv=uv,
         smooth=part == Part.RIM,
         sheen=None if satin is None else Sheen(satin.sheen_fraction, satin.roughness),
     )

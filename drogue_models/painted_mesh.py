@@ -100,9 +100,10 @@ class PaintedMesh:
 
     @cached_property
     def contrast(self) -> float:
-        """Standard deviation of the reflectance over the map, summed over the bands, per mean."""
+        """Half the distance between the 16th and the 84th percentile of the map, summed over the bands, per mean."""
         total = self.reflectance.astype(np.float64).sum(axis=-1)
-        return float(total.std() / max(float(total.mean()), 1e-12))
+        low, high = np.percentile(total, [16, 84])
+        return float((high - low) / 2 / max(float(total.mean()), 1e-12))
 
 
 def wrapped_surface(mesh: trimesh.Trimesh, turn: ArrayLike, along: ArrayLike) -> tuple[trimesh.Trimesh, Array]:

@@ -28,7 +28,7 @@ DIRT_MAP_PX = 64
 DIRT_RGB = (0.055, 0.050, 0.045)
 _BLOTCH_PX = 5.0
 _EDGE_PX = 1.2
-# A map with a larger standard deviation over its mean has edges that a pixel's few rays may miss.
+# A map with more contrast has edges that a pixel's few rays may miss.
 _EVEN_CONTRAST = 0.2
 
 

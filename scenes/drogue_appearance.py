@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from datasets_manifest.random_streams import frame_generator
-from datasets_manifest.recipe.drogue_ranges import AppearanceRanges
+from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, WearRanges
 from datasets_manifest.recipe.recipe import Recipe
 from datasets_manifest.types.appearance import DrogueCondition, Obstacle, SurfaceCondition
 from drogue_models.frozen_model import ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape
 from drogue_models.parameters import RED_PAINT, WHITE_PAINT, DrogueParameters
+from drogue_models.surface_wear import SurfaceWear
 from geometry.se3 import Array, RigidTransform, rotation_from_angles
 from geometry.stereo import StereoRig
 from scenes.environment_sampling import sample_uniform
@@ -46,10 +47,20 @@ def condition_of_scene(recipe: Recipe, scene_id: int, drogue: DrogueParameters) 
     markers = tuple(_sample_surface(rng, ranges, bool(gone)) for gone in missing)
     hub = _sample_surface(rng, ranges, False)
     condition = DrogueCondition(
-        markers=markers, hub=hub, body_reflectance_fraction=sample_uniform(rng, ranges.body_reflectance_fraction)
+        markers=markers,
+        hub=hub,
+        body_reflectance_fraction=sample_uniform(rng, ranges.body_reflectance_fraction),
+        wear=None if ranges.wear is None else _wear_of_scene(recipe.seed, scene_id, ranges.wear),
     )
     as_new = DrogueCondition(markers=(SurfaceCondition(),) * drogue.marker_count)
     return None if condition == as_new else condition
+
+
+def _wear_of_scene(seed: int, scene_id: int, ranges: WearRanges) -> SurfaceWear:
+    rng = frame_generator(seed, scene_id, "surface wear")
+    pattern = int(rng.integers(2**31))
+    shares = {name: sample_uniform(rng, getattr(ranges, name)) for name in WearRanges.model_fields}
+    return SurfaceWear(seed=pattern, **shares)
 
 
 def _sample_surface(rng: np.random.Generator, ranges: AppearanceRanges, missing: bool) -> SurfaceCondition:

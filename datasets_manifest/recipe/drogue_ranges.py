@@ -89,6 +89,23 @@ class DrogueVariant(FrozenModel):
     weight: float = Field(default=1.0, gt=0, le=1e6)
 
 
+class WearRanges(FrozenModel):
+    """Distribution of each scene's `SurfaceWear`, whose attributes these are; uniform, independent of each other."""
+
+    soot: Range = Range(low=0.0, high=0.8)
+    oil: Range = Range(low=0.0, high=0.7)
+    edge_wear: Range = Range(low=0.05, high=0.8)
+    fading: Range = Range(low=0.1, high=0.9)
+    stitching: Range = Range(low=0.2, high=1.0)
+    tape: Range = Range(low=0.0, high=0.3)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        for name in type(self).model_fields:
+            getattr(self, name).within(0, 1, f"wear.{name}")
+        return self
+
+
 class AppearanceRanges(FrozenModel):
     """Distribution of each scene's drogue, its condition and the obstacles; by default a new drogue without obstacles.
 
@@ -101,6 +118,7 @@ class AppearanceRanges(FrozenModel):
         failed_lamp_fraction: probability that a self-lit marker is out.
         lamp_fraction: luminance of the other lamps, as a share of the drogue's.
         body_reflectance_fraction: see `DrogueCondition`.
+        wear: of the drogue's paint, cloth and metal, drawn with the rest of its condition; None for even paint.
         probe: whether the receiver's probe is drawn, with its tip at the rig's `probe_tip_body_m`.
         probe_radius_m: of its tube. [m]
         obstacle_frame_fraction: share of frames in which a bar close to the cameras may hide part of the drogue.
@@ -117,6 +135,7 @@ class AppearanceRanges(FrozenModel):
     failed_lamp_fraction: Fraction = 0.0
     lamp_fraction: Range = CONSTANT_ONE
     body_reflectance_fraction: Range = CONSTANT_ONE
+    wear: WearRanges | None = Field(default=None, exclude_if=lambda wear: wear is None)
     probe: bool = False
     probe_radius_m: float = Field(default=0.04, gt=0, le=0.5)
     obstacle_frame_fraction: Fraction = 0.0

@@ -195,6 +195,13 @@ class Recipe(FrozenModel):
         return self
 
     @model_validator(mode="after")
+    def _engine_draws_wear(self) -> Self:
+        targets = self.target, *(family.target for family in self.families)
+        if any(target.wear is not None for target in targets) and self.render.engine == "analytic":
+            raise ValueError("target.wear: analytic draws even paint only; set render.engine to mitsuba or blender")
+        return self
+
+    @model_validator(mode="after")
     def _board_can_be_drawn(self) -> Self:
         if self.board is None:
             return self

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from datasets_manifest.recipe.recipe import Recipe
+from datasets_manifest.types.appearance import DrogueCondition
 from render.surfaces import DIRT_MAP_PX, dirt_map
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.sampler import sample_frame
@@ -60,6 +61,36 @@ def test_faults_come_in_their_shares_and_three_markers_stay() -> None:
     assert within_chance(gone, 0.9 * 5 / 8, 2400)
     assert within_chance(np.mean([s.hub.dirt_fraction > 0 for s in states]), 0.3, 300)
     assert within_chance(np.mean([m.lamp_fraction == 0 for s in states for m in s.markers]), 0.2, 2400)
+
+
+def test_wear_has_a_stream_of_its_own_and_stays_within_its_ranges() -> None:
+    plain = recipe(missing_marker_fraction=0.3)
+    worn = recipe(missing_marker_fraction=0.3, wear={"soot": {"low": 0.2, "high": 0.3}})
+    states = [condition_of_scene(worn, scene, worn.drogue) for scene in range(100)]
+    for scene, state in enumerate(states):
+        without = condition_of_scene(plain, scene, plain.drogue)
+        assert state.model_copy(update={"wear": None}) == (without or state.model_copy(update={"wear": None}))
+    soot = np.array([state.wear.soot for state in states])
+    assert 0.2 <= soot.min() < 0.21 and 0.29 < soot.max() <= 0.3
+    assert len({state.wear.seed for state in states}) == 100
+    assert condition_of_scene(worn, 3, worn.drogue) == states[3]
+
+
+def test_a_condition_without_wear_is_written_as_before() -> None:
+    state = condition_of_scene(recipe(missing_marker_fraction=0.9), 0, recipe().drogue)
+    assert "wear" not in state.model_dump_json()
+    worn = condition_of_scene(recipe(wear={}), 0, recipe().drogue)
+    assert DrogueCondition.model_validate_json(worn.model_dump_json()) == worn
+
+
+def test_the_analytic_engine_refuses_wear_in_one_line() -> None:
+    with pytest.raises(ValueError, match=r"target\.wear: analytic draws even paint only"):
+        build_recipe(BASE, target={"wear": {}}, render={"engine": "analytic"})
+
+
+def test_wear_beyond_1_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"wear\.oil"):
+        recipe(wear={"oil": {"low": 0.5, "high": 1.5}})
 
 
 def test_bystanders_do_not_change_the_rest_of_a_frame() -> None:
