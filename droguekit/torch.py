@@ -39,6 +39,8 @@ from droguekit.api.recipe_rendering import RECIPE_TEXT
 from droguekit.api.stereo_dataset import StereoDataset, StereoPair, stored_pair
 from droguekit.batch.frame_task import FrameTask
 from droguekit.batch.resume import open_dataset
+from render.device import Device
+from render.engine import engine_notice
 
 Sample = dict[str, torch.Tensor]
 Transform = Callable[[Sample], Any]
@@ -148,6 +150,7 @@ class RenderStream(IterableDataset[Any]):
         transform: Transform | None = None,
         rank: int = 0,
         ranks: int = 1,
+        device: Device = "cpu",
     ) -> None:
         """Make the cache, or check that it belongs to the recipe.
 
@@ -159,16 +162,19 @@ class RenderStream(IterableDataset[Any]):
             transform: changes each sample.
             rank: of this process in a distributed training.
             ranks: number of these processes.
+            device: to render on: `cpu`, or `cuda` for an NVIDIA GPU.
 
         Raises:
-            ValueError: numbers out of range, or a folder that holds something else.
+            ValueError: numbers out of range, a folder that holds something else, or an engine or device that cannot be
+                used.
             OSError: the folder cannot be written.
         """
         if replays < 0:
             raise ValueError(f"replays: must not be negative, got {replays}")
         if not 0 <= rank < ranks:
             raise ValueError(f"rank: must be from 0 to ranks - 1 = {ranks - 1}, got {rank}")
-        self._recipe = recipe
+        engine_notice(recipe.render.engine, device)
+        self._recipe, self._device = recipe, device
         # Each rank locks and tidies a folder of its own, so that ranks may start at the same time.
         self.cache = Path(cache) if ranks == 1 else Path(cache) / f"rank-{rank:03d}"
         self._replays, self._transform = replays, transform
@@ -207,7 +213,7 @@ class RenderStream(IterableDataset[Any]):
         done = len(range(worker, self._batches_done, workers)) * self._batch_size
         shard = self._rank * workers + worker
         reader = Dataset(self.cache)
-        task = FrameTask(self._recipe, self.cache, next(iter(reader.manifest.engines), None))
+        task = FrameTask(self._recipe, self.cache, next(iter(reader.manifest.engines), None), device=self._device)
         for frame_index in self.frame_order(shard, self._ranks * workers, done):
             if not reader.frames.storage.exists(f"{frame_name(frame_index)}/{RECORD_FILE}"):
                 task(frame_index)

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
+from render.device import DEVICES, Device
 
 ENTRY_POINT_GROUP = "droguekit.engines"
 """Entry points of other packages for their engines: classes whose constructor takes no arguments."""
 
 _OURS = ("mitsuba", "analytic", "blender")
+_ON_GPU = ("mitsuba",)
 
 
 class EngineUnavailableError(ValueError):
@@ -82,12 +84,14 @@ def engine_names() -> tuple[str, ...]:
     return (*_OURS, *sorted(_others()))
 
 
-def engine_notice(name: str) -> str | None:
+def engine_notice(name: str, device: Device = "cpu") -> str | None:
     """A line for the user before the engine starts: that it will be slow, and why; None otherwise.
 
     Raises:
-        ValueError: the engine's packages are missing.
+        EngineUnavailableError: its packages are missing, or it cannot use the device.
+        ValueError: no such device.
     """
+    _check_device(name, device)
     if name == "blender":
         from render.blender_engine.process import bpy_version
 
@@ -96,18 +100,34 @@ def engine_notice(name: str) -> str | None:
         return None
     from render.mitsuba_engine.variant import probe_variant
 
-    variant = probe_variant()
-    return None if variant.library is not None else f"engine mitsuba runs as {variant.variant}: {variant.reason}"
+    variant = probe_variant(device)
+    return None if variant.variant != "scalar_rgb" else f"engine mitsuba runs as {variant.variant}: {variant.reason}"
 
 
-def load_engine(name: str) -> RenderEngine:
+def _check_device(name: str, device: Device) -> None:
+    if device not in DEVICES:
+        raise ValueError(f"device: must be {' or '.join(DEVICES)}, got {device!r}")
+    if device != "cpu" and name not in _ON_GPU:
+        raise EngineUnavailableError(
+            f"device {device}: engine {name} renders on the processor only; take device cpu or engine "
+            f"{' or '.join(_ON_GPU)}"
+        )
+
+
+def load_engine(name: str, device: Device = "cpu") -> RenderEngine:
     """The engine named `name`, ready to render.
 
+    Args:
+        name: of the engine.
+        device: that it renders on.
+
     Raises:
-        EngineUnavailableError: no such engine, or its packages are missing.
+        EngineUnavailableError: no such engine, its packages are missing, or it cannot use the device.
+        ValueError: no such device.
     """
     if name not in engine_names():
         raise EngineUnavailableError(f"engine: no engine named {name!r}; there are {', '.join(engine_names())}")
+    _check_device(name, device)
     if name not in _OURS:
         return _loaded(_others()[name])
     if name == "analytic":
@@ -120,7 +140,7 @@ def load_engine(name: str) -> RenderEngine:
         return BlenderEngine()
     from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
 
-    return MitsubaEngine()
+    return MitsubaEngine(device)
 
 
 def _others() -> dict[str, EntryPoint]:

@@ -20,6 +20,7 @@ from droguekit.batch.frame_task import RenderedPair, eye_radiance, process_engin
 from droguekit.batch.progress import progress_report
 from droguekit.numerical_threads import one_thread
 from geometry.stereo import Eye
+from render.device import Device
 
 RECIPE_TEXT = "# This dataset was rendered from Python; manifest.json has the recipe with all its values.\n"
 
@@ -38,7 +39,7 @@ def load_recipe(name_or_path: str, **changes: Any) -> Recipe:
     return recipes.load_recipe(name_or_path, changes=changes).recipe
 
 
-def render_pair(recipe: Recipe, frame: int = 0) -> StereoPair:
+def render_pair(recipe: Recipe, frame: int = 0, *, device: Device = "cpu") -> StereoPair:
     """Render one frame of a recipe: the same pixels and labels as in a dataset that `droguekit render` makes.
 
     The first call in a process loads the engine. An engine that this process already uses stays loaded.
@@ -46,12 +47,13 @@ def render_pair(recipe: Recipe, frame: int = 0) -> StereoPair:
     Args:
         recipe: from `load_recipe`.
         frame: its index, from 0 to the recipe's number of frames.
+        device: to render on: `cpu`, or `cuda` for an NVIDIA GPU.
 
     Raises:
-        ValueError: an index outside the recipe, or an engine that is not installed.
+        ValueError: an index outside the recipe, or an engine or device that cannot be used.
     """
     with one_thread():
-        rendered = render_frame(recipe, frame, process_engine(recipe.render.engine))
+        rendered = render_frame(recipe, frame, process_engine(recipe.render.engine, device))
     spec = rendered.record.frame
     return StereoPair(frame, spec.rig, spec.drogue or spec.sought or recipe.drogue, _RenderedSource(rendered))
 
@@ -62,6 +64,7 @@ def render_dataset(
     *,
     frames: Iterable[int] | None = None,
     workers: int | None = None,
+    device: Device = "cpu",
 ) -> StereoDataset:
     """Render a recipe into a dataset; frames that exist there are kept.
 
@@ -72,18 +75,18 @@ def render_dataset(
         out: folder of the dataset.
         frames: indices of the frames to render; all of the recipe when None.
         workers: number of worker processes; as many as cores and memory allow when None, 0 for this process itself.
+        device: to render on: `cpu`, or `cuda` for an NVIDIA GPU.
 
     Raises:
-        ValueError: frames outside the recipe, a folder of another recipe, or an engine that cannot be used.
+        ValueError: frames outside the recipe, a folder of another recipe, or an engine or device that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
         KeyboardInterrupt: stopped by the user; finished frames stay, and a second call goes on.
     """
     chosen = range(recipe.frames.count) if frames is None else list(frames)
     if workers is not None and workers < 0:
         raise ValueError(f"workers: must not be negative, got {workers}")
-    datasets.render_dataset(
-        RecipeSource(recipe, RECIPE_TEXT), Path(out), chosen, ExecutionOptions(workers), progress_report()
-    )
+    options = ExecutionOptions(workers, device=device)
+    datasets.render_dataset(RecipeSource(recipe, RECIPE_TEXT), Path(out), chosen, options, progress_report())
     return StereoDataset(out)
 
 

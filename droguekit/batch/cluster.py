@@ -22,6 +22,7 @@ from droguekit.batch.execution import resident_gib
 from droguekit.batch.frame_task import FrameReport, FrameTask, OtherBuildError
 from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, run_in_own_process
+from render.device import Device
 from render.engine import load_engine
 
 if TYPE_CHECKING:
@@ -145,7 +146,9 @@ def run_on_cluster(
         ValueError: `distributed` is missing.
         OSError: no scheduler answers there, or it has ended.
     """
-    version = task.engine_version or run_in_own_process(partial(_engine_version, task.recipe.render.engine))
+    version = task.engine_version or run_in_own_process(
+        partial(_engine_version, task.recipe.render.engine, task.device)
+    )
     shared = replace(task, dataset=absolute(task.dataset), engine_version=version)
     client = _connect(address)
     try:
@@ -263,8 +266,8 @@ def _connect(address: str) -> Client:
         raise OSError(f"--scheduler: no Dask scheduler answers at {address}: {error}") from error
 
 
-def _engine_version(name: str) -> str:
-    return load_engine(name).version
+def _engine_version(name: str, device: Device) -> str:
+    return load_engine(name, device).version
 
 
 def _allow_failures(count: int, dask_scheduler: Any) -> None:

@@ -1,4 +1,4 @@
-"""Who renders frames: worker processes, as many as this machine can run, or a Dask scheduler."""
+"""Who renders frames, and where: worker processes, as many as this machine can run, or a Dask scheduler."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
+from render.device import Device, query_gpu
+
 # A worker that has the engine loaded and renders a 1280 x 960 pair stays below this.
 GIB_PER_WORKER = 1.5
+# Of a GPU's memory: driver and OptiX, and 300 bytes for each lane of the largest launch. An estimate.
+_GPU_GIB_PER_WORKER = 2.0
 _GROUP = Path("/sys/fs/cgroup")
 
 
@@ -22,16 +26,18 @@ class ExecutionOptions:
         timeout_s: for one frame; None computes it from the recipe. [s]
         scheduler: address of a Dask scheduler whose workers make the frames instead, or None.
         pairs_per_tar: how many frames come into a tar file; None keeps what the dataset has, folders at first.
+        device: that the engine renders on.
     """
 
     workers: int | None = None
     timeout_s: float | None = None
     scheduler: str | None = None
     pairs_per_tar: int | None = None
+    device: Device = "cpu"
 
     def worker_count(self) -> int:
         """`workers`, or the default of this machine where it is None."""
-        return default_workers() if self.workers is None else self.workers
+        return default_workers(self.device) if self.workers is None else self.workers
 
     def with_workers(self) -> Self:
         """The same with the number of workers filled in."""
@@ -70,9 +76,13 @@ def available_memory_gib(group: Path = _GROUP) -> float:
     return max(0.0, min(free) / 2**30)
 
 
-def default_workers() -> int:
-    """As many workers as cores and memory allow."""
-    return max(1, min(available_cores(), int(available_memory_gib() / GIB_PER_WORKER)))
+def default_workers(device: Device = "cpu") -> int:
+    """As many workers as cores and memory allow; and the memory of the GPU, where they share one."""
+    most = min(available_cores(), int(available_memory_gib() / GIB_PER_WORKER))
+    free_mib = query_gpu("memory.free") if device == "cuda" else None
+    if free_mib is not None:
+        most = min(most, int(free_mib / 1024 / _GPU_GIB_PER_WORKER))
+    return max(1, most)
 
 
 def resident_gib() -> float:

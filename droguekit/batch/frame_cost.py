@@ -29,6 +29,7 @@ from droguekit.batch.frame_task import FrameReport, FrameTask
 from droguekit.batch.recipe_plan import DrawnFrames, RecipePlan
 from droguekit.batch.worker_pool import WorkerLimits, run_in_own_process, run_tasks
 from geometry.se3 import Array
+from render.device import Device
 from scenes.sampler import scene_of_frame
 
 # Fewer than three cannot separate distance from scene; more than a dozen hardly improve the mean.
@@ -109,7 +110,7 @@ def _pick_rarest(drawn: DrawnFrames, strata: Sequence[NDArray[np.intp]]) -> list
     return chosen
 
 
-def probe(recipe: Recipe, frames: ProbeFrames) -> ProbeResult:
+def probe(recipe: Recipe, frames: ProbeFrames, device: Device = "cpu") -> ProbeResult:
     """Make frames in a temporary folder, in a process of their own with one thread, and delete them.
 
     Frames that `render` would drop are reported as drops.
@@ -118,13 +119,13 @@ def probe(recipe: Recipe, frames: ProbeFrames) -> ProbeResult:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the process died, or the temporary folder cannot be written.
     """
-    return run_in_own_process(partial(_probe, recipe, frames))
+    return run_in_own_process(partial(_probe, recipe, frames, device))
 
 
-def _probe(recipe: Recipe, frames: ProbeFrames) -> ProbeResult:
+def _probe(recipe: Recipe, frames: ProbeFrames, device: Device) -> ProbeResult:
     drops = list[Drop]()
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        task = FrameTask(recipe, Path(folder))
+        task = FrameTask(recipe, Path(folder), device=device)
         warm_up, failed_s = make_in_turn(task, frames.warm_up, drops, False)
         counted, more_failed_s = make_in_turn(task, frames.counted, drops, bool(warm_up))
         if not counted:
@@ -216,14 +217,15 @@ class CostEstimate:
         return max(1, min(workers, self.count), math.ceil(self.count / WorkerLimits().tasks_per_process))
 
 
-def probe_cost(recipe: Recipe, plan: RecipePlan) -> CostEstimate:
+def probe_cost(recipe: Recipe, plan: RecipePlan, device: Device = "cpu") -> CostEstimate:
     """Render a few frames, spread over distances and families, and estimate the cost of all from them.
 
     Raises:
         ValueError: the engine cannot be used, or none of the frames can be made.
         OSError: the temporary folder cannot be written.
     """
-    return estimate_cost(recipe, plan, probe(recipe, choose_probe_frames(plan.drawn, recipe.frames.count)))
+    frames = choose_probe_frames(plan.drawn, recipe.frames.count)
+    return estimate_cost(recipe, plan, probe(recipe, frames, device))
 
 
 def estimate_cost(recipe: Recipe, plan: RecipePlan, probed: ProbeResult) -> CostEstimate:
@@ -343,7 +345,7 @@ class MeasuredFrame:
     memory_bytes: int | None
 
 
-def measure_frames(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
+def measure_frames(recipe: Recipe, frames: tuple[int, ...], device: Device = "cpu") -> tuple[MeasuredFrame, ...]:
     """Make frames in a temporary folder, in a process of their own with one thread.
 
     The first frame is made once before, so that loading the engine and compiling its kernels do not count.
@@ -351,22 +353,23 @@ def measure_frames(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFra
     Args:
         recipe: what to make.
         frames: indices of the frames.
+        device: that the engine renders on.
 
     Raises:
         ValueError: the engine cannot be used, or a frame cannot be made.
         OSError: the process died, or the temporary folder cannot be written.
     """
-    return run_in_own_process(partial(_measure, recipe, frames))
+    return run_in_own_process(partial(_measure, recipe, frames, device))
 
 
-def _measure(recipe: Recipe, frames: tuple[int, ...]) -> tuple[MeasuredFrame, ...]:
+def _measure(recipe: Recipe, frames: tuple[int, ...], device: Device) -> tuple[MeasuredFrame, ...]:
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        task = FrameTask(recipe, Path(folder))
+        task = FrameTask(recipe, Path(folder), device=device)
         task(frames[0])
         return tuple(_measure_frame(task, frame_index) for frame_index in frames)
 
 
-def frames_per_second(recipe: Recipe, workers: int) -> float:
+def frames_per_second(recipe: Recipe, workers: int, device: Device = "cpu") -> float:
     """Frames per second of wall time when all frames of a recipe are made, in a temporary folder.
 
     Starting the workers does not count; that they run out of work one by one at the end does.
@@ -374,6 +377,7 @@ def frames_per_second(recipe: Recipe, workers: int) -> float:
     Args:
         recipe: what to make; its first frames, `warm_up(workers)` of them, do not count.
         workers: how many processes.
+        device: that the engine renders on.
 
     Raises:
         ValueError: too few frames, the engine cannot be used, or a frame cannot be made.
@@ -385,7 +389,7 @@ def frames_per_second(recipe: Recipe, workers: int) -> float:
     ended_s = []
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
         frames = range(recipe.frames.count)
-        with closing(run_tasks(FrameTask(recipe, Path(folder)), frames, workers)) as attempts:
+        with closing(run_tasks(FrameTask(recipe, Path(folder), device=device), frames, workers)) as attempts:
             for attempt in attempts:
                 if attempt.final and attempt.error is not None:
                     raise attempt.error

@@ -35,6 +35,7 @@ from geometry.stereo import EYES, Eye
 from labelgen.frame_labels import label_frame
 from labelgen.validation.label_checks import check_against_passes
 from render.camera.sensor import expose
+from render.device import Device
 from render.engine import EyeRadiance, RenderEngine, StereoRadiance, load_engine
 from scenes.sampler import sample_frame
 
@@ -56,12 +57,14 @@ class FrameTask:
         dataset: its place.
         engine_version: of the existing frames, or None when there are none.
         packing: which frames share a tar file, or None where each keeps its folder.
+        device: that the engine renders on.
     """
 
     recipe: Recipe
     dataset: Location
     engine_version: str | None = None
     packing: Packing | None = None
+    device: Device = "cpu"
 
     def __call__(self, frame_index: int) -> FrameReport:
         """Make and write frame `frame_index`.
@@ -72,7 +75,7 @@ class FrameTask:
             OtherBuildError: it is not the one that made the other frames.
             OSError: the frame could not be written; nothing of it is left.
         """
-        engine = process_engine(self.recipe.render.engine)
+        engine = process_engine(self.recipe.render.engine, self.device)
         if self.engine_version not in (None, engine.version):
             raise OtherBuildError(
                 f"{self.dataset}: its frames were made by {self.engine_version}, but this is {engine.version}, whose "
@@ -198,10 +201,14 @@ def eye_radiance(radiance: StereoRadiance, eye: Eye) -> EyeRadiance:
 
 
 @cache
-def process_engine(name: str) -> RenderEngine:
-    """The engine of this process, loaded once and used with one thread, on which the sameness of pixels rests."""
+def process_engine(name: str, device: Device = "cpu") -> RenderEngine:
+    """The engine of this process, loaded once and used with one thread, on which the sameness of pixels rests.
+
+    Raises:
+        EngineUnavailableError: no such engine, or it cannot be used here.
+    """
     cv2.setNumThreads(1)
-    return load_engine(name)
+    return load_engine(name, device)
 
 
 @contextmanager
@@ -241,8 +248,13 @@ class Reproduction:
     build_differences: tuple[str, ...]
 
 
-def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
+def reproduce_frame(dataset: Location, frame_index: int, device: Device = "cpu") -> Reproduction:
     """Make a frame of a dataset again, from the manifest alone, and compare record and files.
+
+    Args:
+        dataset: its place.
+        frame_index: of the frame.
+        device: that the engine renders on.
 
     Raises:
         ValueError: no such dataset or frame, or its engine cannot be used here.
@@ -255,7 +267,7 @@ def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
     if faults:
         return Reproduction("different", tuple(faults), ())
     old = json.loads(source.frames.read(frame_index, RECORD_FILE))
-    new, record_sha256 = run_in_own_process(partial(_make_again, source.manifest.recipe, frame_index))
+    new, record_sha256 = run_in_own_process(partial(_make_again, source.manifest.recipe, frame_index, device))
     expected = next(entry.record_sha256 for entry in source.manifest.frames if entry.frame_index == frame_index)
     # The record holds the hashes of all other files.
     if record_sha256 == expected:
@@ -267,10 +279,10 @@ def reproduce_frame(dataset: Location, frame_index: int) -> Reproduction:
     )
 
 
-def _make_again(recipe: Recipe, frame_index: int) -> tuple[dict[str, Any], str]:
+def _make_again(recipe: Recipe, frame_index: int, device: Device) -> tuple[dict[str, Any], str]:
     """Make the frame in a new folder: its record, and the hash of the record's file."""
     with tempfile.TemporaryDirectory(prefix="droguekit-") as folder:
-        FrameTask(recipe, Path(folder))(frame_index)
+        FrameTask(recipe, Path(folder), device=device)(frame_index)
         data = (frame_folder(Path(folder), frame_index) / RECORD_FILE).read_bytes()
     return json.loads(data), hashlib.sha256(data).hexdigest()
 

@@ -29,6 +29,7 @@ from droguekit.batch.resume import check_frames, finish_frames, open_dataset
 from droguekit.batch.stop_request import StopRequest
 from droguekit.batch.worker_pool import MAX_ATTEMPTS, TaskAttempt, WorkerLimits, is_accident, run_tasks
 from labelgen.export.annotations.coco import write_annotations
+from render.engine import engine_notice
 from render.version import RENDER_VERSION
 from scenes.sampler import split_of_scenes
 
@@ -220,7 +221,7 @@ def render_dataset(
         report: is told of the progress.
 
     Raises:
-        ValueError: wrong frames, a folder of another recipe, or an engine that cannot be used.
+        ValueError: wrong frames, a folder of another recipe, or an engine or device that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
         KeyboardInterrupt: the user asked to stop; finished frames stay, and manifest and annotations are as before.
     """
@@ -228,6 +229,9 @@ def render_dataset(
     if len(set(frames)) != len(frames) or any(not 0 <= index < recipe.frames.count for index in frames):
         raise ValueError(f"frames: must be different indices from 0 to {recipe.frames.count - 1}")
     options = (ExecutionOptions(options) if isinstance(options, int) else options).with_workers()
+    notice = engine_notice(recipe.render.engine, options.device)
+    if notice is not None:
+        report.say(notice)
     with open_dataset(out, source, options.pairs_per_tar) as stream:
         events = EventLog(stream)
         manifest = read_manifest(out)
@@ -242,7 +246,7 @@ def render_dataset(
             report.say(f"{len(there.damaged)} pairs are damaged and will be made again: {_shortened(there.damaged)}")
         events.write("start", frames=len(frames), kept=kept, damaged=there.damaged, **asdict(options))
         packing = read_packing(out, frames if isinstance(frames, range) else range(recipe.frames.count))
-        task = FrameTask(recipe, out, there.engine_version, packing)
+        task = FrameTask(recipe, out, there.engine_version, packing, options.device)
         todo = list(dict.fromkeys([*(index for index in frames if index not in there.whole), *there.damaged]))
         totals, dropped = make_frames(task, todo, options, report, events)
         drops = still_missing([*manifest.drops, *dropped], out)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from datasets_manifest.storage.storage import Location, as_location
+from render.device import Device
 
 if TYPE_CHECKING:
     Place = Location
@@ -69,6 +70,12 @@ DetectorOption = Annotated[
     ),
 ]
 EngineOption = Annotated[str | None, typer.Option("--engine", metavar="NAME", help="Replaces the recipe's engine.")]
+DeviceOption = Annotated[
+    Device,
+    typer.Option(
+        "--device", help="What to render on: the processor, or an NVIDIA GPU; docs/how-to/render-on-a-gpu.md."
+    ),
+]
 
 
 def parse_frames(text: str | None, count: int) -> range:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from droguekit.cli.arguments import EngineOption, WorkersOption
+from droguekit.cli.arguments import DeviceOption, EngineOption, WorkersOption
 from droguekit.workflows.render_timing import render_timing_lines
 
 EXAMPLES = ("droguekit bench", "droguekit bench --repeat 5 --workers 8", "droguekit bench --pairs 500")
@@ -19,6 +19,7 @@ def bench(
     ] = 40,
     workers: WorkersOption = None,
     engine: EngineOption = None,
+    device: DeviceOption = "cpu",
 ) -> None:
     """Measure the CPU time of a full-size pair by distance and stage, everything included.
 
@@ -27,5 +28,5 @@ def bench(
     noise on the drogue relative to the sensor's (root mean square over pairs), and by how much the process's memory
     grows from the first fifth of the pairs to the last pair. Last, how many of these pairs all workers make a second.
     """
-    for line in render_timing_lines(repeat, pairs, workers, engine):
+    for line in render_timing_lines(repeat, pairs, workers, engine, device):
         typer.echo(line)

@@ -9,7 +9,7 @@ import typer
 
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import progress_report
-from droguekit.cli.arguments import RecipeArgument, WorkersOption, output_option
+from droguekit.cli.arguments import DeviceOption, RecipeArgument, WorkersOption, output_option
 from droguekit.cli.main import FAULT
 from droguekit.workflows.benchmarking import benchmark_dataset
 from droguekit.workflows.navigation import navigate_dataset
@@ -26,6 +26,7 @@ def demo(
     recipe: RecipeArgument = "demo",
     out: Annotated[Path, output_option("--out", "DIR", "Where everything goes.")] = Path("out/demo"),
     workers: WorkersOption = None,
+    device: DeviceOption = "cpu",
 ) -> None:
     """Render a small dataset of a drogue from 40 m down to 1.7 m, estimate poses without the truth, and write a report.
 
@@ -37,7 +38,7 @@ def demo(
     source, show = open_recipe(recipe, None, None), progress_report()
     count = source.recipe.frames.count
     show.say(f"1 of 3: rendering {count} stereo pairs into {dataset}")
-    summary = render_frames(source, dataset, range(count), ExecutionOptions(workers), show)
+    summary = render_frames(source, dataset, range(count), ExecutionOptions(workers, device=device), show)
     show.say("2 of 3: estimating poses by every method, without the truth")
     navigate_dataset(dataset, (), estimates, show)
     show.say("3 of 3: comparing the estimates with the truth")

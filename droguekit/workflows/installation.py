@@ -124,6 +124,10 @@ def engine_lines() -> Generator[str, None, bool]:
         yield "engine     mitsuba does not work without libatomic.so.1"
         return False
     yield f"engine     mitsuba works as {variant.variant}: {variant.reason}"
+    try:
+        yield f"gpu        works, for --device cuda: {probe_variant('cuda').gpu}"
+    except ValueError as error:
+        yield f"gpu        is optional: {error}"
     return True
 
 

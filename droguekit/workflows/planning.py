@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from datasets_manifest.recipe.recipe import Recipe
     from datasets_manifest.storage.manifest import Drop
+    from droguekit.batch.execution import ExecutionOptions
     from droguekit.batch.frame_cost import CostEstimate
     from droguekit.batch.recipe_plan import LawCheck, RecipePlan
 
@@ -25,7 +26,12 @@ _BUSY = 1.25
 
 
 def plan_lines(
-    name_or_path: str, seed: int | None, engine: str | None, probe: bool, workers: int | None, html: Path | None
+    name_or_path: str,
+    seed: int | None,
+    engine: str | None,
+    probe: bool,
+    execution: ExecutionOptions,
+    html: Path | None,
 ) -> Iterator[str]:
     """Plan a recipe, and give the lines that describe it as soon as they are known.
 
@@ -34,18 +40,17 @@ def plan_lines(
         seed: replaces the recipe's, or None.
         engine: replaces the recipe's, or None.
         probe: whether a few frames are rendered to estimate time and size.
-        workers: for which the time is estimated; as many as the machine can carry when None.
+        execution: workers for which the time is estimated, and the device that the frames are rendered on.
         html: page to write with the plan's plots, or None.
 
     Raises:
         ValueError: no such recipe or engine, a wrong number, or none of the first frames can be made.
         OSError: the page or the temporary folder cannot be written.
     """
-    from droguekit.batch.execution import default_workers
     from droguekit.batch.frame_cost import probe_cost
     from droguekit.batch.recipe_plan import frame_timeout_s, plan_recipe
 
-    if workers is not None and (not probe or workers < 1):
+    if execution.workers is not None and (not probe or execution.workers < 1):
         raise ValueError("--workers: must be at least 1, and goes with the probe; leave it or --no-probe out")
     recipe = open_recipe(name_or_path, seed, engine).recipe
     plan = plan_recipe(recipe)
@@ -53,7 +58,7 @@ def plan_lines(
     lines.append(f"a frame that is at work for {duration(frame_timeout_s(recipe))} counts as hung and is tried again")
     yield from lines
     if probe:
-        costs = list(cost_lines(probe_cost(recipe, plan), default_workers() if workers is None else workers))
+        costs = list(cost_lines(probe_cost(recipe, plan, execution.device), execution.worker_count()))
         yield from costs
         lines += costs
     if html is not None:

@@ -14,11 +14,14 @@ if TYPE_CHECKING:
     from datasets_manifest.recipe.recipe import Recipe
     from droguekit.batch.frame_cost import MeasuredFrame
     from droguekit.batch.frame_task import FrameReport
+    from render.device import Device
 
 QUALITIES = ("corpus", "benchmark")
 
 
-def render_timing_lines(repeat: int, pairs: int, workers: int | None, engine: str | None) -> Iterator[str]:
+def render_timing_lines(
+    repeat: int, pairs: int, workers: int | None, engine: str | None, device: Device = "cpu"
+) -> Iterator[str]:
     """Measure, and give the lines of three tables as they are measured: by distance, by quality, and by the clock.
 
     Args:
@@ -26,29 +29,32 @@ def render_timing_lines(repeat: int, pairs: int, workers: int | None, engine: st
         pairs: over the uniform law, for each quality.
         workers: processes of the measurement by the clock; as many as the machine can carry when None.
         engine: replaces the recipes'.
+        device: that the engine renders on.
 
     Raises:
-        ValueError: a wrong number, or an engine that cannot be used.
+        ValueError: a wrong number, or an engine or device that cannot be used.
         OSError: a process died, or a temporary folder cannot be written.
     """
     from droguekit.batch.execution import default_workers
     from droguekit.batch.frame_cost import frames_per_second, measure_frames, warm_up_frames
+    from render.engine import engine_notice
 
-    workers = default_workers() if workers is None else workers
+    workers = default_workers(device) if workers is None else workers
     if workers < 1:
         raise ValueError(f"--workers: must be at least 1, got {workers}")
     recipe = open_stations_recipe(repeat, engine)
+    engine_notice(recipe.render.engine, device)
     # The farthest first: the pair that is not counted is the cheapest.
-    measured = measure_frames(recipe, tuple(reversed(range(recipe.frames.count))))
+    measured = measure_frames(recipe, tuple(reversed(range(recipe.frames.count))), device)
     yield from _stations_table(recipe, tuple(frame.report for frame in measured))
     yield f"\n{'2 to 40 m':>9} {'CPU s/pair':>11} {'noise/sensor':>13} {'memory [MB]':>12} {'growth':>8}"
     for quality in QUALITIES:
         uniform = open_uniform_recipe(pairs, quality, engine)
-        yield _mean_row(quality, measure_frames(uniform, tuple(range(pairs))))
+        yield _mean_row(quality, measure_frames(uniform, tuple(range(pairs)), device))
     yield f"\n{'2 to 40 m':>9} {'pairs/s by the clock':>20} {'workers':>8}"
     for quality in QUALITIES:
         uniform = open_uniform_recipe(pairs + warm_up_frames(workers), quality, engine)
-        yield f"{quality:>9} {frames_per_second(uniform, workers):20.2f} {workers:8d}"
+        yield f"{quality:>9} {frames_per_second(uniform, workers, device):20.2f} {workers:8d}"
 
 
 def open_stations_recipe(repeat: int, engine: str | None) -> Recipe:

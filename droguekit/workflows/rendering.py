@@ -57,12 +57,11 @@ def render_frames(
     """Render frames of a recipe into a dataset.
 
     Raises:
-        ValueError: a folder of another recipe, wrong options, or an engine that cannot be used.
+        ValueError: a folder of another recipe, wrong options, or an engine or device that cannot be used.
         OSError: the folder cannot be written or the disk is full; finished frames stay.
     """
     with delay_interrupts():
         from droguekit.batch.render_dataset import render_dataset
-        from render.engine import engine_notice
 
     if options.workers is not None and options.workers < 0:
         raise ValueError(f"workers: must not be negative, got {options.workers}")
@@ -72,9 +71,6 @@ def render_frames(
         raise ValueError("--workers: are processes of this machine; omit it with --scheduler")
     if str(out).startswith("memory:") and options.worker_count() != 0:
         raise ValueError(f"--out: {out} is the memory of one process; give --workers 0 or another place")
-    notice = engine_notice(source.recipe.render.engine)
-    if notice is not None:
-        report.say(notice)
     return render_dataset(source, out, frames, options, report)
 
 

@@ -18,9 +18,9 @@ _RESERVED_NUMBERS = 1024
 def jit_array(kind: Any, values: ArrayLike) -> Any:
     """A Dr.Jit array with a copy of NumPy data.
 
-    Dr.Jit does not copy a NumPy array: kernels read its memory in whole vector registers, and so past its end, which is
-    a segmentation fault where the next page is not mapped. Kernels are also compiled again where the array does not
-    start at a multiple of a register. The copy avoids both.
+    With LLVM, Dr.Jit does not copy a NumPy array: kernels read its memory in whole vector registers, and so past its
+    end, which is a segmentation fault where the next page is not mapped. Kernels are also compiled again where the
+    array does not start at a multiple of a register. The copy avoids both. With CUDA, Dr.Jit sends it to the GPU.
 
     Args:
         kind: Dr.Jit type with elements of 4 bytes.

@@ -13,10 +13,11 @@ from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
 from geometry.stereo import EYES, Eye
 from render.background import air_in_front, backgrounds
+from render.device import Device
 from render.engine import EyeRadiance, StereoRadiance
 from render.mitsuba_engine.render_noise import MonteCarloNoise, measure_noise
 from render.mitsuba_engine.trace_request import DROGUE_PARTS, TraceRequest, TraceResult
-from render.mitsuba_engine.variant import probe_variant
+from render.mitsuba_engine.variant import Variant, probe_variant
 from render.surfaces import shows_surfaces
 from render.version import RENDER_VERSION
 from scenes.environment_radiance import environment_radiance
@@ -25,31 +26,32 @@ from scenes.environment_radiance import environment_radiance
 class MitsubaEngine:
     """Path tracing of the pixels that see drogue, hose or tanker; all others show the environment itself.
 
-    One process holds one engine, with one thread: results are then the same bit for bit in every run.
+    One process holds one engine of each device, with one thread: results of the processor are then the same bit for
+    bit in every run.
 
     Raises:
-        ValueError: Mitsuba is not installed.
+        EngineUnavailableError: Mitsuba is not installed, or cannot use the device.
     """
 
     name = "mitsuba"
 
-    def __init__(self) -> None:
-        chosen = probe_variant()
+    def __init__(self, device: Device = "cpu") -> None:
+        chosen = probe_variant(device)
         if chosen.library is not None:
             os.environ["DRJIT_LIBLLVM_PATH"] = str(chosen.library)
         import mitsuba as mi
 
         mi.set_variant(chosen.variant)
         self.variant = chosen
-        self.version = f"mitsuba {version('mitsuba')} {chosen.variant}, render version {RENDER_VERSION}"
+        self.version = engine_version(chosen)
         if chosen.variant == "scalar_rgb":
             from render.mitsuba_engine.scalar_tracer import ScalarTracer
 
-            self._tracer: ScalarTracer | LlvmTracer = ScalarTracer()
+            self._tracer: ScalarTracer | WavefrontTracer = ScalarTracer()
         else:
-            from render.mitsuba_engine.llvm_tracer import LlvmTracer
+            from render.mitsuba_engine.wavefront_tracer import WavefrontTracer
 
-            self._tracer = LlvmTracer()
+            self._tracer = WavefrontTracer()
 
     def render(self, frame: FrameSpec, settings: RenderSettings) -> StereoRadiance:
         """Radiance and passes of both eyes.
@@ -63,6 +65,10 @@ class MitsubaEngine:
         """
         if frame.rig.lenses is not None and self.variant.variant == "scalar_rgb":
             raise ValueError(f"rig: mitsuba as scalar_rgb draws ideal eyes only ({self.variant.reason}); use analytic")
+        import mitsuba as mi
+
+        # Another engine of this process may have set its own.
+        mi.set_variant(self.variant.variant)
         stage_s: dict[str, float] = {}
         started = time.process_time()
         background = backgrounds(frame)
@@ -100,6 +106,12 @@ class MitsubaEngine:
             stage_s=stage_s,
             monte_carlo_over_sensor_noise=noise_over_sensor,
         )
+
+
+def engine_version(chosen: Variant) -> str:
+    """The engine down to its variant, and to the GPU and its driver, on which pixels depend too."""
+    name = chosen.variant if chosen.gpu is None else f"{chosen.variant} ({chosen.gpu})"
+    return f"mitsuba {version('mitsuba')} {name}, render version {RENDER_VERSION}"
 
 
 def _noise(frame: FrameSpec, traced: TraceResult, background: dict[Eye, NDArray[np.float32]]) -> MonteCarloNoise:

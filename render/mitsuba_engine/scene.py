@@ -229,7 +229,8 @@ def _material(surface: Surface, has_map: bool) -> dict[str, Any]:
     """Matt paint, mixed with specular microfacets if the surface has a sheen; every frame sets its reflectance."""
     if has_map:
         bitmap = mi.Bitmap(np.zeros(surface.reflectance.shape, dtype=np.float32))
-        reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
+        # A GPU's own interpolation counts in 256ths of a texel.
+        reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp", "accel": False}
     else:
         reflectance = {"type": "rgb", "value": surface.reflectance.reshape(-1, 3).mean(axis=0).tolist()}
     matt = {"type": "diffuse", "reflectance": reflectance}

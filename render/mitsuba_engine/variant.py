@@ -1,7 +1,7 @@
-"""Which Mitsuba variant works here: the LLVM one when its library does, else the scalar one.
+"""Which Mitsuba variant works here: on the processor LLVM's when its library does, else the scalar one; or a GPU's.
 
-An unsuitable LLVM library can abort the whole process, which nothing can catch: it is tried in a process of its own,
-and the verdict is remembered per library, drjit version and processor.
+An unsuitable library or driver can abort the whole process, which nothing can catch: it is tried in a process of its
+own, and the verdict is remembered per library or driver, drjit version and processor.
 """
 
 from __future__ import annotations
@@ -15,9 +15,16 @@ import sys
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
+
+from render.device import Device
+from render.engine import EngineUnavailableError
+from render.mitsuba_engine.gpu_trial import kernel_module
 
 _OLDEST_LLVM = 15
 _PROBE_TIMEOUT_S = 120
+# By these a user chooses a GPU, or the driver's libraries.
+_GPU_CHOICES = ("CUDA_VISIBLE_DEVICES", "DRJIT_LIBCUDA_PATH", "DRJIT_LIBOPTIX_PATH")
 _PROBE = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
@@ -34,11 +41,19 @@ print("works")
 
 @dataclass(frozen=True)
 class Variant:
-    """The chosen variant, why, and the LLVM library that it uses (None for the scalar variant)."""
+    """The chosen variant and why.
+
+    Attributes:
+        variant: its name.
+        reason: why this one.
+        library: of LLVM, which it uses; None for the other variants.
+        gpu: name and driver of the GPU that it uses; None on the processor.
+    """
 
     variant: str
     reason: str
-    library: Path | None
+    library: Path | None = None
+    gpu: str | None = None
 
 
 def llvm_libraries() -> list[Path]:
@@ -56,7 +71,7 @@ def llvm_libraries() -> list[Path]:
 
 
 def _cache_file() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "droguekit" / "llvm-verdicts.json"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "droguekit" / "variant-verdicts.json"
 
 
 def _works(library: Path) -> bool:
@@ -65,32 +80,78 @@ def _works(library: Path) -> bool:
         stamp = library.stat().st_mtime_ns
     except OSError:
         return False
-    key = "|".join([version("mitsuba"), version("drjit"), str(library), str(stamp), platform.processor(), _cpu_model()])
-    verdicts: dict[str, bool] = {}
+    key = "|".join([*_versions(), str(library), str(stamp), platform.processor(), _cpu_model()])
+    known = _verdicts().get(key)
+    if isinstance(known, bool):
+        return known
     try:
-        verdicts = json.loads(_cache_file().read_text(encoding="utf-8"))
-        if isinstance(verdicts.get(key), bool):
-            return verdicts[key]
-    except (OSError, ValueError, AttributeError):
-        verdicts = {}
-    try:
-        trial = subprocess.run(
-            [sys.executable, "-c", _PROBE],
-            env={**os.environ, "DRJIT_LIBLLVM_PATH": str(library)},
-            capture_output=True,
-            timeout=_PROBE_TIMEOUT_S,
-            check=False,
-        )
+        trial = _tried(["-c", _PROBE], {"DRJIT_LIBLLVM_PATH": str(library)})
         works = trial.returncode == 0 and b"works" in trial.stdout
     except subprocess.TimeoutExpired:
         works = False
-    _store_verdicts({**verdicts, key: works})
+    _store_verdict(key, works)
     return works
 
 
-def _store_verdicts(verdicts: dict[str, bool]) -> None:
-    """Keep the verdicts for the next process; a cache that cannot be written only costs time."""
-    path = _cache_file()
+def _gpu() -> str:
+    """Name and driver of the GPU that Mitsuba renders on, from the cache or by a trial in its own process.
+
+    Only success is remembered: a GPU may be missing or full for a while.
+
+    Raises:
+        ValueError: there is none; says what is missing and what to do.
+    """
+    chosen = (os.environ.get(name, "") for name in _GPU_CHOICES)
+    module = kernel_module()
+    key = "|".join(["cuda", *_versions(), module, *chosen])
+    known = _verdicts().get(key)
+    if module and isinstance(known, str):
+        return known
+    try:
+        trial = _tried(["-P", "-m", "render.mitsuba_engine.gpu_trial"], {})
+        verdict = json.loads(trial.stdout.splitlines()[-1])
+    except subprocess.TimeoutExpired:
+        raise ValueError(f"a trial did not end within {_PROBE_TIMEOUT_S} s; look with nvidia-smi") from None
+    except (IndexError, ValueError):
+        raise ValueError(f"a trial ended with status {trial.returncode}; look for a newer driver") from None
+    if "fault" in verdict:
+        raise ValueError(verdict["fault"])
+    gpu = str(verdict["gpu"])
+    _store_verdict(key, gpu)
+    return gpu
+
+
+def _tried(arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[bytes]:
+    """Run Python with these arguments.
+
+    Raises:
+        subprocess.TimeoutExpired: it takes too long.
+    """
+    return subprocess.run(
+        [sys.executable, *arguments],
+        env={**os.environ, **environment},
+        capture_output=True,
+        timeout=_PROBE_TIMEOUT_S,
+        check=False,
+    )
+
+
+def _versions() -> tuple[str, str]:
+    return version("mitsuba"), version("drjit")
+
+
+def _verdicts() -> dict[str, Any]:
+    """What earlier processes found; empty where that cannot be read."""
+    try:
+        verdicts = json.loads(_cache_file().read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return verdicts if isinstance(verdicts, dict) else {}
+
+
+def _store_verdict(key: str, verdict: bool | str) -> None:
+    """Keep a verdict for the next process; a cache that cannot be written only costs time."""
+    path, verdicts = _cache_file(), {**_verdicts(), key: verdict}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f"{path.name}.{os.getpid()}")
@@ -108,20 +169,28 @@ def _cpu_model() -> str:
     return match.group(1) if match else platform.machine()
 
 
-def probe_variant() -> Variant:
-    """The fastest variant that works on this machine.
+def probe_variant(device: Device = "cpu") -> Variant:
+    """The fastest variant that works on a device of this machine.
 
     Raises:
-        ValueError: Mitsuba is not installed.
+        EngineUnavailableError: Mitsuba is not installed, or there is no such device that it can use.
     """
     try:
         version("mitsuba")
     except PackageNotFoundError as error:
-        raise ValueError("engine mitsuba: not installed; install it with: pip install 'droguekit[mitsuba]'") from error
+        raise EngineUnavailableError(
+            "engine mitsuba: not installed; install it with: pip install 'droguekit[mitsuba]'"
+        ) from error
+    if device == "cuda":
+        try:
+            gpu = _gpu()
+        except ValueError as error:
+            raise EngineUnavailableError(f"device cuda: {error}, or take device cpu") from error
+        return Variant("cuda_ad_rgb", f"the GPU works: {gpu}", gpu=gpu)
     libraries = llvm_libraries()
     for library in libraries:
         if _works(library):
             return Variant("llvm_ad_rgb", f"LLVM works: {library}", library)
     tried = ", ".join(str(library) for library in libraries)
     reason = f"no LLVM library works (tried {tried})" if libraries else f"no LLVM library >= {_OLDEST_LLVM} found"
-    return Variant("scalar_rgb", f"{reason}; about 3 times slower", None)
+    return Variant("scalar_rgb", f"{reason}; about 3 times slower")

@@ -64,3 +64,15 @@ def test_a_change_of_an_unknown_key_names_it() -> None:
 def test_a_frame_outside_the_recipe_is_refused(pairs_recipe_file: Path) -> None:
     with pytest.raises(ValueError, match=r"frame: must be in \[0, 8\), got 8"):
         droguekit.render_pair(droguekit.load_recipe(str(pairs_recipe_file)), 8)
+
+
+def test_a_device_that_the_engine_cannot_use_is_refused_before_anything_is_made(
+    pairs_recipe_file: Path, tmp_path: Path
+) -> None:
+    recipe = droguekit.load_recipe(str(pairs_recipe_file))
+    refused = "^device cuda: engine analytic renders on the processor only; take device cpu or engine mitsuba"
+    with pytest.raises(ValueError, match=refused):
+        droguekit.render_pair(recipe, device="cuda")
+    with pytest.raises(ValueError, match=refused):
+        droguekit.render_dataset(recipe, tmp_path / "out", device="cuda")
+    assert not (tmp_path / "out").exists()

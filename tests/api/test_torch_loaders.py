@@ -171,3 +171,9 @@ def test_wrong_numbers_are_refused(recipe: Recipe, tmp_path: Path) -> None:
         RenderStream(recipe, tmp_path / "cache", rank=2, ranks=2)
     with pytest.raises(ValueError, match="must be at least 0, 0 and 1, got 0, -1, 1"):
         RenderStream(recipe, tmp_path / "cache").start_at(0, -1)
+
+
+def test_a_device_that_the_engine_cannot_use_is_refused_before_a_loader_starts(recipe: Recipe, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"^device cuda: engine analytic renders on the processor only"):
+        RenderStream(recipe, tmp_path / "cache", device="cuda")
+    assert not (tmp_path / "cache").exists()

@@ -13,13 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from datasets_manifest.recipe.recipe import RecipeSource
+from datasets_manifest.recipe.recipe import RecipeSource, parse_recipe
 from datasets_manifest.storage import layout
 from droguekit.batch import cluster
 from droguekit.batch.cluster import ClusterTask, WorkerBuild, current_build
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.frame_task import FrameTask, OtherBuildError
+from droguekit.batch.stop_request import StopRequest
 from droguekit.cli.main import WRONG_INPUT, run
+from render.engine import EngineUnavailableError
 from tests.support.batch_datasets import ANALYTIC_RECIPE, QUICK_RECIPE, file_hashes, render_recipe
 
 distributed = pytest.importorskip("distributed", reason="Dask is missing: pip install 'droguekit[cluster]'")
@@ -214,8 +216,6 @@ def test_slurm_jobs_that_dask_jobqueue_submits_make_the_dataset(
 
 
 def test_workers_of_another_build_are_refused(start: Start, scheduler: str, tmp_path: Path) -> None:
-    from datasets_manifest.recipe.recipe import parse_recipe
-
     worker(start, scheduler)
     here = current_build()
     builds = {
@@ -240,3 +240,9 @@ def test_workers_and_scheduler_exclude_each_other(tmp_path: Path, capsys: pytest
     options = ["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"]
     assert run(["render", "smoke", "--engine", "analytic", "--out", str(tmp_path / "out"), *options]) == WRONG_INPUT
     assert "--workers: are processes of this machine" in capsys.readouterr().err
+
+
+def test_a_device_that_is_missing_here_is_told_before_workers_are_asked(tmp_path: Path) -> None:
+    task = FrameTask(parse_recipe(ANALYTIC_RECIPE), tmp_path, device="cuda")
+    with StopRequest(print) as stop, pytest.raises(EngineUnavailableError, match=r"^device cuda: engine analytic"):
+        next(cluster.run_on_cluster(task, [0], "tcp://127.0.0.1:9", 600.0, stop))

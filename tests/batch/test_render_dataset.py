@@ -18,6 +18,7 @@ from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.storage.writer import leftovers
 from droguekit.batch.frame_task import FrameTask
 from droguekit.batch.worker_pool import run_in_own_process
+from render.engine import EngineUnavailableError
 from tests.support.batch_datasets import ANALYTIC_RECIPE, TINY_RECIPE, file_hashes, render_recipe
 
 
@@ -129,6 +130,13 @@ def test_frames_of_another_engine_build_are_not_mixed_in(tiny_dataset: Path, tmp
     with pytest.raises(ValueError, match=r"made by mitsuba 0\.1, but this is mitsuba .*, whose pixels differ"):
         run_in_own_process(partial(task, 0))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_device_reaches_the_process_that_renders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", "/nonexistent/libcuda.so.1")
+    task = FrameTask(parse_recipe(TINY_RECIPE), tmp_path, device="cuda")
+    with pytest.raises(EngineUnavailableError, match=r"^device cuda: no NVIDIA driver"):
+        run_in_own_process(partial(task, 0))
 
 
 @pytest.mark.parametrize("frames", [[0, 0], [4], [-1]])

@@ -16,6 +16,7 @@ from datasets_manifest.storage.writer import write_frame
 from datasets_manifest.types.records import PairRecord
 from droguekit.batch.frame_task import reproduce_frame
 from droguekit.batch.render_dataset import describe_dataset
+from render.engine import EngineUnavailableError
 
 Change = Callable[[dict[str, Any]], None]
 
@@ -87,3 +88,9 @@ def test_elsewhere_labels_must_still_agree(with_changed_record: Callable[[Change
 def test_a_frame_that_is_not_there_is_an_error(tiny_dataset: Path) -> None:
     with pytest.raises(ValueError, match="has no frame 17"):
         reproduce_frame(tiny_dataset, 17)
+
+
+def test_a_frame_is_made_again_on_the_given_device(tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", "/nonexistent/libcuda.so.1")
+    with pytest.raises(EngineUnavailableError, match=r"^device cuda: no NVIDIA driver"):
+        reproduce_frame(tiny_dataset, 1, "cuda")

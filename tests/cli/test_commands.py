@@ -19,15 +19,16 @@ import pytest
 from datasets_manifest.storage import layout
 from datasets_manifest.storage.manifest import read_manifest
 from datasets_manifest.types.estimates import read_estimates
-from droguekit.cli.main import DONE, run
+from droguekit.cli.main import DONE, WRONG_INPUT, run
 from nav.runner import method_names
+from render.mitsuba_engine.variant import probe_variant
 from tests.support.recipe_builder import RIG_160_PX, recipe_text, stations
 
 # The scalar variant takes its time with every pixel.
 SMALL_RECIPE = recipe_text(
     name="small",
     rig=RIG_160_PX,
-    frames={"count": 1},
+    frames={"count": 2},
     distance=stations(10.0),
     render={"samples_per_px": 1, "surround_samples_per_px": 1, "max_depth": 2},
 )
@@ -88,9 +89,14 @@ def test_plan_counts_without_rendering(capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.mitsuba
-def test_doctor_names_the_engine_that_works(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_names_the_engine_that_works_and_what_a_gpu_lacks(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", "/nonexistent/libcuda.so.1")
     assert run(["doctor"]) == DONE
-    assert re.search(r"^engine +mitsuba works as (llvm_ad_rgb|scalar_rgb): ", capsys.readouterr().out, re.MULTILINE)
+    shown = capsys.readouterr().out
+    assert re.search(r"^engine +mitsuba works as (llvm_ad_rgb|scalar_rgb): ", shown, re.MULTILINE)
+    assert re.search(r"^gpu +is optional: device cuda: no NVIDIA driver, as /nonexistent/", shown, re.MULTILINE)
 
 
 def test_doctor_names_viewer_and_browser(
@@ -141,12 +147,19 @@ def test_demo_goes_from_a_recipe_to_a_report_and_keeps_what_is_there(
 
 
 @pytest.mark.mitsuba
-def test_the_slow_variant_is_announced(tmp_path: Path) -> None:
+def test_the_slow_variant_is_announced_and_no_other_one_continues_its_dataset(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "small.toml").write_text(SMALL_RECIPE)
     command = [sys.executable, "-m", "droguekit.cli.main", "render", str(tmp_path / "small.toml")]
     # A library that is not there leaves the scalar variant.
     environment = {**os.environ, "DRJIT_LIBLLVM_PATH": "/nonexistent/libLLVM.so"}
-    options = ["--out", str(tmp_path / "out"), "--workers", "1"]
+    options = ["--out", str(tmp_path / "out"), "--workers", "1", "--frames", "0:1"]
     done = subprocess.run([*command, *options], env=environment, capture_output=True, text=True, check=True)
     assert "engine mitsuba runs as scalar_rgb" in done.stdout + done.stderr
     assert (tmp_path / "out" / "frames" / "000000" / "record.json").is_file()
+    if probe_variant().variant == "scalar_rgb":
+        return
+    assert run([*command[3:], "--out", str(tmp_path / "out"), "--workers", "1"]) == WRONG_INPUT
+    told = capsys.readouterr().err
+    assert re.search(r"its frames were made by mitsuba .* scalar_rgb, .* but this is mitsuba .* llvm_ad_rgb, ", told)

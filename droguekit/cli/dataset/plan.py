@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from droguekit.cli.arguments import EngineOption, RecipeArgument, SeedOption, WorkersOption, output_option
+from droguekit.batch.execution import ExecutionOptions
+from droguekit.cli.arguments import DeviceOption, EngineOption, RecipeArgument, SeedOption, WorkersOption, output_option
 from droguekit.workflows.planning import plan_lines
 
 EXAMPLES = (
@@ -25,8 +26,9 @@ def plan(
     ] = True,
     workers: WorkersOption = None,
     engine: EngineOption = None,
+    device: DeviceOption = "cpu",
     html: Annotated[Path | None, output_option("--html", "FILE", "Write the plan with its plots as one page.")] = None,
 ) -> None:
     """Show what a recipe will make, how long it will take and how large it will get, without making it."""
-    for line in plan_lines(recipe, seed, engine, probe, workers, html):
+    for line in plan_lines(recipe, seed, engine, probe, ExecutionOptions(workers, device=device), html):
         typer.echo(line)

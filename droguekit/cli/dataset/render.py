@@ -10,6 +10,7 @@ from datasets_manifest.storage.storage import as_location
 from droguekit.batch.execution import ExecutionOptions
 from droguekit.batch.progress import progress_report
 from droguekit.cli.arguments import (
+    DeviceOption,
     EngineOption,
     Place,
     RecipeArgument,
@@ -68,6 +69,7 @@ def render(
         ),
     ] = None,
     engine: EngineOption = None,
+    device: DeviceOption = "cpu",
 ) -> None:
     """Make a dataset from a recipe.
 
@@ -77,7 +79,7 @@ def render(
     """
     source = open_recipe(recipe, seed, engine)
     wanted = parse_shard(shard, parse_frames(frames, source.recipe.frames.count))
-    options = ExecutionOptions(workers, timeout, scheduler, tar)
+    options = ExecutionOptions(workers, timeout, scheduler, tar, device)
     summary = render_frames(source, out, wanted, options, progress_report())
     for line in run_lines(out, summary):
         typer.echo(line)

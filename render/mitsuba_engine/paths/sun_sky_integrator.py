@@ -180,7 +180,8 @@ class SkyIrradiance:
         self._columns = plates.shape[1]
         # The type is chosen with the variant, which type checkers do not see.
         texture: Any = mi.Texture2f
-        self._texture = texture(jit_tensor(wrapped), wrap_mode=dr.WrapMode.Clamp)
+        # A GPU's own interpolation counts in 256ths of a texel.
+        self._texture = texture(jit_tensor(wrapped), use_accel=False, wrap_mode=dr.WrapMode.Clamp)
         # Python numbers would become part of the compiled kernel.
         self._rotation = [[dr.opaque(mi.Float, float(value)) for value in row] for row in world_from_stage]
 

@@ -48,7 +48,7 @@ BYSTANDERS = {"probe": True, "obstacle_frame_fraction": 1, "distractor_frame_fra
 def test_nothing_is_seen_where_no_ray_is_sent(
     scene_of: Callable[[FrameSpec], Any], changes: RecipeTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from render.mitsuba_engine.llvm_tracer import CenterPasses
+    from render.mitsuba_engine.wavefront_tracer import CenterPasses
 
     recipe = build_recipe(BASE, **changes)
     for frame in (sample_frame(recipe, index) for index in range(recipe.frames.count)):

@@ -1,5 +1,6 @@
-"""Tracing with Mitsuba's LLVM variant: every ray is generated here, so that one compiled kernel serves every frame.
+"""Tracing with Mitsuba's compiled variants, LLVM's and CUDA's.
 
+Every ray is generated here, so that one compiled kernel serves every frame.
 Rays through the pixel centres give part id, depth, normal and amodal counts, and with them the pixels to trace.
 """
 
@@ -38,7 +39,7 @@ from render.mitsuba_engine.trace_request import (
 )
 
 
-class LlvmTracer:
+class WavefrontTracer:
     """Keeps the scenes of recent drogues and the compiled kernels."""
 
     def __init__(self) -> None:

@@ -1,0 +1,181 @@
+"""The variant for a GPU: why there is none, told before anything starts; and what is remembered of one.
+
+No GPU is needed: small libraries stand in for NVIDIA's driver.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from render.engine import EngineUnavailableError, engine_notice
+from render.mitsuba_engine import gpu_trial, variant
+from render.mitsuba_engine.variant import Variant, probe_variant
+
+pytestmark = pytest.mark.mitsuba
+
+DRIVER = """
+#include <string.h>
+int cuInit(unsigned flags) { return INIT; }
+int cuDriverGetVersion(int *version) { *version = 12040; return 0; }
+int cuDeviceGetCount(int *count) { *count = COUNT; return 0; }
+int cuDeviceGetName(char *name, int size, int device) { strncpy(name, "NVIDIA Test 1", size); return 0; }
+int cuDeviceGetAttribute(int *value, int attribute, int device) { *value = attribute == 75 ? MAJOR : 5; return 0; }
+"""
+KERNEL_MODULES = {
+    "NVRM version: NVIDIA UNIX x86_64 Kernel Module  535.104.05  Sat Aug 19 01:15:15 UTC 2023\nGCC version: 12.2.0\n": (
+        "driver 535.104.05"
+    ),
+    "NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  550.54.14  Release Build  (x@y)  Thu Feb 22 2024": (
+        "driver 550.54.14"
+    ),
+    "": "CUDA 12.4",
+}
+
+
+@pytest.fixture(autouse=True)
+def no_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache of verdicts for this test alone."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def driver(folder: Path, init: int = 0, count: int = 1, major: int = 8) -> str:
+    """Compile a library with the driver's functions, and return its path."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    source, library = folder / "driver.c", folder / "libcuda.so"
+    source.write_text(DRIVER)
+    values = [f"-DINIT={init}", f"-DCOUNT={count}", f"-DMAJOR={major}"]
+    subprocess.run([compiler, "-shared", "-fPIC", *values, str(source), "-o", str(library)], check=True)
+    return str(library)
+
+
+def refusal() -> str:
+    with pytest.raises(EngineUnavailableError) as caught:
+        engine_notice("mitsuba", "cuda")
+    return str(caught.value)
+
+
+def test_a_missing_driver_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", "/nonexistent/libcuda.so.1")
+    assert refusal() == (
+        "device cuda: no NVIDIA driver, as /nonexistent/libcuda.so.1 cannot be loaded; install driver 535 or newer, or "
+        "take device cpu"
+    )
+
+
+def test_a_missing_gpu_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # cuda.h: CUDA_ERROR_NO_DEVICE is 100.
+    for library in (driver(tmp_path, init=100), driver(tmp_path, count=0)):
+        monkeypatch.setenv("DRJIT_LIBCUDA_PATH", library)
+        assert refusal().startswith("device cuda: NVIDIA's driver finds no GPU; look with nvidia-smi")
+
+
+def test_a_driver_that_does_not_start_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", driver(tmp_path, init=803))
+    assert "NVIDIA's driver does not start (CUDA error 803)" in refusal()
+
+
+def test_an_old_gpu_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", driver(tmp_path, major=6))
+    monkeypatch.setattr(gpu_trial, "_KERNEL_MODULE", tmp_path / "none")
+    assert (
+        "NVIDIA Test 1" in refusal() and "has compute capability 6.5 and Mitsuba needs 7.5; take a newer" in refusal()
+    )
+
+
+def test_missing_optix_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", driver(tmp_path))
+    monkeypatch.setenv("DRJIT_LIBOPTIX_PATH", "/nonexistent/libnvoptix.so.1")
+    assert "OptiX is missing, as /nonexistent/libnvoptix.so.1 cannot be loaded" in refusal()
+    assert "NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics, or take device cpu" in refusal()
+
+
+@pytest.mark.parametrize("module", KERNEL_MODULES)
+def test_name_and_driver_of_a_gpu(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DRJIT_LIBCUDA_PATH", driver(tmp_path))
+    (tmp_path / "version").write_text(module)
+    monkeypatch.setattr(gpu_trial, "_KERNEL_MODULE", tmp_path / "version")
+    assert gpu_trial.gpu_name() == f"NVIDIA Test 1, {KERNEL_MODULES[module]}"
+
+
+class Trials:
+    """Stands in for the process of a trial, and counts."""
+
+    def __init__(self, stdout: str, status: int = 0) -> None:
+        self.stdout, self.status, self.count = stdout, status, 0
+
+    def __call__(self, arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[bytes]:
+        assert arguments == ["-P", "-m", "render.mitsuba_engine.gpu_trial"]
+        self.count += 1
+        return subprocess.CompletedProcess(arguments, self.status, self.stdout.encode(), b"")
+
+
+def test_a_gpu_is_tried_once_for_each_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    trials = Trials(json.dumps({"gpu": "NVIDIA Test 1, driver 550.54.14"}))
+    monkeypatch.setattr(variant, "_tried", trials)
+    for module in ("550.54.14", "550.54.14", "570.1"):
+        monkeypatch.setattr(variant, "kernel_module", lambda module=module: module)
+        found = probe_variant("cuda")
+        assert (found.variant, found.gpu, found.library) == ("cuda_ad_rgb", "NVIDIA Test 1, driver 550.54.14", None)
+        assert engine_notice("mitsuba", "cuda") is None
+    assert trials.count == 2
+    # Another GPU may have been chosen.
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
+    probe_variant("cuda")
+    assert trials.count == 3
+
+
+def test_a_failure_is_not_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant, "kernel_module", lambda: "550.54.14")
+    trials = Trials(json.dumps({"fault": "out of memory"}))
+    monkeypatch.setattr(variant, "_tried", trials)
+    for _ in range(2):
+        assert refusal() == "device cuda: out of memory, or take device cpu"
+    assert trials.count == 2
+
+
+def test_a_trial_that_dies_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(variant, "_tried", Trials("", -6))
+    assert refusal() == "device cuda: a trial ended with status -6; look for a newer driver, or take device cpu"
+
+
+def test_pixels_are_of_one_gpu_and_driver(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the records of frames name, by which a dataset refuses frames of another device."""
+    from render.mitsuba_engine.mitsuba_engine import engine_version
+
+    on_gpu = Variant("cuda_ad_rgb", "the GPU works", gpu="NVIDIA Test 1, driver 550.54.14")
+    assert " cuda_ad_rgb (NVIDIA Test 1, driver 550.54.14), render version " in engine_version(on_gpu)
+    assert " llvm_ad_rgb, render version " in engine_version(Variant("llvm_ad_rgb", "LLVM works", Path("libLLVM.so")))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["render", "smoke", "--out", "{out}"],
+        ["demo", "smoke", "--out", "{out}"],
+        ["bench"],
+        ["plan", "smoke"],
+    ],
+)
+def test_commands_end_with_one_line_before_any_work(arguments: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = [word.replace("{out}", str(out)) for word in arguments]
+    done = subprocess.run(
+        [sys.executable, "-m", "droguekit.cli.main", *words, "--device", "cuda"],
+        env={**os.environ, "DRJIT_LIBCUDA_PATH": "/nonexistent/libcuda.so.1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 2
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("droguekit: error: device cuda: no NVIDIA driver") and last.endswith("or take device cpu")
+    assert "Traceback" not in done.stderr and not (out / "frames").exists()
