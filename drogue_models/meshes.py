@@ -16,10 +16,21 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
+from drogue_models.drogue_families.body_meshes import body_meshes
+from drogue_models.drogue_families.fittings import (
+    MARKER_SECTIONS,
+    POCKET_DEPTH_M,
+    RIM_SECTIONS,
+    hub_annulus,
+    hub_groove_m,
+    marker_outline_m,
+    marker_plate,
+    rim,
+)
 from drogue_models.obstacles import OBSTACLE_SECTIONS, ObstacleShape
-from drogue_models.parameters import BodyMesh, DrogueParameters, HubParameters
+from drogue_models.parameters import BodyMesh, DrogueParameters
 from drogue_models.parts import Part, marker_id
-from drogue_models.solids import area_radius_m, bar, circle_m, loft, plate, pocketed_plate, revolve
+from drogue_models.solids import area_radius_m, bar, circle_m, loft, pocketed_plate, revolve
 from geometry.se3 import Array
 
 # Sizes of a drogue's body; anything outside was most likely drawn in millimetres or inches.
@@ -141,20 +152,8 @@ def _carried_frame(tangents: Array) -> tuple[Array, Array]:
     return side, np.cross(tangents, side)
 
 
-# Markers and hub: outlines within 10 um of the circle.
-MARKER_SECTIONS = 128
-# Large circles: the chord leaves the rim of 0.33 m by 25 um, a fortieth of a pixel at 2 m.
-RIM_SECTIONS = 256
-RIM_TUBE_SECTIONS = 16
-
 # Our choices, as dimensions of published drogues do not include them.
 FACE_THICKNESS_M = 0.005
-POCKET_DEPTH_M = 0.004
-MARKER_THICKNESS_M = 0.003
-HUB_THICKNESS_M = 0.002
-GROOVE_PER_HUB_THICKNESS = 1.5
-# A dark sleeve lines the hub's hole: its bright wall would be visible past the near edge and shift that edge.
-SLEEVE_THICKNESS_M = 0.00002
 RIB_WIDTH_M = 0.008
 RIB_THICKNESS_M = 0.004
 CANOPY_THICKNESS_M = 0.003
@@ -179,7 +178,9 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
     Raises:
         ValueError: the user's body mesh is missing, changed, or not fit for use.
     """
-    meshes = {int(Part.FACE): _face(drogue), int(Part.RIM): _rim(drogue)}
+    if drogue.body is not None:
+        return body_meshes(drogue)
+    meshes = {int(Part.FACE): _face(drogue), int(Part.RIM): rim(drogue)}
     if drogue.body_mesh is not None:
         meshes[int(Part.COUPLING)] = load_body_mesh(drogue.body_mesh)
     else:
@@ -188,9 +189,9 @@ def drogue_meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
         if drogue.rib_count:
             meshes[int(Part.RIBS)] = _ribs(drogue)
     if drogue.hub is not None:
-        meshes[int(Part.HUB)] = _hub(drogue, drogue.hub)
+        meshes[int(Part.HUB)] = hub_annulus(drogue, drogue.hub)
     for index in range(drogue.marker_count):
-        meshes[marker_id(index)] = plate(_marker_outline_m(drogue, index), [], MARKER_THICKNESS_M)
+        meshes[marker_id(index)] = marker_plate(drogue, index)
     return meshes
 
 
@@ -199,25 +200,12 @@ def obstacle_mesh(shape: ObstacleShape) -> trimesh.Trimesh:
     return revolve(shape.profile_m(), OBSTACLE_SECTIONS)
 
 
-def _marker_outline_m(drogue: DrogueParameters, index: int) -> Array:
-    radius_m = area_radius_m(drogue.marker_radius_m, MARKER_SECTIONS)
-    return circle_m(radius_m, MARKER_SECTIONS, drogue.marker_positions_m[index])
-
-
 def _face(drogue: DrogueParameters) -> trimesh.Trimesh:
     """The plate with a pocket for every marker, deeper than the marker, as coincident surfaces would flicker."""
     opening = circle_m(drogue.face_inner_radius_m, RIM_SECTIONS)
-    pockets = [_marker_outline_m(drogue, index) for index in range(drogue.marker_count)]
+    pockets = [marker_outline_m(drogue, index) for index in range(drogue.marker_count)]
     outer = circle_m(drogue.rim_radius_m - drogue.rim_tube_radius_m, RIM_SECTIONS)
     return pocketed_plate(outer, opening, pockets, FACE_THICKNESS_M, POCKET_DEPTH_M)
-
-
-def _rim(drogue: DrogueParameters) -> trimesh.Trimesh:
-    """A torus that touches z = 0 from behind where the face ends."""
-    tube_m = drogue.rim_tube_radius_m
-    profile = circle_m(tube_m, RIM_TUBE_SECTIONS, (drogue.rim_radius_m - tube_m, tube_m))
-    # The sine of a multiple of pi is not exactly 0: keep rounding errors from reaching before the face.
-    return revolve(np.maximum(profile, [0.0, 0.0]), RIM_SECTIONS)
 
 
 def _rib_line_m(drogue: DrogueParameters) -> tuple[Array, Array]:
@@ -262,11 +250,8 @@ def _coupling(drogue: DrogueParameters) -> trimesh.Trimesh:
         mouth_m = 0.6 * collar_m
         profile = [(0.0, recess_m), (mouth_m, recess_m), (mouth_m, 0.0)]
     else:
-        inner_m, outer_m = _hub_radii_m(drogue.hub)
-        thickness_m = GROOVE_PER_HUB_THICKNESS * _hub_thickness_m(drogue)
-        sleeve_m = inner_m - SLEEVE_THICKNESS_M
-        profile = [(0.0, recess_m), (sleeve_m, recess_m), (sleeve_m, 0.0), (inner_m, 0.0)]
-        profile += [(inner_m, thickness_m), (outer_m, thickness_m), (outer_m, 0.0)]
+        groove = hub_groove_m(drogue, drogue.hub)
+        profile = [(0.0, recess_m), (groove[0][0], recess_m), *groove]
     profile += [
         (collar_m, 0.0),
         (collar_m, 0.30 * length_m),
@@ -277,21 +262,6 @@ def _coupling(drogue: DrogueParameters) -> trimesh.Trimesh:
         (0.0, length_m),
     ]
     return revolve(np.array(profile) + np.array([0.0, drogue.hub_depth_m]), MARKER_SECTIONS)
-
-
-def _hub_radii_m(hub: HubParameters) -> tuple[float, float]:
-    return area_radius_m(hub.inner_radius_m, MARKER_SECTIONS), area_radius_m(hub.outer_radius_m, MARKER_SECTIONS)
-
-
-def _hub_thickness_m(drogue: DrogueParameters) -> float:
-    return min(HUB_THICKNESS_M, 0.1 * drogue.coupling_length_m)
-
-
-def _hub(drogue: DrogueParameters, hub: HubParameters) -> trimesh.Trimesh:
-    inner_m, outer_m = _hub_radii_m(hub)
-    thickness_m = _hub_thickness_m(drogue)
-    profile = [(inner_m, 0.0), (outer_m, 0.0), (outer_m, thickness_m), (inner_m, thickness_m)]
-    return revolve(np.array(profile) + np.array([0.0, hub.depth_m]), MARKER_SECTIONS)
 
 
 _EXAMPLE_SECTIONS = 48

@@ -21,6 +21,7 @@ class Part(IntEnum):
     RIBS = 4
     COUPLING = 5
     HUB = 6
+    LAMPS = 7
     HOSE = 16
     TANKER = 17
     PROBE = 18
@@ -32,7 +33,7 @@ class Part(IntEnum):
 # Parts around the drogue, outside its box.
 SURROUNDING_PARTS = (Part.HOSE, Part.TANKER, Part.PROBE, Part.OBSTACLE, Part.DISTRACTOR, Part.BOARD)
 # Parts that the drogue's box covers, besides the markers.
-DROGUE_PARTS = (Part.FACE, Part.RIM, Part.CANOPY, Part.RIBS, Part.COUPLING, Part.HUB)
+DROGUE_PARTS = (Part.FACE, Part.RIM, Part.CANOPY, Part.RIBS, Part.COUPLING, Part.HUB, Part.LAMPS)
 
 
 def marker_id(index: int) -> int:
@@ -93,6 +94,8 @@ def part_reflectance_rgb(drogue: DrogueParameters, part_id: int) -> tuple[float,
         Part.HOSE: drogue.structure_reflectance_rgb,
         Part.TANKER: TANKER_GREY,
     }
+    if drogue.body is not None and drogue.body.lamps is not None:
+        reflectances[Part.LAMPS] = drogue.body.lamps.reflectance_rgb
     if drogue.hub is not None:
         reflectances[Part.HUB] = drogue.hub.reflectance_rgb
     if part_id not in reflectances:

@@ -1,15 +1,22 @@
-"""The shipped drogues, and the reader of a user's drogue from TOML."""
+"""The shipped drogues, and the reader of a user's drogue from TOML.
+
+Rings like the seed paper's are made here; baskets, leaves, ribbons and cones are files in `drogue_families/presets`.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import tomllib
+from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
-from drogue_models.parameters import WHITE_PAINT, DrogueParameters, HubParameters, even_ring
+from drogue_models.frozen_model import FrozenModel, Metres
+from drogue_models.parameters import WHITE_PAINT, DrogueParameters, HubParameters, PlanePoint, even_ring
 from drogue_models.parts import MAX_MARKERS
 
 # The largest even ring that leaves 10 mm of dark face around markers of 0.10 m inside a rim of 0.33 m.
@@ -34,11 +41,25 @@ PRESETS: dict[str, DrogueParameters] = {
 }
 
 
+@cache
+def preset_names() -> tuple[str, ...]:
+    """Names of all shipped drogues: rings first, then the others by name."""
+    folder = files("drogue_models.drogue_families") / "presets"
+    return (*PRESETS, *sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir()))
+
+
+@cache
+def _shipped(name: str) -> DrogueParameters:
+    file = files("drogue_models.drogue_families") / "presets" / f"{name}.toml"
+    return parse_drogue(file.read_text(encoding="utf-8"), Path())
+
+
 def load_drogue(name_or_path: str, base: Path | None = None) -> DrogueParameters:
     """A shipped preset by name, or a drogue from a TOML file.
 
-    The file holds the keys of `DrogueParameters`. An even ring may be given as `marker_count` and
-    `marker_ring_radius_m` instead of `marker_positions_m`, and `body_mesh` as the path of a mesh, relative to the file.
+    The file holds the keys of `DrogueParameters`. Even rings may be given as `marker_count` and `marker_ring_radius_m`,
+    or as a list `marker_rings`, instead of `marker_positions_m`. `hub = false` stands for no hub, and `body_mesh` is
+    the path of a mesh, relative to the file.
 
     Args:
         name_or_path: name of a preset, or path of a `.toml` file.
@@ -49,25 +70,77 @@ def load_drogue(name_or_path: str, base: Path | None = None) -> DrogueParameters
     """
     if name_or_path in PRESETS:
         return PRESETS[name_or_path]
+    if name_or_path in preset_names():
+        return _shipped(name_or_path)
     if not name_or_path.endswith(".toml"):
         raise ValueError(
-            f"drogue: no preset named {name_or_path!r}; there are {', '.join(PRESETS)}, or give a .toml file"
+            f"drogue: no preset named {name_or_path!r}; there are {', '.join(preset_names())}, or give a .toml file"
         )
     path = (base or Path()) / name_or_path
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_drogue(path.read_text(encoding="utf-8"), path.parent)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from error
-    try:
-        _expand_ring(table)
-        _pin_body_mesh(table, path.parent)
-        return DrogueParameters.model_validate(table)
     except ValidationError as error:
         raise ValueError(f"{path}: {explain(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def parse_drogue(text: str, folder: Path) -> DrogueParameters:
+    """A drogue from TOML text, see `load_drogue`.
+
+    Args:
+        text: TOML.
+        folder: that a path of a mesh is relative to.
+
+    Raises:
+        ValueError: not TOML, or keys are wrong.
+    """
+    table = tomllib.loads(text)
+    _expand_ring(table)
+    _expand_rings(table)
+    _pin_body_mesh(table, folder)
+    if table.get("hub") is False:
+        table["hub"] = None
+    return DrogueParameters.model_validate(table)
+
+
+class MarkerRing(FrozenModel):
+    """An even ring of markers in the short form of a TOML file.
+
+    Attributes:
+        count: of markers.
+        radius_m: of the circle through their centres. [m]
+        depth_m: behind the rim plane. [m]
+        turn_deg: of the first marker from the +y axis towards -x.
+    """
+
+    count: int = Field(ge=1, le=MAX_MARKERS)
+    radius_m: Metres
+    depth_m: float = Field(default=0.0, ge=0, le=10)
+    turn_deg: float = 0.0
+
+
+def _expand_rings(table: dict[str, Any]) -> None:
+    """Replace a list of rings by positions and depths, in place."""
+    if "marker_rings" not in table:
+        return
+    for key in ("marker_positions_m", "marker_depths_m"):
+        if key in table:
+            raise ValueError(f"{key}: leave it out, or leave out marker_rings or marker_count")
+    rings = TypeAdapter(tuple[MarkerRing, ...]).validate_python(table.pop("marker_rings"))
+    positions: list[PlanePoint] = []
+    for ring in rings:
+        turn = complex(math.cos(math.radians(ring.turn_deg)), math.sin(math.radians(ring.turn_deg)))
+        turned = [complex(x, y) * turn for x, y in even_ring(ring.count, ring.radius_m)]
+        positions += [(place.real, place.imag) for place in turned]
+    table["marker_positions_m"] = positions
+    depths = [ring.depth_m for ring in rings for _ in range(ring.count)]
+    if any(depths):
+        table["marker_depths_m"] = depths
 
 
 def _expand_ring(table: dict[str, Any]) -> None:

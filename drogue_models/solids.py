@@ -44,19 +44,21 @@ def plate(outer_m: Array, holes_m: Sequence[Array], thickness_m: float) -> trime
 
 
 def pocketed_plate(
-    outer_m: Array, opening_m: Array, pockets_m: Sequence[Array], thickness_m: float, depth_m: float
+    outer_m: Array, opening_m: Array | None, pockets_m: Sequence[Array], thickness_m: float, depth_m: float
 ) -> trimesh.Trimesh:
-    """A flat ring between z = 0 and z = `thickness_m` with pockets sunk into its front; one solid without inner faces.
+    """A flat plate between z = 0 and z = `thickness_m` with pockets sunk into its front; one solid without inner faces.
 
     Args:
-        outer_m, opening_m: (N, 2) outlines of the ring.
+        outer_m: (N, 2) outline of the plate.
+        opening_m: (N, 2) outline of its hole, or None.
         pockets_m: (M, 2) outline of each pocket.
-        thickness_m: of the ring.
+        thickness_m: of the plate.
         depth_m: of the pockets, below `thickness_m`.
     """
-    parts = [_cap(outer_m, [opening_m, *pockets_m], 0.0, -1), _cap(outer_m, [opening_m], thickness_m, 1)]
+    holes = [] if opening_m is None else [opening_m]
+    parts = [_cap(outer_m, [*holes, *pockets_m], 0.0, -1), _cap(outer_m, holes, thickness_m, 1)]
     parts += [_cap(pocket, [], depth_m, -1) for pocket in pockets_m]
-    parts += [_wall(outer_m, thickness_m, 1), _wall(opening_m, thickness_m, -1)]
+    parts += [_wall(outer_m, thickness_m, 1), *(_wall(hole, thickness_m, -1) for hole in holes)]
     parts += [_wall(pocket, depth_m, -1) for pocket in pockets_m]
     mesh = trimesh.util.concatenate(parts)
     mesh.merge_vertices()

@@ -18,13 +18,13 @@ _PLACE, _TURN, _VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
 def capture_radius_m(drogue: DrogueParameters) -> float:
-    """Largest distance from the axis at which a probe's tip enters the opening without touching the face. [m]
+    """Largest distance from the axis at which a probe's tip enters the opening without touching the rim. [m]
 
     The radius of the opening less that of the probe's nozzle, which is as wide as the hub's inner edge, the coupling's
     mouth; on a drogue without a hub, as the coupling.
     """
     nozzle_m = drogue.coupling_radius_m if drogue.hub is None else drogue.hub.inner_radius_m
-    return drogue.face_inner_radius_m - nozzle_m
+    return drogue.opening_radius_m - nozzle_m
 
 
 def docking_quantities(

@@ -18,17 +18,17 @@ _MARGIN_PX = 1.5
 
 
 def outline_points_m(drogue: DrogueParameters) -> Array:
-    """(M, 3) points in the drogue frame around all that must be in view: rim and back end. [m]"""
+    """(M, 3) points in the drogue frame around all that must be in view: rim, bulging body and back end. [m]"""
     angle = 2 * np.pi * np.arange(_OUTLINE_POINTS) / _OUTLINE_POINTS
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(_OUTLINE_POINTS)], axis=-1)
     back_m = drogue.hub_depth_m + drogue.coupling_length_m
-    return np.concatenate(
-        [
-            ring * drogue.rim_radius_m,
-            ring * drogue.rim_radius_m + np.array([0.0, 0.0, 2 * drogue.rim_tube_radius_m]),
-            ring * drogue.coupling_radius_m + np.array([0.0, 0.0, back_m]),
-        ]
-    )
+    circles_m = [
+        (drogue.rim_radius_m, 0.0),
+        (drogue.rim_radius_m, 2 * drogue.rim_tube_radius_m),
+        (drogue.coupling_radius_m, back_m),
+        *drogue.bulges_m,
+    ]
+    return np.concatenate([ring * radius_m + np.array([0.0, 0.0, z_m]) for radius_m, z_m in circles_m])
 
 
 def origin_bounds_m(rig: StereoRig, points_m: Array, depth_m: float) -> tuple[float, float, float, float] | None:

@@ -202,6 +202,17 @@ class Recipe(FrozenModel):
         return self
 
     @model_validator(mode="after")
+    def _engine_draws_the_drogues(self) -> Self:
+        targets = [family.target for family in self.families] or [self.target]
+        drogues = [drogue for each in targets for drogue in ([v.drogue for v in each.variants] or [self.drogue])]
+        bodies = sorted({drogue.name for drogue in drogues if drogue.body is not None})
+        if bodies and self.render.engine == "analytic" and self.board is None:
+            raise ValueError(
+                f"render.engine: analytic draws flat rings only, not {', '.join(bodies)}; use mitsuba or blender"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _board_can_be_drawn(self) -> Self:
         if self.board is None:
             return self

@@ -31,9 +31,9 @@ def drogue_rings(drogue: DrogueParameters) -> tuple[Ring, ...]:
     middle = (0.0, 0.0, 0.0)
     rings = [
         Ring("rim", middle, drogue.rim_radius_m, RIM_POINTS),
-        Ring("opening", middle, drogue.face_inner_radius_m, RIM_POINTS),
+        Ring("opening", middle, drogue.opening_radius_m, RIM_POINTS),
     ]
-    rings += [Ring("marker", (x, y, 0.0), drogue.marker_radius_m, MARKER_POINTS) for x, y in drogue.marker_positions_m]
+    rings += [Ring("marker", center, drogue.marker_radius_m, MARKER_POINTS) for center in drogue.marker_centers_m]
     if drogue.hub is not None:
         center = (0.0, 0.0, drogue.hub.depth_m)
         radii = (drogue.hub.outer_radius_m, drogue.hub.inner_radius_m)

@@ -232,8 +232,8 @@ def _drogue(drogue: DrogueParameters) -> rr.Mesh3D:
 def _wires(drogue: DrogueParameters, color: Rgb) -> rr.LineStrips3D:
     """Rim, opening, markers and hub as circles; a second mesh in nearly the same place would flicker."""
     middle = (0.0, 0.0, 0.0)
-    circles = [(middle, drogue.rim_radius_m), (middle, drogue.face_inner_radius_m)]
-    circles += [((x, y, 0.0), drogue.marker_radius_m) for x, y in drogue.marker_positions_m]
+    circles = [(middle, drogue.rim_radius_m), (middle, drogue.opening_radius_m)]
+    circles += [(center, drogue.marker_radius_m) for center in drogue.marker_centers_m]
     if drogue.hub is not None:
         circles.append(((0.0, 0.0, drogue.hub.depth_m), drogue.hub.outer_radius_m))
     itself = RigidTransform.identity()
