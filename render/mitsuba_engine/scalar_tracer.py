@@ -132,7 +132,6 @@ class _View:
     def __init__(self, frame: FrameSpec, eye: Eye) -> None:
         self._camera = frame.rig.camera
         self._pose = pose_polynomial(frame, eye)
-        self._emits = frame.drogue is not None and frame.drogue.marker_luminance_cd_m2 > 0
 
     def _stage_from_eye(self, s: float) -> Array:
         """(4, 4) pose at time s of the exposure, from -1 to 1."""
@@ -251,10 +250,10 @@ class _View:
         sensor = self._sensor(s, {"type": "independent", "sample_count": count}, "rgba", crop)
         path = {"type": "path", "max_depth": max_depth, "rr_depth": 64, "hide_emitters": True}
         window = np.array(mi.render(scene.scene, sensor=sensor, integrator=mi.load_dict(path), spp=count, seed=seed))
-        if self._emits:
-            # Mitsuba renders hidden emitters black: their own light comes from a rendering of the features alone.
+        if scene.glowing is not None:
+            # Mitsuba renders hidden emitters black: their own light comes from a rendering without sky and sun.
             direct = {"type": "path", "max_depth": 1}
-            lit = mi.render(scene.features, sensor=sensor, integrator=mi.load_dict(direct), spp=count, seed=seed)
+            lit = mi.render(scene.glowing, sensor=sensor, integrator=mi.load_dict(direct), spp=count, seed=seed)
             window[..., :3] += np.array(lit)[..., :3]
         of_pixels: NDArray[np.float32] = window[rows - top, columns - left].astype(np.float32)
         return of_pixels

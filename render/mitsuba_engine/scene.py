@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,8 @@ class DrogueScene:
         object_corners_m: such points for each object in the frame. [m]
         uneven_parts: ids of the drogue's parts whose paint has edges of its own.
         emits: whether any surface may shine.
+        glowing: everything without sky and sun, or None where nothing emits; only for the scalar variant.
+        shiny_parts: ids of parts with a sheen.
         sun: direction towards the sun in the stage's axes, and its illuminance of a facing plane [lux].
     """
 
@@ -60,6 +62,11 @@ class DrogueScene:
         self.scene = mi.load_dict({**watertight, **shapes, **_lights()}, optimize=False)
         self.features = mi.load_dict({**watertight, **features}, optimize=False)
         self.emits = any(surface.is_lamp for surface in surfaces.all.values())
+        self.glowing = None
+        if self.emits and mi.variant() == "scalar_rgb":
+            self.glowing = mi.load_dict({**watertight, **shapes}, optimize=False)
+        self.shiny_parts = {surface.part_id for surface in surfaces.all.values() if surface.painted.sheen is not None}
+        self._dark = {name for name, surface in surfaces.all.items() if surface.is_lamp and not surface.lights_others}
         self._parameters = mi.traverse(self.scene)
         self._paint: dict[str, NDArray[Any]] = {}
 
@@ -75,6 +82,12 @@ class DrogueScene:
             self._set_material(name, surface)
         self._set_lights(stage_from_world, ambient)
         self._parameters.update()
+
+    def lights_others(self) -> NDArray[np.float32] | None:
+        """By the registry number of a shape, 0 for lamps that no other surface sees, else 1; None without such lamps."""
+        if not self._dark:
+            return None
+        return _by_number(self.scene, lambda name: float(name not in self._dark)).astype(np.float32)
 
     def _set_moved(self, name: str, surface: Surface) -> None:
         mesh, pose = surface.painted.mesh, surface.axes_from_mesh
@@ -115,11 +128,16 @@ class DrogueScene:
 
 def by_shape(scene: Any, of_part: NDArray[Any]) -> NDArray[Any]:
     """A table by the shapes' registry numbers from one by part ids."""
+    return _by_number(scene, lambda name: of_part[int(name.split("_")[1])]).astype(of_part.dtype)
+
+
+def _by_number(scene: Any, of_name: Callable[[str], Any]) -> NDArray[Any]:
+    """A table by the shapes' registry numbers, 0 for numbers of other scenes."""
     registry: Any = dr.reinterpret_array(mi.UInt32, scene.shapes_dr())
     numbers = np.array(registry)
-    table = np.zeros(int(numbers.max()) + 1, dtype=of_part.dtype)
+    table = np.zeros(int(numbers.max()) + 1)
     for number, shape in zip(numbers, scene.shapes(), strict=True):
-        table[number] = of_part[int(shape.id().split("_")[1])]
+        table[number] = of_name(shape.id())
     return table
 
 

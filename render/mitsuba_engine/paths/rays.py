@@ -142,12 +142,14 @@ class FrameRays:
         self._seeds = frame_generator(frame.seed, frame.frame_index, "mitsuba samples")
         to_sun, sun_lux = scene.sun
         world_from_stage = frame.world_from_left @ frame.left_from_stage_at(0.0)
+        lights_others = scene.lights_others()
         self.lights = SceneLights(
             to_sun=to_sun,
             sun_lux=sun_lux,
             sky=SkyIrradiance(as_mitsuba_reads(ambient.light_map), world_from_stage.rotation),
             open_to_sky=jit_array(mi.Float, by_shape(scene.scene, open_to_sky)),
             parts_emit=scene.emits,
+            lights_others=None if lights_others is None else jit_array(mi.Float, lights_others),
         )
 
     def pixels_of_both_eyes(self, plans: dict[Eye, SamplingPlan], kind: str) -> NDArray[np.int64]:

@@ -39,7 +39,9 @@ class SceneLights:
         sun_lux: illuminance of a plane that faces the sun. [lux]
         sky: irradiance by the unobstructed sky.
         open_to_sky: by the registry number of a shape, 1 where light from the whole sky is taken as known, else 0.
-        parts_emit: whether markers are lamps.
+        parts_emit: whether any part is a lamp.
+        lights_others: by the registry number of a shape, 1 where paths from other surfaces find what it emits, else 0;
+            None where it is 1 for all lamps. A path that meets a lamp of a few centimetres would leave a speckle.
     """
 
     to_sun: Any
@@ -47,6 +49,7 @@ class SceneLights:
     sky: SkyIrradiance
     open_to_sky: Any
     parts_emit: bool
+    lights_others: Any = None
 
 
 def trace_direct(scene: Any, lights: SceneLights, ray: Any) -> tuple[Any, Any, Any, Any]:
@@ -91,7 +94,7 @@ def trace_residual(scene: Any, lights: SceneLights, sampler: Any, first: tuple[A
         surface = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         hit = active & surface.is_valid()
         total += weight * _unknown_sky(scene, ray, active, hit, known)
-        total += weight * _emitted_and_sunlight(scene, lights, surface, hit)
+        total += weight * _emitted_and_sunlight(scene, lights, surface, hit, lights.lights_others)
         active, known = hit, mi.Float(0.0)
     sample, share = surface.bsdf().sample(context, surface, sampler.next_1d(), sampler.next_2d(), active)
     weight *= share
@@ -102,14 +105,18 @@ def trace_residual(scene: Any, lights: SceneLights, sampler: Any, first: tuple[A
     return dr.select(dr.isfinite(total), total, 0.0)
 
 
-def _emitted_and_sunlight(scene: Any, lights: SceneLights, surface: Any, hit: Any) -> Any:
-    """Radiance of surfaces towards the ray's origin, by lamps and by sunlight alone."""
+def _emitted_and_sunlight(scene: Any, lights: SceneLights, surface: Any, hit: Any, shown: Any = None) -> Any:
+    """Radiance of surfaces towards the ray's origin, by lamps and by sunlight alone; `shown` is a factor by shape."""
     towards = surface.to_local(lights.to_sun)
     in_sun = hit & (towards.z > 0) & (surface.wi.z > 0)
     in_sun &= ~scene.ray_test(surface.spawn_ray(lights.to_sun), in_sun)
     radiance = lights.sun_lux * surface.bsdf().eval(mi.BSDFContext(), surface, towards, in_sun)
     if lights.parts_emit:
-        radiance += surface.emitter(scene).eval(surface, hit)
+        emitted = surface.emitter(scene).eval(surface, hit)
+        if shown is not None:
+            number: Any = dr.reinterpret_array(mi.UInt32, surface.shape)
+            emitted *= dr.gather(mi.Float, shown, number, hit)
+        radiance += emitted
     return radiance
 
 
