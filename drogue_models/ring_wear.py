@@ -80,9 +80,9 @@ def aged_paint(grid: MapGrid, rgb: ArrayLike, wear: SurfaceWear, seed: int) -> P
     """Paint with mottles, chalked clouds and a film of soot, which every painted part has."""
     paint = even_paint(grid, rgb)
     fine = fractal_noise(grid, seed + 1, 0.012, octaves=2)
-    paint = shaded(paint, np.maximum(1.0 + 0.05 * wear.fading * fractal_noise(grid, seed, 0.10) + 0.02 * fine, 0.3))
+    paint = shaded(paint, np.maximum(1.0 + 0.08 * wear.fading * fractal_noise(grid, seed, 0.10) + 0.02 * fine, 0.3))
     clouds = cover_share(fractal_noise(grid, seed + 2, 0.25), 0.15 + 0.45 * wear.fading, softness=2.0)
-    paint = covered(paint, 0.08 * wear.fading * clouds, _CHALK)
+    paint = covered(paint, 0.15 * wear.fading * clouds, _CHALK)
     film = cover_share(fractal_noise(grid, seed + 3, 0.30), 0.1 + 0.6 * wear.soot, softness=2.0)
     return covered(paint, 0.45 * wear.soot * film, _SOOT)
 
@@ -105,6 +105,9 @@ def _face(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear:
     starts = np.stack([rng.random(count) * ring.width_m, rng.random(count) * 0.3 * ring.height_m], axis=-1)
     oil = streaks(ring, seed + 10, starts, 0.7 * ring.height_m, 0.012)
     paint = covered(paint, 0.5 * wear.oil * _around(oil, ring, radius_m - low_m, turn), _OIL)
+    # Nozzles and tools that slide along the plate leave arcs.
+    arcs = cover_share(fractal_noise(ring, seed + 30, (0.25, 0.004), octaves=2), 0.03 * wear.edge_wear)
+    paint = covered(paint, 0.25 * _around(arcs, ring, radius_m - low_m, turn), _CHALK)
     for edge_m in (low_m + 0.006, high_m - 0.006):
         angle = 2 * np.pi * (np.arange(48) + 0.5) / 48
         screws = dots(grid, side_m / 2 + edge_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1), 0.0022)

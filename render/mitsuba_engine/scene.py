@@ -26,6 +26,8 @@ from render.surfaces import FrameSurfaces, Surface, feature_surfaces, frame_surf
 from scenes.environment_radiance import EnvironmentRadiance
 from scenes.sky.photometry import Radiance
 
+# Embree's fast mode lets one ray in 10,000 pass between the triangles of a marker.
+_WATERTIGHT = {"type": "scene", "embree_use_robust_intersections": True}
 # Scenes that an engine caches; the least recently used one is dropped first.
 KEPT_SCENES = 8
 # Mitsuba's map has +y up; its first column looks along -z and the next ones turn towards +x. Our map starts in the east
@@ -41,6 +43,7 @@ class DrogueScene:
         features: markers and hub alone, for their amodal pixel counts.
         features_m: (V, 3) points in the stage's axes whose convex hull holds all of `features`. [m]
         object_corners_m: such points for each object in the frame. [m]
+        lamp_corners_m: such points for each lamp among the moved objects. [m]
         uneven_parts: ids of the drogue's parts whose paint has edges of its own.
         emits: whether any surface may shine.
         glowing: everything without sky and sun, or None where nothing emits; only for the scalar variant.
@@ -56,17 +59,13 @@ class DrogueScene:
             file = Path(folder) / "mesh.ply"
             shapes = {name: _shape(name, surface, surface.painted.mesh, file) for name, surface in surfaces.all.items()}
             features = {name: _shape(name, surfaces.fixed[name], mesh, file) for name, mesh in fronts.items()}
-        # Merging meshes would lose the parts' identity. Embree's fast mode lets one ray in 10,000 pass between the
-        # triangles of a marker.
-        watertight = {"type": "scene", "embree_use_robust_intersections": True}
-        self.scene = mi.load_dict({**watertight, **shapes, **_lights()}, optimize=False)
-        self.features = mi.load_dict({**watertight, **features}, optimize=False)
+        # Merging meshes would lose the parts' identity.
+        self.scene = mi.load_dict({**_WATERTIGHT, **shapes, **_lights()}, optimize=False)
+        self.features = mi.load_dict({**_WATERTIGHT, **features}, optimize=False)
         self.emits = any(surface.is_lamp for surface in surfaces.all.values())
-        self.glowing = None
-        if self.emits and mi.variant() == "scalar_rgb":
-            self.glowing = mi.load_dict({**watertight, **shapes}, optimize=False)
         self.shiny_parts = {surface.part_id for surface in surfaces.all.values() if surface.painted.sheen is not None}
         self._dark = {name for name, surface in surfaces.all.items() if surface.is_lamp and not surface.lights_others}
+        self.glowing: Any = None
         self._parameters = mi.traverse(self.scene)
         self._paint: dict[str, NDArray[Any]] = {}
 
@@ -75,6 +74,7 @@ class DrogueScene:
     ) -> None:
         """Set poses, materials, lamps, sky and sun as a frame has them."""
         self.object_corners_m = [self._drogue_m, *(surface.hull_m() for surface in surfaces.moved.values())]
+        self.lamp_corners_m = [surface.hull_m() for surface in surfaces.moved.values() if surface.is_lamp]
         self.uneven_parts = surfaces.uneven_parts
         for name, surface in surfaces.moved.items():
             self._set_moved(name, surface)
@@ -82,9 +82,13 @@ class DrogueScene:
             self._set_material(name, surface)
         self._set_lights(stage_from_world, ambient)
         self._parameters.update()
+        if self.emits and mi.variant() == "scalar_rgb":
+            # Another scene of the same shapes does not notice that they move.
+            shapes = {shape.id(): shape for shape in self.scene.shapes()}
+            self.glowing = mi.load_dict({**_WATERTIGHT, **shapes}, optimize=False)
 
     def lights_others(self) -> NDArray[np.float32] | None:
-        """By the registry number of a shape, 0 for lamps that no other surface sees, else 1; None without such lamps."""
+        """By a shape's registry number, 0 for lamps that no other surface sees, else 1; None without such lamps."""
         if not self._dark:
             return None
         return _by_number(self.scene, lambda name: float(name not in self._dark)).astype(np.float32)

@@ -21,21 +21,19 @@ from scenes.environment_radiance import EnvironmentRadiance
 OFF_CENTER = ((0.501, 0.5007), (0.496, 0.503), (0.507, 0.489))
 
 
-def _mask_of_parts(parts: Iterable[int]) -> NDArray[np.uint8]:
+def parts_table(parts: Iterable[int]) -> NDArray[np.uint8]:
     """(256,) 1 at the given part ids, 0 elsewhere."""
     table = np.zeros(256, dtype=np.uint8)
     table[list(parts)] = 1
     return table
 
 
-DROGUE_PARTS = _mask_of_parts(drogue_part_ids(MAX_MARKERS))
-_MARKERS = _mask_of_parts(marker_id(index) for index in range(MAX_MARKERS))
+DROGUE_PARTS = parts_table(drogue_part_ids(MAX_MARKERS))
+_MARKERS = parts_table(marker_id(index) for index in range(MAX_MARKERS))
 _DEEP_PARTS = (Part.COUPLING, Part.HUB)
-_DEEP = _mask_of_parts(_DEEP_PARTS)
+_DEEP = parts_table(_DEEP_PARTS)
 # Parts from which most of the sky is visible.
-OPEN_TO_SKY = _mask_of_parts(
-    {*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS}
-)
+OPEN_TO_SKY = parts_table({*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS})
 
 
 def parts_in(part_id: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -135,7 +133,7 @@ def plan_pixels(
         margin_px: how far a part may extend beyond those centres into other pixels.
         uneven: ids of parts whose paint has edges of its own anywhere.
     """
-    even = (_mask_of_parts(uneven) == 0).astype(np.uint8)
+    even = (parts_table(uneven) == 0).astype(np.uint8)
     kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
     drogue, covered = (np.zeros(ids[0].shape, dtype=np.bool_) for _ in range(2))
     inside = np.ones(ids[0].shape, dtype=np.bool_)

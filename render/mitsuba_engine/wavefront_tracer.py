@@ -21,7 +21,7 @@ from geometry.stereo import EYES, Eye
 from render.camera.exposure_motion import image_window, motion_blur_px
 from render.compositing import Compositor, TracedEye, amodal_counts
 from render.mitsuba_engine.jit_arrays import jit_array, reserve_registry
-from render.mitsuba_engine.paths.context_paths import trace_context
+from render.mitsuba_engine.paths.context_paths import SeenContext, trace_context
 from render.mitsuba_engine.paths.denoised_paths import DenoisedPaths
 from render.mitsuba_engine.paths.drogue_paths import trace_paths
 from render.mitsuba_engine.paths.rays import CameraRays, FrameRays, SampledLight, rows_of
@@ -35,8 +35,11 @@ from render.mitsuba_engine.trace_request import (
     TraceResult,
     leaked_rays,
     parts_in,
+    parts_table,
     plan_pixels,
 )
+
+_OF_DROGUE = {int(part) for part in np.flatnonzero(DROGUE_PARTS)}
 
 
 class WavefrontTracer:
@@ -90,11 +93,13 @@ def _sample_light(
     """Sampled light of all planned pixels; denoised where the settings ask for it and all of the drogue is matt."""
     frame, settings = request.frame, request.settings
     centers = _center_pixels(eyes, plans)
-    matt = frame.drogue is not None and frame.drogue.satin is None
+    matt = frame.drogue is not None and frame.drogue.satin is None and not scene.shiny_parts & _OF_DROGUE
     denoise = settings.denoise and matt and any(len(pixel) > 0 for pixel in centers.values())
     open_to_sky = OPEN_TO_SKY.copy()
     # Few centres see the narrow sides of ribs: what is smoothed over them should vary little with the direction.
     open_to_sky[Part.RIBS] = denoise
+    # What is known is the light on matt paint.
+    open_to_sky[list(scene.shiny_parts)] = 0
     rays, moves_px = FrameRays(frame, scene, request.ambient, open_to_sky), motion_blur_px(frame)
     if denoise:
         assert frame.left_from_drogue is not None
@@ -104,8 +109,32 @@ def _sample_light(
     else:
         sampled = trace_paths(rays, plans, settings)
     pixel = rays.pixels_of_both_eyes(plans, "context")
-    covered = np.concatenate([eyes[eye].part_id.reshape(-1) > 0 for eye in EYES])
-    return sampled.with_pixels(pixel, trace_context(rays, pixel, covered, settings, moves_px))
+    seen = SeenContext(
+        covered=np.concatenate([eyes[eye].part_id.reshape(-1) > 0 for eye in EYES]),
+        shiny=_near_parts(eyes, scene.shiny_parts - _OF_DROGUE, moves_px),
+        lamps=_near_lamps(frame, scene, moves_px),
+    )
+    return sampled.with_pixels(pixel, trace_context(rays, pixel, seen, settings, moves_px))
+
+
+def _near_parts(eyes: dict[Eye, TracedEye], parts: set[int], moves_px: float) -> NDArray[np.bool_]:
+    """(2 H W,) which pixels of both eyes may see some parts."""
+    table = parts_table(parts)
+    kernel = np.ones((3 + 2 * int(np.ceil(moves_px)),) * 2, dtype=np.uint8)
+    near = [cv2.dilate(parts_in(eyes[eye].part_id, table).astype(np.uint8), kernel) > 0 for eye in EYES]
+    return np.concatenate([seen.reshape(-1) for seen in near])
+
+
+def _near_lamps(frame: FrameSpec, scene: DrogueScene, moves_px: float) -> NDArray[np.bool_]:
+    """(2 H W,) which pixels of both eyes may see a lamp beside the drogue, however small it is."""
+    camera, pixels = frame.rig.camera, []
+    kernel = np.ones((3 + 2 * int(np.ceil(moves_px)),) * 2, dtype=np.uint8)
+    for eye in EYES:
+        held = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
+        if scene.lamp_corners_m:
+            held.reshape(-1)[CenterPasses(frame, eye, scene).pixels_of(scene.lamp_corners_m, 0.0)] = 1
+        pixels.append(cv2.dilate(held, kernel).reshape(-1) > 0)
+    return np.concatenate(pixels)
 
 
 def _center_pixels(eyes: dict[Eye, TracedEye], plans: dict[Eye, SamplingPlan]) -> dict[str, NDArray[np.int64]]:
@@ -149,13 +178,13 @@ class CenterPasses:
         """(H, W) part ids and distances [m] at time s of the exposure, from -1 (shutter opens) to 1 (it closes)."""
         ids, distance_m = np.zeros(self._shape, dtype=np.uint8), np.full(self._shape, np.inf, dtype=np.float32)
         # Most rays miss; those through windows without objects need not be traced.
-        pixel = self._pixels_of(self._scene.object_corners_m, s)
+        pixel = self.pixels_of(self._scene.object_corners_m, s)
         if len(pixel):
             rays = self._center_rays(jit_array(mi.UInt32, pixel), (s + 1) / 2)
             ids.reshape(-1)[pixel], distance_m.reshape(-1)[pixel] = self._hits(self._scene.scene, rays)
         return ids, distance_m
 
-    def _pixels_of(self, corners_of_objects_m: list[NDArray[np.float64]], s: float) -> NDArray[np.int64]:
+    def pixels_of(self, corners_of_objects_m: list[NDArray[np.float64]], s: float) -> NDArray[np.int64]:
         """(P,) flat indices of pixels that may show one of some objects, by points whose convex hulls hold them."""
         held = np.zeros(self._shape, dtype=np.bool_)
         pose = self._rays.stage_from_eye(s)
@@ -227,7 +256,7 @@ class CenterPasses:
 
     def _amodal(self, part_id: NDArray[np.uint8], distance_m: NDArray[np.float32]) -> dict[int, int]:
         """Pixel centres that each marker and the hub would cover if nothing occluded it."""
-        pixel = self._pixels_of([self._scene.features_m], 0.0)
+        pixel = self.pixels_of([self._scene.features_m], 0.0)
         if not len(pixel):
             return {}
         alone_id, alone_m = self._hits(self._scene.features, self._center_rays(jit_array(mi.UInt32, pixel)))

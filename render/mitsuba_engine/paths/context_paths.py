@@ -7,6 +7,8 @@ through each pixel shows where edges and shadows are, and only those pixels take
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +21,36 @@ from render.mitsuba_engine.paths.surface_light import SurfaceLight
 from render.mitsuba_engine.trace_request import CONTEXT_DEPTH
 
 _LATTICE_STEP_PX = 3
+# A sheen takes so many times the paths of matt paint, and the pixels around a lamp so many times the rays.
+_TIMES_AT_SHEEN, _TIMES_AT_LAMPS = 16, 16
 # Neighbours that differ by no more than this share show one surface in one light.
 _EVEN = 0.05
 
 
+@dataclass(frozen=True, eq=False)
+class SeenContext:
+    """What is known of the pixels of both eyes.
+
+    Attributes:
+        covered: (2 H W,) which see something at their centre.
+        shiny: (2 H W,) which may see a surface with a sheen, whose light cannot be smoothed.
+        lamps: (2 H W,) which may see a lamp, smaller than a pixel perhaps.
+    """
+
+    covered: NDArray[np.bool_]
+    shiny: NDArray[np.bool_]
+    lamps: NDArray[np.bool_]
+
+
 def trace_context(
-    rays: FrameRays, pixel: NDArray[np.int64], covered: NDArray[np.bool_], settings: RenderSettings, moves_px: float
+    rays: FrameRays, pixel: NDArray[np.int64], seen: SeenContext, settings: RenderSettings, moves_px: float
 ) -> NDArray[np.float32]:
     """Trace pixels that see no drogue.
 
     Args:
         rays: of the frame.
         pixel: (P,) flat indices.
-        covered: (2 H W,) which pixels of both eyes see something at their centre.
+        seen: what the pixels see.
         settings: samples and depths.
         moves_px: largest motion of the image from mid-exposure to either end. [px]
 
@@ -39,19 +58,28 @@ def trace_context(
         (P, 4) radiance and coverage.
     """
     count = settings.surround_samples_per_px
-    if settings.denoise:
-        center = _lattice(rays, pixel)
-        center = center[covered[center]]
-        if len(center):
-            light = SurfaceLight(rays, center, _LATTICE_STEP_PX + moves_px, _LATTICE_STEP_PX)
-            chosen = np.ones(len(center), dtype=np.bool_)
-            light.trace([(chosen, grid_count(count * _LATTICE_STEP_PX**2 / 4))], CONTEXT_DEPTH)
-            light.smooth(chosen, _LATTICE_STEP_PX * MOST_SMOOTHING_STEPS)
-            found = denoised_light(rays, light, pixel, 1, at_edges=True)[:, :4]
-            uneven = _uneven(rays, pixel, found)
-            found[uneven] = denoised_light(rays, light, pixel[uneven], count, at_edges=True)[:, :4]
-            return found
-    return mean_radiance(rays, pixel, count, CONTEXT_DEPTH).radiance_and_coverage()
+    if not settings.denoise:
+        return mean_radiance(rays, pixel, count, CONTEXT_DEPTH).radiance_and_coverage()
+    found = np.zeros((len(pixel), 4), dtype=np.float32)
+    shiny = seen.shiny[pixel]
+    if shiny.any():
+        traced = mean_radiance(rays, pixel[shiny], _TIMES_AT_SHEEN * count, CONTEXT_DEPTH)
+        found[shiny] = traced.radiance_and_coverage()
+    center = _lattice(rays, pixel)
+    center = center[seen.covered[center] & ~seen.shiny[center]]
+    if not len(center):
+        rest = mean_radiance(rays, pixel[~shiny], count, CONTEXT_DEPTH)
+        found[~shiny] = rest.radiance_and_coverage()
+        return found
+    light = SurfaceLight(rays, center, _LATTICE_STEP_PX + moves_px, _LATTICE_STEP_PX)
+    chosen = np.ones(len(center), dtype=np.bool_)
+    light.trace([(chosen, grid_count(count * _LATTICE_STEP_PX**2 / 4))], CONTEXT_DEPTH)
+    light.smooth(chosen, _LATTICE_STEP_PX * MOST_SMOOTHING_STEPS)
+    found[~shiny] = denoised_light(rays, light, pixel[~shiny], 1, at_edges=True)[:, :4]
+    uneven = _uneven(rays, pixel, found) & ~shiny
+    for again, times in ((uneven & ~seen.lamps[pixel], 1), (seen.lamps[pixel] & ~shiny, _TIMES_AT_LAMPS)):
+        found[again] = denoised_light(rays, light, pixel[again], times * count, at_edges=True)[:, :4]
+    return found
 
 
 def _lattice(rays: FrameRays, pixel: NDArray[np.int64]) -> NDArray[np.int64]:

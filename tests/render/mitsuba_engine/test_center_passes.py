@@ -56,13 +56,13 @@ def test_nothing_is_seen_where_no_ray_is_sent(
         for eye in EYES:
             passes, everywhere = (CenterPasses(frame, eye, scene) for _ in range(2))
             size = frame.rig.camera.width_px * frame.rig.camera.height_px
-            monkeypatch.setattr(everywhere, "_pixels_of", lambda *_, size=size: np.arange(size))
+            monkeypatch.setattr(everywhere, "pixels_of", lambda *_, size=size: np.arange(size))
             for s in (-1.0, 0.0, 1.0):
                 (ids, distance_m), (all_ids, all_m) = passes.part_ids(s), everywhere.part_ids(s)
                 assert ids.any() and set(np.unique(all_ids)) == set(np.unique(ids))
                 # What a ray that grazes an edge meets may depend on the rays that travel with it.
                 other = np.flatnonzero(ids != all_ids)
-                sent = np.isin(other, passes._pixels_of(scene.object_corners_m, s))
+                sent = np.isin(other, passes.pixels_of(scene.object_corners_m, s))
                 assert sent.all() and len(other) <= 3
                 assert np.count_nonzero(distance_m != all_m) <= 3
 

@@ -130,3 +130,45 @@ def test_radiance_agrees(both: dict[str, tuple[str, list[StereoRadiance]]]) -> N
                 # The slow variant leaves out what lit markers reflect, here up to 7 % in green and blue.
                 np.testing.assert_allclose(ours, theirs, rtol=0.06 if index == 0 or part < 32 else 0.09)
             assert np.abs(a.coverage - b.coverage).mean() < 0.005
+
+
+HIDDEN_LAMPS = """
+import pickle, sys
+import numpy as np
+from datasets_manifest.recipe.recipe import parse_recipe
+from datasets_manifest.types.appearance import DrogueCondition, Obstacle, SurfaceCondition
+from drogue_models.obstacles import ObstacleShape
+from geometry.se3 import RigidTransform
+from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
+from scenes.sampler import sample_frame
+recipe = parse_recipe(open(sys.argv[1]).read())
+frame = sample_frame(recipe, 0)
+lit = frame.model_copy(update={"drogue": frame.drogue.model_copy(update={"marker_luminance_cd_m2": 1e6})})
+ball = Obstacle(
+    kind="obstacle",
+    shape=ObstacleShape(form="ball", radius_m=0.3),
+    left_from_object=RigidTransform(np.eye(3), 0.5 * frame.left_from_drogue.translation_m),
+    reflectance_rgb=(0.1, 0.1, 0.1),
+)
+hidden = lit.model_copy(update={"bystanders": (ball,)})
+states = tuple(SurfaceCondition(lamp_fraction=0.5) for _ in range(frame.drogue.marker_count))
+faint = lit.model_copy(update={"condition": DrogueCondition(markers=states)})
+engine = MitsubaEngine()
+rendered = [engine.render(each, recipe.render).left for each in (lit, hidden, faint)]
+pickle.dump(rendered, open(sys.argv[2], "wb"))
+"""
+
+
+def test_lamps_behind_other_things_are_dark_and_faint_ones_faint(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed")
+    (tmp_path / "recipe.toml").write_text(RECIPE)
+    command = [sys.executable, "-c", HIDDEN_LAMPS, str(tmp_path / "recipe.toml"), str(tmp_path / "seen.pickle")]
+    subprocess.run(command, check=True, env={**os.environ, "DRJIT_LIBLLVM_PATH": "/nonexistent/libLLVM.so"})
+    lit, hidden, faint = pickle.loads((tmp_path / "seen.pickle").read_bytes())
+    ball = inside_one_part(hidden.part_id) & (hidden.part_id == 19)
+    assert np.count_nonzero(ball & (lit.part_id >= 32)) > 20
+    # A ball in daylight is far below the lamps' million.
+    assert hidden.radiance_cd_m2[ball].max() < 1e5
+    markers = inside_one_part(lit.part_id) & (lit.part_id >= 32)
+    # Daylight on the paint adds less than a per cent.
+    assert faint.radiance_cd_m2[markers].mean() / lit.radiance_cd_m2[markers].mean() == pytest.approx(0.5, abs=0.01)

@@ -1,0 +1,137 @@
+"""Maps and lamps of surfaces: both path tracers draw them where they are, and as bright as they are."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import trimesh
+
+from datasets_manifest.recipe.recipe import RenderSettings
+from datasets_manifest.types.appearance import DrogueCondition
+from datasets_manifest.types.frame import FrameSpec
+from drogue_models.painted_mesh import PaintedMesh
+from drogue_models.parts import Part
+from drogue_models.surface_wear import SurfaceWear
+from render.engine import RenderEngine, load_engine
+from scenes.sampler import sample_frame
+from tests.support.painted_plate import DISTANCE_M, QUARTERS, frame_with, plate, quarter_means, quarters
+from tests.support.recipe_builder import paper_view_recipe
+
+RECIPE = paper_view_recipe(scale=0.25, stations_m=(2.5,), samples=16)
+SETTINGS: RenderSettings = RECIPE.render.model_copy(update={"surround_samples_per_px": 16})
+PLACE = (0.0, 0.0, DISTANCE_M)
+LAMP_CD_M2 = 1e6
+
+ENGINES = [
+    pytest.param("mitsuba", marks=pytest.mark.mitsuba),
+    pytest.param(
+        "blender",
+        marks=[
+            pytest.mark.blender,
+            pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="bpy is not installed"),
+        ],
+    ),
+]
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def tracer(request: pytest.FixtureRequest) -> Iterator[RenderEngine]:
+    if request.param == "mitsuba":
+        yield request.getfixturevalue("engine")
+        return
+    blender = load_engine("blender")
+    yield blender
+    blender.close()  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def frame() -> FrameSpec:
+    return sample_frame(RECIPE, 0)
+
+
+def test_maps_lie_the_right_way_round(tracer: RenderEngine, frame: FrameSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    painted = frame_with(monkeypatch, frame, [(plate(quarters()), PLACE)])
+    means = quarter_means(painted, tracer.render(painted, SETTINGS).left)
+    even = frame_with(monkeypatch, frame, [(plate(np.full(3, 0.5)), PLACE)])
+    light = quarter_means(even, tracer.render(even, SETTINGS).left) / 0.5
+    # The sky's light is traced by some dozens of paths a pixel in one engine, over thousands of pixels.
+    np.testing.assert_allclose(means / light, QUARTERS, rtol=0.02)
+
+
+def test_other_maps_on_the_same_mesh_are_drawn_anew(
+    tracer: RenderEngine, frame: FrameSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = frame_with(monkeypatch, frame, [(plate(quarters()), PLACE)])
+    tracer.render(first, SETTINGS)
+    turned = frame_with(monkeypatch, frame, [(plate(quarters()[::-1]), PLACE)])
+    means = quarter_means(turned, tracer.render(turned, SETTINGS).left)
+    finer = frame_with(monkeypatch, frame, [(plate(quarters(32)[::-1]), PLACE)])
+    np.testing.assert_allclose(means, quarter_means(finer, tracer.render(finer, SETTINGS).left), rtol=0.02)
+    # The upper quarters now have the colours that the lower ones had.
+    assert means[0, 0].argmax() == 2 and means[1, 0].argmax() == 0
+
+
+def test_small_lamps_shine_and_leave_no_speckles(
+    tracer: RenderEngine, frame: FrameSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bulb = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    wall = plate(np.full(3, 0.5))
+    near_wall = (0.0, 0.0, DISTANCE_M - 0.06)
+    seen = {}
+    for level in (0.0, LAMP_CD_M2):
+        lamp = PaintedMesh(mesh=bulb, reflectance=np.full(3, 0.5), emission_cd_m2=np.full(3, level), smooth=True)
+        lit = frame_with(monkeypatch, frame, [(wall, PLACE), (lamp, near_wall)])
+        seen[level] = tracer.render(lit, SETTINGS).left.radiance_cd_m2
+    added = (seen[LAMP_CD_M2] - seen[0.0]).max(axis=-1)
+    camera = frame.rig.camera
+    u, v = camera.project(np.array(near_wall))
+    row, column = np.mgrid[: camera.height_px, : camera.width_px]
+    away_px = np.hypot(column - u, row - v)
+    radius_px = camera.fx_px * 0.02 / near_wall[2]
+    assert added[away_px < radius_px - 1].min() == pytest.approx(LAMP_CD_M2, rel=1e-3)
+    # Its light, over all pixels, is that of a disc of its size: the outline is drawn by rays.
+    area_px2 = added[away_px < radius_px + 2].sum() / LAMP_CD_M2
+    assert area_px2 == pytest.approx(np.pi * radius_px**2, rel=0.1)
+    wall_light = seen[0.0][away_px < 30].mean()
+    # What is left is the paths' noise of the wall in daylight; one path that met the lamp would add hundreds of times.
+    assert added[away_px > radius_px + 2].max() < 0.5 * wall_light
+
+
+def test_a_lamp_smaller_than_a_pixel_keeps_its_light(
+    engine: RenderEngine, frame: FrameSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall, radius_m = plate(np.full(3, 0.05)), 0.002
+    bulb = trimesh.creation.icosphere(subdivisions=2, radius=radius_m)
+    lamp = PaintedMesh(mesh=bulb, reflectance=np.full(3, 0.05), emission_cd_m2=np.full(3, LAMP_CD_M2))
+    totals = []
+    camera = frame.rig.camera
+    for shift in np.linspace(0.0, 1.0, 5):
+        # Through all places of a pixel: its centre's ray meets the lamp or not.
+        place = (0.1 + shift * DISTANCE_M / camera.fx_px, 0.1, DISTANCE_M - 0.05)
+        lit = frame_with(monkeypatch, frame, [(wall, PLACE), (lamp, place)])
+        radiance = engine.render(lit, SETTINGS).left.radiance_cd_m2[..., 0].astype(np.float64)
+        u, v = np.rint(camera.project(np.array(place))).astype(int)
+        totals.append(radiance[v - 3 : v + 4, u - 3 : u + 4].sum() / LAMP_CD_M2)
+    area_px2 = np.pi * (camera.fx_px * radius_m / DISTANCE_M) ** 2
+    assert area_px2 < 0.3
+    # 256 rays, of which a fifth of a pixel's area takes some 50.
+    np.testing.assert_allclose(totals, area_px2, rtol=0.5)
+    assert np.mean(totals) == pytest.approx(area_px2, rel=0.2)
+
+
+def test_worn_drogues_share_a_scene_and_take_their_own_maps(engine: RenderEngine, frame: FrameSpec) -> None:
+    def worn(seed: int) -> FrameSpec:
+        return frame.model_copy(update={"condition": DrogueCondition(wear=SurfaceWear(seed=seed, fading=0.9))})
+
+    first = engine.render(worn(1), SETTINGS).left
+    scenes = len(engine._tracer._scenes._scenes)  # type: ignore[attr-defined]
+    other = engine.render(worn(2), SETTINGS).left
+    again = engine.render(worn(1), SETTINGS).left
+    assert len(engine._tracer._scenes._scenes) == scenes  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(again.radiance_cd_m2, first.radiance_cd_m2)
+    face = first.part_id == Part.FACE
+    ratio = other.radiance_cd_m2[face] / first.radiance_cd_m2[face]
+    assert ratio.std() > 0.03
