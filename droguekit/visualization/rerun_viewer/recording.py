@@ -304,4 +304,5 @@ def _box(box: PixelBox) -> rr.Boxes2D:
 
 def _path(*parts: str) -> str:
     """An entity's path, escaped, since methods may have any name."""
-    return rr.new_entity_path(list(parts))
+    path: str = rr.new_entity_path(list(parts))
+    return path
