@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rerun as rr
 
 
@@ -29,6 +30,24 @@ def values(path: Path, entity: str, component: str) -> dict[int, Any]:
             pairs = zip(batch.column("frame").to_pylist(), batch.column(column).to_pylist(), strict=True)
             found |= {frame: value for frame, value in pairs if value}
     return found
+
+
+def shown_values(path: Path, entity: str, component: str, frames: Sequence[int]) -> dict[int, Any]:
+    """What the viewer shows at each frame: the value that was told last, unless it was taken back."""
+    if hasattr(rr, "dataframe"):
+        view = rr.dataframe.load_recording(path).view(index="frame", contents=entity)
+        view = view.using_index_values(np.array(frames, dtype=np.int64)).fill_latest_at()
+        table = view.select().read_all()
+        (column,) = [column for column in table.column_names if column.endswith(f":{component}")]
+        pairs = zip(table.column("frame").to_pylist(), table.column(column).to_pylist(), strict=True)
+        return {frame: value for frame, value in pairs if value}
+    told, taken_back = values(path, entity, component), values(path, entity, "ClearIsRecursive")
+    shown, last = {}, None
+    for frame in sorted(frames):
+        last = told.get(frame, None if frame in taken_back else last)
+        if last is not None:
+            shown[frame] = last
+    return shown
 
 
 def static_value(path: Path, entity: str, component: str) -> Any:
