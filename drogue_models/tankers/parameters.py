@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -35,6 +35,26 @@ STATIONS: dict[TankerType, tuple[Station, ...]] = {
     "multirotor": ("belly",),
 }
 """Where the hose can leave each type."""
+
+
+class Propellers(NamedTuple):
+    """What turns on a type of tanker.
+
+    Attributes:
+        blades: of each propeller.
+        rate_deg_s: in flight. [deg/s]
+    """
+
+    blades: int
+    rate_deg_s: float
+
+
+PROPELLERS: dict[TankerType, Propellers] = {
+    "four-turboprop": Propellers(6, 6.0 * 1020),  # R391 at 1020 rpm, EASA TCDS P.003
+    "tilt-rotor": Propellers(3, 6.0 * 333),  # V-22 cruise: 84 % of 397 rpm
+    "multirotor": Propellers(2, 6.0 * 4000),  # our estimate of a hovering quadcopter of 5 kg with propellers of 17 in
+}
+"""Types with propellers or rotors."""
 
 
 class Tanker(FrozenModel):

@@ -96,7 +96,8 @@ class DrogueScene:
     def _set_moved(self, name: str, surface: Surface) -> None:
         mesh, pose = surface.painted.mesh, surface.axes_from_mesh
         self._set_buffer(f"{name}.vertex_positions", pose.apply(mesh.vertices))
-        self._set_buffer(f"{name}.vertex_normals", pose.rotate(mesh.vertex_normals))
+        if surface.painted.smooth:
+            self._set_buffer(f"{name}.vertex_normals", pose.rotate(mesh.vertex_normals))
         if surface.uv is not None:
             self._set_buffer(f"{name}.vertex_texcoords", surface.uv)
 
