@@ -19,6 +19,7 @@ from datasets_manifest.types.frame import FrameSpec
 from drogue_models.drogue_surfaces import drogue_surfaces, hose_surface, obstacle_surface
 from drogue_models.painted_mesh import PaintedMesh
 from drogue_models.parts import FIRST_MARKER_ID, SURROUNDING_PARTS, Part, part_reflectance_rgb
+from drogue_models.tankers.tanker_surfaces import tanker_surfaces
 from drogue_models.tankers.wing_with_pod import wing_surfaces
 from geometry.se3 import Array, RigidTransform
 from scenes.sky.photometry import REC709_LUMINANCE
@@ -138,7 +139,7 @@ def shows_surfaces(frame: FrameSpec) -> bool:
 
 def frame_tanker_surfaces(frame: FrameSpec) -> tuple[PaintedMesh, ...]:
     """Surfaces of the frame's tanker in the tanker frame."""
-    return wing_surfaces()
+    return wing_surfaces() if frame.tanker is None else tanker_surfaces(frame.tanker)
 
 
 def obstacle_surfaces(obstacle: Obstacle) -> PaintedMesh:

@@ -13,6 +13,7 @@ from datasets_manifest.types.appearance import PlacedBoard
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import Exposure, FrameSpec, Sensor
 from drogue_models.parameters import WHITE_PAINT, DrogueParameters
+from drogue_models.tankers.parameters import Tanker
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
 from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_obstacles
@@ -23,6 +24,7 @@ from scenes.flight.sequence import sequence_kinematics
 from scenes.flight.trajectory import sample_attitude
 from scenes.framing import outline_points_m, sample_distance_m, sample_pose
 from scenes.sky.photometry import luminance
+from scenes.tanker_sampling import hang_line, tanker_at, tanker_of_scene
 
 SplitName = Literal["train", "val", "test"]
 SPLITS: tuple[SplitName, ...] = ("train", "val", "test")
@@ -85,6 +87,7 @@ def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
         "target": family.target,
         "environment": family.environment,
         "exposure": family.exposure,
+        "tanker": family.tanker,
     }
     return recipe.model_copy(update=changes)
 
@@ -118,7 +121,8 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     scene_recipe = recipe_of_scene(recipe, scene_id)
     environment = environment_of_scene(seed, scene_id, scene_recipe.environment)
     drogue = drogue_of_scene(scene_recipe, scene_id)
-    kinematics = _frame_kinematics(scene_recipe, drogue, frame_index)
+    tanker = tanker_of_scene(scene_recipe, scene_id)
+    kinematics = _frame_kinematics(scene_recipe, drogue, tanker, frame_index)
     pose = kinematics.left_from_drogue
     if kinematics.sequence_id is not None:
         environment = _environment_of_sequence(environment, kinematics)
@@ -126,6 +130,7 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     key = frame_index if kinematics.sequence_id is None else kinematics.sequence_id
     obstacles = sample_obstacles(frame_generator(seed, key, "bystanders"), scene_recipe, pose)
     rig, sensor = scene_recipe.rig, scene_recipe.sensor
+    exposure = automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor)
     return FrameSpec(
         seed=seed,
         frame_index=frame_index,
@@ -142,11 +147,12 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         world_from_left=kinematics.world_from_left,
         left_twist_per_s=kinematics.left_twist_per_s,
         drogue_twist_per_s=kinematics.drogue_twist_per_s,
+        tanker=None if pose is None else tanker_at(tanker, kinematics.time_s, exposure.time_s),
         left_from_tanker=kinematics.left_from_tanker,
         hose_nodes_left_m=kinematics.hose_nodes_left_m,
         rig=rig,
         sensor=sensor,
-        exposure=automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor),
+        exposure=exposure,
         environment=environment,
         rangefinder_reading_m=_rangefinder_reading_m(scene_recipe, frame_index, pose),
         loss=kinematics.loss,
@@ -175,7 +181,9 @@ def sample_left_from_drogue(recipe: Recipe, frame_index: int) -> RigidTransform 
     return _pose_of_frame(scene_recipe, drogue, frame_index)
 
 
-def _frame_kinematics(scene_recipe: Recipe, drogue: DrogueParameters, frame_index: int) -> FrameKinematics:
+def _frame_kinematics(
+    scene_recipe: Recipe, drogue: DrogueParameters, tanker: Tanker | None, frame_index: int
+) -> FrameKinematics:
     """Poses and motion of one frame."""
     if scene_recipe.sequence is not None:
         return sequence_kinematics(scene_recipe, scene_recipe.sequence, drogue, frame_index)
@@ -184,7 +192,12 @@ def _frame_kinematics(scene_recipe: Recipe, drogue: DrogueParameters, frame_inde
     world_from_left = RigidTransform(rotation, np.zeros(3))
     left_from_drogue = _pose_of_frame(scene_recipe, drogue, frame_index)
     left_from_tanker, nodes = None, None
-    if left_from_drogue is not None:
+    if left_from_drogue is not None and tanker is not None and tanker.type == "multirotor":
+        assert scene_recipe.tanker is not None
+        left_from_tanker, nodes = hang_line(
+            frame_generator(seed, frame_index, "line"), scene_recipe.tanker, drogue, left_from_drogue, world_from_left
+        )
+    elif left_from_drogue is not None:
         left_from_tanker, nodes = sample_suspension(
             frame_generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
         )

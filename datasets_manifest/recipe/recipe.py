@@ -16,6 +16,7 @@ from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, DistanceLaw
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
 from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, resolve_rig
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_single_frame_keys, fill_distance
+from datasets_manifest.recipe.tanker_ranges import TankerRanges
 from datasets_manifest.types.appearance import CalibrationBoard
 from datasets_manifest.types.environment import pin_environment_map
 from datasets_manifest.types.field_types import Fraction, Rig
@@ -25,6 +26,8 @@ from drogue_models.parameters import DrogueParameters
 from drogue_models.presets import explain, load_drogue
 
 _FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
+# Sections that a recipe may lack.
+_OPTIONAL_FAMILY_SECTIONS = ("tanker",)
 
 
 def fill_families(table: dict[str, Any]) -> None:
@@ -37,7 +40,8 @@ def fill_families(table: dict[str, Any]) -> None:
     if not isinstance(families, list) or not all(isinstance(family, dict) for family in families):
         raise ValueError("families: must be tables, each begun by [[families]]")
     for family in families:
-        for section in _FAMILY_SECTIONS:
+        optional = (name for name in _OPTIONAL_FAMILY_SECTIONS if name in table or name in family)
+        for section in (*_FAMILY_SECTIONS, *optional):
             common, own = table.get(section, {}), family.get(section, {})
             if isinstance(common, dict) and isinstance(own, dict):
                 family[section] = {**deepcopy(common), **own}
@@ -120,7 +124,8 @@ class Family(FrozenModel):
     Attributes:
         name: stored in the frames of its scenes.
         weight: its share of the scenes, relative to the other families' weights.
-        pose, target, environment, exposure: as in `Recipe`; in TOML only the keys that differ from the recipe's.
+        pose, target, environment, exposure, tanker: as in `Recipe`; in TOML only the keys that differ from the
+            recipe's.
     """
 
     name: str = Field(min_length=1, max_length=40, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -129,6 +134,7 @@ class Family(FrozenModel):
     target: AppearanceRanges = AppearanceRanges()
     environment: EnvironmentRanges = EnvironmentRanges()
     exposure: ExposureLaw = ExposureLaw()
+    tanker: TankerRanges | None = Field(default=None, exclude_if=lambda tanker: tanker is None)
 
 
 class Recipe(FrozenModel):
@@ -144,6 +150,7 @@ class Recipe(FrozenModel):
         rangefinder: simulated rangefinder with readings in the records, or none.
         families: of conditions, over which the scenes are distributed; or none.
         sequence: motion of the sequences; without it all pairs are independent.
+        tanker: types and paints of the tankers, or none for a wing with one pod.
     """
 
     name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -166,6 +173,7 @@ class Recipe(FrozenModel):
     rangefinder: Rangefinder | None = Field(default=None, exclude_if=lambda rangefinder: rangefinder is None)
     families: tuple[Family, ...] = Field(default=(), max_length=100)
     sequence: SequenceRanges | None = Field(default=None, exclude_if=lambda sequence: sequence is None)
+    tanker: TankerRanges | None = Field(default=None, exclude_if=lambda tanker: tanker is None)
 
     @property
     def variants(self) -> tuple[DrogueVariant, ...]:
@@ -222,6 +230,16 @@ class Recipe(FrozenModel):
             raise ValueError("board: takes the drogue's place; set frames.empty_fraction to 1, and give no families")
         if self.pose.speed_m_s != 0 or self.pose.rate_deg_s != 0:
             raise ValueError("board: stands still; set pose.speed_m_s and pose.rate_deg_s to 0")
+        return self
+
+    @model_validator(mode="after")
+    def _tankers_can_be_drawn(self) -> Self:
+        tankers = [part.tanker for part in self.families or (self,) if part.tanker is not None]
+        if tankers and self.render.engine == "analytic":
+            raise ValueError("tanker: the engine analytic draws none; leave it out, or use mitsuba or blender")
+        if self.sequence is not None:
+            for tanker in tankers:
+                tanker.check_hose(self.sequence.hose.length_m)
         return self
 
     @model_validator(mode="after")

@@ -15,6 +15,7 @@ from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
 from datasets_manifest.storage.reader import Dataset
+from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.images import StereoImages
 from datasets_manifest.types.records import PairRecord
 from drogue_models.parameters import DrogueParameters
@@ -89,10 +90,8 @@ class SideView:
             for place in ((0.05, 0.60, 0.43, 0.31), (0.05, 0.10, 0.43, 0.41), (0.5, 0.06, 0.49, 0.87))
         )
         self._whole, self._close, self._camera = whole, close, camera
-        corners_m = np.concatenate([part.mesh.triangles for part in frame_tanker_surfaces(records[0].frame)])
-        triangles = _side(corners_m.reshape(-1, 3)).reshape(-1, 3, 2)
+        self._tankers: dict[str, list[PolyCollection]] = {}
         for axes in (whole, close):
-            axes.add_collection(PolyCollection(list(triangles), facecolors=_STEEL, edgecolors=_STEEL, linewidths=0.3))
             axes.set_aspect("equal", adjustable="box")
             axes.tick_params(labelsize=8)
         places = np.concatenate([_side(_Placed(record).left_eye.translation_m[None]) for record in records])
@@ -101,9 +100,8 @@ class SideView:
         # The height follows from the width and the shape of the axes, with the hose in the middle.
         height_m = (farthest_m + 5.0) * (0.31 * _INCHES[1]) / (0.43 * _INCHES[0])
         whole.set_ylim(-3.0 - height_m / 2, -3.0 + height_m / 2)
-        whole.text(-4.4, 0.9, "tanker's wing and pod", ha="right", fontsize=8, color=_STEEL)
         whole.text(0.99, 0.04, "yellow: what the left camera sees", transform=whole.transAxes, ha="right", fontsize=8)
-        close.set_xlabel("metres ahead of the pod's hose exit (flight to the right)", fontsize=8)
+        close.set_xlabel("metres ahead of the hose's exit (flight to the right)", fontsize=8)
         for axes in (whole, close):
             axes.set_ylabel("metres up", fontsize=8)
         camera.set_axis_off()
@@ -111,6 +109,7 @@ class SideView:
     def draw(self, record: PairRecord, images: StereoImages) -> Picture:
         """(H, W, 3) picture of one pair, red, green, blue."""
         placed = _Placed(record)
+        self._show_tanker(record.frame)
         moving: list[Artist] = [artist for axes in (self._whole, self._close) for artist in _draw_flight(axes, placed)]
         name = _side(placed.left_eye.apply(_from_eye(np.array([[3.8, -1.3]]))))[0]
         moving.append(
@@ -135,6 +134,21 @@ class SideView:
         for artist in moving:
             artist.remove()
         return picture
+
+    def _show_tanker(self, frame: FrameSpec) -> None:
+        """Show the tanker of a pair, which pairs of one scene have in common, and hide the others."""
+        name = "" if frame.tanker is None else frame.tanker.model_dump_json()
+        if name not in self._tankers:
+            corners_m = np.concatenate([part.mesh.triangles for part in frame_tanker_surfaces(frame)])
+            triangles = list(_side(corners_m.reshape(-1, 3)).reshape(-1, 3, 2))
+            self._tankers[name] = [
+                PolyCollection(triangles, facecolors=_STEEL, edgecolors=_STEEL, linewidths=0.3) for _ in range(2)
+            ]
+            for axes, polygons in zip((self._whole, self._close), self._tankers[name], strict=True):
+                axes.add_collection(polygons)
+        for shown, collections in self._tankers.items():
+            for polygons in collections:
+                polygons.set_visible(shown == name)
 
 
 class _Placed:

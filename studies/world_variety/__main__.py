@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drogue_models.presets import PRESETS
+from drogue_models.tankers.parameters import STATIONS
 from droguekit.api.recipe_rendering import load_recipe, render_dataset
 from studies.world_variety.light_sheets import sheet_rows, write_sheet
 from studies.world_variety.variety_measures import Variety, measure_variety
@@ -60,7 +61,15 @@ def _draw_sheets(out: Path, workers: int | None) -> None:
     drogues = {name: {"drogue": name} for name in PRESETS}
     rows = sheet_rows(out / "drogues", drogues, workers, whole_image=False)
     write_sheet(list(rows.values()), out / "drogues.png")
-    print(f"{out / 'drogues.png'}: {len(rows)} drogues")
+    print(f"{out / 'drogues.png'}: {len(rows)} drogues", flush=True)
+    tankers = {
+        f"{name}-{station}": {"tanker": {"variants": [{"type": name, "station": station}]}}
+        for name, stations in STATIONS.items()
+        for station in stations
+    }
+    rows = sheet_rows(out / "tankers", tankers, workers, whole_image=True)
+    write_sheet(list(rows.values()), out / "tankers.png")
+    print(f"{out / 'tankers.png'}: {len(rows)} tankers and stations")
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ class RecipeTable(TypedDict, total=False):
     rangefinder: Section
     families: Sequence[Section] | Section
     sequence: Section
+    tanker: Section
 
 
 # The ideal eyes with an eighth and a quarter of their pixels a side, at the same field of view.
