@@ -116,6 +116,15 @@ class RimLamps(FrozenModel):
             raise ValueError("emission_rgb: lamps that are lit need a colour above 0")
         return self
 
+    @property
+    def radiance_rgb(self) -> tuple[float, float, float]:
+        """Radiance of the lamps, 0 where they are off. [cd/m2]"""
+        red, green, blue = self.emission_rgb
+        # Luminance of linear Rec. 709 (ITU-R BT.709).
+        unit = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+        scale = self.luminance_cd_m2 / unit if self.luminance_cd_m2 else 0.0
+        return red * scale, green * scale, blue * scale
+
 
 class ReceptionCoupling(FrozenModel):
     """The mouth of the coupling, which takes the probe's nozzle.

@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from drogue_models.drogue_families.body_paint import body_part
 from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
 from drogue_models.obstacles import ObstacleShape
 from drogue_models.painted_mesh import PaintedMesh, Sheen, texels_at
@@ -35,22 +36,35 @@ def drogue_surfaces(drogue: DrogueParameters, wear: SurfaceWear | None = None) -
 
 @lru_cache(maxsize=16)
 def _meshes(drogue: DrogueParameters) -> dict[int, trimesh.Trimesh]:
-    return drogue_meshes(drogue)
+    meshes = drogue_meshes(drogue)
+    if drogue.body is None:
+        return meshes
+    # Cloth and other curved parts have rounded shading, with creases where they fold.
+    return {part: with_creases(mesh) if _is_rounded(part) else mesh for part, mesh in meshes.items()}
+
+
+def _is_rounded(part: int) -> bool:
+    """Whether a part of a body has interpolated normals; the rim's torus has no creases."""
+    return part < FIRST_MARKER_ID and part not in (Part.RIM, Part.HUB)
 
 
 def _painted(drogue: DrogueParameters, part: int, mesh: trimesh.Trimesh, wear: SurfaceWear | None) -> PaintedMesh:
-    satin = part_satin(drogue, part)
+    satin, lamps = part_satin(drogue, part), None if drogue.body is None else drogue.body.lamps
     rgb = np.array(part_reflectance_rgb(drogue, part))
     # Markers have dirt of their own, see `datasets_manifest.types.appearance.SurfaceCondition`.
     worn = wear is not None and part < FIRST_MARKER_ID
     painted, uv, reflectance = mesh, _square_uv(drogue, part, mesh), rgb
-    if worn and wear is not None:
+    if drogue.body is not None and part < FIRST_MARKER_ID:
+        own = body_part(drogue, part, mesh, rgb, wear)
+        painted, uv, reflectance = (mesh, uv, rgb) if own is None else own
+    elif worn and wear is not None:
         painted, uv, reflectance = worn_part(drogue, part, mesh, rgb, wear)
     return PaintedMesh(
         mesh=painted,
         reflectance=reflectance,
         uv=uv,
-        smooth=part == Part.RIM,
+        emission_cd_m2=np.array(lamps.radiance_rgb if lamps is not None and part == Part.LAMPS else (0.0, 0.0, 0.0)),
+        smooth=part == Part.RIM or (drogue.body is not None and _is_rounded(part)),
         sheen=None if satin is None else Sheen(satin.sheen_fraction, satin.roughness),
     )
 

@@ -45,11 +45,11 @@ WornPart = tuple[trimesh.Trimesh, Array, NDArray[np.float32]]
 """A mesh whose vertices may be doubled at a seam, its (V, 2) texture coordinates and its map."""
 
 # Diffuse reflectance (our choice): oxidised aluminium, soot, brown hydraulic fluid over paint, chalked paint, webbing.
-_METAL = (0.36, 0.36, 0.35)
-_SOOT = (0.022, 0.021, 0.020)
-_OIL = (0.045, 0.034, 0.020)
+METAL = (0.36, 0.36, 0.35)
+SOOT = (0.022, 0.021, 0.020)
+OIL = (0.045, 0.034, 0.020)
 _CHALK = (0.20, 0.20, 0.19)
-_TAPE = (0.30, 0.29, 0.26)
+WEBBING = (0.30, 0.29, 0.26)
 _GORES = 24
 
 
@@ -78,13 +78,17 @@ def worn_part(
 
 def aged_paint(grid: MapGrid, rgb: ArrayLike, wear: SurfaceWear, seed: int) -> Paint:
     """Paint with mottles, chalked clouds and a film of soot, which every painted part has."""
-    paint = even_paint(grid, rgb)
+    return aged(grid, even_paint(grid, rgb), wear, seed)
+
+
+def aged(grid: MapGrid, paint: Paint, wear: SurfaceWear, seed: int) -> Paint:
+    """New paint, of several colours perhaps, with what `aged_paint` lays over it."""
     fine = fractal_noise(grid, seed + 1, 0.012, octaves=2)
     paint = shaded(paint, np.maximum(1.0 + 0.08 * wear.fading * fractal_noise(grid, seed, 0.10) + 0.02 * fine, 0.3))
     clouds = cover_share(fractal_noise(grid, seed + 2, 0.25), 0.15 + 0.45 * wear.fading, softness=2.0)
     paint = covered(paint, 0.15 * wear.fading * clouds, _CHALK)
     film = cover_share(fractal_noise(grid, seed + 3, 0.30), 0.1 + 0.6 * wear.soot, softness=2.0)
-    return covered(paint, 0.45 * wear.soot * film, _SOOT)
+    return covered(paint, 0.45 * wear.soot * film, SOOT)
 
 
 def _seed(wear: SurfaceWear, part: Part) -> int:
@@ -104,7 +108,7 @@ def _face(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear:
     count = round(4 + 20 * wear.oil)
     starts = np.stack([rng.random(count) * ring.width_m, rng.random(count) * 0.3 * ring.height_m], axis=-1)
     oil = streaks(ring, seed + 10, starts, 0.7 * ring.height_m, 0.012)
-    paint = covered(paint, 0.5 * wear.oil * _around(oil, ring, radius_m - low_m, turn), _OIL)
+    paint = covered(paint, 0.5 * wear.oil * _around(oil, ring, radius_m - low_m, turn), OIL)
     # Nozzles and tools that slide along the plate leave arcs.
     arcs = cover_share(fractal_noise(ring, seed + 30, (0.25, 0.004), octaves=2), 0.03 * wear.edge_wear)
     paint = covered(paint, 0.25 * _around(arcs, ring, radius_m - low_m, turn), _CHALK)
@@ -115,7 +119,7 @@ def _face(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear:
     distance_m = np.minimum(np.abs(radius_m - low_m), np.abs(high_m - radius_m))
     on_face = (radius_m > low_m - 0.005) & (radius_m < high_m + 0.005)
     rubbed = edge_wear(grid, seed + 20, np.where(on_face, distance_m, 1.0), 0.004, 0.012 * wear.edge_wear)
-    return mesh, _square_uv(mesh, side_m), finished(covered(paint, 0.8 * rubbed, _METAL))
+    return mesh, _square_uv(mesh, side_m), finished(covered(paint, 0.8 * rubbed, METAL))
 
 
 def _hub(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear: SurfaceWear) -> WornPart:
@@ -126,7 +130,7 @@ def _hub(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear: 
     radius_m, _ = _polar(grid)
     paint = aged_paint(grid, rgb, wear, seed)
     rubbed = edge_wear(grid, seed + 20, np.abs(radius_m - drogue.hub.inner_radius_m), 0.002, 0.02 * wear.edge_wear)
-    return mesh, _square_uv(mesh, side_m), finished(covered(paint, 0.8 * rubbed, _METAL))
+    return mesh, _square_uv(mesh, side_m), finished(covered(paint, 0.8 * rubbed, METAL))
 
 
 def _rim(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear: SurfaceWear) -> WornPart:
@@ -135,7 +139,7 @@ def _rim(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear: 
     grid = MapGrid(2 * np.pi * drogue.rim_radius_m, np.pi * tube_m, 512, 16, wraps=True)
     paint = aged_paint(grid, rgb, wear, seed)
     patches = fractal_noise(grid, seed + 20, (0.15, 1.0)) + 0.5 * fractal_noise(grid, seed + 21, (0.02, 0.01))
-    paint = covered(paint, 0.8 * cover_share(patches, 0.12 * wear.edge_wear), _METAL)
+    paint = covered(paint, 0.8 * cover_share(patches, 0.12 * wear.edge_wear), METAL)
     # Once from the inner to the outer side of the tube: front and back look alike, which needs no second seam.
     points = np.asarray(mesh.vertices)
     along = np.clip((np.hypot(points[:, 0], points[:, 1]) - drogue.rim_radius_m) / (2 * tube_m) + 1.0, 0.0, 1.0)
@@ -158,8 +162,8 @@ def _canopy(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wea
         stitches(grid, np.concatenate([seams_m - 0.004, seams_m + 0.004]), 0.008, (0.005, 0.0015)),
         stitches(grid, [0.009, length_m - 0.009], 0.008, (0.005, 0.0015), across=True),
     )
-    paint = covered(paint, 0.5 * wear.stitching * thread, _TAPE)
-    paint = covered(paint, 0.5 * wear.soot * _blown(grid, seed + 20, 40, 0.03), _SOOT)
+    paint = covered(paint, 0.5 * wear.stitching * thread, WEBBING)
+    paint = covered(paint, 0.5 * wear.soot * _blown(grid, seed + 20, 40, 0.03), SOOT)
     return *wrapped_surface(mesh, _turn(points), along), finished(paint)
 
 
@@ -179,11 +183,11 @@ def _ribs(drogue: DrogueParameters, mesh: trimesh.Trimesh, rgb: ArrayLike, wear:
         low_m = rng.uniform(0.3, 0.7) * length_m
         around = bands(grid, [(index * pitch_m, (index + 1) * pitch_m)], across=False)
         taped = np.maximum(taped, around * bands(grid, [(low_m, low_m + rng.uniform(0.02, 0.05))]))
-    paint = covered(paint, 0.8 * taped, _TAPE)
+    paint = covered(paint, 0.8 * taped, WEBBING)
     ends_m = np.minimum(np.minimum(grid.y_m, length_m - grid.y_m), np.abs(grid.y_m - 0.36 * length_m))
     distance_m = np.repeat(ends_m[:, None], grid.columns, axis=1)
-    paint = covered(paint, 0.8 * edge_wear(grid, seed + 20, distance_m, 0.02, 0.10 * wear.edge_wear), _METAL)
-    paint = covered(paint, 0.5 * wear.oil * _blown(grid, seed + 30, 30, pitch_m / 3), _OIL)
+    paint = covered(paint, 0.8 * edge_wear(grid, seed + 20, distance_m, 0.02, 0.10 * wear.edge_wear), METAL)
+    paint = covered(paint, 0.5 * wear.oil * _blown(grid, seed + 30, 30, pitch_m / 3), OIL)
     # Ribs stand half a step from the x axis, so that none reaches across the seam.
     return *wrapped_surface(mesh, _turn(points), along), finished(paint)
 
@@ -198,9 +202,9 @@ def _coupling(mesh: trimesh.Trimesh, rgb: ArrayLike, wear: SurfaceWear) -> WornP
     bolts = rivet_rows(grid, joints_m + 0.012, 0.03, 0.0025, across=True)
     paint = shaded(paint, 1.0 - 0.5 * wear.stitching * np.maximum(bolts, lines(grid, joints_m, 0.002, across=True)))
     distance_m = np.repeat(grid.y_m[:, None], grid.columns, axis=1)
-    paint = covered(paint, 0.8 * edge_wear(grid, seed + 20, distance_m, 0.006, 0.04 * wear.edge_wear), _METAL)
-    paint = covered(paint, 0.7 * wear.oil * _blown(grid, seed + 30, 16, 0.02), _OIL)
-    paint = covered(paint, 0.5 * wear.soot * _blown(grid, seed + 40, 12, 0.05), _SOOT)
+    paint = covered(paint, 0.8 * edge_wear(grid, seed + 20, distance_m, 0.006, 0.04 * wear.edge_wear), METAL)
+    paint = covered(paint, 0.7 * wear.oil * _blown(grid, seed + 30, 16, 0.02), OIL)
+    paint = covered(paint, 0.5 * wear.soot * _blown(grid, seed + 40, 12, 0.05), SOOT)
     return *wrapped_surface(mesh, _turn(points), along), finished(paint)
 
 
