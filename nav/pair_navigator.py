@@ -57,6 +57,8 @@ BINARY_METHODS = frozenset(
     {"paper", "paper-literal", "circle-fit", "mono-circle", "mean-plane", "disparity-plane", "constant"}
 )
 
+# Three markers determine a pose.
+_LEAST_MARKERS = 3
 # The best rotation must fit the pairs within this share of the gap between neighbours; a wrong one is off by a gap.
 _LARGEST_COST_FRACTION = 0.35
 # Where both images show a part of the ring only, the pairs must fit better. Drawn ones, tilted by up to 20 degrees,
@@ -115,7 +117,7 @@ class PairNavigator:
 
     def observe(self, images: StereoImages) -> PairMeasurement:
         """Detect the drogue in the whole images and measure its markers."""
-        fault = self._wrong_size(images)
+        fault = self._unusable(images)
         if fault is not None:
             return PairMeasurement(fault, {})
         start = perf_counter()
@@ -144,7 +146,7 @@ class PairNavigator:
 
     def measure(self, images: StereoImages, regions: tuple[Region, ...]) -> PairMeasurement:
         """Measure the markers in these regions of one pair by the binary chain, and match them."""
-        fault = self._wrong_size(images)
+        fault = self._unusable(images)
         if fault is not None or not regions:
             return PairMeasurement(fault or NOT_DETECTED, {})
         best = self._matched(images, regions, PLAIN)
@@ -157,7 +159,11 @@ class PairNavigator:
             best = replace(max(best, again, key=lambda measurement: measurement.markers), stage_s=spent_s)
         return best
 
-    def _wrong_size(self, images: StereoImages) -> NoFixReason | None:
+    def _unusable(self, images: StereoImages) -> NoFixReason | None:
+        """Why nothing can be measured in these images."""
+        few = too_few_markers(self._layout)
+        if few is not None:
+            return few
         size_px = (self._rig.camera.width_px, self._rig.camera.height_px)
         if images.size_px == size_px:
             return None
@@ -226,6 +232,14 @@ class PairNavigator:
 
     def _wants_edges(self, method: str) -> bool:
         return self._centroids == "edge" or (self._centroids == "own" and method not in BINARY_METHODS)
+
+
+def too_few_markers(layout: MarkerLayout) -> NoFixReason | None:
+    """Why a drogue's markers can give no pose; None where they can."""
+    if layout.count >= _LEAST_MARKERS:
+        return None
+    has = "no markers" if layout.count == 0 else f"{layout.count} marker{'s' * (layout.count > 1)}"
+    return NoFixReason(f"the drogue has {has}, a pose needs {_LEAST_MARKERS}; detectors still give its box")
 
 
 @dataclass(frozen=True, eq=False)

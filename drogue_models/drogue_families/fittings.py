@@ -85,11 +85,15 @@ def marker_plate(drogue: DrogueParameters, index: int) -> trimesh.Trimesh:
 def marker_holders(drogue: DrogueParameters) -> list[trimesh.Trimesh]:
     """A dark dish around each marker, with a bracket to the nearest strut."""
     solids = []
+    assert drogue.body is not None
+    has_struts = drogue.body.family in ("basket", "ribbons")
     line, angles = drogue.body_line, strut_angles(max(drogue.rib_count, 1))
     for index, (x, y, depth_m) in enumerate(drogue.marker_centers_m):
         outer = circle_m(drogue.marker_radius_m + HOLDER_BORDER_M, MARKER_SECTIONS, (x, y))
         solids.append(_moved_back(_dish(outer, marker_outline_m(drogue, index)), depth_m))
-        angle = angles[np.argmin(np.abs(np.angle(np.exp(1j * (angles - np.arctan2(y, x))))))]
+        own = np.arctan2(y, x)
+        # A wall is everywhere, struts are not.
+        angle = angles[np.argmin(np.abs(np.angle(np.exp(1j * (angles - own)))))] if has_struts else own
         behind_m = depth_m + HOLDER_THICKNESS_M + _BRACKET_M[1] / 2
         reach_m = line.radius_m(behind_m)
         foot = np.array([reach_m * np.cos(angle), reach_m * np.sin(angle), behind_m])

@@ -67,6 +67,8 @@ def clockwise_order(view: ViewRecord) -> list[int]:
 
     An evenly spaced ring looks the same after a turn by one marker; this order does not depend on the marker's index.
     """
+    if not view.markers:
+        return []
     centers = np.array([marker.center_proj_px for marker in view.markers])
     right, down = (centers - centers.mean(axis=0)).T
     from_top = np.arctan2(right, -down)
@@ -83,6 +85,8 @@ def symmetric_orders(drogue: DrogueParameters) -> tuple[tuple[int, ...], ...]:
     """
     layout = marker_layout(drogue)
     places = layout.centers_m[:, :2]
+    if layout.count == 0:
+        return ((),)
     orders = []
     for step in range(layout.symmetry_order):
         angle = 2 * np.pi * step / layout.symmetry_order

@@ -205,7 +205,7 @@ def _annotation_faults(annotation: dict[str, Any], record: PairRecord, eye: Eye)
     if len(points) < len(view.markers) or shown[len(view.markers) :].any():
         return [*faults, f"keypoints: {len(points)} do not fit the record's {len(view.markers)} markers"]
     centers = np.zeros((len(points), 2))
-    centers[: len(view.markers)] = np.array([marker.center_proj_px for marker in view.markers]) + 0.5
+    centers[: len(view.markers)] = np.reshape([marker.center_proj_px for marker in view.markers], (-1, 2)) + 0.5
     if np.abs(points[shown, :2] - centers[shown]).max(initial=0.0) > _TOLERANCE_PX or points[~shown].any():
         faults.append("keypoints: differ from the record's markers")
     if annotation["num_keypoints"] != int(shown.sum()):

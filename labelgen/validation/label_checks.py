@@ -265,8 +265,10 @@ def box_faults(record: PairRecord) -> list[str]:
 def _point_faults(
     rig: StereoRig, pose: RigidTransform, points_m: Array, labelled: dict[Eye, Array], names: list[str]
 ) -> list[str]:
-    """Faults of (N, 2) labels of both eyes against the images of (N, 3) points at a pose."""
+    """Faults of (N, 2) labels of both eyes against the images of (N, 3) points at a pose; N may be 0."""
     faults, ideal = [], {}
+    if len(points_m) == 0 and not any(map(len, labelled.values())):
+        return []
     for eye in EYES:
         if len(labelled[eye]) != len(points_m):
             return [f"{eye}: has {len(labelled[eye])} features, there are {len(points_m)}"]

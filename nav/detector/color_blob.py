@@ -25,10 +25,12 @@ _LEVELS = tuple(0.8 * 0.75**step for step in range(11))
 # Below this level there is only quantisation noise.
 _MIN_LEVEL_DN = 2.0
 _MAX_BLOBS = 150
+# Fewer markers are no ring.
+_LEAST_MARKERS = 3
 
 
 class ColorBlobDetector:
-    """Finds the ring of markers at the brightness threshold that shows most of them.
+    """Finds the ring of markers at the brightness threshold that shows most of them; nothing for a drogue without one.
 
     Attributes:
         name: `color-blob`.
@@ -51,6 +53,8 @@ class ColorBlobDetector:
         return {eye: (one,) if one is not None and one.score >= least_score else () for eye, one in found.items()}
 
     def _detect_eye(self, images: StereoImages, eye: Eye) -> Detection | None:
+        if self._layout.count < _LEAST_MARKERS:
+            return None
         best: RingMatch | None = None
         for weight in OTHERS_WEIGHTS:
             best = self._best_ring(marker_channel(images, eye, self._color, weight), best)

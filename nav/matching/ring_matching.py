@@ -2,12 +2,13 @@
 
 The image of a flat pattern is an affine map up to perspective, which moves a marker by less than a third of its radius
 where the whole drogue is in view. Missing markers, false blobs and the hub (near the middle, where no marker is) need
-no special rules.
+no special rules. Markers at several depths lean with the drogue's tilt: once most are matched, their
+map has one more column, for the depth.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -26,6 +27,8 @@ _FIT_TOLERANCE = 0.4
 _ON_A_LINE = 1e-6
 _STRONGEST_TILT_COSINE = 0.35  # beyond 70 degrees the markers hide in the basket
 _REFINED_GUESSES = 16
+# Four numbers in each row of the map of markers at several depths, and one marker to spare.
+_LEAST_FOR_LEAN = 5
 FEW = 4  # markers are enough where the ring is predicted or another image shows the same ones
 # A disc that touches the picture's edge is dropped, and perspective shifts it by up to a third of its radius.
 _REACH = 1.4
@@ -44,11 +47,13 @@ class RingMatch:
         affine: (2, 3) map from the rim plane [m] to pixels.
         blob_of_marker: (N,) index of each marker's blob, -1 for a missing one; modulo the layout's symmetry.
         rms_fraction: root mean square distance of the blobs from the map, as a share of a marker's radius.
+        lean_px_per_m: (2,) how far markers behind the rim plane are moved, per depth; zero where all have one depth.
     """
 
     affine: Array
     blob_of_marker: NDArray[np.int64]
     rms_fraction: float
+    lean_px_per_m: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
     def count(self) -> int:
@@ -71,7 +76,7 @@ class RingMatch:
 
     def _inside(self, layout: MarkerLayout, size_px: tuple[int, int], reach_px_per_m: float) -> NDArray[np.bool_]:
         """(N,) markers whose centres are further from the picture's edge than their radius times a scale."""
-        places_px = layout.centers_m[:, :2] @ self.affine[:, :2].T + self.affine[:, 2]
+        places_px = _places_px(layout, self.affine, self.lean_px_per_m)
         reach_px = layout.radius_m * reach_px_per_m
         inside: NDArray[np.bool_] = ((places_px > reach_px) & (places_px < np.array(size_px) - 1 - reach_px)).all(
             axis=1
@@ -223,6 +228,7 @@ def _pair_guesses(blobs: Blobs, layout: MarkerLayout) -> tuple[NDArray[np.comple
 def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, least: int) -> RingMatch | None:
     """Affine map refined from the blobs that a guess matches, or None where they cannot be the drogue."""
     places = np.column_stack([layout.centers_m[:, :2], np.ones(layout.count)])
+    lean = np.zeros(2)
     fitted = None
     for tolerance in (_GUESS_TOLERANCE, _FIT_TOLERANCE, _FIT_TOLERANCE, None):
         # Mostly the first guess already matches the right blobs, and the same blobs give the same map.
@@ -235,20 +241,39 @@ def _fit(blob_of_marker: NDArray[np.int64], blobs: Blobs, layout: MarkerLayout, 
             if singular[-1] <= _ON_A_LINE:
                 return None
             affine = solution.T
+            if not layout.is_flat and hit.sum() >= _LEAST_FOR_LEAN:
+                affine, lean = _fit_with_lean(layout.centers_m[hit], centers_px, affine)
         if tolerance is not None:
-            blob_of_marker = _nearest_blobs(affine, blobs, layout, tolerance)
+            blob_of_marker = _nearest_blobs(affine, blobs, layout, tolerance, lean)
     largest, smallest = _singular_values(affine)
     if _determinant(affine) <= 0 or smallest < _STRONGEST_TILT_COSINE * largest:
         return None
     residual = seen @ affine.T - centers_px
+    if lean.any():
+        residual = residual + layout.centers_m[hit, 2:] * lean
     rms_px = np.sqrt((residual**2).sum(axis=1).mean())
     radius_px = layout.radius_m * np.sqrt(_determinant(affine))
-    return RingMatch(affine, blob_of_marker, float(rms_px / radius_px))
+    return RingMatch(affine, blob_of_marker, float(rms_px / radius_px), lean)
 
 
-def _nearest_blobs(affine: Array, blobs: Blobs, layout: MarkerLayout, tolerance: float) -> NDArray[np.int64]:
+def _fit_with_lean(centers_m: Array, centers_px: Array, affine: Array) -> tuple[Array, Array]:
+    """Affine map of the rim plane, and its lean with depth, of markers at several depths; as given if undetermined."""
+    design = np.column_stack([centers_m[:, :2], np.ones(len(centers_m)), centers_m[:, 2]])
+    solution, _, rank, _ = np.linalg.lstsq(design, centers_px, rcond=_ON_A_LINE)
+    return (solution.T[:, :3], solution[3]) if rank == design.shape[1] else (affine, np.zeros(2))
+
+
+def _places_px(layout: MarkerLayout, affine: Array, lean_px_per_m: Array) -> Array:
+    """(N, 2) images of the markers by a map. [px]"""
+    places: Array = layout.centers_m[:, :2] @ affine[:, :2].T + affine[:, 2]
+    return places if layout.is_flat else places + layout.centers_m[:, 2:] * lean_px_per_m
+
+
+def _nearest_blobs(
+    affine: Array, blobs: Blobs, layout: MarkerLayout, tolerance: float, lean_px_per_m: Array | None = None
+) -> NDArray[np.int64]:
     """(N,) the blob nearest to each marker's image, -1 where no blob of similar size lies within the tolerance."""
-    places_px = layout.centers_m[:, :2] @ affine[:, :2].T + affine[:, 2]
+    places_px = _places_px(layout, affine, np.zeros(2) if lean_px_per_m is None else lean_px_per_m)
     radius_px = layout.radius_m * np.sqrt(abs(_determinant(affine)))
     gaps = places_px[:, None] - blobs.centers_px
     distance = np.sqrt(gaps[..., 0] ** 2 + gaps[..., 1] ** 2)

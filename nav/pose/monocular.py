@@ -127,6 +127,8 @@ def mono_ippe(observation: Observation) -> Solution | NoFixReason:
 
     Without the refinement the errors are twice the Cramer-Rao bound below 5 m.
     """
+    if not observation.layout.is_flat:
+        return NoFixReason("IPPE needs all markers in one plane, and the drogue's lie at several depths")
     return solve_with_one_eye(
         observation, _LEAST_FOR_PNP, partial(_solve_by_opencv, flag=cv2.SOLVEPNP_IPPE, refine=True)
     )

@@ -43,6 +43,7 @@ from nav.pose.pose_method import NoFixReason, Observation, PoseMethod, Solution
 # Any three points lie on a circle, whatever their error.
 _LEAST_FOR_CIRCLE = 4
 _REFINEMENTS = 10
+NOT_FLAT = NoFixReason("this method fits a plane, and the drogue's markers lie at several depths")
 
 
 def constant(observation: Observation) -> Solution | NoFixReason:
@@ -60,6 +61,8 @@ def mean_plane(observation: Observation) -> Solution | NoFixReason:
     reason = stereo_fault(observation)
     if reason is not None:
         return reason
+    if not observation.layout.is_flat:
+        return NOT_FLAT
     index, points = triangulate_markers(observation)
     pose = pose_from_axis(points, observation.layout.centers_m[index], plane_normal(points))
     return Solution(pose, paired_mask(observation))
@@ -74,6 +77,8 @@ def disparity_plane(observation: Observation) -> Solution | NoFixReason:
     reason = stereo_fault(observation)
     if reason is not None:
         return reason
+    if not observation.layout.is_flat:
+        return NOT_FLAT
     rig, paired = observation.rig, observation.paired
     left, right = observation.pixels_px[:, paired]
     rays = rig.camera.rays(np.column_stack([left[:, 0], (left[:, 1] + right[:, 1]) / 2]))
