@@ -63,7 +63,8 @@ def centroid_errors(truth: DrogueTruth, features: Sequence[Feature]) -> Centroid
     visible = truth.visible[eye, places]
     near = np.linalg.norm(offset, axis=1) <= width
     keep = visible & near
-    middle = truth.centers_px[:, : truth.layout.count].mean(axis=1)
+    markers_px = truth.centers_px[:, : truth.layout.count]
+    middle = markers_px.mean(axis=1) if truth.layout.count else np.zeros((2, 2))
     arm = (truth.centers_px[eye, places] - middle[eye])[keep]
     outward = np.einsum("ki,ki->k", offset[keep], arm) / np.maximum(np.linalg.norm(arm, axis=1), np.finfo(float).tiny)
     return CentroidErrors(
@@ -80,6 +81,8 @@ def centroid_errors(truth: DrogueTruth, features: Sequence[Feature]) -> Centroid
 
 def symmetric_orders(layout: MarkerLayout) -> list[NDArray[np.intp]]:
     """Renumberings of the features by the rotations that map the markers onto themselves; the hub stays. Each (M,)."""
+    if layout.count == 0:
+        return [np.array([0])]
     orders = []
     for step in range(layout.symmetry_order):
         angle = 2 * np.pi * step / layout.symmetry_order

@@ -79,10 +79,12 @@ def drogue_truth(record: PairRecord) -> DrogueTruth | None:
         left_from_drogue=record.left_from_drogue,
         rig=record.frame.rig,
         layout=layout,
-        centers_px=np.array([[feature.center_ellipse_px for feature in features] for features in eyes]),
+        centers_px=np.array(
+            [[feature.center_ellipse_px for feature in features] for features in eyes], dtype=np.float64
+        ).reshape(2, expected, 2),
         visible=np.array(
-            [[f.in_image and f.visible_fraction >= VISIBLE_FRACTION for f in features] for features in eyes]
-        ),
+            [[f.in_image and f.visible_fraction >= VISIBLE_FRACTION for f in features] for features in eyes], dtype=bool
+        ).reshape(2, expected),
         sequence_id=record.sequence_id,
         rangefinder_reading_m=record.frame.rangefinder_reading_m,
     )
