@@ -69,9 +69,16 @@ def _basket(drogue: DrogueParameters, body: BasketBody) -> dict[Part, trimesh.Tr
     shares = np.linspace(0.0, 1.0, _STRUT_PIECES)
     points, _ = line_points_m(line, shares)
     widths = body.strut_width_m + (body.strut_root_width_m - body.strut_width_m) * shares
+    points = points + _inset_m(drogue, body.strut_thickness_m, float(widths.max()))
     solids = [strut(points, angle, widths, body.strut_thickness_m) for angle in angles]
     solids += _cords(line, body, drogue.rib_count)
     return {Part.RIBS: trimesh.util.concatenate(solids), Part.CANOPY: _canopy(drogue, body, line)}
+
+
+def _inset_m(drogue: DrogueParameters, thickness_m: float, width_m: float) -> Array:
+    """(radius, z) by which struts thicker than the rim's tube must move to stay inside the rim and behind it. [m]"""
+    beyond_m = thickness_m / 2 + width_m**2 / (8 * drogue.rim_radius_m) - drogue.rim_tube_radius_m
+    return max(beyond_m + 1e-4, 0.0) * np.array([-1.0, 1.0])
 
 
 def _cords(line: BodyLine, body: BasketBody, strut_count: int) -> list[trimesh.Trimesh]:
@@ -209,6 +216,7 @@ def _ribbons(drogue: DrogueParameters, body: RibbonBody) -> dict[Part, trimesh.T
     line, count = drogue.body_line, drogue.rib_count
     points, _ = line_points_m(line, np.linspace(0.0, 1.0, _STRUT_PIECES))
     widths = np.full(_STRUT_PIECES, min(body.strap_width_m, 0.8 * 2 * np.pi * drogue.coupling_radius_m / count))
+    points = points + _inset_m(drogue, _STRAP_M, float(widths.max()))
     straps = [strut(points, angle, widths, _STRAP_M) for angle in strut_angles(count)]
     angles = _columns(count * _COLUMNS_PER_BILLOW)
     billow = np.abs(np.sin((angles - np.pi / 2) * count / 2))
