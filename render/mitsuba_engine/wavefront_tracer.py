@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.parts import Part
 from geometry.stereo import EYES, Eye
-from render.camera.exposure_motion import image_window, motion_blur_px
+from render.camera.exposure_motion import NEAREST_M, image_window, motion_blur_px
 from render.compositing import Compositor, TracedEye, amodal_counts
 from render.mitsuba_engine.jit_arrays import jit_array, reserve_registry
 from render.mitsuba_engine.paths.context_paths import SeenContext, trace_context
@@ -112,7 +112,7 @@ def _sample_light(
     seen = SeenContext(
         covered=np.concatenate([eyes[eye].part_id.reshape(-1) > 0 for eye in EYES]),
         shiny=_near_parts(eyes, scene.shiny_parts - _OF_DROGUE, moves_px),
-        lamps=_near_lamps(frame, scene, moves_px),
+        lamps=_near_lamps(frame, scene, rays, moves_px),
     )
     return sampled.with_pixels(pixel, trace_context(rays, pixel, seen, settings, moves_px))
 
@@ -125,16 +125,21 @@ def _near_parts(eyes: dict[Eye, TracedEye], parts: set[int], moves_px: float) ->
     return np.concatenate([seen.reshape(-1) for seen in near])
 
 
-def _near_lamps(frame: FrameSpec, scene: DrogueScene, moves_px: float) -> NDArray[np.bool_]:
+def _near_lamps(frame: FrameSpec, scene: DrogueScene, rays: FrameRays, moves_px: float) -> NDArray[np.bool_]:
     """(2 H W,) which pixels of both eyes may see a lamp beside the drogue, however small it is."""
-    camera, pixels = frame.rig.camera, []
-    kernel = np.ones((3 + 2 * int(np.ceil(moves_px)),) * 2, dtype=np.uint8)
-    for eye in EYES:
-        held = np.zeros((camera.height_px, camera.width_px), dtype=np.uint8)
-        if scene.lamp_corners_m:
-            held.reshape(-1)[CenterPasses(frame, eye, scene).pixels_of(scene.lamp_corners_m, 0.0)] = 1
-        pixels.append(cv2.dilate(held, kernel).reshape(-1) > 0)
-    return np.concatenate(pixels)
+    camera, reach_px = frame.rig.camera, 1 + int(np.ceil(moves_px))
+    held = np.zeros((2, camera.height_px, camera.width_px), dtype=np.bool_)
+    for index, eye in enumerate(EYES):
+        eye_from_stage = rays.stage_from_eye(eye).inverse()
+        for corners_m in scene.lamp_corners_m:
+            points = eye_from_stage.apply(corners_m)
+            if points[:, 2].min() < NEAREST_M:
+                continue
+            places = np.rint(frame.rig.real_px(camera.project(points), eye))
+            (left, top), (right, bottom) = places.min(axis=0) - reach_px, places.max(axis=0) + reach_px + 1
+            columns, rows = (max(int(low), 0) for low in (left, top))
+            held[index, rows : max(int(bottom), 0), columns : max(int(right), 0)] = True
+    return held.reshape(-1)
 
 
 def _center_pixels(eyes: dict[Eye, TracedEye], plans: dict[Eye, SamplingPlan]) -> dict[str, NDArray[np.int64]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ import trimesh
 from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.appearance import DrogueCondition
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.painted_mesh import PaintedMesh
+from drogue_models.painted_mesh import PaintedMesh, Sheen
 from drogue_models.parts import Part
 from drogue_models.surface_wear import SurfaceWear
+from render.compositing import inside_one_part
 from render.engine import RenderEngine, load_engine
 from scenes.sampler import sample_frame
 from tests.support.painted_plate import DISTANCE_M, QUARTERS, frame_with, plate, quarter_means, quarters
@@ -135,3 +137,35 @@ def test_worn_drogues_share_a_scene_and_take_their_own_maps(engine: RenderEngine
     face = first.part_id == Part.FACE
     ratio = other.radiance_cd_m2[face] / first.radiance_cd_m2[face]
     assert ratio.std() > 0.03
+
+
+def test_maps_leave_smoothed_light_unbiased(engine: RenderEngine) -> None:
+    recipe = paper_view_recipe(scale=1 / 3, stations_m=(3.0,))
+    worst = SurfaceWear(seed=2, soot=0.8, oil=0.8, edge_wear=0.8, fading=0.8, tape=0.5)
+    worn = sample_frame(recipe, 0).model_copy(update={"condition": DrogueCondition(wear=worst)})
+    many = {"samples_per_px": 196, "open_samples_per_px": 64, "edge_samples_per_px": 1024, "denoise": False}
+    truth = engine.render(worn.model_copy(update={"seed": 99}), recipe.render.model_copy(update=many)).left
+    renders = [engine.render(worn.model_copy(update={"seed": seed}), recipe.render).left for seed in range(3)]
+    smoothed = np.mean([seen.radiance_cd_m2 for seen in renders], axis=0)
+    for part in (Part.FACE, Part.HUB, Part.COUPLING):
+        inside = (truth.part_id == part) & inside_one_part(truth.part_id)
+        ours, theirs = (light[inside].sum(axis=-1).astype(float) for light in (smoothed, truth.radiance_cd_m2))
+        # Noise of the means is 0.1 to 0.2 %.
+        assert ours.mean() / theirs.mean() == pytest.approx(1.0, abs=0.006)
+        # Where the map is dark, light that was divided by little is multiplied by as little again.
+        dark = theirs <= np.quantile(theirs, 0.1)
+        assert ours[dark].mean() / theirs[dark].mean() == pytest.approx(1.0, abs=0.05)
+    face = (truth.part_id == Part.FACE) & inside_one_part(truth.part_id)
+    assert np.corrcoef(smoothed[face].sum(axis=-1), truth.radiance_cd_m2[face].sum(axis=-1))[0, 1] > 0.99
+
+
+def test_a_sheen_beside_the_drogue_is_as_bright_as_paths_alone_find_it(
+    engine: RenderEngine, frame: FrameSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shiny = replace(plate(quarters()), sheen=Sheen(0.3, 0.3))
+    painted = frame_with(monkeypatch, frame, [(shiny, PLACE)])
+    many = {"denoise": False, "surround_samples_per_px": 400}
+    alone = quarter_means(painted, engine.render(painted, SETTINGS.model_copy(update=many)).left)
+    np.testing.assert_allclose(quarter_means(painted, engine.render(painted, SETTINGS).left), alone, rtol=0.02)
+    matt = frame_with(monkeypatch, frame, [(plate(quarters()), PLACE)])
+    assert not np.allclose(quarter_means(matt, engine.render(matt, SETTINGS).left), alone, rtol=0.1)

@@ -152,6 +152,10 @@ class FrameRays:
             lights_others=None if lights_others is None else jit_array(mi.Float, lights_others),
         )
 
+    def stage_from_eye(self, eye: Eye) -> RigidTransform:
+        """Pose of an eye at mid-exposure."""
+        return self._cameras[EYES.index(eye)].stage_from_eye(0.0)
+
     def pixels_of_both_eyes(self, plans: dict[Eye, SamplingPlan], kind: str) -> NDArray[np.int64]:
         """Pixels of one group of both eyes' plans, such as `edges`."""
         return np.concatenate([getattr(plans[eye], kind) + index * self.size for index, eye in enumerate(EYES)])
