@@ -46,6 +46,7 @@ class Surface:
         emission_cd_m2: (3,) emitted radiance. [cd/m2]
         is_lamp: it may shine in another condition of the same drogue.
         lights_others: whether paths from other surfaces find it. A lamp of a few centimetres would leave speckles.
+        is_dirty: dirt lies on the paint.
     """
 
     part_id: int
@@ -56,6 +57,7 @@ class Surface:
     emission_cd_m2: Array
     is_lamp: bool
     lights_others: bool
+    is_dirty: bool = False
 
     @property
     def uv(self) -> Array | None:
@@ -102,10 +104,7 @@ class FrameSurfaces:
 
 
 def _is_uneven(surface: Surface) -> bool:
-    if surface.reflectance.ndim == 1:
-        return False
-    own = surface.reflectance is surface.painted.reflectance
-    return not own or surface.painted.contrast > _EVEN_CONTRAST
+    return surface.is_dirty or (surface.painted.has_map and surface.painted.contrast > _EVEN_CONTRAST)
 
 
 def frame_surfaces(frame: FrameSpec, axes_from_left: RigidTransform) -> FrameSurfaces:
@@ -187,6 +186,7 @@ def _fixed_surfaces(frame: FrameSpec) -> dict[str, Surface]:
                 emission_cd_m2=lamp_radiance_rgb(frame, part) if lamp else painted.emission_cd_m2,
                 is_lamp=lamp or surface.is_lamp,
                 lights_others=lamp,
+                is_dirty=is_feature(part) and not surface_condition(frame, part).is_clean,
             )
     return found
 

@@ -11,13 +11,15 @@ import pytest
 import trimesh
 
 from datasets_manifest.recipe.recipe import RenderSettings
-from datasets_manifest.types.appearance import DrogueCondition
+from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.painted_mesh import PaintedMesh, Sheen
-from drogue_models.parts import Part
+from drogue_models.parts import FIRST_MARKER_ID, Part
 from drogue_models.surface_wear import SurfaceWear
+from geometry.se3 import RigidTransform
 from render.compositing import inside_one_part
 from render.engine import RenderEngine, load_engine
+from render.surfaces import frame_surfaces
 from scenes.sampler import sample_frame
 from tests.support.painted_plate import DISTANCE_M, QUARTERS, frame_with, plate, quarter_means, quarters
 from tests.support.recipe_builder import paper_view_recipe
@@ -137,6 +139,16 @@ def test_worn_drogues_share_a_scene_and_take_their_own_maps(engine: RenderEngine
     face = first.part_id == Part.FACE
     ratio = other.radiance_cd_m2[face] / first.radiance_cd_m2[face]
     assert ratio.std() > 0.03
+
+
+def test_only_dirt_and_bold_maps_count_as_edges_all_over(frame: FrameSpec) -> None:
+    states = (SurfaceCondition(dirt_fraction=0.3), *(SurfaceCondition() for _ in range(frame.drogue.marker_count - 1)))
+    for fraction in (1.0, 0.7):
+        worn = DrogueCondition(markers=states, wear=SurfaceWear(seed=1), body_reflectance_fraction=fraction)
+        surfaces = frame_surfaces(frame.model_copy(update={"condition": worn}), RigidTransform.identity())
+        assert surfaces.uneven_parts == {FIRST_MARKER_ID}
+        face = surfaces.fixed[f"part_{int(Part.FACE)}"]
+        np.testing.assert_allclose(face.reflectance, face.painted.reflectance * np.float32(fraction), rtol=1e-6)
 
 
 def test_maps_leave_smoothed_light_unbiased(engine: RenderEngine) -> None:
