@@ -79,13 +79,18 @@ def annotated_views(source: Dataset, images: Path, log: ExportLog) -> Iterator[A
             split = splits[record.frame_index]
             file_name = f"{split}/{record.frame_index:06d}_{eye}.png"
             export_image(source, record.frame_index, eye, images / file_name, log)
-            objects = _objects(source, record, eye, log)
+            objects = annotated_objects(source, record, eye, log)
             points = view_keypoints(view_of(record, eye), camera, 0) if objects else []
             size_px = camera.width_px, camera.height_px
             yield AnnotatedView(record, eye, split, file_name, size_px, tuple(objects), tuple(points))
 
 
-def _objects(source: Dataset, record: PairRecord, eye: Eye, log: ExportLog) -> list[AnnotatedObject]:
+def annotated_objects(source: Dataset, record: PairRecord, eye: Eye, log: ExportLog) -> list[AnnotatedObject]:
+    """What is seen on a view: the drogue first, then hub and markers; the log counts what is not.
+
+    Raises:
+        ValueError: part ids that cannot be read; names the file.
+    """
     part_id = read_part_ids(source, record, eye)
     drogue = coco_annotation(record, eye, part_id, 0)
     if drogue is None:
