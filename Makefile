@@ -18,7 +18,7 @@ demo: ## render a small dataset, navigate on it blind, and report how accurate t
 	@$(BIN)/droguekit demo --out out/demo
 	@echo "demo: the report is $(CURDIR)/out/demo/report.html"
 
-docs: ## build the documentation into out/docs (installs mkdocs-material)
+docs: ## build the documentation into out/docs (installs mkdocs-material and mkdocstrings)
 	@scripts/setup docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "docs: open $(CURDIR)/out/docs/index.html"
