@@ -73,7 +73,12 @@ def llvm_libraries() -> list[Path]:
 
 
 def _cache_file() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "droguekit" / "variant-verdicts.json"
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        # A user without a home, as containers have: a file that can neither be read nor written.
+        cache = Path(os.devnull)
+    return cache / "droguekit" / "variant-verdicts.json"
 
 
 def _works(library: Path) -> bool:
