@@ -1,4 +1,4 @@
-"""The painted surfaces of a drogue, its hose and obstacles around it."""
+"""The painted surfaces of a drogue."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from functools import lru_cache
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from PIL import Image
 
 from drogue_models.drogue_families.body_paint import body_part
-from drogue_models.meshes import drogue_meshes, hose_mesh, obstacle_mesh
-from drogue_models.obstacles import ObstacleShape
+from drogue_models.meshes import drogue_meshes
 from drogue_models.painted_mesh import PaintedMesh, Sheen, texels_at
 from drogue_models.parameters import DrogueParameters
 from drogue_models.parts import FIRST_MARKER_ID, Part, part_name, part_reflectance_rgb, part_satin
@@ -79,21 +78,6 @@ def _square_uv(drogue: DrogueParameters, part: int, mesh: trimesh.Trimesh) -> Ar
         return None
     uv: Array = (np.asarray(mesh.vertices)[:, :2] - np.asarray(center_m)) / (2 * radius_m) + 0.5
     return uv
-
-
-def hose_surface(drogue: DrogueParameters, nodes_m: ArrayLike) -> PaintedMesh:
-    """The hose along (K, 3) nodes, in their axes. [m]"""
-    return PaintedMesh(
-        mesh=hose_mesh(nodes_m, drogue.hose_radius_m),
-        reflectance=np.array(part_reflectance_rgb(drogue, Part.HOSE)),
-        smooth=True,
-    )
-
-
-@lru_cache(maxsize=16)
-def obstacle_surface(shape: ObstacleShape, reflectance_rgb: tuple[float, float, float]) -> PaintedMesh:
-    """An obstacle in its own axes, in one colour; nobody may change it."""
-    return PaintedMesh(mesh=with_creases(obstacle_mesh(shape)), reflectance=np.array(reflectance_rgb), smooth=True)
 
 
 def encode_mesh_file(surfaces: Mapping[int, PaintedMesh], suffix: str) -> bytes:

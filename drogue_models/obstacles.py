@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pydantic import Field
@@ -15,24 +15,46 @@ OBSTACLE_SECTIONS = 64
 PROBE_PROFILE = ((0.55, 0.0), (0.80, 0.12), (0.95, 0.35), (0.95, 1.6), (0.62, 2.2), (0.62, 5.2), (1.0, 6.0))
 
 
+PlainForm = Literal["probe", "bar", "ball", "disc", "ring"]
+ProbeForm = Literal["probe-straight", "probe-cranked", "probe-retractable", "probe-nose", "probe-boom"]
+CockpitForm = Literal["nose", "canopy-frame", "glare-shield"]
+DistractorBody = Literal["nacelle", "intake", "wheel", "antenna", "roundel", "lamp", "bird", "pod"]
+PLAIN_FORMS: tuple[PlainForm, ...] = get_args(PlainForm)
+PROBE_FORMS: tuple[ProbeForm, ...] = get_args(ProbeForm)
+COCKPIT_FORMS: tuple[CockpitForm, ...] = get_args(CockpitForm)
+DISTRACTOR_BODIES: tuple[DistractorBody, ...] = get_args(DistractorBody)
+
+
 class ObstacleShape(FrozenModel):
-    """An obstacle's dimensions: a body of revolution about its own z axis.
+    """An obstacle's dimensions, in its own axes.
+
+    The plain forms are bodies of revolution about the z axis in one colour; the others are painted, see
+    `drogue_models.surroundings`.
 
     Attributes:
         form: `probe` (tip at the origin, body along +z), `bar` (a rod along z around the origin), `ball`, `disc` (a
             thin round plate facing -z) or `ring` (a torus around z).
         radius_m: largest radius; of a ring that of its centre line. [m]
         length_m: of probe and bar, thickness of a disc; ignored otherwise. [m]
-        tube_radius_m: of a ring's tube; ignored otherwise. [m]
+        tube_radius_m: of a ring's tube; ignored by the other plain forms. [m]
+        seed: of a painted form's details and wear.
+        mirrored: whether a painted form is that of the other side, such as a probe on the left.
     """
 
-    form: Literal["probe", "bar", "ball", "disc", "ring"]
+    form: PlainForm | ProbeForm | CockpitForm | DistractorBody
     radius_m: Metres
     length_m: float = Field(default=0.01, gt=0, le=50, allow_inf_nan=False)
     tube_radius_m: Metres = 0.05
+    # Left out for the plain forms, so that the hashes of other datasets stay those of earlier versions.
+    seed: int = Field(default=0, ge=0, exclude_if=lambda seed: seed == 0)
+    mirrored: bool = Field(default=False, exclude_if=lambda mirrored: not mirrored)
 
     def profile_m(self) -> Array:
-        """(P, 2) corners (radius, z) of its section, counter-clockwise with the radius to the right and z up. [m]"""
+        """(P, 2) corners (radius, z) of a plain form's section, counter-clockwise with z up, radius to the right. [m]
+
+        Raises:
+            ValueError: the form is no body of revolution.
+        """
         profile: Array
         match self.form:
             case "probe":
@@ -52,4 +74,6 @@ class ObstacleShape(FrozenModel):
                 angle = 2 * np.pi * np.arange(OBSTACLE_SECTIONS // 2) / (OBSTACLE_SECTIONS // 2)
                 tube = self.tube_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
                 profile = np.array([self.radius_m, 0.0]) + tube
+            case _:
+                raise ValueError(f"form: {self.form} is no body of revolution")
         return profile

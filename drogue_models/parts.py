@@ -9,6 +9,9 @@ from drogue_models.parameters import DrogueParameters, SatinPaint
 
 FIRST_MARKER_ID = 32
 MAX_MARKERS = 32
+# Parts of the k-th drogue beside the sought one have ids higher by k times this.
+INSTANCE_STEP = 64
+MAX_NEIGHBOURS = 2
 
 
 class Part(IntEnum):
@@ -47,17 +50,21 @@ def marker_id(index: int) -> int:
     return FIRST_MARKER_ID + index
 
 
-def drogue_part_ids(marker_count: int) -> list[int]:
-    """Ids of all parts that the drogue's box covers."""
-    return [int(part) for part in DROGUE_PARTS] + [marker_id(index) for index in range(marker_count)]
+def drogue_part_ids(marker_count: int, instance: int = 0) -> list[int]:
+    """Ids of all parts that a drogue's box covers; instance 0 is the drogue that is sought, 1 the first beside it."""
+    own = [int(part) for part in DROGUE_PARTS] + [marker_id(index) for index in range(marker_count)]
+    return [INSTANCE_STEP * instance + part for part in own]
 
 
 def part_name(part_id: int) -> str:
-    """Name of a part in messages and files, such as `face` or `marker_3`.
+    """Name of a part in messages and files, such as `face`, `marker_3` or `neighbour_1_face`.
 
     Raises:
         ValueError: no part has this id.
     """
+    instance, own = divmod(part_id, INSTANCE_STEP)
+    if 0 < instance <= MAX_NEIGHBOURS:
+        return f"neighbour_{instance}_{part_name(own)}"
     if FIRST_MARKER_ID <= part_id < FIRST_MARKER_ID + MAX_MARKERS:
         return f"marker_{part_id - FIRST_MARKER_ID}"
     return Part(part_id).name.lower()

@@ -8,17 +8,19 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.images import StereoImages
+from datasets_manifest.types.neighbours import OtherDrogue
 from datasets_manifest.types.records import (
     Conditions,
     FeatureView,
     HubView,
+    NeighbourView,
     PairRecord,
     PixelPoint,
     StereoViews,
     ViewRecord,
 )
 from drogue_models.marker_layout import MarkerLayout, marker_layout
-from drogue_models.parts import FIRST_MARKER_ID, MAX_MARKERS, SURROUNDING_PARTS, Part
+from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP, MAX_MARKERS, SURROUNDING_PARTS, Part
 from geometry.circles import disc_image_centers
 from geometry.se3 import Array, RigidTransform, angles_from_rotation
 from geometry.stereo import Eye
@@ -125,6 +127,21 @@ def _view(frame: FrameSpec, pose: RigidTransform | None, eye: Eye, seen: EyeRadi
     return ViewRecord(
         markers=marker_views(frame, layout, pose, eye, seen),
         hub=hub_view(frame, layout, pose, eye, seen),
+        box_full_xywh_px=box,
+        box_visible_xywh_px=mask_box(mask),
+        visible_drogue_px=int(np.count_nonzero(mask)),
+        truncated=is_truncated(box, frame.rig.camera),
+        neighbours=tuple(
+            _neighbour_view(frame, other, index + 1, eye, seen) for index, other in enumerate(frame.neighbours)
+        ),
+    )
+
+
+def _neighbour_view(frame: FrameSpec, other: OtherDrogue, instance: int, eye: Eye, seen: EyeRadiance) -> NeighbourView:
+    """Boxes of a drogue beside the sought one."""
+    mask = drogue_mask(seen.part_id, other.drogue.marker_count, instance)
+    box = drogue_box(other.drogue, frame.rig, other.left_from_drogue, eye)
+    return NeighbourView(
         box_full_xywh_px=box,
         box_visible_xywh_px=mask_box(mask),
         visible_drogue_px=int(np.count_nonzero(mask)),
@@ -255,7 +272,8 @@ def _electrons(frame: FrameSpec, radiance_cd_m2: NDArray[np.float32]) -> Array:
 def _is_structure(part_id: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Whether pixels see a part of the drogue other than markers and hub."""
     is_marker = (part_id >= FIRST_MARKER_ID) & (part_id < FIRST_MARKER_ID + MAX_MARKERS)
-    others: NDArray[np.bool_] = ~is_marker & ~np.isin(part_id, (Part.SKY, Part.HUB, *SURROUNDING_PARTS))
+    own = part_id < INSTANCE_STEP
+    others: NDArray[np.bool_] = own & ~is_marker & ~np.isin(part_id, (Part.SKY, Part.HUB, *SURROUNDING_PARTS))
     return others
 
 

@@ -35,7 +35,7 @@ class FeaturePixels:
 
     def __init__(self, part_id: NDArray[np.uint8]) -> None:
         found = cv2.findNonZero(parts_mask(part_id, _FEATURES).view(np.uint8))
-        places = np.zeros((0, 2), dtype=np.int64) if found is None else found.reshape(-1, 2).astype(np.int64)
+        places = np.zeros((0, 2), dtype=np.int64) if found is None else found[:, 0].astype(np.int64)
         parts = part_id[places[:, 1], places[:, 0]]
         order = np.argsort(parts, kind="stable")
         self._places = places[order]
@@ -81,9 +81,9 @@ def drogue_box(drogue: DrogueParameters, rig: StereoRig, left_from_drogue: Rigid
     return float(low[0]), float(low[1]), float(high[0] - low[0]), float(high[1] - low[1])
 
 
-def drogue_mask(part_id: NDArray[np.uint8], marker_count: int) -> NDArray[np.bool_]:
-    """(H, W) whether a pixel centre sees a part of the drogue, as its box covers it."""
-    return parts_mask(part_id, drogue_part_ids(marker_count))
+def drogue_mask(part_id: NDArray[np.uint8], marker_count: int, instance: int = 0) -> NDArray[np.bool_]:
+    """(H, W) whether a pixel centre sees a part of a drogue, as its box covers it; see `drogue_part_ids`."""
+    return parts_mask(part_id, drogue_part_ids(marker_count, instance))
 
 
 def mask_box(mask: NDArray[np.bool_]) -> PixelBox | None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
 from datasets_manifest.types.records import PairRecord
-from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, MAX_MARKERS, Part, drogue_part_ids, part_name
+from drogue_models.parts import DROGUE_PARTS, FIRST_MARKER_ID, Part, drogue_part_ids, part_name
 from geometry.distortion import border_px
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import Eye, StereoRig
@@ -35,7 +35,8 @@ _MAX_PIECES = 128
 def named_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
     """Part ids by name of the mask, for all masks of a pair.
 
-    `drogue` is everything inside its box, `occluder` the receiver's probe and obstacles; all others are single parts.
+    `drogue` is everything inside its box, `neighbour_1` the same of the first drogue beside it, and `occluder` the
+    receiver's probe and obstacles; all others are single parts.
     """
     drogue = record.frame.drogue
     parts: dict[str, tuple[int, ...]] = {}
@@ -46,6 +47,8 @@ def named_parts(record: PairRecord) -> dict[str, tuple[int, ...]]:
             part_name(FIRST_MARKER_ID + index): (FIRST_MARKER_ID + index,) for index in range(drogue.marker_count)
         }
         parts |= {part_name(part): (int(part),) for part in (Part.HOSE, Part.TANKER)}
+    for index, other in enumerate(record.frame.neighbours):
+        parts[f"neighbour_{index + 1}"] = tuple(drogue_part_ids(other.drogue.marker_count, index + 1))
     parts["occluder"] = OCCLUDERS
     parts[part_name(Part.DISTRACTOR)] = (int(Part.DISTRACTOR),)
     if record.frame.board is not None:
@@ -68,7 +71,7 @@ def amodal_masks(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> di
         ValueError: a user's body mesh that is missing or was changed.
     """
     alone = flat_part_masks(record.frame, eye) if record.engine == "analytic" else _mesh_masks(record, eye)
-    for part in np.flatnonzero(np.bincount(part_id.ravel(), minlength=256)[: FIRST_MARKER_ID + MAX_MARKERS]):
+    for part in np.flatnonzero(np.bincount(part_id.ravel(), minlength=256)):
         if part != Part.SKY:
             seen = part_id == part
             alone[int(part)] = alone[int(part)] | seen if int(part) in alone else seen

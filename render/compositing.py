@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.parts import FIRST_MARKER_ID, Part
+from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP, Part
 from geometry.stereo import EYES, Eye
 from render.background import air_in_front
 from render.engine import EyeRadiance
@@ -141,14 +141,14 @@ def amodal_counts(
         part_id, depth_m: what the pixel centres see, and its depth.
         alone_id, alone_depth_m: the same with markers and hub alone; of equal shape.
     """
-    feature = (part_id >= FIRST_MARKER_ID) | (part_id == Part.HUB)
+    feature = ((part_id >= FIRST_MARKER_ID) & (part_id < INSTANCE_STEP)) | (part_id == Part.HUB)
     with np.errstate(invalid="ignore"):
         one_depth = np.abs(depth_m - alone_depth_m) <= _SEAM_DEPTH_FRACTION * depth_m
     counts = np.bincount(np.where(feature | one_depth, part_id, alone_id).ravel(), minlength=256)
-    return {part: int(counts[part]) for part in (int(Part.HUB), *range(FIRST_MARKER_ID, 256)) if counts[part]}
+    return {part: int(counts[part]) for part in (int(Part.HUB), *range(FIRST_MARKER_ID, INSTANCE_STEP)) if counts[part]}
 
 
-def inside_one_part(part_id: NDArray[np.uint8], reach_px: int = 1) -> NDArray[np.bool_]:
+def inside_one_part(part_id: NDArray[np.uint8] | NDArray[np.uint16], reach_px: int = 1) -> NDArray[np.bool_]:
     """(H, W) pixels around which all within `reach_px` see the same part: differences there are noise, not edges."""
     kernel = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
     alone: NDArray[np.bool_] = (cv2.erode(part_id, kernel) == cv2.dilate(part_id, kernel)) & (part_id > 0)

@@ -16,15 +16,30 @@ from scipy.ndimage import gaussian_filter
 from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.types.appearance import AS_NEW, Obstacle, SurfaceCondition
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.drogue_surfaces import drogue_surfaces, hose_surface, obstacle_surface
+from drogue_models.drogue_surfaces import drogue_surfaces
+from drogue_models.obstacles import ObstacleShape
 from drogue_models.painted_mesh import PaintedMesh
-from drogue_models.parts import FIRST_MARKER_ID, SURROUNDING_PARTS, Part, part_reflectance_rgb
+from drogue_models.parts import (
+    FIRST_MARKER_ID,
+    INSTANCE_STEP,
+    SURROUNDING_PARTS,
+    TANKER_GREY,
+    Part,
+    part_reflectance_rgb,
+)
+from drogue_models.surroundings.bystander_surface import bystander_surface
+from drogue_models.surroundings.hose_surface import hose_surface
 from drogue_models.tankers.tanker_surfaces import tanker_surfaces
-from drogue_models.tankers.wing_with_pod import wing_surfaces
+from drogue_models.tankers.wing_with_pod import POD_LENGTH_M, POD_RADIUS_M, wing_surfaces
 from geometry.se3 import Array, RigidTransform
 from scenes.sky.photometry import REC709_LUMINANCE
 
 DIRT_MAP_PX = 64
+# How groups of surfaces of drogues beside the sought one begin.
+NEIGHBOUR_GROUP = "neighbour_drogue_"
+# A second pod beside that of the wing in view, and columns of its axes (left, up, forward) in the tanker's.
+_POD = ObstacleShape(form="pod", radius_m=POD_RADIUS_M, length_m=POD_LENGTH_M, seed=1)
+_TANKER_FROM_POD = np.column_stack([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 # Soot, hydraulic fluid and road dust: dark and nearly grey (our choice).
 DIRT_RGB = (0.055, 0.050, 0.045)
 _BLOTCH_PX = 5.0
@@ -75,7 +90,7 @@ class Surface:
         """(N, 3) points whose convex hull holds the surface, in the axes that were asked for. [m]"""
         mesh = self.painted.mesh
         # The box around a curved hose would hold much more than the hose.
-        points = mesh.vertices if self.part_id == Part.HOSE else trimesh.bounds.corners(mesh.bounds)
+        points = mesh.vertices if self.part_id % INSTANCE_STEP == Part.HOSE else trimesh.bounds.corners(mesh.bounds)
         hull: Array = self.axes_from_mesh.apply(np.asarray(points))
         return hull
 
@@ -119,7 +134,7 @@ def frame_surfaces(frame: FrameSpec, axes_from_left: RigidTransform) -> FrameSur
     """
     moved: dict[str, Surface] = {}
     if frame.drogue is not None and frame.hose_nodes_left_m is not None:
-        hose = hose_surface(frame.drogue, axes_from_left.apply(frame.hose_nodes_left_m))
+        hose = hose_surface(frame.drogue, axes_from_left.apply(frame.hose_nodes_left_m), frame.hose_look)
         moved |= _named([hose], Part.HOSE, RigidTransform.identity(), _worn_fraction(frame, Part.HOSE))
     if frame.left_from_tanker is not None:
         moved |= _named(frame_tanker_surfaces(frame), Part.TANKER, axes_from_left @ frame.left_from_tanker)
@@ -128,7 +143,47 @@ def frame_surfaces(frame: FrameSpec, axes_from_left: RigidTransform) -> FrameSur
         name = f"part_{int(part)}_{index}"
         pose = axes_from_left @ obstacle.left_from_object
         moved[name] = _surface(obstacle_surfaces(obstacle), int(part), name, pose)
+    for instance, other in enumerate(frame.sought_and_neighbours()):
+        if instance > 0:
+            moved |= _neighbour_surfaces(other, instance, axes_from_left)
+            if other.left_from_tanker is None:
+                moved |= _second_pod(frame, other, instance, axes_from_left)
     return FrameSurfaces(fixed=_fixed_surfaces(frame), moved=moved)
+
+
+def _second_pod(
+    frame: FrameSpec, other: FrameSpec, instance: int, axes_from_left: RigidTransform
+) -> dict[str, Surface]:
+    """The pod of the tanker in view that a neighbour's hose comes from."""
+    assert frame.left_from_tanker is not None and other.hose_nodes_left_m is not None
+    left_from_pod = RigidTransform(frame.left_from_tanker.rotation @ _TANKER_FROM_POD, other.hose_nodes_left_m[-1])
+    pod = bystander_surface(_POD, TANKER_GREY)
+    name = f"part_{int(Part.TANKER)}_pod_{instance}"
+    return {name: _surface(pod, int(Part.TANKER), name, axes_from_left @ left_from_pod)}
+
+
+def _neighbour_surfaces(frame: FrameSpec, instance: int, axes_from_left: RigidTransform) -> dict[str, Surface]:
+    """Drogue, hose and second tanker of a frame that has a neighbour as its drogue, with that neighbour's part ids."""
+    assert frame.drogue is not None and frame.left_from_drogue is not None and frame.hose_nodes_left_m is not None
+    axes_from_drogue = axes_from_left @ frame.left_from_drogue
+    hose = hose_surface(frame.drogue, axes_from_left.apply(frame.hose_nodes_left_m), frame.hose_look)
+    own = {int(Part.HOSE): _surface(hose, 0, "", RigidTransform.identity(), _worn_fraction(frame, Part.HOSE))}
+    own |= {
+        surface.part_id: replace(surface, axes_from_mesh=axes_from_drogue)
+        for surface in _fixed_surfaces(frame).values()
+    }
+    found = {}
+    for part, surface in own.items():
+        part_id = INSTANCE_STEP * instance + part
+        group = f"neighbour_hose_{instance}" if part == Part.HOSE else f"{NEIGHBOUR_GROUP}{instance}"
+        found[f"part_{part_id}"] = replace(surface, part_id=part_id, group=group)
+    if frame.left_from_tanker is not None:
+        tanker = _named(frame_tanker_surfaces(frame), Part.TANKER, axes_from_left @ frame.left_from_tanker)
+        found |= {
+            f"{name}_of_{instance}": replace(surface, group=f"{surface.group}_of_{instance}")
+            for name, surface in tanker.items()
+        }
+    return found
 
 
 def shows_surfaces(frame: FrameSpec) -> bool:
@@ -143,7 +198,7 @@ def frame_tanker_surfaces(frame: FrameSpec) -> tuple[PaintedMesh, ...]:
 
 def obstacle_surfaces(obstacle: Obstacle) -> PaintedMesh:
     """The surface of a bystander in its own axes."""
-    return obstacle_surface(obstacle.shape, obstacle.reflectance_rgb)
+    return bystander_surface(obstacle.shape, obstacle.reflectance_rgb, obstacle.luminance_cd_m2)
 
 
 def _named(

@@ -13,17 +13,21 @@ from datasets_manifest.types.appearance import PlacedBoard
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.frame import Exposure, FrameSpec, Sensor
 from drogue_models.parameters import WHITE_PAINT, DrogueParameters
+from drogue_models.surroundings.hose_look import HoseLook
 from drogue_models.tankers.parameters import Tanker
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
-from scenes.drogue_appearance import condition_of_scene, drogue_of_scene, sample_obstacles
+from scenes.drogue_appearance import condition_of_scene, drogue_of_scene
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
 from scenes.environment_sampling import environment_of_scene
-from scenes.flight.frame_kinematics import FrameKinematics, sample_suspension
+from scenes.flight.frame_kinematics import FrameKinematics
 from scenes.flight.sequence import sequence_kinematics
+from scenes.flight.suspension import hang_hose, hose_look_of_scene, hose_of_scene, sample_suspension
 from scenes.flight.trajectory import sample_attitude
 from scenes.framing import outline_points_m, sample_distance_m, sample_pose
 from scenes.sky.photometry import luminance
+from scenes.surroundings.bystander_sampling import bystanders_of_frame
+from scenes.surroundings.neighbour_sampling import NeighbourKind, neighbours_of_frame
 from scenes.tanker_sampling import hang_line, tanker_at, tanker_of_scene
 
 SplitName = Literal["train", "val", "test"]
@@ -88,6 +92,9 @@ def recipe_of_scene(recipe: Recipe, scene_id: int) -> Recipe:
         "environment": family.environment,
         "exposure": family.exposure,
         "tanker": family.tanker,
+        "hose": family.hose,
+        "receiver": family.receiver,
+        "neighbours": family.neighbours,
     }
     return recipe.model_copy(update=changes)
 
@@ -122,15 +129,16 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
     environment = environment_of_scene(seed, scene_id, scene_recipe.environment)
     drogue = drogue_of_scene(scene_recipe, scene_id)
     tanker = tanker_of_scene(scene_recipe, scene_id)
-    kinematics = _frame_kinematics(scene_recipe, drogue, tanker, frame_index)
+    kinematics = _frame_kinematics(scene_recipe, drogue, tanker, scene_id, frame_index)
     pose = kinematics.left_from_drogue
     if kinematics.sequence_id is not None:
         environment = _environment_of_sequence(environment, kinematics)
-    # Other objects stay the same throughout a sequence.
-    key = frame_index if kinematics.sequence_id is None else kinematics.sequence_id
-    obstacles = sample_obstacles(frame_generator(seed, key, "bystanders"), scene_recipe, pose)
     rig, sensor = scene_recipe.rig, scene_recipe.sensor
     exposure = automatic_exposure(scene_recipe.exposure, environment, rig.camera, kinematics.world_from_left, sensor)
+    condition = None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue)
+    neighbours = neighbours_of_frame(
+        scene_recipe, scene_id, frame_index, kinematics, NeighbourKind(drogue, condition, tanker)
+    )
     return FrameSpec(
         seed=seed,
         frame_index=frame_index,
@@ -140,8 +148,8 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         time_s=kinematics.time_s,
         drogue=None if pose is None else drogue,
         sought=drogue if pose is None and scene_recipe.target.variants else None,
-        condition=None if pose is None else condition_of_scene(scene_recipe, scene_id, drogue),
-        bystanders=obstacles if kinematics.obstacle is None else (*obstacles, kinematics.obstacle),
+        condition=condition,
+        bystanders=bystanders_of_frame(scene_recipe, scene_id, frame_index, kinematics, tanker),
         board=_placed_board(scene_recipe, frame_index),
         left_from_drogue=pose,
         world_from_left=kinematics.world_from_left,
@@ -150,6 +158,8 @@ def sample_frame(recipe: Recipe, frame_index: int) -> FrameSpec:
         tanker=None if pose is None else tanker_at(tanker, kinematics.time_s, exposure.time_s),
         left_from_tanker=kinematics.left_from_tanker,
         hose_nodes_left_m=kinematics.hose_nodes_left_m,
+        hose_look=_hose_look(scene_recipe, scene_id, pose),
+        neighbours=neighbours,
         rig=rig,
         sensor=sensor,
         exposure=exposure,
@@ -181,8 +191,15 @@ def sample_left_from_drogue(recipe: Recipe, frame_index: int) -> RigidTransform 
     return _pose_of_frame(scene_recipe, drogue, frame_index)
 
 
+def _hose_look(scene_recipe: Recipe, scene_id: int, pose: RigidTransform | None) -> HoseLook | None:
+    """Paint of the hose, or None without a drogue or in a recipe without `[hose]`."""
+    if scene_recipe.hose is None or pose is None:
+        return None
+    return hose_look_of_scene(scene_recipe.seed, scene_id, scene_recipe.hose)
+
+
 def _frame_kinematics(
-    scene_recipe: Recipe, drogue: DrogueParameters, tanker: Tanker | None, frame_index: int
+    scene_recipe: Recipe, drogue: DrogueParameters, tanker: Tanker | None, scene_id: int, frame_index: int
 ) -> FrameKinematics:
     """Poses and motion of one frame."""
     if scene_recipe.sequence is not None:
@@ -198,9 +215,12 @@ def _frame_kinematics(
             frame_generator(seed, frame_index, "line"), scene_recipe.tanker, drogue, left_from_drogue, world_from_left
         )
     elif left_from_drogue is not None:
-        left_from_tanker, nodes = sample_suspension(
-            frame_generator(seed, frame_index, "suspension"), drogue, left_from_drogue, world_from_left
-        )
+        rng, ranges = frame_generator(seed, frame_index, "suspension"), scene_recipe.hose
+        if ranges is None:
+            left_from_tanker, nodes = sample_suspension(rng, drogue, left_from_drogue, world_from_left)
+        else:
+            hose = hose_of_scene(seed, scene_id, ranges, drogue)
+            left_from_tanker, nodes = hang_hose(rng, ranges, hose, drogue, left_from_drogue, world_from_left)
     left_twist, drogue_twist = _sample_twists(frame_generator(seed, frame_index, "motion"), scene_recipe)
     return FrameKinematics(
         sequence_id=None,

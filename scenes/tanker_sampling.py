@@ -13,7 +13,7 @@ from drogue_models.parameters import DrogueParameters
 from drogue_models.tankers.parameters import PROPELLERS, Tanker
 from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
-from scenes.flight.frame_kinematics import HOSE_NODES, HOSE_OVERLAP_M, WORLD_FROM_TANKER
+from scenes.flight.suspension import HOSE_NODES, HOSE_OVERLAP_M, WORLD_FROM_TANKER
 
 _FLAP_STEP_DEG = 2.5
 _SWEEP_STEPS = 12

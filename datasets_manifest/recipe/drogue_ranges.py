@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from datasets_manifest.types.field_types import Fraction, Range
 from drogue_models.frozen_model import FrozenModel
+from drogue_models.obstacles import DistractorBody
 from drogue_models.parameters import DrogueParameters
 
 
@@ -73,8 +74,8 @@ class PoseRanges(FrozenModel):
 
 CONSTANT_ONE = Range(low=1, high=1)
 
-DistractorForm = Literal["ball", "disc", "ring"]
-_ALL_FORMS: tuple[DistractorForm, ...] = ("ball", "disc", "ring")
+DistractorForm = Literal["ball", "disc", "ring"] | DistractorBody
+_PLAIN_DISTRACTORS: tuple[DistractorForm, ...] = ("ball", "disc", "ring")
 
 
 class DrogueVariant(FrozenModel):
@@ -124,7 +125,9 @@ class AppearanceRanges(FrozenModel):
         obstacle_frame_fraction: share of frames in which a bar close to the cameras may hide part of the drogue.
         distractor_frame_fraction: share of frames with other round objects; in frames without a drogue they are the
             hard negatives.
-        distractor_forms: forms to choose from with equal probability; a form may be listed several times.
+        distractor_forms: forms to choose from with equal probability; a form may be listed several times. `ball`,
+            `disc` and `ring` are plain and as large in the image as a drogue; the others are painted, of their true
+            sizes, and placed on the tanker or in the sky where they belong.
     """
 
     variants: tuple[DrogueVariant, ...] = ()
@@ -141,7 +144,7 @@ class AppearanceRanges(FrozenModel):
     obstacle_frame_fraction: Fraction = 0.0
     distractor_frame_fraction: Fraction = 0.0
     distractor_forms: tuple[DistractorForm, ...] = Field(
-        default=_ALL_FORMS, min_length=1, exclude_if=lambda forms: forms == _ALL_FORMS
+        default=_PLAIN_DISTRACTORS, min_length=1, exclude_if=lambda forms: forms == _PLAIN_DISTRACTORS
     )
 
     @model_validator(mode="after")

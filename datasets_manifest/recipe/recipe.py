@@ -14,6 +14,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from datasets_manifest.recipe.drogue_ranges import AppearanceRanges, DistanceLaw, DrogueVariant, PoseRanges
 from datasets_manifest.recipe.environment_ranges import EnvironmentRanges
+from datasets_manifest.recipe.hose_ranges import HoseRanges
+from datasets_manifest.recipe.neighbour_ranges import NeighbourRanges
+from datasets_manifest.recipe.receiver_ranges import ReceiverRanges
 from datasets_manifest.recipe.rigs import ExposureLaw, Rangefinder, resolve_rig
 from datasets_manifest.recipe.sequence_ranges import SequenceRanges, check_single_frame_keys, fill_distance
 from datasets_manifest.recipe.tanker_ranges import TankerRanges
@@ -27,7 +30,7 @@ from drogue_models.presets import explain, load_drogue
 
 _FAMILY_SECTIONS = ("pose", "target", "environment", "exposure")
 # Sections that a recipe may lack.
-_OPTIONAL_FAMILY_SECTIONS = ("tanker",)
+_OPTIONAL_FAMILY_SECTIONS = ("tanker", "hose", "receiver", "neighbours")
 
 
 def fill_families(table: dict[str, Any]) -> None:
@@ -124,8 +127,8 @@ class Family(FrozenModel):
     Attributes:
         name: stored in the frames of its scenes.
         weight: its share of the scenes, relative to the other families' weights.
-        pose, target, environment, exposure, tanker: as in `Recipe`; in TOML only the keys that differ from the
-            recipe's.
+        pose, target, environment, exposure, tanker, hose, receiver, neighbours: as in `Recipe`; in TOML only the keys
+            that differ from the recipe's.
     """
 
     name: str = Field(min_length=1, max_length=40, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -135,6 +138,9 @@ class Family(FrozenModel):
     environment: EnvironmentRanges = EnvironmentRanges()
     exposure: ExposureLaw = ExposureLaw()
     tanker: TankerRanges | None = Field(default=None, exclude_if=lambda tanker: tanker is None)
+    hose: HoseRanges | None = Field(default=None, exclude_if=lambda hose: hose is None)
+    receiver: ReceiverRanges | None = Field(default=None, exclude_if=lambda receiver: receiver is None)
+    neighbours: NeighbourRanges | None = Field(default=None, exclude_if=lambda neighbours: neighbours is None)
 
 
 class Recipe(FrozenModel):
@@ -151,6 +157,9 @@ class Recipe(FrozenModel):
         families: of conditions, over which the scenes are distributed; or none.
         sequence: motion of the sequences; without it all pairs are independent.
         tanker: types and paints of the tankers, or none for a wing with one pod.
+        hose: length, hang and paint of the hoses, or none for one length in the drogue's paint.
+        receiver: its probe, and what else of it is in view, or none for what `target.probe` says.
+        neighbours: other drogues in view, or none.
     """
 
     name: str = Field(min_length=1, max_length=80, pattern=r"^[a-z0-9][a-z0-9-]*$")
@@ -174,6 +183,9 @@ class Recipe(FrozenModel):
     families: tuple[Family, ...] = Field(default=(), max_length=100)
     sequence: SequenceRanges | None = Field(default=None, exclude_if=lambda sequence: sequence is None)
     tanker: TankerRanges | None = Field(default=None, exclude_if=lambda tanker: tanker is None)
+    hose: HoseRanges | None = Field(default=None, exclude_if=lambda hose: hose is None)
+    receiver: ReceiverRanges | None = Field(default=None, exclude_if=lambda receiver: receiver is None)
+    neighbours: NeighbourRanges | None = Field(default=None, exclude_if=lambda neighbours: neighbours is None)
 
     @property
     def variants(self) -> tuple[DrogueVariant, ...]:
@@ -243,6 +255,20 @@ class Recipe(FrozenModel):
         return self
 
     @model_validator(mode="after")
+    def _surroundings_can_be_drawn(self) -> Self:
+        parts: tuple[Recipe | Family, ...] = (self, *self.families)
+        for part in parts:
+            sections = {"hose": part.hose, "receiver": part.receiver, "neighbours": part.neighbours}
+            for name, section in sections.items():
+                if section is not None and self.render.engine == "analytic":
+                    raise ValueError(f"{name}: the engine analytic draws none; leave it out, or use mitsuba or blender")
+            if part.neighbours is not None and self.sequence is not None:
+                raise ValueError("neighbours: are drawn in single frames only; leave them out with [sequence]")
+            if part.receiver is not None and part.target.probe:
+                raise ValueError("target.probe: draws a second probe beside that of [receiver]; leave it out")
+        return self
+
+    @model_validator(mode="after")
     def _sequences_move_by_themselves(self) -> Self:
         if self.sequence is None:
             return self
@@ -255,6 +281,8 @@ class Recipe(FrozenModel):
             )
         for part in self.families or (self,):
             check_single_frame_keys(part.pose, part.target)
+            if part.hose is not None:
+                part.hose.check_sequence()
             if dropouts is not None:
                 dropouts.check_sun(part.pose, part.environment)
             longest_s = part.exposure.auto_time_s.high if part.exposure.time_s is None else part.exposure.time_s

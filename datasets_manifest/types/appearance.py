@@ -69,13 +69,15 @@ class Obstacle(FrozenModel):
         kind: `probe` of the receiver, `obstacle` close to the cameras, or `distractor` that resembles a drogue.
         shape: dimensions, in its own frame.
         left_from_object: pose at mid-exposure.
-        reflectance_rgb: diffuse reflectance in linear Rec. 709.
+        reflectance_rgb: diffuse reflectance of its main paint in linear Rec. 709.
+        luminance_cd_m2: of a lamp, in the colour of its paint. [cd/m2]
     """
 
     kind: Literal["probe", "obstacle", "distractor"]
     shape: ObstacleShape
     left_from_object: Transform
     reflectance_rgb: ReflectanceRgb
+    luminance_cd_m2: float = Field(default=0.0, ge=0, le=1e6, exclude_if=lambda luminance: luminance == 0)
 
 
 class CalibrationBoard(FrozenModel):

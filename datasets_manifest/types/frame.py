@@ -10,8 +10,11 @@ from pydantic import Field, model_validator
 from datasets_manifest.types.appearance import DrogueCondition, Obstacle, PlacedBoard
 from datasets_manifest.types.environment import Environment
 from datasets_manifest.types.field_types import Points3, Rig, Transform, Vector6
+from datasets_manifest.types.neighbours import OtherDrogue
 from drogue_models.frozen_model import FrozenModel
 from drogue_models.parameters import DrogueParameters
+from drogue_models.parts import MAX_NEIGHBOURS
+from drogue_models.surroundings.hose_look import HoseLook
 from drogue_models.tankers.parameters import Tanker
 from geometry.se3 import RigidTransform, exp_twist
 
@@ -117,6 +120,8 @@ class FrameSpec(FrozenModel):
         tanker: what `left_from_tanker` is the pose of; None for a swept wing with one pod.
         left_from_tanker: pose of the tanker (x aft, y right wing, z up, origin where the hose leaves), or None.
         hose_nodes_left_m: (K, 3) centre line from coupling to pod in the left camera at mid-exposure, or None. [m]
+        hose_look: paint of the hose, or None for the drogue's structural paint.
+        neighbours: other drogues in view, none of which is sought.
         rig, sensor, exposure, environment: as named.
         rangefinder_reading_m: measured distance of the rim centre along the optical axis, or None without one. [m]
         loss: kind of the dropout whose onset, middle or end this frame is in, or None.
@@ -141,6 +146,10 @@ class FrameSpec(FrozenModel):
     tanker: Tanker | None = Field(default=None, exclude_if=lambda tanker: tanker is None)
     left_from_tanker: Transform | None
     hose_nodes_left_m: Points3 | None
+    hose_look: HoseLook | None = Field(default=None, exclude_if=lambda look: look is None)
+    neighbours: tuple[OtherDrogue, ...] = Field(
+        default=(), max_length=MAX_NEIGHBOURS, exclude_if=lambda neighbours: not neighbours
+    )
     rig: Rig
     sensor: Sensor
     exposure: Exposure
@@ -154,12 +163,31 @@ class FrameSpec(FrozenModel):
             raise ValueError("left_from_drogue: must be given exactly when there is a drogue")
         if self.drogue is not None and self.board is not None:
             raise ValueError("board: stands only in frames without a drogue")
+        if self.drogue is None and self.neighbours:
+            raise ValueError("neighbours: are in view only beside the drogue that is sought")
         states = self.condition.markers if self.condition is not None else ()
         if self.condition is not None and self.drogue is None:
             raise ValueError("condition: an empty frame has none")
         if self.drogue is not None and states and len(states) != self.drogue.marker_count:
             raise ValueError(f"condition.markers: must be {self.drogue.marker_count} or none, got {len(states)}")
         return self
+
+    def sought_and_neighbours(self) -> tuple[FrameSpec, ...]:
+        """The frame as it is, then once for each neighbour with that as its drogue and no others."""
+        frames = [self]
+        for other in self.neighbours:
+            changes = {
+                "drogue": other.drogue,
+                "condition": other.condition,
+                "left_from_drogue": other.left_from_drogue,
+                "hose_nodes_left_m": other.hose_nodes_left_m,
+                "hose_look": other.hose_look,
+                "left_from_tanker": other.left_from_tanker,
+                "bystanders": (),
+                "neighbours": (),
+            }
+            frames.append(self.model_copy(update=changes))
+        return tuple(frames)
 
     def left_from_drogue_at(self, offset_s: float) -> RigidTransform:
         """Pose of the drogue in the left camera, `offset_s` after mid-exposure.

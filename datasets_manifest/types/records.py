@@ -39,6 +39,19 @@ class HubView(FeatureView):
     center_ellipse_inner_px: PixelPoint
 
 
+class NeighbourView(FrozenModel):
+    """Boxes of a drogue that is not sought, in one image.
+
+    Attributes:
+        box_full_xywh_px, box_visible_xywh_px, visible_drogue_px, truncated: as in `ViewRecord`.
+    """
+
+    box_full_xywh_px: PixelBox
+    box_visible_xywh_px: PixelBox | None
+    visible_drogue_px: int = Field(ge=0)
+    truncated: bool
+
+
 class ViewRecord(FrozenModel):
     """Truth of one eye.
 
@@ -49,6 +62,7 @@ class ViewRecord(FrozenModel):
         box_visible_xywh_px: around its visible pixels; None when no pixel is visible.
         visible_drogue_px: number of pixel centres that see the drogue.
         truncated: the full box leaves the image.
+        neighbours: in the order of the frame's `neighbours`.
         board_corners_px: images of a calibration board's inner corners, row by row; only in frames with a board.
     """
 
@@ -58,6 +72,7 @@ class ViewRecord(FrozenModel):
     box_visible_xywh_px: PixelBox | None
     visible_drogue_px: int = Field(ge=0)
     truncated: bool
+    neighbours: tuple[NeighbourView, ...] = Field(default=(), exclude_if=lambda neighbours: not neighbours)
     board_corners_px: tuple[PixelPoint, ...] = Field(default=(), exclude_if=lambda corners: not corners)
 
 
@@ -90,22 +105,12 @@ class PairRecord(FrozenModel):
     """All labels of one stereo pair.
 
     Attributes:
-        frame_index: in the dataset.
-        scene_id: of the drawn environment.
-        sequence_id: None for a single pair.
-        time_s: mid-exposure. [s]
         left_from_drogue: at mid-exposure; None in an empty frame.
-        left_from_drogue_open: when the shutter opens.
-        left_from_drogue_close: when the shutter closes.
-        pitch_deg: of `left_from_drogue`.
-        yaw_deg: of `left_from_drogue`.
-        roll_deg: of `left_from_drogue`.
+        left_from_drogue_open, left_from_drogue_close: when the shutter opens and closes.
+        pitch_deg, yaw_deg, roll_deg: of `left_from_drogue`.
         roll_modulo_deg: roll modulo the markers' symmetry, in [0, 360/order).
-        views: labels of both images.
-        conditions: by which reports group pairs.
         file_sha256: of every other file of the frame, by name.
-        engine: renderer of the radiance.
-        engine_version: of the renderer.
+        engine, engine_version: renderer of the radiance.
         image_black_level_dn: pixel value of the stored images without light. [DN]
         frame: the specification that it was made from.
     """

@@ -44,6 +44,18 @@ def wing_surfaces() -> tuple[PaintedMesh, ...]:
     return (PaintedMesh(mesh=with_creases(tanker_mesh()), reflectance=np.array(TANKER_GREY), smooth=True),)
 
 
+def pod_exit_m(y_m: float) -> Array:
+    """(3,) where the hose of a second pod leaves, under the wing beside the first one, in the tanker frame. [m]
+
+    Raises:
+        ValueError: there is no wing.
+    """
+    if not TIP_Y_M + 1.0 <= y_m <= ROOT_Y_M - 1.0:
+        raise ValueError(f"y_m: must be in [{TIP_Y_M + 1:g}, {ROOT_Y_M - 1:g}], where there is a wing, got {y_m:g}")
+    back_m = _nose_x_m(y_m) + _chord_m(y_m) - TRAILING_EDGE_X_M
+    return np.array([back_m, y_m, _wing_z_m(y_m) - WING_HEIGHT_M])
+
+
 def _aerofoil(points_a_side: int) -> Array:
     """(N, 2) outline of a symmetric section of chord 1: x from nose to tail, z up; over the top first.
 

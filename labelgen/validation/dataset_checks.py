@@ -39,6 +39,7 @@ from labelgen.validation.label_checks import (
     box_faults,
     check_boxes,
     check_empty,
+    check_neighbours,
     check_unoccluded_marker,
     named_features,
     projection_faults,
@@ -321,6 +322,7 @@ def _label_faults(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8]) -> l
         return check_empty(view, part_id)
     layout = marker_layout(drogue)
     faults = check_boxes(view, parts_mask(part_id, drogue_part_ids(layout.count)))
+    faults += check_neighbours(record, view, part_id)
     pixels = FeaturePixels(part_id)
     if len(view.markers) != layout.count:
         return [*faults, f"markers: {len(view.markers)} are labelled, the drogue has {layout.count}"]

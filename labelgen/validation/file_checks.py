@@ -19,13 +19,14 @@ from datasets_manifest.storage.layout import ANNOTATIONS_FOLDER, passes_file
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location, open_storage
+from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parts import Part, drogue_part_ids
 from geometry.stereo import EYES, Eye
-from labelgen.export.annotations.coco import DROGUE, coco_image_id
-from labelgen.export.keypoints import view_of
-from labelgen.part_pixels import FeaturePixels
+from labelgen.export.annotations.coco import DROGUE, coco_image_id, coco_neighbours
+from labelgen.export.keypoints import keypoint_count, view_of
+from labelgen.part_pixels import FeaturePixels, drogue_mask
 from labelgen.validation.label_checks import check_feature_pixels, named_features
 
 # Numbers that went through float64 and one product.
@@ -118,6 +119,7 @@ class CocoFiles:
     def __init__(self, dataset: Location, manifest: Manifest) -> None:
         """Read all files; those that cannot be read become faults."""
         self._faults: list[str] = []
+        self._manifest = manifest
         self._storage = open_storage(dataset)
         self._path = self._storage.where(f"{ANNOTATIONS_FOLDER}/all.json")
         wanted: dict[str, set[int]] = {"all": set()}
@@ -143,6 +145,20 @@ class CocoFiles:
         view = view_of(record, eye)
         where = f"{self._path}: image {image_id}"
         annotations = self._all.imgToAnns[image_id]
+        try:
+            wanted = coco_neighbours(record, eye, part_id, keypoint_count(self._manifest))
+        except ValueError as error:
+            return [f"{where}: {error}"]
+        others = [entry for entry in annotations if entry.get("id") in {other["id"] for other in wanted}]
+        # As JSON, in which numbers of both are the same.
+        if canonical_json(others) != canonical_json(wanted):
+            return [f"{where}: the annotations of drogues beside the sought one differ from the record and part ids"]
+        for index, other in enumerate(record.frame.neighbours):
+            mask = drogue_mask(part_id, other.drogue.marker_count, index + 1)
+            masks = [self._all.annToMask(entry).astype(bool) for entry in others]
+            if mask.any() and not any(np.array_equal(mask, found) for found in masks):
+                return [f"{where}: no segmentation is that of neighbours[{index}] in the part ids"]
+        annotations = [entry for entry in annotations if entry not in others]
         if view.box_visible_xywh_px is None:
             return [f"{where}: has annotations, no drogue is visible"] if annotations else []
         if [annotation.get("category_id") for annotation in annotations] != [DROGUE]:

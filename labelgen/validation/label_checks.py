@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datasets_manifest.types.records import FeatureView, PairRecord, PixelBox, ViewRecord
+from datasets_manifest.types.records import FeatureView, NeighbourView, PairRecord, PixelBox, ViewRecord
 from drogue_models.marker_layout import MarkerLayout, marker_layout
 from drogue_models.parameters import DrogueParameters
-from drogue_models.parts import FIRST_MARKER_ID, drogue_part_ids
+from drogue_models.parts import FIRST_MARKER_ID, INSTANCE_STEP, drogue_part_ids
 from geometry.distortion import Lens
 from geometry.se3 import Array, RigidTransform
 from geometry.stereo import EYES, Eye, StereoRig
 from labelgen.disc_images import DiscInEye, hub_discs, marker_discs
-from labelgen.part_pixels import FeaturePixels, parts_mask
+from labelgen.part_pixels import FeaturePixels, drogue_mask, parts_mask
 from render.engine import EyeRadiance, StereoRadiance
 
 # Root mean square distance between the centroid of the pixel centres in a disc and the disc's own centre is this times
@@ -71,8 +71,8 @@ def check_empty(view: ViewRecord, part_id: NDArray[np.uint8]) -> list[str]:
     return faults
 
 
-def check_boxes(view: ViewRecord, mask: NDArray[np.bool_]) -> list[str]:
-    """Faults of one eye's boxes against the (H, W) pixels that see the drogue."""
+def check_boxes(view: ViewRecord | NeighbourView, mask: NDArray[np.bool_]) -> list[str]:
+    """Faults of one eye's boxes of a drogue against the (H, W) pixels that see it."""
     faults = []
     count = int(np.count_nonzero(mask))
     if count != view.visible_drogue_px:
@@ -89,6 +89,21 @@ def check_boxes(view: ViewRecord, mask: NDArray[np.bool_]) -> list[str]:
         # A pixel reaches half a pixel beyond its centre on either side.
         if full is None or not _contains(full, box, margin_px=1.0):
             faults.append(f"box_visible_xywh_px: {box} is not inside box_full_xywh_px {full}")
+    return faults
+
+
+def check_neighbours(record: PairRecord, view: ViewRecord, part_id: NDArray[np.uint8]) -> list[str]:
+    """Faults of one eye's boxes of the drogues beside the sought one."""
+    others = record.frame.neighbours
+    if len(view.neighbours) != len(others):
+        return [f"neighbours: {len(view.neighbours)} are labelled, the frame has {len(others)}"]
+    faults = []
+    for index, (seen, other) in enumerate(zip(view.neighbours, others, strict=True)):
+        found = check_boxes(seen, drogue_mask(part_id, other.drogue.marker_count, index + 1))
+        faults += [f"neighbours[{index}]: {fault}" for fault in found]
+    beyond = INSTANCE_STEP * (len(others) + 1)
+    if (part_id >= beyond).any():
+        faults.append(f"neighbours: {np.count_nonzero(part_id >= beyond)} pixels show one that the frame has not")
     return faults
 
 
@@ -135,6 +150,7 @@ def _check_drogue(
         return [f"markers, hub: {len(view.markers)} markers are labelled, the drogue has {layout.count}"]
     pixels = FeaturePixels(seen.part_id)
     faults = check_boxes(view, parts_mask(seen.part_id, drogue_part_ids(layout.count)))
+    faults += check_neighbours(record, view, seen.part_id)
     for name, feature, disc in named_features(record, layout, pose, eye):
         hole_m = layout.hub_inner_radius_m if name == "hub" else 0.0
         found = _check_visibility(feature, pixels.count(disc.part), seen.amodal_px.get(disc.part, 0))
@@ -277,7 +293,7 @@ def _point_faults(
         turn, _ = cv2.Rodrigues(real_from_ideal @ pose.rotation)
         offset = real_from_ideal @ (pose.translation_m - rig.eye_offset_m(eye))
         want, _ = cv2.projectPoints(points_m, turn, offset, lens.camera.matrix(), lens.distortion.coefficients())
-        error = np.abs(labelled[eye] - want.reshape(-1, 2)).max(axis=1)
+        error = np.abs(labelled[eye] - want[:, 0]).max(axis=1)
         for index in np.flatnonzero(~(error <= _PROJECTION_TOLERANCE_PX)):
             faults.append(f"{eye}: {names[index]}: is {error[index]:.3g} px off the pose's image")
         try:

@@ -35,7 +35,7 @@ from nav.training.training_settings import SizePx, size_text
 
 EyeIndex = int
 """0 the left eye, 1 the right."""
-_VERSION = 1  # incremented with every change of a cache's contents
+_VERSION = 2  # incremented with every change of a cache's contents
 _IMAGES_FILE, _INDEX_FILE, _LOCK_FILE = "images.npy", "index.json", ".lock"
 _LOCK_POLL_S = 0.2
 
@@ -48,11 +48,16 @@ class CachedPair(FrozenModel):
         split: that it belongs to.
         boxes: of the left and the right eye: the visible part of the drogue in the cached image, x, y of the low
             corner, width, height, counted from the image's corner; None where none is visible. [px]
+        others: of both eyes, those of the drogues beside it. [px]
     """
 
     frame_index: int
     split: SplitName
     boxes: tuple[tuple[float, float, float, float] | None, tuple[float, float, float, float] | None]
+    others: tuple[tuple[tuple[float, float, float, float], ...], tuple[tuple[float, float, float, float], ...]] = (
+        (),
+        (),
+    )
 
 
 class _Index(FrozenModel):
@@ -186,13 +191,16 @@ def _read_pair(dataset: Dataset, frame_index: int, split: SplitName, size_px: Si
     if faults:
         raise ValueError(faults[0])
     record, stereo = dataset.record(frame_index), dataset.images(frame_index)
-    images, boxes = [], []
+    images, boxes, others = [], [], []
     for eye in EYES:
         image, placement = input_image(stereo, eye, (size_px[1], size_px[0]))
         images.append(image)
         box = getattr(record.views, eye).box_visible_xywh_px
         boxes.append(None if box is None else tuple(placement.to_input(box)[0].tolist()))
-    return _ReadPair(images, CachedPair(frame_index=frame_index, split=split, boxes=(boxes[0], boxes[1])))
+        beside = [other.box_visible_xywh_px for other in getattr(record.views, eye).neighbours]
+        others.append(tuple(tuple(placement.to_input(box)[0].tolist()) for box in beside if box is not None))
+    entry = CachedPair(frame_index=frame_index, split=split, boxes=(boxes[0], boxes[1]), others=(others[0], others[1]))
+    return _ReadPair(images, entry)
 
 
 @dataclass(frozen=True)
@@ -237,9 +245,10 @@ class Corpus:
         return image
 
     def boxes(self, pair: int, eye: EyeIndex) -> Boxes:
-        """(n, 4) boxes of one eye, n at most 1."""
-        box = self.entry(pair).boxes[eye]
-        return np.zeros((0, 4)) if box is None else np.array([box])
+        """(n, 4) boxes of one eye: that of the sought drogue if it is seen, then those of drogues beside it."""
+        entry = self.entry(pair)
+        found = [*([] if entry.boxes[eye] is None else [entry.boxes[eye]]), *entry.others[eye]]
+        return np.array(found, dtype=np.float64).reshape(-1, 4)
 
 
 def open_corpus(

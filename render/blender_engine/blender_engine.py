@@ -28,6 +28,7 @@ from render.blender_engine.process import (
     BlenderEndedError,
     BlenderProcess,
     CenterPixels,
+    bpy_version,
     paste,
     read_light,
     read_passes,
@@ -85,9 +86,9 @@ class BlenderEngine:
     name = "blender"
 
     def __init__(self) -> None:
+        self.version = f"blender {bpy_version()} cycles cpu, render version {RENDER_VERSION}"
         self._stage = Stage()
         self._process = BlenderProcess()
-        self.version = f"blender {self._process.version} cycles cpu, render version {RENDER_VERSION}"
         self._stage_s: dict[str, float] = {}
 
     def close(self) -> None:
@@ -175,6 +176,10 @@ class BlenderEngine:
         light = np.zeros((camera.height_px, camera.width_px, 4), dtype=np.float32)
         for window in context:
             paste(light, window, self._light(path, window, (0, settings.surround_samples_per_px), _CONTEXT_DEPTH, job))
+        for corners_m in self._stage.neighbours_m:
+            window = path.window(corners_m)
+            if window is not None:
+                paste(light, window, self._light(path, window, (0, settings.samples_per_px), settings.max_depth, job))
         difference = np.zeros_like(light)
         if drogue is not None:
             traced.amodal_px.update(self._amodal(path, drogue, traced, job))

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from datasets_manifest.types.frame import FrameSpec
 from drogue_models.painted_mesh import PaintedMesh
@@ -20,7 +19,7 @@ from render.blender_engine.messages import (
     StageObjects,
     SurfaceAppearance,
 )
-from render.surfaces import FrameSurfaces, Surface, feature_surfaces, frame_surfaces
+from render.surfaces import NEIGHBOUR_GROUP, FrameSurfaces, Surface, feature_surfaces, frame_surfaces
 from scenes.environment_radiance import EnvironmentRadiance
 
 
@@ -30,6 +29,7 @@ class Stage:
     Attributes:
         drogue_m: (V, 3) vertices of the drogue's own parts. [m]
         context_m: (V, 3) vertices of each other thing. [m]
+        neighbours_m: those among them that are drogues, too. [m]
     """
 
     def __init__(self) -> None:
@@ -37,6 +37,7 @@ class Stage:
         self._paint: dict[str, NDArray[np.floating[Any]]] = {}
         self.drogue_m: NDArray[np.float32] = np.zeros((0, 3), dtype=np.float32)
         self.context_m: list[NDArray[np.float32]] = []
+        self.neighbours_m: list[NDArray[np.float32]] = []
 
     def set_frame(self, frame: FrameSpec, ambient: EnvironmentRadiance) -> FrameSetup:
         """The setup that Blender needs for this frame."""
@@ -53,6 +54,9 @@ class Stage:
         for name, surface in surfaces.moved.items():
             things.setdefault(surface.group, []).append(moved[name].vertices_m)
         self.context_m = [np.concatenate(vertices) for vertices in things.values()]
+        self.neighbours_m = [
+            np.concatenate(vertices) for group, vertices in things.items() if group.startswith(NEIGHBOUR_GROUP)
+        ]
         appearances = {name: self._appearance(name, surface) for name, surface in surfaces.all.items()}
         return FrameSetup(stage=stage, moved=moved, appearances=appearances, light=_light(frame, ambient))
 
@@ -126,11 +130,10 @@ def _light(frame: FrameSpec, ambient: EnvironmentRadiance) -> StageLight:
     world_from_stage = (frame.world_from_left @ frame.left_from_stage_at(0.0)).rotation
     light_map = ambient.light_map
     unit_cd_m2 = max(float(light_map.mean()), 1e-12)
-    stage_from_sun, _ = Rotation.align_vectors([world_from_stage.T @ ambient.beam_direction], [[0.0, 0.0, 1.0]])
     return StageLight(
         sky=(light_map / np.float32(unit_cd_m2)).astype(np.float32),
-        world_from_stage_rad=Rotation.from_matrix(world_from_stage).as_euler("xyz"),
-        stage_from_sun=stage_from_sun.as_quat(scalar_first=True),
+        world_from_stage=world_from_stage,
+        to_sun=world_from_stage.T @ ambient.beam_direction,
         sun=ambient.beam_illuminance_lux / unit_cd_m2,
         unit_cd_m2=unit_cd_m2,
     )

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.frame import FrameSpec
-from drogue_models.parts import MAX_MARKERS, SURROUNDING_PARTS, Part, drogue_part_ids, marker_id
+from drogue_models.parts import (
+    INSTANCE_STEP,
+    MAX_MARKERS,
+    MAX_NEIGHBOURS,
+    SURROUNDING_PARTS,
+    Part,
+    drogue_part_ids,
+    marker_id,
+)
 from geometry.stereo import Eye
 from render.compositing import TracedEye, inside_one_part
 from scenes.environment_radiance import EnvironmentRadiance
@@ -28,12 +36,18 @@ def parts_table(parts: Iterable[int]) -> NDArray[np.uint8]:
     return table
 
 
-DROGUE_PARTS = parts_table(drogue_part_ids(MAX_MARKERS))
+_INSTANCES = range(MAX_NEIGHBOURS + 1)
+# Drogues beside the sought one are sampled like it.
+DROGUE_PARTS = parts_table(part for instance in _INSTANCES for part in drogue_part_ids(MAX_MARKERS, instance))
 _MARKERS = parts_table(marker_id(index) for index in range(MAX_MARKERS))
 _DEEP_PARTS = (Part.COUPLING, Part.HUB)
-_DEEP = parts_table(_DEEP_PARTS)
+_DEEP = parts_table(INSTANCE_STEP * instance + part for instance in _INSTANCES for part in _DEEP_PARTS)
 # Parts from which most of the sky is visible.
-OPEN_TO_SKY = parts_table({*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS})
+OPEN_TO_SKY = parts_table(
+    INSTANCE_STEP * instance + part
+    for instance in _INSTANCES
+    for part in {*drogue_part_ids(MAX_MARKERS), *SURROUNDING_PARTS} - {Part.CANOPY, Part.RIBS, *_DEEP_PARTS}
+)
 
 
 def parts_in(part_id: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -141,7 +155,9 @@ def plan_pixels(
         drogue |= parts_in(part_id, DROGUE_PARTS)
         covered |= part_id != Part.SKY
         # A part's sunlit and shadowed surfaces count as two.
-        inside &= inside_one_part((2 * part_id + in_sun).astype(np.uint8), margin_px) & parts_in(part_id, even)
+        inside &= inside_one_part((2 * part_id.astype(np.uint16) + in_sun).astype(np.uint16), margin_px) & parts_in(
+            part_id, even
+        )
     belongs, reached = (cv2.dilate(seen.view(np.uint8), kernel) > 0 for seen in (drogue, covered))
     of_open, of_deep = (parts_in(ids[0], table) for table in (OPEN_TO_SKY, _DEEP))
     within, edges = belongs & inside, belongs & ~inside

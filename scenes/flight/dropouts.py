@@ -14,8 +14,8 @@ from drogue_models.frozen_model import ReflectanceRgb
 from drogue_models.obstacles import ObstacleShape
 from geometry.pinhole import PinholeCamera
 from geometry.se3 import Array, RigidTransform
-from scenes.drogue_appearance import rotation_with_z
 from scenes.environment_sampling import sample_uniform
+from scenes.placement import rotation_with_z
 
 # The bar is wider by this share, for the canopy behind the rim and for motion between the samples.
 _SPARE_FRACTION = 0.15

@@ -26,8 +26,9 @@ from scenes.flight.dropouts import (
     sample_dropout,
     sun_beside_drogue_deg,
 )
-from scenes.flight.frame_kinematics import HOSE_OVERLAP_M, WORLD_FROM_TANKER, FrameKinematics
+from scenes.flight.frame_kinematics import FrameKinematics
 from scenes.flight.hose_dynamics import HoseModel, drogue_rotation, still_mouth_direction
+from scenes.flight.suspension import WORLD_FROM_TANKER, hose_tail_m
 from scenes.flight.trajectory import (
     SETTLING_S,
     SimulationInputs,
@@ -105,7 +106,7 @@ class Flight:
         """
         self._id, self._sequence, self._drogue = sequence_id, sequence, drogue
         receiver = sequence.receiver
-        tail_m = drogue.hub_depth_m + drogue.coupling_length_m - HOSE_OVERLAP_M
+        tail_m = hose_tail_m(drogue)
         self._drogue_from_tail_m = np.array([0.0, 0.0, tail_m])
         self._roll_rad = float(
             np.radians(sample_uniform(frame_generator(seed, sequence_id, "drogue roll"), pose.roll_deg))

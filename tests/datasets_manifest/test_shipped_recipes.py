@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datasets_manifest.random_streams import frame_generator
 from datasets_manifest.recipe.recipe import load_recipe, recipe_names
 from droguekit.batch.recipe_plan import draw_frames, plan_recipe
-from scenes.drogue_appearance import sample_obstacles
-from scenes.sampler import sample_left_from_drogue
+from scenes.sampler import sample_frame, sample_left_from_drogue
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -57,9 +55,7 @@ def test_detector_small_has_empty_frames_and_things_that_are_no_drogue() -> None
     # 1200 draws at 12.5 %: a standard deviation of 1 %.
     assert abs(plan.empty_fraction - 0.125) < 0.03
     empty = np.flatnonzero(np.isnan(plan.drawn.distances_m))
-    bystanders = [
-        sample_obstacles(frame_generator(recipe.seed, int(k), "bystanders"), recipe, None) for k in empty[:60]
-    ]
+    bystanders = [sample_frame(recipe, int(k)).bystanders for k in empty[:60]]
     negatives = sum(any(found.kind == "distractor" for found in frame) for frame in bystanders)
     # 60 draws at 40 %: a standard deviation of 3.8.
     assert 12 <= negatives <= 36

@@ -43,6 +43,9 @@ class RecipeTable(TypedDict, total=False):
     families: Sequence[Section] | Section
     sequence: Section
     tanker: Section
+    hose: Section
+    receiver: Section
+    neighbours: Section
 
 
 # The ideal eyes with an eighth and a quarter of their pixels a side, at the same field of view.

@@ -34,6 +34,8 @@ RECALLS: Array = np.linspace(0.0, 1.0, 101)
 MOST_BOXES = 100
 """Of an image, the best ones: COCO's limit."""
 _ALL_AREAS = (0.0, 1e10)
+# Above all ids of images; pycocotools keeps ids in float64.
+_OTHER_ID_STEP = 2**40
 Counts = NDArray[np.signedinteger[Any]]
 # Numbers held at once: some tens of megabytes.
 _NUMBERS_AT_ONCE = 4_000_000
@@ -57,7 +59,8 @@ class Matches:
         score: (n,) descending.
         is_true: (10, n) whether it is the first box on its drogue, at each of `IOU_THRESHOLDS`.
         box: (n,) the boxes themselves.
-        has_drogue: (len(images),) whether there is one to be found.
+        has_drogue: (len(images),) whether the one that is sought is to be found.
+        is_sought: (n,) whether it is the first box on the sought drogue at overlap 0.5, not on one beside it.
     """
 
     images: tuple[ImageTruth, ...]
@@ -66,16 +69,22 @@ class Matches:
     is_true: NDArray[np.bool_]
     box: tuple[DetectedBox, ...]
     has_drogue: NDArray[np.bool_]
+    is_sought: NDArray[np.bool_]
 
     @property
     def drogues(self) -> int:
         """How many there are to be found."""
-        return int(self.has_drogue.sum())
+        return int(self.counts().sum())
+
+    def counts(self) -> NDArray[np.int64]:
+        """(len(images),) drogues to be found in each image, sought or not."""
+        others = np.array([len(image.others_xywh) for image in self.images], dtype=np.int64)
+        return self.has_drogue.astype(np.int64) + others
 
     def found_scores(self) -> Array:
-        """(len(images),) score of the box on each image's drogue at overlap 0.5; -inf where it was not found."""
+        """(len(images),) score of the box on each image's sought drogue at overlap 0.5; -inf where it is not found."""
         scores = np.full(len(self.images), -np.inf)
-        true = self.is_true[AT_50]
+        true = self.is_sought
         scores[self.image[true]] = self.score[true]
         return scores
 
@@ -118,6 +127,7 @@ class Evaluation:
         """The matches on some of the images."""
         place, score, box = [], [], []
         true: list[NDArray[np.bool_]] = []
+        sought: list[NDArray[np.bool_]] = []
         for k, image in enumerate(images):
             entry = self._entries.get(image.image_id)
             if entry is None or not entry["dtIds"]:
@@ -125,7 +135,10 @@ class Evaluation:
             place += [k] * len(entry["dtIds"])
             score += entry["dtScores"]
             box += [self._boxes[number] for number in entry["dtIds"]]
-            true.append(np.asarray(entry["dtMatches"]) > 0)
+            matched = np.asarray(entry["dtMatches"])
+            true.append(matched > 0)
+            # The sought drogue's id is its image's.
+            sought.append(matched[AT_50] == image.image_id)
         scores = np.asarray(score, dtype=np.float64)
         # Stable, like pycocotools: equal scores stay in the order of the images.
         order = np.argsort(-scores, kind="stable")
@@ -136,6 +149,7 @@ class Evaluation:
             score=scores[order],
             is_true=is_true[:, order],
             box=tuple(box[k] for k in order),
+            is_sought=(np.concatenate(sought) if sought else np.zeros(0, dtype=np.bool_))[order],
             has_drogue=np.array([image.box_xywh is not None for image in images], dtype=np.bool_),
         )
 
@@ -268,12 +282,17 @@ def resampled_precision(matches: Matches, overlap: int, times: Counts) -> Array:
 
 def scene_count(matches: Matches) -> int:
     """Scenes that show a drogue to be found."""
-    return len({image.scene_id for image in matches.images if image.box_xywh is not None})
+    return len({matches.images[k].scene_id for k in np.flatnonzero(matches.counts())})
 
 
 def _evaluator(images: Sequence[ImageTruth], boxes: dict[int, DetectedBox]) -> COCOeval:
     """The evaluator, with all images evaluated."""
     truth = [(image.image_id, image.image_id, image.box_xywh) for image in images if image.box_xywh is not None]
+    truth += [
+        (_OTHER_ID_STEP * (place + 1) + image.image_id, image.image_id, box)
+        for image in images
+        for place, box in enumerate(image.others_xywh)
+    ]
     found = [(number, box.image_id, box.box_xywh, box.score) for number, box in boxes.items()]
     with contextlib.redirect_stdout(io.StringIO()):
         evaluator = COCOeval(_coco(images, truth), _coco(images, found), iouType="bbox")
@@ -317,7 +336,7 @@ def _passing(matches: Matches) -> tuple[Array, Array, Array]:
 def _scenes(matches: Matches) -> tuple[Counts, Counts, Counts]:
     """Ids of the scenes, the place of each image's among them, and how many drogues each shows."""
     ids, scene = np.unique([image.scene_id for image in matches.images], return_inverse=True)
-    return ids, scene, np.bincount(scene[matches.has_drogue], minlength=len(ids))
+    return ids, scene, np.bincount(scene, weights=matches.counts(), minlength=len(ids)).astype(np.int64)
 
 
 def _sampled_mean(recall: Array, envelope: Array) -> float:

@@ -37,6 +37,8 @@ class ImageTruth:
         box_xywh: to be found; None where there is nothing to find. [px]
         ignored_xywh: full box, clipped to the image, of a drogue that counts neither way. [px]
         is_known_empty: the truth says that there is no drogue in the pair.
+        others_xywh: boxes of drogues beside the sought one, to be found too. [px]
+        ignored_others_xywh: as `ignored_xywh`, of those. [px]
     """
 
     frame_index: int
@@ -48,6 +50,8 @@ class ImageTruth:
     box_xywh: PixelBox | None
     ignored_xywh: PixelBox | None
     is_known_empty: bool
+    others_xywh: tuple[PixelBox, ...] = ()
+    ignored_others_xywh: tuple[PixelBox, ...] = ()
 
     @property
     def image_id(self) -> int:
@@ -108,6 +112,13 @@ def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, in
             box = corner_box(view.box_visible_xywh_px)
         else:
             ignored = clipped_box(corner_box(view.box_full_xywh_px), size_px)
+    others, ignored_others = [], []
+    for other in view.neighbours:
+        full, visible = other.box_full_xywh_px, other.box_visible_xywh_px
+        if visible is not None and visible[2] * visible[3] >= LEAST_SEEN_FRACTION * full[2] * full[3]:
+            others.append(corner_box(visible))
+        elif (clipped := clipped_box(corner_box(full), size_px)) is not None:
+            ignored_others.append(clipped)
     return ImageTruth(
         frame_index=record.frame_index,
         eye=eye,
@@ -118,6 +129,8 @@ def image_truth(record: PairRecord, eye: Eye, split: str, size_px: tuple[int, in
         box_xywh=box,
         ignored_xywh=ignored,
         is_known_empty=record.left_from_drogue is None,
+        others_xywh=tuple(others),
+        ignored_others_xywh=tuple(ignored_others),
     )
 
 
@@ -129,10 +142,15 @@ def scored_boxes(images: Sequence[ImageTruth], found: Sequence[DetectedBox]) -> 
 
 def _is_ignored(box: DetectedBox, image: ImageTruth) -> bool:
     """Whether at least half of a box lies in the box of an ignored drogue."""
-    region = image.ignored_xywh
-    if region is None:
-        return False
-    x, y, width, height = box.box_xywh
+    regions = (
+        image.ignored_others_xywh if image.ignored_xywh is None else (image.ignored_xywh, *image.ignored_others_xywh)
+    )
+    return any(_lies_in(box.box_xywh, region) for region in regions)
+
+
+def _lies_in(box_xywh: PixelBox, region: PixelBox) -> bool:
+    """Whether at least half of a box lies in a region."""
+    x, y, width, height = box_xywh
     common_x = min(x + width, region[0] + region[2]) - max(x, region[0])
     common_y = min(y + height, region[1] + region[3]) - max(y, region[1])
     return max(common_x, 0.0) * max(common_y, 0.0) >= _LEAST_SHARE_INSIDE * width * height

@@ -26,7 +26,7 @@ from datasets_manifest.storage.writer import canonical_json
 from datasets_manifest.types.records import PairRecord, PixelBox, PixelPoint
 from geometry.se3 import Array
 from geometry.stereo import EYES, Eye
-from labelgen.export.annotations.part_masks import DroguePixels
+from labelgen.export.annotations.part_masks import DroguePixels, MaskPixels
 from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import ImageBits, export_image
 from labelgen.export.keypoints import (
@@ -46,8 +46,10 @@ DROGUE, MARKER, HUB = 1, 2, 3
 NAMESPACE = "droguekit"
 
 # Ids of markers and hubs: the feature's number in the upper bits, the image's id in the lower ones. Many programs keep
-# ids in signed integers of 32 bits; with at most 33 features these are below 34 * 2^25 < 2^31.
+# ids in signed integers of 32 bits; with at most 33 features these are below 34 * 2^25 < 2^31. Drogues beside the
+# sought one come after them.
 _FEATURE_ID_STEP = 2**25
+_FIRST_NEIGHBOUR = 40
 
 IMAGES_FOLDER = "images"
 
@@ -134,6 +136,8 @@ def _write(
                 annotations = [] if drogue is None else [drogue]
                 if with_features and part_id is not None:
                     annotations += coco_features(record, eye, part_id, count)
+                objects = len(annotations)
+                annotations += coco_neighbours(record, eye, part_id, count)
                 image = coco_image(record, eye, split)
                 for name in ("all", split):
                     own_name = image if images is None else {**image, "file_name": _copy_name(record, eye, split, name)}
@@ -143,7 +147,7 @@ def _write(
                     export_image(source, record.frame_index, eye, copy, log, images.bits)
                 elif bits > 8:
                     log.lost(f"images of {bits} bits in 16, nearly black to programs for 8: add --images for copies")
-                masked = None if drogue is None else len(annotations) if part_id is not None else 0
+                masked = None if drogue is None else objects if part_id is not None else 0
                 log_missing_labels(log, record, eye, masked)
         for writer in writers.values():
             writer.finish()
@@ -207,11 +211,6 @@ class _CocoFile:
 def coco_image_id(frame_index: int, eye: Eye) -> int:
     """Id of an image, and of its drogue's annotation; the same in every file and after any merge."""
     return 2 * frame_index + EYES.index(eye) + 1
-
-
-def coco_feature_id(image_id: int, marker_index: int | None) -> int:
-    """Id of the annotation of a marker, or of the hub where the index is None, on an image."""
-    return (1 if marker_index is None else 2 + marker_index) * _FEATURE_ID_STEP + image_id
 
 
 def coco_header(manifest: Manifest, with_features: bool) -> dict[str, Any]:
@@ -313,6 +312,7 @@ def coco_annotation(
         NAMESPACE: {
             "bbox_full": _corner_box(view.box_full_xywh_px),
             "truncated": view.truncated,
+            **({"sought": True} if record.frame.neighbours else {}),
             "drogue": drogue.name,
             "keypoint_order_in_image": clockwise_order(view),
             "equal_keypoint_orders": symmetric_orders(drogue),
@@ -327,6 +327,67 @@ def coco_annotation(
     }
 
 
+def coco_neighbours(
+    record: PairRecord, eye: Eye, part_id: NDArray[np.uint8] | None, count: int
+) -> list[dict[str, Any]]:
+    """The entries of the drogues beside the sought one in one eye's image, without those of which no pixel is seen.
+
+    Arguments as those of `coco_annotation`. They are of the same category; their attribute `sought` is false, and all
+    their keypoints are absent.
+
+    Raises:
+        ValueError: the frame's index is too large for ids of 32 bits.
+    """
+    view, entries = view_of(record, eye), []
+    for index, (seen, other) in enumerate(zip(view.neighbours, record.frame.neighbours, strict=True)):
+        box = seen.box_visible_xywh_px
+        if box is None:
+            continue
+        image_id = _small_image_id(record, eye)
+        pixels = None if part_id is None else neighbour_pixels(record, index, box, part_id)
+        entries.append(
+            {
+                "id": (_FIRST_NEIGHBOUR + index) * _FEATURE_ID_STEP + image_id,
+                "image_id": image_id,
+                "category_id": DROGUE,
+                "iscrowd": 0,
+                "bbox": _corner_box(box),
+                "area": seen.visible_drogue_px,
+                **({} if pixels is None else {"segmentation": pixels.segmentation()}),
+                "keypoints": [0] * (3 * count),
+                "num_keypoints": 0,
+                NAMESPACE: {
+                    "bbox_full": _corner_box(seen.box_full_xywh_px),
+                    "truncated": seen.truncated,
+                    "sought": False,
+                    "drogue": other.drogue.name,
+                    "rim_radius_m": other.drogue.rim_radius_m,
+                    "left_from_drogue": other.left_from_drogue.as_matrix().tolist(),
+                    "eye_offset_m": record.frame.rig.eye_offset_m(eye).tolist(),
+                },
+            }
+        )
+    return entries
+
+
+def neighbour_pixels(record: PairRecord, index: int, box: PixelBox, part_id: NDArray[np.uint8]) -> MaskPixels:
+    """Mask of a drogue beside the sought one, within its visible box in one eye's image."""
+    count = record.frame.neighbours[index].drogue.marker_count
+    return DroguePixels(part_id, box, count, index + 1).drogue()
+
+
+def _small_image_id(record: PairRecord, eye: Eye) -> int:
+    """Id of an image, to which a feature's or a neighbour's number can be added.
+
+    Raises:
+        ValueError: it is too large for ids of 32 bits.
+    """
+    image_id = coco_image_id(record.frame_index, eye)
+    if image_id >= _FEATURE_ID_STEP:
+        raise ValueError(f"frame {record.frame_index}: must be below {_FEATURE_ID_STEP // 2 - 1} for COCO's ids")
+    return image_id
+
+
 def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], count: int) -> list[dict[str, Any]]:
     """The entries of hub and markers in one eye's image, without those of which no pixel is seen.
 
@@ -339,15 +400,12 @@ def coco_features(record: PairRecord, eye: Eye, part_id: NDArray[np.uint8], coun
     view = view_of(record, eye)
     if view.box_visible_xywh_px is None:
         return []
-    image_id = coco_image_id(record.frame_index, eye)
-    if image_id >= _FEATURE_ID_STEP:
-        raise ValueError(f"frame {record.frame_index}: must be below {_FEATURE_ID_STEP // 2 - 1} for COCO's ids")
-    entries = []
+    image_id, entries = _small_image_id(record, eye), []
     for seen in drogue_pixels(record, eye, part_id).features(view):
         feature, index = seen.feature, seen.marker_index
         entries.append(
             {
-                "id": coco_feature_id(image_id, index),
+                "id": (1 if index is None else 2 + index) * _FEATURE_ID_STEP + image_id,
                 "image_id": image_id,
                 "category_id": HUB if index is None else MARKER,
                 "iscrowd": 0,

@@ -19,6 +19,7 @@ from datasets_manifest.atomic import new_folder
 from datasets_manifest.storage.manifest import Manifest
 from datasets_manifest.storage.reader import Dataset
 from datasets_manifest.storage.storage import Location
+from drogue_models.parts import MAX_MARKERS
 from labelgen.export.annotations.annotated_views import (
     IMAGES_FOLDER,
     AnnotatedObject,
@@ -32,6 +33,8 @@ ANNOTATIONS_FILE = "annotations.xml"
 
 # Groups within an image: 1 the drogue, 2 its hub, then the markers.
 _DROGUE_GROUP, _HUB_GROUP, _FIRST_MARKER_GROUP = 1, 2, 3
+# Drogues beside the sought one come after the groups of as many markers as a drogue can have.
+_LAST_MARKER_GROUP = _FIRST_MARKER_GROUP + MAX_MARKERS
 
 _LABELS = (("drogue", "#ff5c00", ""), ("marker", "#00c8ff", "index"), ("hub", "#c800ff", ""))
 
@@ -125,6 +128,8 @@ def _attributes(one: AnnotatedObject) -> str:
 
 
 def _group(one: AnnotatedObject) -> int:
+    if one.instance:
+        return _LAST_MARKER_GROUP + one.instance
     if one.marker_index is not None:
         return _FIRST_MARKER_GROUP + one.marker_index
     return _DROGUE_GROUP if one.label == "drogue" else _HUB_GROUP

@@ -89,6 +89,7 @@ def _detection(view: AnnotatedView, one: AnnotatedObject) -> dict[str, Any]:
         "bounding_box": [x / width, y / height, box_width / width, box_height / height],
         "marker_index": one.marker_index,
         "visible_fraction": one.visible_fraction,
+        **({"sought": one.instance == 0} if view.record.frame.neighbours else {}),
         "tags": [],
         "mask": None if one.pixels is None else {"$binary": {"base64": _mask(one.pixels), "subType": "00"}},
     }

@@ -78,6 +78,7 @@ def _task(number: int, view: AnnotatedView, log: ExportLog) -> dict[str, Any]:
     results: list[dict[str, Any]] = []
     for one in view.objects:
         name = one.label if one.marker_index is None else f"marker_{one.marker_index}"
+        name = f"neighbour_{one.instance}" if one.instance else name
         if one.label == "drogue":
             x, y, width, height = one.box
             (corner, size) = _per_cent(view, [(x, y), (width, height)])

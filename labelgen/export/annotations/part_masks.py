@@ -83,13 +83,14 @@ class SeenFeature:
 class DroguePixels:
     """Masks of the drogue and its features in one eye's image, computed within the drogue's visible box."""
 
-    def __init__(self, part_id: NDArray[np.uint8], box: PixelBox, marker_count: int) -> None:
+    def __init__(self, part_id: NDArray[np.uint8], box: PixelBox, marker_count: int, instance: int = 0) -> None:
         """Crop the part ids.
 
         Args:
             part_id: (H, W) of the whole image.
             box: `box_visible_xywh_px` of the view.
             marker_count: of the drogue.
+            instance: which drogue, see `drogue_part_ids`; features are those of the sought one, 0.
         """
         u, v = round(box[0] + 0.5), round(box[1] + 0.5)
         crop = part_id[v : v + round(box[3]), u : u + round(box[2])]
@@ -97,12 +98,12 @@ class DroguePixels:
         self._turned = np.ascontiguousarray(crop.T)
         self._low = u, v
         self._size_px = part_id.shape[1], part_id.shape[0]
-        self._marker_count = marker_count
+        self._marker_count, self._instance = marker_count, instance
         self._features = FeaturePixels(self._turned)
 
     def drogue(self) -> MaskPixels:
         """The whole drogue."""
-        return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count)))
+        return self._set(*np.nonzero(drogue_mask(self._turned, self._marker_count, self._instance)))
 
     def features(self, view: ViewRecord) -> list[SeenFeature]:
         """Hub and markers of which a pixel is seen."""

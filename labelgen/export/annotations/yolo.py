@@ -17,7 +17,14 @@ from datasets_manifest.types.records import PairRecord
 from drogue_models.marker_layout import marker_layout
 from drogue_models.parameters import DrogueParameters
 from geometry.stereo import EYES, Eye
-from labelgen.export.annotations.coco import HUB, MARKER, coco_annotation, coco_features, read_part_ids
+from labelgen.export.annotations.coco import (
+    HUB,
+    MARKER,
+    coco_annotation,
+    coco_features,
+    coco_neighbours,
+    read_part_ids,
+)
 from labelgen.export.export_log import ExportLog
 from labelgen.export.frame_files import export_image
 from labelgen.export.keypoints import (
@@ -70,15 +77,17 @@ def write_yolo_detect(dataset: Location, out: Path, log: ExportLog) -> list[Path
     def rows(record: PairRecord, eye: Eye) -> list[list[float]]:
         part_id = read_part_ids(source, record, eye)
         drogue = coco_annotation(record, eye, None, 0)
+        others = [[0, *_shares(entry["bbox"], record)] for entry in coco_neighbours(record, eye, None, 0)]
         if drogue is None:
-            return []
+            return others
         if part_id is None:
             log.lost("views without boxes of markers and hub: the dataset has no part ids of them")
-            return [[0, *_shares(drogue["bbox"], record)]]
+            return [[0, *_shares(drogue["bbox"], record)], *others]
         features = coco_features(record, eye, part_id, 0)
         return [
             [0, *_shares(drogue["bbox"], record)],
             *([_CLASS_OF_CATEGORY[entry["category_id"]], *_shares(entry["bbox"], record)] for entry in features),
+            *others,
         ]
 
     return _write(source, out, log, rows, ())
@@ -91,14 +100,16 @@ def _write_pose(dataset: Location, out: Path, log: ExportLog, in_image_order: bo
     def rows(record: PairRecord, eye: Eye) -> list[list[float]]:
         view, camera = view_of(record, eye), record.frame.rig.camera
         drogue = coco_annotation(record, eye, None, 0)
+        absent = [0.0] * (3 * count)
+        others = [[0, *_shares(entry["bbox"], record), *absent] for entry in coco_neighbours(record, eye, None, 0)]
         if drogue is None:
-            return []
+            return others
         points = view_keypoints(view, camera, count)
         log_absent_keypoints(log, points, len(view.markers))
         if in_image_order:
             points = [points[index] for index in clockwise_order(view)] + [ABSENT] * (count - len(view.markers))
         shares = [(point.x / camera.width_px, point.y / camera.height_px, point.flag) for point in points]
-        return [[0, *_shares(drogue["bbox"], record), *(number for share in shares for number in share)]]
+        return [[0, *_shares(drogue["bbox"], record), *(number for share in shares for number in share)], *others]
 
     if not _one_flip_fits(source.manifest, in_image_order):
         log.lost("values of flip_idx that do not fit all drogues: train with fliplr=0")

@@ -86,6 +86,7 @@ def write_bop(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
         write_models(recipe, folder)
         writer = _Scenes(source, folder, log)
         for record in log.records(source):
+            log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
             split = splits[record.frame_index]
             seen = writer.add(record, split)
             if split == "test" and seen >= _TARGET_FROM_FRACTION:

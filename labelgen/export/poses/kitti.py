@@ -60,6 +60,7 @@ def write_kitti(dataset: Location, out: Path, log: ExportLog) -> list[Path]:
             for split in sorted(set(splits.values()))
         }
         for record in log.records(source):
+            log.lost("drogues beside the sought one: left out", len(record.frame.neighbours))
             name = f"{record.frame_index:06d}"
             lists[splits[record.frame_index]].write(f"{name}\n")
             _write_lines(training / "calib" / f"{name}.txt", calibration)

@@ -12,8 +12,8 @@ from drogue_models.marker_layout import MarkerLayout, marker_layout
 from geometry.circles import disc_outline
 from geometry.se3 import RigidTransform, exp_twist, log_twist
 from geometry.stereo import EYES, StereoRig
-from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
 from scenes.flight.sequence import _flight
+from scenes.flight.suspension import WORLD_FROM_TANKER
 from scenes.sampler import sample_frame, sample_left_from_drogue, scene_of_frame, split_of_scenes
 from tests.support.recipe_builder import build_recipe
 from tests.support.small_datasets import STATION_KEEPING

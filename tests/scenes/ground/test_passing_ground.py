@@ -9,7 +9,7 @@ import pytest
 from datasets_manifest.types.environment import CloudLayer, Environment
 from scenes.clouds.cloud_layers import CloudLight, render_cloud_layer
 from scenes.environment_radiance import EnvironmentRadiance, environment_radiance
-from scenes.flight.frame_kinematics import WORLD_FROM_TANKER
+from scenes.flight.suspension import WORLD_FROM_TANKER
 from scenes.ground.ground_radiance import MEAN_REFLECTANCE, Ground
 from scenes.ground.sea import GroundLight
 from scenes.sampler import sample_frame

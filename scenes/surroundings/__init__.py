@@ -1,0 +1,1 @@
+"""Sampling what is around a drogue: the receiver, obstacles, distractors."""
