@@ -188,8 +188,8 @@ def _leaves(drogue: DrogueParameters, body: PetalBody) -> trimesh.Trimesh:
     wide = 1.0 + body.overlap_fraction
     opened = body.root_fraction + (wide - body.root_fraction) * _smooth_step((1.0 - shares) / 0.55)
     points, normals = line_points_m(line, shares)
-    # Within the rim's torus, with room for both sheets where they overlap.
-    points = points - [drogue.rim_tube_radius_m + 3 * sheet_m, 0.0]
+    # Against the rim's torus from inside; both sheets where they overlap stay within the rim.
+    points = points - [max(drogue.rim_tube_radius_m, 1.8 * sheet_m - drogue.rim_tube_radius_m), 0.0]
     lap_m = 1.2 * sheet_m * across
     back_m = body.tip_m * across**2 * (1.0 - shares[:, None]) ** 2
     solids = []
