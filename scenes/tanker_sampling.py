@@ -15,7 +15,7 @@ from geometry.se3 import Array, RigidTransform
 from scenes.environment_sampling import sample_uniform
 from scenes.flight.suspension import HOSE_NODES, HOSE_OVERLAP_M, WORLD_FROM_TANKER
 
-_FLAP_STEP_DEG = 2.5
+_FLAP_STEP_DEG = 5.0
 _SWEEP_STEPS = 12
 _LINE_SPREAD_DEG = 12.0
 

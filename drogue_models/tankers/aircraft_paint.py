@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from drogue_models.tankers.airframe import Airframe, Roundel, Trail
 from drogue_models.tankers.airframe_grids import Finish
 from drogue_models.tankers.atlas import ATLAS_HEIGHT_PX, ATLAS_WIDTH_PX, Chart
 from drogue_models.tankers.paint_schemes import Scheme
+from geometry.se3 import Array
 
 Texels = NDArray[np.float32]
 
@@ -31,6 +33,8 @@ _LINE_YELLOW: ReflectanceRgb = (0.55, 0.38, 0.04)
 _WARNING_RED: ReflectanceRgb = (0.42, 0.03, 0.03)
 _GAP_M = 0.012  # of panel and control surface gaps, with the dirt beside them
 _EMBLEM_PX = 96
+_SMALLEST_PX = 12  # of charts that show more than one colour
+_SPREAD = 0.08  # of a trail's width over its length
 _STREAM = 0x7A4B  # of the seeds of aircraft's paint
 
 
@@ -55,8 +59,6 @@ class _Sheet:
         self.role = chart.grid.role
         self.is_wing = self.role in _WINGS
         self.place_m = chart.points_m()
-        points_m = chart.grid.points_m.reshape(-1, 3)
-        self.box_m = points_m.min(axis=0), points_m.max(axis=0)
         self.size = (chart.height, chart.width)
         self.texel_m = chart.length_m / max(chart.width - 1, 1), chart.girth_m / max(chart.height - 1, 1)
         self.lower = (np.arange(chart.height) < chart.height / 2)[:, None]
@@ -66,7 +68,7 @@ class _Sheet:
         if self.role == "canopy":
             return self._canopy()
         color = self._base()
-        if min(self.size) >= 12:
+        if min(self.size) >= _SMALLEST_PX:
             color *= self._panels()[..., None]
             self._equipment(color)
             for place in self.airframe.roundels:
@@ -75,7 +77,7 @@ class _Sheet:
         self._finishes(color)
         for trail in self.airframe.trails:
             self._trail(color, trail)
-        if min(self.size) >= 12:
+        if min(self.size) >= _SMALLEST_PX:
             self._grime(color)
         return color
 
@@ -264,12 +266,14 @@ class _Sheet:
         """Fading and handling: broad and fine unevenness of the paint."""
         broad = self._noise((1.4 * self.airframe.panel_m,) * 2, 2)
         fine = self.rng.standard_normal(self.size, dtype=np.float32)
-        streaks = self._streaks(0.10 * self.airframe.panel_m)
+        streaks = self._streaks
         factor: Texels = 1.0 + np.float32(0.045) * broad + np.float32(0.012) * fine + np.float32(0.03) * streaks
         return factor
 
-    def _streaks(self, width_m: float) -> Texels:
+    @cached_property
+    def _streaks(self) -> Texels:
         """Noise that is long along the flow: along the columns of bodies, along the rows of wings."""
+        width_m = 0.07 * self.airframe.panel_m
         along_m = 14.0 * width_m
         return self._noise((along_m, width_m) if self.is_wing else (width_m, along_m), 1)
 
@@ -293,36 +297,48 @@ class _Sheet:
     def _trail(self, color: Texels, trail: Trail) -> None:
         if self.chart.grid.mirrored and trail.start_m[1] < 0:
             return
-        reach_m = 3.0 * trail.length_m
-        low, high = self.box_m
-        start = np.array(trail.start_m)
-        widest_m = 4.0 * (trail.width_m + 0.08 * reach_m)
-        if (
-            high[0] < start[0]
-            or low[0] > start[0] + reach_m
-            or low[1] > start[1] + widest_m
-            or high[1] < start[1] - widest_m
-        ):
+        window = self._reach(trail)
+        if window is None:
             return
-        behind = self.place_m[..., 0] - np.float32(start[0])
-        width = trail.width_m + 0.08 * np.maximum(behind, 0.0)
-        beside = (self.place_m[..., 1] - np.float32(start[1])) / width
-        above = (self.place_m[..., 2] - np.float32(start[2])) / (2.2 * width)
+        place_m, start = self.place_m[window], np.array(trail.start_m, dtype=np.float32)
+        behind = place_m[..., 0] - start[0]
+        width = trail.width_m + _SPREAD * np.maximum(behind, 0.0)
+        beside = (place_m[..., 1] - start[1]) / width
+        above = (place_m[..., 2] - start[2]) / (2.2 * width)
         amount = np.exp(-(beside**2) - above**2 - np.maximum(behind, 0.0) / trail.length_m)
         amount *= trail.strength * np.clip(behind / (0.3 * trail.width_m + 0.05), 0.0, 1.0)
-        if min(self.size) >= 12:
-            amount *= np.clip(0.85 + 0.45 * self._streaks(0.25 * trail.width_m), 0.0, 1.3)
-        _blend(color, amount, _OIL if trail.oil else _SOOT)
+        if min(self.size) >= _SMALLEST_PX:
+            amount *= np.clip(0.85 + 0.45 * self._streaks[window], 0.0, 1.3)
+        _blend(color[window], amount, _OIL if trail.oil else _SOOT)
+
+    def _reach(self, trail: Trail) -> tuple[slice, slice] | None:
+        """Rows and columns that a trail may soil, or None."""
+        reach_m = 3.0 * trail.length_m
+        widest_m = 2.5 * (trail.width_m + _SPREAD * reach_m)
+        start = np.array(trail.start_m)
+        offset = np.concatenate([self.chart.grid.points_m, self.chart.grid.points_m[:, :1]], axis=1) - start
+        near = (np.abs(offset[..., 1]) < widest_m) & (np.abs(offset[..., 2]) < 2.2 * widest_m)
+        near &= (offset[..., 0] > -1.0) & (offset[..., 0] < reach_m)
+        if not near.any():
+            return None
+        rows = _span(self.chart.around, near.any(axis=0), self.size[0])
+        return rows, _span(self.chart.along, near.any(axis=1), self.size[1])
 
     def _grime(self, color: Texels) -> None:
         """Streaks of oil from drains and gaps on lower sides, and soil along the gaps."""
         if self.role in ("fin", "canopy", "blade", "lens") or self.scheme.weave:
             return
         drops = self._noise((1.1 * self.airframe.panel_m,) * 2, 1)
-        streaks = self._streaks(0.05 * self.airframe.panel_m + 0.02)
         lower = np.broadcast_to(self.lower, self.size) if self.is_wing else self.place_m[..., 2] < self._side_z_m()
-        amount = np.clip(0.5 * drops + 0.6 * streaks - 0.75, 0.0, 1.0) * np.float32(0.55)
+        amount = np.clip(0.5 * drops + 0.6 * self._streaks - 0.75, 0.0, 1.0) * np.float32(0.55)
         _blend(color, np.where(lower, amount, 0.25 * amount), _OIL)
+
+
+def _span(places: Array, near: NDArray[np.bool_], count: int) -> slice:
+    """The texels between the outermost grid points that are near, and their neighbours."""
+    found = np.flatnonzero(near)
+    first, last = max(int(found[0]) - 1, 0), min(int(found[-1]) + 1, len(places) - 1)
+    return slice(int(places[first] * (count - 1)), int(np.ceil(places[last] * (count - 1))) + 1)
 
 
 def _as_map(rgb: ReflectanceRgb) -> Texels:

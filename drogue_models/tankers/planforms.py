@@ -33,7 +33,7 @@ _BUILDERS: dict[TankerType, Callable[[float], Airframe]] = {
 _CREASE_DEG = 32.0
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=48)
 def airframe(tanker_type: TankerType, flaps_deg: float) -> Airframe:
     """The airframe of a type."""
     return _BUILDERS[tanker_type](flaps_deg)

@@ -29,14 +29,15 @@ _OTHER_BLADE_RGB = (0.055, 0.056, 0.058)
 
 
 def tanker_surfaces(tanker: Tanker) -> tuple[PaintedMesh, ...]:
-    """All surfaces of a tanker in its frame; the airframe comes first, then propellers and lamps. [m]"""
+    """All surfaces of a tanker in its frame; the airframe comes first, then lamps and propellers. [m]"""
     return (
         *_fixed_surfaces(tanker.model_copy(update={"blade_phase_deg": 0.0, "blade_sweep_deg": 0.0})),
         *_blades(tanker),
     )
 
 
-@lru_cache(maxsize=12)
+# A map takes 25 MB, and frames of one scene follow each other or are far apart.
+@lru_cache(maxsize=3)
 def _fixed_surfaces(tanker: Tanker) -> tuple[PaintedMesh, ...]:
     frame = airframe(tanker.type, tanker.flaps_deg)
     origin = -np.array(frame.stations_m[tanker.station])
@@ -46,27 +47,27 @@ def _fixed_surfaces(tanker: Tanker) -> tuple[PaintedMesh, ...]:
     return (PaintedMesh(moved, paint, uv, smooth=True), *_lamps(tanker, origin))
 
 
-@lru_cache(maxsize=12)
+@lru_cache(maxsize=48)
 def _charts(tanker_type: TankerType, flaps_deg: float) -> tuple[Chart, ...]:
     return tuple(lay_out(airframe(tanker_type, flaps_deg).grids))
 
 
-@lru_cache(maxsize=12)
+@lru_cache(maxsize=48)
 def _airframe_mesh(tanker_type: TankerType, flaps_deg: float) -> tuple[trimesh.Trimesh, Array]:
     charts = _charts(tanker_type, flaps_deg)
     return joined_mesh(airframe(tanker_type, flaps_deg).grids, lambda index: charts[index].uv, np.zeros(3))
 
 
-@lru_cache(maxsize=12)
 def _paint(tanker_type: TankerType, flaps_deg: float, paint: PaintScheme, seed: int) -> NDArray[np.float32]:
     frame = airframe(tanker_type, flaps_deg)
     return paint_aircraft(frame, _charts(tanker_type, flaps_deg), SCHEMES[paint], seed)
 
 
-def _blades(tanker: Tanker) -> list[PaintedMesh]:
+@lru_cache(maxsize=4)
+def _blades(tanker: Tanker) -> tuple[PaintedMesh, ...]:
     frame = airframe(tanker.type, 0.0)
     if not frame.rotors:
-        return []
+        return ()
     origin = np.array(frame.stations_m[tanker.station])
     meshes = [
         # Propellers are not in step.
@@ -76,7 +77,7 @@ def _blades(tanker: Tanker) -> list[PaintedMesh]:
     mesh = trimesh.util.concatenate(meshes)
     mesh.apply_translation(-origin)
     rgb = np.array(_BLADE_RGB.get(tanker.type, _OTHER_BLADE_RGB))
-    return [PaintedMesh(mesh, rgb)]
+    return (PaintedMesh(mesh, rgb),)
 
 
 def _lamps(tanker: Tanker, origin: Array) -> list[PaintedMesh]:
