@@ -30,6 +30,8 @@ from scenes.sky.photometry import Radiance
 _WATERTIGHT = {"type": "scene", "embree_use_robust_intersections": True}
 # Scenes that an engine caches; the least recently used one is dropped first.
 KEPT_SCENES = 8
+# The map of one tanker takes 25 MB.
+_MOST_MAP_BYTES = 100_000_000
 # Mitsuba's map has +y up; its first column looks along -z and the next ones turn towards +x. Our map starts in the east
 # (+x) and turns towards north (+y), the other way round: so the columns are reversed and the axes exchanged.
 _MAP_FROM_WORLD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
@@ -48,6 +50,7 @@ class DrogueScene:
         emits: whether any surface may shine.
         glowing: everything without sky and sun, or None where nothing emits; only for the scalar variant.
         shiny_parts: ids of parts with a sheen.
+        map_bytes: size of all reflectance maps.
         sun: direction towards the sun in the stage's axes, and its illuminance of a facing plane [lux].
     """
 
@@ -63,6 +66,7 @@ class DrogueScene:
         self.scene = mi.load_dict({**_WATERTIGHT, **shapes, **_lights()}, optimize=False)
         self.features = mi.load_dict({**_WATERTIGHT, **features}, optimize=False)
         self.emits = any(surface.is_lamp for surface in surfaces.all.values())
+        self.map_bytes = sum(surface.reflectance.nbytes for surface in surfaces.all.values() if surface.uv is not None)
         self.shiny_parts = {surface.part_id for surface in surfaces.all.values() if surface.painted.sheen is not None}
         self._dark = {name for name, surface in surfaces.all.items() if surface.is_lamp and not surface.lights_others}
         self.glowing: Any = None
@@ -226,10 +230,13 @@ class SceneCache:
         key = _scene_key(frame, surfaces)
         scene = self._scenes.pop(key, None) or DrogueScene(surfaces)
         self._scenes[key] = scene
-        if len(self._scenes) > KEPT_SCENES:
+        while len(self._scenes) > KEPT_SCENES or (len(self._scenes) > 1 and self._map_bytes() > _MOST_MAP_BYTES):
             self._scenes.popitem(last=False)
         scene.set_frame(surfaces, stage_from_left @ frame.world_from_left.inverse(), ambient)
         return scene
+
+    def _map_bytes(self) -> int:
+        return sum(scene.map_bytes for scene in self._scenes.values())
 
 
 def _shape(name: str, surface: Surface, mesh: trimesh.Trimesh, file: Path) -> Any:

@@ -20,6 +20,7 @@ from geometry.se3 import RigidTransform
 from render.compositing import inside_one_part
 from render.engine import RenderEngine, load_engine
 from render.surfaces import frame_surfaces
+from scenes.environment_radiance import environment_radiance
 from scenes.sampler import sample_frame
 from tests.support.painted_plate import DISTANCE_M, QUARTERS, frame_with, plate, quarter_means, quarters
 from tests.support.recipe_builder import paper_view_recipe
@@ -139,6 +140,23 @@ def test_worn_drogues_share_a_scene_and_take_their_own_maps(engine: RenderEngine
     face = first.part_id == Part.FACE
     ratio = other.radiance_cd_m2[face] / first.radiance_cd_m2[face]
     assert ratio.std() > 0.03
+
+
+def test_few_scenes_with_large_maps_are_kept(
+    engine: RenderEngine, frame: FrameSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene_module = pytest.importorskip("render.mitsuba_engine.scene")
+    monkeypatch.setattr(scene_module, "_MOST_MAP_BYTES", 3 * 512 * 512 * 3 * 4)
+    scenes, ambient = scene_module.SceneCache(), environment_radiance(frame.environment)
+    kept = []
+    for index in range(5):
+        # Maps of unequal sizes take scenes of their own.
+        painted = frame_with(monkeypatch, frame, [(plate(np.full((512, 512 + index, 3), 0.5)), PLACE)])
+        scenes.scene_of(painted, ambient)
+        kept.append(len(scenes._scenes))
+    assert kept == [1, 2, 2, 2, 2]
+    huge = frame_with(monkeypatch, frame, [(plate(np.full((2048, 2048, 3), 0.5)), PLACE)])
+    assert scenes.scene_of(huge, ambient) is scenes.scene_of(huge, ambient)
 
 
 def test_only_dirt_and_bold_maps_count_as_edges_all_over(frame: FrameSpec) -> None:
