@@ -113,3 +113,12 @@ def test_navigation_says_in_one_line_why_there_is_no_pose(dataset: Path, tmp_pat
     lines.write_text("".join(estimate.model_dump_json() + "\n" for estimate in estimates))
     rows = json.loads(run_benchmark(dataset, lines).to_json())["methods"]
     assert set(rows) == set(method_names())
+
+
+def test_the_analytic_engine_refuses_bodies_before_it_begins() -> None:
+    table = {"name": "flat", "frames": {"count": 1}, "distance": stations(3.0), "render": {"engine": "analytic"}}
+    build_recipe(table, drogue="red-8")
+    with pytest.raises(ValueError, match=r"render\.engine: analytic draws flat rings only, not basket-grey"):
+        build_recipe(table, drogue="basket-grey")
+    with pytest.raises(ValueError, match="not cone-white, petals-dark; use mitsuba or blender"):
+        build_recipe(table, target={"variants": [{"drogue": name} for name in ("petals-dark", "red-8", "cone-white")]})
