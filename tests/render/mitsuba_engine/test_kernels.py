@@ -1,8 +1,12 @@
-"""Compiled kernels serve the frames of all scenes: compiling takes longer than tracing a frame."""
+"""Compiled kernels serve the frames of all scenes: compiling takes longer than tracing a frame.
+
+Memory stays what the kept scenes and the largest frame take.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,12 +15,19 @@ import pytest
 from datasets_manifest.recipe.recipe import RenderSettings
 from datasets_manifest.types.appearance import DrogueCondition, SurfaceCondition
 from datasets_manifest.types.frame import FrameSpec
+from droguekit.api.recipe_rendering import load_recipe
+from droguekit.batch.execution import resident_gib
+from droguekit.batch.worker_pool import run_in_own_process
 from geometry.se3 import RigidTransform
+from render.engine import load_engine
 from scenes.sampler import sample_frame
-from tests.support.recipe_builder import paper_view_recipe
+from tests.support.recipe_builder import RIG_160_PX, paper_view_recipe
 
 if TYPE_CHECKING:
     from render.mitsuba_engine.mitsuba_engine import MitsubaEngine
+
+# Kernels do not depend on the sky, and clouds take most of a small frame's time.
+CLEAR = [{"name": "clear"}]
 
 
 @pytest.fixture
@@ -70,3 +81,46 @@ def test_new_scenes_and_other_pixels_take_the_same_kernels(
     # has put them, there would be variants for those that lie on 64 bytes and for those that do not, one or two a
     # scene; with numbers of shapes or pixels compiled in, five and more.
     assert sum(settled) <= 2, str(new)
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a process has used after a frame: new kernels, bytes allocated for the device, and its own memory. [GiB]"""
+
+    new_kernels: int
+    allocated_bytes: int
+    resident_gib: float
+
+
+def usage_over_frames() -> list[Usage] | None:
+    """Renders fifty frames of other drogues, paints, obstacles, distances and motions; None for the scalar variant."""
+    import drjit as dr
+
+    engine = load_engine("mitsuba")
+    if "scalar_rgb" in engine.version:
+        return None
+    recipe = load_recipe("detector-small", rig=RIG_160_PX, frames={"count": 50, "scenes": 16}, families=CLEAR)
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    known: set[str] = set()
+    usage = []
+    for index in range(recipe.frames.count):
+        dr.kernel_history_clear()
+        engine.render(sample_frame(recipe, index), recipe.render)
+        taken = {kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel}
+        allocated = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+        usage.append(Usage(len(taken - known), allocated, resident_gib()))
+        known |= taken
+    return usage
+
+
+def test_kernels_and_memory_settle_over_the_frames_of_a_varied_recipe() -> None:
+    usage = run_in_own_process(usage_over_frames)
+    if usage is None:
+        pytest.skip("the scalar variant compiles nothing")
+    early, late = usage[:25], usage[25:]
+    assert sum(after.new_kernels for after in early) > 30
+    # The number of paths from a pixel, one of few, is compiled into a kernel; rare ones may come late.
+    assert sum(after.new_kernels for after in late) <= 3, str(usage)
+    # A frame that is nearer than all before may still take more.
+    assert late[-1].allocated_bytes <= 1.2 * early[-1].allocated_bytes
+    assert late[-1].resident_gib <= 1.1 * early[-1].resident_gib
